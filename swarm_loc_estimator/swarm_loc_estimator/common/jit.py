@@ -15,7 +15,7 @@ import os
 import pickle
 import re
 import sys
-import tempfile
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
@@ -35,6 +35,8 @@ Function = TypeVar("Function", bound=Callable[..., object])
 _NUMBERS = {"None", "bool", "int", "float", "tuple"}
 _KEPT_S = 30 * 86400.0
 _DAY_S = 86400.0
+_DIGEST_SIZE = 32
+_FOREIGN = {*sys.stdlib_module_names, "numpy", "numba", "scipy", "llvmlite"}
 _PLAIN = (int, float, complex, str, bytes, type(None), type(...), np.generic, np.dtype)
 _core: Any = core  # most of it has no types
 _types = _core.types
@@ -125,12 +127,16 @@ class _ContentCache(NullCache):
         file = self._file(sig, target_context.codegen())
         try:
             data = file.read_bytes()
+            if hashlib.sha256(data[_DIGEST_SIZE:]).digest() != data[:_DIGEST_SIZE]:
+                return None  # damaged: it is compiled again
+            rebuild: Any = CompileResult._rebuild  # noqa: SLF001
+            found = rebuild(target_context, *pickle.loads(data[_DIGEST_SIZE:]))  # noqa: S301
+        except (OSError, ImportError, AttributeError):
+            return None  # never written, or of types that have moved: it is compiled again
+        with suppress(OSError):  # another user's cache may be used, but not touched
             if time.time() - file.stat().st_mtime > _DAY_S:
                 os.utime(file)
-            rebuild: Any = CompileResult._rebuild  # noqa: SLF001
-            return rebuild(target_context, *pickle.loads(data))  # noqa: S301
-        except (OSError, EOFError, pickle.UnpicklingError, ImportError, AttributeError, ValueError):
-            return None  # never written, cut off, or of types that have moved: it is compiled again
+        return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep compiled code for the next process."""
@@ -139,7 +145,8 @@ class _ContentCache(NullCache):
         file = self._file(sig, data.codegen)
         with suppress(OSError):  # where nothing can be kept, the next start compiles again
             file.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(file, _core.serialize.dumps(data._reduce()))  # noqa: SLF001
+            code = _core.serialize.dumps(data._reduce())  # noqa: SLF001
+            write_whole(file, hashlib.sha256(code).digest() + code)
 
     def _file(self, sig: Any, codegen: Any) -> Path:
         arguments, _ = _core.sigutils.normalize_signature(sig)
@@ -150,24 +157,29 @@ class _ContentCache(NullCache):
 
 def write_whole(file: Path, data: bytes) -> None:
     """Write a file so that whoever reads it sees all of it, or the one before."""
-    with tempfile.NamedTemporaryFile(dir=file.parent, prefix=file.name, suffix=".tmp", delete=False) as new:
-        new.write(data)
-    Path(new.name).replace(file)
+    part = file.with_name(f"{file.name}.{os.getpid()}-{threading.get_ident()}.tmp")
+    try:
+        part.write_bytes(data)
+        part.replace(file)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def _contents(functions: Iterable[Any]) -> list[str]:
     """What code depends on: a line for each function, compiled or not, and for each one that it reaches."""
-    found: dict[str, str] = {}
+    found: dict[FunctionType, str] = {}
     left = list(functions)
     while left:
         one = left.pop()
-        name, function = _name(one), getattr(one, "py_func", one)
-        if name not in found:
+        function = getattr(one, "py_func", one)
+        if function not in found:
             options = getattr(one, "targetoptions", {})
             described = [f"{option}={_described(options[option], (), left)}" for option in sorted(options)]
+            given = (function.__defaults__, *sorted((function.__kwdefaults__ or {}).items()))
+            described += [_described(given, (), left)]
             described += _described_code(function.__code__, _globals_of(function), left)
-            found[name] = " ".join(described)
-    return [f"{name} {found[name]}" for name in sorted(found)]
+            found[function] = " ".join([_name(one), *described])
+    return sorted(found.values())
 
 
 def _name(function: Any) -> str:
@@ -197,26 +209,27 @@ def _described_code(code: CodeType, names: Mapping[str, Any], reached: list[Any]
 def _described(value: Any, attributes: tuple[str, ...], reached: list[Any]) -> str:
     """A value that compiled code uses as a constant; of a module the attributes that may be meant."""
     if isinstance(value, Dispatcher | FunctionType):
-        reached.append(value)
+        if _name(value).partition(".")[0] not in _FOREIGN:
+            reached.append(value)
         return _name(value)
     if isinstance(value, enum.Enum):
         return f"{type(value).__qualname__}.{value.name}={_described(value.value, (), reached)}"
     if isinstance(value, _PLAIN):
         return f"{type(value).__name__} {value!r}"
     if isinstance(value, tuple | list):
-        return f"({', '.join(_described(one, attributes, reached) for one in value)})"
+        fields = f"{type(value).__qualname__}{getattr(value, '_fields', '')}"
+        return f"{fields}({', '.join(_described(one, attributes, reached) for one in value)})"
     if isinstance(value, set | frozenset):
         return f"{{{', '.join(sorted(_described(one, (), reached) for one in value))}}}"
     if isinstance(value, np.ndarray):
         return f"{value.dtype!r} {value.shape} {value.tobytes().hex()}"
     if isinstance(value, ModuleType):
-        inside = [(name, vars(value)[name]) for name in attributes if name in vars(value)]
-        ours = [
-            (n, v)
-            for n, v in inside
-            if isinstance(v, Dispatcher | enum.EnumMeta | type | int | float | tuple)
-        ]
-        return f"{value.__name__}({', '.join(f'{n}={_described(v, (), reached)}' for n, v in ours)})"
+        if value.__name__.partition(".")[0] in _FOREIGN:
+            return value.__name__
+        meant = sorted({name for name in attributes if name in vars(value)})
+        rest = tuple(name for name in attributes if name not in meant)  # ends where modules hold each other
+        inside = [f"{name}={_described(vars(value)[name], rest, reached)}" for name in meant]
+        return f"{value.__name__}({', '.join(inside)})"
     if isinstance(value, enum.EnumMeta):
         return f"({', '.join(_described(member, (), reached) for member in cast('Any', value))})"
     if isinstance(value, type):
@@ -224,7 +237,7 @@ def _described(value: Any, attributes: tuple[str, ...], reached: list[Any]) -> s
         return f"{value.__module__}.{value.__qualname__}{getattr(value, '_fields', '')}{defaults}"
     if isinstance(value, _types.ExternalFunction):
         return f"{value.symbol} {value.sig}"
-    return f"{type(value).__module__}.{type(value).__qualname__}"
+    return f"{type(value).__module__}.{type(value).__qualname__} {getattr(value, '__name__', '')}"
 
 
 def _described_type(argument: Any) -> str:
@@ -267,7 +280,8 @@ def _functions_of(module: ModuleType) -> Iterator[Any]:
 
 
 def _digest(parts: list[str], codegen: Any) -> str:
-    text = "\n".join([_OPTIONS, repr(codegen.magic_tuple()), *parts])
+    checked = _core.config.BOUNDSCHECK
+    text = "\n".join([_OPTIONS, f"boundscheck {checked}", repr(codegen.magic_tuple()), *parts])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 

@@ -210,13 +210,18 @@ MODELS: dict[int, MeasurementModel] = {
 
 
 def register(model: MeasurementModel) -> None:
-    """Add a model to `MODELS`.
+    """Add a model.
 
     Raises:
-        ValueError: The number is in use or not positive.
+        ValueError: Its number is in use or not positive, or its degrees of freedom are not 1, 2 or 3.
     """
     if model.number <= 0 or model.number in MODELS:
         raise ValueError(f"the number {model.number} of the measurement model {model.name!r} is not free")
+    if model.degrees_of_freedom not in (1, 2, 3):
+        raise ValueError(
+            f"the measurement model {model.name!r} has {model.degrees_of_freedom} degrees of freedom"
+            " but must have 1, 2 or 3"
+        )
     MODELS[model.number] = model
 
 

@@ -69,10 +69,14 @@ def _evaluate(
     innovation = model.innovation(one, predicted.value)
     gated = slice(model.degrees_of_freedom)
     batch.noise[k, :count, :count], batch.innovation[k, :count] = noise, innovation
-    batch.distance[k] = innovation[gated] @ np.linalg.solve(s[gated, gated], innovation[gated])
-    batch.accepted[k] = batch.distance[k] <= one["gate"][0]
-    batch.nis[k] = innovation @ np.linalg.solve(s, innovation)
     batch.whitened[k], batch.cause[k] = 0.0, 0
+    if np.isfinite(s).all() and np.isfinite(innovation).all() and np.isfinite(jacobian).all():
+        batch.distance[k] = innovation[gated] @ np.linalg.solve(s[gated, gated], innovation[gated])
+        batch.accepted[k] = batch.distance[k] <= one["gate"][0]
+        batch.nis[k] = innovation @ np.linalg.solve(s, innovation)
+    else:  # the model has failed at these poses
+        batch.jacobian[k], batch.innovation[k], batch.noise[k] = 0.0, 0.0, np.eye(3)
+        batch.distance[k], batch.nis[k], batch.accepted[k] = np.inf, np.nan, False
 
 
 def _columns(one: MeasurementArray, belief: BeliefArrays) -> tuple[int, int]:

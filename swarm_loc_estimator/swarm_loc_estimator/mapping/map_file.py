@@ -139,8 +139,11 @@ def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """
     data = read_file(path, _MAX_BYTES)
     try:
-        with Image.open(io.BytesIO(data)) as image:
+        with Image.open(io.BytesIO(data)) as opened:
+            image: Any = opened
             small_enough = 0 < image.width * image.height <= _MAX_CELLS
+            if small_enough and image.mode.startswith("I"):  # 16 bits, which `convert` would cut off
+                image = Image.fromarray((np.asarray(image) / 257.0).astype(np.uint8))
             gray: Any = image.convert("LA") if small_enough else None
     except Exception as error:  # the library raises whatever a broken file makes its decoders raise
         raise MapFileError(f"The image '{path}' of a map cannot be decoded: {error}.") from error

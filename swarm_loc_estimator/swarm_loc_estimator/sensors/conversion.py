@@ -19,7 +19,13 @@ from swarm_loc_estimator.sensors.sensor import (
     SensorSettings,
     chosen,
 )
-from swarm_loc_estimator.sensors.validation import REJECT_REASONS, VALID, reject_reasons
+from swarm_loc_estimator.sensors.validation import (
+    BAD_MEASUREMENT,
+    REJECT_REASONS,
+    VALID,
+    is_about_swarm,
+    reject_reasons,
+)
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 
@@ -48,6 +54,7 @@ class InputConverter:
             if sensor.create_converter is not None
         }
         self._future_ns = round(settings.future_tolerance_s * 1e9)
+        self._robots, self._landmarks = len(swarm.robots), len(swarm.landmarks)
 
     def convert(self, batch: Batch) -> Measurements:
         """Convert valid readings; count the others in `drops`."""
@@ -72,6 +79,7 @@ class InputConverter:
     def _valid(self, found: Measured) -> Measured:
         """Select valid measurements; count the others in `drops`."""
         reasons = reject_reasons(found.measurements)
+        reasons[~is_about_swarm(found.measurements, self._robots, self._landmarks)] = BAD_MEASUREMENT
         counts = np.bincount(reasons, minlength=len(REJECT_REASONS)).tolist()
         self.drops.update({REJECT_REASONS[k]: counts[k] for k in range(1, len(REJECT_REASONS)) if counts[k]})
         return chosen(found, reasons == VALID)

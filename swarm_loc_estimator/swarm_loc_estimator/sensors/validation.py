@@ -6,13 +6,14 @@ import math
 
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.small_matrix import cholesky3
-from swarm_loc_estimator.filter.measurement_model import MeasurementArray
+from swarm_loc_estimator.filter.measurement_model import MODELS, NOBODY, MeasurementArray
 
 VALID = 0
-REJECT_REASONS = ("", "non_finite", "absurd", "bad_covariance")
+REJECT_REASONS = ("", "non_finite", "absurd", "bad_covariance", "bad_measurement")
+BAD_MEASUREMENT = REJECT_REASONS.index("bad_measurement")
 """Why a measurement is rejected, by the numbers that `reject_reasons` gives."""
 
 _MAX_DISTANCE_M = 1e6
@@ -28,6 +29,18 @@ def reject_reasons(measurements: MeasurementArray) -> IntArray:
     reasons[np.abs(value).max(axis=1) > _MAX_DISTANCE_M] = REJECT_REASONS.index("absurd")
     reasons[~np.isfinite(value).all(axis=1)] = REJECT_REASONS.index("non_finite")
     return reasons
+
+
+def is_about_swarm(measurements: MeasurementArray, robots: int, landmarks: int) -> BoolArray:
+    """Whether measurements (m,) have a registered model, valid indices, and finite parameters."""
+    observer, target, landmark = (measurements[name] for name in ("observer", "target", "landmark"))
+    valid: BoolArray = np.isin(measurements["kind"], list(MODELS))
+    valid &= (observer >= NOBODY) & (observer < robots) & (target >= NOBODY) & (target < robots)
+    valid &= (landmark >= 0) & (landmark <= landmarks) & ((observer != target) | (observer == NOBODY))
+    valid &= np.isfinite(measurements["sensor"]).all(axis=1) & np.isfinite(measurements["marker"]).all(axis=1)
+    variance = measurements["stamp_variance"]
+    valid &= np.isfinite(variance) & (variance >= 0.0) & ~np.isnan(measurements["gate"])
+    return valid
 
 
 _BAD_COVARIANCE = REJECT_REASONS.index("bad_covariance")

@@ -28,6 +28,7 @@ from swarm_loc_estimator.filter.integrity.fault_detection import is_kidnapped
 from swarm_loc_estimator.filter.joint_filter import JointFilter, Robots
 from swarm_loc_estimator.filter.measurement_model import (
     MODELS,
+    POLAR,
     Command,
     Kind,
     MeasurementArray,
@@ -304,7 +305,7 @@ class Fusion:
             fields, belief, self._limits, batch.distance, batch.whitened, batch.cause, accepted
         )
         lost = confirm_all(fields, belief, accepted)
-        systematic = (fields.systematic_share > 0.0).any(axis=1)
+        systematic = (fields.systematic_share > 0.0).any(axis=1) & (fields.kind <= POLAR)
         for k in np.flatnonzero(accepted & systematic).tolist():
             record_pair(fields, k, belief, batch.pair[k])
         if accepted.any():
@@ -335,7 +336,7 @@ class Fusion:
         if constraint is None or not self._initializer.note(state, at_initialization(constraint(one))):
             return Verdict.NOT_LOCALIZED
         sides = np.array([one["observer"][0], one["target"][0]])
-        if self._pairs and (sides >= 0).all():
+        if self._pairs and (sides >= 0).all() and one["kind"][0] <= POLAR:
             tracks = self._tracks.at(sides, np.repeat(one["stamp_ns"], 2))
             record_constraint(MeasurementColumns.of(one), 0, state.arrays(), tracks)
         return Verdict.CONSTRAINT

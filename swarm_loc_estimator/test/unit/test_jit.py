@@ -15,8 +15,10 @@ USED = """
 from typing import NamedTuple
 from swarm_loc_estimator.common import jit as tool
 
+import math
 FACTOR = 1.5
 OFFSETS = (0.0, 0.25)
+ROOT = math.sqrt
 
 class Record(NamedTuple):
     low: float
@@ -25,7 +27,11 @@ class Record(NamedTuple):
 @tool.cached_njit
 def factor(record: Record) -> float:
     \"\"\"The factor.\"\"\"
-    return FACTOR * record.low + OFFSETS[0]
+    return FACTOR * record.low + OFFSETS[0] + rest(0.0)
+
+@tool.cached_njit
+def rest(zero: float, more: float = 0.0) -> float:
+    return ROOT(zero) + more
 """
 USING = """
 import used
@@ -83,6 +89,8 @@ def test_docstrings_comments_and_lines_do_not_matter(tmp_path: Path, cache: Path
         ("+ OFFSETS[0]", "- OFFSETS[1]", "2.5"),
         ("    low: float\n    high: float", "    high: float\n    low: float", "9.0"),
         ("tool.cached_njit", "tool.reassociated_njit", "3.0"),
+        ("more: float = 0.0", "more: float = 0.5", "4.0"),
+        ("ROOT = math.sqrt", "ROOT = math.cos", "5.0"),
     ],
 )
 def test_a_change_of_what_is_called_is_noticed(
@@ -92,9 +100,12 @@ def test_a_change_of_what_is_called_is_noticed(
     assert run(tmp_path / "first", cache, USED.replace(old, new)) == ["False", result, "0"]
 
 
-def test_a_file_that_was_cut_off_is_compiled_again(tmp_path: Path, cache: Path) -> None:
+@pytest.mark.parametrize("damage", ["cut off", "one bit"])
+def test_a_damaged_file_is_compiled_again(tmp_path: Path, cache: Path, damage: str) -> None:
     for file in cache.rglob("*.nbc"):
-        file.write_bytes(file.read_bytes()[:100])
+        data = bytearray(file.read_bytes())
+        data[len(data) // 2] ^= 4
+        file.write_bytes(data if damage == "one bit" else data[:100])
     assert run(tmp_path / "first", cache)[1:] == ["3.0", "0"]
     assert run(tmp_path / "first", cache)[1:] == ["3.0", "1"]
 

@@ -177,6 +177,8 @@ def test_the_modes_of_map_server_are_understood(tmp_path: Path) -> None:
     shades = np.array([[0, 128, 254, 255]], dtype=np.uint8)
     trinary = load_map(write_map(tmp_path, Image.fromarray(shades), mode="trinary"), CELL).log_odds[:, 0]
     assert np.sign(trinary).tolist() == [1, 0, -1, -1]
+    deep = load_map(write_map(tmp_path, Image.fromarray(shades.astype(np.uint16) * 257)), CELL)
+    assert np.sign(deep.log_odds[:, 0]).tolist() == [1, 0, -1, -1]
     negated = load_map(write_map(tmp_path, Image.fromarray(shades), negate=1), CELL).log_odds[:, 0]
     assert np.sign(negated).tolist() == [-1, 0, 1, 1]
     alpha = np.stack([np.array([[0, 100, 150, 255]]), np.array([[255, 255, 255, 0]])], axis=-1)

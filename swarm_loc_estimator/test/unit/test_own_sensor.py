@@ -224,6 +224,61 @@ def test_outliers_are_gated_with_the_one_degree_of_freedom_of_the_sensor(setting
     assert np.sqrt(np.square(error[..., :2]).mean()) < 0.05
 
 
+@ALL
+def test_a_model_that_fails_is_gated_and_leaves_poses_finite(
+    settings: Settings, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def predict(one: MeasurementArray, observer: FloatArray, target: FloatArray) -> Prediction:
+        found = predict_range(one, observer, target)
+        return found if one["landmark"][0] else found._replace(value=np.array([np.nan]))
+
+    world = world_of(930)
+    monkeypatch.setitem(MODELS, RANGE.number, replace(RANGE, predict=predict))
+    estimator, estimates = run(world, ranges(world, 3), settings)
+    assert settled(estimator)["GATED"] > 300
+    assert settled(estimator)["USED"] > 600
+    error, covariance = errors(world, estimates)
+    assert np.isfinite(error).all()
+    assert np.isfinite(covariance).all()
+    assert np.sqrt(np.square(error[..., :2]).mean()) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("kind", 77),
+        ("observer", 99),
+        ("observer", -2),
+        ("target", 99),
+        ("landmark", 99),
+        ("landmark", -1),
+        ("sensor", np.nan),
+        ("marker", np.inf),
+        ("stamp_variance", -1.0),
+        ("gate", np.nan),
+    ],
+)
+def test_measurements_that_no_model_can_use_are_dropped_and_counted(
+    field: str, value: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def create(swarm: Swarm, settings: SensorSettings, drops: Counter[str]) -> Converter:
+        convert = create_converter(swarm, settings, drops)
+
+        def spoiled(rows: RangeRows) -> Measured:
+            found: Measured = convert(rows)
+            found.measurements[field] = value
+            return found
+
+        return spoiled
+
+    world = world_of(940)
+    measured = ranges(world, 4)
+    monkeypatch.setitem(SENSORS, RANGES.name, replace(RANGES, create_converter=create))
+    estimator, estimates = run(world, measured, IN_ORDER)
+    assert estimator.drops["bad_measurement"] == len(measured)
+    np.testing.assert_array_equal(estimates[-1].poses, run(world, [], IN_ORDER)[1][-1].poses)
+
+
 @pytest.mark.parametrize("number", [*MODELS, RANGE.number])
 @pytest.mark.parametrize("seed", range(3))
 def test_jacobians_of_all_models_agree_with_finite_differences(number: int, seed: int) -> None:
@@ -245,3 +300,9 @@ def test_jacobians_of_all_models_agree_with_finite_differences(number: int, seed
 def test_a_number_stands_for_one_model() -> None:
     with pytest.raises(ValueError, match="the number 100 of the measurement model 'range' is not free"):
         register(RANGE)
+
+
+@pytest.mark.parametrize("degrees", [0, 4])
+def test_a_model_has_one_to_three_degrees_of_freedom(degrees: int) -> None:
+    with pytest.raises(ValueError, match=f"'range' has {degrees} degrees of freedom but must have 1, 2 or 3"):
+        register(replace(RANGE, number=101, degrees_of_freedom=degrees))
