@@ -1,1 +1,1 @@
-"""Identification of anonymous robots from above: which of the detections in an aerial image is a robot."""
+"""Identification of robots among anonymous detections in aerial images."""

@@ -1,4 +1,4 @@
-"""Constraints of sightings on where the odometry track of a robot lies that waits to be located."""
+"""Constraints by sightings on the pose of the odometry track of a robot that is not localized."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ CONSTRAINT_DTYPE = np.dtype(
         ("other_turn", np.float64),  # of its mirrored solution, NaN: none
         ("turn_variance", np.float64),
         ("track_noise", np.float64, (3, 3)),  # preintegrated covariance of the track
-        ("frame", np.float64, (3,)),  # where the other side's error acts: T, or what moves a landmark
+        ("frame", np.float64, (3,)),  # frame of the other side's error: T, or a landmark's correction
         ("frame_noise", np.float64, (3, 3)),  # preintegrated covariance of the other side's track
         ("shared", np.float64, (3, 3)),  # covariance of the other side's error, once `refreshed`
     ]

@@ -1,4 +1,4 @@
-"""Anonymous detections of robots in aerial images; `timeline/aerial_images.py` finds out who is who."""
+"""Anonymous detections of robots in aerial images, identified by `timeline/aerial_images.py`."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ from swarm_loc_estimator.sensors.sensor import (
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 FOREIGN_FRAME = "aerial_frame"
-"""Why an aerial image is dropped whose detections are not in `map`."""
+"""Reason to drop an aerial image that is not in the frame `map`."""
 TOO_MANY = "aerial_too_many"
-"""Why an aerial image with more detections than MAX_ANONYMOUS is dropped: it shows something else."""
+"""Reason to drop an aerial image with more detections than MAX_ANONYMOUS."""
 MAX_ANONYMOUS = 2000
 _UNKNOWN_VARIANCE = -1.0
-"""First element of the covariance of a detection whose sender does not know it."""
+"""First element of an unknown covariance."""
 
 
 class AerialRows(NamedTuple):
     """Anonymous detections of aerial images, a row per detection (d,).
 
     Attributes:
-        robot: (d,) -1: they are about the whole swarm.
+        robot: (d,) always -1, the whole swarm.
         stamp_ns: (d,) exposure times.
-        number: (d,) of each in its message.
+        number: (d,) index of the detection in its message.
         pose: (d, 3) x [m], y [m], heading [rad] in `map`; heading NaN: not measured.
-        covariance: (d, 3, 3) of it; a first element of -1: not known.
-        arrival_ns: (d,).
+        covariance: (d, 3, 3) of the pose; a first element of -1: unknown.
+        arrival_ns: (d,) arrival times.
     """
 
     robot: IntArray
@@ -108,6 +108,6 @@ AERIAL = Sensor(
         ),
     ),
     _create_converter,
-    unit=("robot", "stamp_ns"),  # a part of an image would say that robots are missing
+    unit=("robot", "stamp_ns"),  # a partial image would imply missing robots
 )
 """The sensor, see `registry.SENSORS`."""

@@ -1,8 +1,8 @@
 """Camera detections to measurements: association by marker id, pose in the plane, covariance.
 
-A detection is a marker's pose in the camera's optical frame (x right, y down, z forward). It becomes a
-measurement in the sensor frame of the plane: at the camera's place on the robot, turned by its yaw, with
-the mount's pitch and roll taken out.
+A detection is a marker's pose in the camera's optical frame (x right, y down, z forward). It is converted to
+a measurement in the planar sensor frame: at the camera's position on the robot, rotated by its yaw, with the
+mount's pitch and roll removed.
 """
 
 from __future__ import annotations
@@ -65,13 +65,13 @@ _SENSOR_DTYPE = np.dtype([(f.name, np.float64) for f in fields(SensorModel)])
 
 
 class DetectionRows(NamedTuple):
-    """What cameras saw, a row per detection (d,).
+    """Detections of cameras, a row per detection (d,).
 
     Attributes:
         robot: (d,) index of the robot that carries the camera.
         stamp_ns: (d,) exposure times.
         detection: (d,) structured, see `SightingConverter.convert`.
-        arrival_ns: (d,).
+        arrival_ns: (d,) arrival times.
     """
 
     robot: IntArray
@@ -85,13 +85,13 @@ NO_DETECTIONS = DetectionRows(NO_ROWS, NO_ROWS, np.zeros(0, dtype=DETECTION_DTYP
 
 @dataclass(frozen=True)
 class Conversion:
-    """What became of detections.
+    """Result of converting detections.
 
     Attributes:
         measurements: (m,) of MEASUREMENT_DTYPE.
-        measured: (d,) which detections they come from.
-        dropped: Reason -> count, for `unknown_id`, `own_marker`, `no_camera`, `bad_content`, `non_finite` and
-            `absurd`.
+        measured: (d,) True for detections that were converted.
+        dropped: Number of dropped detections by reason: `unknown_id`, `own_marker`, `no_camera`,
+            `bad_content`, `non_finite` and `absurd`.
     """
 
     measurements: MeasurementArray
@@ -100,7 +100,7 @@ class Conversion:
 
 
 class _Cameras(NamedTuple):
-    """All cameras, per robot: whether it has one, S (N, 3), axes optical to level (N, 3, 3), errors, gate."""
+    """Cameras by robot: has one (N,), S (N, 3), optical to level rotation (N, 3, 3), errors, gate."""
 
     present: NDArray[np.bool_]
     mount: FloatArray
@@ -110,9 +110,9 @@ class _Cameras(NamedTuple):
 
 
 class _Markers(NamedTuple):
-    """All markers by ascending id (k,): whose, which landmark, M (k, 3), heading NaN if it has none.
+    """All markers by ascending id (k,): robot, landmark, M (k, 3) with heading NaN if there is none.
 
-    `variance` (k,) is that of a face's place on its robot; a landmark's is up to the filter.
+    `variance` (k,) is that of a face's position on its robot; the filter adds that of a landmark.
     """
 
     id: IntArray
@@ -123,7 +123,7 @@ class _Markers(NamedTuple):
 
 
 class _Detections(NamedTuple):
-    """The fields of detections (d,) that count."""
+    """The used fields of detections (d,)."""
 
     id: NDArray[np.uint32]
     content: NDArray[np.uint8]
@@ -135,10 +135,10 @@ class _Detections(NamedTuple):
 
 
 class SightingConverter:
-    """Converts the detections of all cameras of a swarm at once.
+    """Converts the detections of all cameras of a swarm.
 
     Args:
-        swarm: Cameras, their calibration, and whose the markers are.
+        swarm: Cameras, their calibration, and owners of markers.
     """
 
     def __init__(self, swarm: Swarm) -> None:
@@ -166,10 +166,10 @@ class SightingConverter:
         )
 
     def convert(self, robots: IntArray, stamps_ns: IntArray, detections: NDArray[np.void]) -> Conversion:
-        """Turn detections into measurements.
+        """Convert detections to measurements.
 
         Args:
-            robots: (d,) index of the robot whose camera saw each.
+            robots: (d,) index of the robot with the camera.
             stamps_ns: (d,) exposure times.
             detections: (d,) with fields id, content, position (3,), orientation (4,) xyzw, covariance (6, 6),
                 alternative_position, alternative_orientation, as published in the optical frame.
@@ -196,8 +196,8 @@ class SightingConverter:
     def _note_stamp_variance(self, measurements: MeasurementArray) -> None:
         """Write the variance of the stamps.
 
-        All measurements of an image share the error of its stamp. The filter takes errors as independent, so
-        each gets the variance times their number.
+        All measurements of an image share the error of its stamp. The filter assumes independent errors, so
+        each measurement gets the variance times their number.
         """
         variance = np.square(self._cameras.sensor["time_sigma_s"])[measurements["observer"]]
         if variance.any():
@@ -215,7 +215,7 @@ def _convert_all(
     marker_id: IntArray,
     outcomes: IntArray,
 ) -> None:
-    """Fill the measurements (d,), whose stamps and observers are there, and say what became of each."""
+    """Fill the measurements (d,) except stamps and observers, and write their outcomes (d,)."""
     position, other_position = np.empty(3), np.empty(3)
     for k in range(outcomes.size):
         robot = out.observer[k]
@@ -256,7 +256,7 @@ def _convert_all(
 def _outcome(
     detections: _Detections, k: int, cameras: _Cameras, markers: _Markers, robot: int, place: int
 ) -> int:
-    """Whether detection k, of the marker that may be at `place`, becomes a measurement, or why not."""
+    """Outcome of detection k with the marker at index `place`: valid, or a reason to drop it."""
     if place < 0 or markers.id[place] != detections.id[k]:
         return _UNKNOWN_ID
     if markers.owner[place] == robot:
@@ -295,7 +295,7 @@ def _is_rotation(quaternion: FloatArray) -> bool:
 
 @cached_njit
 def _to_level_frame(level: FloatArray, optical: FloatArray, out: FloatArray) -> None:
-    """Write a vector (3,) of the optical frame in the level axes forward, left, up of the camera."""
+    """Rotate a vector (3,) from the optical frame to the camera's level axes forward, left, up."""
     for i in range(3):
         out[i] = level[i, 0] * optical[0] + level[i, 1] * optical[1] + level[i, 2] * optical[2]
 
@@ -309,7 +309,7 @@ def _scale(vector: FloatArray, factor: float) -> None:
 
 @cached_njit
 def _face_heading(level: FloatArray, quaternion: FloatArray) -> float:
-    """Heading in the sensor plane of the z axis of an orientation xyzw (4,), the direction out of a face."""
+    """Heading in the sensor plane of the z axis of an orientation xyzw (4,), the normal of a face."""
     x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     out_of_face, axes = np.empty(3), np.empty(3)
     out_of_face[0], out_of_face[1] = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x)
@@ -337,7 +337,7 @@ def _calibrate(
 
 @cached_njit
 def _pose_noise(sensor: SensorModel, level: FloatArray, published: FloatArray, noise: FloatArray) -> None:
-    """Write the covariance (3, 3) of forward, left, heading; the sensor model is for unknown ones (-1)."""
+    """Write the covariance (3, 3) of forward, left, heading; from the sensor model if unknown (-1)."""
     if published[0, 0] < 0.0:
         noise[0, 0], noise[1, 1] = sensor.forward_sigma**2, sensor.left_sigma**2
         noise[2, 2] = sensor.heading_sigma**2

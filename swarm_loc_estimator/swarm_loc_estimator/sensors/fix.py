@@ -38,7 +38,7 @@ from swarm_loc_estimator.sensors.shared_topics import FOREIGN_FRAME, shared_kind
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 HEADING_UNKNOWN = math.pi**2
-"""A heading with such a variance [rad^2] or more was not measured: all headings there are vary by less."""
+"""Variance from which a heading counts as not measured [rad^2]; it exceeds that of uniform headings."""
 _GATE = float(MODELS[Kind.CARTESIAN].gate(0.9999))
 
 
@@ -47,10 +47,10 @@ class FixRows(NamedTuple):
 
     Attributes:
         robot: (f,) index of the robot.
-        stamp_ns: (f,) when it was there.
+        stamp_ns: (f,) time of measurement.
         pose: (f, 3) x [m], y [m], heading [rad] in `map`; heading NaN: not measured.
-        covariance: (f, 3, 3) of it; what it says of a heading not measured does not count.
-        arrival_ns: (f,).
+        covariance: (f, 3, 3) of the pose; the part of a heading not measured is ignored.
+        arrival_ns: (f,) arrival times.
     """
 
     robot: IntArray
@@ -64,14 +64,14 @@ NO_FIXES = FixRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros((0, 3, 3)), NO_R
 
 
 def has_heading(covariance: FloatArray) -> NDArray[np.bool_]:
-    """Whether fixes with covariances (f, 3, 3) tell a heading (f,)."""
+    """Whether fixes with covariances (f, 3, 3) include a heading (f,)."""
     return np.asarray((covariance[:, 2, 2] > 0.0) & (covariance[:, 2, 2] < HEADING_UNKNOWN))
 
 
 def _columns(
     found: MessageColumns[FixMessage], batch: MessageBatch, robot: IntArray, known: Known
 ) -> tuple[FixRows, Mapping[str, int]]:
-    """No heading was measured where its variance is no number, not positive, or very large."""
+    """A heading with a NaN, non-positive or very large variance counts as not measured."""
     messages = found.messages
     pose = np.array([message.pose for message in messages], dtype=float).reshape(-1, 3)
     covariance = np.array([message.covariance for message in messages]).reshape(-1, 3, 3)
@@ -95,7 +95,7 @@ def about_robots(
     covariances: FloatArray,
     kind: int,
 ) -> MeasurementArray:
-    """Measurements (m,) without observer of poses (m, 3) in `map` with covariances (m, 3, 3)."""
+    """Absolute measurements (m,) of poses (m, 3) in `map` with covariances (m, 3, 3)."""
     measurements = np.zeros(len(poses), dtype=MEASUREMENT_DTYPE)
     measurements["stamp_ns"], measurements["kind"] = stamps_ns, kind
     measurements["received_from"] = measurements["target"] = robots
@@ -106,7 +106,7 @@ def about_robots(
 
 
 def take_out_headings(measurements: MeasurementArray, without: NDArray[np.bool_]) -> None:
-    """Take the headings out of those measurements (m,) that have none."""
+    """Remove the headings of those measurements (m,) selected by `without` (m,)."""
     measurements["has_heading"][without], measurements["value"][without, 2] = 0, 0.0
     covariance = measurements["covariance"]
     covariance[without, 2, :] = covariance[without, :, 2] = [0.0, 0.0, 1.0]

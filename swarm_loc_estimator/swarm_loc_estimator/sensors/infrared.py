@@ -1,8 +1,8 @@
-"""Brightness matrices to relative measurements, one per exchange of two robots.
+"""Conversion of brightness matrices to relative measurements, one per exchange of two robots.
 
-The matrices of all powers of one exchange share their stamp. Those received so far are used at once; when
-another one arrives, a measurement from all of them replaces the earlier one. So nothing waits, the order of
-arrival does not matter, and a lost matrix costs only its own information.
+The matrices of all powers of an exchange have the same stamp. Received matrices are used immediately; when
+another one arrives, a measurement from all of them replaces the earlier one. So there is no delay, the order
+of arrival does not matter, and a lost matrix loses only its own information.
 """
 
 from __future__ import annotations
@@ -47,15 +47,15 @@ class BrightnessRows(NamedTuple):
     """Brightness matrices (b,), as `swarm_loc_msgs/BrightnessMatrix` has them.
 
     Attributes:
-        robot: (b,) index of the robot on whose topic each came.
-        stamp_ns: (b,) middle of the exchange, the same for all power modes of one.
+        robot: (b,) index of the robot of the topic.
+        stamp_ns: (b,) middle of the exchange, equal for all its power modes.
         receiver: (b,) id of the robot that measured.
         transmitter: (b,) id of the robot that lit its emitters.
-        n: (b,) sensors, and emitters.
+        n: (b,) number of sensors, and of emitters.
         power: (b,) index of the power mode.
-        saturation: (b,) the reading from which on a sensor tells no more [count]; 0: that of the platform.
+        saturation: (b,) reading at which a sensor saturates [count]; 0: that of the platform.
         readings: (b,) of arrays (k,) [count], row-major [sensor, emitter]; k should be n * n.
-        arrival_ns: (b,).
+        arrival_ns: (b,) arrival times.
     """
 
     robot: IntArray
@@ -73,11 +73,11 @@ NO_BRIGHTNESS = BrightnessRows(*(NO_ROWS,) * 7, np.zeros(0, dtype=object), NO_RO
 
 
 class Matrix(NamedTuple):
-    """What was read at one power.
+    """Readings at one power.
 
     Attributes:
-        light: (n, n) [count], [sensor, emitter], what is read in the dark taken off.
-        saturation: Light of it or more tells only that it was at least so bright.
+        light: (n, n) [count], [sensor, emitter], dark readings subtracted.
+        saturation: Light at or above this is only a lower bound [count].
     """
 
     light: FloatArray
@@ -85,11 +85,11 @@ class Matrix(NamedTuple):
 
 
 Readings = dict[int, Matrix]
-"""Of an exchange, by power."""
+"""Matrices of an exchange by power."""
 
 
 class ExchangeKey(NamedTuple):
-    """Which exchange; robots are indices into the swarm."""
+    """Identity of an exchange; robots are indices into the swarm."""
 
     stamp_ns: int
     receiver: int
@@ -97,14 +97,14 @@ class ExchangeKey(NamedTuple):
 
 
 class MatrixScreening:
-    """Looks through the matrices of a swarm's infrared boards.
+    """Validates the matrices of a swarm's infrared boards.
 
     Args:
-        swarm: Whose.
+        swarm: Robots with their boards.
 
     Attributes:
-        boards: Robot -> its board; robots without one are missing.
-        dropped: Reason -> how many matrices could not be used.
+        boards: Board by robot; robots without a board are omitted.
+        dropped: Number of unusable matrices by reason.
     """
 
     def __init__(self, swarm: Swarm) -> None:
@@ -115,7 +115,7 @@ class MatrixScreening:
         self._robot_of = {ir.id: robot for robot, ir in self.boards.items()}
 
     def key_of(self, rows: BrightnessRows, k: int) -> ExchangeKey | None:
-        """The exchange of matrix k; None, and counted, when the matrix cannot be used whatever else comes."""
+        """Exchange of matrix k; None, and counted in `dropped`, if the matrix is invalid."""
         fault = self._fault(rows, k)
         if fault:
             self.dropped[fault] += 1
@@ -124,7 +124,7 @@ class MatrixScreening:
         return ExchangeKey(int(rows.stamp_ns[k]), int(rows.robot[k]), transmitter)
 
     def add(self, rows: BrightnessRows, k: int, readings: Readings) -> None:
-        """Put matrix k to others of its exchange; of two for one power the same one counts in any order."""
+        """Add matrix k to its exchange; of two for one power, the choice does not depend on their order."""
         platform, sent = self.boards[int(rows.robot[k])].platform, float(rows.saturation[k])
         counts = rows.readings[k].reshape(platform.n, platform.n).astype(np.float64)
         limit = min(sent, platform.saturation) if sent > 0.0 else platform.saturation
@@ -149,7 +149,7 @@ class MatrixScreening:
         return whole, saturation
 
     def _fault(self, rows: BrightnessRows, k: int) -> str:
-        """Why matrix k cannot be used; "" if it can."""
+        """Reason to drop matrix k; "" if it is valid."""
         receiver, transmitter = (self._robot_of.get(int(ids[k])) for ids in (rows.receiver, rows.transmitter))
         ir = self.boards.get(int(rows.robot[k]))
         if ir is None:
@@ -169,12 +169,12 @@ class MatrixScreening:
 
 @dataclass
 class _Exchange:
-    """What has come of an exchange.
+    """State of an exchange.
 
     Attributes:
-        readings: Its matrices.
-        measurement: (1,) as it is used, (0,) when there is none.
-        fault: Why there is none.
+        readings: Received matrices.
+        measurement: Current measurement (1,), or (0,) if there is none.
+        fault: Reason why there is none.
     """
 
     readings: Readings = field(default_factory=dict)
@@ -184,15 +184,15 @@ class _Exchange:
 
 @lru_cache(maxsize=64)
 def _estimator(platform: IrPlatform, method: IrMethod) -> IrEstimator:
-    """The estimator of a kind for a board; what it prepares is worth keeping."""
+    """Estimator of a method for a board; cached, because its preparation is expensive."""
     return _METHODS[method](platform)
 
 
 class BrightnessConverter:
-    """Keeps the exchanges of the last while, and makes measurements of them.
+    """Stores recent exchanges and converts them to measurements.
 
     Args:
-        swarm: Whose.
+        swarm: Robots with their boards.
     """
 
     def __init__(self, swarm: Swarm) -> None:
@@ -205,34 +205,34 @@ class BrightnessConverter:
         self._measured = 0
         self._exchanges: dict[ExchangeKey, _Exchange] = {}
         for ir in self._ir.values():
-            _estimator(ir.platform, ir.estimator)  # now, and not when the first message is waiting
+            _estimator(ir.platform, ir.estimator)  # prepare now, so that the first message is not delayed
 
     @property
     def drops(self) -> Counter[str]:
-        """Matrices not used, by reason; what still comes of their exchanges may make them useful."""
+        """Number of unused matrices by reason; it may decrease when their exchanges are completed."""
         return self._validator.dropped + self._dropped + _faults(self._exchanges.values())
 
     @property
     def measured(self) -> int:
-        """Exchanges that gave a measurement, since the last `restart`."""
+        """Number of exchanges with a measurement since the last `restart`."""
         return self._measured + sum(exchange.measurement.size for exchange in self._exchanges.values())
 
     @property
     def counters(self) -> dict[str, int]:
-        """What was used since the last `restart`, by name."""
+        """Numbers of used data by name, since the last `restart`."""
         return {"infrared exchanges measured": self.measured}
 
     def forget_before(self, oldest_ns: int) -> None:
-        """Let go of the exchanges before an instant: nothing more comes of them."""
+        """Discard the exchanges before an instant."""
         self._forget([key for key in self._exchanges if key.stamp_ns < oldest_ns])
 
     def restart(self) -> None:
-        """Let go of all exchanges."""
+        """Discard all exchanges."""
         self._forget(list(self._exchanges))
         self._measured = 0
 
     def take(self, rows: BrightnessRows) -> Change:
-        """Take matrices (b,) in."""
+        """Add matrices (b,); return the change of the measurements."""
         touched: dict[ExchangeKey, None] = {}
         for k in range(rows.robot.size):
             key = self._validator.key_of(rows, k)
@@ -248,13 +248,13 @@ class BrightnessConverter:
         return Change(np.concatenate(added), np.concatenate(withdrawn))
 
     def _forget(self, keys: Iterable[ExchangeKey]) -> None:
-        """Let go of exchanges."""
+        """Discard exchanges and count their unused matrices."""
         gone = [self._exchanges.pop(key) for key in keys]
         self._dropped += _faults(gone)
         self._measured += sum(exchange.measurement.size for exchange in gone)
 
     def _alike(self, keys: Iterable[ExchangeKey]) -> Iterable[list[ExchangeKey]]:
-        """Exchanges of one kind of board and estimator together."""
+        """Group exchanges by board and estimator."""
         groups: dict[IrEstimator, list[ExchangeKey]] = {}
         for key in keys:
             ir = self._ir[key.receiver]
@@ -262,7 +262,7 @@ class BrightnessConverter:
         return groups.values()
 
     def _solved(self, keys: list[ExchangeKey]) -> list[tuple[_Exchange, MeasurementArray]]:
-        """Exchanges of one kind whose measurement changes, with what it becomes, (1,) or (0,)."""
+        """Exchanges of one group whose measurement changes, with the new one, (1,) or (0,)."""
         ir = self._ir[keys[0].receiver]
         exchanges = [self._exchanges[key] for key in keys]
         readings, limits = self._validator.together(keys[0].receiver, [one.readings for one in exchanges])
@@ -281,10 +281,10 @@ class BrightnessConverter:
         return changed
 
     def _measurements(self, keys: list[ExchangeKey], solutions: IrSolutions) -> MeasurementArray:
-        """Measurements (k,) as the filter knows them: the transmitter's base_link in the receiver's.
+        """Measurements (k,) for the filter: the transmitter's base_link in the receiver's base_link.
 
-        That one robot hears another and is heard by it are two measurements: other sensors read the light of
-        other emitters, so neither noise nor gains have anything in common.
+        The two directions between two robots are separate measurements: they use different sensors and
+        emitters, so their noise and gains are independent.
         """
         measurements = np.zeros(len(keys), dtype=MEASUREMENT_DTYPE)
         stamps_ns, receivers, transmitters = np.array(keys, dtype=np.int64).T
@@ -301,7 +301,7 @@ class BrightnessConverter:
 
 
 def _faults(exchanges: Iterable[_Exchange]) -> Counter[str]:
-    """How many matrices of exchanges were not used, by reason."""
+    """Number of unused matrices of exchanges by reason."""
     counts: Counter[str] = Counter()
     for exchange in exchanges:
         if exchange.fault:
@@ -310,7 +310,7 @@ def _faults(exchanges: Iterable[_Exchange]) -> Counter[str]:
 
 
 def _reason(outcome: int, readings: FloatArray, saturation: FloatArray) -> str:
-    """Why readings (modes, n, n), of saturation (modes,), gave no pose, "" if they did."""
+    """Reason why readings (modes, n, n) with saturation (modes,) gave no pose; "" if they did."""
     if outcome == IrOutcome.FOUND:
         return ""
     if np.all(np.isnan(readings) | (readings >= saturation[:, None, None])):

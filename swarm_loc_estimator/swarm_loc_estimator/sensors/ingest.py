@@ -1,6 +1,6 @@
-"""Decode the raw messages of all inputs to columns, the same for a live node and for replay.
+"""Decoding of the raw messages of all inputs to columns, for live nodes and for replay.
 
-Bytes that are no message of the topic's type are counted and go no further.
+Malformed messages are counted and dropped.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from swarm_loc_estimator.sensors.sensor import Known, in_order_of_arrival
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 MAX_PAUSE_NS = 3_600_000_000_000
-"""Where arrivals are further apart, the clock was set, as when a robot without one gets the time."""
+"""Maximum time between arrivals; beyond it the clock was set, as on a robot without a hardware clock."""
 
 _STATISTICS_DTYPE = np.dtype(
     [
@@ -42,10 +42,10 @@ _STATISTICS_DTYPE = np.dtype(
 
 
 class InputStatistics:
-    """What came in on one topic.
+    """Message statistics of one topic.
 
     Args:
-        row: (1,) of _STATISTICS_DTYPE, where it is counted.
+        row: (1,) of _STATISTICS_DTYPE, the counters.
     """
 
     def __init__(self, row: NDArray[np.void]) -> None:
@@ -53,63 +53,63 @@ class InputStatistics:
 
     @property
     def received(self) -> int:
-        """Messages so far, malformed ones included."""
+        """Number of messages, malformed ones included."""
         return int(self._row["received"][0])
 
     @property
     def malformed(self) -> int:
-        """Those that were no message of the topic's type."""
+        """Number of malformed messages."""
         return int(self._row["malformed"][0])
 
     @property
     def last_stamp_ns(self) -> int | None:
-        """Stamp of the newest well-formed one; None before the first."""
+        """Stamp of the newest valid message; None before the first."""
         return int(self._row["last_stamp_ns"][0]) if self.received > self.malformed else None
 
     @property
     def last_arrival_ns(self) -> int | None:
-        """When it arrived."""
+        """Arrival of the newest valid message; None before the first."""
         return int(self._row["last_arrival_ns"][0]) if self.received > self.malformed else None
 
     @property
     def mean_period_ns(self) -> float | None:
-        """Mean time between two well-formed ones; None before the second."""
+        """Mean period of valid messages; None before the second."""
         row, count = self._row[0], self.received - self.malformed
         return float(row["last_arrival_ns"] - row["first_arrival_ns"]) / (count - 1) if count > 1 else None
 
     @property
     def late_count(self) -> int:
-        """How many well-formed ones came since `restart`."""
+        """Number of valid messages since `restart`."""
         return int(self._row["late_count"][0])
 
     @property
     def late_sum_ns(self) -> int:
-        """Sum of their arrivals minus their stamps."""
+        """Sum of delays (arrival minus stamp) since `restart`."""
         return int(self._row["late_sum_ns"][0])
 
     @property
     def late_max_ns(self) -> int | None:
-        """Largest one; None when nothing came."""
+        """Maximum delay since `restart`; None without messages."""
         return int(self._row["late_max_ns"][0]) if self.late_count else None
 
     def restart(self) -> None:
-        """Begin a new interval for the lateness."""
+        """Start a new interval for the delays."""
         for name in ("late_sum_ns", "late_max_ns", "late_count"):
             self._row[name] = 0
 
 
 class Ingest:
-    """Reads the messages of a swarm's topics.
+    """Decodes the messages of a swarm's topics.
 
     Args:
-        swarm: Whose topics they are.
+        swarm: Swarm with the topics.
         map_frame: Name of the frame `map` in messages.
-        topics: Which of them there may be; None: all that a swarm may have.
+        topics: Input topics; None: all possible topics of the swarm.
 
     Attributes:
-        topics: The inputs; their index here is the topic's number in a batch.
-        handle_of: Topic name -> that number.
-        statistics: Per topic what came in.
+        topics: Input topics; the index is the topic's number in a batch.
+        handle_of: Topic number by name.
+        statistics: Statistics of each topic.
         map_frame: Name of the frame `map`.
     """
 
@@ -129,10 +129,10 @@ class Ingest:
         self.statistics = [InputStatistics(self._counted[k : k + 1]) for k in range(len(self.topics))]
 
     def read(self, batch: MessageBatch) -> Iterator[Batch]:
-        """Read messages, numbered as `topics`, in order of arrival.
+        """Decode messages in order of arrival, with topic numbers as in `topics`.
 
         Yields:
-            One part for each stretch in which time neither goes back nor jumps ahead.
+            One part per interval in which time neither jumps back nor ahead.
         """
         passed_ns = np.diff(batch.log_ns)
         jumps = np.flatnonzero((passed_ns < 0) | (passed_ns > MAX_PAUSE_NS)) + 1
@@ -141,7 +141,7 @@ class Ingest:
                 yield self._read_forwards(batch.chosen(slice(begin, end)))
 
     def received(self) -> dict[str, int]:
-        """Messages so far by kind of topic, such as `<robot>/odom`; kinds of which none came are missing."""
+        """Number of messages by kind of topic, such as `<robot>/odom`; kinds without any are omitted."""
         received = np.bincount(self._kind, weights=self._counted["received"], minlength=len(self._kinds))
         counts = {kind.pattern: int(received[number]) for number, kind in enumerate(self._kinds)}
         return {topic: count for topic, count in counts.items() if count}
@@ -163,7 +163,7 @@ class Ingest:
             found = reader.read(part)
             _count(self._counted, part.topic, part.log_ns, found.stamp_ns, found.valid)
             read, unused = kind.columns_of(found, part, self._robot[part.topic], self._known)
-            # the same may come of each robot alone and of many together
+            # a sensor may have both topics of single robots and shared ones
             before = rows.get(kind.rows)
             rows[kind.rows] = read if before is None else in_order_of_arrival([before, read])
             dropped.update(unused)
@@ -179,7 +179,7 @@ def _count(
     stamp_ns: IntArray,
     valid: NDArray[np.bool_],
 ) -> None:
-    """Note messages (n,) in the statistics (t,) of their topics."""
+    """Add messages (n,) to the statistics (t,) of their topics."""
     for k in range(topic.size):
         one = counted[topic[k]]
         one.received += 1

@@ -38,7 +38,7 @@ class OdometryRows(NamedTuple):
         robot: (k,) index of the robot.
         stamp_ns: (k,) acquisition stamps.
         pose: (k, 3) x [m], y [m], yaw [rad] in the robot's own odom frame.
-        arrival_ns: (k,).
+        arrival_ns: (k,) arrival times.
     """
 
     robot: IntArray
@@ -62,7 +62,7 @@ def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> OdometryRows:
 
 
 def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: Counter[str]) -> Converter:
-    """Keep poses of robots with odometry that are finite and not absurd."""
+    """Create a filter for finite poses of plausible size, of robots with odometry."""
     stands = np.array([robot.stands for robot in swarm.robots], dtype=bool)
 
     def valid(rows: OdometryRows) -> OdometryRows:

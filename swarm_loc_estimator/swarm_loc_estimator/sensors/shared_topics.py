@@ -1,4 +1,4 @@
-"""Decode messages that carry what many robots have sent; one bad reading does not take the others with it."""
+"""Decoding of messages with readings of many robots; an invalid reading does not affect the others."""
 
 from __future__ import annotations
 
@@ -18,30 +18,30 @@ from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.sensors.sensor import InputKind, Known, chosen, joined
 
 MAX_READINGS = 100_000
-"""A message with more readings is dropped whole: no swarm sends so many at once."""
+"""Maximum number of readings per message; larger messages are dropped."""
 MAX_OF_ONE = 1_000
-"""One with more of the same robot is dropped whole, too: as many as of its own topic wait for a tick."""
+"""Maximum number of readings of one robot per message, equal to the queue of its own topic."""
 TOO_MANY = "shared_too_many"
-"""Why such a message is dropped."""
+"""Reason to drop messages beyond these limits."""
 OTHER_SWARM = "other_swarm"
-"""Why readings are dropped whose sender has robots other than these, or in another order."""
+"""Reason to drop readings of a sender with another list of robots."""
 UNKNOWN_ROBOT = "unknown_robot"
-"""Why a reading is dropped whose index is no robot's."""
+"""Reason to drop a reading with an invalid robot index."""
 BAD_STAMP = "bad_stamp"
-"""Why one is whose stamp has a second and more of nanoseconds."""
+"""Reason to drop a reading with 10^9 or more nanoseconds in its stamp."""
 
 FOREIGN_FRAME = "fix_frame"
-"""Why a reading that is not in `map` is dropped."""
+"""Reason to drop a reading that is not in the frame `map`."""
 
 
 class SharedColumns(NamedTuple):
-    """What messages (n,) with readings of many robots hold.
+    """Decoded messages (n,) with readings of many robots.
 
     Attributes:
-        stamp_ns: (n,) their stamps.
-        valid: (n,) whether the bytes were a whole message of the type.
+        stamp_ns: (n,) stamps of the messages.
+        valid: (n,) True if the message is complete and of the right type.
         rows: The readings.
-        dropped: Reason -> how many readings were whole, but cannot be used.
+        dropped: Number of unusable readings of valid messages by reason.
     """
 
     stamp_ns: IntArray
@@ -54,12 +54,12 @@ class SharedReader:
     """Decodes messages with readings of many robots each.
 
     Args:
-        topics: How many.
-        known: The swarm.
-        decode: Reads a message.
-        rows_of: Makes rows of readings and their arrivals (n,).
-        nothing: No rows.
-        in_map: Whether readings must be in the frame `map`.
+        topics: Number of topics.
+        known: Expected contents.
+        decode: Decodes a message.
+        rows_of: Converts a message and arrivals (n,) to readings.
+        nothing: Empty readings.
+        in_map: True if readings must be in the frame `map`.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class SharedReader:
         return SharedColumns(stamp_ns, valid, joined(parts), +dropped)
 
     def _fault(self, message: SharedMessage) -> str:
-        """Why no reading of a message can be used; "" when they can."""
+        """Reason to drop all readings of a message; "" if there is none."""
         if message.swarm != self._known.swarm:
             return OTHER_SWARM
         robot = message.robot[message.robot < self._known.robots]
@@ -108,7 +108,7 @@ class SharedReader:
         return FOREIGN_FRAME if self._in_map and message.frame_id != self._known.map_frame else ""
 
     def _sound(self, rows: Any, dropped: Counter[str]) -> Any:
-        """The readings of known robots with valid stamps; the others are counted."""
+        """Select readings of known robots with valid stamps; count the others in `dropped`."""
         unknown, unstamped = rows.robot >= self._known.robots, rows.stamp_ns < 0
         dropped[UNKNOWN_ROBOT] += int(np.sum(unknown))
         dropped[BAD_STAMP] += int(np.sum(unstamped & ~unknown))
@@ -118,7 +118,7 @@ class SharedReader:
 def _shared_columns(
     found: SharedColumns, _batch: MessageBatch, _robot: IntArray, _known: Known
 ) -> tuple[Any, Mapping[str, int]]:
-    """The readings that a `SharedReader` found."""
+    """Readings and drop counts of a `SharedReader`."""
     return found.rows, found.dropped
 
 
@@ -130,15 +130,15 @@ def shared_kind(
     rows_of: Callable[[SharedMessage, IntArray], Any],
     nothing: Any,
 ) -> InputKind:
-    """The kind of a topic that carries the readings of many robots in place of their own topics.
+    """Create the kind of a topic with readings of many robots, which replaces their own topics.
 
     Args:
-        own: The kind of a robot's own topics.
-        topic: Its whole name.
-        message_type: Of its messages.
-        decode: Reads a message.
-        rows_of: Makes rows of readings and their arrivals (n,).
-        nothing: No rows.
+        own: Kind of the replaced topics.
+        topic: Full name of the topic.
+        message_type: Message type.
+        decode: Decodes a message.
+        rows_of: Converts a message and arrivals (n,) to readings.
+        nothing: Empty readings.
     """
     return replace(
         own,

@@ -1,4 +1,4 @@
-"""Checks of measurements: finite values of a possible size, valid covariances."""
+"""Validation of measurements: finite values of plausible size, valid covariances."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from swarm_loc_estimator.filter.measurement_model import MODELS, NOBODY, Measure
 
 VALID = 0
 REJECT_REASONS = ("", "non_finite", "absurd", "bad_covariance", "bad_measurement")
+"""Reasons to reject a measurement, indexed by the result of `reject_reasons`."""
 BAD_MEASUREMENT = REJECT_REASONS.index("bad_measurement")
-"""Why a measurement is rejected, by the numbers that `reject_reasons` gives."""
 
 _MAX_DISTANCE_M = 1e6
 _MIN_VARIANCE, _MAX_VARIANCE = 1e-14, 1e14
@@ -22,7 +22,7 @@ _ASYMMETRY, _ROUNDING = 1e-6, 1e-9
 
 
 def reject_reasons(measurements: MeasurementArray) -> IntArray:
-    """Why measurements (m,) are rejected, as places in `REJECT_REASONS`; `VALID` where they are not."""
+    """Reasons (m,) to reject measurements (m,), as indices of `REJECT_REASONS`; `VALID` if none."""
     value = measurements["value"]
     reasons = np.full(measurements.size, VALID)
     _check_covariances(measurements["covariance"], reasons)
@@ -48,7 +48,7 @@ _BAD_COVARIANCE = REJECT_REASONS.index("bad_covariance")
 
 @cached_njit
 def _check_covariances(matrices: FloatArray, reasons: IntArray) -> None:
-    """Write where a matrix is not symmetric, positive definite, and of a magnitude to reckon with."""
+    """Mark matrices that are not symmetric positive definite or of implausible magnitude."""
     scaled = np.empty((3, 3))
     for k in range(reasons.size):
         good = True
@@ -62,7 +62,7 @@ def _check_covariances(matrices: FloatArray, reasons: IntArray) -> None:
                 for j in range(3):
                     good = good and abs(scaled[i, j] - scaled[j, i]) < _ASYMMETRY
                 scaled[i, i] -= _ROUNDING
-            factor = cholesky3(scaled)  # not a number where it has none
+            factor = cholesky3(scaled)  # NaN if not positive definite
             good = good and math.isfinite(factor[0, 0] + factor[1, 1] + factor[2, 2])
         if not good:
             reasons[k] = _BAD_COVARIANCE

@@ -32,11 +32,11 @@ Made = TypeVar("Made")
 
 
 class IrPlatformFileError(UserError):
-    """A platform file that cannot be used; the message is one sentence with file, key and value."""
+    """An invalid platform file; the message is one sentence with file, key and value."""
 
 
 def packaged_platforms() -> tuple[str, ...]:
-    """The names of the platforms that come with this package."""
+    """Names of the platforms in this package."""
     return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
 
 
@@ -45,7 +45,7 @@ def load_ir_platform(name: str, folder: Path | None = None) -> IrPlatform:
 
     Args:
         name: Of a packaged platform, such as "droplet", or the path of a file (it ends in .yaml).
-        folder: What a relative path starts from; None: the working folder.
+        folder: Base of a relative path; None: the working folder.
 
     Raises:
         IrPlatformFileError: One sentence with file, key, value and what is allowed.
@@ -69,9 +69,9 @@ def save_ir_platform(platform: IrPlatform, path: Path, comment: str = "") -> Non
     """Write a board that `load_ir_platform` reads back equal.
 
     Args:
-        platform: What to write.
+        platform: Board to write.
         path: The file; replaced when it exists, its folder created when missing.
-        comment: Lines that say where the numbers come from.
+        comment: Comment lines for the top of the file.
     """
     laws = dict(zip(platform.powers, platform.amplitudes, strict=True))
     tree = {
@@ -90,7 +90,7 @@ def save_ir_platform(platform: IrPlatform, path: Path, comment: str = "") -> Non
 
 
 class _Reader(TreeChecks):
-    """Checks the tree of one file on the way to the platform."""
+    """Converts the tree of one file to a platform, and checks it."""
 
     def platform(self, tree: Tree) -> IrPlatform:
         """The whole file."""
@@ -148,7 +148,7 @@ class _Reader(TreeChecks):
         )
 
     def _made(self, prefix: str, cls: Callable[..., Made], **arguments: Any) -> Made:
-        """An object; what it has against its arguments gets the file's and the key's name."""
+        """Create an object; add file and key to the message of its error."""
         try:
             return cls(**arguments)
         except IrPlatformError as error:

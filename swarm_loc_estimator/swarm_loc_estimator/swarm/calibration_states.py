@@ -1,11 +1,11 @@
-"""Self-calibration states: systematic errors of odometry, cameras and the map, estimated besides the poses.
+"""Self-calibration states: systematic errors of odometry, cameras and the map, estimated with the poses.
 
-Of a robot's parameters the first three act through the motion: the further it drives, the more they move its
-pose. The last two turn and stretch what its camera sees. A landmark whose survey is not exact is a body that
-stands: like a robot's pose it has a right-invariant error, here of the identity, which moves the marker from
-where the survey has it. What has a sigma in the description is estimated from the start; what has none only
-once it is contradicted, with the sigmas that stand here. The columns of the filter are behind those of all
-poses, in the order in which they were opened.
+The first three parameters of a robot are errors of its motion, whose effect on the pose grows with distance
+and turn. The last two are the yaw offset and the scale error of its camera. A landmark with an inexact survey
+is a static body: its state is a correction of the survey, with a right-invariant error about the identity.
+Parameters with a standard deviation in the description are estimated from the start, others only after a
+contradiction, with the standard deviations below. Their filter columns follow those of all poses, in the
+order in which they were added.
 """
 
 from __future__ import annotations
@@ -21,43 +21,43 @@ from swarm_loc_estimator.common.se2 import error_covariance
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot
 
 TURN_BIAS = 0
-"""A turn rate besides the one reported, while moving [rad/s]; it changes slowly."""
+"""Bias of the turn rate while moving [rad/s]; it changes slowly."""
 DISTANCE_SCALE = 1
-"""Relative error of the path."""
+"""Relative error of the distance driven."""
 TURN_SCALE = 2
 """Relative error of the turn."""
 CAMERA_YAW = 3
-"""The camera is turned to the left by so much more [rad]."""
+"""Yaw offset of the camera, positive to the left [rad]."""
 CAMERA_SCALE = 4
-"""Distances are seen too large by this share."""
+"""Relative error of distances measured by the camera."""
 
 DRIVES = 3
-"""So many, the first, act through the motion."""
+"""Number of leading parameters that act through the motion."""
 PARAMETERS = 5
 BLOCKS = -(-PARAMETERS // DRIVES)
-"""A robot's parameters are so many blocks of as many columns as a pose has: of its motion, of its camera."""
+"""Number of blocks of three columns for a robot's parameters: one for motion, one for the camera."""
 _BLOCK, _SLOT = np.divmod(np.arange(PARAMETERS), DRIVES)
-"""In which block each stands, and where there."""
+"""Block of each parameter, and its index in the block."""
 
 _CONTRADICTED_SIGMA = (0.0, 0.05, 0.1, 0.03, 0.03)
-"""Standard deviations of parameters that were taken to be exact, once they are contradicted."""
+"""Standard deviations of parameters that are exact in the description, after a contradiction."""
 _CONTRADICTED_SURVEY_SIGMA = (0.02, 0.03)
-"""Standard deviations of a landmark's place [m] and yaw [rad], once they are contradicted."""
+"""Standard deviations of a landmark's position [m] and yaw [rad] after a contradiction."""
 
 _MIN_SURVEY_SIGMA = 1e-4
-"""Of a landmark of which one of position and yaw is exact [m], [rad]: the filter inverts its covariance."""
+"""Minimum standard deviation of an estimated landmark [m, rad], so that its covariance is invertible."""
 
 
 class ParameterTable(NamedTuple):
-    """What is estimated of which robot and landmark, as compiled code reads it.
+    """Table of estimated parameters of robots and landmarks, for compiled code.
 
     Attributes:
-        column: (N, PARAMETERS) column of the filter; -1: not estimated, its value stays 0.
-        sigma: (N, PARAMETERS) standard deviation when it is opened; 0: never estimated.
-        turn_bias_time_s: (N,) time constant of TURN_BIAS; the others do not change.
-        survey_column: (L,) of each landmark the first of its three columns; -1: not estimated.
-        survey: (L, 3, 3) covariance of its right-invariant error when it is opened.
-        in_blocks: Whether a robot's parameters stand in blocks of three columns, some of them of nothing.
+        column: (N, PARAMETERS) filter column; -1: not estimated, value 0.
+        sigma: (N, PARAMETERS) prior standard deviation; 0: never estimated.
+        turn_bias_time_s: (N,) time constant of TURN_BIAS; the other parameters are constant.
+        survey_column: (L,) first of the three filter columns of each landmark; -1: not estimated.
+        survey: (L, 3, 3) prior covariance of its right-invariant error.
+        in_blocks: True if a robot's parameters have blocks of three columns, some of them unused.
     """
 
     column: NDArray[np.int64]
@@ -71,7 +71,7 @@ class ParameterTable(NamedTuple):
     def of(
         cls, robots: Sequence[Robot], landmarks: Sequence[Landmark] = (), *, in_blocks: bool = False
     ) -> ParameterTable:
-        """What the descriptions of robots and landmarks ask for."""
+        """Table of the parameters that the descriptions of robots and landmarks estimate from the start."""
         sigma = np.zeros((len(robots), PARAMETERS))
         for i, robot in enumerate(robots):
             odometry = robot.odometry
@@ -94,20 +94,20 @@ class ParameterTable(NamedTuple):
 
     @property
     def filter_size(self) -> int:
-        """How many columns the filter has: three per pose, one per parameter and three per landmark."""
+        """Number of filter columns: three per pose, one per parameter and three per landmark."""
         parameters, landmarks = self.column.max(initial=-1) + 1, self.survey_column.max(initial=-3) + 3
         if self.in_blocks:
             parameters = -(-parameters // DRIVES) * DRIVES
         return int(max(3 * self.column.shape[0], parameters, landmarks))
 
     def with_robot(self, robot: int) -> ParameterTable:
-        """The table with all parameters of a robot estimated that may be."""
+        """Table in which all parameters of a robot with a standard deviation are estimated."""
         new = np.zeros(self.column.shape, dtype=bool)
         new[robot] = (self.column[robot] < 0) & (self.sigma[robot] > 0.0)
         return self.with_parameters(new)
 
     def with_parameters(self, new: BoolArray) -> ParameterTable:
-        """The table with more parameters (N, PARAMETERS) estimated."""
+        """Table in which more parameters (N, PARAMETERS) are estimated."""
         column = self.column.copy()
         if not self.in_blocks:
             column[new] = self.filter_size + np.arange(new.sum())
@@ -122,12 +122,12 @@ class ParameterTable(NamedTuple):
 
     @property
     def block_columns(self) -> IntArray:
-        """The first columns (N, BLOCKS) of the robots' blocks of parameters; -1: there is none."""
+        """First columns (N, BLOCKS) of the robots' blocks of parameters; -1: none."""
         first = np.where(self.column >= 0, self.column - _SLOT, -1)
         return np.stack([first[:, block == _BLOCK].max(axis=1) for block in range(BLOCKS)], axis=1)
 
     def with_landmark(self, landmark: int) -> ParameterTable:
-        """The table with a landmark estimated."""
+        """Table in which a landmark is estimated."""
         survey_column = self.survey_column.copy()
         if survey_column[landmark] < 0:
             survey_column[landmark] = self.filter_size
@@ -135,7 +135,7 @@ class ParameterTable(NamedTuple):
 
 
 def _survey(mark: Landmark) -> FloatArray:
-    """Covariance (3, 3) of the right-invariant error of a landmark's survey when it is opened."""
+    """Prior covariance (3, 3) of the right-invariant error of a landmark's survey."""
     position, yaw = (mark.position_sigma, mark.yaw_sigma) if mark.is_estimated else _CONTRADICTED_SURVEY_SIGMA
     sigma = np.maximum([position, position, yaw], _MIN_SURVEY_SIGMA)
     return error_covariance([mark.x, mark.y, mark.yaw or 0.0], np.diag(sigma**2))

@@ -1,7 +1,7 @@
 """Infrared boards as data: arrangement, curves and errors of the elements.
 
-The sensor and the emitter of one number sit side by side, on a circle about the origin of base_link, both
-looking outwards. Any number of them from three on.
+Sensor and emitter of the same number are side by side on a circle about the origin of base_link, both facing
+outwards. There are at least three of each.
 """
 
 from __future__ import annotations
@@ -25,22 +25,22 @@ from swarm_loc_estimator.swarm.ir_curves import (
 )
 
 POWERS = ("far", "near")
-"""Powers of the emitters in the order of BrightnessMatrix's POWER_* constants; only the first is a must."""
+"""Powers of the emitters in the order of BrightnessMatrix's POWER_* constants; the second is optional."""
 MAX_ELEMENTS = 32
 GAIN_RANGE = (0.05, 20.0)
 _TOGETHER = 1e-3
-"""Two elements closer than this are one [rad]."""
+"""Minimum angle between two elements [rad]."""
 
 
 class ReadingErrors(NamedTuple):
-    """Errors of readings, as numbers only, since passing a whole model for every reading is slow.
+    """Error model of readings; a separate tuple, because passing a whole model per reading is slow.
 
     Attributes:
-        noise: Of every reading, one standard deviation [count].
-        relative: Standard deviation besides, relative to the expectation [1].
-        systematic: The share of this in variance that is the same every time.
-        blocked: The scale on which the cost of a reading that may be blocked ends; infinite: none is.
-        bright: That scale for a reading that may be too bright.
+        noise: Standard deviation of a reading [count].
+        relative: Additional standard deviation relative to the expected reading [1].
+        systematic: Share of the relative variance that is systematic.
+        blocked: Maximum cost of a reading that may be blocked; infinite: never blocked.
+        bright: Maximum cost of a reading that may be too bright.
     """
 
     noise: float
@@ -51,20 +51,20 @@ class ReadingErrors(NamedTuple):
 
 
 class IrModel(NamedTuple):
-    """A platform as compiled code reads it.
+    """A platform for compiled code.
 
     Attributes:
-        radius: From the centre to the elements [m].
+        radius: Distance from the centre to the elements [m].
         angles: (n,) directions of the elements in base_link [rad].
         units: (n, 2) their unit vectors.
         sensor: The curve S.
         emitter: The curve E.
         amplitudes: (modes, 5) the fields of `Amplitude`.
         saturation: Readings at or above are only lower bounds [count].
-        noise: Of every reading, one standard deviation [count].
-        errors: How readings err.
-        stray: Noise besides, relative to the brightest reading of an exchange.
-        scale: What covariances are multiplied by.
+        noise: Standard deviation of a reading [count].
+        errors: Error model of readings.
+        stray: Additional noise, relative to the brightest reading of an exchange.
+        scale: Factor on covariances.
     """
 
     radius: float
@@ -86,8 +86,8 @@ class IrPlatform:
 
     Attributes:
         angles: (n,) directions of the elements in base_link [rad], counter-clockwise positive.
-        sensor: S, how a sensor's reading falls with the angle of incidence.
-        emitter: E, how an emitter's light falls with the angle to its axis.
+        sensor: S, sensor reading over the angle of incidence.
+        emitter: E, emitted light over the angle to the emitter's axis.
         amplitudes: A for each power of the emitters, in the order of `POWERS`.
 
     Raises:
@@ -146,22 +146,22 @@ class IrPlatform:
 
     @property
     def n(self) -> int:
-        """How many sensors, and emitters."""
+        """Number of sensors, and of emitters."""
         return len(self.angles)
 
     @property
     def powers(self) -> tuple[str, ...]:
-        """The names of its powers, in the order of readings' first axis."""
+        """Names of its powers, in the order of the first axis of readings."""
         return POWERS[: len(self.amplitudes)]
 
     @property
     def relative(self) -> float:
-        """By how much readings are off besides `noise`, relative, one standard deviation."""
+        """Relative standard deviation of readings, in addition to `noise`."""
         return math.hypot(self.relative_noise, self.curve_sigma)
 
     @cached_property
     def model(self) -> IrModel:
-        """What compiled code reads."""
+        """The platform for compiled code."""
         angles = np.array(self.angles)
         laws = [[getattr(law, name) for name in number_specs(Amplitude)] for law in self.amplitudes]
         errors = ReadingErrors(
@@ -200,8 +200,8 @@ class IrGains:
     Attributes:
         sensor: (n,) factors of the sensors [1].
         emitter: (n,) factors of the emitters [1].
-        dead_sensors: Numbers of sensors whose readings mean nothing.
-        dead_emitters: Numbers of emitters whose light means nothing.
+        dead_sensors: Numbers of sensors to ignore.
+        dead_emitters: Numbers of emitters to ignore.
 
     Raises:
         IrPlatformError: A factor is not in [0.05, 20], sizes differ, or there is no such element.
@@ -236,18 +236,18 @@ class IrGains:
 
     @classmethod
     def unknown(cls, platform: IrPlatform) -> IrGains:
-        """Of a robot that was never calibrated."""
+        """Gains of a robot that was never calibrated."""
         ones = (1.0,) * platform.n
         return cls(ones, ones, platform.element_sigma)
 
 
 class PairGains(NamedTuple):
-    """Gains of k pairs of robots, as the models take them.
+    """Gains of k pairs of robots, for the models.
 
     Attributes:
-        sensor: (k, n) of each receiver's sensors; NaN: dead, what it reads means nothing.
-        emitter: (k, n) of each transmitter's emitters; NaN: dead.
-        sigma: (k, 4) own and common sigma of the receiver's sensors, then of the transmitter's emitters.
+        sensor: (k, n) gains of each receiver's sensors; NaN: dead.
+        emitter: (k, n) gains of each transmitter's emitters; NaN: dead.
+        sigma: (k, 4) individual and common sigma of the receiver's sensors, then of the emitters.
     """
 
     sensor: FloatArray
@@ -256,7 +256,7 @@ class PairGains(NamedTuple):
 
     @classmethod
     def of(cls, receivers: list[IrGains], transmitters: list[IrGains]) -> PairGains:
-        """Of pairs."""
+        """Gains of pairs of a receiver and a transmitter."""
         pairs = list(zip(receivers, transmitters, strict=True))
         return cls(
             _without(np.array([r.sensor for r, _ in pairs]), [r.dead_sensors for r, _ in pairs]),
@@ -266,14 +266,14 @@ class PairGains(NamedTuple):
 
 
 def _without(factors: FloatArray, dead: list[tuple[int, ...]]) -> FloatArray:
-    """Factors (k, n) with NaN for elements that are dead."""
+    """Factors (k, n) with NaN for dead elements."""
     for row, elements in zip(factors, dead, strict=True):
         row[list(elements)] = np.nan
     return factors
 
 
 class IrMethod(Enum):
-    """How brightness becomes a relative pose."""
+    """Method to estimate a relative pose from brightness."""
 
     LIKELIHOOD = "likelihood"  # the most likely pose of all readings of all powers
     CLOSED_FORM = "closed_form"  # eqs (9)-(18) of the Droplet paper, corrected
@@ -284,13 +284,13 @@ class RobotIr:
     """The infrared board of one robot.
 
     Attributes:
-        id: By which its exchanges name it, 1 to 65535, unique in the swarm.
-        platform: What the board is.
-        source: Name of a packaged platform, or absolute path of the file that it comes from.
-        estimator: How what it reads becomes a pose.
-        gains: What is known of its elements; None: never calibrated.
-        dead_sensors: Numbers of sensors whose readings mean nothing.
-        dead_emitters: Numbers of emitters whose light means nothing.
+        id: Id in its exchanges, 1 to 65535, unique in the swarm.
+        platform: Model of the board.
+        source: Name of a packaged platform, or absolute path of its file.
+        estimator: Method to estimate poses.
+        gains: Calibrated gains of its elements; None: never calibrated.
+        dead_sensors: Numbers of sensors to ignore.
+        dead_emitters: Numbers of emitters to ignore.
     """
 
     id: int
@@ -306,6 +306,6 @@ class RobotIr:
 
     @property
     def believed_gains(self) -> IrGains:
-        """The gains to use: those described, or unknown ones, with the dead elements."""
+        """Gains of the description, or unknown gains, with the dead elements."""
         gains = self.gains or IrGains.unknown(self.platform)
         return replace(gains, dead_sensors=self.dead_sensors, dead_emitters=self.dead_emitters)

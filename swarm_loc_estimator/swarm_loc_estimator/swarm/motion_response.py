@@ -1,4 +1,4 @@
-"""Motion response: what share of a reported motion is true, for odometry that is a command or that slips."""
+"""Motion response: true share of the reported motion, for odometry from commands or with slip."""
 
 from __future__ import annotations
 
@@ -7,23 +7,23 @@ from dataclasses import dataclass
 
 
 class MotionResponseError(ValueError):
-    """A response that contradicts itself; the message is one sentence."""
+    """An inconsistent response; the message is one sentence."""
 
 
 @dataclass(frozen=True)
 class MotionResponse:
-    """How much of the reported speed and turn rate is true, for odometry that is a command or that slips.
+    """True shares of the reported speed and turn rate, for odometry from commands or with slip.
 
-    Between the points of the grid the shares are interpolated, beyond it they are those of its border.
+    Shares are interpolated between the points of the grid and constant beyond its border.
 
     Attributes:
-        speeds: (V,) reported speeds [m/s], ascending, from 0 on.
-        turn_rates: (W,) reported turn rates [rad/s], ascending, from 0 on; their sign does not matter.
+        speeds: (V,) reported speeds [m/s], ascending from 0.
+        turn_rates: (W,) absolute reported turn rates [rad/s], ascending from 0.
         speed_share: (V, W) true speed per reported speed.
         turn_share: (V, W) true turn rate per reported turn rate.
 
     Raises:
-        MotionResponseError: Sizes do not fit, an axis does not ascend, or a share is not in [0, 10].
+        MotionResponseError: Sizes differ, an axis does not ascend, or a share is not in [0, 10].
     """
 
     speeds: tuple[float, ...]

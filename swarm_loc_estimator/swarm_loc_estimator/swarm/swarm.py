@@ -1,8 +1,8 @@
-"""The description of a swarm: robots, what they carry, how their sensors err, and the landmarks.
+"""Swarm description: robots with their sensors and error models, and landmarks.
 
-Everything here is immutable and in SI units and radians. Each number states its unit and allowed range
-beside its default, so that the reader of `swarm.yaml`, the documentation and the calibration share one
-table; a new parameter is one line in one of these classes.
+All classes are immutable; units are SI and radians. Each number has its default, unit and allowed range in
+one table for the reader of `swarm.yaml`, the documentation and the calibration; a new parameter is one line
+in one of these classes.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ Pose2 = tuple[float, float, float]
 
 
 TURN = 6.2832
-"""Angles may be written up to a whole turn either way [rad]."""
+"""Maximum absolute angle in descriptions: a full turn [rad]."""
 
 
 @dataclass(frozen=True)
 class OdometryModel:
-    """How a robot's odometry errs: noise of the motion, and a calibration of the motion it reports.
+    """Error model of a robot's odometry: process noise, and calibration of the reported motion.
 
     The reported speed v and turn rate w of a step become distance_scale * v and turn_scale * w, further
     scaled by the robot's `MotionResponse` if it has one. They take effect `delay_s` after their stamp,
@@ -92,16 +92,16 @@ class OdometryModel:
 
     @property
     def is_calibrated(self) -> bool:
-        """Whether anything of it is estimated from the start."""
+        """Whether any of its parameters is estimated from the start."""
         return max(self.distance_scale_sigma, self.turn_scale_sigma, self.turn_bias_sigma) > 0.0
 
 
 @dataclass(frozen=True)
 class SensorModel:
-    """How a robot's sightings err: noise, calibration and gate.
+    """Error model of a robot's sightings: noise, calibration and gate.
 
-    Whatever is seen is closer or farther by distance_scale. A sighting without heading has a range r [m] and
-    a bearing b [rad], positive to the left, which become
+    Measured distances are multiplied by distance_scale. A sighting without heading has a range r [m] and a
+    bearing b [rad], positive to the left, which become
     distance = r * exp(range_log_scale + range_skew * b + range_curve * b^2) + range_offset, to a robot's
     marker with robot_range_offset more, and
     bearing = bearing_scale * b + bearing_curve * b^2 + bearing_offset, taken `time_offset_s` after the stamp.
@@ -160,9 +160,9 @@ class SensorModel:
 
 @dataclass(frozen=True)
 class CameraMount:
-    """Where the camera sits in base_link (x forward, y left, z up).
+    """Pose of the camera in base_link (x forward, y left, z up).
 
-    The camera looks along R = Rz(yaw) Ry(pitch) Rx(roll) times base_link's x axis; positive pitch looks down.
+    The viewing direction is R = Rz(yaw) Ry(pitch) Rx(roll) times the x axis; positive pitch looks down.
     """
 
     x: float = number(0.0, "m", -10.0, 10.0, "forward of base_link")
@@ -181,14 +181,14 @@ class Face:
     """A marker on a robot's body, in base_link.
 
     Attributes:
-        name: What the robot's type calls this side.
+        name: Name of this side in the robot's type.
         id: Marker id, unique in the swarm.
         x: [m], forward.
         y: [m], left.
         z: [m], up.
-        yaw: Direction out of the face [rad]; None when the marker shows no heading.
+        yaw: Direction of the outward normal [rad]; None if the marker shows no heading.
         size: Side of the marker, black border included [m].
-        position_sigma: How unsure x and y are, each [m].
+        position_sigma: Standard deviation of x and y, each [m].
     """
 
     name: str
@@ -205,17 +205,17 @@ class Face:
 
 @dataclass(frozen=True)
 class Landmark:
-    """A marker that does not move, in map.
+    """A static marker in `map`.
 
     Attributes:
         id: Marker id, unique in the swarm.
         x: [m].
         y: [m].
         z: [m].
-        yaw: Direction out of the marker's face [rad]; None when it shows no heading.
+        yaw: Direction of the outward normal [rad]; None if the marker shows no heading.
         size: Side of the marker, black border included [m].
-        position_sigma: How unsure x and y are, each [m].
-        yaw_sigma: How unsure yaw is [rad].
+        position_sigma: Standard deviation of x and y, each [m].
+        yaw_sigma: Standard deviation of yaw [rad].
     """
 
     id: int
@@ -231,13 +231,13 @@ class Landmark:
 
     @property
     def is_estimated(self) -> bool:
-        """Whether its place is not exact."""
+        """Whether its pose is estimated: any standard deviation is positive."""
         return self.position_sigma > 0.0 or self.yaw_sigma > 0.0
 
 
 @dataclass(frozen=True)
 class StartSigma:
-    """How sure the start pose is, one standard deviation."""
+    """Standard deviations of the start pose."""
 
     x: float = number(0.01, "m", 0.0, 1e3, "along map x", above=True)
     y: float = number(0.01, "m", 0.0, 1e3, "along map y", above=True)
@@ -246,14 +246,14 @@ class StartSigma:
 
 @dataclass(frozen=True)
 class RandomWalk:
-    """How a robot moves that sends no odometry: nothing is known but how fast its pose may change."""
+    """Random walk of a robot without odometry, given by the growth of its pose variance."""
 
     position: float = number(0.0, "m^2/s", 0.0, 1e3, "variance of x and of y per second; 0: it stands")
     heading: float = number(0.0, "rad^2/s", 0.0, 1e3, "variance of the heading per second")
 
     @property
     def moves(self) -> bool:
-        """Whether it does at all."""
+        """Whether the pose changes at all."""
         return self.position > 0.0 or self.heading > 0.0
 
 
@@ -262,18 +262,18 @@ class Robot:
     """One robot.
 
     Attributes:
-        name: Its namespace and prefix of its frames.
-        type: The type its settings come from; "" when it has none.
-        odometry: Noise and calibration of its motion.
-        response: Share of the reported motion that is true; None: all of it.
-        camera: Where its camera sits; None when it has none and only others see it.
-        sensor: Noise, calibration and gate of its sightings.
+        name: Namespace of its topics and prefix of its frames.
+        type: Name of its type; "" if it has none.
+        odometry: Error model of its odometry.
+        response: True share of the reported motion; None: all of it.
+        camera: Pose of its camera; None if it has none.
+        sensor: Error model of its sightings.
         faces: Markers on its body.
-        start: Pose in map at the first datum; None: unknown, it waits for a fix.
-        start_sigma: How sure the start is.
-        stands: Whether it has no odometry, and does not move but as `random_walk` says.
-        random_walk: How it may move without odometry.
-        ir: Its infrared board; None when it has none.
+        start: Start pose in `map`; None: unknown, to be initialized by sightings or fixes.
+        start_sigma: Standard deviations of the start pose.
+        stands: True if it has no odometry; it moves only by `random_walk`.
+        random_walk: Random walk without odometry.
+        ir: Infrared board; None if it has none.
     """
 
     name: str
@@ -292,7 +292,7 @@ class Robot:
 
 @dataclass(frozen=True)
 class MarkerOwner:
-    """Whom a marker id belongs to.
+    """Owner of a marker id.
 
     Attributes:
         robot_index: Index into `Swarm.robots`; -1 for a landmark.
@@ -306,7 +306,7 @@ class MarkerOwner:
 
 
 class SwarmError(ValueError):
-    """A swarm that contradicts itself; the message is one sentence."""
+    """An inconsistent swarm; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -315,7 +315,7 @@ class Swarm:
 
     Raises:
         SwarmError: A robot name, a marker id or the id of an infrared board appears twice, or a robot with
-            odometry walks at random.
+            odometry has a random walk.
     """
 
     robots: tuple[Robot, ...] = ()
@@ -345,12 +345,12 @@ class Swarm:
 
     @cached_property
     def index_of(self) -> Mapping[str, int]:
-        """Robot name -> index."""
+        """Robot index by name."""
         return {robot.name: index for index, robot in enumerate(self.robots)}
 
     @cached_property
     def owner_of(self) -> Mapping[int, MarkerOwner]:
-        """Marker id -> whom it belongs to."""
+        """Owner by marker id."""
         owners = {
             face.id: MarkerOwner(index, -1, face)
             for index, robot in enumerate(self.robots)

@@ -1,4 +1,4 @@
-"""Read and check a swarm description: `swarm.yaml` to `Swarm`.
+"""Reader of swarm descriptions: `swarm.yaml` to `Swarm`.
 
 ```yaml
 fileversion: 1
@@ -92,7 +92,7 @@ _RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
 _MAX_ID = 2**32 - 1
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _MAX_NAME = 64
-"""Characters; topics and frames are built from names, and DDS bounds them."""
+"""Maximum length of a robot name; DDS limits the length of topic names."""
 RESERVED_NAMES = frozenset(
     [
         "aerial",
@@ -112,15 +112,15 @@ RESERVED_NAMES = frozenset(
         "watch",
     ]
 )
-"""Topics, nodes and frames of the workspace and of ROS; a robot's name is a namespace beside them."""
+"""Names of topics, nodes and frames that a robot's namespace must not collide with."""
 MAX_ROBOTS = 1000
-"""So many have been simulated and run live; larger swarms are not known to work."""
+"""Maximum number of robots; larger swarms have not been tested."""
 MAX_STATES = 10_000
-"""Of a filter whose covariance is one matrix: 800 MB for so many, and several of them are kept."""
+"""Maximum number of states of the dense filter, whose covariance then has 800 MB per checkpoint."""
 
 
 class SwarmFileError(UserError):
-    """A swarm description that cannot be used; the message is one sentence with file, key and value."""
+    """An invalid swarm description; the message is one sentence with file, key and value."""
 
 
 def load_swarm(path: Path | str) -> Swarm:
@@ -141,19 +141,19 @@ def load_swarm(path: Path | str) -> Swarm:
 
 
 def parse_swarm(tree: Tree, path: Path) -> Swarm:
-    """Check the content of a swarm description as `load_swarm`; its paths begin at the folder of `path`."""
+    """Parse the content of a swarm description, see `load_swarm`; relative paths start at that of `path`."""
     return _Loader(path, SwarmFileError).swarm(tree)
 
 
 @dataclass
 class _Layer:
-    """What one of defaults, type and robot says; what it leaves out is missing here.
+    """Settings of one layer: defaults, type or robot; keys that the layer omits are omitted here.
 
     Attributes:
-        sections: Key -> values by name; None: there is no such thing.
-        response: Share of the motion that is true.
-        says_response: Whether the layer says so.
-        faces: Name -> place; None: taken away.
+        sections: Values by section; None: null in the file.
+        response: Motion response of the layer.
+        says_response: True if the layer has the key `response`.
+        faces: Face by name; None: removed.
     """
 
     sections: dict[str, Values | None]
@@ -163,14 +163,14 @@ class _Layer:
 
 
 class _Loader(TreeChecks):
-    """Checks the tree of one file on the way to the dataclasses."""
+    """Converts the tree of one file to the dataclasses, and checks it."""
 
     def __init__(self, path: Path, error: type[ValueError]) -> None:
         super().__init__(path, error)
         self._ir = IrSection(self, path.parent)
 
     def swarm(self, tree: Tree) -> Swarm:
-        """The whole file."""
+        """Parse the whole file."""
         sections = self.mapping(tree, "the file", _SECTIONS)
         version = sections.get("fileversion")
         if version != FILE_VERSION or isinstance(version, bool):
@@ -201,7 +201,7 @@ class _Loader(TreeChecks):
             raise self.said(str(error).removesuffix(".")) from error
 
     def _robot(self, name: str, tree: Tree, defaults: _Layer, types: Mapping[str, _Layer]) -> Robot:
-        """One robot from its three layers."""
+        """Parse one robot from its three layers."""
         key = f"robots.{name}"
         mapping = self.mapping(tree, key, _ROBOT)
         type_name = mapping.get("type", "")
@@ -226,7 +226,7 @@ class _Loader(TreeChecks):
         )
 
     def _layer(self, tree: Tree, key: str, known: Collection[str], *, of_robot: bool = False) -> _Layer:
-        """The settings that one layer says."""
+        """Parse the settings of one layer."""
         mapping = self.mapping(tree, key, known)
         sections: dict[str, Values | None] = {
             section: None
@@ -250,7 +250,7 @@ class _Loader(TreeChecks):
         )
 
     def _response(self, tree: Tree, key: str) -> MotionResponse | None:
-        """A table of shares, or that there is none; said as a whole by one layer."""
+        """Parse a motion response or null; layers are not merged."""
         if tree is None:
             return None
         mapping = self.mapping(tree, key, _RESPONSE)
@@ -275,7 +275,7 @@ class _Loader(TreeChecks):
             raise self.said(f"{key.removesuffix('response')}{error}".removesuffix(".")) from error
 
     def _faces(self, key: str, layers: Iterable[_Layer], ids_tree: Tree) -> tuple[Face, ...]:
-        """The robot's markers: where they sit from the layers, which they are from its ids."""
+        """Parse the robot's markers: poses from the layers, marker ids from the robot."""
         places: dict[str, Numbers] = {}
         for layer in layers:
             for name, numbers in layer.faces.items():
@@ -295,7 +295,7 @@ class _Loader(TreeChecks):
         )
 
     def _landmarks(self, tree: Tree, defaults: Tree) -> tuple[Landmark, ...]:
-        """All landmarks, in the order of the file."""
+        """Parse all landmarks, in the order of the file."""
         shared_tree = self.mapping(defaults, "defaults").get("landmark", {})
         shared = self.numbers(shared_tree, "defaults.landmark", LANDMARK_DEFAULTS)
         result = []
@@ -306,20 +306,20 @@ class _Loader(TreeChecks):
         return tuple(result)
 
     def _start(self, tree: Tree, key: str) -> Pose2 | None:
-        """A start pose, or that there is none."""
+        """Parse a start pose; None if it is unknown."""
         if tree is None:
             return None
         numbers = self.numbers(tree, key, _START, required=tuple(_START))
         return (float(numbers["x"] or 0.0), float(numbers["y"] or 0.0), float(numbers["theta"] or 0.0))
 
     def _marker_id(self, value: Tree, key: str) -> int:
-        """A marker id."""
+        """Parse a marker id."""
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= _MAX_ID:
             raise self.error(key, value, f"must be a marker id, a whole number in [0, {_MAX_ID}]")
         return value
 
     def _named(self, tree: Tree, key: str) -> list[tuple[str, Tree]]:
-        """A mapping from names that can stand in topics and frames."""
+        """Parse a mapping whose keys are valid names for topics and frames."""
         mapping = self.mapping(tree, key)
         for name in mapping:
             if not isinstance(name, str) or not _NAME.fullmatch(name):
@@ -334,7 +334,7 @@ class _Loader(TreeChecks):
 
 
 def _said(layers: Iterable[_Layer], section: str) -> Values | None:
-    """The values of a section; the last layer that says null takes all away, those behind bring it back."""
+    """Merge the values of a section over layers; null removes it, and a later layer can restore it."""
     values: Values | None = {}
     for layer in layers:
         if section in layer.sections:
@@ -344,7 +344,7 @@ def _said(layers: Iterable[_Layer], section: str) -> Values | None:
 
 
 def _state_count(robots: tuple[Robot, ...], landmarks: tuple[Landmark, ...]) -> int:
-    """States of the filter: three per pose and per estimated landmark, one per parameter with a sigma."""
+    """Number of filter states: three per pose and estimated landmark, one per estimated parameter."""
     sigmas = [
         sigma
         for robot in robots

@@ -1,4 +1,4 @@
-"""Write a swarm description: what robots of a type share stands with the type, the rest with the robot."""
+"""Writer of swarm descriptions; values common to all robots of a type are written with the type."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
     Args:
         swarm: What to write.
         path: The file; replaced when it exists, its folder created when missing.
-        comment: Lines that say where the numbers come from.
+        comment: Comment lines for the top of the file.
 
     Raises:
         SwarmFileError: It has numbers that `load_swarm` refuses; nothing is written.

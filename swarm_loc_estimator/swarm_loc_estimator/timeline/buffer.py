@@ -1,7 +1,7 @@
-"""A buffer of measurements in the order of their stamps, into which late ones are merged.
+"""Buffer of measurements sorted by stamp, into which late measurements are merged.
 
-The order is that of the stamps and does not depend on that of arrival, not even among measurements that share
-a stamp: these are ordered by all their numbers. What is equal to the last bit is a repetition.
+The order does not depend on the order of arrival: measurements with equal stamps are sorted by all their
+fields. Measurements equal in all bits are duplicates.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ _FIRST = (
     "alternative",
     "value",
 )
-"""Fields that order measurements of one stamp before all others."""
+"""First sort keys of measurements with equal stamps."""
 
 
 def _words_in_order() -> tuple[IntArray, NDArray[np.bool_]]:
-    """All words (w,), the weightiest first, and (w,) whether each is a float."""
+    """Indices (w,) of all words, most significant sort key first, and (w,) True for floats."""
     fields: Any = MEASUREMENT_DTYPE.fields
     words: list[int] = []
     floats: list[bool] = []
@@ -49,15 +49,15 @@ def _words_in_order() -> tuple[IntArray, NDArray[np.bool_]]:
 _ORDER, _IS_FLOAT = _words_in_order()
 _FIRST_CAPACITY = 1024
 _Columns = tuple[IntArray, IntArray, NDArray[np.uint8], FloatArray]
-"""Rows as words (n, w), their stamps (n,), verdicts and normalised innovations squared."""
+"""Rows as words (n, w), their stamps (n,), verdicts and normalized innovations squared."""
 
 
 class Merged(NamedTuple):
-    """What `MeasurementBuffer.merge` did.
+    """Result of `MeasurementBuffer.merge`.
 
     Attributes:
-        first_ns: Stamp of the first measurement that was not there yet; None when there is none.
-        duplicates: Repetitions.
+        first_ns: Stamp of the first new measurement; None if there is none.
+        duplicates: Number of duplicates.
     """
 
     first_ns: int | None
@@ -65,9 +65,9 @@ class Merged(NamedTuple):
 
 
 class MeasurementBuffer:
-    """Measurements that come and go like a queue, but may enter anywhere.
+    """Sorted queue of measurements: removed at the front, inserted anywhere.
 
-    What was computed of a measurement goes with it; of new ones nothing is as yet.
+    Verdicts and NIS move with their measurements; those of new measurements are OPEN and NaN.
     """
 
     def __init__(self) -> None:
@@ -79,12 +79,12 @@ class MeasurementBuffer:
 
     @property
     def stamp_ns(self) -> IntArray:
-        """(m,) not decreasing."""
+        """Stamps (m,), sorted."""
         return self._stamp_ns[self._begin : self._end]
 
     @property
     def measurements(self) -> MeasurementArray:
-        """(m,) of MEASUREMENT_DTYPE in order."""
+        """Measurements (m,) of MEASUREMENT_DTYPE, sorted."""
         return self._rows[self._begin : self._end]
 
     @property
@@ -98,7 +98,7 @@ class MeasurementBuffer:
         return self._nis[self._begin : self._end]
 
     def merge(self, new: MeasurementArray) -> Merged:
-        """Sort measurements (k,) in."""
+        """Insert measurements (k,)."""
         self._make_room(new.size)
         words = np.ascontiguousarray(new).view(np.int64).reshape(-1, _WORDS)
         columns = self._words, self._stamp_ns, self._verdicts, self._nis
@@ -107,7 +107,7 @@ class MeasurementBuffer:
         return Merged(first_ns if count else None, new.size - count)
 
     def remove(self, gone: MeasurementArray) -> int | None:
-        """Take measurements (k,) out; return the stamp of the first that was there, None when none was."""
+        """Remove measurements (k,); return the stamp of the first one found, None if none was found."""
         words = np.ascontiguousarray(gone).view(np.int64).reshape(-1, _WORDS)
         first_ns = None
         for one in words[np.argsort(words[:, 0], kind="stable")]:
@@ -121,7 +121,7 @@ class MeasurementBuffer:
         return first_ns
 
     def drop_first(self, count: int) -> None:
-        """Forget the oldest ones."""
+        """Remove the oldest measurements."""
         self._begin += count
 
     def _allocate(self, capacity: int) -> None:
@@ -132,7 +132,7 @@ class MeasurementBuffer:
         self._nis: FloatArray = np.full(capacity, np.nan)
 
     def _make_room(self, count: int) -> None:
-        """Have space for so many more: those forgotten give theirs back, or all becomes twice as large."""
+        """Reserve space for `count` rows: reuse that of removed rows, or double the capacity."""
         if self._end + count <= self._stamp_ns.size:
             return
         size, old = len(self), slice(self._begin, self._end)
@@ -147,14 +147,14 @@ class MeasurementBuffer:
 
 @cached_njit
 def _merge(columns: _Columns, begin: int, end: int, new: IntArray) -> tuple[int, int]:
-    """Merge new rows into those from `begin` to `end`, which have room behind.
+    """Merge new rows into rows `begin` to `end`; space behind them must be reserved.
 
     Returns:
-        How many it has more now, and the stamp of the first one it has more.
+        Number of inserted rows, and the stamp of the first one.
     """
     rows, stamps_ns, verdicts, nis = columns
     order = np.argsort(new[:, 0], kind="mergesort")
-    for k in range(1, order.size):  # those that share a stamp
+    for k in range(1, order.size):  # sort rows with equal stamps
         row, place = order[k], k
         while place > 0 and _compared(new[row], new[order[place - 1]]) < 0:
             order[place] = order[place - 1]
@@ -186,7 +186,7 @@ def _merge(columns: _Columns, begin: int, end: int, new: IntArray) -> tuple[int,
 
 @cached_njit
 def _lower_bound(rows: IntArray, stamps_ns: IntArray, begin: int, end: int, one: IntArray) -> int:
-    """The first place in rows[begin:end] that does not come before a row."""
+    """Index of the first row in rows[begin:end] that is not less than a row."""
     place: int = begin + np.searchsorted(stamps_ns[begin:end], one[0])
     while place < end and _compared(rows[place], one) < 0:
         place += 1
@@ -195,11 +195,11 @@ def _lower_bound(rows: IntArray, stamps_ns: IntArray, begin: int, end: int, one:
 
 @cached_njit
 def _compared(one: IntArray, other: IntArray) -> int:
-    """-1 when one row comes before the other, 1 when behind it, 0 when they are equal."""
+    """Compare two rows: -1 if `one` is less than `other`, 1 if greater, 0 if equal."""
     for k in range(_ORDER.size):
         a, b = one[_ORDER[k]], other[_ORDER[k]]
         if a != b:
-            both_negative = _IS_FLOAT[k] and a < 0 and b < 0  # a float's sign stands apart from its size
+            both_negative = _IS_FLOAT[k] and a < 0 and b < 0  # floats are sign and magnitude
             return -1 if (a < b) != both_negative else 1
     return 0
 

@@ -1,4 +1,4 @@
-"""Initialization of robots at the starts that the swarm description gives."""
+"""Initialization of robots at the start poses of the swarm description."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 
 
 class ConfiguredStarts:
-    """Takes robots into the estimate at their configured starts.
+    """Initializes robots at their configured starts.
 
     Args:
-        swarm: Whose starts.
-        tracks: The robots' odometry.
+        swarm: Robots with their starts.
+        tracks: Odometry of the robots.
     """
 
     def __init__(self, swarm: Swarm, tracks: OdometryTracks) -> None:
@@ -28,9 +28,9 @@ class ConfiguredStarts:
         self._start_variance: FloatArray = np.square(sigma).reshape(-1, 3)
 
     def with_starts(self, state: SwarmState, stamp_ns: int) -> SwarmState:
-        """The state with those robots at their starts of which there is no measurement yet.
+        """State in which robots without any measurement are initialized at their starts.
 
-        A robot that walks at random is left out: the time since which it has walked is not known.
+        Robots that are random walks are excluded, because the start of their motion is unknown.
         """
         robots = np.flatnonzero(state.start_pending)
         ready = robots[~self._tracks.is_random_walk(robots) & self._may_start(state, robots, stamp_ns)]
@@ -40,35 +40,35 @@ class ConfiguredStarts:
         return state
 
     def initialize_pending(self, state: SwarmState, stamp_ns: int) -> None:
-        """Initialize all robots whose odometry has begun by an instant."""
+        """Initialize all pending robots with odometry before an instant."""
         robots = np.flatnonzero(state.start_pending)
         ready = robots[self._may_start(state, robots, stamp_ns)]
         if ready.size:
             self._initialize(state, ready, np.full(ready.size, stamp_ns))
 
     def _may_start(self, state: SwarmState, robots: IntArray, stamps_ns: IntArray | int) -> BoolArray:
-        """Whether robots (k,) may start at configured poses: their odometry has begun by instants (k,)."""
+        """Whether robots (k,) are pending and have odometry before instants (k,)."""
         pending: BoolArray = state.start_pending[robots] & self._has_start[robots]
         return pending & self._tracks.has_started(robots, stamps_ns)
 
     def _initialize(self, state: SwarmState, robots: IntArray, stamps_ns: IntArray) -> None:
-        """Where their tracks begin; or, if they walk at random, with the first measurements about them."""
+        """Initialize robots (k,) at the start of their tracks, random walks at `stamps_ns`."""
         tracks, start, walks = self._tracks.arrays, self._start[robots], self._tracks.is_random_walk(robots)
         transform = se2.compose(start, se2.inverse(tracks.begin_pose[robots]))
         error = se2.error_covariance(start, self._start_variance[robots][:, :, None] * np.eye(3))
         begun_ns = np.where(walks, stamps_ns, tracks.begin_ns[robots])
         covariance, jacobian = self._tracks.at(robots, stamps_ns)[2:4]
-        covariance[~walks], jacobian[~walks] = 0.0, 0.0  # where a track begins, nothing is preintegrated yet
+        covariance[~walks], jacobian[~walks] = 0.0, 0.0  # nothing is preintegrated at the start of a track
         state.start(robots, Starts(transform, error, begun_ns, covariance, jacobian))
 
     def initialize_measured(self, state: SwarmState, measurements: MeasurementArray) -> bool:
-        """Initialize robots at their starts with the first measurement (m,) about them; whether any was.
+        """Initialize pending robots of measurements (m,) at their starts; return whether there were any.
 
-        Not before: only a measurement about a robot is computed again when its first odometry arrives late.
+        Not earlier: when the first odometry of a robot arrives late, only its measurements are fused again.
         """
         initialized = False
         for side in ("observer", "target"):
-            new = np.append(state.start_pending, False)[measurements[side]]  # NOBODY (-1) finds the last
+            new = np.append(state.start_pending, False)[measurements[side]]  # NOBODY (-1) is the last element
             robots, stamps_ns = measurements[side][new], measurements["stamp_ns"][new]
             ready = self._may_start(state, robots, stamps_ns)
             chosen_robots, first = np.unique(robots[ready], return_index=True)

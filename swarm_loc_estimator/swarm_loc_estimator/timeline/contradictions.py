@@ -1,4 +1,4 @@
-"""Detected faults in words: which robot or landmark contradicts the estimate, and by which sensor."""
+"""Reports of detected faults: which robot or landmark contradicts the estimate, and by which sensor."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 
 
 class Contradicted(Enum):
-    """What of a robot or landmark is contradicted."""
+    """Contradicted property of a robot or landmark."""
 
     ODOMETRY = "odometry"
     POSE = "pose"
@@ -28,9 +28,9 @@ class Contradiction(NamedTuple):
     """A fault of a robot or landmark.
 
     Attributes:
-        about: A robot's name, or a landmark such as "landmark 7".
-        kind: What is contradicted.
-        text: One sentence for people.
+        about: Name of the robot, or a landmark such as "landmark 7".
+        kind: Contradicted property.
+        text: Message for users, one sentence.
     """
 
     about: str
@@ -41,12 +41,12 @@ class Contradiction(NamedTuple):
 def contradictions(
     swarm: Swarm, state: SwarmState, tracks: OdometryTracks, now_ns: int
 ) -> list[Contradiction]:
-    """All faults that are known at an instant.
+    """All faults detected at an instant.
 
     Args:
         swarm: Gives the names.
-        state: The newest state.
-        tracks: Odometry; a robot whose odometry jumps may have two sources.
+        state: Newest state.
+        tracks: Odometry, to detect conflicting sources.
         now_ns: The instant.
     """
     names = [robot.name for robot in swarm.robots] + [f"landmark {mark.id}" for mark in swarm.landmarks]
@@ -79,7 +79,7 @@ def _sightings(observer: str, source: str) -> Contradiction:
 
 
 def _description(name: str, source: int, state: SwarmState) -> Contradiction:
-    """The fault of a robot or landmark whose parameters are re-estimated."""
+    """Fault of a robot or landmark whose parameters are re-estimated."""
     robots = state.tracked.size
     if source < robots:
         text = f"{name} contradicts its calibration; re-estimating its camera and odometry parameters"

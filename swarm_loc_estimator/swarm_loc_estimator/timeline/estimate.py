@@ -1,4 +1,4 @@
-"""Estimates: poses of all robots at an instant, their covariances and the drivers' frames."""
+"""Estimates: poses of all robots at an instant, covariances and transforms to the odom frames."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArra
 
 
 class Status(IntEnum):
-    """How a robot stands; the values of SwarmPose.status."""
+    """Localization status of a robot; the values of SwarmPose.status."""
 
-    WAITING = 0  # not located
+    WAITING = 0  # not localized
     TRACKED = 1
-    STALE = 2  # located, but its odometry is silent
-    UNCONFIRMED = 3  # where its description says; no sighting has confirmed it yet
-    CONTRADICTED = 4  # its newest sightings do not agree with its pose
+    STALE = 2  # localized, but its odometry has timed out
+    UNCONFIRMED = 3  # initialized, but not confirmed by a sighting yet
+    CONTRADICTED = 4  # its newest sightings contradict its pose
 
 
 _WAITING, _TRACKED, _STALE = int(Status.WAITING), int(Status.TRACKED), int(Status.STALE)
@@ -39,11 +39,11 @@ class Estimate(NamedTuple):
 
     Attributes:
         stamp_ns: The instant.
-        poses: (N, 3) x [m], y [m], theta [rad] in `map`; NaN for robots that are not located.
+        poses: (N, 3) x [m], y [m], theta [rad] in `map`; NaN for robots that are not localized.
         covariances: (N, 3, 3) of x, y, theta; NaN where `poses` are.
-        map_to_odom: (N, 3) from `map` to the driver's own odom frame; NaN where `poses` are.
+        map_to_odom: (N, 3) transform from `map` to the robot's odom frame; NaN where `poses` are.
         status: (N,) of `Status`.
-        fix_age_s: (N,) since the newest measurement tied to a landmark or an absolute fix; -1: never.
+        fix_age_s: (N,) age of the newest accepted landmark sighting or absolute fix [s]; -1: none.
     """
 
     stamp_ns: int
@@ -55,12 +55,12 @@ class Estimate(NamedTuple):
 
 
 def estimate_at(state: SwarmState, tracks: TrackArrays, timeout_s: FloatArray, now_ns: int) -> Estimate:
-    """The estimate at an instant.
+    """Predict the estimate to an instant.
 
     Args:
-        state: Belief at its newest measurements.
-        tracks: Odometry, which leads from there to the instant.
-        timeout_s: (N,) silence of the odometry after which a robot is stale.
+        state: State at the newest measurements.
+        tracks: Odometry, used for the prediction.
+        timeout_s: (N,) age of the newest odometry after which a robot is stale [s].
         now_ns: The instant.
     """
     estimate = _new_estimate(now_ns, state.tracked.size)
@@ -70,7 +70,7 @@ def estimate_at(state: SwarmState, tracks: TrackArrays, timeout_s: FloatArray, n
 
 @cached_njit
 def _new_estimate(now_ns: int, robots: int) -> Estimate:
-    """An estimate of so many robots, none of them located."""
+    """An estimate without localized robots."""
     return Estimate(
         now_ns,
         np.full((robots, 3), np.nan),
@@ -83,7 +83,7 @@ def _new_estimate(now_ns: int, robots: int) -> Estimate:
 
 @cached_njit
 def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray, out: Estimate) -> None:
-    """Fill an estimate."""
+    """Write the predictions of all tracked robots to an estimate."""
     sample, scratch, t, error = new_sample(1), new_scratch(), np.empty(3), np.empty((3, 3))
     track, raw = sample.pose[0], sample.raw[0]
     for i in range(belief.tracked.size):
@@ -107,7 +107,7 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray,
 
 @inlined_njit
 def _status(integrity: IntegrityArrays, robot: int, silent: bool) -> int:
-    """The status of a robot that is located."""
+    """Status of a localized robot."""
     if silent:
         return _STALE
     if integrity.confirmations[robot] < CONFIRMED:
@@ -117,7 +117,7 @@ def _status(integrity: IntegrityArrays, robot: int, silent: bool) -> int:
 
 @inlined_njit
 def _pose_covariance(x: float, y: float, error: FloatArray, out: FloatArray) -> None:
-    """Write the covariance (3, 3) of x, y, theta from that of the right-invariant error."""
+    """Write the covariance (3, 3) of x, y, theta, converted from that of the right-invariant error."""
     shear = (-y, x, 0.0)
     for a in range(3):
         for b in range(3):

@@ -1,7 +1,7 @@
-"""When measurements are fused, and which sizes of swarms and batches change how.
+"""Fusion periods, and the swarm and batch sizes at which the fusion strategy changes.
 
-A large swarm fuses the measurements of a fusion period together. A period is closed at its end, (t, t + T]:
-a measurement at the very instant of fusing belongs to the period that ends then.
+A large swarm fuses the measurements of a fusion period as one batch. A period is closed at its end, (t, t +
+T]: a measurement at the instant of fusion belongs to the period that ends then.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ Stamps = TypeVar("Stamps", int, IntArray)
 
 @dataclass(frozen=True)
 class Policy:
-    """Sizes from which on the estimator works differently; `Settings.sparse_from` is the one that users set.
+    """Sizes at which the estimator changes its strategy; users set only `Settings.sparse_from`.
 
     Attributes:
-        batch_from: Measurements of a fusion period from which on one update with all of them costs less than
-            one update each, whatever the size of the swarm.
-        delay_from: Robots from which on a period is fused only `fusion_delay_s` after its end; a smaller
-            swarm is fused again at little cost when late data arrive.
-        reopen_all_up_to: Robots up to which all parameters are re-estimated when several robots or landmarks
-            are contradicted; in a larger swarm only those of the contradicted ones.
-        fusion_periods_s: Default fusion period [s] by the number of robots with calibrated odometry from
-            which on it holds, largest number first.
+        batch_from: Minimum number of measurements per fusion period for a batch update; sequential updates
+            of fewer measurements are faster.
+        delay_from: Minimum number of robots to fuse a period only `fusion_delay_s` after its end; a smaller
+            swarm fuses late data again at little cost.
+        reopen_all_up_to: Maximum number of robots for which all parameters are re-estimated when several
+            robots or landmarks are contradicted; a larger swarm re-estimates only the contradicted ones.
+        fusion_periods_s: Default fusion period [s] by the minimum number of robots with calibrated odometry,
+            largest number first.
     """
 
     batch_from: int = 64
@@ -36,12 +36,12 @@ class Policy:
     fusion_periods_s: tuple[tuple[int, float], ...] = ((600, 0.5), (250, 0.4), (0, 0.2))
 
     def fusion_period_s(self, calibrated: int) -> float:
-        """The default fusion period where the odometry of so many robots is calibrated [s]."""
+        """Default fusion period for a number of robots with calibrated odometry [s]."""
         return next(period_s for count, period_s in self.fusion_periods_s if calibrated >= count)
 
 
 def end_of_period(stamp_ns: Stamps, period_ns: int) -> Stamps:
-    """The last instant of the period of a stamp, or of stamps (m,): a multiple of its length."""
+    """End of the period of a stamp, or of stamps (m,): the next multiple of its length."""
     return -(-stamp_ns // period_ns) * period_ns
 
 
@@ -50,8 +50,8 @@ _end_of_period = cached_njit(end_of_period)
 
 @cached_njit
 def middle_of_period(stamp_ns: int, period_ns: int) -> int:
-    """The instant to which robots are predicted for all measurements of the period of a stamp.
+    """Instant to which robots are predicted for all measurements of the period of a stamp.
 
-    Not the mean of what has come: so more that comes of the period finds the same prediction.
+    It does not depend on the measurements, so late measurements of the period use the same prediction.
     """
     return _end_of_period(stamp_ns, period_ns) - period_ns + period_ns // 2

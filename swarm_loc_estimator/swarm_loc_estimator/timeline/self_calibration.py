@@ -1,4 +1,4 @@
-"""Exports self-calibration results as a swarm description."""
+"""Export of self-calibration results as a swarm description."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 
 
 def learns(swarm: Swarm) -> bool:
-    """Whether there is anything to learn: a camera, odometry or landmark whose description has a sigma."""
+    """Whether parameters of any camera, odometry or landmark are described with a standard deviation."""
     lasting = np.delete(ParameterTable.of(swarm.robots).column, TURN_BIAS, axis=1)
     return bool((lasting >= 0).any()) or any(mark.is_estimated for mark in swarm.landmarks)
 
 
 def learned(swarm: Swarm, state: SwarmState) -> Swarm:
-    """The swarm with all estimated parameters and their standard deviations.
+    """Swarm with all estimated parameters and their standard deviations.
 
-    The bias of a turn rate is left out, because it changes. The sigmas of landmarks are marginal: they
-    include errors that all landmarks share.
+    The bias of the turn rate is omitted, because it changes. Standard deviations of landmarks are marginal:
+    they include errors common to all landmarks.
     """
     return Swarm(
         tuple(
@@ -46,7 +46,7 @@ def learned(swarm: Swarm, state: SwarmState) -> Swarm:
 
 
 def swapped_signs(swarm: Swarm) -> list[str]:
-    """One sentence for each robot whose path or turn has the wrong sign, as its estimated scale says."""
+    """One sentence for each robot with a negative estimated scale of distance or turn."""
     return [
         f"{robot.name}: its odometry reports the {what} with the wrong sign ({key} is {scale:.3f});"
         f" negate the {what} in its driver."
@@ -57,7 +57,7 @@ def swapped_signs(swarm: Swarm) -> list[str]:
 
 
 def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
-    """A robot with its parameters."""
+    """Robot with its estimated parameters."""
     value, sigma = state.parameter[index].tolist(), state.parameter_sigma(index).tolist()
     odometry, camera, sensor = robot.odometry, robot.camera, robot.sensor
     path, turn, seen = (1.0 + value[which] for which in (DISTANCE_SCALE, TURN_SCALE, CAMERA_SCALE))
@@ -85,7 +85,7 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
 
 
 def _landmark(mark: Landmark, number: int, state: SwarmState) -> Landmark:
-    """A landmark at its place."""
+    """Landmark at its estimated pose."""
     x, y, yaw = se2.compose(state.landmark[number], [mark.x, mark.y, mark.yaw or 0.0]).tolist()
     covariance = se2.pose_covariance([x, y, yaw], state.landmark_covariance(number))
     return replace(

@@ -1,4 +1,4 @@
-"""What the robots have measured lately, and what became of it: the newest measurement of each pair."""
+"""Newest measurement of each pair of robots, with its verdict and NIS."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from swarm_loc_estimator.filter.measurement_model import Command, MeasurementArr
 from swarm_loc_estimator.timeline.fusion import Verdict
 
 RECENT_NS = 2_000_000_000
-"""Older measurements do not tell what a robot sees now."""
+"""Maximum age of reported measurements."""
 
 
 class Recent(NamedTuple):
-    """Recent measurements and what became of them.
+    """Recent measurements with their verdicts.
 
     Attributes:
-        measurements: (m,) in order of their stamps.
+        measurements: (m,) sorted by stamp.
         verdicts: (m,) of `Verdict`.
-        nis: (m,) normalised innovations squared.
+        nis: (m,) normalized innovation squared.
     """
 
     measurements: MeasurementArray
@@ -31,14 +31,14 @@ class Recent(NamedTuple):
 
 
 class Sightings(NamedTuple):
-    """One row per pair (M,), in the order of observer and target.
+    """One row per pair (M,), sorted by observer and target.
 
     Attributes:
-        observer: Index of the robot that measured; -1: an absolute fix.
-        target: Index of the robot measured; below 0: landmark -1 - target.
+        observer: Index of the observing robot; -1: absolute fix.
+        target: Index of the observed robot; below 0: landmark -1 - target.
         verdict: Of `Verdict`.
-        nis: Normalised innovation squared; NaN: not computed.
-        age_s: Time since it was measured [s].
+        nis: Normalized innovation squared; NaN if not evaluated.
+        age_s: Time since the measurement [s].
     """
 
     observer: NDArray[np.int32]
@@ -49,11 +49,11 @@ class Sightings(NamedTuple):
 
 
 def newest_sightings(recent: Recent, now_ns: int) -> Sightings:
-    """The newest measurement of each pair within the last two seconds.
+    """Newest measurement of each pair within the last two seconds.
 
     Args:
-        recent: Measurements in the order of their stamps.
-        now_ns: The instant.
+        recent: Measurements sorted by stamp.
+        now_ns: The current instant.
     """
     rows, verdicts, nis = recent
     first = int(np.searchsorted(rows["stamp_ns"], now_ns - RECENT_NS))
@@ -62,7 +62,7 @@ def newest_sightings(recent: Recent, now_ns: int) -> Sightings:
     target = np.where(landmark > 0, -landmark, robot)
     observer = rows["observer"]
     chosen = np.flatnonzero((rows["command"] == Command.NONE) & ((landmark > 0) | (robot >= 0)))[::-1]
-    # np.unique keeps the first of equal keys: by the reversed order the newest
+    # np.unique keeps the first of equal keys, which is the newest in reversed order
     _, places = np.unique((observer[chosen] << 32) + target[chosen], return_index=True)
     kept = chosen[places]
     computed = np.isin(verdicts[kept], (Verdict.USED, Verdict.GATED))
@@ -85,7 +85,7 @@ def decode_sightings(data: bytes) -> tuple[int, Sightings]:
     """Stamp [ns] and columns of a serialized SwarmSightings.
 
     Raises:
-        CdrError: It is not a whole one, or its columns differ in length.
+        CdrError: The message is incomplete, or its columns differ in length.
     """
     message = decode(data, SWARM_SIGHTINGS)
     header, *columns = vars(message).values()

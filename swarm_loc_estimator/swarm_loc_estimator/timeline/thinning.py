@@ -1,14 +1,14 @@
-"""Leave out some of what was measured, evenly over all robots and pairs, where more comes than can be used.
+"""Under overload, drop measurements uniformly over all robots and pairs.
 
-Each source (a robot's camera, infrared board or fixes, a camera above) may use the same number of its
-measurements: where some send more than others, theirs are the first that go (max-min fairness; D. Bertsekas,
-R. Gallager: Data Networks, 6.5.2). A source's own are numbered, and number k is used when the fractional
-part of k times the golden ratio lies below the share. Such a sequence is even over any stretch and also over
-every n-th number (H. Weyl: Ueber die Gleichverteilung von Zahlen mod. Eins, 1916), so that a robot that
-always sends what it sees in the same order does not lose the same neighbour each time.
+Each source (a robot's camera, infrared board or fixes, an overhead camera) has the same maximum number of
+used measurements, so those that send most lose measurements first (max-min fairness; D. Bertsekas, R.
+Gallager: Data Networks, 6.5.2). Measurement k of a source is used if the fractional part of k times the
+golden ratio is below the share. This sequence is uniform over any interval and over every n-th number (H.
+Weyl: Ueber die Gleichverteilung von Zahlen mod. Eins, 1916), so a robot that sends its detections always in
+the same order does not lose the same neighbour each time.
 
-A large swarm's measurements of one fusion period are fused together, which costs as much for few as for
-many. There all sightings of some periods are used and none of the others: period k by the same rule.
+A large swarm fuses the measurements of a fusion period as one batch, whose cost hardly depends on their
+number. So whole periods are used or dropped: period k by the same rule.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from swarm_loc_estimator.sensors.sensor import Sensor, chosen
 from swarm_loc_estimator.timeline.scheduling import end_of_period
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-"""The golden ratio's fractional part in units of 2^-64."""
+"""Fractional part of the golden ratio in units of 2^-64."""
 _SILVER = np.uint64(0x6A09E667F3BCC909)
-"""That of the square root of two: where a source's numbers begin, so that not all are used at once."""
+"""Fractional part of the square root of two: offset between sources, so that their drops alternate."""
 
 _WHOLE = 2.0**64
 
 SHED_REASONS = frozenset(f"shed_{sensor.name}" for sensor in SENSORS.values() if sensor.unit is not None)
-"""Why readings are left out, by sensor."""
+"""Reasons in `drops` for readings dropped by thinning, one per sensor."""
 
 
 class Thinned(NamedTuple):
-    """What is left of messages.
+    """Result of thinning.
 
     Attributes:
-        messages: Their `dropped` counts what has been left out, too.
-        measurements: How many there were: detections, fixes, infrared exchanges, aerial images.
-        shed: How many of them were left out.
+        messages: The remaining readings; `dropped` includes the readings dropped here.
+        measurements: Number of measurements before: detections, fixes, infrared exchanges, aerial images.
+        shed: Number of dropped measurements.
     """
 
     messages: Batch
@@ -51,25 +51,25 @@ class Thinned(NamedTuple):
 
 
 class Thinning:
-    """Thins out measurements; odometry stays, since all else is used by way of it.
+    """Thins out measurements, but never odometry, which all predictions need.
 
-    The same messages in the same order leave the same behind. All matrices of an infrared exchange are used
-    or none, and so are all detections of an aerial image: a part of it would say that robots are missing.
+    The result is deterministic. All matrices of an infrared exchange are used or none, and all detections of
+    an aerial image or none: a partial image would imply missing robots.
 
     Args:
-        robots: How many robots there are.
-        period_ns: Fusion period of a large swarm [ns]; 0: of each source some measurements are used.
+        robots: Number of robots.
+        period_ns: Fusion period of a large swarm, to drop whole periods [ns]; 0: drop per source.
     """
 
     def __init__(self, robots: int, period_ns: int = 0) -> None:
         self._period_ns = period_ns
-        self._sources_of_kind = robots + 1  # the last one is the swarm, whose number is -1
+        self._sources_of_kind = robots + 1  # the last one is the swarm, index -1
         self._sensors = [sensor for sensor in SENSORS.values() if sensor.unit is not None]
         self._number = np.zeros(len(self._sensors) * self._sources_of_kind, dtype=np.uint64)
         self._exchanges: dict[tuple[int, ...], bool] = {}
 
     def thin(self, messages: Batch, share: float) -> Thinned:
-        """Use a share of all measurements, in (0, 1]."""
+        """Keep a share of all measurements, in (0, 1]."""
         units = [_units(sensor, messages[sensor.name]) for sensor in self._sensors]
         sources = [
             k * self._sources_of_kind + one.robot % self._sources_of_kind for k, one in enumerate(units)
@@ -91,13 +91,13 @@ class Thinning:
         return Thinned(left, used.size, sum(shed.values()))
 
     def _in_periods(self, stamp_ns: IntArray, share: float) -> NDArray[np.bool_]:
-        """Whether to use measurements (u,) with stamps (u,) [ns]: those of some periods."""
+        """Select measurements (u,) by the periods of their stamps (u,) [ns]."""
         number = (end_of_period(stamp_ns, self._period_ns) // self._period_ns).astype(np.uint64)
         fraction = (number * _GOLDEN).astype(np.float64) / _WHOLE
         return np.asarray((fraction < share) | (share >= 1.0))
 
     def _used(self, source: IntArray, share: float) -> NDArray[np.bool_]:
-        """Whether to use measurements (u,) of sources (u,)."""
+        """Select measurements (u,) by their sources (u,)."""
         count = np.bincount(source, minlength=self._number.size)
         order = np.argsort(source, kind="stable")
         first = np.cumsum(count) - count
@@ -112,7 +112,7 @@ class Thinning:
         return np.asarray(fraction < share_of[source])
 
     def _decide_as_before(self, exchanges: Sequence[tuple[int, ...]], used: NDArray[np.bool_]) -> None:
-        """Let exchanges share the fate of their matrices in the backlog before."""
+        """Repeat the decisions of the previous call for exchanges that continue."""
         if not exchanges:
             return
         for k, exchange in enumerate(exchanges):
@@ -121,22 +121,22 @@ class Thinning:
 
 
 def water_level(count: IntArray, total: float) -> float:
-    """How many each source may use at most, so that together they use `total` of counts (s,)."""
+    """Maximum number per source such that all sources together use `total` of counts (s,)."""
     ascending = np.sort(count)
-    left = total - (np.cumsum(ascending) - ascending)  # for this source and those that have more
+    left = total - (np.cumsum(ascending) - ascending)  # total left for this source and all larger ones
     level = left / np.arange(count.size, 0, -1)
     above = np.flatnonzero(ascending >= level)
     return float(level[above[0]]) if above.size else float(np.inf)
 
 
 class _Units(NamedTuple):
-    """What of a kind is used or left out together (u,).
+    """Groups (u,) of readings that are used or dropped as a whole.
 
     Attributes:
-        robot: (u,) whose it is.
-        stamp_ns: (u,) when it was measured.
-        of_row: (k,) the unit of each row.
-        exchange: Robot, stamp and transmitter of each, of infrared only.
+        robot: (u,) robot index.
+        stamp_ns: (u,) time of measurement.
+        of_row: (k,) group of each row.
+        exchange: Robot, stamp and transmitter of each group; infrared only.
     """
 
     robot: IntArray
@@ -146,7 +146,7 @@ class _Units(NamedTuple):
 
 
 def _units(sensor: Sensor, rows: Any) -> _Units:
-    """What of a sensor's readings is used or left out together: those alike in `unit`, else each alone."""
+    """Group a sensor's readings by the columns `unit`; without these, each row is a group."""
     if not sensor.unit:
         return _Units(rows.robot, rows.stamp_ns, np.arange(rows.robot.size))
     keys = np.column_stack([getattr(rows, name) for name in sensor.unit])

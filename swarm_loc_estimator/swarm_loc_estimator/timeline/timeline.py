@@ -1,8 +1,8 @@
-"""Out-of-sequence measurements: checkpoints, to which the filter goes back when something comes late.
+"""Out-of-sequence measurements: rollback to checkpoints and re-fusion.
 
-The state after some of the steps is kept (checkpoints). What arrives late takes the filter back to the
-checkpoint before it, and everything since is computed again; so the result is that of an orderly arrival.
-The e-puck paper's buffer (V-B) assigns a measurement to the closest stored state: `state_period_s` does that.
+States after some of the steps are stored as checkpoints. A late measurement rolls the filter back to the
+last checkpoint before it, and all later steps are repeated; the result equals that of in-order arrival.
+`state_period_s` assigns measurements to the closest stored state instead, as the e-puck paper (V-B) does.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from swarm_loc_estimator.timeline.settings import Settings
 
 Step = Callable[[SwarmState, MeasurementArray, NDArray[np.uint8], FloatArray], None]
 HasBudget = Callable[[], bool]
-"""Whether there is time for another step."""
+"""Returns True if there is time for another step."""
 
 _CHECKPOINTS = 40
 _FORGOTTEN_AT_ONCE = 4
@@ -33,7 +33,7 @@ _BEFORE_ALL, _AFTER_ALL = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 @dataclass(frozen=True)
 class _Checkpoint:
-    """The state after the step `key`."""
+    """State after the step `key`."""
 
     key: int
     state: SwarmState
@@ -43,15 +43,15 @@ class Timeline:
     """Buffered measurements with their verdicts, and the newest state.
 
     Args:
-        settings: Horizon, and how stamps are grouped into steps.
+        settings: Horizon and periods of the steps.
         step: Fuses the measurements of one step into a state, see `Fusion.step`.
-        state: Where to begin.
-        lookback_ns: How far before its stamp late odometry may change what measurements meant, and they may
-            count; they are kept so much longer than the horizon.
+        state: Initial state.
+        lookback_ns: Maximum time before its stamp at which late odometry may change measurements, which are
+            kept longer than the horizon by this time.
 
     Attributes:
-        state: The newest of which all is computed.
-        is_busy: Whether steps are left to compute of what the last `advance` began.
+        state: Newest complete state.
+        is_busy: True if the last `advance` left steps to compute.
     """
 
     def __init__(self, settings: Settings, step: Step, state: SwarmState, lookback_ns: int) -> None:
@@ -66,7 +66,7 @@ class Timeline:
         self.restart(state)
 
     def restart(self, state: SwarmState) -> None:
-        """Drop all measurements and go on from `state`."""
+        """Drop all measurements and continue from `state`."""
         self.state = self._ahead = state
         self.is_busy = False
         self._head_key = _BEFORE_ALL
@@ -81,45 +81,45 @@ class Timeline:
 
     @property
     def measurements(self) -> MeasurementArray:
-        """Those within the horizon (m,), in order."""
+        """Measurements (m,) within the horizon, sorted by stamp."""
         return self._buffer.measurements
 
     @property
     def verdicts(self) -> NDArray[np.uint8]:
-        """(m,) what became of them, of `Verdict`."""
+        """Verdicts (m,) of the measurements."""
         return self._buffer.verdicts
 
     @property
     def nis(self) -> FloatArray:
-        """(m,) their normalised innovations squared."""
+        """Normalized innovation squared (m,) of the measurements."""
         return self._buffer.nis
 
     def add(self, measurements: MeasurementArray) -> None:
-        """Take measurements (m,) in; they count from the next `advance` on."""
+        """Add measurements (m,), to be fused by the next `advance`."""
         if measurements.size:
             self._new.append(measurements)
 
     def withdraw(self, measurements: MeasurementArray) -> None:
-        """Take back measurements (m,) that were added, as if they had never come."""
+        """Remove measurements (m,) added before, and undo their effect at the next `advance`."""
         if measurements.size:
             self._withdrawn.append(measurements)
 
     @property
     def waiting(self) -> int:
-        """How many measurements wait for the next `advance`."""
+        """Number of measurements waiting for the next `advance`."""
         return sum(measurements.size for measurements in self._new)
 
     def oldest_due_ns(self, otherwise_ns: int) -> int:
-        """The instant of the oldest measurement that is left to compute, if it is before another instant."""
+        """Stamp of the oldest measurement left to fuse, at most `otherwise_ns`."""
         due_ns = [otherwise_ns] if self._redo_from_ns is None else [otherwise_ns, self._redo_from_ns]
         due_ns += self._buffer.stamp_ns[self._count_until(self._head_key) :][:1].tolist()
         return min(due_ns)
 
     def invalidate(self, changed_from_ns: NDArray[np.int64]) -> None:
-        """Have the steps computed again whose robots' tracks have changed.
+        """Mark steps of robots with changed tracks to be computed again.
 
         Args:
-            changed_from_ns: (N,) per robot the instant after which its track changed.
+            changed_from_ns: (N,) instant after which each robot's track has changed.
         """
         rows = self._buffer.measurements
         first = _first_touched(
@@ -129,14 +129,14 @@ class Timeline:
             self._redo_from(int(self._buffer.stamp_ns[first]))
 
     def verdict_counts(self) -> NDArray[np.int64]:
-        """How many measurements got each verdict since the start (len(Verdict),)."""
+        """Number of measurements by verdict (len(Verdict),) since the last restart."""
         return self.settled + np.bincount(self.verdicts, minlength=len(Verdict))
 
     def advance(self, now_ns: int, has_budget: HasBudget = lambda: True) -> None:
-        """Compute all steps that new or changed data touch, and let go of what lies beyond the horizon.
+        """Compute all steps affected by new or changed data, and drop data beyond the horizon.
 
-        A large swarm fuses a period `fusion_delay_s` after its end, when most of it has arrived. When
-        `has_budget` returns False after a step, the rest is left to the next calls; new data wait till then.
+        A large swarm fuses a period `fusion_delay_s` after its end, when most of its data have arrived. When
+        `has_budget` returns False after a step, the next calls continue; new data wait until all is done.
         """
         if not self.is_busy:
             if self._new:
@@ -153,19 +153,19 @@ class Timeline:
             self._forget_before(self._key(self.oldest_due_ns(now_ns - self._kept_ns)))
 
     def _key(self, stamp_ns: int) -> int:
-        """The step that a stamp belongs to, as the last stamp that is of the step."""
+        """Key of a stamp's step: the last stamp that belongs to the step."""
         return end_of_period(stamp_ns, self._fusion_period_ns) if self._fusion_period_ns else stamp_ns
 
     def _count_until(self, key: int) -> int:
-        """How many measurements belong to steps up to `key`."""
+        """Number of measurements in steps up to `key`."""
         return int(self._buffer.stamp_ns.searchsorted(key, side="right"))
 
     def _redo_from(self, stamp_ns: int) -> None:
-        """Have the steps from that of a stamp on computed at the next `advance`."""
+        """Mark the step of a stamp and all later ones for the next `advance`."""
         self._redo_from_ns = stamp_ns if self._redo_from_ns is None else min(stamp_ns, self._redo_from_ns)
 
     def _merge(self, oldest_ns: int) -> None:
-        """Sort new measurements in."""
+        """Merge new measurements into the buffer."""
         count, new = self.waiting, self._not_older(self._new, oldest_ns)
         self._new = []
         self.too_old += count - new.size
@@ -175,16 +175,16 @@ class Timeline:
             self._redo_from(merged.first_ns)
 
     def _remove(self, oldest_ns: int) -> None:
-        """Take withdrawn measurements out, unless what replaces them has just been refused as too old."""
+        """Remove withdrawn measurements, unless their replacements were rejected as too old."""
         gone, self._withdrawn = self._not_older(self._withdrawn, oldest_ns), []
         first_ns = self._buffer.remove(gone)
         if first_ns is not None:
             self._redo_from(first_ns)
 
     def _not_older(self, parts: list[MeasurementArray], oldest_ns: int) -> MeasurementArray:
-        """Measurements (m,) of some parts whose own stamps are not older than an instant.
+        """Select measurements (m,) whose stamps are not older than an instant.
 
-        Where stored states are wanted, they come with the stamps of the closest ones.
+        With `state_period_s`, stamps are rounded to the closest stored state.
         """
         rows, period = parts[0] if len(parts) == 1 else np.concatenate(parts), self._state_period_ns
         fresh = rows["stamp_ns"] >= oldest_ns
@@ -192,13 +192,13 @@ class Timeline:
             rows = rows[fresh]
         if period:
             rows = rows.copy()
-            stamp_ns = rows["stamp_ns"]  # what one aerial image shows must not mix with another one's
+            stamp_ns = rows["stamp_ns"]  # detections of different aerial images must not be mixed
             nearest_ns = (stamp_ns + period // 2) // period * period
             rows["stamp_ns"] = np.where(rows["kind"] == Kind.ANONYMOUS, stamp_ns, nearest_ns)
         return rows
 
     def _go_back(self, key: int) -> None:
-        """Go back to before step `key`, if it is not ahead."""
+        """Roll back to the last checkpoint before step `key`, unless `key` is ahead."""
         if key <= self._head_key:
             while self._checkpoints[-1].key >= key:
                 self._checkpoints.pop()
@@ -206,7 +206,7 @@ class Timeline:
             self._ahead = self._checkpoints[-1].state.copy()
 
     def _compute(self, due_ns: int, has_budget: HasBudget) -> bool:
-        """Do the steps that end until `due_ns`, as long as there is time; whether all of them are done."""
+        """Compute steps that end until `due_ns` within the budget; return whether all are done."""
         buffer, begin = self._buffer, self._count_until(self._head_key)
         while begin < len(buffer):
             end = self._end_of_steps(begin)
@@ -224,7 +224,7 @@ class Timeline:
         return True
 
     def _end_of_steps(self, begin: int) -> int:
-        """Where those steps end that are computed together with the one at `begin`, up to a checkpoint."""
+        """End of the run of steps from `begin` to the next checkpoint, which are computed together."""
         stamps_ns, length_ns = self._buffer.stamp_ns, self._fusion_period_ns or self._spacing_ns
         last_ns = end_of_period(int(stamps_ns[begin]), length_ns)
         return (
@@ -232,7 +232,7 @@ class Timeline:
         )
 
     def _forget_before(self, key: int) -> None:
-        """Keep one checkpoint before step `key` and only the measurements after it."""
+        """Drop data before step `key`, except one checkpoint and the measurements after it."""
         older = 0
         while older < len(self._checkpoints) and self._checkpoints[older].key < key:
             older += 1
@@ -252,10 +252,10 @@ def _first_touched(
     changed_from_ns: NDArray[np.int64],
     period_ns: int,
 ) -> int:
-    """The first measurement (of m, by stamp) of a robot whose track (of N) changed before it; m when none.
+    """First measurement (of m, by stamp) of a robot whose track (of N) changed before it; m if none.
 
-    Or before the instant that the measurements of its period are predicted to. One that names nobody, an
-    anonymous detection, may be of any robot.
+    Changes before the prediction instant of its period count too. An anonymous detection may be of any
+    robot.
     """
     if not stamps_ns.size:
         return 0
