@@ -33,7 +33,7 @@ class IntegrityArrays(NamedTuple):
         fault_score: (N + L,) of each robot and landmark.
         confirmations: (N,) number of sightings that agree with the robot's initial pose.
         confirmed_ns: (N,) stamp of the last counted confirmation.
-        gated_in_a_row: (N,) number of changes of the gated source since the last accepted measurement.
+        gated_in_a_row: (N,) counted gated measurements since the last accepted one; not quick repeats.
         gated_source: (N,) source of the last gated measurement.
         gated_ns: (N,) stamp of the last gated measurement.
         gated_fixes: (N,) absolute fixes gated since the last accepted fix or landmark sighting.

@@ -62,7 +62,7 @@ class TrackArrays(NamedTuple):
         jacobian: (N, capacity, 3, 3) preintegrated to the row; columns as in `estimated_parameters`.
         rate: (N, capacity, 3) calibrated velocity forward and left [m/s] and turn rate [rad/s] at the row,
             after the lag.
-        known_ns: (N, capacity) end of the known motion: the row's instant, earlier after a jump.
+        known_ns: (N, capacity) end of the known motion: the row's instant, or earlier after repeated jumps.
         jump_ns: (N, capacity, 2) instants of the last two jumps, newest first.
         delay_ns: (N,) delay of the stamps.
         model: (N,) of MODEL_DTYPE.

@@ -43,7 +43,7 @@ class TrackChange:
 
     Attributes:
         changed_from_ns: (N,) instant after which look-ups of each robot have changed, or UNCHANGED_NS.
-        duplicates: Number of dropped rows with the stamp of an earlier row.
+        duplicates: Number of dropped rows with the stamp of another row of the robot.
         too_old: Number of dropped rows older than the oldest accepted stamp.
         jumps: Number of new rows beyond the robot's maximum speed; their steps are unknown motion.
     """
@@ -199,7 +199,7 @@ class OdometryTracks:
         newest = arrays.stamp_ns[robots, np.maximum(arrays.filled[robots] - 1, 0)]
         late = (arrays.filled[robots] > 0) & (
             stamps <= newest
-        )  # of two rows with the same stamp, the earlier one is kept
+        )  # equal stamps: the sort order decides which is kept
         for robot in np.unique(robots[late]):
             count = arrays.filled[robot]
             first = int(
