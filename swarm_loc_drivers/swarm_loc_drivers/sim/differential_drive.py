@@ -1,6 +1,6 @@
 """Differential-drive motion model: true wheels slip at random, odometry reports the commanded motion.
 
-The wheels follow Siegwart and Nourbakhsh: a wheel that is meant to roll ds really rolls ds plus noise of
+The wheels follow Siegwart and Nourbakhsh: a wheel commanded to roll ds rolls ds plus noise of
 variance `wheel_noise` * abs(ds), independently of the other wheel.
 """
 
@@ -60,16 +60,16 @@ class Driven:
 class LastingNoise:
     """Unit noise that is correlated over several steps.
 
-    White noise would shake a wheel at every step, however short: a camera that exposes for 8 ms would see
-    the robot jump. Real wheels slip over millimetres, and a robot has inertia. So each draw is spread evenly
-    over the steps of `time_s`, of which every step takes the mean. Sums over longer times keep the variance
-    of sums of white noise but for a third of `time_s`, so that `wheel_noise` means what it says.
+    White noise would move a wheel abruptly at every step, visibly so in an exposure of 8 ms. Real wheels
+    slip over millimetres, and a robot has inertia. So the noise is a moving average over `time_s`. The
+    variance of sums over longer times equals that of white noise except for a third of `time_s`, so
+    `wheel_noise` keeps its meaning.
 
     Args:
-        rng: Source.
-        shape: Of one step's noise.
-        step_s: [s].
-        time_s: Correlation time: how long a draw acts [s].
+        rng: Random generator.
+        shape: Shape of one step's noise.
+        step_s: Time step [s].
+        time_s: Correlation time [s].
     """
 
     def __init__(
@@ -163,7 +163,7 @@ def record_drive(
 
 
 def integrate(twists: FloatArray) -> FloatArray:
-    """Odometry (T + 1, N, 3) from zero: each step follows its middle heading, e-puck paper eq. (1)."""
+    """Odometry (T + 1, N, 3) from zero, by the mean heading of each step, e-puck paper eq. (1)."""
     heading = np.concatenate([np.zeros((1, *twists.shape[1:-1])), np.cumsum(twists[..., 2], axis=0)])
     middle = heading[:-1] + 0.5 * twists[..., 2]
     steps = twists[..., :1] * np.stack([np.cos(middle), np.sin(middle)], axis=-1)

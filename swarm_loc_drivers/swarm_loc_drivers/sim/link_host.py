@@ -18,7 +18,7 @@ from typing_extensions import Self
 
 _CHUNK = 4096
 _MAX_CLIENTS = 9
-"""From power-on: the firmware never closes a client's socket, and has ten with the server's own."""
+"""Number of client sockets: the firmware never closes one, and has ten including the server's."""
 
 
 class _Port(Protocol):
@@ -27,30 +27,30 @@ class _Port(Protocol):
     def fileno(self) -> int: ...
 
     def on_readable(self) -> None:
-        """Take what has come."""
+        """Read and process pending input."""
 
     def on_cycle(self) -> None:
-        """Send what is due."""
+        """Send pending output."""
 
     def close(self) -> None:
-        """End it."""
+        """Close the descriptor."""
 
 
 class ConsoleFirmware(Protocol):
     """A firmware behind a serial port."""
 
     def receive(self, data: bytes) -> bytes:
-        """Take bytes; what the robot answers at once."""
+        """Process received bytes; returns the immediate answer."""
 
     def stream(self) -> bytes:
-        """What the robot sends by itself; behind flow control called when all before is on its way."""
+        """The bytes that the robot sends unprompted; with flow control, called when all others are sent."""
 
 
 class StreamFirmware(ConsoleFirmware, Protocol):
     """A firmware behind a TCP port, which answers as it streams."""
 
     def disconnect(self) -> None:
-        """The client has gone."""
+        """Handle a disconnected client."""
 
 
 class _PtyPort:
@@ -98,7 +98,7 @@ class _PtyPort:
 
 
 class _TcpPort:
-    """A TCP server for one client at a time; the next one waits, and sending waits for the client."""
+    """A TCP server for one client at a time; others wait, and sending blocks until it reads."""
 
     def __init__(
         self, firmware: StreamFirmware, host: str, port: int, selector: selectors.BaseSelector
@@ -116,7 +116,7 @@ class _TcpPort:
         return self._server.fileno()
 
     def on_readable(self) -> None:
-        """Accept a client, and until it is gone listen to it only."""
+        """Accept a client; others wait until it disconnects."""
         with contextlib.suppress(BlockingIOError):
             self._client, _ = self._server.accept()
             self._client.setblocking(False)
@@ -125,7 +125,7 @@ class _TcpPort:
             self._selector.register(self._client, selectors.EVENT_READ, self._on_client)
 
     def _on_client(self) -> None:
-        """Take commands, notice the end."""
+        """Process commands; detects a disconnected client."""
         assert self._client is not None  # noqa: S101
         try:
             data = self._client.recv(_CHUNK)
@@ -197,14 +197,14 @@ class FirmwareHost:
         self._selector.register(port, selectors.EVENT_READ, port.on_readable)
 
     def poll(self, timeout_s: float) -> None:
-        """Wait for bytes no longer than this, answer them, and send what the streams have due."""
+        """Wait for bytes up to a timeout, answer them, and send pending output of the streams."""
         for key, _ in self._selector.select(timeout_s):
             key.data()
         for port in self._ports:
             port.on_cycle()
 
     def close(self) -> None:
-        """Close all links, as when the robots are switched off."""
+        """Close all links."""
         self._selector.close()
         for port in self._ports:
             port.close()

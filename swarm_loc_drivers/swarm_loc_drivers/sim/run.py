@@ -1,8 +1,8 @@
 """Data of a simulated run, the same for every simulated swarm: true tracks, odometry, images, delays.
 
 Sensor data is kept as flat structured arrays, because a run of a thousand robots has a million entries.
-`stamp_ns` is when something happened, `arrival_ns` when a receiver got it; a receiver sees the data in
-order of arrival. Ground truth stands apart and is for evaluation only.
+`stamp_ns` is the time of measurement, `arrival_ns` the time of reception; data is sorted by arrival.
+Ground truth is separate and for evaluation only.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Trajectories:
         return _interpolate(self.poses[index], self.poses[index + 1], share[:, None])
 
     def _locate(self, stamp_ns: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Index of the stamp before each time, and how far on it is to the next one, in [0, 1]."""
+        """Index of the stamp before each time, and its fraction of the interval to the next, in [0, 1]."""
         stamp_ns = np.asarray(stamp_ns, dtype=np.int64)
         if stamp_ns.size and (stamp_ns.min() < self.stamp_ns[0] or stamp_ns.max() > self.stamp_ns[-1]):
             raise ValueError(
@@ -63,7 +63,7 @@ class Trajectories:
 def _interpolate(
     before: NDArray[np.float64], after: NDArray[np.float64], share: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """The pose (..., 3) that lies `share` (...) of the way along the constant twist between two poses."""
+    """The pose (..., 3) at the fraction `share` (...) of the constant twist between two poses."""
     return se2.compose(before, se2.exp(share[..., None] * se2.log(se2.between(before, after))))
 
 
@@ -81,7 +81,7 @@ SIGHTING_DTYPE = np.dtype([("marker_id", "<u4"), ("value", "<f8", (3,))])
 """One marker: forward [m] and left [m] of the camera, its normal from the optical axis [rad]."""
 
 START_NS = 1_000 * 10**9
-"""First moment of simulated runs."""
+"""Start time of simulated runs."""
 
 Records = NDArray[Any]
 """A structured array of one of the types above."""
@@ -89,11 +89,11 @@ Records = NDArray[Any]
 
 @dataclass(frozen=True)
 class LivedRun:
-    """What every simulated swarm has.
+    """Data common to all simulated swarms.
 
     Attributes:
-        swarm: The description that a user would have; it does not know the hidden errors of the world.
-        truth: Where the robots really were, in map.
+        swarm: The description available to a user, without the hidden errors of the world.
+        truth: True poses of the robots in map.
         odometry: (M,) of ODOMETRY_DTYPE in order of arrival.
     """
 
@@ -103,12 +103,12 @@ class LivedRun:
 
     @property
     def start_ns(self) -> int:
-        """First simulated moment."""
+        """Start of the simulation."""
         return int(self.truth.stamp_ns[0])
 
     @property
     def end_ns(self) -> int:
-        """Last simulated moment; nothing arrives later."""
+        """End of the simulation; nothing arrives later."""
         return int(self.truth.stamp_ns[-1])
 
     @property
@@ -146,7 +146,7 @@ def in_order_of_arrival(records: Records, end_ns: int) -> Records:
 
 @dataclass(frozen=True)
 class Lateness:
-    """Delay between the moment something happened and its arrival, uniform between two bounds.
+    """Delay between measurement and arrival, uniform between two bounds.
 
     Attributes:
         low_s: Shortest delay [s].
@@ -165,7 +165,7 @@ ODOMETRY_LATENESS = Lateness(0.002, 0.020)
 
 
 def arrival_ns(rng: np.random.Generator, stamp_ns: NDArray[np.int64], late: Lateness) -> NDArray[np.int64]:
-    """Arrival (M,) of what happened at `stamp_ns` (M,); each is delayed on its own, so order may change."""
+    """Arrival times (M,) of messages with stamps (M,); independent delays may change their order."""
     delay_s = rng.uniform(late.low_s, late.high_s, len(stamp_ns))
     return stamp_ns + np.rint(delay_s * 1e9).astype(np.int64)
 

@@ -29,13 +29,13 @@ Exposures = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class View:
-    """What a camera can see.
+    """Limits of visibility of a camera.
 
     Attributes:
         field_of_view: Full horizontal angle [rad].
-        nearest: Smallest distance to a marker [m].
-        farthest: Largest distance [m].
-        incidence: Largest angle between a marker's normal and the line to the camera [rad].
+        nearest: Minimum distance to a marker [m].
+        farthest: Maximum distance [m].
+        incidence: Maximum angle between a marker's normal and the line to the camera [rad].
     """
 
     field_of_view: float
@@ -53,13 +53,13 @@ class View:
 
 
 def hidden(camera: FloatArray, marker: FloatArray, discs: FloatArray, radius: float) -> NDArray[np.bool_]:
-    """Whether a disc stands between camera and marker.
+    """Whether a disc occludes a marker.
 
     Args:
         camera: (..., 2) [m].
         marker: (..., 2) [m].
-        discs: (..., D, 2) centres [m]; NaN is no disc.
-        radius: Of every disc [m].
+        discs: (..., D, 2) centres [m]; NaN: no disc.
+        radius: Radius of every disc [m].
 
     Returns:
         (...), broadcast.
@@ -104,8 +104,8 @@ def deliver(
         exposures: Robot and stamp of each image.
         frame: (S,) image of each sighting, ascending.
         sightings: (S,) of SIGHTING_DTYPE.
-        end_ns: What would arrive later is dropped.
-        loss: Share of images that never arrive.
+        end_ns: Images that arrive later are dropped.
+        loss: Share of lost images.
 
     Returns:
         The images that arrive, of FRAME_DTYPE, in order of arrival, and their sightings.
@@ -138,12 +138,12 @@ def observe_markers(
     """Frames and sightings of the cameras' images.
 
     Args:
-        rng: Source of every imperfection.
-        swarm: Geometry as described.
-        truth: Where the robots are.
+        rng: Random generator.
+        swarm: Described geometry.
+        truth: True poses of the robots.
         exposures: Robot and stamp of each image.
-        view: What a camera can see.
-        errors: The imperfections.
+        view: Limits of visibility.
+        errors: Simulated errors.
 
     Returns:
         Frames in order of arrival, of FRAME_DTYPE, and their sightings, of SIGHTING_DTYPE.
@@ -176,7 +176,7 @@ def _occluded(
     marks: FloatArray,
     poses: FloatArray,
 ) -> NDArray[np.bool_]:
-    """Which markers (F, M) a third robot hides; a robot's own markers count as hidden from it."""
+    """Markers (F, M) occluded by a third robot; a robot's own markers count as occluded."""
     frames, count = marks.shape[:2]
     owner = np.concatenate([np.full(count - len(geometry.face_owner), -1), geometry.face_owner])
     discs = np.broadcast_to(poses[:, None, :, :2], (frames, count, poses.shape[1], 2)).copy()
@@ -192,7 +192,7 @@ def _occluded(
 def _disturb(
     rng: np.random.Generator, exact: FloatArray, scale: FloatArray, errors: ErrorModel
 ) -> FloatArray:
-    """Exact sightings (S, 3) turned into reported ones."""
+    """Add noise and outliers to exact sightings (S, 3)."""
     count = len(exact)
     value: FloatArray = exact.copy()
     flipped = rng.random(count) < errors.flip_probability

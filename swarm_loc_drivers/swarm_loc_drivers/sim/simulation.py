@@ -46,7 +46,7 @@ _AERIAL_CAMERA: Parameters = {
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """What a user chooses about a simulation.
+    """Options of a simulation.
 
     Attributes:
         swarm_file: Path of the swarm description.
@@ -180,7 +180,7 @@ def _epuck_nodes(options: SimulationOptions, swarm: Swarm, links: str) -> list[N
 
 
 def _reliable(space: str) -> Parameters:
-    """That no image of a camera may get lost because the machine is busy, nor the calibration before it."""
+    """Parameters that keep images and calibrations reliable on a busy machine."""
     return {
         f"qos_overrides./{space}/{topic}.subscription.reliability": "reliable"
         for topic in ("image_raw", "camera_info")

@@ -1,4 +1,4 @@
-"""Steering by ground truth: where robots drive does not depend on how well they are localized."""
+"""Steering by ground truth: paths do not depend on the accuracy of localization."""
 
 from __future__ import annotations
 

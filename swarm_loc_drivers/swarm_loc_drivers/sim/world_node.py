@@ -60,7 +60,7 @@ class WorldNode(ConfiguredNode[Parameters]):
             link_folder: Folder for serial ports named like the robots; "": TCP ports.
             first_port: TCP port of the first robot, the others follow; 0: any.
             waits: Whether serial ports have flow control.
-            clock_steps: The time is published after every so many steps.
+            clock_steps: Number of steps between published times.
 
         Raises:
             ParameterError: A link cannot be made.
@@ -87,7 +87,7 @@ class WorldNode(ConfiguredNode[Parameters]):
         ]
 
     def step(self) -> None:
-        """Let the world do its next step, and `publish_step`."""
+        """Advance the world by a step, and `publish_step`."""
         raise NotImplementedError
 
     def is_held(self) -> bool:

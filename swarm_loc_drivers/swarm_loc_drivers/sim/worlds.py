@@ -1,4 +1,4 @@
-"""What is wrong with a simulated world: error models, hidden systematic errors, swarms it cannot hold."""
+"""Error models of simulated worlds, hidden systematic errors, and checks of swarms."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Constraints of the pose graph and their normal equations.
 
-A stop has the unknowns x, y, theta (on arrival) and ratio (true turn over turn by odometry); behind those of
-all stops stands one slip per robot. Residuals are estimates minus measurements.
+A stop has the unknowns x, y, theta (on arrival) and ratio (true turn over turn by odometry). One slip
+per robot follows the unknowns of all stops. Residuals are estimates minus measurements.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ class Linearised(NamedTuple):
     """Constraints (m,) with e residuals each on c unknowns each.
 
     Attributes:
-        unknowns: (m, c) their indices.
+        unknowns: (m, c) indices of the unknowns.
         jacobian: (m, e, c).
         residual: (m, e).
-        weight: (m, e) one over the variance.
+        weight: (m, e) inverse variance.
     """
 
     unknowns: IntArray
@@ -40,9 +40,9 @@ class Departures(NamedTuple):
     """Odometry from stop to stop (m,).
 
     Attributes:
-        begin: (m,) stop that was left.
-        end: (m,) stop that was reached.
-        turn: (m,) turn by odometry at the stop that was left [rad].
+        begin: (m,) stop of departure.
+        end: (m,) stop of arrival.
+        turn: (m,) turn by odometry at the stop of departure [rad].
         motion: (m, 3) pose on arrival in the frame at departure, by odometry.
         sigma: (m, 3) along the motion [m], across it [m], of the heading [rad].
     """
@@ -55,11 +55,11 @@ class Departures(NamedTuple):
 
 
 class Ties(NamedTuple):
-    """Relative poses (m,) of stops, found by matching.
+    """Relative poses (m,) of stops, from scan matching.
 
     Attributes:
-        begin: (m,) stop in whose frame the pose is.
-        end: (m,) stop whose pose it is.
+        begin: (m,) reference stop.
+        end: (m,) stop whose pose in the frame of `begin` is given.
         pose: (m, 3).
         sigma: (m, 3) [m, m, rad].
     """
@@ -71,11 +71,11 @@ class Ties(NamedTuple):
 
 
 class Bearings(NamedTuple):
-    """Lights (m,) of robots at other stops.
+    """Bearings (m,) of lights of robots at other stops.
 
     Attributes:
         begin: (m,) stop from which the light was seen.
-        end: (m,) stop where the other robot stood.
+        end: (m,) stop of the other robot.
         turn: (m,) turn by odometry at which the light would be straight ahead [rad].
         sigma: (m,) [rad].
     """
@@ -87,7 +87,7 @@ class Bearings(NamedTuple):
 
 
 def odometry(states: FloatArray, given: Departures) -> Linearised:
-    """Motion from stop to stop, in the frame at departure turned along the motion."""
+    """Residuals of odometry, along and across the motion."""
     begin, end = states[given.begin], states[given.end]
     swing = given.turn + given.motion[:, 2]
     course = np.arctan2(given.motion[:, 1], given.motion[:, 0])
@@ -112,7 +112,7 @@ def odometry(states: FloatArray, given: Departures) -> Linearised:
 
 
 def ties(states: FloatArray, given: Ties) -> Linearised:
-    """Relative poses of stops."""
+    """Residuals of relative poses of stops."""
     begin, end = states[given.begin], states[given.end]
     cos, sin = np.cos(begin[:, 2]), np.sin(begin[:, 2])
     dx, dy = end[:, 0] - begin[:, 0], end[:, 1] - begin[:, 1]
@@ -133,7 +133,7 @@ def ties(states: FloatArray, given: Ties) -> Linearised:
 
 
 def bearings(states: FloatArray, given: Bearings) -> Linearised:
-    """Directions of lights; those that do not fit weigh less."""
+    """Residuals of bearings of lights, with a robust loss."""
     begin, end = states[given.begin], states[given.end]
     dx, dy = end[:, 0] - begin[:, 0], end[:, 1] - begin[:, 1]
     square = dx * dx + dy * dy
@@ -146,7 +146,7 @@ def bearings(states: FloatArray, given: Bearings) -> Linearised:
 
 
 def priors(states: FloatArray, stop: IntArray, pose: FloatArray, sigma: FloatArray) -> Linearised:
-    """Poses (m, 3) with sigmas (m, 3) that stops (m,) are known to have."""
+    """Residuals of priors on poses (m, 3) of stops (m,) with standard deviations (m, 3)."""
     residual = states[stop, :3] - pose
     residual[:, 2] = wrap_angle(residual[:, 2])
     jacobian = np.broadcast_to(np.eye(3), (len(stop), 3, 3))
@@ -154,7 +154,7 @@ def priors(states: FloatArray, stop: IntArray, pose: FloatArray, sigma: FloatArr
 
 
 def ratios(states: FloatArray, slip: FloatArray, robot: IntArray, sigma: FloatArray) -> Linearised:
-    """Each stop's ratio (k,) is one minus the slip of its robot, but for sigmas (k,)."""
+    """Residuals of each stop's ratio from one minus the slip of its robot, with sigmas (k,)."""
     count = len(states)
     residual = states[:, 3] - 1.0 + slip[robot]
     index = np.stack([STOP_UNKNOWNS * np.arange(count) + 3, STOP_UNKNOWNS * count + robot], -1)
@@ -163,7 +163,7 @@ def ratios(states: FloatArray, slip: FloatArray, robot: IntArray, sigma: FloatAr
 
 
 def slips(count: int, slip: FloatArray, usual: float, sigma: float) -> Linearised:
-    """What is known of the robots' slips (R,) beforehand; behind the unknowns of so many stops."""
+    """Residuals of the prior on the robots' slips (R,), which follow the unknowns of `count` stops."""
     robots = len(slip)
     index = STOP_UNKNOWNS * count + np.arange(robots)[:, None]
     weight = np.full((robots, 1), sigma**-2.0)
@@ -180,10 +180,10 @@ _DAMPING = 1e-6
 
 
 class NormalEquations:
-    """Sums of normal equations over the unknowns (u,) that are free.
+    """Accumulates normal equations over the free ones of u unknowns.
 
     Args:
-        free: (u,) which unknowns may change.
+        free: (u,) True for free unknowns.
     """
 
     def __init__(self, free: BoolArray) -> None:
@@ -215,7 +215,7 @@ class NormalEquations:
         self._columns.append(columns[both])
 
     def solve(self) -> tuple[FloatArray, NormalFactor]:
-        """The step (u,), zero where an unknown is not free, and the factor that gives covariances."""
+        """The step (u,), zero for fixed unknowns, and the factor for covariances."""
         diagonal = np.arange(self._size)
         values = np.concatenate([*self._values, np.full(self._size, _DAMPING)])
         rows = np.concatenate([*self._rows, diagonal])
@@ -233,8 +233,8 @@ class NormalFactor:
     """The factor of normal equations.
 
     Args:
-        factor: Of the sparse matrix.
-        place: (u,) of each unknown among those that were free, -1: it was not.
+        factor: LU factor of the sparse matrix.
+        place: (u,) index of each unknown among the free ones, -1: fixed.
     """
 
     def __init__(self, factor: SuperLU, place: IntArray) -> None:
@@ -242,7 +242,7 @@ class NormalFactor:
         self._place = place
 
     def covariance(self, index: IntArray, directions: FloatArray | None = None) -> FloatArray:
-        """Covariance (d, d) of free unknowns (c,), or of combinations (d, c) of them."""
+        """Covariance (d, d) of free unknowns (c,), or of linear combinations (d, c) of them."""
         chosen = np.eye(len(index)) if directions is None else directions
         columns = np.zeros((self._factor.shape[0], len(chosen)))
         for number, direction in enumerate(chosen):

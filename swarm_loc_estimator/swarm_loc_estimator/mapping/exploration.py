@@ -20,14 +20,14 @@ UNKNOWN, OPEN, WALL = 0, 1, 2
 
 
 class PlanningGrid(NamedTuple):
-    """Coarse cells.
+    """Coarse occupancy grid for path planning.
 
     Attributes:
         corner: (2,) lower left corner in map [m].
         cell: [m].
         state: (nx, ny) `UNKNOWN`, `OPEN` or `WALL`.
         evidence: (nx, ny) the largest log odds in each.
-        passable: (nx, ny) whether the middle of a robot may be there.
+        passable: (nx, ny) True where the centre of a robot may be.
     """
 
     corner: FloatArray
@@ -42,7 +42,7 @@ class PlanningGrid(NamedTuple):
         return min(max(i, 0), self.state.shape[0] - 1), min(max(j, 0), self.state.shape[1] - 1)
 
     def point(self, index: tuple[int, int]) -> FloatArray:
-        """Middle (2,) of a cell [m]."""
+        """Centre (2,) of a cell [m]."""
         middle: FloatArray = self.corner + (np.array(index) + 0.5) * self.cell
         return middle
 
@@ -50,7 +50,7 @@ class PlanningGrid(NamedTuple):
 def planning_grid(
     occupancy: OccupancyMap, position: FloatArray, others: FloatArray, settings: MapperSettings
 ) -> PlanningGrid:
-    """Coarse cells around a robot at a position (2,), with other robots at (r, 2) as obstacles [m]."""
+    """Planning grid around a robot at a position (2,), with other robots at (r, 2) as obstacles [m]."""
     shape = tuple(size // 2 for size in occupancy.log_odds.shape)
     blocks = occupancy.log_odds[: 2 * shape[0], : 2 * shape[1]].reshape(shape[0], 2, shape[1], 2)
     cell, highest = 2.0 * occupancy.cell, blocks.max(axis=(1, 3))
@@ -74,13 +74,13 @@ def paths_from(passable: BoolArray, i: int, j: int) -> tuple[FloatArray, IntArra
     """Shortest paths from a cell to all others over passable ones, to eight neighbours each.
 
     Returns:
-        (nx, ny) their lengths in cells, infinite where there is none; and (nx, ny) the cell before, as a flat
-        index, -1 at the beginning.
+        (nx, ny) path lengths in cells, infinite where unreachable; and (nx, ny) flat index of the preceding
+        cell, -1 at the start.
     """
     nx, ny = passable.shape
     length, before = np.full((nx, ny), math.inf), np.full((nx, ny), -1)
     queued = np.zeros((nx, ny), dtype=np.bool_)
-    queue = np.zeros(nx * ny + 1, dtype=np.int64)  # a ring: each cell is in it once at most
+    queue = np.zeros(nx * ny + 1, dtype=np.int64)  # ring buffer: contains each cell at most once
     queue[0], first, last = i * ny + j, 0, 1
     length[i, j] = 0.0
     while first != last:
@@ -103,7 +103,7 @@ def paths_from(passable: BoolArray, i: int, j: int) -> tuple[FloatArray, IntArra
 
 _RAYS = 60
 _SURE = 2.0
-"""Log odds from which on a wall needs no more looks."""
+"""Log odds above which a wall yields no information gain."""
 _WALL_GAIN = 0.5
 
 
@@ -111,9 +111,9 @@ _WALL_GAIN = 0.5
 def information_gain(
     state: NDArray[np.int8], evidence: FloatArray, cells: IntArray, reach: int
 ) -> FloatArray:
-    """The gain (n,) of looking around from cells (n, 2), out to `reach` cells.
+    """Expected information gain (n,) of scans from cells (n, 2), out to `reach` cells.
 
-    Unknown cells count by the area that a ray stands for; behind two unknown ones a ray sees nothing more.
+    Unknown cells count by the area that a ray represents; a ray ends after two unknown cells.
     """
     gains = np.zeros(len(cells))
     for n in range(len(cells)):
@@ -139,14 +139,14 @@ def information_gain(
 
 @dataclass(frozen=True)
 class Goal:
-    """Where a robot should go and look around.
+    """Goal of a robot for its next scan.
 
     Attributes:
-        number: Counts the goals of a robot, from 1 on.
+        number: Counter of the goals of a robot, from 1 on.
         position: (2,) in map [m].
-        odometry: (2,) the same in the robot's odom frame, if it turns there and drives by its odometry [m].
-        stamp_ns: When that was decided.
-        pose: (3,) of the robot in map then.
+        odometry: (2,) the goal in the odom frame for a turn followed by a straight drive by odometry [m].
+        stamp_ns: Time of the decision.
+        pose: (3,) pose of the robot in map at that time.
     """
 
     number: int
@@ -159,12 +159,12 @@ class Goal:
 def goal_by_odometry(
     pose: FloatArray, odometry: FloatArray, position: FloatArray, ratio: float
 ) -> FloatArray:
-    """Where a robot that turns and drives by its odometry must go (2,) [m].
+    """Goal (2,) in the odom frame for a turn followed by a straight drive by odometry [m].
 
     Args:
-        pose: (3,) of the robot in map.
-        odometry: (3,) the same by odometry.
-        position: (2,) where it should come in map [m].
+        pose: (3,) pose of the robot in map.
+        odometry: (3,) pose of the robot by odometry.
+        position: (2,) goal in map [m].
         ratio: True turn over turn by odometry.
     """
     way = position - pose[:2]
@@ -179,7 +179,7 @@ def goal_by_odometry(
 _LATTICE, _CANDIDATES = 0.2, 260
 _MIN_PATH = 0.3
 _REACH_SHARE = 0.72
-"""Of the laser's range: walls further off are not known well from there."""
+"""Share of the laser's range within which walls are measured accurately."""
 _CROWD_RADIUS, _GOAL_RADIUS, _GOAL_WEIGHT = 0.45, 2.0, 0.8
 
 
@@ -192,20 +192,20 @@ def next_stop(
     settings: MapperSettings,
     home: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Where a robot should go next.
+    """Next stop and goal of a robot.
 
     Args:
         occupancy: The map.
-        position: (2,) of the robot [m].
-        stops: (k, 2) where robots have looked around [m].
-        others: (r, 2) where the other robots are [m].
-        goals: (g, 2) where these want to go [m].
-        settings: Of the mapper.
-        home: (2,) go as near to this as can be, and do not explore; None: explore [m].
+        position: (2,) position of the robot [m].
+        stops: (k, 2) positions of all scans [m].
+        others: (r, 2) positions of the other robots [m].
+        goals: (g, 2) goals of the other robots [m].
+        settings: Settings of the mapper.
+        home: (2,) position to approach instead of exploring [m]; None: explore.
 
     Returns:
-        (2,) the next stop, in a straight line from here, and (2,) the goal behind it [m]; the position itself
-        where there is no way at all.
+        (2,) the next stop, on a straight line from here, and (2,) the final goal [m]; the position itself if
+        no path exists.
     """
     grid = planning_grid(occupancy, position, others, settings)
     here = grid.cell_of(position)
@@ -230,7 +230,7 @@ def next_stop(
 
 
 def _candidates(length: FloatArray, cell: float) -> IntArray:
-    """Cells (n, 2) on a lattice that can be reached, not too near; nearer ones where there are no others."""
+    """Reachable cells (n, 2) on a lattice, not too near; nearer ones if there are no others."""
     reached: BoolArray = np.isfinite(length)
     far = np.argwhere(reached & (length * cell > _MIN_PATH))
     step = round(_LATTICE / cell)
@@ -243,7 +243,7 @@ def _candidates(length: FloatArray, cell: float) -> IntArray:
 def first_hop(
     grid: PlanningGrid, before: IntArray, here: tuple[int, int], goal: tuple[int, int], max_hop: float
 ) -> FloatArray:
-    """The farthest point (2,) of the path to a goal that a straight free drive reaches [m]."""
+    """The farthest point (2,) of the path to a goal within a straight collision-free drive [m]."""
     start = grid.point(here)
     cell = goal
     while before[cell] >= 0:

@@ -1,4 +1,4 @@
-"""Grids: occupancy by log odds, beams drawn on it, and visits."""
+"""Occupancy grid by log odds, ray tracing of scans, and visit counts."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from swarm_loc_estimator.mapping.scans import BINS, LINE, POINT, UNKNOWN, Lines
 _FREE_STEP, _HIT_STEP = 0.25, 0.9
 """Change of the log odds of a cell by one ray."""
 _POINT_HIT = 0.25
-"""Share of `_HIT_STEP` where a reflection was seen but no line could be fitted."""
+"""Share of `_HIT_STEP` for a reflection without a fitted line."""
 _FREE_RANGE_SHARE = 0.76
-"""Where nothing came back, space is free to this share of the range."""
+"""Share of the range that counts as free without a reflection."""
 _SHARP_M = 0.03
-"""A wall whose sigma is larger than this raises the log odds of its cell less."""
+"""Standard deviation of a wall above which the increase of the log odds is reduced."""
 
 
 @cached_njit
@@ -33,7 +33,7 @@ def draw_stop(
     lines: Lines,
     max_range: float,
 ) -> None:
-    """Add the evidence of a stop to a grid; what lies outside is left out.
+    """Add the evidence of a stop to a grid; cells outside of it are ignored.
 
     Args:
         log_odds: (nx, ny).
@@ -67,7 +67,7 @@ def draw_stop(
 def _draw_free(
     log_odds: FloatArray, x: float, y: float, cos: float, sin: float, end: float, step: float
 ) -> None:
-    """Lower each cell along a ray from (x, y) in cells, whose direction is in cells per metre, once."""
+    """Decrease each cell along a ray from (x, y) [cells] once; the direction is in cells per metre."""
     last_i, last_j = -1, -1
     for k in range(int(end / step) + 1 if end > 0.0 else 0):
         i, j = math.floor(x + k * step * cos), math.floor(y + k * step * sin)
@@ -77,9 +77,9 @@ def _draw_free(
 
 
 CELL = 0.02
-"""Size of a cell, that of the PushBot paper [m]."""
+"""Size of a cell as in the PushBot paper [m]."""
 LOG_ODDS_CAP = 5.0
-"""Largest log odds of a cell, both ways."""
+"""Maximum absolute log odds of a cell."""
 _OCCUPIED, _FREE = 0.45, -0.2
 
 
@@ -90,7 +90,7 @@ class OccupancyMap:
     Attributes:
         corner: (2,) its lower left corner [m], a multiple of the cell.
         cell: [m].
-        log_odds: (nx, ny) of being occupied, 0: unknown, at most `LOG_ODDS_CAP` both ways.
+        log_odds: (nx, ny) log odds of occupancy, 0: unknown, clipped to +-`LOG_ODDS_CAP`.
     """
 
     corner: FloatArray
@@ -99,25 +99,25 @@ class OccupancyMap:
 
     @property
     def occupied(self) -> BoolArray:
-        """(nx, ny) where there is something."""
+        """(nx, ny) True where occupied."""
         occupied: BoolArray = self.log_odds > _OCCUPIED
         return occupied
 
     @property
     def free(self) -> BoolArray:
-        """(nx, ny) where there is nothing."""
+        """(nx, ny) True where free."""
         free: BoolArray = self.log_odds < _FREE
         return free
 
     @property
     def percent(self) -> FloatArray:
-        """How probably each cell is occupied [%]; -1 where nothing is known."""
+        """Occupancy probability of each cell [%]; -1 where unknown."""
         probability = 100.0 / (1.0 + np.exp(-self.log_odds))
         known: FloatArray = np.where(self.log_odds == 0.0, -1.0, probability)
         return known
 
     def centres(self, chosen: BoolArray) -> FloatArray:
-        """Middles (n, 2) of chosen cells (nx, ny) [m]."""
+        """Centres (n, 2) of the cells where `chosen` (nx, ny) is True [m]."""
         centres: FloatArray = self.corner + (np.argwhere(chosen) + 0.5) * self.cell
         return centres
 
@@ -129,13 +129,13 @@ class OccupancyMap:
 def draw_map(
     scans: Scans, count: int, max_cells: int, background: OccupancyMap | None = None
 ) -> OccupancyMap:
-    """The map that the first stops draw; its size follows from where they are.
+    """Draw the map of the first stops; its size follows from their positions.
 
     Args:
         scans: All stops.
-        count: How many there are.
-        max_cells: Of a larger map, what lies furthest from its middle is left out.
-        background: A map with such cells below what is drawn.
+        count: Number of stops to draw.
+        max_cells: Maximum number of cells; a larger map is cropped around its centre.
+        background: A map with the same cell size, drawn below the stops.
     """
     reach = scans.max_range + 0.1
     places = scans.states[:count, :2]
@@ -152,7 +152,7 @@ def draw_map(
 
 
 def _lay_below(log_odds: FloatArray, corner: FloatArray, background: OccupancyMap) -> None:
-    """Write a map into a grid with the same cells, as far as it lies there."""
+    """Copy the overlapping part of a map into a grid with the same cells."""
     first = np.round((background.corner - corner) / CELL).astype(int)
     low = np.maximum(first, 0)
     high = np.minimum(first + background.log_odds.shape, log_odds.shape)
@@ -170,7 +170,7 @@ def grid_around(points: FloatArray, cell: float, max_cells: int) -> tuple[FloatA
     size = np.maximum(high - low, 1.0)
     if size.prod() > max_cells:
         side = np.floor(np.sqrt(max_cells))
-        limit = np.maximum(side, np.floor(max_cells / size[::-1]))  # a long hall may stay long
+        limit = np.maximum(side, np.floor(max_cells / size[::-1]))  # keeps the aspect of a long hall
         size = np.minimum(size, limit)
         low = np.floor(0.5 * (low + high - size))
     return low * cell, (int(size[0]), int(size[1]))
@@ -180,14 +180,14 @@ _MAX_CELLS = 1_000_000
 
 
 class VisitationMap:
-    """Counts of the 3 x 3 cells around each pose, as the PushBot paper has them (IV-B)."""
+    """Visit counts of the 3 x 3 cells around each pose, as in the PushBot paper (IV-B)."""
 
     def __init__(self) -> None:
         self._visits: Counter[tuple[int, int]] = Counter()
         self.dropped = 0
 
     def add(self, positions: FloatArray) -> None:
-        """A robot was at positions (n, 2) in map [m]."""
+        """Count visits at positions (n, 2) in map [m]."""
         cells, counts = np.unique(np.floor(positions / CELL).astype(int), axis=0, return_counts=True)
         for (i, j), count in zip(cells.tolist(), counts.tolist(), strict=True):
             for cell in ((i + a, j + b) for a in (-1, 0, 1) for b in (-1, 0, 1)):

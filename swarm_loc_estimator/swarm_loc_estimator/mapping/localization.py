@@ -21,23 +21,23 @@ _START_TARGETS, _MIN_START_OVERLAP = 8, 0.08
 _FINAL_TARGETS, _MIN_FINAL_OVERLAP = 9, 0.35
 _GATE = 0.06
 _MAX_SHIFT, _MAX_SHIFT_PER_METRE, _MAX_TURN = 0.10, 0.08, math.radians(5.0)
-"""A scan that alignment moves by more than the error of odometry keeps the pose by odometry."""
+"""Maximum correction by alignment; larger ones are rejected in favour of odometry."""
 _SOLVE_ALL_EVERY = 4
-"""Solving at every stop is worse: errors of a closed ring grow by half."""
+"""Number of stops between solutions; solving at every stop increases errors of closed loops by half."""
 _RECENT = 8
 _START_SEARCH = Lattice(0.3, 0.05, math.radians(12.0), math.radians(1.5))
 _START_RADIUS, _START_AGAINST, _MIN_START_SCORE = 2.5, 48, 0.35
-"""A first scan has ten parts: against a dozen would be against those of the nearest robot alone."""
+"""Radius [m], maximum number of targets (a first scan has ten parts), and minimum score of a start search."""
 _MAX_START_SIGMAS, _LEAST_START_SHIFT = 4.0, 0.02
 
 
 def align(graph: PoseGraph, stop: int, path: float) -> bool:
-    """Align the scan of a new stop with those around; whether it fitted where odometry had put it.
+    """Align the scan of a new stop with its neighbours; returns whether the correction was accepted.
 
     Args:
-        graph: Is changed.
-        stop: The newest.
-        path: Driven from the stop before [m].
+        graph: The graph; modified.
+        stop: The newest stop.
+        path: Length driven from the previous stop [m].
     """
     graph.targets[stop] = graph.neighbours(stop, _TARGETS, _MIN_OVERLAP)
     fitted = _align_alone(graph, stop, path) if graph.targets[stop] else True
@@ -52,7 +52,7 @@ def align(graph: PoseGraph, stop: int, path: float) -> bool:
 
 
 def _align_alone(graph: PoseGraph, stop: int, path: float) -> bool:
-    """Align the newest stop only; restore it where the shift exceeds the limits."""
+    """Align the newest stop only; restores it if the shift exceeds the limits."""
     predicted, slip = graph.states[stop].copy(), graph.slip.copy()
     graph.solve(4, [stop], _GATE)
     shift, turn = np.hypot(*(graph.states[stop] - predicted)[:2]), graph.states[stop, 2] - predicted[2]
@@ -67,10 +67,10 @@ def align_start(graph: PoseGraph, parts: Sequence[int], sigma: FloatArray) -> No
     """Align the parts of a robot's first scan with each other and, as one body, with older scans.
 
     Args:
-        graph: Is changed.
+        graph: The graph; modified.
         parts: The newest stops, all at one place.
-        sigma: (3,) standard deviation of that place. Where older scans would move the robot by more than four
-            of these, they are ignored, and the robot keeps the pose that it was given.
+        sigma: (3,) standard deviations of the start pose. If older scans would move the robot by more than
+            four of these, the alignment is rejected and the start pose is kept.
     """
     away = graph.distances(parts[0])
     others = [one for one in np.argsort(away, kind="stable") if one < parts[0] and away[one] < _START_RADIUS]
@@ -91,7 +91,7 @@ def align_start(graph: PoseGraph, parts: Sequence[int], sigma: FloatArray) -> No
 
 
 def _match_parts(graph: PoseGraph, parts: Sequence[int], oldest: int) -> None:
-    """Match parts of a first scan with stops from the oldest on, and solve."""
+    """Match parts of a first scan with all stops from `oldest` on, and solve."""
     for stop in parts:
         near = graph.neighbours(stop, _START_TARGETS, _MIN_START_OVERLAP)
         graph.targets[stop] = [other for other in near if other >= oldest]
@@ -122,9 +122,9 @@ _LOOP_GATE = 0.05
 
 
 def close_loop(graph: PoseGraph, stop: int) -> bool:
-    """Tie the newest stop to old ones nearby that nothing connects it with; whether it was tied.
+    """Loop closure: tie the newest stop to unconnected old stops nearby; returns whether it succeeded.
 
-    The whole graph is solved afterwards.
+    Afterwards the whole graph is solved.
     """
     if graph.count < _MIN_STOPS:
         return False
@@ -155,7 +155,7 @@ def close_loop(graph: PoseGraph, stop: int) -> bool:
 
 
 def tie(graph: PoseGraph, stop: int, pose: FloatArray, against: list[int]) -> None:
-    """Tie a stop, whose pose (3,) has been found, to the first of others, and solve everything."""
+    """Add a tie of a stop at a pose (3,) to the first of `against`, and solve the whole graph."""
     relative = between(graph.states[against[0], :3], pose)
     graph.constraints.add_tie(against[0], stop, relative, _TIE_SIGMA)
     graph.solve(4)
@@ -165,7 +165,7 @@ def tie(graph: PoseGraph, stop: int, pose: FloatArray, against: list[int]) -> No
 
 
 def refine(graph: PoseGraph, stop: int, against: list[int]) -> bool:
-    """Align a stop with others only, without odometry; whether it fits and is fully determined."""
+    """Align a stop with others, without odometry; returns whether it fits and is fully determined."""
     fit, H = 0.0, np.zeros((8, 8))
     for _ in range(4):
         H, g, fit = np.zeros((8, 8)), np.zeros(8), 0.0
@@ -178,7 +178,7 @@ def refine(graph: PoseGraph, stop: int, against: list[int]) -> bool:
 
 
 def _unconnected(graph: PoseGraph, stop: int) -> list[int]:
-    """Old stops nearby, the nearest first, that are neither matched with this one nor with its targets."""
+    """Old stops nearby, nearest first, that are matched neither with this stop nor with its targets."""
     near = {stop, *graph.targets.get(stop, ())}
     connected = near.union(*(graph.targets.get(one, ()) for one in near))
     away, robot = graph.distances(stop), graph.robot
@@ -194,7 +194,7 @@ def _unconnected(graph: PoseGraph, stop: int) -> list[int]:
 _MAX_PENDING = 20_000
 _MAX_VISITS = 50
 _LIGHT_OFFSET = 0.03
-"""How far a robot's lights are from its middle, of which turning leaves this [m]."""
+"""Effective offset of a robot's lights from its centre, averaged over turns [m]."""
 _LEAST_SIGMA = math.radians(1.0)
 
 
@@ -218,7 +218,7 @@ class Visit:
 
 
 class LightBook:
-    """Sightings that wait until the stops of both robots are known, the newest `_MAX_PENDING` of them."""
+    """Queue of the newest `_MAX_PENDING` sightings that wait until the stops of both robots are known."""
 
     def __init__(self) -> None:
         self._pending: deque[tuple[int, int, int, float]] = deque(maxlen=_MAX_PENDING)
@@ -227,7 +227,7 @@ class LightBook:
         self.dropped = 0
 
     def add(self, robot: int, sightings: LightSightings) -> None:
-        """Take sightings (m,) by a robot."""
+        """Queue sightings (m,) by a robot."""
         columns = (sightings.stamp_ns.tolist(), sightings.target.tolist(), sightings.bearing.tolist())
         for stamp_ns, target, bearing in zip(*columns, strict=True):
             self.dropped += len(self._pending) == _MAX_PENDING
@@ -243,11 +243,11 @@ class LightBook:
             self._visits[robot] = deque((one for one in visits if one.node != node), maxlen=_MAX_VISITS)
 
     def note_time(self, robot: int, stamp_ns: int) -> None:
-        """All stops of a robot until this time are recorded."""
+        """Mark all stops of a robot until this time as recorded."""
         self._until_ns[robot] = stamp_ns
 
     def settle(self, graph: PoseGraph) -> None:
-        """Add the bearings whose stops are known by now to the graph, one for each pair of stops."""
+        """Add the bearings with known stops to the graph, one per pair of stops."""
         found: dict[tuple[int, int], list[float]] = defaultdict(list)
         for _ in range(len(self._pending)):
             one = self._pending.popleft()
@@ -263,7 +263,7 @@ class LightBook:
             _add_bearing(graph, seer_node, seen_node, np.array(turns))
 
     def _visit(self, robot: int, stamp_ns: int) -> Visit | None:
-        """The stop of a robot at a time; None: it drove."""
+        """The stop of a robot at a time; None if it was driving."""
         for visit in self._visits.get(robot, ()):
             if visit.begin_ns <= stamp_ns <= visit.end_ns:
                 return visit
@@ -271,7 +271,7 @@ class LightBook:
 
 
 def _add_bearing(graph: PoseGraph, seer: int, seen: int, turns: FloatArray) -> None:
-    """One bearing from the directions (n,) in which a light was seen, as turns by odometry [rad]."""
+    """Add the median of light directions (n,), given as turns by odometry [rad], as one bearing."""
     middle = turns[0] + float(np.median(wrap_angle(turns - turns[0])))
     away = math.dist(graph.states[seer, :2], graph.states[seen, :2])
     if away > 2.0 * _LIGHT_OFFSET:

@@ -22,7 +22,7 @@ _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
 _MODES = ("trinary", "scale", "raw")
 _MAX_BYTES = 200_000_000
 _MAX_CELLS = 50_000_000
-"""A grid of this size takes 400 MB: 141 x 141 m with cells of 2 cm."""
+"""Maximum number of cells: 400 MB, or 141 x 141 m with cells of 2 cm."""
 _NUMBERS = {
     "resolution": NumberSpec("m", 0.0, 10.0, True, "side of a pixel"),
     "occupied_thresh": NumberSpec("1", 0.0, 1.0, False, "cells above are occupied"),
@@ -69,7 +69,7 @@ def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
 def load_map(path: Path, cell: float) -> OccupancyMap:
     """Read a map of any of map_server's modes, with cells of the given size [m].
 
-    Pixels of another size are resampled by the nearest one.
+    Pixels of another size are resampled by nearest neighbour.
 
     Raises:
         UserError: It cannot be read, or is not such a map.
@@ -103,7 +103,7 @@ def load_map(path: Path, cell: float) -> OccupancyMap:
 
 
 def _log_odds(shade: NDArray[np.int64], mode: str, free: float, occupied: float) -> FloatArray:
-    """Log odds (256,) of pixel values whose darkness, or occupancy in percent, is given (256,)."""
+    """Log odds (256,) of pixel values, from their darkness or occupancy in percent (256,)."""
     if mode == "raw":
         probability = np.where(shade <= 100, shade / 100.0, 0.5)
         free, occupied = 0.0, 1.0
@@ -117,7 +117,7 @@ def _log_odds(shade: NDArray[np.int64], mode: str, free: float, occupied: float)
 
 
 def _resampled(log_odds: FloatArray, scale: float, checks: TreeChecks) -> FloatArray:
-    """Log odds (height, width), the last row lowest, with pixels larger by a factor; by the nearest pixel."""
+    """Log odds (height, width), the last row lowest, scaled by nearest neighbour."""
     height, width = (max(1, round(size / scale)) for size in log_odds.shape)
     if height * width > _MAX_CELLS:
         raise checks.said(
@@ -145,7 +145,7 @@ def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
             if small_enough and image.mode.startswith("I"):  # 16 bits, which `convert` would cut off
                 image = Image.fromarray((np.asarray(image) / 257.0).astype(np.uint8))
             gray: Any = image.convert("LA") if small_enough else None
-    except Exception as error:  # the library raises whatever a broken file makes its decoders raise
+    except Exception as error:  # decoders raise arbitrary exceptions for broken files
         raise MapFileError(f"The image '{path}' of a map cannot be decoded: {error}.") from error
     if gray is None:
         raise MapFileError(f"The image '{path}' of a map has more than {_MAX_CELLS} pixels.")

@@ -1,7 +1,7 @@
-"""The cooperative mapper: readings of many robots in, their poses, one map and their next goals out.
+"""The cooperative mapper: computes poses, one map and next goals from the readings of many robots.
 
-A robot stands, looks around by turning, and drives on. Each stop becomes a node of the pose graph; its beams
-are matched against those of other stops, of whichever robot. Robots join and leave at any time.
+A robot stops, scans by turning in place, and drives on. Each stop becomes a node of the pose graph; its beams
+are matched against those of stops of all robots. Robots may join and leave at any time.
 """
 
 from __future__ import annotations
@@ -30,38 +30,38 @@ from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.mapping.stops import MIN_TURN, MotionTracker, ScanStop
 
 START_TURN = 4.5 * math.pi
-"""Turn by odometry of a whole first scan: a quarter, slowly, to hold the heading; then two turns [rad]."""
+"""Turn by odometry of a complete first scan [rad]: a slow quarter that fixes the heading, then two turns."""
 SCAN_TURN = 2.14 * math.pi
-"""Turn by odometry at every later stop: a full turn also where wheels slip [rad]."""
+"""Turn by odometry at every later stop [rad]; enough for a full turn despite slip."""
 _START_PARTS = (0.25 * math.pi, *(0.5 * math.pi * k for k in range(1, 9)))
-"""Where a first scan is cut into parts, each a stop [rad]."""
+"""Turns at which a first scan is split into parts, each a stop [rad]."""
 _TURN_TOLERANCE = 0.03
 _PART_SIGMA = np.array([0.002, 0.002, 0.002])
 _LEAST_SIGMA = 0.003
 _LOST_SIGMA, _CHECK_EVERY = 0.15, 4
-"""A robot whose position has a larger sigma [m] goes home: to an old stop nearby."""
+"""Maximum position standard deviation [m]; above it a robot returns to an old stop nearby (home)."""
 _RESTART_SIGMA = np.array([0.10, 0.10, math.radians(5.0)])
 _HOME_AGE, _HOME_RADIUS, _AT_HOME = 10, 4.0, 0.5
 
 
 @dataclass
 class _Track:
-    """What the mapper knows of one robot.
+    """State of one robot.
 
     Attributes:
-        prior: (3,) pose at which it started.
-        prior_sigma: (3,) of it.
-        motion: Tells standing from driving.
-        stop: Where it stands.
+        prior: (3,) start pose.
+        prior_sigma: (3,) standard deviations of the start pose.
+        motion: Detects stops.
+        stop: The current stop.
         node: Its newest stop in the graph.
         is_known: Whether `stop` is in the graph, as `node`.
-        passes: Whether `node` is one too many: the next stop takes its place.
-        left: (3,) pose by odometry when it left `node`.
+        passes: Whether the next stop replaces `node` because the graph is full.
+        left: (3,) pose by odometry at departure from `node`.
         last: (3,) newest pose by odometry.
-        path: Driven since it left the node [m].
-        target: (2,) where it wants to be in the end [m].
+        path: Length driven since the departure [m].
+        target: (2,) final target position [m].
         goal: Its next stop.
-        home: (2,) old stop where it goes to reduce its position sigma [m].
+        home: (2,) old stop to which it returns to reduce its position uncertainty [m].
     """
 
     prior: FloatArray
@@ -87,9 +87,9 @@ class CooperativeMapper:
 
     Attributes:
         settings: Noise and limits.
-        graph: The stops.
-        visits: Where robots have been.
-        counters: Event -> how often it happened.
+        graph: The pose graph.
+        visits: Visit counts of cells.
+        counters: Event -> count.
         background: An earlier map, drawn below the stops.
         begin_ns: Stop in the graph -> its first reading [ns].
     """
@@ -106,18 +106,18 @@ class CooperativeMapper:
         self._map: OccupancyMap | None = None
 
     def join(self, pose: FloatArray, sigma: FloatArray) -> int:
-        """Let a robot join at a pose (3,) in map that is known to sigmas (3,); its number."""
+        """Add a robot with a start pose (3,) in map and standard deviations (3,); returns its number."""
         robot = self.graph.add_robot()
         self._tracks[robot] = _Track(np.asarray(pose, dtype=float), np.asarray(sigma, dtype=float))
         return robot
 
     def leave(self, robot: int) -> None:
-        """Let a robot leave; what it saw stays."""
+        """Remove a robot; its scans stay in the map."""
         self._depart(robot, self._tracks[robot])
         del self._tracks[robot]
 
     def add_readings(self, robot: int, readings: Readings) -> None:
-        """Take readings (n,) of a robot, newer than all before."""
+        """Process readings (n,) of a robot, newer than all before."""
         track = self._tracks[robot]
         for run in track.motion.runs(readings):
             if run.arrives or not run.stands:
@@ -137,7 +137,7 @@ class CooperativeMapper:
                 self._lights.note_time(robot, int(run.readings.stamp_ns[-1]))
 
     def _restart_track(self, robot: int, track: _Track) -> _Track:
-        """Restart a robot's track near its last pose after a jump of odometry, as of a restarted driver."""
+        """Restart a robot's track near its last pose after odometry jumped, as by a restart of its driver."""
         self.counters["odometry_restarts"] += 1
         pose = self.pose(robot)
         fresh = _Track(track.prior, track.prior_sigma) if pose is None else _Track(pose, _RESTART_SIGMA)
@@ -146,7 +146,7 @@ class CooperativeMapper:
         return fresh
 
     def add_lights(self, robot: int, sightings: LightSightings) -> None:
-        """Take sightings (m,) of other robots by one of them."""
+        """Process sightings (m,) of other robots by one robot."""
         self._lights.add(robot, sightings)
 
     def pose(self, robot: int) -> FloatArray | None:
@@ -166,7 +166,7 @@ class CooperativeMapper:
         return np.full((3, 3), np.nan) if node is None else self.graph.covariance(node)
 
     def goal(self, robot: int) -> Goal | None:
-        """Where a robot should go now; None unless it stands and has looked around."""
+        """The goal of a robot; None unless it is stopped and its scan is complete."""
         track = self._tracks[robot]
         return track.goal if track.is_known else None
 
@@ -175,12 +175,12 @@ class CooperativeMapper:
         return self._tracks[robot].node
 
     def turned(self, robot: int) -> float:
-        """Turn by odometry of a robot that stands, since its newest stop began [rad]."""
+        """Turn by odometry of a stopped robot since its newest stop began [rad]."""
         stop = self._tracks[robot].stop
         return 0.0 if stop is None or not self._tracks[robot].is_known else stop.turn[-1] - stop.begin_turn
 
     def occupancy(self) -> OccupancyMap:
-        """The map by the present poses of the stops."""
+        """The map from the current poses of the stops."""
         if self._map is None:
             limit = self.settings.max_cells
             self._map = draw_map(self.graph.scans, self.graph.count, limit, self.background)
@@ -194,13 +194,13 @@ class CooperativeMapper:
         self._map = None
 
     def _driven(self, track: _Track, odometry: FloatArray) -> FloatArray:
-        """Poses (..., 3) in map of poses (..., 3) by odometry on the way from the newest stop."""
+        """Poses (..., 3) in map of odometry poses (..., 3) since the newest stop."""
         left = self.graph.states[track.node, :3].copy()
         left[2] = self.graph.heading_at_departure(track.node) if track.node is not None else 0.0
         return compose(left, between(track.left, odometry))
 
     def _drive(self, track: _Track, odometry: FloatArray) -> None:
-        """Note where a robot drove (n, 3)."""
+        """Process odometry poses (n, 3) of a driving robot."""
         if track.last is not None:
             steps = np.diff(np.vstack([track.last, odometry])[:, :2], axis=0)
             paths = np.concatenate([[track.path], np.hypot(steps[:, 0], steps[:, 1])])
@@ -210,7 +210,7 @@ class CooperativeMapper:
             self.visits.add(self._driven(track, odometry)[:, :2])
 
     def _look(self, robot: int, track: _Track, stop: ScanStop) -> None:
-        """Take a stop into the graph once the robot has looked around."""
+        """Add a stop to the graph when its scan is complete."""
         around = min(2.02 * math.pi / (1.0 - self.graph.slip[robot]), SCAN_TURN - _TURN_TOLERANCE)
         if not track.is_known:
             count = stop.completed(START_TURN - _TURN_TOLERANCE if track.node is None else around)
@@ -218,13 +218,13 @@ class CooperativeMapper:
                 self._enter(robot, track, stop, count)
                 self._choose_goal(robot, track, stop)
         again = stop.split(around) if track.is_known else None
-        if again is not None:  # it could not leave, and turns once more: a stop of its own, and a new goal
+        if again is not None:  # the robot could not leave and turned again: a new stop and a new goal
             self._depart(robot, track)
             track.stop = again
             self._look(robot, track, again)
 
     def _depart(self, robot: int, track: _Track) -> None:
-        """End the stop of a robot that leaves."""
+        """Finish a stop when the robot departs."""
         stop, track.stop = track.stop, None
         if stop is None or not len(stop.turn):
             return
@@ -235,14 +235,14 @@ class CooperativeMapper:
             track.stop = stop
             self._update_scan(track)
             self._note_visit(robot, track, stop)
-            # from where the node is: its first steps away already count
+            # relative to the node: includes the first steps of the drive
             track.left = np.array([*stop.arrival[:2], stop.departure[2]])
             self.visits.add(np.tile(self.graph.states[track.node, :2], (stop.total, 1)))
             track.path = math.dist(stop.arrival[:2], stop.departure[:2])
         track.stop, track.is_known = None, False
 
     def _note_visit(self, robot: int, track: _Track, stop: ScanStop) -> None:
-        """Note where a robot stood until now, for lights that it saw and others saw of it."""
+        """Record a finished stop, for light bearings by and of this robot."""
         if track.node is not None:
             begin_ns, end_ns = int(stop.stamp_ns[stop.begin]), int(stop.stamp_ns[-1])
             self._lights.note_visit(robot, Visit(track.node, begin_ns, end_ns, stop, stop.begin_turn))
@@ -250,7 +250,7 @@ class CooperativeMapper:
             self._lights.settle(self.graph)
 
     def _update_scan(self, track: _Track) -> None:
-        """Set all readings made at the newest stop as its scan."""
+        """Set all readings of the newest stop as its scan."""
         stop = track.stop
         if stop is not None and track.is_known and track.node is not None:
             turn = stop.turn[stop.begin :] - stop.begin_turn
@@ -258,7 +258,7 @@ class CooperativeMapper:
             self._map = None
 
     def _enter(self, robot: int, track: _Track, stop: ScanStop, count: int) -> None:
-        """Make a node of the first readings of a stop, or several of a first scan, and align them."""
+        """Add the first `count` readings of a stop as a node (several for a first scan) and align it."""
         self.counters["scans"] += 1
         self._map = None
         track.is_known, stop.looked = True, count
@@ -282,7 +282,7 @@ class CooperativeMapper:
             self.counters["loops_closed"] += 1
 
     def _replace(self, node: int, pose: FloatArray, motion_sigma: FloatArray, sigma: float) -> int:
-        """Let the newest stop of a robot become its next one: the map is full, the robot goes on."""
+        """Replace a robot's newest stop by its next one, since the graph is full; returns its number."""
         known = np.sqrt(np.maximum(np.diag(self.graph.covariance(node)), 0.0))
         self._lights.forget_node(node)
         self.graph.reuse_stop(node, pose, sigma)
@@ -303,7 +303,7 @@ class CooperativeMapper:
         )
 
     def _enter_first(self, robot: int, track: _Track, stop: ScanStop, count: int) -> None:
-        """Make nodes of the parts of a first scan: what was seen first holds the heading at the start."""
+        """Add the parts of a first scan as nodes; the first part fixes the start heading."""
         turn, inverse = stop.turn[:count], stop.inverse[:count]
         furthest = np.maximum.accumulate(np.abs(turn))
         ratio = turn_ratio(turn, inverse, stop.sigma)
@@ -331,7 +331,7 @@ class CooperativeMapper:
         align_start(self.graph, nodes, track.prior_sigma)
 
     def _choose_goal(self, robot: int, track: _Track, stop: ScanStop) -> None:
-        """Decide where a robot goes next."""
+        """Set the next goal of a robot."""
         node = track.node
         if node is None:
             return

@@ -1,4 +1,4 @@
-"""From messages to the mapper, and from its poses to fixes with covariance."""
+"""Conversion of messages to mapper input, and of its poses to fixes with covariance."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from swarm_loc_estimator.odometry.process_noise import OdometryStep, add_step_no
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot
 
 _LEAST_SIGMA = np.array([0.02, 0.02, 0.01])
-"""Smallest sigma of a fix, for the errors of the map that all fixes share [m, m, rad]."""
+"""Minimum standard deviations of a fix, for errors of the map that all fixes share [m, m, rad]."""
 _OPTIMISM = 2.5
-"""Factor on variances of the graph, which takes scans for rigid while wheels slip unevenly."""
+"""Factor on variances of the graph, which assumes rigid scans although wheels slip unevenly."""
 _LEAST_SIGMA_MOVED = 0.003
 _LEAST_NEW = 0.02
-"""Least share of the mapper's information that a fix carries."""
+"""Minimum share of the mapper's information that a fix carries."""
 
 
 class FixCovariances:
-    """Covariances of the fixes of one robot, one after the other.
+    """Covariances of successive fixes of one robot.
 
     An error of the map shifts all poses in it, so successive fixes have correlated errors, and a filter that
     fuses them as independent counts the same scans several times. Each fix therefore carries only the
@@ -51,7 +51,7 @@ class FixCovariances:
     """
 
     def __init__(self, odometry: OdometryModel) -> None:
-        self._odometry: Any = np.array(astuple(odometry), MODEL_DTYPE)[()]  # as the compiled code takes it
+        self._odometry: Any = np.array(astuple(odometry), MODEL_DTYPE)[()]  # argument of compiled code
         self._last: tuple[Goal, FloatArray] | None = None
 
     def next_covariance(self, goal: Goal, covariance: FloatArray) -> FloatArray:
@@ -69,7 +69,7 @@ class FixCovariances:
         return _new_alone(now, known)
 
     def _carried_on(self, before: Goal, covariance: FloatArray, goal: Goal) -> FloatArray:
-        """Covariance (3, 3) at a goal by that at the one before, the drive between and the scan after it."""
+        """Covariance (3, 3) at a goal from the previous one, the drive in between and the new scan."""
         dx, dy = (goal.pose - before.pose)[:2].tolist()
         path, duration_s = math.hypot(dx, dy), 1e-9 * (goal.stamp_ns - before.stamp_ns)
         effect = np.eye(3)
@@ -85,16 +85,16 @@ class FixCovariances:
 
 
 def pose_covariance(covariance: FloatArray) -> FloatArray:
-    """Covariance (3, 3) of a pose whose stop has this one (3, 3) in the graph [m, rad]."""
+    """Covariance (3, 3) of a fix, inflated from that of its stop in the graph (3, 3) [m, rad]."""
     whole: FloatArray = _OPTIMISM * covariance + np.diag(_LEAST_SIGMA**2)
     return whole
 
 
 def _new_alone(now: FloatArray, known: FloatArray) -> FloatArray:
-    """Covariance (3, 3) of a measurement that turns the covariance `known` (3, 3) into `now` (3, 3)."""
+    """Covariance (3, 3) of the measurement whose update reduces `known` (3, 3) to `now` (3, 3)."""
     root = np.linalg.cholesky(now)
     inverse = np.linalg.inv(root)
-    ratio, axes = np.linalg.eigh(inverse @ known @ inverse.T)  # of variances: known over now
+    ratio, axes = np.linalg.eigh(inverse @ known @ inverse.T)  # ratio of variances, known over now
     new = np.maximum(1.0 - 1.0 / ratio, _LEAST_NEW)
     basis = root @ axes
     whole = (basis / new) @ basis.T
@@ -103,18 +103,18 @@ def _new_alone(now: FloatArray, known: FloatArray) -> FloatArray:
 
 
 MAX_WAITING = 500
-"""Odometry messages, and distances, that wait at most; older ones are dropped."""
+"""Maximum numbers of queued odometry messages and distances; the oldest are dropped."""
 MAX_GAP_NS = 500_000_000
-"""Odometry is not interpolated over longer gaps."""
+"""Maximum gap over which odometry is interpolated."""
 _SIGMAS = 301
-"""The sigma is the median of so many distances."""
+"""Number of distances over which the median sigma is taken."""
 
 
 class ReadingPairer:
-    """Waits for the odometry on both sides of each distance of one robot.
+    """Interpolates odometry at the stamp of each distance of one robot.
 
     Attributes:
-        drops: Reason -> how many messages were not used.
+        drops: Reason -> number of dropped messages.
     """
 
     def __init__(self) -> None:
@@ -125,11 +125,11 @@ class ReadingPairer:
 
     @property
     def newest_ns(self) -> float:
-        """Stamp of the newest odometry; before the first less than any."""
+        """Stamp of the newest odometry; -inf before the first."""
         return self._odometry[-1][0] if self._odometry else -math.inf
 
     def add_odometry(self, stamp_ns: int, pose: FloatArray) -> None:
-        """Take a pose (3,) by odometry."""
+        """Add a pose (3,) by odometry."""
         if not np.isfinite(pose).all():
             self.drops["odometry_not_finite"] += 1
         elif stamp_ns <= self.newest_ns:
@@ -138,7 +138,7 @@ class ReadingPairer:
             self._odometry.append((stamp_ns, np.asarray(pose, dtype=float)))
 
     def add_distance(self, stamp_ns: int, distance: float, sigma: float) -> None:
-        """Take a distance [m] with its sigma; NaN: nothing was seen."""
+        """Add a distance [m] with its standard deviation; NaN: no reflection."""
         seen = math.isfinite(distance) and distance > 0.0 and math.isfinite(sigma) and sigma > 0.0
         if self._distances and stamp_ns <= self._distances[-1][0]:
             self.drops["laser_too_old"] += 1
@@ -154,7 +154,7 @@ class ReadingPairer:
         self._distances.append((stamp_ns, 1.0 / distance if seen else UNSEEN))
 
     def ready(self) -> Readings | None:
-        """The readings whose odometry is known now, in order; None: there are none yet."""
+        """The readings with known odometry, in order; None if there are none."""
         rows: list[tuple[int, FloatArray, float]] = []
         while self._distances and self._distances[0][0] <= self.newest_ns:
             stamp_ns, inverse = self._distances.popleft()
@@ -169,11 +169,11 @@ class ReadingPairer:
         return Readings(np.array(stamps, dtype=np.int64), np.array(poses), np.array(inverses), self._sigma())
 
     def _sigma(self) -> float:
-        """Standard deviation of an inverse distance, the median of recent ones; NaN without any."""
+        """Median standard deviation of recent inverse distances; NaN if there are none."""
         return float(np.median(self._sigmas)) if self._sigmas else math.nan
 
     def _pose_at(self, stamp_ns: int) -> FloatArray | None:
-        """Pose (3,) by odometry at an instant up to the newest; None: not known."""
+        """Pose (3,) by odometry at a time up to the newest stamp; None: unknown."""
         while len(self._odometry) > 1 and self._odometry[1][0] <= stamp_ns:
             self._odometry.popleft()
         begin_ns, begin = self._odometry[0]
@@ -187,16 +187,16 @@ class ReadingPairer:
 
 
 ORIGIN_SIGMA = np.full(3, 1e-3)
-"""Of the first robot where its start is not described: that place is the origin of the map."""
+"""Start uncertainty of the first robot if undescribed: its start defines the origin of the map."""
 _FREQUENCY_TOLERANCE_HZ = 5.0
 
 
 class MapperInput(Enum):
-    """What a robot sends to the mapper.
+    """Input topics of the mapper.
 
     Attributes:
-        topic: Below the robot's name.
-        message_type: Of its messages.
+        topic: Topic in the robot's namespace.
+        message_type: Message type.
     """
 
     ODOMETRY = ("odom", ODOMETRY)
@@ -209,23 +209,23 @@ class MapperInput(Enum):
 
 
 class MapperInputError(UserError):
-    """The mapper cannot start with such robots; the message is one sentence."""
+    """The mapper cannot start with these robots; the message is one sentence."""
 
 
 class MapperFeed:
     """Decodes messages and passes them to the mapper; a robot joins with its first reading.
 
     Args:
-        robots: Those that may come.
-        mapper: Makes the map.
-        frequencies: Robot -> frequency of its LEDs [Hz], for those whose lights are looked for.
+        robots: All robots that may join.
+        mapper: The mapper.
+        frequencies: Robot -> frequency of its LEDs [Hz], for robots with tracked lights.
 
     Raises:
         MapperInputError: The start of more than one robot is unknown.
 
     Attributes:
-        drops: Reason -> how many messages were not used.
-        received: (robot, input) -> how many messages came.
+        drops: Reason -> number of dropped messages.
+        received: (robot, input) -> number of received messages.
     """
 
     def __init__(
@@ -253,7 +253,7 @@ class MapperFeed:
         }
 
     def add(self, robot: int, kind: MapperInput, data: bytes) -> None:
-        """Take a message of a robot, by its index."""
+        """Process a message of a robot, by its index."""
         self.received[robot, kind] += 1
         try:
             self._readers[kind](robot, data)
@@ -266,14 +266,14 @@ class MapperFeed:
 
     @property
     def all_drops(self) -> Counter[str]:
-        """Reason -> how many messages of all robots were not used."""
+        """Reason -> number of dropped messages of all robots."""
         total = Counter(self.drops)
         for pairer in self._pairers:
             total.update(pairer.drops)
         return total
 
     def number(self, robot: int) -> int | None:
-        """The mapper's number of a robot by its index; None: it has not joined."""
+        """The mapper's number of a robot by its index; None: not joined yet."""
         return self._number.get(robot)
 
     def missing(self) -> Iterator[str]:
@@ -284,7 +284,7 @@ class MapperFeed:
                     yield f"{robot.name}/{kind.topic}"
 
     def _joined(self, robot: int, odometry: FloatArray) -> int:
-        """The mapper's number of a robot; it joins where odometry (3,) since its first message has it."""
+        """The mapper's number of a robot, which first joins at its start moved by odometry (3,)."""
         if robot not in self._number:
             described = self._robots[robot]
             start, sigma = described.start, described.start_sigma
@@ -324,7 +324,7 @@ class MapperFeed:
             self._mapper.add_lights(self._number[robot], sightings)
 
     def _seen(self, frequency: float) -> int | None:
-        """The robot whose LEDs have this frequency [Hz]; None: no robot, or several."""
+        """The robot whose LEDs have this frequency [Hz]; None if there is none or several."""
         near = [
             index
             for hz, index in self._light_of

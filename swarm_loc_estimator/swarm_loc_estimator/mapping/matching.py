@@ -1,8 +1,8 @@
 """Matching of scans: beams on lines, and a search over a lattice of offsets.
 
 The residual of a beam in direction u on a line with normal n at distance D from where the beam starts is
-z = y - (n.u)/D. Its Jacobian, and whether the beam is used at all, follow from the predicted value and not
-from the measured one: a cut on what was measured keeps those with errors of one sign and shrinks the map.
+z = y - (n.u)/D. Its Jacobian, and whether the beam is used at all, follow from the predicted value, not
+from the measured one: a cut on measured values selects errors of one sign and shrinks the map.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from swarm_loc_estimator.mapping.scans import BINS, LINE, Beams, Lines
 CAUCHY = 6.0
 """Square of the scale of the Cauchy loss, in variances."""
 MIN_MATCHED = 30
-"""A pair of stops with fewer matched beams is not used."""
+"""Minimum number of matched beams of a pair of stops."""
 _MIN_INCIDENCE = 0.15
 _MIN_DISTANCE = 0.05
 _ROUGHNESS = 0.004
-"""How far walls are from straight [m]."""
+"""Standard deviation of walls from straight lines [m]."""
 _GATE_VARIANCES = 16.0
 _RANGE_SIGMAS = 2.5
 
 OFF, UNUSABLE, FIT = 0, 1, 2
-"""A beam: off the line that it should meet; not comparable; on the line."""
+"""Result for a beam: off the line; not comparable; on the line."""
 
 
 class Scans(NamedTuple):
-    """Stops, as matching needs them.
+    """Stops as input of scan matching.
 
     Attributes:
         states: (k, 4) x [m], y [m], theta [rad] on arrival, true turn over turn by odometry.
-        beams: What was seen.
-        lines: Fitted to the beams.
-        max_range: Beyond this nothing comes back [m].
+        beams: Their beams.
+        lines: Lines fitted to the beams.
+        max_range: Maximum range of the laser [m].
     """
 
     states: FloatArray
@@ -58,7 +58,7 @@ def beam_residual(
         k: The stop with the beam.
         i: Number of the beam.
         j: The stop with the lines.
-        gate: Further than this and four sigmas off a line, a beam does not belong to it [m].
+        gate: A beam further off a line than this and four sigmas is not matched [m].
 
     Returns:
         Whether it fits, residual and its variance, predicted inverse distance over the line's distance, the
@@ -96,7 +96,7 @@ def beam_residual(
 
 @cached_njit
 def agreement(scans: Scans, k: int, j: int, gate: float, stride: int) -> tuple[int, int, float]:
-    """How well beams of stop k, every `stride`-th, agree with lines of stop j: matched, tried, loss."""
+    """Agreement of every `stride`-th beam of stop k with lines of stop j: numbers matched and tried, loss."""
     matched, tried, loss = 0, 0, 0.0
     for i in range(0, scans.beams.counts[k], stride):
         if scans.beams.inverse[k, i] <= 0.0:
@@ -114,7 +114,7 @@ def agreement(scans: Scans, k: int, j: int, gate: float, stride: int) -> tuple[i
 def accumulate(
     scans: Scans, k: int, j: int, gate: float, stride: int, H: FloatArray, g: FloatArray
 ) -> tuple[int, int]:
-    """Add the normal equations of a pair of stops to H (8, 8) and g (8,); matched and tried beams.
+    """Add the normal equations of a pair of stops to H (8, 8) and g (8,); returns matched and tried beams.
 
     The unknowns are x, y, theta, ratio of stop k, then those of stop j; H dx = g is the Gauss-Newton step.
     """
@@ -166,9 +166,9 @@ def match_pairs(
     Args:
         scans: All stops.
         pairs: (p, 2).
-        weights: (p,) of each pair: its beams share errors.
+        weights: (p,) weight of each pair, since its beams share errors.
         gate: See `beam_residual` [m].
-        stride: Every so many-th beam is used, and weighs as much more.
+        stride: Every `stride`-th beam is used, with `stride` times the weight.
     """
     H, g = np.zeros((len(pairs), 8, 8)), np.zeros((len(pairs), 8))
     for p in range(len(pairs)):
@@ -180,19 +180,19 @@ def match_pairs(
 
 
 _APART_M = 0.2
-"""Places further from the best one than this are other places."""
+"""Minimum distance of another place from the best one."""
 _BEAMS = 60
-"""So many beams of a stop are enough to search with."""
+"""Number of beams of a stop used by the search."""
 
 
 class Lattice(NamedTuple):
-    """Offsets to try around a pose.
+    """Lattice of offsets around a pose.
 
     Attributes:
-        reach: [m], along x and y of map.
-        step: [m].
-        turn_reach: [rad].
-        turn_step: [rad].
+        reach: Maximum offset along x and y of map [m].
+        step: Step along x and y [m].
+        turn_reach: Maximum offset of the heading [rad].
+        turn_step: Step of the heading [rad].
     """
 
     reach: float
@@ -206,7 +206,7 @@ class BestOffset(NamedTuple):
 
     Attributes:
         offset: (3,) x [m], y [m], theta [rad] to add to the pose.
-        score: Share of beams that fit any of the stops searched against, less their losses.
+        score: Share of beams that fit any of the other stops, minus their losses.
         other: The best score of another place.
     """
 
@@ -216,7 +216,7 @@ class BestOffset(NamedTuple):
 
 
 def search_offsets(scans: Scans, parts: IntArray, against: IntArray, lattice: Lattice) -> BestOffset:
-    """Search the offset that moves stops (p,), as one body around the first of them, to fit others (q,)."""
+    """The offset of stops (p,), a rigid body that turns about the first, that fits others (q,) best."""
     scores = np.zeros(_shape(lattice))
     for k in parts:
         stride = max(3, int(scans.beams.counts[k]) // _BEAMS)
@@ -239,7 +239,7 @@ def _shape(lattice: Lattice) -> tuple[int, int, int]:
 
 @cached_njit
 def _scores(scans: Scans, k: int, pivot: int, against: IntArray, lattice: Lattice, stride: int) -> FloatArray:
-    """The share of beams that fit, for all offsets."""
+    """The score of every offset of the lattice."""
     turns, cells = int(lattice.turn_reach / lattice.turn_step), int(lattice.reach / lattice.step)
     scores = np.zeros((2 * turns + 1, 2 * cells + 1, 2 * cells + 1))
     states = scans.states
@@ -261,7 +261,7 @@ def _scores(scans: Scans, k: int, pivot: int, against: IntArray, lattice: Lattic
 
 @cached_njit
 def _score(scans: Scans, k: int, against: IntArray, stride: int) -> float:
-    """The share of every `stride`-th beam of a stop that fits any of others, each less its loss."""
+    """The share of every `stride`-th beam of a stop that fits any of the others, minus its loss."""
     good, tried = 0.0, 0
     for i in range(0, scans.beams.counts[k], stride):
         if scans.beams.inverse[k, i] <= 0.0:

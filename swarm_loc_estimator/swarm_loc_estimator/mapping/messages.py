@@ -15,14 +15,14 @@ from swarm_loc_estimator.common.messages.poses import planar_pose
 from swarm_loc_estimator.common.parameters import ParameterError
 
 MAX_CELLS = 4_000_000
-"""A larger map is none of a swarm's."""
+"""Maximum number of cells of a valid map."""
 
 
 class GridMessage(NamedTuple):
     """A map.
 
     Attributes:
-        stamp_ns: When it was so.
+        stamp_ns: Time of the map.
         frame_id: Frame of the origin.
         resolution: Side of a cell [m].
         origin: x [m], y [m], yaw [rad] of the outer corner of the first cell.
@@ -40,7 +40,7 @@ def decode_occupancy_grid(data: bytes) -> GridMessage:
     """Read a nav_msgs/OccupancyGrid.
 
     Raises:
-        CdrError: The bytes are not one, or its numbers cannot be those of a map.
+        CdrError: The bytes are not a valid OccupancyGrid.
     """
     message = decode(data, OCCUPANCY_GRID)
     header, about, cells = message.header, message.info, message.data
@@ -54,7 +54,7 @@ def decode_occupancy_grid(data: bytes) -> GridMessage:
 
 
 class LaserMessage(NamedTuple):
-    """A swarm_loc_msgs/LaserDistance: distance and sigma [m], row of the spot [px]; NaN: nothing was seen."""
+    """A swarm_loc_msgs/LaserDistance: distance and sigma [m], row of the spot [px]; NaN: no spot."""
 
     stamp_ns: int
     distance: float
@@ -82,7 +82,7 @@ def decode_laser(data: bytes) -> LaserMessage:
 
 
 def decode_lights(data: bytes) -> list[LightMessage]:
-    """Read a swarm_loc_msgs/LightBearingArray: those lights whose numbers are finite.
+    """Read a swarm_loc_msgs/LightBearingArray; lights with non-finite numbers are skipped.
 
     Raises:
         CdrError: The bytes are not one.

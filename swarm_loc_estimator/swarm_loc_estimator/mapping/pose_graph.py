@@ -1,4 +1,4 @@
-"""The pose graph: stops as nodes, slip as a state, Gauss-Newton."""
+"""The pose graph: stops as nodes, wheel slip as a state, solved by Gauss-Newton."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _Row = tuple[int, int, FloatArray]
 
 
 class ConstraintLists:
-    """Priors, odometry, ties and bearings in the order in which they came."""
+    """Priors, odometry, ties and bearings in order of insertion."""
 
     def __init__(self) -> None:
         self._priors: list[_Row] = []
@@ -28,24 +28,24 @@ class ConstraintLists:
         self._bearings: list[_Row] = []
 
     def add_prior(self, stop: int, pose: FloatArray, sigma: FloatArray) -> None:
-        """A pose (3,) with sigmas (3,) that a stop is known to have."""
+        """Add a prior on the pose (3,) of a stop with standard deviations (3,)."""
         self._priors.append((stop, stop, np.concatenate([pose, sigma])))
 
     def add_departure(self, begin: int, end: int, turn: float, motion: FloatArray, sigma: FloatArray) -> None:
-        """Odometry from stop to stop, see `constraints.Departures`."""
+        """Add odometry from stop to stop, see `constraints.Departures`."""
         self._departures.append((begin, end, np.concatenate([[turn], motion, sigma])))
 
     def add_tie(self, begin: int, end: int, pose: FloatArray, sigma: FloatArray) -> None:
-        """A relative pose, see `constraints.Ties`."""
+        """Add a relative pose, see `constraints.Ties`."""
         self._ties.append((begin, end, np.concatenate([pose, sigma])))
 
     def add_bearing(self, begin: int, end: int, turn: float, sigma: float) -> None:
-        """The light of a robot at another stop, see `constraints.Bearings`."""
+        """Add the bearing of a robot's light at another stop, see `constraints.Bearings`."""
         self._bearings.append((begin, end, np.array([turn, sigma])))
 
     @property
     def bearing_count(self) -> int:
-        """How many bearings there are."""
+        """Number of bearings."""
         return len(self._bearings)
 
     def remove_stop(self, stop: int) -> None:
@@ -54,7 +54,7 @@ class ConstraintLists:
             rows[:] = [one for one in rows if stop not in one[:2]]
 
     def linearised(self, states: FloatArray) -> Iterator[model.Linearised]:
-        """All of them at states (k, 4)."""
+        """Linearize all constraints at states (k, 4)."""
         if self._priors:
             stop, _, v = _arrays(self._priors)
             yield model.priors(states, stop, v[:, :3], v[:, 3:])
@@ -75,31 +75,31 @@ def _arrays(rows: list[_Row]) -> tuple[IntArray, IntArray, FloatArray]:
 
 
 _REFIT_RATIO = 0.0006
-"""Lines are fitted again when the ratio of turns has changed by more."""
+"""Threshold of the change of the turn ratio above which lines are refitted."""
 _MIN_RATIO_SIGMA = 0.0013
 _MATCH_WEIGHT, _START_WEIGHT = 0.3, 1.5
-"""Total weight of the matches of a stop: beams of a pair share the errors of one scan."""
+"""Total weight of the matches of a stop; beams of a pair share the errors of one scan."""
 _SMALL_STEP = (1e-3, 1e-3, 5e-4)
 MATCH_GATE = 0.03
-"""Beams further off a line do not belong to it, in the final solution [m]."""
+"""Maximum distance of a matched beam from its line in the final solution [m]."""
 _OVERLAP_STRIDE = 6
 
 
 class PoseGraph:
-    """Stops with beams and lines, constraints, Gauss-Newton over all or some of them.
+    """Stops with beams and lines, and constraints; optimized by Gauss-Newton over all or some stops.
 
     Args:
-        settings: Of the mapper.
+        settings: Settings of the mapper.
 
     Attributes:
-        settings: Of the mapper.
+        settings: Settings of the mapper.
         count: Number of stops.
         states: (capacity, 4) x [m], y [m], theta on arrival [rad], true turn over turn by odometry.
-        robot: (capacity,) whose stop it is.
-        turned: (capacity,) turn by odometry at the stop until now [rad].
-        slip: (R,) share of turns that each robot's wheels slip.
-        constraints: All but the matches of beams.
-        targets: Stop -> those against whose lines its beams are matched.
+        robot: (capacity,) number of the robot of each stop.
+        turned: (capacity,) turn by odometry at the stop so far [rad].
+        slip: (R,) share of turns lost to wheel slip, per robot.
+        constraints: All constraints except beam matches.
+        targets: Stop -> stops against whose lines its beams are matched.
         starts: Stops of first scans.
     """
 
@@ -121,7 +121,7 @@ class PoseGraph:
 
     @property
     def scans(self) -> Scans:
-        """What matching needs."""
+        """The stops as input of scan matching."""
         return Scans(self.states, self._beams, self._lines, self.settings.max_range)
 
     @property
@@ -130,13 +130,13 @@ class PoseGraph:
         return self.states[: self.count, :3]
 
     def add_robot(self) -> int:
-        """Let a robot join; its number."""
+        """Add a robot; returns its number."""
         self.slip = np.append(self.slip, self.settings.usual_slip)
         self._factored = -1
         return len(self.slip) - 1
 
     def add_stop(self, robot: int, pose: FloatArray, sigma: float) -> int:
-        """Add a stop at a pose (3,) whose inverse distances have this sigma [1/m]; its number."""
+        """Add a stop at a pose (3,); `sigma`: of its inverse distances [1/m]. Returns its number."""
         if self.count == len(self.states):
             self._grow()
         k = self.count
@@ -147,7 +147,7 @@ class PoseGraph:
         return k
 
     def reuse_stop(self, stop: int, pose: FloatArray, sigma: float) -> None:
-        """Replace a stop by a new one of the same robot, with its number; see `add_stop`."""
+        """Replace a stop by a new one of the same robot under the same number; see `add_stop`."""
         self.constraints.remove_stop(stop)
         self.targets = {
             one: [other for other in others if other != stop]
@@ -171,7 +171,7 @@ class PoseGraph:
         return float(self.states[stop, 2] + self.states[stop, 3] * self.turned[stop])
 
     def fit(self, stop: int) -> None:
-        """Fit the lines of a stop with its present ratio of turns."""
+        """Fit the lines of a stop with its current turn ratio."""
         ratio = self._fitted_ratio[stop] = self.states[stop, 3]
         fit_lines(stop, ratio, self.settings.max_range, self._beams, self._lines)
 
@@ -181,13 +181,13 @@ class PoseGraph:
         return matched / max(1, tried)
 
     def distances(self, stop: int) -> FloatArray:
-        """Distances (count,) of all stops from one [m]."""
+        """Distances (count,) of all stops from one stop [m]."""
         off = self.states[: self.count, :2] - self.states[stop, :2]
         distances: FloatArray = np.hypot(off[:, 0], off[:, 1])
         return distances
 
     def neighbours(self, stop: int, limit: int, least: float) -> list[int]:
-        """The nearest stops within sight of which the beams of a stop overlap the lines by a share."""
+        """The nearest stops in range whose lines overlap at least the share `least` of a stop's beams."""
         away = self.distances(stop)
         found: list[int] = []
         for other in np.argsort(away, kind="stable"):
@@ -207,13 +207,13 @@ class PoseGraph:
     def solve(
         self, iterations: int, free: Iterable[int] | None = None, gate: float = MATCH_GATE, stride: int = 2
     ) -> None:
-        """Gauss-Newton steps over all stops, or some; slips are free always.
+        """Gauss-Newton optimization of all or some stops; slips are always free.
 
         Args:
-            iterations: Steps at most.
+            iterations: Maximum number of steps.
             free: Stops that may move; None: all.
             gate: See `beam_residual` [m].
-            stride: Of the beams every so many-th is used.
+            stride: Every `stride`-th beam is used.
         """
         count = self.count
         moves = np.ones(count, dtype=bool)
@@ -251,7 +251,7 @@ class PoseGraph:
         return self._factor
 
     def _apply(self, step: FloatArray) -> bool:
-        """Apply a step; whether it is below `_SMALL_STEP` for all stops."""
+        """Apply a step; returns whether it is below `_SMALL_STEP` for all stops."""
         count = self.count
         change = step[: STOP_UNKNOWNS * count].reshape(-1, STOP_UNKNOWNS)
         self.states[:count] += change
@@ -292,5 +292,5 @@ class PoseGraph:
 
 
 def _doubled(array: Any) -> Any:
-    """An array with as many zeros appended."""
+    """The array with twice the length, padded with zeros."""
     return np.concatenate([array, np.zeros_like(array)])

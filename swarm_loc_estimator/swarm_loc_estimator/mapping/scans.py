@@ -16,7 +16,7 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 
 UNSEEN = 0.0
-"""The inverse distance of a beam that came back from nothing."""
+"""Inverse distance of a beam without reflection."""
 
 
 class Readings(NamedTuple):
@@ -29,8 +29,8 @@ class Readings(NamedTuple):
         stamp_ns: (n,).
         odometry: (n, 3) pose by odometry at each stamp, in the robot's own odom frame.
         inverse: (n,) inverse distance along x of the robot, from its centre [1/m]; `UNSEEN`: nothing.
-        sigma: Standard deviation of an inverse distance, sigma_px / (f b) [1/m]; NaN where
-            nothing was seen so far.
+        sigma: Standard deviation of an inverse distance, sigma_px / (f b) [1/m]; NaN before
+            the first reflection.
     """
 
     stamp_ns: IntArray
@@ -40,7 +40,7 @@ class Readings(NamedTuple):
 
 
 class LightSightings(NamedTuple):
-    """Lights (m,) of other robots that one robot saw.
+    """Sightings (m,) of lights of other robots by one robot.
 
     Attributes:
         stamp_ns: (m,).
@@ -56,16 +56,16 @@ class LightSightings(NamedTuple):
 
 
 MAX_BEAMS = 768
-"""Of one stop; where there are more, every second one is left out."""
+"""Maximum number of beams per stop; if exceeded, every second one is dropped."""
 
 
 class Beams(NamedTuple):
     """Beams of stops (k,).
 
     Attributes:
-        turn: (k, MAX_BEAMS) turn by odometry since the robot came to this stop [rad].
-        inverse: (k, MAX_BEAMS) inverse distance [1/m], 0: nothing seen.
-        counts: (k,) how many beams there are.
+        turn: (k, MAX_BEAMS) turn by odometry since arrival at the stop [rad].
+        inverse: (k, MAX_BEAMS) inverse distance [1/m], 0: no reflection.
+        counts: (k,) number of beams.
         sigma: (k,) standard deviation of an inverse distance [1/m].
     """
 
@@ -76,7 +76,7 @@ class Beams(NamedTuple):
 
 
 def no_beams(capacity: int) -> Beams:
-    """Memory for the beams of so many stops."""
+    """Memory for the beams of `capacity` stops."""
     shape = (capacity, MAX_BEAMS)
     return Beams(np.zeros(shape), np.zeros(shape), np.zeros(capacity, dtype=np.int64), np.ones(capacity))
 
@@ -91,22 +91,22 @@ def set_beams(beams: Beams, stop: int, turn: FloatArray, inverse: FloatArray) ->
 
 BINS = 360
 UNKNOWN, FREE, POINT, LINE = 0, 1, 2, 3
-"""What is known of a direction: nothing; nothing came back; something did; a line did."""
+"""Kinds of a direction: unknown; no reflection; reflection without a line; line."""
 
 _SEEN, _CC, _CS, _SS, _YC, _YS, _YY, _C, _S, _Y, _ALL = range(11)
 """Sums over the beams of a direction; y is the inverse distance."""
 _WINDOWS = (40, 28, 20, 14, 9, 6)
 _MIN_BEAMS, _MIN_SEEN_SHARE = 5, 0.85
 _MAX_THIRD_SIGMAS = 2.2
-"""Where the middle of a third lies further off the line, there is a step in the wall."""
+"""Maximum distance of the mean of a third of a window from the line; beyond it the wall has a step."""
 _MIN_INCIDENCE = 0.15
-"""Least cosine between beam and normal."""
+"""Minimum cosine between beam and normal."""
 _MAX_NORMAL_SIGMA = 0.08
 _RANGE_SIGMAS = 2.5
 
 
 class Lines(NamedTuple):
-    """Lines of stops (k,), per degree of direction from the heading at which the robot came.
+    """Lines of stops (k,), per degree of direction relative to the heading on arrival.
 
     Attributes:
         kind: (k, BINS) `UNKNOWN`, `FREE`, `POINT` or `LINE`.
@@ -114,8 +114,8 @@ class Lines(NamedTuple):
         b: (k, BINS) normal over distance, along y [1/m].
         distance: (k, BINS) along the direction [m].
         variance: (k, BINS) of the line's inverse distance along the direction [1/m^2].
-        turn: (k, BINS) turn by odometry at which the robot looked there [rad].
-        usable: (k, BINS) whether the normal is known well enough to match other beams against.
+        turn: (k, BINS) turn by odometry at which the direction was scanned [rad].
+        usable: (k, BINS) whether the normal is accurate enough for scan matching.
     """
 
     kind: NDArray[np.int8]
@@ -128,7 +128,7 @@ class Lines(NamedTuple):
 
 
 def no_lines(capacity: int) -> Lines:
-    """Memory for the lines of so many stops."""
+    """Memory for the lines of `capacity` stops."""
     shape = (capacity, BINS)
     a, b, distance, variance, turn = np.zeros((5, *shape))
     return Lines(np.zeros(shape, dtype=np.int8), a, b, distance, variance, turn, np.zeros(shape, dtype=bool))
@@ -141,12 +141,12 @@ def fit_lines(stop: int, ratio: float, max_range: float, beams: Beams, lines: Li
     Args:
         stop: Its number.
         ratio: True turn over turn by odometry.
-        max_range: Beyond this nothing comes back [m].
+        max_range: Maximum range of the laser [m].
         beams: Of all stops.
         lines: Of all stops; those of this one are written.
     """
     sums, turns = _sums_per_bin(stop, ratio, beams)
-    total = np.zeros((3 * BINS + 1, 11))  # three times around: windows go across the seam
+    total = np.zeros((3 * BINS + 1, 11))  # three periods, since windows cross the seam
     for m in range(3 * BINS):
         total[m + 1] = total[m] + sums[m % BINS]
     sigma = beams.sigma[stop]
@@ -193,7 +193,7 @@ def _sums_per_bin(stop: int, ratio: float, beams: Beams) -> tuple[FloatArray, Fl
 
 @cached_njit
 def _fit_bin(stop: int, m: int, total: FloatArray, sigma: float, least: float, lines: Lines) -> bool:
-    """Fit the longest window around a bin in which a line holds; whether there is one."""
+    """Fit the longest window around a bin that is consistent with a line; returns whether there is one."""
     here = BINS + m
     if total[here + 3, _SEEN] - total[here - 2, _SEEN] == 0.0:
         return False
@@ -254,7 +254,7 @@ def _fit_window(
 
 @cached_njit
 def _is_free(total: FloatArray, m: int) -> bool:
-    """Whether so few beams came back from around a bin that there is nothing within range."""
+    """Whether the beams around a bin show no obstacle within range."""
     here = BINS + m
     looked = total[here + 2, _ALL] - total[here - 1, _ALL]
     seen = total[here + 2, _SEEN] - total[here - 1, _SEEN]
@@ -265,19 +265,19 @@ def _is_free(total: FloatArray, m: int) -> bool:
 
 
 MIN_OVERLAP = 50
-"""So many beams of the first turn must have one of the second beside them."""
+"""Minimum number of beams of the first turn with a neighbour in the second."""
 _LOW, _HIGH, _STEP = 0.90, 1.02, 0.0005
 _OUTLIER = 9.0
 
 
 @cached_njit
 def turn_ratio(turn: FloatArray, inverse: FloatArray, sigma: float) -> float:
-    """The ratio at which beams (n,) agree best with those one turn later; NaN where too few overlap.
+    """The turn ratio at which beams (n,) agree best with those one turn later; NaN if too few overlap.
 
     Args:
         turn: (n,) by odometry, increasing or decreasing throughout [rad].
-        inverse: (n,) inverse distances, 0: nothing [1/m].
-        sigma: Of an inverse distance [1/m].
+        inverse: (n,) inverse distances, 0: no reflection [1/m].
+        sigma: Standard deviation of an inverse distance [1/m].
     """
     forward = np.abs(turn - turn[0])
     best, found = math.inf, math.nan
@@ -291,7 +291,7 @@ def turn_ratio(turn: FloatArray, inverse: FloatArray, sigma: float) -> float:
 
 @cached_njit
 def _disagreement(turn: FloatArray, inverse: FloatArray, sigma: float, later: float) -> tuple[float, int]:
-    """Sum of capped squares between each beam and that a turn `later` [rad], and their number."""
+    """Sum of capped squared differences of beams and those a turn `later` [rad], and their number."""
     cost, count, j = 0.0, 0, 0
     for i in range(len(turn)):
         wanted = turn[i] + later

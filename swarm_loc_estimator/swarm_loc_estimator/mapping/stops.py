@@ -1,4 +1,4 @@
-"""From a stream of readings to stops: where a robot stands and looks around between two drives."""
+"""Segmentation of a stream of readings into stops, at which a robot scans, and drives."""
 
 from __future__ import annotations
 
@@ -15,36 +15,36 @@ from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.scans import Readings
 
 MIN_TURN = 0.5
-"""A robot that has not turned so much [rad] has not looked around: it drives on."""
+"""Minimum turn of a scan [rad]."""
 _STAND_SPEED = 0.02
-"""A robot that drives slower than this stands [m/s]."""
+"""Maximum speed of a stopped robot [m/s]."""
 _DEPARTED = 0.01
-"""A robot that is further than this from where it came has left [m]."""
+"""Maximum distance from the arrival position within a stop [m]."""
 _MAX_READINGS = 4096
-"""Of more at one stop, every second one is left out."""
+"""Maximum number of readings per stop; if exceeded, every second one is dropped."""
 _REST_NS, _REST_TURN = 1_000_000_000, 0.01
-"""A robot that turns less than this in such a time rests [rad]."""
+"""A robot rests if it turns less than this [rad] within this time."""
 _DRIVES, _STANDS, _ARRIVES, _JUMPS = 0, 1, 2, 3
 _MAX_SPEED, _MAX_STEP, _MAX_RATE, _MAX_TURN = 3.0, 0.05, 20.0, 0.3
-"""Odometry that moves by more than these rates allow has restarted [m/s], [m], [rad/s], [rad]."""
+"""Limits beyond which odometry counts as restarted: rate and offset of position, and of heading."""
 
 
 class ScanStop:
-    """A place where a robot stands, or stood.
+    """A stop of a robot with its readings.
 
     Args:
-        arrival: (3,) pose by odometry when it came.
+        arrival: (3,) pose by odometry on arrival.
 
     Attributes:
-        arrival: (3,) pose by odometry when it came.
+        arrival: (3,) pose by odometry on arrival.
         departure: (3,) pose by odometry at the last reading.
         stamp_ns: (n,) of its readings.
-        turn: (n,) turn by odometry since it came [rad].
+        turn: (n,) turn by odometry since arrival [rad].
         inverse: (n,) inverse distances [1/m].
-        sigma: Of an inverse distance; undefined before a reflection was seen [1/m].
-        begin: How many of the readings belong to nodes before the one that this stop is.
-        looked: How many there were when it became a node; 0: it is not one.
-        total: How many there were in all.
+        sigma: Standard deviation of an inverse distance [1/m]; undefined before the first reflection.
+        begin: Number of readings that belong to earlier nodes.
+        looked: Number of readings when it became a node; 0: not a node yet.
+        total: Number of all readings, including dropped ones.
     """
 
     def __init__(self, arrival: FloatArray) -> None:
@@ -56,7 +56,7 @@ class ScanStop:
         self.begin = self.looked = self.total = 0
 
     def extend(self, readings: Readings) -> None:
-        """Add readings made here."""
+        """Append readings."""
         headings = np.concatenate([self.departure[2:], readings.odometry[:, 2]])
         turned = self.turn[-1:] if len(self.turn) else np.zeros(1)
         steps = np.concatenate([turned, wrap_angle(np.diff(headings))])
@@ -75,7 +75,7 @@ class ScanStop:
 
     @property
     def turned(self) -> float:
-        """The largest turn by odometry there was [rad]."""
+        """Maximum turn by odometry [rad]."""
         return float(np.abs(self.turn).max(initial=0.0))
 
     @property
@@ -84,7 +84,7 @@ class ScanStop:
         return float(self.turn[self.begin - 1]) if self.begin else 0.0
 
     def split(self, around: float) -> ScanStop | None:
-        """Cut off what came since it became a node as another stop, if it turned by `around` [rad] then."""
+        """Split off the readings since it became a node as a new stop, if they turn by `around` [rad]."""
         if not self.looked or self.looked == len(self.turn):
             return None
         before = float(self.turn[self.looked - 1])
@@ -103,7 +103,7 @@ class ScanStop:
         return other
 
     def completed(self, full: float) -> int:
-        """After how many readings the robot had turned by `full` [rad], or looked and rested; 0: not yet."""
+        """Number of readings until the turn reached `full` [rad], or rested after a scan; 0: not yet."""
         return _completed(self.stamp_ns, self.turn, full)
 
     def turn_at(self, stamp_ns: int) -> float:
@@ -113,13 +113,13 @@ class ScanStop:
 
 
 class Run(NamedTuple):
-    """Readings that belong together.
+    """Consecutive readings with the same motion state.
 
     Attributes:
-        stands: Whether the robot stands.
-        arrives: Whether it has just come.
+        stands: Whether the robot is stopped.
+        arrives: Whether it has just arrived.
         jumps: Whether odometry has restarted, so that the motion to this place is unknown.
-        readings: These.
+        readings: The readings.
     """
 
     stands: bool
@@ -129,14 +129,14 @@ class Run(NamedTuple):
 
 
 class MotionTracker:
-    """Separates standing from driving for one robot."""
+    """Classifies the readings of one robot as stopped or driving."""
 
     def __init__(self) -> None:
-        self._state = np.full(6, np.nan)  # anchor x, y; before x, y; whether it stands; heading before
+        self._state = np.full(6, np.nan)  # anchor x, y; previous x, y; whether stopped; previous heading
         self._before_ns = 0
 
     def runs(self, readings: Readings) -> Iterator[Run]:
-        """Cut readings (n,) where the robot comes or leaves."""
+        """Split readings (n,) at arrivals and departures."""
         labels = _labels(readings.stamp_ns, readings.odometry, self._state, self._before_ns)
         self._before_ns = int(readings.stamp_ns[-1])
         changes = (labels[1:] >= _ARRIVES) | ((labels[1:] == _DRIVES) != (labels[:-1] == _DRIVES))
@@ -152,7 +152,7 @@ class MotionTracker:
 
 @cached_njit
 def _labels(stamp_ns: IntArray, odometry: FloatArray, state: FloatArray, before_ns: int) -> IntArray:
-    """Whether a robot drives, stands or arrives at each reading, or jumps; the state goes on."""
+    """Label each reading as driving, stopped, arriving or jump; updates the state."""
     labels = np.zeros(len(stamp_ns), dtype=np.int64)
     for k in range(len(stamp_ns)):
         x, y = odometry[k, 0], odometry[k, 1]

@@ -91,7 +91,7 @@ class IrPlatform:
         amplitudes: A for each power of the emitters, in the order of `POWERS`.
 
     Raises:
-        IrPlatformError: A number is out of its range, elements coincide, or it is too bright in the dark.
+        IrPlatformError: A number is out of range, elements coincide, or dark_level reaches saturation.
     """
 
     angles: tuple[float, ...]
@@ -204,7 +204,7 @@ class IrGains:
         dead_emitters: Numbers of emitters to ignore.
 
     Raises:
-        IrPlatformError: A factor is not in [0.05, 20], sizes differ, or there is no such element.
+        IrPlatformError: A factor is not in [0.05, 20], sizes differ, or an element does not exist.
     """
 
     sensor: tuple[float, ...]
@@ -275,7 +275,7 @@ def _without(factors: FloatArray, dead: list[tuple[int, ...]]) -> FloatArray:
 class IrMethod(Enum):
     """Method to estimate a relative pose from brightness."""
 
-    LIKELIHOOD = "likelihood"  # the most likely pose of all readings of all powers
+    LIKELIHOOD = "likelihood"  # maximum likelihood over all readings of all powers
     CLOSED_FORM = "closed_form"  # eqs (9)-(18) of the Droplet paper, corrected
 
 

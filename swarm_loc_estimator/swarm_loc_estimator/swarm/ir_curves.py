@@ -1,8 +1,8 @@
 """Response curves of sensors, emitters and distance: the models S, E and A of a board.
 
 Angle curves are data, either pieces of sums of powers, as the Droplet paper prints (19) and (20), or a table.
-Both are sampled once into cubic pieces whose joints are exact, so that the search evaluates either in the
-same few nanoseconds, with the exact one-sided slopes at a kink.
+Both are sampled once into piecewise cubics with exact joints, which are fast to evaluate and have the exact
+one-sided slopes at a kink.
 """
 
 from __future__ import annotations
@@ -22,22 +22,22 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 _CELLS = 128
-"""Cubics per piece: the curves of the Droplet are met to 2e-6."""
+"""Number of cubics per piece; the error for the curves of the Droplet is 2e-6."""
 _TABLE_CELLS = 720
-"""Cubics over the whole turn for a measured curve, which has no kinks: half a degree each."""
+"""Number of cubics of a tabulated curve, which has no kinks: half a degree each."""
 _JOINT = 0.01
-"""The largest jump at a joint, relative to the curve's maximum; a rounded joint as printed has 1e-4."""
+"""Maximum jump at a joint, relative to the curve's maximum; rounded printed joints have 1e-4."""
 
 
 class IrPlatformError(ValueError):
-    """A platform that contradicts itself; the message is one sentence with key and value."""
+    """An invalid platform; the message is one sentence with key and value."""
 
 
 def check_numbers(holder: DataclassInstance, prefix: str = "") -> None:
-    """Refuse numbers of a dataclass that are out of the range given beside their default.
+    """Check that the numbers of a dataclass lie in their declared ranges.
 
     Raises:
-        IrPlatformError: One is.
+        IrPlatformError: A number is out of range.
     """
     for name, spec in number_specs(type(holder)).items():
         value = getattr(holder, name)
@@ -46,12 +46,12 @@ def check_numbers(holder: DataclassInstance, prefix: str = "") -> None:
 
 
 class CurveTable(NamedTuple):
-    """A curve over [-pi, pi] as compiled code reads it.
+    """A curve over [-pi, pi] in the form used by compiled code.
 
     Attributes:
-        edges: (P + 1,) where the pieces meet [rad].
-        per_radian: (P,) how many cells of a piece one radian has.
-        cubics: (P, cells, 4) coefficients by the share of the cell passed, constant first.
+        edges: (P + 1,) boundaries of the pieces [rad].
+        per_radian: (P,) cells per radian of each piece.
+        cubics: (P, cells, 4) coefficients of powers of t in [0, 1] across the cell, constant first.
     """
 
     edges: FloatArray
@@ -60,16 +60,16 @@ class CurveTable(NamedTuple):
 
     @classmethod
     def of(cls, edges: FloatArray, cubics: FloatArray) -> CurveTable:
-        """From where pieces meet, and their cubics."""
+        """A table from the boundaries of pieces and their cubics."""
         return cls(edges, cubics.shape[1] / np.diff(edges), cubics)
 
 
 @dataclass(frozen=True)
 class PowerPiece:
-    """A sum of powers of the angle's size, up to some size.
+    """A sum of powers of the absolute angle, up to a maximum.
 
     Attributes:
-        below: Where the next piece begins [rad]; pi for the last.
+        below: Start of the next piece [rad]; pi for the last.
         terms: Pairs (coefficient, exponent) of coefficient * |angle|^exponent.
     """
 
@@ -102,7 +102,7 @@ class PowerCurve:
                 )
 
     def table(self) -> CurveTable:
-        """The curve as compiled code reads it."""
+        """The curve in the form used by compiled code."""
         edges = np.array([0.0, *(piece.below for piece in self.pieces)])
         half = [
             _cubics(*_powers(piece.terms, np.linspace(begin, piece.below, _CELLS + 1)), piece.below - begin)
@@ -112,18 +112,18 @@ class PowerCurve:
         return CurveTable.of(np.concatenate([-edges[:0:-1], edges]), np.array([*mirror, *half]))
 
     def _spans(self) -> list[tuple[float, PowerPiece]]:
-        """Where each piece begins, and the piece."""
+        """The start of each piece [rad], and the piece."""
         begins = [0.0, *(piece.below for piece in self.pieces[:-1])]
         return list(zip(begins, self.pieces, strict=True))
 
 
 @dataclass(frozen=True)
 class TabulatedCurve:
-    """A curve measured at angles, joined without overshoot; it need not be symmetric.
+    """A curve given at angles, interpolated without overshoot; it need not be symmetric.
 
     Attributes:
-        angles: (K,) ascending, within [-pi, pi] [rad]; beyond its ends the curve stays as it is there.
-        values: (K,) at these angles, not negative [1].
+        angles: (K,) ascending within [-pi, pi] [rad]; the curve is constant beyond the first and last.
+        values: (K,) non-negative values at these angles [1].
 
     Raises:
         IrPlatformError: Sizes do not fit, angles do not ascend, or values are not finite and positive.
@@ -144,7 +144,7 @@ class TabulatedCurve:
         _check(self.table())
 
     def table(self) -> CurveTable:
-        """The curve as compiled code reads it."""
+        """The curve in the form used by compiled code."""
         curve = PchipInterpolator(self.angles, self.values)
         at = np.linspace(-math.pi, math.pi, _TABLE_CELLS + 1)
         within = np.clip(at, self.angles[0], self.angles[-1])
@@ -157,10 +157,10 @@ AngleCurve = PowerCurve | TabulatedCurve
 
 @dataclass(frozen=True)
 class Amplitude:
-    """How bright an aligned pair is at a distance r: scale / (r + offset)^exponent + background.
+    """Brightness of an aligned pair at a distance r: scale / (r + offset)^exponent + background.
 
-    Eq. (21) of the Droplet paper has a pole at 3 cm, so it is no model of what is nearer. Closer than
-    `nearest` the curve goes on along its tangent, which keeps it finite and monotonic.
+    Eq. (21) of the Droplet paper has a pole at 3 cm and is invalid at shorter distances. Below `nearest` the
+    curve is extrapolated along its tangent, which keeps it finite and monotonic.
 
     Raises:
         IrPlatformError: The pole is not nearer than `nearest`.
@@ -191,7 +191,7 @@ def _powers(terms: tuple[tuple[float, float], ...], size: FloatArray) -> tuple[F
 _BACKWARDS = np.array(
     [[1.0, 0.0, 0.0, 0.0], [1.0, -1.0, 0.0, 0.0], [1.0, -2.0, 1.0, 0.0], [1.0, -3.0, 3.0, -1.0]]
 )
-"""A row of coefficients by t times this: the same cubic by 1 - t."""
+"""Right factor that converts coefficients of powers of t into those of powers of 1 - t."""
 
 
 def _cubics(values: FloatArray, slopes: FloatArray, length: float) -> FloatArray:
@@ -204,7 +204,7 @@ def _cubics(values: FloatArray, slopes: FloatArray, length: float) -> FloatArray
 
 
 def _check(table: CurveTable) -> None:
-    """Refuse a curve that is negative somewhere or dark everywhere."""
+    """Check that a curve is nowhere negative and not zero everywhere."""
     values = table.cubics[..., 0]
     if values.min() < 0.0:
         raise IrPlatformError(f"curve falls to {values.min():.4g} but must not be negative.")

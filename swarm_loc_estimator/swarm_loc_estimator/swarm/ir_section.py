@@ -32,8 +32,8 @@ class IrSection:
     """Reads the section of one file.
 
     Args:
-        checks: Of the file.
-        folder: Where it lies; the path of a platform starts from there.
+        checks: Checks of the file.
+        folder: Folder of the file, to which platform paths are relative.
     """
 
     def __init__(self, checks: TreeChecks, folder: Path) -> None:
@@ -42,7 +42,7 @@ class IrSection:
         self._platforms: dict[str, IrPlatform] = {}
 
     def layer(self, tree: Tree, key: str, *, of_robot: bool) -> Values | None:
-        """What one of defaults, type and robot says; only a robot has an id. None: it has no board."""
+        """The values of one layer (defaults, type or robot); only a robot has an id. None: no board."""
         if tree is None:
             return None
         mapping = self._checks.mapping(tree, key, ("id", *_LAYER) if of_robot else _LAYER)
@@ -61,7 +61,7 @@ class IrSection:
         }
 
     def board(self, values: Values | None, key: str) -> RobotIr | None:
-        """The board of a robot, of all that its layers say."""
+        """The board of a robot from the merged values of its layers."""
         if values is None or not values:
             return None
         if "platform" not in values:
@@ -84,14 +84,14 @@ class IrSection:
         return RobotIr(platform=platform, source=source, gains=gains, **rest)
 
     def _id(self, value: Tree, key: str) -> int:
-        """A board's id, also as the robots print it, with 0x before it."""
+        """A board's id, decimal or hexadecimal with 0x as the robots print it."""
         number = int(value, 16) if isinstance(value, str) and _HEXADECIMAL.fullmatch(value) else value
         if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= _MAX_ID:
             raise self._checks.error(key, value, f"must be a whole number in [1, {_MAX_ID}]")
         return number
 
     def _platform(self, value: Tree, key: str) -> str:
-        """The source of a platform, which is read."""
+        """The source of a platform; also loads the platform."""
         if not isinstance(value, str):
             raise self._checks.error(key, value, "must be the name of a packaged one or the path of a file")
         is_path = value.endswith((".yaml", ".yml"))

@@ -1,8 +1,8 @@
 """Joint pose of a rigid body from several of its markers.
 
-One face seen head-on is ambiguous with its mirror image, two faces together are not. Each face gets the
-common pose and n times its covariance for n faces, so an estimator that treats the faces as independent
-arrives at the covariance of the common pose. As for a single face, the covariance does not contain
+The pose of one face seen head-on is ambiguous, that of two faces is not. Each of n faces gets the common pose
+and n times its covariance, so an estimator that treats the faces as independent obtains the covariance of the
+common pose. As for a single face, the covariance does not contain
 `position_sigma` of the description, which the estimator adds to each face.
 """
 
@@ -19,12 +19,12 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Robot
 from swarm_loc_vision.markers.pose import Poses, Upright, body_pose, square
 
 _MIN_SIGMA = 0.0005
-"""Lower bound of `position_sigma` [m]."""
+"""Minimum of `position_sigma` [m]."""
 _MAX_CHI2 = 25.0
-"""Largest chi square per degree of freedom; above it the faces do not sit as described and stay separate."""
+"""Maximum chi square per degree of freedom; above it the faces contradict the description and stay single."""
 
 _MAX_LEFT_OUT = 0.99
-"""Largest share of a position's variance that is left out."""
+"""Maximum share of a position's variance that is subtracted."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def robot_body(robot: Robot) -> Body:
 
 
 def _placement(face: Face, yaw: float) -> Placement:
-    """The pose of an upright face that looks along its yaw."""
+    """The pose of an upright face whose normal points along its yaw."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     rotation = np.array([[-sin, 0.0, cos], [cos, 0.0, sin], [0.0, 1.0, 0.0]])
     return Placement(rotation, np.array([face.x, face.y, face.z]), max(face.position_sigma, _MIN_SIGMA))
@@ -108,7 +108,7 @@ def _solve(
     intrinsics: FloatArray,
     upright: Upright | None,
 ) -> None:
-    """Solve one body that is seen in some rows."""
+    """Solve for the pose of one body from its rows."""
     points = np.stack(
         [square(seen.lengths[i]) @ at.rotation.T + at.position for i, at in zip(rows, places, strict=True)]
     )

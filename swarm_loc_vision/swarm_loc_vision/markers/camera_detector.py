@@ -1,4 +1,4 @@
-"""Detector of one camera: CameraInfo and images in, serialized detections out.
+"""Detector of one camera: converts CameraInfo and images to serialized detections.
 
 Messages may be those of rclpy or of rosbags, whose fields have the same names.
 """
@@ -23,7 +23,7 @@ CreateDetector = Callable[[Camera], MarkerDetector]
 
 
 class CameraDetector(CalibratedCamera):
-    """The detector of one camera, created with its calibration.
+    """The detector of one camera; created when its calibration arrives.
 
     Args:
         create: Creates the detector for a camera.

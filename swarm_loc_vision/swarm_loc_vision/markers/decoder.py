@@ -1,7 +1,7 @@
 """Decode the brightness of cells: the nearest code word over all ids and rotations, and its margin.
 
-Blur mixes neighbouring cells, so cells are sharpened first. Bits are weighted by their clearness: a
-difference in a cell near the threshold costs little, in a clear cell a whole bit.
+Blur mixes neighbouring cells, so cells are sharpened first. Bits are weighted by the distance of a cell from
+the threshold: a difference in a clear cell costs a whole bit.
 """
 
 from __future__ import annotations
@@ -21,31 +21,31 @@ from swarm_loc_vision.markers.families import BITS, CELLS, Family, rotated, unpa
 Words = NDArray[np.uint64]
 
 FALSE_READINGS = 1e-5
-"""Rate of random squares read as a marker in use, for whole bits and one threshold. Weighted bits and the
-second threshold add to it: with all 4096 ids one or two of 100 000 random squares are read."""
+"""Maximum false positive rate for random squares, with whole bits and one threshold. Weighted bits and the
+second threshold increase it: with all 4096 ids to one or two of 100 000 random squares."""
 _SHARPENING = 0.2
 """Share of the difference to each of its four neighbours that is added to a cell."""
 _MAX_DARK_ERRORS = 3.0
-"""Largest number of the 28 cells of the border's inner ring that may look light."""
+"""Maximum number of light cells among the 28 cells of the border's inner ring."""
 _MAX_SLOPE = 0.5
-"""Largest difference of the border's brightness between its sides, over the contrast."""
+"""Maximum difference of the border's brightness between its sides, relative to the contrast."""
 _MIDDLE, _LOW = 0.5, 0.28
-"""Thresholds between ink and paper: the usual one, and that for a marker half in shadow."""
+"""Thresholds between ink and paper: the default, and one for a marker half in shadow."""
 _MIN_CORRELATION = 0.4
-"""Least correlation of a candidate and its word. The cells of a black square with a speck of light are
-neither dark nor light and fit any word at little cost; they reach 0.37, moving markers 0.5 and more."""
+"""Minimum correlation of a candidate and its word. A black square with a speck of light has cells near the
+threshold that fit any word at little cost; it reaches 0.37, moving markers 0.5 and more."""
 _FAR = 1e9
 _WEIGHED = 4
-"""Words with up to so many more different bits than the nearest may be nearer by weighted bits."""
+"""Maximum excess of different bits over the nearest word for words compared by weighted bits."""
 
 
 class Readings(NamedTuple):
     """Decoded candidates, one row each.
 
     Attributes:
-        word: Index of the nearest word, -1: no marker in use.
+        word: Index of the nearest word, -1: none accepted.
         quarters: Counter-clockwise quarter turns of the marker in the image.
-        errors: Weighted bits by which the candidate differs from the word.
+        errors: Distance from the word in weighted bits.
         margin: Weighted bits that could flip before another reading would be nearer.
         contrast: Light minus dark cells [counts].
     """
@@ -82,11 +82,11 @@ class Dictionary:
         self.strips = np.pad(rows, ((0, 0), (0, 0), (border, border)))
 
     def read(self, cells: FloatArray, min_contrast: float) -> Readings:
-        """Read candidates.
+        """Decode candidates.
 
         Args:
             cells: (N, GRID, GRID) of `sampling.read_cells`.
-            min_contrast: Between light and dark cells [counts].
+            min_contrast: Minimum difference of light and dark cells [counts].
         """
         count = len(cells)
         readings = Readings(
@@ -97,7 +97,7 @@ class Dictionary:
 
 
 def correctable_bits(words: int) -> int:
-    """Largest number of different bits for which random squares are read at most at FALSE_READINGS."""
+    """Maximum number of different bits with a false positive rate of at most FALSE_READINGS."""
     near, bits = 1, 0
     while bits < BITS // 4:
         near += math.comb(BITS, bits + 1)
@@ -111,7 +111,7 @@ def correctable_bits(words: int) -> int:
 def _read(
     cells: FloatArray, words: Words, min_contrast: float, correctable: float, readings: Readings
 ) -> None:
-    """Fill the readings."""
+    """Decode each candidate into the readings."""
     word, quarters, errors, margin, contrast = readings
     clear, flat = np.empty(BITS), np.empty((GRID - 2, GRID - 2))
     bits = np.empty(len(words), np.uint8)
@@ -140,7 +140,7 @@ def _read(
 
 @cached_njit
 def _flatten(cells: FloatArray, sharp: FloatArray) -> float:
-    """Write sharpened brightness above dark (GRID - 2, GRID - 2); returns that of light, 0 if there is none.
+    """Write sharpened brightness minus dark (GRID - 2, GRID - 2); returns that of light, 0 if there is none.
 
     Dark is a plane through the border's inner ring, to allow for uneven light; light is the mean of the
     lighter cells.
@@ -212,7 +212,7 @@ def nearest(
     Args:
         words: (N,) all words.
         seen: The candidate's bits.
-        clear: (BITS,) clearness of each bit, -1 to 1.
+        clear: (BITS,) soft bits, -1 (dark) to 1 (light).
         bits: (N,) filled with the number of different bits.
 
     Returns:

@@ -54,7 +54,7 @@ class ImageBag:
 
     Attributes:
         cameras: The detectors by namespace.
-        losses: What could not be read, a sentence each.
+        losses: Unreadable parts of the bag, one sentence each.
 
     Raises:
         BagError: The bag cannot be read, or has no images.
@@ -140,7 +140,7 @@ def _detected(camera: CameraDetector, kind: str, data: bytes) -> bytes | None:
 
 
 def _calibrate(camera: CameraDetector, data: bytes) -> None:
-    """Use a calibration; `trouble` of the camera says why it cannot be used."""
+    """Set a calibration; if it cannot be used, `trouble` of the camera states why."""
     try:
         message = decode(data, _CAMERA_INFO)
     except CdrError:

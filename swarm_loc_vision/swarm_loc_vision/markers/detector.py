@@ -1,4 +1,4 @@
-"""Detector of square fiducial markers: an image in; ids, corners and poses out."""
+"""Detector of square fiducial markers: computes ids, corners and poses from an image."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from swarm_loc_vision.markers.quads import find_quads
 
 @dataclass(frozen=True)
 class DetectorSettings:
-    """Numbers of the detector."""
+    """Settings of the detector."""
 
     marker_length: float = number(
         0.05, "m", 0.001, 10.0, "side of markers without a length of their own, black border included"
@@ -44,13 +44,13 @@ class DetectorSettings:
 _ROUGH_PX = 3.0
 """Distance of the profiles across the sides of candidates [px]."""
 _MIN_EDGE = 2.0
-"""Least contrast of a candidate's sides over `min_contrast`, which is relative to the local mean."""
+"""Minimum contrast of a candidate's sides over `min_contrast`, which is relative to the local mean."""
 _MAX_CANDIDATES = 8192
-"""Bound on the candidates of an image; beyond it the smallest are dropped."""
+"""Maximum number of candidates per image; the smallest are dropped."""
 _BLOCK = 256
-"""Number of candidates that are read at once, to bound memory."""
+"""Number of candidates decoded at once, to limit memory."""
 _SAME = 0.3
-"""Readings closer than this share of a marker's diagonal are the same marker."""
+"""Maximum distance of duplicate readings, relative to a marker's diagonal."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +103,9 @@ class MarkerDetector:
     """Finds the markers in use.
 
     Args:
-        settings: Numbers of the detector.
+        settings: Settings of the detector.
         families: Ids in use of each family in use; None: all of its ids.
-        camera: The camera; without one there are no poses and no distortion.
+        camera: The camera; None: no poses, no distortion.
         lengths: Sides of markers that differ from `settings.marker_length`, by id [m].
         up: (3,) direction up in the camera frame, for `settings.tilt_sigma`.
         bodies: Bodies that carry several markers.
@@ -195,7 +195,7 @@ class MarkerDetector:
 
 
 def _best(markers: _Markers) -> _Markers:
-    """One reading per place: that with the fewest errors, then the highest contrast."""
+    """Remove duplicates: keeps the reading with the fewest errors, then the highest contrast."""
     if not len(markers.id):
         return markers
     middle, kept = markers.corners.mean(axis=1), np.zeros(len(markers.id), np.bool_)

@@ -21,11 +21,11 @@ from swarm_loc_vision.markers.sides import fit_sides
 
 _MIN_CROSSINGS = 3
 _MIN_SINE = 0.1
-"""Least sine of the angle between neighbouring sides."""
+"""Minimum sine of the angle between neighbouring sides."""
 _MIN_SIGMA_PX = 0.004
-"""Error of a line without noise, from print, lens and pixels."""
+"""Standard deviation of a line without noise, from print, lens and pixels."""
 _NEIGHBOUR_PX3 = 0.25
-"""Over the square of a cell's width [px]: the bias by neighbouring edges that blur into the side."""
+"""Bias by neighbouring edges that blur into the side, times the square of a cell's width [px]."""
 _SHARE_FRESH = 0.5
 """Share of independent information of crossings, which share pixels."""
 
@@ -45,7 +45,7 @@ class Corners(NamedTuple):
 
 
 def refine(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, spacing: float = 1.0) -> Corners:
-    """Move quadrangles to their edges.
+    """Refine quadrangles by lines fitted to their edges.
 
     Args:
         image: (height, width).

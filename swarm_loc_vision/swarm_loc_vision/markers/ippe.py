@@ -1,6 +1,6 @@
 """Initial poses of planar markers: Infinitesimal Plane-based Pose Estimation, Collins and Bartoli, IJCV 2014.
 
-The perspective of a plane at its centre leaves two rotations, mirrored about the line of sight. Frames are
+The perspective of a plane at its centre yields two rotations, mirrored about the line of sight. Frames are
 those of `pose`. `cv2.solvePnPGeneric` finds the same two poses, to 1e-11 m after refinement, but takes 28 us
 per marker instead of 0.3 us.
 """

@@ -21,14 +21,14 @@ from swarm_loc_vision.markers.ippe import two_starts
 
 _ROUNDS = 12
 _STILL = 1e-6
-"""Weighted square of a step below which the search ends."""
+"""Threshold of the weighted squared step at convergence."""
 _NOWHERE = 1e12
 _TRUST = 6.0
-"""Degrees of freedom that the covariance of the corners counts for. Where corners fit worse, as on a partly
-covered marker, the covariance of the pose grows. A single marker has two degrees of freedom."""
+"""Prior degrees of freedom of the corners' covariance. The pose covariance is inflated where residuals are
+larger, as on a partly covered marker. A single marker has two degrees of freedom."""
 _MISFIT = 100.0
-"""Chi square, of two degrees of freedom, above which the model is wrong, not the noise: a lens that is not
-the calibrated one, or a bent marker."""
+"""Threshold of chi square, with two degrees of freedom, for a model error such as a wrong calibration or a
+bent marker."""
 _SAME = 1.0 + 2.0 * math.cos(0.05)
 """Solutions with less than 0.05 rad between their rotations are the same. The sum of the elementwise product
 of two rotations is 1 + 2 cos of the angle between them."""
@@ -97,9 +97,9 @@ def marker_poses(
     intrinsics: FloatArray,
     upright: Upright | None = None,
 ) -> tuple[Poses, NDArray[np.bool_]]:
-    """Solve for the poses of markers; returns also which markers misfit.
+    """Solve for the poses of markers; also returns which markers misfit.
 
-    There is one solution where both initial poses lead to the same. For a misfit, the variance of the
+    There is one solution where both initial poses converge to the same. For a misfit, the variance of the
     residuals of plain least squares is added to the covariance of the corners.
 
     Args:

@@ -23,14 +23,14 @@ from swarm_loc_vision.common.images import Gray
 IntArray = NDArray[np.int32]
 
 _MIN_SIDE_PX = 3
-"""Least size of an image with inner pixels."""
+"""Minimum size of an image with inner pixels."""
 _DARK = 255
 _FOLLOWED = 1
 """Value of a dark pixel on a followed outline whose left neighbour is light."""
 _SAME = 0.15
-"""Quadrangles closer than this share of their size are the same."""
+"""Maximum distance of duplicate quadrangles, relative to their size."""
 _NOISE_SIGMAS = 1.25
-"""Least contrast over the noise; with less, specks of noise would take most of the time."""
+"""Minimum ratio of contrast to noise; below it, specks of noise would dominate the run time."""
 _SMOOTHING_PX = 0.5
 """Standard deviation of the blur that keeps outlines connected; more would close narrow cells."""
 _NOISE_ROWS = 16
@@ -38,19 +38,19 @@ _NOISE_ROWS = 16
 _DEVIATION = 0.75
 """Standard deviation of noise, blurred as above, over the median of its second differences."""
 _MIN_AREA = 0.6
-"""Least area of a quadrangle over the square of the least side."""
+"""Minimum area of a quadrangle over the square of the minimum side."""
 _MIN_COMPACTNESS = 0.008
-"""Least area of a quadrangle over the square of its outline. A square seen at 75 degrees has 0.04, and a
+"""Minimum area of a quadrangle over the square of its outline. A square seen at 75 degrees has 0.04, and a
 fourth of that if the outline leads through a gap and around the inside."""
 _SLACK_PX, _SLACK = 1.0, 0.05
-"""Largest distance of an outline from its side: pixels, and a share of its length. Points farther away, as at
-a gap or at something on the border, are left out."""
+"""Maximum distance of an outline from its side: pixels, and a share of its length. Points farther away, as at
+a gap or an obstacle on the border, are ignored."""
 _MIN_SEEN = 0.5
-"""Least share of a side that the outline follows."""
+"""Minimum share of a side that the outline covers."""
 _LEFT = 4
 """Index of the direction to the left; the eight directions count counter-clockwise from the right."""
 _LONGEST_OUTLINE = 4
-"""Bound on the points of an outline, over height plus width of the image."""
+"""Maximum number of points of an outline, relative to height plus width of the image."""
 WINDOWS = ((7, 25), (35,))
 """Sides of the neighbourhoods of the local mean [px], in full and in half resolution."""
 
@@ -60,8 +60,8 @@ def find_quads(gray: Gray, min_side: float, min_contrast: float) -> FloatArray:
 
     Args:
         gray: (height, width).
-        min_side: Least side of a quadrangle [px].
-        min_contrast: Least difference from the local mean [counts]; raised for noisy images.
+        min_side: Minimum side of a quadrangle [px].
+        min_contrast: Minimum difference from the local mean [counts]; raised for noisy images.
 
     Returns:
         (N, 4, 2) corners, clockwise in the image, on the boundary between dark and light [px].
@@ -84,7 +84,7 @@ def find_quads(gray: Gray, min_side: float, min_contrast: float) -> FloatArray:
 
 
 def _distinct(quads: FloatArray) -> FloatArray:
-    """Remove those at the place and with the size of an earlier one."""
+    """Remove quadrangles with the position and size of an earlier one."""
     if not len(quads):
         return quads
     middle = quads.mean(axis=1)
@@ -134,8 +134,8 @@ def _follow(
         dark: (height * width) 255 where dark; modified, see `_FOLLOWED`.
         eights: (height, width / 8) the same memory.
         ahead: (8,) offsets of the neighbours of a pixel in the eight directions.
-        min_side: Least side of a quadrangle [px].
-        points: Memory for an outline; longer ones are no markers.
+        min_side: Minimum side of a quadrangle [px].
+        points: Memory for an outline; longer ones are rejected.
     """
     height, words = eights.shape
     width = 8 * words
@@ -176,7 +176,7 @@ def _outline(dark: NDArray[np.uint8], ahead: NDArray[np.int64], start: int, poin
     Border following of Suzuki and Abe (1985), 8-connected.
 
     Returns:
-        Number of its points. As many as fit are written to points[:, 0], as indices of `dark`.
+        Number of its points. Those that fit are written to points[:, 0], as indices of `dark`.
     """
     dark[start] = _FOLLOWED
     back = -1

@@ -19,9 +19,9 @@ from swarm_loc_vision.common.images import Gray
 from swarm_loc_vision.common.sampling import homographies
 
 REACH_PX, INNER_REACH_PX = 7.0, 3.5
-"""Largest distance of pixels from a side, and from the inner edge of its border."""
+"""Maximum distance of pixels from a side, and from the inner edge of its border."""
 _MAX_ROWS = 32
-"""Bound on the rows or columns of pixels across a side; they are spread evenly over longer sides."""
+"""Maximum number of rows or columns of pixels across a side; spread evenly over longer sides."""
 _ROOM = 4 * (_MAX_ROWS + 1) * (2 * math.ceil(math.sqrt(2.0) * (REACH_PX + INNER_REACH_PX)) + 4)
 _NODES = 6
 """Points at a side whose shift is computed: start, middle and end on it, and one pixel outside of these."""

@@ -41,7 +41,7 @@ _OF_SIDE = 2 + _PARAMETERS - _ENDS
 """Parameters of a pixel: the two ends of its side, and those that all sides share."""
 _ROUNDS = 5
 _STILL = 0.2
-"""Largest motion of an end in the last round, in standard deviations."""
+"""Maximum motion of an end at convergence, in standard deviations."""
 _FIRST_BLUR, _MIN_BLUR, _MAX_BLUR = 0.45, 0.08, 12.0
 """Variance of the blur [px^2]."""
 _BLUR_FREEDOM = 4.0
@@ -54,11 +54,11 @@ _CLEAR = 1.6
 """Distance of the window from unknown areas: beyond the margin, behind the first row of cells [blurs]."""
 _CLEAR_OF_CORNERS = 1.8
 _MAX_SHIFT_PX = 1.5
-"""Largest motion of a corner in the fit."""
+"""Maximum motion of a corner in the fit."""
 _OUTLIER = 4.0
 """Residual above which the weight of a pixel decreases, in standard deviations."""
 _MIN_NOISE = 0.5
-"""Lower bound of the standard deviation of a pixel [counts]."""
+"""Minimum standard deviation of a pixel [counts]."""
 _MIN_SIGMA_PX = 0.01
 """Error of an end without noise. Blur is not exactly Gaussian: that of a shutter or of a defocused lens
 shifts edges by about 0.01 px, depending on their place in the pixels."""
@@ -67,7 +67,7 @@ _NEIGHBOURS = 0.7
 _TABLE_END, _TABLE_STEPS = 5.0, 256.0
 _NORMAL = ndtr(np.arange(-_TABLE_END, _TABLE_END, 1.0 / _TABLE_STEPS))
 _BY_CHANCE, _CLEARLY_WHITE = 3.0, 0.7
-"""Displacement of white cells behind the border by noise [standard deviations]; least whiteness."""
+"""Maximum displacement of white cells behind the border by noise [sigma]; minimum whiteness."""
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
 
 
@@ -149,8 +149,7 @@ def _fit(pixels: SidePixels, n: int, strips: Bits, border: int, work: _Work) -> 
 def _add_doubts(frames: FloatArray, border: int, work: _Work) -> None:
     """Add model errors to the covariance of the ends.
 
-    Where the cells behind the border are displaced, something covers the side, which may be displaced as
-    much.
+    Displaced cells behind the border indicate an occluded side, which may be displaced by the same amount.
     """
     for k in range(4):
         cell = min(frames[k, NEAR], frames[k, FAR]) / border
@@ -314,7 +313,7 @@ def _set_levels(work: _Work) -> bool:
 
 @cached_njit
 def _add_knowledge(noise: float, work: _Work) -> None:
-    """Add priors: blur is narrow, light is even."""
+    """Add the priors on the blur and on the gradient of the light."""
     p, normal, gradient = work.p, work.normal, work.gradient
     for i in (_LIGHT_X, _LIGHT_Y):
         weight = (noise / _LIGHT_FREEDOM) ** 2

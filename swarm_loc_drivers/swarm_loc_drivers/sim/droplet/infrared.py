@@ -1,4 +1,4 @@
-"""Infrared channel between Droplets: messages that get lost or collide, exchanges of brightness."""
+"""Infrared channel between Droplets: messages with losses and collisions, and brightness exchanges."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class InfraredCommand(NamedTuple):
 
     Attributes:
         line: The command.
-        end_ns: When its last byte arrived.
+        end_ns: Arrival time of its last byte.
     """
 
     line: str
@@ -44,7 +44,7 @@ class ExchangeReadings(NamedTuple):
 
 
 def overlap(one: InfraredMessage | Exchange, other: InfraredMessage | Exchange) -> bool:
-    """Whether two transmissions are on their way at the same time."""
+    """Whether two transmissions overlap in time."""
     return one.begin_ns < other.end_ns and one.end_ns > other.begin_ns
 
 
@@ -54,10 +54,10 @@ class InfraredMessage:
 
     Attributes:
         sender: Index of the robot.
-        begin_ns: When.
+        begin_ns: Start of the transmission.
         end_ns: End of the transmission.
-        hearers: Indices of the robots in its reach at its begin.
-        line: The command; "" for the call that begins an exchange.
+        hearers: Indices of the robots in range at its start.
+        line: The command; "" for the call that starts an exchange.
         target: Id of the receiver; 0: all.
     """
 
@@ -70,7 +70,7 @@ class InfraredMessage:
     done: bool = False
 
     def reaches(self, robot: int) -> bool:
-        """Whether a robot sends it or may hear it."""
+        """Whether a robot is its sender or in range."""
         return robot == self.sender or robot in self.hearers
 
 
@@ -80,12 +80,12 @@ class Exchange:
 
     Attributes:
         emitter: Index of the robot.
-        begin_ns: When the call began.
-        power: Of its emitters.
-        receivers: (k,) indices of the robots that have heard the call.
-        readings: (k, n, n) emitters by sensors, as far as measured.
-        flashes: How many.
-        done: Whether it is over and its readings are delivered.
+        begin_ns: Start of the call.
+        power: Power of the emitters.
+        receivers: (k,) indices of the robots that received the call.
+        readings: (k, n, n) emitters by sensors, measured so far.
+        flashes: Number of flashes.
+        done: Whether its readings have been delivered.
     """
 
     emitter: int
@@ -98,7 +98,7 @@ class Exchange:
 
     @property
     def end_ns(self) -> int:
-        """When the last flash is over."""
+        """End of the last flash [ns]."""
         return self.begin_ns + timing.EXCHANGE_NS
 
     def has(self, robot: int) -> bool:
@@ -158,7 +158,7 @@ class DropletLight:
     def _blocked(
         self, poses: FloatArray, receivers: NDArray[np.int64], transmitter: int, emitter: int
     ) -> BoolArray:
-        """Which sensors (k, n) have another robot between them and the emitter."""
+        """Sensors (k, n) with another robot between them and the emitter."""
         sensors = se2.transform_points(poses[receivers, None], self._elements)
         lit = se2.transform_points(poses[transmitter], self._elements[emitter])
         others = np.ones((len(receivers), len(poses)), dtype=bool)
@@ -180,7 +180,7 @@ def distance_to_segments(begins: FloatArray, end: FloatArray, points: FloatArray
 
 
 _REMEMBERED_NS = 1_000_000_000
-"""Messages and exchanges are kept for this time after their end, longer than any message takes."""
+"""Time for which messages and exchanges are kept after their end; exceeds the longest message."""
 _BASELINE_PERIOD_NS = 5_407_000_000
 _DRIFT_NS = 100_000_000
 _RECEIVING, _TRANSMITTING, _TIMED, _BLOCKED = 1, 2, 4, 8
@@ -191,10 +191,10 @@ class InfraredSettings:
     """Losses and ambient light of infrared; messages do not disturb measurements.
 
     Attributes:
-        reach: How far messages reach [m].
-        loss: Share of messages that a robot in reach does not understand, each robot by itself.
-        ambient: Largest light that sensors read without any emitter [count].
-        ambient_walk: How it changes, one standard deviation after a second [count].
+        reach: Maximum range of messages [m].
+        loss: Probability that a robot in range loses a message, independent per robot.
+        ambient: Maximum ambient light [count].
+        ambient_walk: Standard deviation of the change of ambient light in one second [count].
     """
 
     reach: float
@@ -204,18 +204,18 @@ class InfraredSettings:
 
 
 class DropletInfrared:
-    """Carries messages and light.
+    """Transmits messages and light.
 
     Args:
         platform: The board of all robots.
-        light: What falls on sensors.
-        ids: (N,) of the robots.
-        settings: How it fails.
-        rng: Source of what is random.
-        now_ns: First moment.
+        light: Light on the sensors.
+        ids: (N,) ids of the robots.
+        settings: Losses and ambient light.
+        rng: Random generator.
+        now_ns: Start time.
 
     Attributes:
-        heard: Per robot the commands and readings that were not fetched yet.
+        heard: Per robot the commands and readings not fetched yet.
         deaf_until_ns: Per robot the end of its last exchange [ns].
         counts: Events by name.
     """
@@ -243,14 +243,14 @@ class DropletInfrared:
         self.counts: Counter[str] = Counter()
 
     def send(self, sender: int, line: str, target: int, poses: FloatArray) -> None:
-        """A robot begins to send a command."""
+        """Start the transmission of a command."""
         end_ns = self._now_ns + timing.message_ns(len(line))
         self._messages.append(
             InfraredMessage(sender, self._now_ns, end_ns, self._in_reach(sender, poses), line, target)
         )
 
     def emit(self, emitter: int, power: int, poses: FloatArray) -> None:
-        """A robot begins an exchange."""
+        """Start an exchange."""
         end_ns = self._now_ns + timing.CALL_NS
         self._messages.append(InfraredMessage(emitter, self._now_ns, end_ns, self._in_reach(emitter, poses)))
         self._exchanges.append(Exchange(emitter, self._now_ns, power))
@@ -268,7 +268,7 @@ class DropletInfrared:
         return status
 
     def step(self, now_ns: int, poses: FloatArray) -> None:
-        """Let time pass."""
+        """Advance the time."""
         self._now_ns = now_ns
         if now_ns >= self._drift_due_ns:
             self._drift()
@@ -291,7 +291,7 @@ class DropletInfrared:
         self._messages = [one for one in self._messages if one.end_ns > now_ns - _REMEMBERED_NS]
 
     def _in_reach(self, sender: int, poses: FloatArray) -> NDArray[np.int64]:
-        """Indices of the robots to which messages of a robot come through."""
+        """Indices of the robots in range of a robot that no other robot occludes."""
         places = poses[:, :2]
         near = np.linalg.norm(places - places[sender], axis=1) <= self._settings.reach
         between = distance_to_segments(places, places[sender], places) < self._platform.radius
@@ -316,7 +316,7 @@ class DropletInfrared:
                 self.heard[robot].append(InfraredCommand(message.line, message.end_ns))
 
     def _is_clear(self, robot: int, message: InfraredMessage) -> bool:
-        """Whether a robot was free during a whole message, and received no other one."""
+        """Whether a robot was idle during a whole message and received no other one."""
         if any(
             one.has(robot) and overlap(one, message) and one.emitter != message.sender
             for one in self._exchanges
@@ -328,7 +328,7 @@ class DropletInfrared:
         )
 
     def _begin_to_measure(self, call: InfraredMessage, receivers: NDArray[np.int64]) -> None:
-        """Register the robots that heard a call as receivers of its exchange."""
+        """Register the robots that received a call as receivers of its exchange."""
         for exchange in self._exchanges:
             if exchange.emitter == call.sender and exchange.begin_ns == call.begin_ns:
                 exchange.receivers = receivers
@@ -342,7 +342,7 @@ class DropletInfrared:
         exchange.flashes += 1
         at_ns = exchange.begin_ns + timing.flash_ns(emitter)
         light = self._ambient[receivers]
-        for one in self._exchanges:  # others may emit at the same time
+        for one in self._exchanges:  # other robots may emit at the same time
             lit = one.lit(at_ns)
             if lit is not None and len(receivers):
                 light = light + self._light.falling_on(poses, receivers, one.emitter, lit, one.power)
@@ -359,7 +359,7 @@ class DropletInfrared:
             self.heard[robot].append(ExchangeReadings(emitter, readings, exchange.end_ns))
 
     def _drift(self) -> None:
-        """Let the ambient light drift; robots measure it from time to time."""
+        """Let the ambient light drift; robots measure it periodically."""
         self._drift_due_ns += _DRIFT_NS
         walk = self._settings.ambient_walk * np.sqrt(_DRIFT_NS * 1e-9)
         self._ambient = np.abs(self._ambient + walk * self._rng.standard_normal(self._ambient.shape))

@@ -1,7 +1,6 @@
-"""A world of Droplets with the drivers' own sessions at their consoles, all in simulated time in one thread.
+"""A world of Droplets with the drivers' sessions at their consoles, in simulated time and one thread.
 
-The bytes are those that go over the cable, without delay. So runs behave as live ones, and are reproducible.
-every time.
+The bytes are those of the cable, without delay. So runs behave like live ones and are reproducible.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ STRIDE_S = 2.0
 
 
 class Cable:
-    """A robot at a cable: its console, and the driver's session.
+    """A robot connected by cable: its console and the driver's session.
 
     Args:
-        world: Where the robot lives.
+        world: The world of the robot.
         robot: Its index.
-        settings: Of the session.
+        settings: Settings of the session.
         noise: The session's model of motion errors.
-        publish: Gets the matrices of exchanges.
+        publish: Called with the matrices of exchanges.
 
     Attributes:
-        firmware: Who answers at the console.
-        session: The conversation.
+        firmware: The firmware at the console.
+        session: The session of the driver.
         counts: Events of the session by name.
     """
 
@@ -65,7 +64,7 @@ class Cable:
         return self._motion.state(self._world.now_ns)
 
     def step(self) -> None:
-        """Exchange bytes until both ends are silent."""
+        """Exchange bytes until neither end sends."""
         data = self.firmware.stream()
         while not self.session.ended:
             output = self.session.step(data, self._world.now_ns)
@@ -79,13 +78,13 @@ class Cable:
 def run(
     world: DropletWorld, robots: Sequence[Callable[[], object]], steps: int, control: Callable[[], None]
 ) -> None:
-    """Let time pass.
+    """Advance the simulation.
 
     Args:
         world: The world.
-        robots: Let each of its robots work, such as `Cable.step`.
-        steps: How many steps of the world.
-        control: Called after every step; sets velocities, keeps records.
+        robots: Step function of each robot, such as `Cable.step`.
+        steps: Number of steps of the world.
+        control: Called after every step, to set velocities and record data.
     """
     for _ in range(steps):
         world.step()

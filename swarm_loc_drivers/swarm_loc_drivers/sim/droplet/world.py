@@ -1,7 +1,7 @@
-"""One world of Droplets, stepped in simulated time: motors shake, robots creep and veer, infrared flashes.
+"""A simulated world of Droplets: motion by vibration motors, infrared exchanges, an optional tracker.
 
-The seed and the times of the robots' commands fix what happens. A tracker above the table sees some robots.
-At the end stand the parameters of `droplet_world_node`. No ROS here.
+The seed and the times of the robots' commands determine the result. A tracker above the table measures the
+poses of some robots. The end of the file has the parameters of `droplet_world_node`. No ROS here.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ class DropletErrors:
         veer_noise: Variance of the heading per metre walked [rad^2/m].
         turn_noise: Variance of a turn per radian [rad^2/rad].
         gain_sigma: Of each sensor and each emitter, relative.
-        infrared: How infrared fails.
+        infrared: Losses and ambient light of infrared.
     """
 
     scale_sigma: float
@@ -122,11 +122,11 @@ class DropletWorldSettings:
     """Settings of a world.
 
     Attributes:
-        seed: Fixes its systematic errors and its noise.
-        errors: Which errors there are.
+        seed: Seed of systematic errors and noise.
+        errors: Error model.
         platform: The infrared board of all robots.
-        start_ns: First moment.
-        boards: Fixes the gains of the elements instead of `seed`.
+        start_ns: Start time.
+        boards: Seed of the gains of the elements, instead of `seed`.
     """
 
     seed: int
@@ -156,7 +156,7 @@ class DropletWorld:
         self.ids = np.array(ids, dtype=np.int64)
         self.now_ns = settings.start_ns
         self.poses: FloatArray = np.array(start, dtype=float)
-        """(N, 3) where the robots truly are now, in map."""
+        """(N, 3) true poses of the robots in map."""
         self._twists = np.zeros((count, 3))
         self._true = self._true_velocities(count)
         rng = self._random(settings.seed if settings.boards is None else settings.boards, _GAINS)
@@ -215,10 +215,10 @@ def nominal_gait(direction: int) -> Gait:
 
 
 class SimulatedDroplet:
-    """One robot of a world as its firmware finds it; see `DropletBody`.
+    """One robot of a world as seen by its firmware; see `DropletBody`.
 
     Args:
-        world: Where it lives.
+        world: The world of the robot.
         robot: Its index.
     """
 
@@ -234,7 +234,7 @@ class SimulatedDroplet:
         self._world.move(self._robot, direction)
 
     def infrared_status(self) -> int:
-        """What keeps infrared busy."""
+        """Status bits of infrared."""
         return self._world.infrared.status(self._robot)
 
     def send(self, line: str, target: int) -> None:
@@ -246,7 +246,7 @@ class SimulatedDroplet:
         self._world.infrared.emit(self._robot, power, self._world.poses)
 
     def heard(self) -> Sequence[InfraredCommand | ExchangeReadings]:
-        """What has come since the last call."""
+        """Commands and readings since the last call."""
         everybody = self._world.infrared.heard
         heard = everybody[self._robot]
         if heard:
@@ -254,7 +254,7 @@ class SimulatedDroplet:
         return heard
 
     def deaf_until_ns(self) -> int:
-        """When the firmware has time again [ns]."""
+        """End of the current exchange [ns]."""
         return self._world.infrared.deaf_until_ns[self._robot]
 
     @property
@@ -318,10 +318,10 @@ def make_droplet_world(parameters: DropletWorldParameters) -> tuple[Swarm, Dropl
 
 
 def check_droplets(swarm: Swarm) -> None:
-    """Make sure that every robot has a start and an infrared board.
+    """Check that every robot has a start and an infrared board.
 
     Raises:
-        WorldError: One has none.
+        WorldError: A robot lacks one of them.
     """
     for robot in swarm.robots:
         _needed(robot)

@@ -1,7 +1,7 @@
 """One world of e-pucks, stepped in simulated time: motors turn wheels, wheels slip, cameras look.
 
-The seed and the times of the robots' commands fix what happens; images are drawn only on demand, and look
-the same whenever that is. At the end stand the parameters of `epuck_world_node`. No ROS here.
+The seed and the times of the robots' commands determine the result. Images are rendered on demand and do not
+depend on the time of rendering. The parameters of `epuck_world_node` are at the end. No ROS here.
 """
 
 from __future__ import annotations
@@ -120,7 +120,7 @@ class EpuckWorld:
         self._slip = LastingNoise(rng, (count, 2), STEP_NS * 1e-9, _SLIP_S)
         self.now_ns = settings.start_ns
         self.poses: FloatArray = np.array([robot.start for robot in swarm.robots], dtype=float)
-        """(N, 3) where the robots truly are now, in map."""
+        """(N, 3) true poses of the robots in map."""
         self.rates: FloatArray = np.zeros((count, 2))
         """(N, 2) of the left and the right wheel, as commanded [steps/s]."""
         self.steps: FloatArray = np.zeros((count, 2))
@@ -212,10 +212,10 @@ class EpuckWorld:
 
 
 class SimulatedEpuck:
-    """One robot of a world as its firmware finds it; see `EpuckBody`.
+    """One robot of a world as seen by its firmware; see `EpuckBody`.
 
     Args:
-        world: Where it lives.
+        world: The world of the robot.
         robot: Its index.
     """
 

@@ -1,4 +1,4 @@
-"""What the commands of the emulated firmware act on: motors, timers, sensors, the stream of events."""
+"""State behind the commands of the emulated firmware: motors, timers, sensors, the event stream."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ _PWM_LIMIT = 9600
 """Counts of a PWM period of 50 us at 192 MHz."""
 _GAIN = 80
 _WINDUP = _PWM_LIMIT // _GAIN * 20
-"""The wanted position runs ahead of the wheel by no more ticks."""
+"""Maximum lead of the target position over the wheel [ticks]."""
 _PRESCALER = 20
 _DECAY_TENTHS = 10
 _MAX = 100
@@ -160,7 +160,7 @@ class Motor:
         self._velocity = _clamped(velocity)
 
     def decay(self) -> None:
-        """A tenth of a second has passed."""
+        """Process a tick of a tenth of a second."""
         if not self._decays:
             return
         if self._decay_left:
@@ -194,7 +194,7 @@ def _clamped(value: int) -> int:
 
 
 TX_BUFFER = 4096
-"""Bytes of text that may wait; then the main loop waits, and with it commands and motor control."""
+"""Capacity of the text buffer [bytes]; when full, it blocks the main loop with commands and motor control."""
 _BATTERY_MV, _BATTERY_BIT = 7400, 0
 _EVENT_RATE_BITS = {"first": 14, "second": 21}
 
@@ -269,7 +269,7 @@ class Board:
         self.say("".join([" Bit Name Values\n", *rows, "\n"]))
 
     def stream_events(self, on: bool) -> None:
-        """Send events from now on, or no more."""
+        """Start or stop sending events."""
         self.is_streaming = on
 
     def enable_motors(self, on: bool) -> None:
@@ -308,13 +308,13 @@ class Board:
         self._light_up()
 
     def start_sensors(self, mask: int, period_ms: int) -> None:
-        """Report sensors again and again; a period of 0 wraps to never."""
+        """Report sensors periodically; a period of 0 wraps to never."""
         for bit in self._bits(mask):
             count = self._sensors.get(bit, (0, period_ms))[1]
             self._sensors[bit] = (period_ms, count)
 
     def stop_sensors(self, mask: int) -> None:
-        """Report them no more."""
+        """Stop the reports."""
         for bit in self._bits(mask):
             self._sensors.pop(bit, None)
 

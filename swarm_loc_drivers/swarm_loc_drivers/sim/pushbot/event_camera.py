@@ -1,8 +1,8 @@
 """Events of a simulated event camera: blinking spots, edges that move, noise; refractory pixels, one bus.
 
-A pixel sends an event when the logarithm of its brightness has changed by its threshold. A light that is
-switched on makes each pixel of its image send a burst, the longer the brighter, one event after each
-refractory time.
+A pixel sends an event when the logarithm of its brightness has changed by its threshold. Switching
+a light on causes a burst at each pixel of its image, one event per refractory time; the brighter the light,
+the longer the burst.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Blinking(NamedTuple):
 
 
 _REACH_PX = 4
-"""Half the width of the part of the image that a spot is computed in."""
+"""Half width of the window in which a spot is computed [px]."""
 _WINDOW = np.arange(-_REACH_PX, _REACH_PX + 1)
 _MAX_BURST = 6
 _LATENCY_US = 20.0
@@ -46,7 +46,7 @@ _Raw = tuple[IntArray, IntArray, IntArray, FloatArray]
 
 @dataclass(frozen=True)
 class CameraNoise:
-    """How far an event camera is from an ideal one."""
+    """Noise and limits of an event camera."""
 
     noise_rate: float = number(
         1.0, "1/s", 0.0, 100.0, "noise events of each pixel of an event camera per second"
@@ -93,9 +93,9 @@ class EventCamera:
     """One sensor of 128 x 128 pixels.
 
     Args:
-        noise: How far it is from an ideal one.
-        rng: Source of all that is random from event to event.
-        sensor: Which one: seed of what its pixels are like for good.
+        noise: Noise and limits.
+        rng: Random generator of events.
+        sensor: Seed of the fixed properties of its pixels.
     """
 
     def __init__(self, noise: CameraNoise, rng: np.random.Generator, sensor: int) -> None:
@@ -200,7 +200,7 @@ class EventCamera:
 
 
 def _columns(columns: Sequence[NDArray[Any]], chosen: NDArray[Any]) -> _Raw:
-    """Some of the events."""
+    """A selection of events."""
     x, y, polarity, time_us = (column[chosen] for column in columns)
     return x, y, polarity, time_us
 

@@ -1,7 +1,7 @@
 """PushBots that explore a floor plan without firmware: truth, odometry, distances, and a mapper's goals.
 
-What the firmware's emulator does byte by byte is done here a whole turn or drive at a time, so that hundreds
-of hours of mapping can be simulated.
+Unlike the firmware emulator, which processes single bytes, each call simulates a whole turn or drive, so that
+hundreds of hours of mapping can be simulated.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ FOCAL_BASELINE = 90.0 * 0.07
 """Focal length times distance of laser and lens [px m]."""
 _MAX_PX = 40.0
 _NEAREST, _FARTHEST = 0.10, 2.5
-"""Between these distances a reflection is seen [m]."""
+"""Minimum and maximum distance of a reflection [m]."""
 _LED_RADIUS = 0.045
 _LED_RANGE = 3.0
 _HALF_FIELD = math.radians(35.0)
@@ -44,10 +44,10 @@ class PushBotNoise:
         turn: Of a turn, per square root of a full turn [rad].
         distance: Of a drive, per path.
         heading: While driving, per square root of a metre [rad].
-        pixel: Of where the tracker sees the laser [px].
-        dropout: Share of readings that see nothing.
+        pixel: Of the tracked row of the laser spot [px].
+        dropout: Share of readings without reflection.
         outlier: Share of readings that are outliers.
-        bearing: Of where it sees a light [rad].
+        bearing: Of the bearing of a light [rad].
     """
 
     slip: float = 0.0
@@ -70,9 +70,9 @@ class KinematicPushBot:
         rng: Source of the noise.
 
     Attributes:
-        time_s: Until now.
-        trace: (n, 3) true pose every `PERIOD_S` until now.
-        bumps: How often an obstacle stopped it.
+        time_s: Current time [s].
+        trace: (n, 3) true pose every `PERIOD_S` so far.
+        bumps: Number of stops by obstacles.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ def _distances(walls: FloatArray, discs: FloatArray, poses: FloatArray) -> Float
 
 @cached_njit
 def _free_steps(walls: FloatArray, discs: FloatArray, start: FloatArray, poses: FloatArray) -> int:
-    """How many of the steps to poses (n, 3) a robot can make before it touches something."""
+    """Number of steps along poses (n, 3) before a collision."""
     before = clearance(walls, discs[0], BODY_RADIUS, start[0], start[1])
     for k in range(len(poses)):
         room = clearance(walls, discs[k], BODY_RADIUS, poses[k, 0], poses[k, 1])
@@ -254,22 +254,22 @@ _REST_S = 1.2
 
 
 class Mapper(Protocol):
-    """A mapper that makes a map of readings and chooses goals."""
+    """A mapper that builds a map from readings and sets goals."""
 
     def join(self, pose: FloatArray, sigma: FloatArray) -> int:
-        """Let a robot join; its number."""
+        """Add a robot; returns its number."""
 
     def add_readings(self, robot: int, readings: Readings) -> None:
-        """Take readings."""
+        """Process readings."""
 
     def add_lights(self, robot: int, sightings: LightSightings) -> None:
-        """Take sightings of lights."""
+        """Process sightings of lights."""
 
     def pose(self, robot: int) -> FloatArray | None:
         """The pose of a robot now."""
 
     def goal(self, robot: int) -> Goal | None:
-        """Where it should go."""
+        """The next goal of a robot."""
 
 
 @dataclass(frozen=True)
@@ -350,7 +350,7 @@ class Exploration:
         else:
             self._go(robot, body, others)
             self._feed(robot, body.turn(SCAN_TURN, others))
-        if self.mapper.goal(robot) is None:  # it has slipped a lot: a rest ends the scan
+        if self.mapper.goal(robot) is None:  # after much slip, a rest ends the scan
             self._feed(robot, body.rest(_REST_S, others))
         online = self.mapper.pose(robot)
         known = np.full(3, np.nan) if online is None else online
@@ -368,7 +368,7 @@ class Exploration:
             self._feed(robot, body.drive(length, others))
 
     def _feed(self, robot: int, readings: Readings) -> None:
-        """Give readings to the mapper, and what was seen of others."""
+        """Pass readings and sightings of other robots to the mapper."""
         self._odometry[robot] = readings.odometry[-1]
         others = {key: one for key, one in self.robots.items() if key != robot}
         sightings = self.robots[robot].lights(readings, others) if self.use_lights and others else None

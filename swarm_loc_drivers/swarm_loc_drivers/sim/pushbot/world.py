@@ -1,7 +1,7 @@
 """One world of PushBots, stepped in simulated time: motors, slipping wheels, walls, lasers, event cameras.
 
-The seed and the times of the robots' commands fix what happens. At the end stand the parameters of
-`pushbot_world_node`. No ROS here.
+The seed and the times of the robots' commands determine the result. The parameters of `pushbot_world_node`
+are at the end. No ROS here.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ class PushbotWorld:
         count = len(starts)
         self.now_ns = _START_NS
         self.poses: FloatArray = np.array(starts, dtype=float).reshape(count, 3)
-        """(N, 3) where the robots truly are, in map."""
+        """(N, 3) true poses of the robots in map."""
         self.drivetrain = Drivetrain(count, 1e-3)
         self.optics = assembled_robots(params.seed, count)
         """Optics of the robots, for evaluation."""
@@ -127,7 +127,7 @@ class PushbotWorld:
         """Laser, rear and front LED of each robot."""
         self.firmwares: list[StepsAlong | None] = [None] * count
         self.sight = HallSight(plan.walls, self.optics, params.camera, rng)
-        """What their cameras see."""
+        """The event cameras of the robots."""
         self._slip = LastingNoise(rng, (count, 3), STEP_NS * 1e-9, _SLIP_S)
         self._drive = Drive(params.wheel_separation, params.wheel_noise, params.turn_slip)
         for robot in range(count):
@@ -179,10 +179,10 @@ class PushbotWorld:
 
 
 class SimulatedPushbot:
-    """One robot of a world as its firmware finds it; see `PushbotBody`.
+    """One robot of a world as seen by its firmware; see `PushbotBody`.
 
     Args:
-        world: Where it lives.
+        world: The world of the robot.
         robot: Its index.
     """
 

@@ -1,10 +1,10 @@
 """Rasterize planar patches by exact area coverage: a pixel's value is the mean over its whole square.
 
-Pixel (0, 0) is the square around the image point (0, 0), as OpenCV counts. A boundary does not paint an
-area, it notes by how much the image changes across it: in every row that it crosses it leaves signed shares
-of that change, and the running sum along the row is the exact mean over every pixel (box filter). Boundaries
-simply add up. So nested patches need no order, an image averaged over an exposure costs more boundaries but
-no more pixels, and nothing is sampled: no aliasing, no bias.
+Pixel (0, 0) is the square around the image point (0, 0), as OpenCV counts. A boundary stores
+the change of brightness across it: in every row that it crosses it adds signed shares of that change, and the
+cumulative sum along the row is the exact mean over every pixel (box filter). Boundaries are additive, so
+nested patches need no order, averaging over an exposure adds boundaries but no pixels, and there is no
+aliasing.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ Changes = NDArray[np.float32]
 
 
 class Layer(NamedTuple):
-    """What was noted of something to be drawn.
+    """Changes of brightness and opacity of an object.
 
     Attributes:
-        changes: Of the brightness.
-        covers: Of what hides the background.
+        changes: Changes of the brightness.
+        covers: Changes of the opacity.
         box: (4,) left, top, right and bottom [px] of it.
     """
 
@@ -128,7 +128,7 @@ CORNERS = 12  # a quadrangle cut by five planes has at most nine
 
 @cached_njit
 def _inside(plane: int, reach: float, point: FloatArray) -> float:
-    """How far a point lies inside one of the five planes around what is drawn; negative outside."""
+    """Signed distance of a point inside one of the five clipping planes; negative outside."""
     x, y, z = float(point[0]), float(point[1]), float(point[2])
     if plane == 0:
         return z - _NEAR
