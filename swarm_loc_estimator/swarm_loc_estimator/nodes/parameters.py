@@ -51,10 +51,10 @@ class MapperParameters:
 
 
 def chosen_robots(wanted: Collection[str], known: Collection[str]) -> list[str]:
-    """The names of the robots that map, in the order of the description.
+    """Names of the robots that map, in the order of the description; all of `known` if none is wanted.
 
     Raises:
-        ParameterError: One of those wanted is not known.
+        ParameterError: A wanted robot is not in the description.
     """
     for name in wanted:
         if name not in known:
@@ -69,10 +69,10 @@ class PlayerParameters:
     bag: str = text("", "a rosbag2 folder, or an .mcap or .db3 file", required=True)
     rate: float = number(1.0, "1", 0.01, 1000.0, "bag seconds per second")
     loop: bool = flag(False, "play again from the beginning at the end, without limit")
-    start_offset_s: float = number(0.0, "s", 0.0, 1e9, "how much of the bag's beginning to leave out")
+    start_offset_s: float = number(0.0, "s", 0.0, 1e9, "offset in the bag at which playing begins")
     topics: tuple[str, ...] = texts("topics to play; all when empty")
     wait_for_subscribers: int = number(
-        0, "1", 0, 100000, "begin when at least so many topics, and /clock, have a subscriber; 0: at once"
+        0, "1", 0, 100000, "number of topics, besides /clock, that need a subscriber first; 0: do not wait"
     )
     clock: bool = flag(True, "publish /clock")
 

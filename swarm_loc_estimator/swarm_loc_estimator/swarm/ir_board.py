@@ -99,33 +99,29 @@ class IrPlatform:
     emitter: AngleCurve
     amplitudes: tuple[Amplitude, ...]
     radius: float = number(0.022, "m", 0.0, 10.0, "from the centre to the elements", above=True)
-    saturation: float = number(255.0, "count", 0.0, 1e9, "a reading tells no more from here on", above=True)
-    dark_level: float = number(
-        0.0, "count", -1e6, 1e6, "what sensors read on average where there is no light"
-    )
+    saturation: float = number(255.0, "count", 0.0, 1e9, "readings from here on are lower bounds", above=True)
+    dark_level: float = number(0.0, "count", -1e6, 1e6, "mean reading without light")
     noise: float = number(1.0, "count", 0.0, 1e6, "standard deviation of every reading", above=True)
-    relative_noise: float = number(0.0, "1", 0.0, 1.0, "noise besides, relative to the reading")
+    relative_noise: float = number(0.0, "1", 0.0, 1.0, "additional noise, relative to the reading")
     stray_noise: float = number(
         0.0,
         "1",
         0.0,
         1.0,
-        "noise besides, relative to the brightest reading: light by way of bodies and floor",
+        "additional noise, relative to the brightest reading: light reflected by bodies and floor",
     )
     curve_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "how far readings are off the curves, relative, the same every time"
+        0.0, "1", 0.0, 1.0, "relative systematic error of the curves, one standard deviation"
     )
-    blocked_share: float = number(
-        0.02, "1", 0.0, 0.5, "share of readings that something in between darkens; 0: none ever"
-    )
+    blocked_share: float = number(0.02, "1", 0.0, 0.5, "share of readings darkened by an obstacle; 0: none")
     bright_share: float = number(
-        0.0, "1", 0.0, 0.5, "share of readings that show light which the model has not; 0: none ever"
+        0.0, "1", 0.0, 0.5, "share of readings with light that is not in the model; 0: none"
     )
     covariance_scale: float = number(
-        1.0, "1", 1.0, 1e3, "what covariances are multiplied by, since errors have longer tails than noise"
+        1.0, "1", 1.0, 1e3, "factor on covariances, for errors with longer tails than the noise"
     )
     element_sigma: float = number(
-        0.1, "1", 0.0, 1.0, "how much elements differ, relative, one standard deviation; 0: not at all"
+        0.1, "1", 0.0, 1.0, "relative standard deviation of the gains of elements; 0: equal elements"
     )
 
     def __post_init__(self) -> None:

@@ -62,26 +62,24 @@ class OdometryModel:
     turn_drift: float = number(0.0, "rad^2/s", 0.0, 10.0, "variance of the turn per second while moving")
     distance_scale: float = number(1.0, "1", 0.1, 10.0, "true path per reported path")
     distance_scale_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "how unsure distance_scale is, relative; 0: exact, else it is estimated"
+        0.0, "1", 0.0, 1.0, "relative standard deviation of distance_scale; 0: exact, else estimated"
     )
     turn_scale: float = number(1.0, "1", 0.1, 10.0, "true turn per reported turn")
     turn_scale_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "how unsure turn_scale is, relative; 0: exact, else it is estimated"
+        0.0, "1", 0.0, 1.0, "relative standard deviation of turn_scale; 0: exact, else estimated"
     )
     turn_bias_sigma: float = number(
-        0.0, "rad/s", 0.0, 10.0, "size of a turn rate besides while moving, estimated; 0: there is none"
+        0.0, "rad/s", 0.0, 10.0, "standard deviation of a turn-rate bias while moving, estimated; 0: none"
     )
-    turn_bias_time_s: float = number(
-        60.0, "s", 0.1, 1e6, "time constant with which that turn rate changes (Gauss-Markov)"
-    )
+    turn_bias_time_s: float = number(60.0, "s", 0.1, 1e6, "time constant of this bias (Gauss-Markov)")
     course_offset: float = number(
         0.0, "rad", -math.pi, math.pi, "direction of motion against base_link's x axis"
     )
     axle_offset: float = number(0.0, "m", -1.0, 1.0, "base_link ahead of the wheels' axle")
     delay_s: float = number(0.0, "s", -2.0, 2.0, "the motion happens this much after its stamp")
     lag_s: float = number(0.0, "s", 0.0, 10.0, "time constant with which the motion follows the report")
-    timeout_s: float = number(1.0, "s", 0.01, 60.0, "after this much silence the motion counts as unknown")
-    max_speed: float = number(1.0, "m/s", 0.001, 100.0, "no step is believed that would need more")
+    timeout_s: float = number(1.0, "s", 0.01, 60.0, "time without messages after which the motion is unknown")
+    max_speed: float = number(1.0, "m/s", 0.001, 100.0, "steps that imply more are dropped")
     max_turn_rate: float = number(10.0, "rad/s", 0.01, 1000.0, "bounds the turn while the motion is unknown")
     speed_change: float = number(
         0.1, "m/s/s^0.5", 0.0, 100.0, "random walk of the speed past the newest message"
@@ -119,11 +117,9 @@ class SensorModel:
         "m",
         0.0,
         10.0,
-        "error forward and left besides the noise of the detection, such as of calibration",
+        "additional error forward and left, such as of calibration",
     )
-    residual_heading_sigma: float = number(
-        0.0, "rad", 0.0, 10.0, "error of the marker's heading besides the noise of the detection"
-    )
+    residual_heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "additional error of the marker's heading")
     range_sigma: float = number(
         0.15, "m", 0.0, 10.0, "noise of the range, sightings without heading", above=True
     )
@@ -133,9 +129,9 @@ class SensorModel:
     bearing_sigma: float = number(
         0.05, "rad", 0.0, 10.0, "noise of the bearing, sightings without heading", above=True
     )
-    distance_scale: float = number(1.0, "1", 0.1, 10.0, "distance as seen per true distance")
+    distance_scale: float = number(1.0, "1", 0.1, 10.0, "measured per true distance")
     distance_scale_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "how unsure distance_scale is, relative; 0: exact, else it is estimated"
+        0.0, "1", 0.0, 1.0, "relative standard deviation of distance_scale; 0: exact, else estimated"
     )
     range_log_scale: float = number(0.0, "1", -2.0, 2.0, "a of the range curve")
     range_skew: float = number(0.0, "1/rad", -10.0, 10.0, "c of the range curve")
@@ -143,15 +139,13 @@ class SensorModel:
         0.0, "1/rad^2", -10.0, 10.0, "q of the range curve; 0.5 when depth is logged as range"
     )
     range_offset: float = number(0.0, "m", -5.0, 5.0, "added to the scaled range")
-    robot_range_offset: float = number(0.0, "m", -5.0, 5.0, "added besides to the range of a robot's marker")
+    robot_range_offset: float = number(0.0, "m", -5.0, 5.0, "also added to the range of a robot's marker")
     bearing_curve: float = number(0.0, "1/rad", -10.0, 10.0, "quadratic term of the bearing")
     bearing_offset: float = number(0.0, "rad", -TURN, TURN, "added to the scaled bearing")
     bearing_scale: float = number(1.0, "1", 0.1, 10.0, "true bearing per logged bearing")
-    time_offset_s: float = number(
-        0.0, "s", -2.0, 2.0, "the picture was taken this much after its stamp (negative: before)"
-    )
+    time_offset_s: float = number(0.0, "s", -2.0, 2.0, "exposure time minus stamp of the image")
     time_sigma_s: float = number(
-        0.0, "s", 0.0, 2.0, "noise of that time from picture to picture, the same for all that one shows"
+        0.0, "s", 0.0, 2.0, "noise of the stamp of an image, common to its detections"
     )
     gate_probability: float = number(
         0.9999, "1", 0.5, 1.0, "share of good sightings that must pass the gate; 1 passes all"
@@ -170,7 +164,7 @@ class CameraMount:
     z: float = number(0.0, "m", -10.0, 10.0, "above base_link")
     yaw: float = number(0.0, "rad", -TURN, TURN, "turned to the left")
     yaw_sigma: float = number(
-        0.0, "rad", 0.0, 1.0, "how unsure yaw is; 0: exact, else it is estimated along with the pose"
+        0.0, "rad", 0.0, 1.0, "standard deviation of yaw; 0: exact, else estimated with the pose"
     )
     pitch: float = number(0.0, "rad", -TURN, TURN, "turned down")
     roll: float = number(0.0, "rad", -TURN, TURN, "turned about the optical axis")
@@ -199,7 +193,7 @@ class Face:
     yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of the face; null: shows no heading")
     size: float = number(0.036, "m", 0.001, 10.0, "side of the marker, black border included")
     position_sigma: float = number(
-        0.0, "m", 0.0, 10.0, "how unsure x and y are; adds to the noise of its sightings"
+        0.0, "m", 0.0, 10.0, "standard deviation of x and y; added to the noise of its sightings"
     )
 
 
@@ -225,9 +219,9 @@ class Landmark:
     yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of its face; null: shows no heading")
     size: float = number(0.05, "m", 0.001, 10.0, "side of the marker, black border included")
     position_sigma: float = number(
-        0.0, "m", 0.0, 100.0, "how unsure x and y are; 0: exact, else they are estimated along with the poses"
+        0.0, "m", 0.0, 100.0, "standard deviation of x and y; 0: exact, else estimated with the poses"
     )
-    yaw_sigma: float = number(0.0, "rad", 0.0, 10.0, "how unsure yaw is; 0: exact, else it is estimated")
+    yaw_sigma: float = number(0.0, "rad", 0.0, 10.0, "standard deviation of yaw; 0: exact, else estimated")
 
     @property
     def is_estimated(self) -> bool:
@@ -248,7 +242,7 @@ class StartSigma:
 class RandomWalk:
     """Random walk of a robot without odometry, given by the growth of its pose variance."""
 
-    position: float = number(0.0, "m^2/s", 0.0, 1e3, "variance of x and of y per second; 0: it stands")
+    position: float = number(0.0, "m^2/s", 0.0, 1e3, "variance of x and of y per second; 0: stationary")
     heading: float = number(0.0, "rad^2/s", 0.0, 1e3, "variance of the heading per second")
 
     @property
