@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure the layout of the code: `make house`; `--list FIGURE` names the places behind a figure.
+"""Measure the layout of the code: `make house`; `--list FIGURE` lists the places that a figure counts.
 
 Product code is every Python file of the packages outside their tests. The figures are written to
 `out/bench/house.json`; their limits are tested in `tools/test/test_house.py`.
@@ -24,7 +24,7 @@ PACKAGES = ("swarm_loc_estimator", "swarm_loc_vision", "swarm_loc_drivers")
 LONG, SHORT = 400, 40
 
 PRIVATE_WORDS = ("told", "anew", "likewise", "held against", "of late")
-"""Words that a plainer one replaces, in product code and in documentation."""
+"""Words that product code and documentation must not use."""
 WORDS = re.compile(rf"\b({'|'.join(PRIVATE_WORDS)})\b", re.IGNORECASE)
 
 
@@ -34,7 +34,7 @@ class Module:
 
     Attributes:
         name: Dotted name below the repository's packages.
-        path: Where it lies.
+        path: Path of the file.
     """
 
     name: str
@@ -156,7 +156,7 @@ def private_words(root: Path = ROOT) -> Iterator[str]:
 
 
 def places(root: Path = ROOT) -> dict[str, list[str]]:
-    """What each figure counts, place by place."""
+    """Figure -> the places that it counts."""
     modules = product_modules(root)
     return {
         "files_under_40": [f"{m.name} {m.line_count}" for m in modules if m.line_count < SHORT],
@@ -169,7 +169,7 @@ def places(root: Path = ROOT) -> dict[str, list[str]]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Print the figures, or the places behind one."""
+    """Print the figures, or the places that one figure counts."""
     found = places()
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--list", choices=found, metavar="FIGURE", help="places behind: " + ", ".join(found))

@@ -1,7 +1,7 @@
 #!/usr/bin/env python3
-"""Make this clone ready to run: a virtual environment, ROS 2 in it where none is sourced, the built packages.
+"""Set up this clone: a virtual environment, ROS 2 in it unless one is sourced, the built packages.
 
-Doing it again costs next to nothing, and after an interruption is all there is to do.
+A repeated set-up takes little time; run it again after an interruption.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ from workspace.stamps import only_one
 
 
 def ensure(*, bench: bool = False, compiled: bool = False) -> None:
-    """Do what is not done yet.
+    """Run the steps of the set-up that are not done yet.
 
     Args:
-        bench: Whether the benchmarks' requirements belong to it.
-        compiled: Whether the estimator's inner loops are compiled, too.
+        bench: Whether to install the benchmarks' requirements.
+        compiled: Whether to compile the estimator's inner loops.
 
     Raises:
         WorkspaceError: Something is missing, or a step failed.
@@ -33,7 +33,7 @@ def ensure(*, bench: bool = False, compiled: bool = False) -> None:
 
 
 def main() -> int:
-    """Run from the command line: 0 when all is ready, 1 with one sentence when something is missing."""
+    """Run from the command line; returns 0, or 1 after one sentence about a failure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--bench", action="store_true", help="add what the benchmarks compare with")
     arguments = parser.parse_args()

@@ -1,4 +1,4 @@
-"""What stands between a clone and a running node: set-up, environment, and the `run` command.
+"""The workspace of a clone: set-up, environment, and the `run` command.
 
-Standard library only, since it runs before anything is installed.
+It uses the standard library only, since it runs before anything is installed.
 """

@@ -1,4 +1,4 @@
-"""The packages, built by colcon under `.workspace`, each again only when what colcon copies has changed."""
+"""Build the packages with colcon under `.workspace`, each only if a file that colcon copies has changed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from workspace.stamps import Stamp, digest, write_whole
 BUILD = STATE / "build"
 INSTALL = STATE / "install"
 OVERLAY = STATE / "overlay.json"
-"""What the built packages prepend to environment variables: name -> entries."""
+"""Environment variable -> entries that the built packages prepend."""
 
 COPIED = (
     "package.xml",
@@ -31,7 +31,7 @@ COPIED = (
     "srv/*",
     "action/*",
 )
-"""Files of a package that end up in a build as they were then; all others are linked."""
+"""Files of a package that a build copies; all others are linked."""
 LINKED_ONE_BY_ONE = "launch/*"
 
 _NOT_YET = 3
@@ -44,7 +44,7 @@ sys.exit(0 if is_precompiled(precompile) else {_NOT_YET})
 
 
 def ensure() -> None:
-    """Make sure that all packages are built as their sources are.
+    """Build all packages that are out of date.
 
     Raises:
         WorkspaceError: A package does not build.
@@ -73,7 +73,7 @@ def ensure() -> None:
 
 
 def compile_estimator() -> None:
-    """Have the estimator's inner loops compiled, which its first run would otherwise spend three minutes on.
+    """Compile the estimator's inner loops, which would otherwise take three minutes at its first run.
 
     Raises:
         WorkspaceError: The estimator does not run.
@@ -99,9 +99,9 @@ def compile_estimator() -> None:
 
 @contextmanager
 def _compiling_beside(env: Mapping[str, str]) -> Iterator[None]:
-    """Have another process compile what the estimator needs last, and the detector, meanwhile.
+    """Compile the last functions of the estimator, and the detector, in another process.
 
-    Should it fail, they are compiled when they are first needed.
+    If it fails, they are compiled when they are first needed.
     """
     program = "from swarm_loc_estimator.precompile import precompile_infrared; precompile_infrared()\n"
     program += "from swarm_loc_vision.markers.detector import precompile; precompile()"
@@ -124,7 +124,7 @@ def environment() -> dict[str, str]:
 
 
 def _inputs(name: str) -> str:
-    """The hash of all that a build of a package depends on."""
+    """Hash of everything on which the build of a package depends."""
     facts = [str(ROOT), install.identity()]
     if name == "tf2_msgs":
         return digest([], *facts, *tf2_msgs.FILES.values())
@@ -156,7 +156,7 @@ def _colcon_status(line: str) -> str | None:
 
 
 def _mend_first_lines() -> None:
-    """Let executables find Python by PATH where its own path has a space, which a first line cannot hold."""
+    """Let executables find Python by PATH if its path has a space, which a shebang line cannot have."""
     if " " not in str(VENV_PYTHON):
         return
     for script in INSTALL.glob("*/lib/swarm_loc_*/*"):
@@ -166,9 +166,9 @@ def _mend_first_lines() -> None:
 
 
 def _prepended() -> dict[str, list[str]]:
-    """What sourcing the built packages prepends to environment variables, found by doing it in an empty one.
+    """Entries that sourcing the built packages prepends to variables, found in an empty environment.
 
-    colcon's own local_setup scripts do the same, but not in a folder with a space.
+    colcon's local_setup scripts do the same, but fail in a folder with a space.
     """
     listing: list[str | Path] = [VENV_PYTHON, INSTALL / "_local_setup_util_sh.py", "sh"]
     exports = subprocess.run(listing, capture_output=True, text=True, check=True).stdout

@@ -1,4 +1,4 @@
-"""What this machine has: a Python that fits, tools to build with, and perhaps a ROS 2 installation."""
+"""Checks of this machine: Python version, build tools, and an optional ROS 2 installation."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from workspace.layout import ROOT, WorkspaceError
 
 LOWEST_PYTHON = (3, 10)
 HIGHEST_WHEEL_PYTHON = (3, 13)
-"""The newest Python that the ROS wheels are made for."""
+"""The newest Python version that the ROS wheels support."""
 
 
 def ros_prefix() -> Path | None:
     """The sourced ROS 2 installation: the prefix of AMENT_PREFIX_PATH that holds rclpy for this Python.
 
     Returns:
-        None where no ROS 2 is sourced. What lies inside this workspace does not count.
+        None if no ROS 2 is sourced. Folders of this workspace are ignored.
 
     Raises:
         WorkspaceError: The sourced ROS 2 is for another Python.
@@ -43,7 +43,7 @@ def ros_prefix() -> Path | None:
 
 
 def check_python_age() -> None:
-    """Raise WorkspaceError where this Python is too old for the workspace."""
+    """Raise WorkspaceError if this Python is too old for the workspace."""
     if sys.version_info < LOWEST_PYTHON:
         raise WorkspaceError(
             f"Python {sys.version_info.major}.{sys.version_info.minor} is too old: "
@@ -52,7 +52,7 @@ def check_python_age() -> None:
 
 
 def check_python_parts() -> None:
-    """Raise WorkspaceError where this Python cannot make the virtual environment."""
+    """Raise WorkspaceError if this Python cannot create the virtual environment."""
     version = f"{sys.version_info.major}.{sys.version_info.minor}"
     if ros_prefix() is None and sys.version_info[:2] > HIGHEST_WHEEL_PYTHON:
         raise WorkspaceError(
@@ -65,7 +65,7 @@ def check_python_parts() -> None:
 
 
 def check_build_tools() -> None:
-    """Raise WorkspaceError where something is missing that building the interfaces needs."""
+    """Raise WorkspaceError if a build tool for the interfaces is missing."""
     needed = {
         "C compiler": [os.environ.get("CC", ""), "cc", "gcc", "clang"],
         "C++ compiler": [os.environ.get("CXX", ""), "c++", "g++", "clang++"],

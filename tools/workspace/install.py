@@ -1,4 +1,4 @@
-"""The virtual environment: made once, filled by pip, and its ROS wheels' CMake exports put right."""
+"""The virtual environment: created once, filled by pip; corrects the CMake exports of the ROS wheels."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ NETWORK_TROUBLE = re.compile(
 FOREIGN_PATHS = re.compile(
     r"/opt/python/cp3\d+-cp3\d+/(?P<rest>include/python3\.\d+|lib/python3\.\d+/site-packages)(?=[/\";>])"
 )
-"""Where the machine that built the wheels had its Python."""
+"""Python paths of the machine that built the wheels."""
 
 
 def _wanted(groups: tuple[str, ...]) -> dict[str, str]:
-    """What the environment must be, as its stamp says it: folder, origin, a hash per requirements file."""
+    """Required state of the environment for its stamp: folder, origin, a hash per requirements file."""
     facts = {"venv": str(VENV), "ros": str(host.ros_prefix() or "wheels")}
     facts |= {f"group.{group}": digest([REQUIREMENTS / f"{group}.txt"]) for group in groups}
     return facts
 
 
 def ensure(*, bench: bool) -> None:
-    """Make sure that `.venv` holds what the requirements say.
+    """Create or update `.venv` from the requirements.
 
     Args:
-        bench: Whether the benchmarks' requirements belong to it.
+        bench: Whether to install the benchmarks' requirements.
 
     Raises:
         WorkspaceError: Something is missing, or pip failed.
@@ -66,14 +66,14 @@ def ensure(*, bench: bool) -> None:
 
 
 def identity() -> str:
-    """What a build owes to the environment it was made in."""
+    """Properties of the environment on which a build depends."""
     facts = json.loads(STAMP.read() or "{}")
     python = next(VENV.glob("lib/python3*"), Path()).name
     return json.dumps([python, facts.get("ros"), facts.get("group.ros")])
 
 
 def _create(*, system_packages: bool) -> None:
-    """Make an empty virtual environment in place of whatever is there."""
+    """Create an empty virtual environment, replacing an existing one."""
     host.check_python_parts()
     host.check_build_tools()
     say("Setting up this clone, which takes some minutes once; interrupted, it goes on from there")
@@ -90,7 +90,7 @@ def _create(*, system_packages: bool) -> None:
 
 
 def _pip_install(group: str, ros: Path | None) -> None:
-    """Install one requirements file, told in one line, with the whole of pip's words in a log."""
+    """Install one requirements file; shows one line of progress and writes pip's output to a log."""
     say(f"  installing requirements/{group}.txt")
     log_name = f"pip-{group}.log"
     command: list[str | Path] = [
@@ -119,7 +119,7 @@ def _pip_install(group: str, ros: Path | None) -> None:
 
 
 def _system_constraints() -> Path:
-    """Hold numpy at the version of the sourced ROS 2, whose messages do not load under another."""
+    """Pin numpy to the version of the sourced ROS 2, whose messages do not load with another."""
     constraints = STATE / "constraints.txt"
     probe: list[str | Path] = [VENV_PYTHON, "-c", "import numpy; print(numpy.__version__)"]
     found = subprocess.run(probe, capture_output=True, text=True, check=False).stdout.strip()
@@ -147,14 +147,14 @@ def _pip_status() -> Callable[[str], str | None]:
 
 
 def _last_line(output: str, start: str = "") -> str:
-    """The last line that says something, without its `start` and full stop."""
+    """The last line that is not empty, without its `start` and full stop."""
     lines = [line.strip() for line in output.splitlines() if line.strip()]
     matching = [line for line in lines if line.startswith(start)]
     return (matching or lines or ["no output"])[-1].removeprefix(start).rstrip(".")
 
 
 def _patch_cmake_exports() -> None:
-    """Let the wheels' CMake files name this Python where they name that of the machine they were built on."""
+    """Replace the Python of the build machine by this one in the CMake files of the wheels."""
     probe = "import sysconfig; print(sysconfig.get_path('include')); print(sysconfig.get_path('purelib'))"
     found = subprocess.run([VENV_PYTHON, "-c", probe], capture_output=True, text=True, check=True).stdout
     own = dict(zip(("include", "lib"), found.splitlines(), strict=True))
@@ -168,7 +168,7 @@ def _patch_cmake_exports() -> None:
 def base_environment() -> dict[str, str]:
     """The environment that ROS programs and colcon need, without this workspace's packages.
 
-    With a sourced ROS 2 that is the present one with `.venv` in front; else the wheels in `.venv` are ROS 2.
+    With a sourced ROS 2 it is the present one with `.venv` in front; else ROS 2 is the wheels in `.venv`.
     """
     env = dict(os.environ)
     env["PATH"] = os.pathsep.join([str(VENV / "bin"), env.get("PATH", "")])
@@ -180,6 +180,6 @@ def base_environment() -> dict[str, str]:
         env["LD_LIBRARY_PATH"] = os.pathsep.join(
             [*map(str, libraries), *filter(None, [env.get("LD_LIBRARY_PATH")])]
         )
-        # The wheels start Python a second time to set the same path, unless told that it is set.
+        # Without this, the wheels start Python a second time to set the same path.
         env["_ROS_WHEELS_BOOTSTRAP_COMPLETE"] = "1"
     return env

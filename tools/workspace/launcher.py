@@ -1,4 +1,4 @@
-"""`./run`: what `ros2 run` does, for machines without the ros2 command line.
+"""`./run`: `ros2 run` for machines without the ros2 command line.
 
     ./run PACKAGE EXECUTABLE [ARGUMENTS...]   start an executable
     ./run PACKAGE                             list its executables
@@ -6,7 +6,7 @@
     ./run -- COMMAND [ARGUMENTS...]           run any command in the workspace's environment
 
 ARGUMENTS are those of `ros2 run`: --ros-args -p NAME:=VALUE -r FROM:=TO --params-file FILE.
-The workspace is set up first where that is not done yet.
+The workspace is set up first if necessary.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def packages(env: Mapping[str, str]) -> list[str]:
 
 
 def command(env: Mapping[str, str], arguments: Sequence[str]) -> list[str]:
-    """The program and arguments that a call of `run` stands for.
+    """Program and arguments for a call of `run`.
 
     Raises:
         WorkspaceError: No such package or executable.
@@ -57,7 +57,7 @@ def command(env: Mapping[str, str], arguments: Sequence[str]) -> list[str]:
 
 
 def start(env: Mapping[str, str], arguments: Sequence[str]) -> NoReturn:
-    """Become the program that the arguments name.
+    """Replace this process by the program that the arguments name.
 
     Raises:
         WorkspaceError: There is no such program.
@@ -70,7 +70,7 @@ def start(env: Mapping[str, str], arguments: Sequence[str]) -> NoReturn:
 
 
 def describe(env: Mapping[str, str], arguments: Sequence[str]) -> str:
-    """What an incomplete call of `run` could go on with.
+    """Possible completions of an incomplete call of `run`.
 
     Raises:
         WorkspaceError: No such package.
@@ -81,7 +81,7 @@ def describe(env: Mapping[str, str], arguments: Sequence[str]) -> str:
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Start what the arguments name, in an environment that is ready."""
+    """Set up the environment and start the program that the arguments name."""
     env = build.environment()
     if len(arguments) < 2:
         print(f"{__doc__}\n{describe(env, arguments)}", file=sys.stderr)

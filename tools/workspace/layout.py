@@ -1,4 +1,4 @@
-"""Where things are in the workspace."""
+"""Paths of the workspace."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ VENV_PYTHON = VENV / "bin" / "python"
 REQUIREMENTS = ROOT / "requirements"
 
 STATE = ROOT / ".workspace"
-"""All that set-up makes beside the virtual environment."""
+"""Folder of everything that set-up creates except the virtual environment."""
 LOGS = STATE / "log"
 
 PACKAGES = ("swarm_loc_msgs", "swarm_loc_estimator", "swarm_loc_vision", "swarm_loc_drivers")
 
 
 class WorkspaceError(Exception):
-    """Something stops the set-up or a start; its text is one sentence for a person."""
+    """The set-up or a start failed; the message is one sentence."""

@@ -1,4 +1,4 @@
-"""Steps on the terminal; long commands whose output goes to a file while one line tells how far they are."""
+"""Progress on the terminal; long commands with a status line and their output in a log file."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from pathlib import Path
 from workspace.layout import LOGS
 
 SHOWN_EVERY_S = 5.0
-"""How often a log that is no terminal gets a line."""
+"""Period of status lines where the output is not a terminal [s]."""
 
 
 def say(text: str) -> None:
-    """Print a line at once."""
+    """Print a line and flush it."""
     print(text, flush=True)
 
 
 class StatusLine:
-    """One line that overwrites itself on a terminal and appears now and then in a log."""
+    """A status line that is overwritten on a terminal, and printed periodically to a log."""
 
     def __init__(self) -> None:
         self._terminal = sys.stdout.isatty()
@@ -28,7 +28,7 @@ class StatusLine:
         self._open = False
 
     def show(self, text: str) -> None:
-        """Show how far the step is."""
+        """Show the progress of the step."""
         if self._terminal:
             print(f"\r\x1b[K    {text[:70]}", end="", flush=True)
             self._open = True
@@ -37,7 +37,7 @@ class StatusLine:
             say(f"    {text}")
 
     def close(self) -> None:
-        """Leave the terminal at the start of an empty line."""
+        """End the status line with a line break."""
         if self._open:
             print("\r\x1b[K", end="", flush=True)
 
@@ -54,9 +54,9 @@ def run_logged(
     Args:
         command: Program and arguments.
         log_name: Name of the file under the workspace's log folder.
-        status: Makes the text of the status line from a line of output, or None to leave it.
-        env: Environment, the own one by default.
-        cwd: Working directory, the own one by default.
+        status: Returns the text of the status line for a line of output; None: unchanged.
+        env: Environment, by default that of this process.
+        cwd: Working directory, by default that of this process.
 
     Returns:
         The exit status and all output.

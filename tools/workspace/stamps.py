@@ -1,6 +1,6 @@
-"""Memory of what is done: a stamp is taken away before a step touches anything and written when it has ended.
+"""Stamps of completed steps: a stamp is removed before a step changes anything and written after it.
 
-So a step that was interrupted, however hard, has no stamp and starts from nothing.
+So a step that was interrupted in any way has no stamp and is repeated from the beginning.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from workspace.layout import ROOT, STATE
 
 
 def digest(files: Iterable[Path], *facts: str) -> str:
-    """The hash of files' names and contents, and of further facts."""
+    """Hash of the names and contents of files, and of further texts."""
     state = hashlib.sha256()
     for path in sorted(files):
         content = path.read_bytes()
@@ -29,7 +29,7 @@ def digest(files: Iterable[Path], *facts: str) -> str:
 
 
 def write_whole(path: Path, text: str) -> None:
-    """Write a file so that it is there whole or not at all."""
+    """Write a file atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f"{path.name}.{os.getpid()}")
     with partial.open("w", encoding="utf-8") as file:
@@ -40,33 +40,33 @@ def write_whole(path: Path, text: str) -> None:
 
 
 class Stamp:
-    """The record that one step was done for certain inputs."""
+    """Record of a completed step and its inputs."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def read(self) -> str | None:
-        """What the step was done for, or None where it never ended."""
+        """Inputs of the completed step; None if it is not completed."""
         try:
             return self._path.read_text(encoding="utf-8").strip()
         except FileNotFoundError:
             return None
 
     def clear(self) -> None:
-        """Say that the step is under way."""
+        """Mark the step as not completed."""
         self._path.unlink(missing_ok=True)
 
     def write(self, value: str) -> None:
-        """Say that the step is done."""
+        """Mark the step as completed."""
         write_whole(self._path, value + "\n")
 
 
 @contextmanager
 def only_one(patience_s: float = 2.0) -> Iterator[None]:
-    """Hold the workspace's lock, so that two set-ups do not meet; the kernel frees it when a holder dies.
+    """Hold the workspace's lock against concurrent set-ups; the kernel frees it if the process dies.
 
     Args:
-        patience_s: Waiting longer is reported. Nodes that start at once hold the lock for a moment each.
+        patience_s: Longer waiting is reported. Starting nodes hold the lock for a short time each.
     """
     STATE.mkdir(exist_ok=True)
     sentence = "Another set-up of this workspace is running: waiting for it."

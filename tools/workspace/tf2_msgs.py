@@ -1,6 +1,6 @@
-"""A stand-in for tf2_msgs where there is none to install: the one message that /tf carries.
+"""A minimal tf2_msgs for machines without it: the one message type of /tf.
 
-It is written under `.workspace`, where no colcon looks, so a full installation never meets it.
+It is written under `.workspace`, which colcon does not search, so it never hides that of a full installation.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ ament_package()
 
 
 def is_installed(env: Mapping[str, str]) -> bool:
-    """Whether an environment has the real package."""
+    """Whether an environment has the original package."""
     prefixes = filter(None, env.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
     return any(Path(prefix, "share/tf2_msgs/package.xml").is_file() for prefix in prefixes)
 

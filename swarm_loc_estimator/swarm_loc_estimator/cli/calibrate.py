@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _unused(recording: Recording) -> list[str]:
-    """A sentence when the bag holds inputs that nothing is fitted to."""
+    """A sentence if the bag has inputs that are not used."""
     counts = {"brightness": recording.brightness.robot.size, "fix": recording.fixes.robot.size}
     said = " and ".join(f"{count} messages on <robot>/{name}" for name, count in counts.items() if count)
     return [f"Not used: {said}. Infrared boards are calibrated by calibrate_ir."] if said else []

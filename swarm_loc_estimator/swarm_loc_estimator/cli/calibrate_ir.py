@@ -1,11 +1,11 @@
-"""Find the gains of infrared sensors and emitters from what robots read of each other.
+"""Estimate the gains of infrared sensors and emitters from exchanges between robots.
 
     calibrate_ir bags/droplets_twenty
     calibrate_ir recording.mcap --swarm swarm.yaml --out calibrated.yaml --without-truth
     calibrate_ir bags/droplets_real --board out/board.yaml --out out/swarm.yaml
 
-The bag holds <robot>/brightness. Where it has <robot>/ground_truth, that is used, but it can do without: then
-the poses are sought together with the gains. The description is the `swarm.yaml` inside the bag's folder
+The bag holds <robot>/brightness. <robot>/ground_truth is used if present; without it
+the poses are estimated together with the gains. The description is the `swarm.yaml` inside the bag's folder
 unless --swarm names another. Robots are calibrated with those of the same platform. Beside --out a picture of
 the same name shows the residuals before and after, and the gains.
 """
@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _board(options: argparse.Namespace, swarm: Swarm) -> int:
-    """Find what the board is, and write it and the swarm description with it."""
+    """Fit the parameters of the board, and write it and a swarm description that uses it."""
     with ProgressLine() as progress:
         recording = read_recording(options.bag, swarm, progress)
         board, done = calibrate_from(recording, swarm, progress)

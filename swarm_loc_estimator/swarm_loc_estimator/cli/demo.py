@@ -1,9 +1,9 @@
-"""Five simulated e-pucks through the live graph: a bag is played over DDS, poses come out on topics.
+"""Play a bag of five simulated e-pucks into the live graph over DDS, and check the poses.
 
     demo
     demo bags/eight_five_robots --rate 1 --out out/demo
 
-It prints the error table and ends with status 1 when the poses are not as good as they must be for this bag.
+It prints the error table and ends with status 1 if the errors exceed the limits of this bag.
 The report (report.txt, report.html, overview.png, paths.png, errors.png) and the nodes' output (nodes.log)
 are in --out.
 """
@@ -84,7 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def live_facts(live: LiveRun, compared: Agreement) -> list[str]:
-    """How the live graph did, in words."""
+    """Performance of the live graph, in words."""
     # the time of reception is known to a step of /clock
     age_s = float(np.percentile(live.age_s, 95)) + 1e-9 * clock_step_ns(live.rate)
     live_line = (
@@ -100,7 +100,7 @@ def live_facts(live: LiveRun, compared: Agreement) -> list[str]:
 
 
 def failed_bars(live: LiveRun) -> list[str]:
-    """One sentence for each bar that the poses fail; none when they are right."""
+    """One sentence for each limit that the poses exceed."""
     result = live.result
     row = result.overall
     heading_deg = math.degrees(row.heading_rmse)
@@ -135,7 +135,7 @@ def coverage(live: LiveRun) -> float:
 
 
 class _Progress:
-    """Says how it goes while the bag plays: one line in a terminal, a few where nobody watches."""
+    """Shows the progress of the bag: one line in a terminal, a few lines in a log."""
 
     def __init__(self, swarm: Swarm) -> None:
         self._swarm = swarm
@@ -143,7 +143,7 @@ class _Progress:
         self._said_s = 0.0
 
     def __call__(self, recorder: Recorder, content: BagContent) -> None:
-        """Take a look at what has come."""
+        """Update the progress from the poses received."""
         pause_s = _REDRAW_S if self._in_terminal else _REDRAW_UNWATCHED_S
         if time.monotonic() < self._said_s + pause_s:
             return
@@ -152,7 +152,7 @@ class _Progress:
         print(f"\r{line}\x1b[K" if self._in_terminal else f"{line}\n", end="", flush=True)
 
     def close(self) -> None:
-        """Leave the line."""
+        """End the line."""
         if self._in_terminal:
             print()
 

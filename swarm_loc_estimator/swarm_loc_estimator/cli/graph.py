@@ -31,7 +31,7 @@ def parse(arguments: Sequence[str]) -> GraphOptions:
 
 
 def check_graph(options: GraphOptions) -> None:
-    """Make sure that the files of a graph can be used.
+    """Check that the files of a graph can be used.
 
     Raises:
         UserError: A file cannot be used; the message says why.

@@ -1,11 +1,11 @@
-"""Turn a recording of Droplets under an overhead camera into a bag with its swarm.yaml.
+"""Convert a recording of Droplets under an overhead camera to a bag with swarm.yaml.
 
     import_droplets rnbCalibData.txt bags/droplets
     import_droplets rnbCalibData.txt bags/droplets --platform droplet --metres-per-pixel 0.00105
 
-One line an exchange: {"TX", "RX", 6 x 6 counts, camera time [s], {"id"->{x, y, orientation}, ...}},. The bag
-holds <robot>/brightness, <robot>/ground_truth of robots that stand, and <robot>/fix of receivers. What the
-camera saw is cleaned: ids misread, orientations a quarter turn off, robots in two places.
+One line per exchange: {"TX", "RX", 6 x 6 counts, camera time [s], {"id"->{x, y, orientation}, ...}},. The bag
+holds <robot>/brightness, <robot>/ground_truth of stationary robots, and <robot>/fix of receivers. Errors of
+the camera are corrected: misread ids, orientations wrong by quarter turns, robots in two places.
 """
 
 from __future__ import annotations

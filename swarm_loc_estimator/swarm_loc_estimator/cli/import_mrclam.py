@@ -1,4 +1,4 @@
-"""Turn a folder of the MRCLAM dataset into a bag with its swarm.yaml.
+"""Convert a folder of the MRCLAM dataset to a bag with swarm.yaml.
 
     import_mrclam MRCLAM_Dataset1 bags/mrclam1
     import_mrclam MRCLAM_Dataset1 bags/mrclam1_late --delay-ms 150 300 7

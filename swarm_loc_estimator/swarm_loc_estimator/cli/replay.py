@@ -7,8 +7,8 @@
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The report
 (report.txt, report.html, overview.png, paths.png, errors.png) and the poses (poses.csv) are written to --out.
 --mcap writes poses, /tf, markers, and the bag's map and goals for RViz, Foxglove and other viewers.
---learned writes the description for the next run, with what the filter has learned of cameras, odometry and
-landmarks; it learns of what the description gives a sigma.
+--learned writes the description with the self-calibrated parameters of cameras, odometry and landmarks; the
+parameters with a sigma in the description are estimated.
 """
 
 from __future__ import annotations

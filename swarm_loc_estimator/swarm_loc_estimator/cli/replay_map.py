@@ -5,8 +5,8 @@
 
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The map goes
 to OUT/map.yaml and OUT/map.pgm, a picture of it to OUT/map.png, the robots' stops to OUT/stops.csv. The same
-bag gives the same files, byte for byte. --walls draws a floor plan below the map, a line x0,y0,x1,y1 [m] a
-wall, and prints the errors of the map's walls; ground truth in the bag gives the errors of the stops.
+bag gives the same files, byte for byte. --walls draws a floor plan below the map (x0,y0,x1,y1 [m] per line)
+and prints the errors of the map's walls; with ground truth in the bag, the errors of the stops, too.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
 class WallsError(UserError):
-    """A file of walls that cannot be used; the message is one sentence."""
+    """An invalid file of walls; the message is one sentence."""
 
 
 @exit_with_message
@@ -95,7 +95,7 @@ def read_walls(path: Path) -> FloatArray:
 
 
 def write_stops(mapper: CooperativeMapper, name_of: Mapping[int, str], path: Path) -> None:
-    """Write where the robots stopped: robot, x, y, theta on arrival."""
+    """Write the stops of the robots: robot, x, y, theta on arrival."""
     robots = mapper.graph.robot[: mapper.graph.count].tolist()
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)

@@ -1,9 +1,9 @@
 """Show a swarm on a page, in any browser of this machine.
 
-    watch swarm.yaml              a swarm whose graph runs already
+    watch swarm.yaml              a swarm whose graph is running
     watch bags/eight_five_robots  a bag, played through the estimator
 
-The page asks nothing of anywhere else. --address lets others look, too; they then need the --token.
+The page loads nothing from other hosts. --address allows access from other machines, with the --token.
 """
 
 from __future__ import annotations

@@ -1,1 +1,1 @@
-"""What all packages share: geometry, compilation, parameters, messages, bags and nodes."""
+"""Code shared by all packages: geometry, compilation, parameters, messages, bags and nodes."""

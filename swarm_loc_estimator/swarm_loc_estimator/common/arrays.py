@@ -1,4 +1,4 @@
-"""Types of arrays that all modules share."""
+"""Array types shared by all modules."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all commands share: their start, how they end, their arguments, and a progress bar."""
+"""Shared parts of all commands: entry point, exit status, common arguments, progress bar."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def program(module: str) -> Callable[[], int]:
 
 
 def exit_with_message(main: Callable[Arguments, int]) -> Callable[Arguments, int]:
-    """Decorate the `main` of a command: mistakes of the user end it with one sentence and status 1."""
+    """Decorate the `main` of a command: a `UserError` ends it with one sentence and status 1."""
 
     @wraps(main)
     def wrapped(*args: Arguments.args, **kwargs: Arguments.kwargs) -> int:
@@ -132,7 +132,7 @@ def add_bag(parser: argparse.ArgumentParser, content: str = "") -> None:
 
 
 def swarm_beside(bag: Path) -> Path:
-    """The swarm description that belongs to a bag; raises UserError where there is no bag."""
+    """Path of the swarm description beside a bag; raises UserError if there is no bag."""
     if not bag.exists():
         raise UserError(f"There is no bag '{bag}'.")
     return (bag if bag.is_dir() else bag.parent) / "swarm.yaml"

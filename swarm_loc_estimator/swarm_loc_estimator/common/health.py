@@ -11,11 +11,11 @@ from enum import IntEnum
 from typing import Any
 
 PATIENCE_S = 5.0
-"""A topic may be silent for so long before the log says so."""
+"""Time without messages after which a topic is logged as silent [s]."""
 THROTTLE_S = 30.0
 """The same warning is logged at most once in this time."""
 _MAX_LINES = 8
-"""So many new problems of a kind are logged one by one."""
+"""Maximum number of new problems of a kind that are logged one by one."""
 _MAX_NAMES = 8
 
 
@@ -62,13 +62,13 @@ def drop_values(drops: Mapping[str, int]) -> dict[str, object]:
 
 
 def listed(names: Sequence[str]) -> str:
-    """Names in one line; of many only the first ones, and how many more there are."""
+    """Names in one line; of many only the first ones and the number of the others."""
     more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
     return ", ".join(names[:_MAX_NAMES]) + more
 
 
 class Health:
-    """Counts drops, notes when topics were received last, and logs each problem once in a while.
+    """Counts drops, records when topics were received last, and limits the rate of log messages.
 
     Args:
         warn: Logs a sentence as a warning.
@@ -89,12 +89,12 @@ class Health:
         self._received_s: dict[str, float] = {}
 
     def drop(self, reason: str, detail: str = "") -> None:
-        """Count one message or datum that was not used; `detail` explains the reason in the log."""
+        """Count one dropped message or datum; `detail` explains the reason in the log."""
         self.drops[reason] += 1
         self._details[reason] = detail
 
     def warn_of_drops(self, drops: Mapping[str, int] | None = None, what: str = "dropped") -> None:
-        """Log the reasons whose counts have grown since they were logged last.
+        """Log the drop reasons whose counts have grown since they were logged last.
 
         Args:
             drops: Counts by reason; None: those of `drop`.
@@ -114,7 +114,7 @@ class Health:
         self._received_s[topic] = self._now_s()
 
     def silence(self, topic: str) -> str:
-        """A sentence where no message of a topic has been received yet, or none for a while; else ""."""
+        """A sentence if no message of a topic has been received yet, or none recently; else ""."""
         received_s = self._received_s.get(topic)
         if received_s is None:
             return f"no messages received on {topic}"
@@ -127,7 +127,7 @@ class Health:
             self._warn(sentence)
 
     def warn_of(self, kind: str, problems: Mapping[Any, str], patience_s: float = 0.0) -> None:
-        """Log each problem of a kind once; again only once it has gone and come back.
+        """Log each problem of a kind once; again only if it has disappeared in between.
 
         Args:
             kind: Name of the kind.
@@ -147,7 +147,7 @@ class Health:
             self._warn(f"{len(due) - _MAX_LINES} more warnings of this kind, see /diagnostics")
 
     def _is_due(self, kind: str, problem: object) -> bool:
-        """Whether a problem was not logged lately; if so, it counts as logged now."""
+        """Whether a problem was not logged recently; if so, records that it is logged now."""
         now_s = self._now_s()
         if now_s - self._warned_s.get((kind, problem), -math.inf) < THROTTLE_S:
             return False

@@ -1,9 +1,9 @@
 """Compilation of inner loops by numba, with a cache that is keyed by content.
 
-The hot paths touch a handful of numbers a hundred thousand times, where calls of array functions cost ten to
-fifty times the arithmetic. The key of a compiled function is made of its byte code, of that of all compiled
-functions that it reaches, of the constants and record types that they use, and of the argument types; it has
-no paths, times or docstrings. So another clone, another folder or a copy of the cache finds the code again.
+The hot paths operate on a few numbers a hundred thousand times, where calls of array functions cost ten to
+fifty times the arithmetic. The key of a compiled function is a hash of its byte code, that of all compiled
+functions that it calls, the constants and record types that they use, and the argument types; it contains
+no paths, times or docstrings. So another clone, another folder or a copy of the cache reuses the code.
 """
 
 from __future__ import annotations
@@ -51,9 +51,9 @@ def cached_njit(function: Function) -> Function:
 def norefcount_njit(function: Function) -> Function:
     """Compile a function of large tuples of arrays without counting references to the arrays.
 
-    Numba's counting for every array touched would cost more than the arithmetic. Such a function borrows the
-    arrays of its caller. It cannot allocate one, which does not compile; and it and all that it calls return
-    numbers, for nobody would release an array.
+    Reference counting for every array would cost more than the arithmetic. Such a function borrows the
+    arrays of its caller. It cannot allocate arrays (this does not compile), and it and all functions that it
+    calls return numbers, since no one would release an array.
 
     Raises:
         TypeError: It is declared to return something else.
@@ -62,22 +62,22 @@ def norefcount_njit(function: Function) -> Function:
 
 
 def inlined_njit(function: Function) -> Function:
-    """Compile as `norefcount_njit` does, and inline the function where even a call would cost too much."""
+    """Compile like `norefcount_njit` and inline the function, where even a call would be too slow."""
     return _without_references(function, forceinline=True)
 
 
 def reassociated_njit(function: Function) -> Function:
-    """Compile a function whose sums may be taken in any order: several times faster for long ones."""
+    """Compile a function whose sums may be evaluated in any order: several times faster for long sums."""
     return _compiled(function, fastmath={"reassoc", "contract"})
 
 
 def is_precompiled(precompile: Callable[[], None]) -> bool:
-    """Whether a function that compiles all that it reaches has run here since any of that changed."""
+    """Whether the cache has the compiled code of a function and of all functions that it calls."""
     return _mark(precompile).exists()
 
 
 def note_precompiled(precompile: Callable[[], None]) -> None:
-    """Remember that a function has compiled all that it reaches; delete what nobody has used for a month."""
+    """Record that a function and all that it calls are compiled; delete code unused for a month."""
     mark = _mark(precompile)
     with suppress(OSError):  # where nothing can be kept, the next start compiles again
         mark.parent.mkdir(parents=True, exist_ok=True)
@@ -122,7 +122,7 @@ class _ContentCache(NullCache):
         return str(_folder())
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """The compiled code for a signature; None where there is none that can be read."""
+        """The compiled code for a signature; None if missing or unreadable."""
         target_context.refresh()
         file = self._file(sig, target_context.codegen())
         try:
@@ -188,7 +188,7 @@ def _name(function: Any) -> str:
 
 
 def _globals_of(function: FunctionType) -> Mapping[str, Any]:
-    """All names from outside that a function may use."""
+    """All global and free names that a function may use."""
     cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
     return {**function.__globals__, **{name: cell.cell_contents for name, cell in cells}}
 
@@ -207,7 +207,7 @@ def _described_code(code: CodeType, names: Mapping[str, Any], reached: list[Any]
 
 
 def _described(value: Any, attributes: tuple[str, ...], reached: list[Any]) -> str:
-    """A value that compiled code uses as a constant; of a module the attributes that may be meant."""
+    """Text of a value that compiled code uses as a constant; of a module, the attributes it may use."""
     if isinstance(value, Dispatcher | FunctionType):
         if _name(value).partition(".")[0] not in _FOREIGN:
             reached.append(value)
@@ -252,7 +252,7 @@ def _described_type(argument: Any) -> str:
 
 
 def _mark(precompile: Callable[[], None]) -> Path:
-    """The file that says that a function has compiled all that it reaches, named by that code."""
+    """Path of the file that marks a function as precompiled; its name is the hash of the code."""
     modules: dict[str, ModuleType] = {}
     left = [precompile.__module__]
     while left:

@@ -1,7 +1,7 @@
-"""LAPACK and BLAS inside compiled code, on parts of matrices where they stand.
+"""LAPACK and BLAS inside compiled code, in place on parts of matrices.
 
 SciPy's Python functions copy every part that is not contiguous. These are the same routines, by its Cython
-interface; matrices are in Fortran's order, given by all their numbers and the place where a part begins.
+interface; matrices are in Fortran order, given by all their numbers and the offset of a part.
 """
 
 from __future__ import annotations
@@ -36,20 +36,20 @@ _LOWER = _LEFT = np.frombuffer(b"L", dtype=np.uint8)
 _RIGHT, _TRANSPOSED, _PLAIN = (np.frombuffer(letter, dtype=np.uint8) for letter in (b"R", b"T", b"N"))
 _PLUS, _MINUS = np.array([1.0]), np.array([-1.0])
 _LEAF = 40
-"""So many rows are left to LAPACK, which is slow with larger triangles."""
+"""Maximum number of rows that are passed to LAPACK, which is slow with larger triangles."""
 _WHOLE, _FIRST, _LAST = 0, 1, 2
 """Steps of a plan: a small part; what follows from the upper half of a part; from the lower one."""
 
 
 def invert_positive(numbers: FloatArray, size: int) -> bool:
-    """Invert a symmetric positive definite matrix (size, size) where it stands; its lower triangle counts.
+    """Invert a symmetric positive definite matrix (size, size) in place; only its lower triangle is used.
 
     Args:
         numbers: (size * size,) column by column.
         size: Number of rows.
 
     Returns:
-        Whether it is positive definite; else the matrix is spoilt.
+        Whether it is positive definite; if not, the content of the matrix is undefined.
     """
     return _invert(numbers, size, _plan(size))
 
@@ -57,7 +57,7 @@ def invert_positive(numbers: FloatArray, size: int) -> bool:
 def invert_factor(numbers: FloatArray, size: int) -> bool:
     """Replace a symmetric positive definite matrix (size, size) by the inverse of its Cholesky factor.
 
-    Its lower triangle counts and is written; for arguments and result see `invert_positive`.
+    Only its lower triangle is read and written; for arguments and result see `invert_positive`.
     """
     return _invert_factor(numbers, size, _plan(size))
 
@@ -91,7 +91,7 @@ def _invert(numbers: FloatArray, size: int, plan: IntArray) -> bool:
 
 @cached_njit
 def _invert_factor(numbers: FloatArray, size: int, plan: IntArray) -> bool:
-    """Invert the factor in steps; not by recursion, which numba's cache does not survive."""
+    """Invert the factor in steps; not by recursion, which numba's cache does not support."""
     sizes = np.empty(3, dtype=np.int32)
     for k in range(plan.shape[0]):
         step, begin, rows = plan[k, 0], plan[k, 1] * (size + 1), plan[k, 2]

@@ -1,4 +1,4 @@
-"""Graphs of nodes: as data, as child processes that live and die together, and as actions of `ros2 launch`.
+"""Graphs of nodes: as data, as child processes that end together, and as actions of `ros2 launch`.
 
 `ros2 launch swarm_loc_estimator swarm.launch.py` and the `graph` command start the same nodes.
 """
@@ -24,7 +24,7 @@ Options = TypeVar("Options")
 ParameterValue = bool | int | float | str | list[str]
 
 GRACE_S = 5.0
-"""Time that processes get to end after SIGINT, and again after SIGTERM."""
+"""Timeout of processes after SIGINT, and again after SIGTERM."""
 STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM}
 AWAITED_SIGNALS = STOP_SIGNALS | {signal.SIGCHLD}
 _ARGUMENTS = {"parameter_file": "params_file"}
@@ -118,7 +118,7 @@ class Child:
 
 
 def graph_nodes(options: GraphOptions) -> list[NodeSpec]:
-    """The nodes of a swarm's graph in the order of their start: estimator, player and page, where wanted."""
+    """The nodes of a swarm's graph in the order of their start: estimator, player and page if requested."""
 
     def node(executable: str, name: str, parameters: dict[str, ParameterValue]) -> NodeSpec:
         file, required = options.parameter_file, name != "watch"
@@ -205,7 +205,7 @@ def node_action(spec: NodeSpec) -> Any:
 
 
 def executable_path(package: str, executable: str) -> Path:
-    """Where a package's executable is installed.
+    """Path of a package's executable.
 
     Raises:
         GraphError: The package or the executable is missing.
@@ -312,7 +312,7 @@ def stop(children: Sequence[Child], say: Callable[[str], None]) -> None:
 
 
 def _wait_for_all(children: Sequence[Child], patience_s: float | None) -> None:
-    """Wait until all have ended, at most so long."""
+    """Wait until all processes have ended, or until the timeout."""
     deadline = None if patience_s is None else time.monotonic() + patience_s
     for child in children:
         try:

@@ -1,4 +1,4 @@
-"""What all nodes share: start and stop, parameters, ticks and clocks, and who publishes a topic."""
+"""Shared parts of all nodes: start and stop, parameters, ticks and clocks, publishers of topics."""
 
 from __future__ import annotations
 
@@ -42,12 +42,12 @@ from swarm_loc_estimator.common.parameters import (
 Parameters = TypeVar("Parameters")
 
 BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
-"""A clock that jumps back, by however little."""
+"""Threshold for any backward jump of the clock."""
 _EACH_CHANGE = JumpThreshold(
     min_forward=Duration(nanoseconds=1), min_backward=Duration(nanoseconds=-1), on_clock_change=False
 )
 _WAKE_S = 0.2
-"""How long a signal may go unnoticed while nothing happens."""
+"""Maximum time until a signal is noticed while the node is idle [s]."""
 _LEAVE_S = 0.7
 """The process ends this long after a signal, even if it is busy. Destroying thousands of publishers takes DDS
 20 s, since for each of them it announces all remaining ones."""
@@ -109,7 +109,7 @@ class ConfiguredNode(Node, Generic[Parameters]):
 
     Attributes:
         params: Values of the parameters.
-        health: What the log and /diagnostics say.
+        health: Drops and problems for the log and /diagnostics.
 
     Raises:
         UserError: A parameter, or a file that it names, cannot be used.
@@ -248,7 +248,7 @@ def declare_parameters(node: Node, cls: type[Parameters]) -> Parameters:
 
 
 def _refuse_clock_change(parameters: Sequence[Parameter]) -> SetParametersResult:
-    """Refuse a change of use_sim_time: stamps of one clock mean nothing to the other."""
+    """Refuse a change of use_sim_time: stamps of the two clocks are not comparable."""
     changed = any(parameter.name == "use_sim_time" for parameter in parameters)
     reason = "use_sim_time is read at the start only: restart the node." if changed else ""
     return SetParametersResult(successful=not changed, reason=reason)
@@ -277,7 +277,7 @@ _TYPES = {
 
 
 def _descriptor(spec: ParameterSpec) -> ParameterDescriptor:
-    """What `ros2 param describe` prints."""
+    """The descriptor that `ros2 param describe` prints."""
     kind = _TYPES[type(spec.default)].value
     descriptor = ParameterDescriptor(type=kind, description=spec.doc, read_only=True)
     descriptor.additional_constraints = spec.range_text

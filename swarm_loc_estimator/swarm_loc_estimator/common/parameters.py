@@ -1,4 +1,4 @@
-"""Parameters with unit, range and meaning beside their default, and the base class of users' errors.
+"""Parameters with default, unit, range and documentation, and the base class of users' errors.
 
 A frozen dataclass is filled from ROS parameters (`common.node.declare_parameters`), checks a swarm file
 or the settings, and gives the tables under doc/. A field with the metadata `numbers_of` holds a
@@ -26,14 +26,14 @@ class ParameterError(UserError):
 
 @dataclass(frozen=True)
 class NumberSpec:
-    """What one number may be.
+    """Unit, range and documentation of a number.
 
     Attributes:
         unit: SI unit, "1" for none.
         low: Smallest allowed value, itself allowed unless `above`.
         high: Largest allowed value.
         above: Whether `low` itself is refused.
-        doc: One line for people.
+        doc: One line of documentation.
         optional: Whether None is allowed and means unknown.
     """
 
@@ -77,11 +77,11 @@ class ParameterSpec:
 
     Attributes:
         name: Its name.
-        default: Value when nobody sets it; its type is the parameter's.
-        doc: One line for people.
+        default: Default value; its type is that of the parameter.
+        doc: One line of documentation.
         number: Unit and range of a number; None for the other types.
         required: Whether an empty text is refused.
-        choices: The texts that there are; empty: any.
+        choices: Allowed texts; empty: any.
     """
 
     name: str
@@ -93,11 +93,11 @@ class ParameterSpec:
 
     @property
     def range_text(self) -> str:
-        """The values allowed, for people; empty: any."""
+        """The allowed values as text; empty: any."""
         return self.number.range_text if self.number else ", ".join(self.choices)
 
     def checked(self, value: object) -> Value:
-        """The value, with its type made exact; a whole number will do for a real one.
+        """The value, converted to the exact type; an integer is accepted for a float.
 
         Raises:
             ParameterError: It has another type or is out of range.
@@ -125,22 +125,22 @@ class ParameterSpec:
 
 
 def text(default: str, doc: str, *, required: bool = False) -> Any:
-    """A dataclass field that is a text; a required one may not be empty."""
+    """A dataclass field for a text; a required text must not be empty."""
     return field(default=default, metadata={"doc": doc, "required": required})
 
 
 def choice(default: str, choices: Sequence[str], doc: str) -> Any:
-    """A dataclass field that is one of some texts."""
+    """A dataclass field for a text out of a list."""
     return field(default=default, metadata={"doc": doc, "choices": tuple(choices)})
 
 
 def flag(default: bool, doc: str) -> Any:
-    """A dataclass field that is true or false."""
+    """A dataclass field for a boolean."""
     return field(default=default, metadata={"doc": doc})
 
 
 def texts(doc: str) -> Any:
-    """A dataclass field that is a tuple of texts, empty when nobody sets it."""
+    """A dataclass field for a tuple of texts, empty by default."""
     return field(default=(), metadata={"doc": doc})
 
 

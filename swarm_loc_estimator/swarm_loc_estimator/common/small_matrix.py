@@ -12,7 +12,7 @@ from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 
 @cached_njit
 def assign(target: FloatArray, source: FloatArray) -> None:
-    """Copy a vector; a slice assignment would cost seconds of compilation at every place it stands."""
+    """Copy a vector; each slice assignment would cost seconds of compilation."""
     for i in range(target.size):
         target[i] = source[i]
 

@@ -1,4 +1,4 @@
-"""Trajectories: poses over time, and in between."""
+"""Trajectories: poses over time, and their interpolation."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ DEFAULT_GAP_NS = 500_000_000
 
 
 class TrajectoryError(ValueError):
-    """Stamps and poses that do not belong together; the message is one sentence."""
+    """Inconsistent stamps and poses; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -46,13 +46,13 @@ def interpolate(
     """Poses of a trajectory at other times, along the arc between the neighbours.
 
     Args:
-        trajectory: What is known.
-        query_ns: (M,) when it is asked for.
-        max_gap_ns: Longest distance of the two neighbours.
+        trajectory: The known poses.
+        query_ns: (M,) times of the interpolated poses.
+        max_gap_ns: Maximum time between two neighbours.
 
     Returns:
-        (M, 3) poses, NaN where there is none, and (M,) whether there is one: a trajectory is not continued
-        beyond its ends nor across longer gaps; at its own stamps it is always known.
+        (M, 3) poses, NaN if undefined, and (M,) whether they are defined: a trajectory is not extrapolated
+        beyond its ends nor interpolated across longer gaps; at its own stamps it is always defined.
     """
     poses = np.full((len(query_ns), 3), np.nan)
     if len(trajectory.stamp_ns) == 0:

@@ -24,7 +24,7 @@ Tree = Any
 """dict, list, str, int, float, bool or None."""
 
 MAX_BYTES = 2_000_000
-"""Larger files are refused [byte]; a thousand robots take a fourth of it."""
+"""Larger files are refused [byte]; the file of a thousand robots has a quarter of this size."""
 
 _TAG = "tag:yaml.org,2002:"
 _FLOAT = r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
@@ -47,7 +47,7 @@ class YamlTreeError(UserError):
 
 
 class _Resolver(VersionedResolver):
-    """Numbers are decimal; what else YAML allows, such as 0x10 and 1_000, is text."""
+    """Numbers are decimal; other notations of YAML, such as 0x10 and 1_000, are text."""
 
     @property
     def versioned_resolver(self) -> dict[None, list[tuple[str, re.Pattern[str]]]]:
@@ -59,7 +59,7 @@ class _Resolver(VersionedResolver):
 
 
 class _Constructor(SafeConstructor):
-    """Values of the kinds above alone; no merge keys, whose expansion has no bound."""
+    """Only the types above; no merge keys, whose expansion is unbounded."""
 
     yaml_constructors = {  # noqa: RUF012  # the library's own attribute
         tag: SafeConstructor.yaml_constructors[tag]

@@ -1,1 +1,1 @@
-"""The ROS nodes, one per file: convert, call the core, publish."""
+"""ROS nodes, one per file: they convert messages, call the core and publish its results."""

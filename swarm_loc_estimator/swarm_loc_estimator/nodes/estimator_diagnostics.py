@@ -23,7 +23,7 @@ from swarm_loc_estimator.timeline.fusion import Verdict
 
 _FULL_LOAD = 0.95
 _PATIENCE_S, _PATIENCE_PERIODS = 10.0, 5.0
-"""An expected input may be silent for so many seconds, and for so many of its mean periods."""
+"""Timeout of an expected input [s], and in its mean periods."""
 
 
 @dataclass
@@ -32,10 +32,10 @@ class TickCost:
 
     Attributes:
         count: Number of ticks.
-        sum_s: Their total duration [s].
-        max_s: The longest [s].
+        sum_s: Total duration of the ticks [s].
+        max_s: Duration of the longest tick [s].
         sightings: Number of measurements received.
-        shed: Number of these that were dropped under overload.
+        shed: Number of measurements dropped under overload.
     """
 
     count: int = 0
@@ -79,24 +79,24 @@ def add_identities(reports: Sequence[Report], identities: Identities | None) -> 
 
 
 class Graph(Protocol):
-    """What the ROS graph knows of publishers, see `ConfiguredNode`."""
+    """Publishers in the ROS graph, see `ConfiguredNode`."""
 
     def duplicate_publishers(self, topic: str) -> list[str]:
-        """The nodes that publish a topic, if there are several."""
+        """Names of the nodes that publish a topic, if there are several."""
 
     def why_missing(self, topic: str, message_type: str) -> str:
         """Why a topic has no messages, such as " (no publisher)"."""
 
 
 class Diagnostics:
-    """Makes the reports, once per interval.
+    """Creates the diagnostic reports of an interval.
 
     Args:
         swarm: The robots.
-        ingest: What came in; each of its topics should have one publisher.
-        odom_frame: Name below the robot's of the frame that its odometry should be in.
-        graph: Who publishes.
-        sole: Further topics that should have one publisher.
+        ingest: The inputs; each of its topics should have one publisher.
+        odom_frame: Expected frame of the odometry, below the robot's name.
+        graph: Publishers of topics.
+        sole: Other topics that should have one publisher.
 
     Attributes:
         duplicate_publishers: One sentence for each topic that has more publishers, at the newest reports.
@@ -126,7 +126,7 @@ class Diagnostics:
         return [topic for topic, statistics in pairs if topic.expected and not statistics.received]
 
     def missing_text(self) -> str:
-        """One sentence about the missing topics, by cause; "" when there are none."""
+        """One sentence about the missing topics, grouped by cause; "" without any."""
         by_cause: dict[str, list[str]] = {}
         for topic in self.missing():
             by_cause.setdefault(self._why_missing(topic), []).append(topic.name)
@@ -136,12 +136,12 @@ class Diagnostics:
     def reports(
         self, now_ns: int, estimate: Estimate, recent: Recent, drops: Mapping[str, int]
     ) -> list[Report]:
-        """One per robot, then the swarm's inputs and drops; begins a new interval.
+        """Reports of the robots, then of the swarm's inputs and drops; begins a new interval.
 
         Args:
             now_ns: The node's time.
-            estimate: The newest.
-            recent: The estimator's measurements with verdicts and normalised innovations squared.
+            estimate: The newest estimate.
+            recent: The estimator's measurements with verdicts and normalized innovations squared.
             drops: Data not used, by reason.
         """
         elapsed_s = (now_ns - self._reported_ns) * 1e-9 if self._reported_ns is not None else 0.0
@@ -202,7 +202,7 @@ class Diagnostics:
         return Report(robot.name, "; ".join(troubles) or status.name.lower(), level_of(troubles), values)
 
     def _input_troubles(self, handle: int, topic: InputTopic, robot: Robot | None, now_ns: int) -> list[str]:
-        """What is wrong with an input, in words."""
+        """Problems of an input, in words."""
         statistics = self._ingest.statistics[handle]
         if not statistics.received:
             missing = f"no messages received on {topic.name}{self._why_missing(topic)}"
@@ -246,7 +246,7 @@ class Diagnostics:
 
 
 def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period_s: float) -> Report:
-    """What the ticks cost, and what to do when that is too much.
+    """Report of the ticks' durations, with advice if they are too long.
 
     Args:
         cost: The ticks of the interval.
@@ -271,7 +271,7 @@ def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period
 
 
 def shedding_report(cost: TickCost) -> Report:
-    """Which share of the measurements is dropped under overload.
+    """Report of the share of measurements dropped under overload.
 
     Args:
         cost: The ticks of the interval.
@@ -286,16 +286,16 @@ def shedding_report(cost: TickCost) -> Report:
 
 
 def overload_report(count: int) -> Report:
-    """A warning that messages were lost before they were taken.
+    """A warning about messages that the middleware dropped from full queues.
 
     Args:
-        count: How many, in the interval.
+        count: Number of dropped messages in the interval.
     """
     return Report("overload", f"overload: {count} messages were lost in full queues", Level.WARN)
 
 
 def merged(reports: Sequence[Report], name: str) -> Report:
-    """Several reports as one; the sentences of those that warn come first."""
+    """Several reports merged into one; warnings come first."""
     warnings = [report.message for report in reports if report.warning]
     values = {key: value for report in reports for key, value in report.values.items()}
     message = "; ".join(warnings or [report.message for report in reports])
@@ -323,5 +323,5 @@ def _used_per_robot(recent: Recent, robots: int) -> tuple[list[int], list[float]
 
 
 def _figure(value: float | None) -> str:
-    """A number for people; "-" when there is none."""
+    """A number as text; "-" for NaN."""
     return "-" if value is None or not math.isfinite(value) else f"{value:.4g}"

@@ -6,7 +6,7 @@ It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness`, `<r
 `<robot>/initialpose` of the robots in the swarm description, and to `aerial/detections`; with `shared_topics`
 to `swarm/odom`, `swarm/detections` and `swarm/fixes` in their place. It publishes
 `swarm/poses`, `<robot>/pose`, `aerial/identities`, `/diagnostics`, and `/tf` (map to `<robot>/odom`, which no
-one else may publish).
+other node may publish).
 Services: `~/reset`, `~/set_robot_pose`. Parameters: see `doc/estimator_node.md`.
 """
 
@@ -127,7 +127,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         return Diagnostics(self._swarm, self._ingest, self.params.odom_frame, self, sole)
 
     def _owned_frames(self) -> list[str]:
-        """The frames whose parent only this node publishes; none without publish_tf."""
+        """Child frames of the transforms that only this node may publish; none without publish_tf."""
         robots = self._swarm.robots if self.params.publish_tf else ()
         return [f"{robot.name}/{self.params.odom_frame}" for robot in robots]
 

@@ -1,4 +1,4 @@
-"""Topics of the estimator: raw inputs, which wait for a tick, and the estimates that it publishes."""
+"""Topics of the estimator: raw inputs, which are queued until the next tick, and published estimates."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ _MAX_FRAME_LENGTH = 64
 """Longer names of foreign frames are cut."""
 _RELIABLE = QoSProfile(depth=10)
 _SIGHTINGS_PERIOD_NS = 180_000_000
-"""Of swarm/sightings, which people look at."""
+"""Publishing period of swarm/sightings, which are for display only."""
 _TF = QoSProfile(depth=100)  # what tf2's own broadcaster offers
 
 
@@ -137,7 +137,7 @@ class EstimatorInputs:
         )
 
     def _follow(self, handle: int, _event: object) -> None:
-        """Subscribe again as best effort, which matches every publisher but gets no retransmissions."""
+        """Subscribe again as best effort, which matches all publishers but has no retransmissions."""
         before = self._subscriptions[handle]
         if before.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             return
@@ -151,8 +151,8 @@ class EstimatorInputs:
 def newest_time_ns(node: Node) -> int:
     """Time of a node [ns]; in simulated time that of the newest /clock received, handled or not.
 
-    On a busy machine a node may take data that are newer than the /clock that its executor handled last; they
-    would seem to come from the future. A clock that jumped back is left to the executor.
+    On a busy machine a node may take data newer than the /clock that its executor handled last, which would
+    appear to be stamped in the future. The executor handles a clock that jumped back.
     """
     now_ns = int(node.get_clock().now().nanoseconds)
     source = node._time_source  # noqa: SLF001 - rclpy has no public access to it
@@ -173,7 +173,7 @@ class StaticTransforms:
 
     Args:
         node: Has the subscription.
-        owned: The frames whose parent only this node may publish.
+        owned: Frames whose parent only this node may publish.
     """
 
     def __init__(self, node: Node, owned: Collection[str]) -> None:
@@ -184,7 +184,7 @@ class StaticTransforms:
 
     @property
     def foreign(self) -> list[str]:
-        """One sentence for each owned frame to which another node has given a parent."""
+        """One sentence for each owned frame for which another node publishes a static parent."""
         return [
             f"/tf_static has a transform from '{parent}' to '{child}', which only the estimator may publish"
             for child, parent in self._parents.items()
@@ -201,9 +201,9 @@ class EstimateOutputs:
     """Publishes estimates.
 
     Args:
-        node: Whose publishers they are.
+        node: Owns the publishers.
         swarm: Names of the robots.
-        parameters: Frames, and what is wanted.
+        parameters: Frames, and which topics to publish.
     """
 
     def __init__(self, node: Node, swarm: Swarm, parameters: EstimatorParameters) -> None:
@@ -226,7 +226,7 @@ class EstimateOutputs:
         self._tf_encoder = TransformsEncoder(frame, [f"{name}/{parameters.odom_frame}" for name in names])
 
     def publish(self, estimate: Estimate) -> None:
-        """Publish all poses; robots that wait for a fix are in `swarm/poses` only, as waiting."""
+        """Publish all poses; robots that are not localized are in `swarm/poses` only, with status waiting."""
         e = estimate
         located = e.status != Status.WAITING
         self._swarm_poses.publish(

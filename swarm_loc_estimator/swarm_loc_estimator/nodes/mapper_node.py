@@ -172,12 +172,12 @@ class MapperNode(ConfiguredNode[MapperParameters]):
 
 
 def occupancy_message(occupancy: OccupancyMap, header: Header) -> OccupancyGrid:
-    """The map: -1 unknown, else the probability that a cell is occupied [%]."""
+    """The occupancy grid: probability of each cell [%], -1 if unknown."""
     return _grid(occupancy, occupancy.percent, header)
 
 
 def visitation_message(occupancy: OccupancyMap, visits: IntArray, header: Header) -> OccupancyGrid:
-    """How often robots were on each cell, 100 at most."""
+    """Number of robot visits of each cell, at most 100."""
     return _grid(occupancy, np.minimum(visits, 100).astype(float), header)
 
 
@@ -193,7 +193,7 @@ def _grid(occupancy: OccupancyMap, values: FloatArray, header: Header) -> Occupa
 
 
 def goal_message(goal: Goal, frame: str) -> PoseStamped:
-    """Where a robot should stop, facing as it comes from where it is."""
+    """Next stop of a robot, with the heading of the straight line from its present position."""
     message = PoseStamped()
     message.header.frame_id = frame
     message.header.stamp = Time(nanoseconds=goal.stamp_ns).to_msg()
@@ -203,7 +203,7 @@ def goal_message(goal: Goal, frame: str) -> PoseStamped:
 
 
 def fix_message(goal: Goal, covariance: FloatArray, frame: str) -> PoseWithCovarianceStamped:
-    """Where a robot was when its goal was decided, with a covariance (3, 3); see `FixCovariances`."""
+    """Pose of a robot when its goal was chosen, with a covariance (3, 3); see `FixCovariances`."""
     message = PoseWithCovarianceStamped()
     message.header.frame_id = frame
     message.header.stamp = Time(nanoseconds=goal.stamp_ns).to_msg()

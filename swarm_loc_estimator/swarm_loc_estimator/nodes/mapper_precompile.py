@@ -1,4 +1,4 @@
-"""Compile the mapper before data comes; it would fall behind the robots meanwhile. No ROS here."""
+"""Compile the mapper before data arrive, so that it does not fall behind the robots. No ROS here."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from swarm_loc_estimator.mapping.scans import Readings
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
 _ROOM = (1.7, 1.1)
-"""How far its walls are to the east and west, north and south of the middle [m]."""
+"""Distances of the walls from the centre of the room, east and west, north and south [m]."""
 _PERIOD_NS, _TURN_RATE, _SPEED = 20_000_000, 1.0, 0.2
 _STOPS = 4
 _SIGMA = 0.016
-"""Of an inverse distance [1/m]."""
+"""Noise of an inverse distance [1/m]."""
 
 
 def precompile() -> None:
-    """Let a robot look around in a room, several times: a minute unless `is_precompiled`, then a second."""
+    """Map a simulated room several times; takes a minute unless `is_precompiled`, then a second."""
     mapper = CooperativeMapper(MapperSettings())
     robot = mapper.join(np.zeros(3), np.array([0.01, 0.01, 0.01]))
     pose, stamp_ns = np.zeros(3), 0

@@ -1,8 +1,8 @@
-"""Plays a bag into the graph with /clock, as `ros2 bag play --clock` does, for machines without it.
+"""Publishes the messages of a bag with /clock, as `ros2 bag play --clock` does, for machines without it.
 
     ./run swarm_loc_estimator play --ros-args -p bag:=FOLDER -p rate:=4.0
 
-Topics keep the bag's names and types; remappings work as for any node. It ends when the bag does.
+Topics keep the names and types of the bag; remappings work as for any node. The node ends with the bag.
 """
 
 from __future__ import annotations
@@ -34,18 +34,18 @@ from swarm_loc_estimator.nodes.playback import STEP_S, PlayedSoFar, play
 _CLOCK = "clock"
 _POLL_S = 0.05
 _SETTLED_S = 0.5
-"""A node's subscriptions are discovered one by one; no new one for so long, and all are there."""
+"""Discovery of subscriptions counts as complete after this time without a new one."""
 _SAY_EVERY_S = 5.0
 _LAST_WORDS_S = 30.0
-"""Longer than the 20 s after which DDS forgets a subscriber that has gone: who lives acknowledges in time,
-also by a radio, whose lost packets are asked for again only every 3 s."""
+"""Time to wait for acknowledgements. DDS removes a dead subscriber after 20 s; a live one acknowledges
+earlier, even by a lossy radio, where lost packets are requested again only every 3 s."""
 _AT_ONCE = Duration(nanoseconds=0)
 _RUN_ON_S = 0.25
-"""The clock runs on for so long behind the last message, so that nodes that work by timers use it, too."""
+"""Time for which /clock continues after the last message, so that timers of other nodes process it."""
 DEPTH = 1000
-"""The player's own, whatever the recorded publisher kept: deep enough for any rate."""
+"""History depth of the player's publishers, whatever the recorded depth; enough for any rate."""
 RELIABLE = QoSProfile(depth=DEPTH)
-"""Subscribers that ask for reliability hear it, and those that do not."""
+"""Reliable, which matches reliable and best-effort subscribers."""
 LATCHED = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _LATCHED_TOPICS = frozenset({"tf_static", "robot_description", "map"})
 
@@ -61,7 +61,7 @@ _LONGEST_NS = 2**63 - 1
 
 
 class PlayNode(ConfiguredNode[PlayerParameters]):
-    """Publishes the messages of a bag at their times."""
+    """Publishes the messages of a bag at their log times."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("player", PlayerParameters, **node_arguments)
@@ -86,7 +86,7 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
         self._now_ns = 0
 
     def run(self, stop: Stop) -> int:
-        """Play to the end, or until asked to stop; the exit status."""
+        """Play to the end, or until asked to stop; returns the exit status."""
         self._wait_for_subscribers(stop)
         while not stop.requested:
             played_before = self.so_far.messages
@@ -102,13 +102,13 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
         return 0
 
     def destroy_node(self) -> None:
-        """Close the bag, too."""
+        """Close the bag and destroy the node."""
         self._reader.close()
         self._own_executor.shutdown()
         super().destroy_node()
 
     def _chosen_topics(self) -> list[BagTopic]:
-        """The topics to play; the bag's own /clock is not among them."""
+        """The topics to play, without the /clock of the bag."""
         topics = {topic.name: topic for topic in self._reader.topics if topic.name != _CLOCK}
         wanted = [name.lstrip("/") for name in self.params.topics]
         for name in wanted:
@@ -119,7 +119,7 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
         return [topics[name] for name in wanted or topics]
 
     def _add_publisher(self, topic: BagTopic) -> None:
-        """Get ready to publish a topic, if its type is installed."""
+        """Create the publisher of a topic, if its type is installed."""
         package, _, name = topic.type.replace("/msg/", "/").partition("/")
         try:
             message_class = getattr(import_module(f"{package}.msg"), name)
@@ -134,18 +134,18 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
         play(messages, self._begin_ns, self.params.rate, self, self.so_far)
 
     def publish(self, message: RawMessage) -> None:
-        """Send a message of the bag out."""
+        """Publish a message of the bag."""
         topic, _, _, data = message
         self._publisher_of[topic].publish(bytes(data))
 
     def publish_clock(self, now_ns: int) -> None:
-        """Send /clock out, if it is wanted."""
+        """Publish /clock, if enabled."""
         self._now_ns = now_ns
         if self._clock_publisher is not None:
             self._clock_publisher.publish(ClockMessage(clock=Time(nanoseconds=now_ns).to_msg()))
 
     def _run_clock_on(self) -> None:
-        """Let time go on, at its own pace whatever the rate."""
+        """Continue /clock after the last message, in real time whatever the rate."""
         begin_s, begin_ns = time.monotonic(), self._now_ns
         for step in range(1, round(_RUN_ON_S / STEP_S) + 1):
             self.wait_until(begin_s + step * STEP_S)
@@ -156,13 +156,13 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
         return time.monotonic()
 
     def wait_until(self, instant_s: float) -> None:
-        """Return when the steady clock has come to an instant; serve the node's parameters meanwhile."""
+        """Wait until an instant of the steady clock; serve the node's parameters meanwhile."""
         self._own_executor.spin_once(timeout_sec=max(0.0, instant_s - time.monotonic()))
         while (left_s := instant_s - time.monotonic()) > 0.0:
             self._own_executor.spin_once(timeout_sec=left_s)
 
     def _wait_for_subscribers(self, stop: Stop) -> None:
-        """Return once topics are heard as the user asked for, and no more come; say what is waited for."""
+        """Wait until enough topics have subscribers and no new ones appear; log the reason."""
         wanted = self.params.wait_for_subscribers
         said_s = changed_s = time.monotonic()
         heard, clock_heard = 0, False
@@ -180,7 +180,7 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
             self._own_executor.spin_once(timeout_sec=_POLL_S)
 
     def _wait_for_acknowledgements(self, stop: Stop) -> None:
-        """Stay until everyone has received the last message, or somebody stops it; say what is waited for."""
+        """Wait until all subscribers have acknowledged the last message, or until stopped; log the reason."""
         silent, begin_s = self._publisher_of, time.monotonic()
         said_s = begin_s
         while silent and not stop.requested and (now_s := time.monotonic()) < begin_s + _LAST_WORDS_S:
@@ -199,8 +199,8 @@ def playing_qos(topic: str, recorded: Sequence[Qos]) -> QoSProfile:
 
     Args:
         topic: Its name in the bag.
-        recorded: Those of its publishers. Where these differ, or none is known, it is reliable, and latched
-            if its name says so.
+        recorded: Profiles of its publishers. If these differ or none is known, the result is reliable, and
+            latched for topics that are latched by convention.
     """
     profiles = [_profile(one) for one in recorded]
     if profiles and all(one == profiles[0] for one in profiles):
@@ -209,7 +209,7 @@ def playing_qos(topic: str, recorded: Sequence[Qos]) -> QoSProfile:
 
 
 def _profile(recorded: Qos) -> QoSProfile:
-    """A recorded profile; policies that only ask for some default become this player's."""
+    """A recorded profile; unspecified policies are replaced by the defaults of this player."""
     latched = recorded.durability is QosDurability.TRANSIENT_LOCAL
     return QoSProfile(
         # of a latched topic, late subscribers get as much as they used to

@@ -11,25 +11,25 @@ from swarm_loc_estimator.common.bags.bag_file import RawMessage
 
 _SECOND = 1_000_000_000
 STEP_S = 0.005
-"""Messages go out in steps of this much wall time, each after a /clock that none of them is ahead of."""
+"""Wall time of a playback step [s]; the messages of a step follow a /clock not behind them."""
 LONGEST_STEP_NS = 20_000_000
-"""A step is never longer than this much bag time, at any rate and however far behind."""
+"""Longest bag time of a step, at any rate and lag."""
 
 
 def clock_step_ns(rate: float) -> int:
-    """By how much /clock goes on at a time, where a bag is played at `rate` seconds per second."""
+    """Step of /clock in bag time, at a rate of `rate` bag seconds per second."""
     return max(1, min(round(STEP_S * rate * _SECOND), LONGEST_STEP_NS))
 
 
 @dataclass
 class PlayedSoFar:
-    """What went out.
+    """Progress of the playback.
 
     Attributes:
-        messages: How many.
-        bag_ns: Bag time that has passed.
-        wall_s: Wall time that has passed.
-        latest_s: How late the latest message was, in wall time.
+        messages: Number of messages published.
+        bag_ns: Elapsed bag time.
+        wall_s: Elapsed wall time.
+        latest_s: Maximum delay of a message, in wall time.
     """
 
     messages: int = 0
@@ -48,32 +48,32 @@ class PlayedSoFar:
 
 
 class Output(Protocol):
-    """Where messages go, and the steady clock that they keep to."""
+    """Publishes messages, and has the steady clock that schedules them."""
 
     def publish(self, message: RawMessage) -> None:
-        """Send a message out."""
+        """Publish a message."""
 
     def publish_clock(self, now_ns: int) -> None:
-        """Send /clock out; every message follows one that is not behind it."""
+        """Publish /clock; every message follows a /clock that is not behind it."""
 
     def now_s(self) -> float:
         """The steady clock."""
 
     def wait_until(self, instant_s: float) -> None:
-        """Return when that clock has come to an instant."""
+        """Wait until an instant of that clock."""
 
 
 def play(
     messages: Iterable[RawMessage], begin_ns: int, rate: float, output: Output, so_far: PlayedSoFar
 ) -> None:
-    """Publish messages in time with a steady clock; being late once does not shift what follows.
+    """Publish messages in time with a steady clock; a delay does not shift later messages.
 
     Args:
-        messages: In order of log time; earlier ones than `begin_ns` are left out.
-        begin_ns: Log time that stands for now.
+        messages: In order of log time; messages before `begin_ns` are skipped.
+        begin_ns: Log time at which playback begins.
         rate: Bag seconds per second.
-        output: Where they go.
-        so_far: Is kept up to date.
+        output: Publishes the messages.
+        so_far: Updated during playback.
     """
     step_ns = clock_step_ns(rate)
     # finding the first one takes a while in a large bag: not after the clock has begun to run

@@ -1,4 +1,4 @@
-"""Set robots to poses as users ask: the service `set_robot_pose` and the topics `<robot>/initialpose`."""
+"""Set the poses of robots by the service `set_robot_pose` and the topics `<robot>/initialpose`."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ REFUSALS = {
     " 1e14, or zero for the default.",
     "not_localized": "the robot has sent no odometry yet.",
 }
-"""What the estimator's reasons not to set a pose mean, each a sentence."""
+"""Reason of the estimator not to set a pose -> sentence for the user."""
 
 
 class SetPoseError(ValueError):
-    """A pose that a robot cannot be set to; the message is one sentence."""
+    """A pose that cannot be set; the message is one sentence."""
 
 
 def planar_pose(pose: PoseWithCovariance, start_sigma: StartSigma) -> tuple[FloatArray, FloatArray]:
@@ -35,10 +35,10 @@ def planar_pose(pose: PoseWithCovariance, start_sigma: StartSigma) -> tuple[Floa
 
     Args:
         pose: In map.
-        start_sigma: Taken when the covariance was left at zero.
+        start_sigma: Used if the covariance is zero.
 
     Raises:
-        SetPoseError: Numbers that are not finite, or no quaternion.
+        SetPoseError: A number is not finite, or the quaternion is invalid.
     """
     position, q = pose.pose.position, pose.pose.orientation
     planar = np.array([position.x, position.y, yaw_of(q.x, q.y, q.z, q.w)])
@@ -51,14 +51,14 @@ def planar_pose(pose: PoseWithCovariance, start_sigma: StartSigma) -> tuple[Floa
 
 
 class PoseCommands:
-    """Sets the pose of a robot as a user asks, or makes it unlocated until the next fix.
+    """Sets the pose of a robot, or deinitializes it until the next fix, at the user's request.
 
     Args:
-        node: Offers the service and subscribes.
+        node: Owns the service and the subscriptions.
         swarm: The robots.
-        estimator: Carries the commands out.
-        map_frame: The frame in which poses must be.
-        by_topics: Whether there is a topic for each robot beside the service.
+        estimator: Executes the commands.
+        map_frame: Required frame of the poses.
+        by_topics: Whether to subscribe to a topic for each robot, too.
     """
 
     def __init__(
@@ -87,7 +87,7 @@ class PoseCommands:
         return response
 
     def _obey(self, request: SetRobotPose.Request) -> str:
-        """Do what was asked, and say it."""
+        """Execute the request and log it."""
         robot = self._swarm.index_of.get(request.robot)
         if robot is None:
             raise SetPoseError(f"there is no robot '{request.robot}' in the swarm description.")
@@ -109,7 +109,7 @@ class PoseCommands:
             raise SetPoseError(f"the pose is in frame '{frame}' but must be in '{self._map_frame}'.")
 
     def _set_pose(self, robot: int, wanted: PoseWithCovariance) -> str:
-        """Set a robot to a pose, now, and say it."""
+        """Set the present pose of a robot and log it."""
         pose, covariance = planar_pose(wanted, self._swarm.robots[robot].start_sigma)
         fault = self._estimator.set_pose(robot, self._now_ns(), pose, covariance)
         if fault:
@@ -119,7 +119,7 @@ class PoseCommands:
         return f"Robot '{name}' is at x {x:.3f} m, y {y:.3f} m, theta {theta:.3f} rad."
 
     def _now_ns(self) -> int:
-        """The node's time, if there is one."""
+        """The node's time; raises SetPoseError before the first /clock."""
         now_ns: int = self._node.get_clock().now().nanoseconds
         if not now_ns:
             raise SetPoseError(f"{NO_CLOCK}.")

@@ -1,4 +1,4 @@
-"""Ground truth of a recording, which only evaluation and calibration see: poses of several message types."""
+"""Ground truth of a recording, used only by evaluation and calibration: poses of several message types."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _READ: Mapping[str, tuple[Callable[[bytes], OdometryMessage | PoseMessage | FixM
     ODOMETRY: (decode_odometry, 2),
     TRANSFORM_STAMPED: (_decode_transform, 2),
 }
-"""Type of a message -> how to read it, and how many frame names lie before its pose."""
+"""Type of a message -> its reader, and the number of frame names before its pose."""
 
 
 class TruthReader:

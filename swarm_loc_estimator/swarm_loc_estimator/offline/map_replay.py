@@ -74,17 +74,17 @@ def truth_of(bag: Path, swarm: Swarm) -> dict[str, Trajectory]:
 
 
 COVERED_M = 0.06
-"""A piece of wall is covered if a cell so near is occupied."""
+"""A piece of wall is covered if a cell within this distance is occupied [m]."""
 _SPACING_M = 0.01
 
 
 class MapFigures(NamedTuple):
-    """Figures of a map; NaN where there is nothing to compare with.
+    """Quality of a map; NaN without ground truth or floor plan.
 
     Attributes:
-        stops: How many stops have ground truth.
-        position_m: RMS error of these.
-        heading_rad: RMS error of their headings.
+        stops: Number of stops with ground truth.
+        position_m: RMS position error of these stops.
+        heading_rad: RMS heading error of these stops.
         wall_m: Mean distance of occupied cells from the nearest wall.
         coverage: Share of the walls with an occupied cell nearby.
     """
@@ -113,7 +113,7 @@ def map_figures(mapper: CooperativeMapper, truth: Mapping[int, Trajectory], wall
 
     Args:
         mapper: Holds the map and the stops.
-        truth: Number of a robot -> where it truly was, in map.
+        truth: Index of a robot -> its true trajectory in map.
         walls: (S, 4) segments x0, y0, x1, y1 of the floor plan [m]; may be empty.
     """
     off = _stop_errors(mapper, truth)

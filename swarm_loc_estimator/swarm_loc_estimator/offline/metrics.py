@@ -42,7 +42,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """Statistics of errors; NaN when there was nothing to compare.
+    """Statistics of errors; NaN without poses to compare.
 
     Attributes:
         count: Number of compared poses.
@@ -154,7 +154,7 @@ def pool(errors: Sequence[Errors]) -> Errors:
 
 
 def _figures(values: FloatArray) -> tuple[float, float, float, float, float]:
-    """Root mean square, mean, median, 95 % and maximum of errors without sign."""
+    """Root mean square, mean, median, 95th percentile and maximum of absolute errors."""
     rmse = float(np.sqrt(np.mean(values * values)))
     median, p95 = (float(figure) for figure in np.percentile(values, [50, 95]))
     return rmse, float(values.mean()), median, p95, float(values.max())

@@ -1,4 +1,4 @@
-"""Read a bag of a swarm once: inputs in order of arrival; ground truth, maps and goals beside them."""
+"""Read a bag of a swarm once: inputs in order of arrival, ground truth, maps and goals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from swarm_loc_estimator.sensors.registry import Batch, kinds
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 Progress = Callable[[float, str], None]
-"""Is called with the share done, 0 to 1, and what is being done."""
+"""Called with the completed share, 0 to 1, and the name of the present step."""
 
 
 def unwatched(_share: float, _what: str) -> None:
@@ -30,14 +30,14 @@ def unwatched(_share: float, _what: str) -> None:
 
 @dataclass(frozen=True)
 class BagSummary:
-    """Contents of a bag beside the inputs of the estimator.
+    """Contents of a bag other than the inputs of the estimator.
 
     Attributes:
         range_ns: First and last log time.
         truth: Robot name -> ground truth; robots without are missing.
         received: Messages for the estimator by kind of topic.
-        remarks: What could not be read or used, one sentence each.
-        unusable: Why no message at all can be used, one sentence each; empty: some can, or none is expected.
+        remarks: Unreadable or unused contents, one sentence each.
+        unusable: Why no message can be used, one sentence each; empty if some can or none is expected.
         maps: Messages of `map`, thinned out to `MAX_MAP_BYTES`.
         goals: Robot name -> its goals by their stamps.
     """
@@ -108,7 +108,7 @@ def _strangers(topics: Sequence[BagTopic], ingest: Ingest) -> list[str]:
 
 
 def _unusable(topics: Sequence[BagTopic], ingest: Ingest, swarm: Swarm) -> tuple[str, ...]:
-    """For each expected kind of input without a usable message, one sentence about what the bag holds."""
+    """One sentence for each expected kind of input without a usable message, with topics that the bag has."""
     pairs = [*zip(ingest.topics, ingest.statistics, strict=True)]
     used = {topic.kind.rows for topic, statistics in pairs if statistics.received > statistics.malformed}
     sentences = []
@@ -149,9 +149,9 @@ def _listed(topics: Sequence[BagTopic]) -> str:
 
 
 MAX_MAP_BYTES = 48_000_000
-"""Beyond this, maps are thinned out evenly over time."""
+"""Size from which maps are thinned out evenly over time."""
 MAX_GOALS = 20_000
-"""Goals kept of one robot."""
+"""Maximum number of stored goals per robot."""
 
 
 class MapReader:

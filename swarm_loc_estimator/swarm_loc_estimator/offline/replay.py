@@ -1,7 +1,7 @@
-"""Replay a bag: inputs reach the estimator when they arrived, and poses are taken on a schedule.
+"""Replay a bag: the estimator receives inputs at their recorded arrival times, and poses follow a schedule.
 
-Replay, calibration and benchmarks step the estimator as the live node does: late inputs are late again, and
-the same inputs give the same poses, byte for byte.
+Replay, calibration and benchmarks run the estimator like the live node, with the recorded delays. The same
+inputs give the same poses, byte for byte.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ def replay(
     keep_sightings: bool = False,
     progress: Progress = unwatched,
 ) -> ReplayResult:
-    """Estimate all poses from a bag and compare them with the ground truth that it may hold.
+    """Estimate all poses from a bag, and compare them with the bag's ground truth, if any.
 
     Args:
         bag: rosbag2 folder, .mcap or .db3 file.
@@ -84,18 +84,18 @@ def replay(
 
 
 MAX_DETECTIONS = 200_000
-"""Detections of aerial images kept for display; of a very long run only the beginning."""
+"""Maximum number of aerial detections stored for display; later ones of a long run are not stored."""
 _TICKS_AT_ONCE = 256
 _SIGHTINGS_PERIOD_NS = 500_000_000
 _MAX_SIGHTINGS = 500_000
-"""Sightings kept for display; of a very long run only the beginning."""
+"""Maximum number of sightings stored for display; later ones of a long run are not stored."""
 
 
 class Schedule(Protocol):
-    """When to output poses."""
+    """Schedule of the outputs."""
 
     def begin(self, now_ns: int) -> None:
-        """Inputs without a long pause between them begin to arrive."""
+        """Start at the first input after a long pause."""
 
     def due(self, now_ns: int) -> list[int]:
         """Output times until now that were not due before."""
@@ -108,7 +108,7 @@ class PeriodicSchedule:
     """Outputs at every whole multiple of a period, except while the clock jumps ahead.
 
     Attributes:
-        jumps: How often the clock jumped ahead by more than `MAX_PAUSE_NS`.
+        jumps: Number of forward jumps of the clock by more than `MAX_PAUSE_NS`.
     """
 
     def __init__(self, period_ns: int) -> None:
@@ -117,7 +117,7 @@ class PeriodicSchedule:
         self._next_ns: int | None = None
 
     def begin(self, now_ns: int) -> None:
-        """Inputs begin to arrive; no output is due in a long pause before them."""
+        """Start at the first input after a long pause, in which no output is due."""
         jumps = self._next_ns is not None and now_ns - self._next_ns > MAX_PAUSE_NS
         if self._next_ns is None or jumps:
             self._next_ns = (now_ns // self._period_ns + 1) * self._period_ns
@@ -146,7 +146,7 @@ class ListedSchedule:
         self._done = 0
 
     def begin(self, now_ns: int) -> None:
-        """Nothing changes."""
+        """Do nothing: the outputs are given."""
 
     def due(self, now_ns: int) -> list[int]:
         """Output times until now that were not due before."""
@@ -164,7 +164,7 @@ class Runner:
 
     Args:
         estimator: Fed by this runner only.
-        schedule: When it ticks.
+        schedule: Schedule of its ticks.
         keep_sightings: Whether sightings and aerial images are kept for display, too.
     """
 
@@ -184,7 +184,7 @@ class Runner:
         self._filled = 0
 
     def take(self, inputs: Batch) -> None:
-        """Feed inputs, and do all ticks that are due until the last of them."""
+        """Feed inputs, and run all ticks that are due until the last of them."""
         self._schedule.begin(inputs.begin_ns)
         if self._images is not None:
             self._images.add(inputs["aerial"])
@@ -196,7 +196,7 @@ class Runner:
         self._estimator.receive(next(parts))
 
     def finish(self, last_ns: int) -> None:
-        """Do the ticks after the last inputs of a recording that ends at `last_ns`."""
+        """Run the ticks after the last inputs of a recording that ends at `last_ns`."""
         for now_ns in self._schedule.rest(last_ns):
             self._tick(now_ns)
 

@@ -19,7 +19,7 @@ from swarm_loc_estimator.timeline.sightings import Sightings
 
 
 class RecordedMap(NamedTuple):
-    """A message of `map`, and when it was recorded."""
+    """A message of `map` and its log time."""
 
     log_ns: int
     data: bytes
@@ -48,7 +48,7 @@ class AerialImage(NamedTuple):
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """Estimated poses of all robots over time, and what there is to compare them with.
+    """Estimated poses of all robots over time, with ground truth and statistics of the run.
 
     Attributes:
         title: Such as the name of the bag.
@@ -58,11 +58,11 @@ class ReplayResult:
         covariances: (T, N, 3, 3) of x, y, theta.
         status: (T, N) of `Status`.
         truth: Robot name -> ground truth; robots without are missing.
-        counters: Such as dropped inputs by reason.
-        remarks: Sentences for the user, such as what of the bag could not be read.
+        counters: Counts by name, such as dropped inputs by reason.
+        remarks: Sentences for the user, such as unreadable parts of the bag.
         data_s: Duration of the data [s].
         wall_s: Duration of the replay [s].
-        self_calibrated: The swarm with calibration parameters as estimated; None: none were estimated.
+        self_calibrated: The swarm with the estimated calibration parameters; None if none were estimated.
         sightings: Time [ns] and sightings, every half second; empty: not kept.
         images: Aerial images with the identities of their detections; empty: none, or not kept.
         maps: Recorded messages of `map`.

@@ -1,1 +1,1 @@
-"""The page for watching a swarm: server, files, node, and markers for RViz and Foxglove."""
+"""Web page with a live view of the swarm: server, frames, node; markers for RViz and Foxglove."""

@@ -1,4 +1,4 @@
-"""Who may open the page: this machine's browsers, and from elsewhere only those who know the token."""
+"""Access control of the page: browsers of this machine, and other clients only with the token."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from swarm_loc_estimator.common.parameters import UserError
 
 MIN_TOKEN_LENGTH = 8
 GUESS_PERIOD_S = 1.0
-"""A client that has used up its free guesses may give one wrong token in such a period."""
+"""A client that has used its free guesses may send one wrong token per period of this length [s]."""
 _FREE_GUESSES = 5
 _SLOTS = 256
 _LOCAL_NAMES = {"localhost", "127.0.0.1", "::1"}
@@ -27,21 +27,21 @@ class AccessError(UserError):
 
 
 class WrongTokens:
-    """Slows down clients that guess the token.
+    """Limits the rate at which clients guess the token.
 
-    Its memory is fixed: clients whose names have the same hash share a slot. A token that is repeated tells a
-    client nothing new, so that a page which reconnects with an old token does not lock out its neighbours.
+    Its memory is fixed: clients whose names have the same hash share a slot. A repeated token does not count
+    as a guess, so that a page which reconnects with an old token does not lock out clients of the same slot.
     """
 
     def __init__(self) -> None:
         self._slots = [_Slot(0.0, 0)] * _SLOTS
 
     def refusal(self, client: str, given: str, token: str) -> str:
-        """Why a token is refused, one sentence; "" when it is right.
+        """Reason to refuse a token, one sentence; "" if it is right.
 
         Args:
             client: Address of the client.
-            given: The token that it gave; "" for none.
+            given: The token that it sent; "" for none.
             token: The right one.
         """
         place, guess = hash(client) % _SLOTS, hash((client, given))
@@ -57,10 +57,10 @@ class WrongTokens:
 
 
 class _Slot(NamedTuple):
-    """What is known of the clients of one slot.
+    """State of the clients of one slot.
 
     Attributes:
-        clear_s: When their wrong tokens are forgiven [s, monotonic].
+        clear_s: Time at which their wrong tokens expire [s, monotonic].
         guess: Hash of the last wrong token.
     """
 
@@ -70,14 +70,14 @@ class _Slot(NamedTuple):
 
 @dataclass(frozen=True)
 class Access:
-    """The rule.
+    """Decides which requests the server accepts.
 
     Args:
-        address: What the server listens on.
-        token: What a page must know; "" for none, on a loopback address only.
+        address: Address on which the server listens.
+        token: Required token; "" for none, on a loopback address only.
 
     Raises:
-        AccessError: Others could reach the address, and there is no token; or the token is too short.
+        AccessError: The address is reachable from outside without a token, or the token is too short.
     """
 
     address: str
@@ -96,16 +96,15 @@ class Access:
             )
 
     def refusal(self, host: str, origin: str | None, token: str, client: str = "") -> str:
-        """Why a request is refused, one sentence; "" when it is not.
+        """Reason to refuse a request, one sentence; "" if it is accepted.
 
-        A page of another site may not use this browser to look or to command (Origin), nor may a foreign name
-        that was made to lead here (Host).
+        Checks of Origin and Host prevent cross-site requests of the browser, and DNS rebinding.
 
         Args:
             host: Its Host header.
-            origin: Its Origin header, which browsers give with a WebSocket.
+            origin: Its Origin header, which browsers send with a WebSocket.
             token: Its ?token=.
-            client: Address of who sent it.
+            client: Address of the sender.
         """
         parsed = _HOST.fullmatch(host.lower())
         if not parsed:
@@ -127,7 +126,7 @@ def is_loopback(address: str) -> bool:
 
 
 def free_port() -> int:
-    """A port of this machine that nobody listens on just now."""
+    """A port of this machine that is free at present."""
     with socket.socket() as one:
         one.bind(("127.0.0.1", 0))
         port: int = one.getsockname()[1]

@@ -29,7 +29,7 @@ _ELSE_NS = 500_000_000
 
 
 class Frame(NamedTuple):
-    """One piece.
+    """A binary message to the page.
 
     Attributes:
         kind: Its content: "poses", "sightings", "truth", "aerial", "goals" or "map".
@@ -48,8 +48,8 @@ def pack(kind: str, stamp_ns: int, columns: Mapping[str, npt.NDArray[Any]], **ex
     Args:
         kind: See `Frame`.
         stamp_ns: Time of the content [ns].
-        columns: By name; each is made flat.
-        extra: What else stands in the header.
+        columns: By name; each is flattened.
+        extra: Further entries of the header.
     """
     flat = {name: np.ascontiguousarray(column).reshape(-1) for name, column in columns.items()}
     listed = [[name, _TYPES[str(column.dtype)], column.size] for name, column in flat.items()]
@@ -97,7 +97,7 @@ def sightings_frame(stamp_ns: int, sightings: Sightings) -> Frame:
 def places_frame(
     kind: str, stamp_ns: int, robot: Sequence[int], pose: npt.NDArray[np.float64], **extra: object
 ) -> Frame:
-    """Poses (n, 3) in map of some robots, or of nobody known (-1): ground truth, goals, aerial detections."""
+    """Poses (n, 3) in map of robots, -1 for an unknown robot: ground truth, goals, aerial detections."""
     columns: dict[str, npt.NDArray[Any]] = {
         "robot": np.array(robot, dtype=np.int32),
         "x": pose[:, 0],
@@ -141,8 +141,8 @@ class History:
     """A ring of frames.
 
     Args:
-        span_ns: How far it reaches back.
-        max_bytes: How much it may hold; the oldest frames go first.
+        span_ns: Maximum age of a frame.
+        max_bytes: Maximum size; the oldest frames are dropped first.
     """
 
     def __init__(self, span_ns: int = SPAN_NS, max_bytes: int = MAX_BYTES) -> None:
@@ -179,7 +179,7 @@ class History:
         self._bytes = 0
 
     def frames(self) -> list[Frame]:
-        """All that is kept, and the newest of each kind, in the order of their arrival."""
+        """All stored frames, and the newest of each kind, in the order of arrival."""
         kept = list(self._frames)
         known = set(map(id, kept))
         return kept + [frame for frame in self._newest_of.values() if id(frame) not in known]

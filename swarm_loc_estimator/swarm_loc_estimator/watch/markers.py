@@ -1,6 +1,6 @@
-"""Serialize visualization_msgs/MarkerArray of a swarm: a handful of markers, however many robots.
+"""Serialize visualization_msgs/MarkerArray of a swarm: a few markers for any number of robots.
 
-Robots are points of one list in the colours of their status, headings, 95 % ellipses and sightings are lines.
+Robots are points of one list in the colours of their status; headings, 95 % ellipses and sightings are lines.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ _USED, _GATED, _KEPT = [0.0, 0.62, 0.45, 0.7], [0.84, 0.37, 0.0, 0.9], [0.9, 0.6
 _VERDICT_COLOURS = np.array([_KEPT, _USED, _GATED, _KEPT, _KEPT])
 _INK = (0.2, 0.25, 0.3, 1.0)
 _CHI2_95 = 5.991
-"""Of two degrees of freedom."""
+"""95 % bound of the chi-square distribution with two degrees of freedom."""
 _CORNERS = 24
 _MAX_LABELS = 100
 _HEIGHT = 0.01
 _BODY_PER_WHEELS = 1.32
-"""Diameter of a body by the distance of its wheels, as of an e-puck."""
+"""Ratio of body diameter to wheel separation, as of an e-puck."""
 
 
 class _Marker(NamedTuple):
-    """What the markers differ in."""
+    """The fields in which the markers differ."""
 
     name: str
     kind: int

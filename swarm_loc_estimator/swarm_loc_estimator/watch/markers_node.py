@@ -2,8 +2,8 @@
 
     ./run swarm_loc_estimator markers_node --ros-args -p swarm_file:=swarm.yaml
 
-It publishes `swarm/markers` and `<robot>/odometry/filtered`. As long as nobody subscribes to these it listens
-to nothing; else to `swarm/poses`, `swarm/sightings` and, for the twist, `<robot>/odom`.
+It publishes `swarm/markers` and `<robot>/odometry/filtered`. While one of these has a subscriber, the node
+subscribes to `swarm/poses`, `swarm/sightings` and, for the twist, `<robot>/odom`.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _UNKNOWN_TWIST = (0.0, 0.0, 0.0)
 
 
 class MarkersNode(ConfiguredNode[MarkersParameters]):
-    """Converts estimates while somebody wants to see them.
+    """Converts estimates while its topics have subscribers.
 
     Args:
         node_arguments: Further arguments of `rclpy.node.Node`.
@@ -69,7 +69,7 @@ class MarkersNode(ConfiguredNode[MarkersParameters]):
         self.get_logger().info(f"ready: {len(self._names)} robots of '{self.params.swarm_file}'")
 
     def _look_around(self) -> None:
-        """Listen to what is needed for those who listen here."""
+        """Subscribe to the inputs that the present subscribers need."""
         markers = bool(self._markers.get_subscription_count())
         robots = [k for k, one in enumerate(self._filtered) if one.get_subscription_count()]
         self._listen("swarm/poses", SwarmPoses, self._on_poses, wanted=markers or bool(robots))
@@ -78,7 +78,7 @@ class MarkersNode(ConfiguredNode[MarkersParameters]):
             self._listen(f"{name}/odom", Odometry, partial(self._on_odometry, k), wanted=k in robots)
 
     def _listen(self, topic: str, message_class: type, use: Any, *, wanted: bool) -> None:
-        """Subscribe, or no longer."""
+        """Create or destroy a subscription."""
         if wanted and topic not in self._heard:
             self._heard[topic] = self.create_subscription(message_class, topic, use, _FLEETING, raw=True)
         elif not wanted and topic in self._heard:
@@ -115,13 +115,13 @@ class MarkersNode(ConfiguredNode[MarkersParameters]):
             self._markers.publish(self._encoder.encode(estimate, self._sightings_at(estimate.stamp_ns)))
 
     def _sightings_at(self, stamp_ns: int) -> Sightings | None:
-        """The newest, unless they are old."""
+        """The newest sightings, unless they are old."""
         if self._seen is None or abs(stamp_ns - self._seen[0]) > _OLD_NS:
             return None
         return self._seen[1]
 
     def _publish_odometry(self, estimate: EstimateMessage) -> None:
-        """Pose in map and the robot's own twist, for those robots that somebody listens to."""
+        """Publish pose in map and twist of the robots whose topics have subscribers."""
         for k, publisher in enumerate(self._filtered):
             if not np.isfinite(estimate.pose[k]).all() or not publisher.get_subscription_count():
                 continue

@@ -1,4 +1,4 @@
-"""The page as one text, what it gets first, and a recorded run inside it."""
+"""The page as one text, its initial data, and a recorded run inside it."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _SCRIPTS = (
 )
 _ALIGNMENT = 8
 _BODY_PER_WHEELS = 0.66
-"""Radius of a robot's body by the distance of its wheels, as of an e-puck."""
+"""Ratio of body radius to wheel separation, as of an e-puck."""
 
 
 @lru_cache(maxsize=1)
@@ -54,7 +54,7 @@ def page(data: str = "") -> str:
 
 
 def content_security_policy() -> str:
-    """What the page may do: run this script, connect to its server, and nothing else."""
+    """Content security policy: the page may only run this script and connect to its server."""
     digest = base64.b64encode(hashlib.sha256(_parts()[2].encode()).digest()).decode()
     return (
         f"default-src 'none'; script-src 'sha256-{digest}'; style-src 'unsafe-inline'; img-src data:;"
@@ -66,7 +66,7 @@ def recording(about: dict[str, Any], frames: Iterable[Frame]) -> str:
     """The text: base64 of gzip of the length of a JSON text, that text, and the frames.
 
     Args:
-        about: What the page gets first, see `about`.
+        about: Initial data of the page, see `about`.
         frames: In the order of their stamps.
     """
     head = json.dumps(about).encode()
@@ -76,7 +76,7 @@ def recording(about: dict[str, Any], frames: Iterable[Frame]) -> str:
 
 
 def about(swarm: Swarm, title: str, *, teleop: bool = False, commands: bool = True) -> dict[str, Any]:
-    """The swarm for the page.
+    """Description of the swarm for the page.
 
     Args:
         swarm: Its description.

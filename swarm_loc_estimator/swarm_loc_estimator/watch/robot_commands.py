@@ -18,20 +18,20 @@ from swarm_loc_msgs.srv import SetRobotPose
 
 _MAX_WAITING = 64
 _DRIVEN_NS = 400_000_000
-"""A robot that is driven is stopped after so long without a command."""
+"""Time without a command after which a driven robot is stopped."""
 
 
 class RobotCommands:
-    """Carries out commands one after the other, in the node's thread.
+    """Executes commands one after the other, in the node's thread.
 
     Args:
-        node: Calls and publishes.
+        node: Calls services and publishes.
         names: The robots.
-        parameters: What is allowed.
-        now_ns: A clock that always runs [ns].
+        parameters: Allowed commands.
+        now_ns: A steady clock [ns].
 
     Attributes:
-        dropped: Number of commands dropped because too many waited.
+        dropped: Number of commands dropped from the full queue.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class RobotCommands:
         }
 
     def order(self, command: Command, answer: Answer) -> None:
-        """Take a command; from any thread."""
+        """Queue a command; may be called from any thread."""
         try:
             self._waiting.put_nowait((command, answer))
         except queue.Full:
@@ -62,7 +62,7 @@ class RobotCommands:
             answer("Too many commands at once: this one was dropped.", ok=False)
 
     def work(self) -> None:
-        """Obey what waits, and stop robots that nobody drives any more."""
+        """Execute queued commands, and stop robots whose last drive command is too old."""
         while True:
             try:
                 command, answer = self._waiting.get_nowait()
@@ -79,7 +79,7 @@ class RobotCommands:
                 self._velocity[robot].publish(Twist())
 
     def _refusal(self, command: Command) -> str:
-        """Why a command is not obeyed, one sentence; "" when it is."""
+        """Reason to refuse a command, one sentence; "" if it is accepted."""
         todo = command["do"]
         if todo not in self._obey:
             return f"There is no command '{todo}'."
@@ -119,7 +119,7 @@ class RobotCommands:
         self._driven_until_ns[robot] = self._now_ns() + _DRIVEN_NS
 
     def _call(self, client: Any, request: Any, answer: Answer) -> None:
-        """Call a service whose response has `success` and `message`, and answer that."""
+        """Call a service whose response has `success` and `message`, and return these as answer."""
         if not client.service_is_ready():
             answer(f"Nobody offers {client.srv_name}: is the estimator running?", ok=False)
             return
@@ -132,7 +132,7 @@ class RobotCommands:
 
 
 def numbers(values: object, count: int) -> list[float] | None:
-    """So many finite numbers as a page has sent them; None where they are not."""
+    """The given number of finite numbers from a page; None if invalid."""
     if not isinstance(values, list) or len(values) != count:
         return None
     if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in values):

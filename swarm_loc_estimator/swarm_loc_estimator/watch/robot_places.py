@@ -1,4 +1,4 @@
-"""Places that robots publish, as frames: ground truth, goals, aerial detections with names."""
+"""Frames of published positions: ground truth, goals, aerial detections with identities."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities, RobotId
 _OLD_NS = 500_000_000
 _IMAGES = 8
 _NEWEST_ONLY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Hears reliable publishers and best-effort ones, and never makes one wait."""
+"""Matches reliable and best-effort publishers, and never blocks one."""
 
 
 class Places:
     """The newest place of each robot of one kind.
 
     Args:
-        kind: Of the frames.
-        keeps: Whether a place holds until the next one comes, however old.
-        drop: Called with the reason when a message cannot be used.
+        kind: Kind of the frames.
+        keeps: Whether a place is valid until the next one, at any age.
+        drop: Called with the reason of a dropped message.
     """
 
     def __init__(self, kind: str, drop: Callable[[str], None], *, keeps: bool) -> None:
@@ -37,7 +37,7 @@ class Places:
         self._sent_ns = -1
 
     def take(self, robot: int, data: bytes) -> None:
-        """A serialized PoseStamped of a robot."""
+        """Store a serialized PoseStamped of a robot."""
         try:
             message = decode_pose_stamped(data)
         except CdrError:
@@ -49,7 +49,7 @@ class Places:
         self._newest[robot] = (message.stamp_ns, message.pose)
 
     def frame(self) -> Frame | None:
-        """All places; None when nothing has come since."""
+        """All places; None if none has changed since the last call."""
         newest_ns = max((stamp_ns for stamp_ns, _ in self._newest.values()), default=-1)
         if newest_ns == self._sent_ns:
             return None
@@ -102,12 +102,12 @@ class AerialNames:
 
 
 class NewestMessages:
-    """Topics of one type, one of each robot; subscribed to once somebody publishes them.
+    """Topics of one type, one per robot; each is subscribed to once it has a publisher.
 
     Args:
-        node: Has the subscriptions; no executor may handle them.
-        message_class: Their type.
-        topics: Their names, in the order of the robots.
+        node: Owns the subscriptions; no executor may handle them.
+        message_class: Type of the topics.
+        topics: Names of the topics, in the order of the robots.
     """
 
     def __init__(self, node: Node, message_class: type, topics: Sequence[str]) -> None:
@@ -117,7 +117,7 @@ class NewestMessages:
         self._subscriptions: dict[int, Subscription] = {}
 
     def look_for_publishers(self, published: Mapping[str, object]) -> None:
-        """Subscribe to those of the topics that are published by now."""
+        """Subscribe to the topics that have a publisher by now."""
         for topic, index in self._topics.items():
             if index not in self._subscriptions and topic in published:
                 self._subscriptions[index] = self._node.create_subscription(
@@ -130,7 +130,7 @@ class NewestMessages:
         return frozenset(self._subscriptions.values())
 
     def take(self, use: Callable[[int, bytes], None]) -> None:
-        """Hand over the newest message of each robot that has sent one since."""
+        """Return the newest message of each robot with a message since the last call."""
         for index, subscription in self._subscriptions.items():
             taken = subscription.handle.take_message(self._class, True)
             if taken is not None:

@@ -27,20 +27,20 @@ _SEND_BUFFER_BYTES = 262144
 _HEARTBEAT_S = 10.0
 _START_PATIENCE_S = 10.0
 REQUEST_PATIENCE_S = 10.0
-"""A connection that has not become a page's WebSocket after so long is closed."""
+"""Timeout after which a connection that is not a page's WebSocket is closed."""
 _SWEEP_PERIOD_S = 1.0
 
 Command = Mapping[str, Any]
 MAX_NOTES = 64
-"""So many texts wait for a slow page; older ones go first."""
+"""Maximum number of texts queued for a slow page; the oldest are dropped first."""
 RECEIVED = "+"
-"""What a page says of each frame that it has taken in."""
+"""Acknowledgement of a frame by a page."""
 _MAX_ON_THE_WAY = 4
-"""More frames would only lie in the buffers of a page that is busy, and be old when it comes to them."""
+"""Maximum number of unacknowledged frames; more would only age in the buffers of a busy page."""
 
 
 class Answer(Protocol):
-    """Takes the answer to a command; from any thread."""
+    """Receives the answer to a command; may be called from any thread."""
 
     def __call__(self, said: str, *, ok: bool = True) -> None:
         """One sentence, and whether the command was obeyed."""
@@ -48,7 +48,7 @@ class Answer(Protocol):
 
 Connection = web.RequestHandler
 OnCommand = Callable[[Command, Answer], None]
-"""Takes a page's command; called in the server's thread."""
+"""Receives a page's command; called in the server's thread."""
 
 
 class ServerError(UserError):
@@ -56,14 +56,14 @@ class ServerError(UserError):
 
 
 class ServerLoad(NamedTuple):
-    """How the server and its pages get on.
+    """Load of the server.
 
     Attributes:
-        pages: Open now.
-        slow: Of these, those for which frames were left out since the last time.
-        left_out: Frames left out for pages that were busy with older ones, of all pages so far.
-        texts_left_out: Texts left out for the same reason.
-        refused: Pages that were not let in so far.
+        pages: Number of open pages.
+        slow: Number of these for which frames were dropped since the last report.
+        left_out: Total number of frames dropped because pages were busy with older ones.
+        texts_left_out: Total number of texts dropped for the same reason.
+        refused: Total number of refused requests.
     """
 
     pages: int
@@ -77,10 +77,10 @@ class WatchServer:
     """Serves the page.
 
     Args:
-        about: What pages get first, see `page.about`.
-        access: Where to listen, and who may look.
-        port: 0 for any that is free.
-        rate: Frames of a kind that a page gets per second, at most.
+        about: Initial data of pages, see `page.about`.
+        access: Address to listen on, and access control.
+        port: Port to listen on, 0 for any free one.
+        rate: Maximum frames of a kind per second and page.
         on_command: Called with each command.
 
     Raises:
@@ -115,14 +115,14 @@ class WatchServer:
 
     @property
     def url(self) -> str:
-        """Where to look."""
+        """URL of the page."""
         host = self._access.address if is_loopback(self._access.address) else _own_name()
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.port}/" + (f"?token={self._access.token}" if self._access.token else "")
 
     @property
     def has_viewers(self) -> bool:
-        """Whether somebody looks."""
+        """Whether any page is open."""
         return bool(self._viewers)
 
     @property
@@ -131,7 +131,7 @@ class WatchServer:
         return {viewer.selected for viewer in tuple(self._viewers)} - {-1}
 
     def load(self) -> ServerLoad:
-        """How it gets on; slow pages since the last call."""
+        """The present load; `slow` counts since the last call."""
         counts = {id(viewer): viewer.left_out for viewer in tuple(self._viewers)}
         slow = sum(count.frames > self._known_left_out.get(key, 0) for key, count in counts.items())
         self._known_left_out = {key: count.frames for key, count in counts.items()}
@@ -146,13 +146,13 @@ class WatchServer:
         """Send a message to the pages; may be called from any thread.
 
         Args:
-            message: For the pages.
-            robot: Only for those that show this robot.
+            message: The message.
+            robot: Only pages that show this robot get it.
         """
         self._loop.call_soon_threadsafe(self._note, message, robot)
 
     def close(self) -> None:
-        """End; all connections are closed."""
+        """Stop the server and close all connections."""
         if self._thread.is_alive():
             self._loop.call_soon_threadsafe(self._loop.stop)
             self._thread.join()
@@ -189,10 +189,10 @@ class WatchServer:
         await web.TCPSite(self._runner, self._access.address, port).start()
 
     def _close_slow_requests(self, known: Mapping[Connection, float]) -> None:
-        """Close connections that are no page's WebSocket in time, now and once a second.
+        """Close connections that have not become a WebSocket in time, now and once a second.
 
         Args:
-            known: Such connections, and when each was first seen [s].
+            known: Pending connections, and when each was first seen [s].
         """
         now_s = self._loop.time()
         connections = self._runner.server.connections if self._runner.server else []
@@ -210,7 +210,7 @@ class WatchServer:
         return application
 
     def _check(self, request: web.Request) -> None:
-        """Refuse who may not look."""
+        """Refuse requests without access."""
         hosts = request.headers.getall("Host", [])
         refusal = self._access.refusal(
             hosts[0] if len(hosts) == 1 else "",
@@ -258,7 +258,7 @@ class WatchServer:
         return socket
 
     async def _send(self, socket: web.WebSocketResponse, viewer: Viewer, past: list[Frame]) -> None:
-        """All that a page gets; a connection that breaks ends it, and its reader, too."""
+        """Send everything to a page until its connection breaks, which also ends its reader."""
         try:
             await socket.send_str(json.dumps(self._about))
             await viewer.send_past(past)
@@ -290,13 +290,13 @@ class WatchServer:
         self._on_command(command, answer)
 
     async def _close_all(self, _application: web.Application) -> None:
-        """Close the connections, so that pages know."""
+        """Close the connections, which notifies the pages."""
         for viewer in tuple(self._viewers):
             await viewer.close()
 
 
 def read_command(text: str) -> Command | None:
-    """A command with the text `do` and the whole number `robot`, -1 by default; None if it is none."""
+    """A command with the text `do` and the integer `robot`, -1 by default; None if invalid."""
     try:
         command = json.loads(text)
     except (ValueError, RecursionError):
@@ -309,16 +309,16 @@ def read_command(text: str) -> Command | None:
 
 
 def _own_name() -> str:
-    """How others may call this machine."""
+    """Host name of this machine."""
     return sockets.gethostname()
 
 
 class LeftOut(NamedTuple):
-    """What a page did not get.
+    """Numbers of messages dropped for a page.
 
     Attributes:
-        frames: That newer ones replaced while it was still busy with older ones.
-        texts: That were dropped since too many waited.
+        frames: Frames replaced by newer ones while the page was busy.
+        texts: Texts dropped from the full queue.
     """
 
     frames: int
@@ -326,15 +326,15 @@ class LeftOut(NamedTuple):
 
 
 class Viewer:
-    """Sends to one page; a slow one gets fewer frames, and nothing piles up for it.
+    """Sends to one page; a slow page gets fewer frames, and its queues are bounded.
 
     Args:
         socket: The connection.
-        rate: Frames of a kind per second, at most.
+        rate: Maximum frames of a kind per second.
 
     Attributes:
         selected: Index of the robot whose numbers the page shows; -1: none.
-        left_out: What it did not get.
+        left_out: Numbers of dropped messages.
     """
 
     def __init__(self, socket: web.WebSocketResponse, rate: float) -> None:
@@ -348,26 +348,26 @@ class Viewer:
         self.left_out = LeftOut(0, 0)
 
     def offer(self, frame: Frame) -> None:
-        """Have a frame sent, unless a newer one of its kind comes before."""
+        """Queue a frame, replacing an older one of its kind."""
         if frame.kind in self._newest and self._on_the_way >= _MAX_ON_THE_WAY:
             self.left_out = self.left_out._replace(frames=self.left_out.frames + 1)
         self._newest[frame.kind] = frame
         self._wake.set()
 
     def note(self, message: dict[str, Any]) -> None:
-        """Have a text sent."""
+        """Queue a text."""
         if len(self._notes) == MAX_NOTES:
             self.left_out = self.left_out._replace(texts=self.left_out.texts + 1)
         self._notes.append(json.dumps(message))
         self._wake.set()
 
     def on_received(self) -> None:
-        """The page has taken a frame in."""
+        """Handle the page's acknowledgement of a frame."""
         self._on_the_way -= 1
         self._wake.set()
 
     async def send_past(self, frames: Iterable[Frame]) -> None:
-        """Send what happened before the page was opened."""
+        """Send the history from before the page was opened."""
         for frame in frames:
             while self._on_the_way >= _MAX_ON_THE_WAY:
                 self._wake.clear()

@@ -1,8 +1,8 @@
-"""Serves a web page on which people watch the swarm live, in any browser.
+"""Serves a web page with a live view of the swarm.
 
     ./run swarm_loc_estimator watch_node --ros-args -p swarm_file:=swarm.yaml
 
-It subscribes to `swarm/poses`, `swarm/sightings` (while somebody looks), `/diagnostics`, `aerial/detections`,
+It subscribes to `swarm/poses`, `swarm/sightings` (while a page is open), `/diagnostics`, `aerial/detections`,
 `aerial/identities`, `map`, `<robot>/ground_truth` and `<robot>/goal`; and publishes `/diagnostics`, and
 `<robot>/cmd_vel` where driving is allowed. Parameters: see `doc/watch.md`.
 """
@@ -42,14 +42,14 @@ from swarm_loc_estimator.watch.server import WatchServer
 from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities, SwarmPoses, SwarmSightings
 
 _FLEETING = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Hears every publisher, and what comes too fast for it is lost to it alone."""
+"""Matches every publisher; messages that arrive too fast are lost for this node only."""
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _WORK_S, _LOOK_S = 0.05, 1.0
 _PLACES_PERIOD_S = 0.1
 
 
 class WatchNode(ConfiguredNode[WatchParameters]):
-    """Converts what is published into frames, and hands them to the server.
+    """Converts messages to frames and passes them to the server.
 
     Args:
         node_arguments: Further arguments of `rclpy.node.Node`.
@@ -82,12 +82,12 @@ class WatchNode(ConfiguredNode[WatchParameters]):
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
-        """Those that an executor handles; the others are looked at when new poses come."""
+        """Subscriptions that an executor handles; the others are polled when new poses arrive."""
         taken = self._truth.subscriptions | self._goals.subscriptions if hasattr(self, "_goals") else ()
         return (one for one in super().subscriptions if one not in taken)
 
     def destroy_node(self) -> None:
-        """Close the page's connections, too."""
+        """Close the connections of pages and destroy the node."""
         self.server.close()
         super().destroy_node()
 
@@ -116,7 +116,7 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         self._map = raw(OccupancyGrid, "map", self._on_map, _LATCHED, event_callbacks=follow)
 
     def _follow_map(self, _event: object) -> None:
-        """The map's publisher keeps none for late subscribers, or is best effort: hear it all the same."""
+        """Subscribe again if the map's publisher is volatile or best effort."""
         if self._map.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             return
         self.destroy_subscription(self._map)
@@ -178,7 +178,7 @@ class WatchNode(ConfiguredNode[WatchParameters]):
                 self.server.send_text({"kind": "report", "stamp": stamp_ms, **report}, robot)
 
     def _look_around(self) -> None:
-        """Hear what is published by now, and sightings as long as somebody looks; name what is missing."""
+        """Subscribe to published topics, and to sightings while a page is open; report missing ones."""
         published = dict(self.get_topic_names_and_types())
         self._truth.look_for_publishers(published)
         self._goals.look_for_publishers(published)
@@ -214,7 +214,7 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         self.publish_reports(Report(self.get_name(), message, level_of(said), values))
 
     def _drop(self, topic: str, reason: str) -> None:
-        """Count a message that cannot be used."""
+        """Count a dropped message."""
         self.health.drop(f"{topic} {reason}")
 
 

@@ -1,7 +1,7 @@
 """Calibrate cameras: mount, range and bearing models, time offset of the exposure.
 
-Every robot is fitted alone first; what the robots of a type have in common is then the prior of each, so
-that a robot with little ground truth gains from the others.
+Each robot is first fitted separately. The distribution of the parameters over the robots of a type is then
+the prior of each, so that a robot with little ground truth benefits from the others.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, SensorModel, Swarm
 
 DENSE_GAP_NS = 200_000_000
-"""Ground truth with longer gaps is not interpolated."""
+"""Longest gap of ground truth that is interpolated."""
 OFFSET_REACH_NS = 250_000_000
 """Largest time offset of a camera."""
 

@@ -76,7 +76,7 @@ class DriveFit:
 
     Attributes:
         members: Indices of its robots.
-        drives: Those with dense ground truth.
+        drives: Motion of the robots with dense ground truth.
         late: Delay and lag.
         response: Scale factors; None if only noise is fitted.
         before: (m, 2) errors of path [m] and turn [rad] of 5 s windows as reported.
@@ -99,7 +99,7 @@ class FittedModels:
         swarm: Calibrated.
         cameras: Of all robots, ordered by type.
         motion: One per type.
-        remarks: What could not be fitted, one sentence each.
+        remarks: Parameters that could not be fitted, one sentence each.
     """
 
     swarm: Swarm
@@ -113,7 +113,7 @@ class Calibration:
     """Result of a calibration.
 
     Attributes:
-        swarm: Calibrated; robots start where they started before.
+        swarm: Calibrated, with unchanged starts.
         models: The fits behind it.
         noise: Fitted noise parameters by name.
         before: Score of the estimator on the recording, started at the true poses.

@@ -40,7 +40,7 @@ _NEAR_ZERO = 0.05
 _CLEARLY = 0.85
 """Delay and lag are used if they reduce the errors of short windows to this share."""
 _MOVING = 1e-3
-"""Slower robots stand still [m/s, rad/s]."""
+"""Speeds below which a robot counts as stationary [m/s, rad/s]."""
 _SMOOTHNESS, _TO_ONE = 0.02, 0.001
 """Weights of the priors that neighbouring scale factors are equal, and that they are 1."""
 _FIRST_LATENESS = (0.05, 0.1)

@@ -28,7 +28,7 @@ from swarm_loc_estimator.swarm.swarm import OdometryModel, SensorModel, Swarm
 TICK_S = 1.0
 """Interval at which errors are computed."""
 NEES_AIM = 2.5
-"""A little less than 3: errors in other recordings are larger."""
+"""Target of the NEES, slightly below 3 since errors in other recordings are larger."""
 
 _SPACING_NS = 50_000_000
 _INCONSISTENCY = 0.2

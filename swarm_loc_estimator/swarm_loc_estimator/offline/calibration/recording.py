@@ -44,7 +44,7 @@ class Recording:
         truth: Robot name -> ground truth; robots without are missing.
         brightness: Of all infrared boards.
         fixes: Of all robots.
-        remarks: What could not be read, one sentence each.
+        remarks: Unreadable contents, one sentence each.
     """
 
     name: str

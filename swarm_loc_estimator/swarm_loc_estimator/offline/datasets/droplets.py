@@ -2,8 +2,8 @@
 
     {"TX", "RX", {{6 counts}, ...}, camera time [s], {"id"->{x, y, orientation}, ...}},
 
-Matrices are as the firmware's console prints them, one row per emitter and one column per sensor. Places are
-in pixels, y downwards, orientations in degrees. Ids are the four hexadecimal digits that the robots print.
+Matrices are printed by the firmware's console, one row per emitter and one column per sensor. Positions are
+in pixels, y downwards, orientations in degrees. Ids are four hexadecimal digits.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Sighting:
 
 @dataclass(frozen=True)
 class Exchange:
-    """What one robot measured of another's emitters, and what the camera saw at that time.
+    """Readings of one robot while another lit its emitters, and the camera's detections at that time.
 
     Attributes:
         transmitter: Id of the robot that lit its emitters.
@@ -102,7 +102,7 @@ def read_exchanges(path: Path) -> tuple[list[Exchange], Counter[str]]:
 
 
 def parse_line(line: str) -> Exchange | str:
-    """The exchange of a line, or why there is none: `not_an_exchange`, `not_square`, `hears_itself`."""
+    """The exchange of a line, or the reason to drop it: `not_an_exchange`, `not_square`, `hears_itself`."""
     match = _LINE.fullmatch(line.strip())
     if match is None:
         return "not_an_exchange"
@@ -196,7 +196,7 @@ class CleanTruth:
 
     Attributes:
         poses: One mapping per exchange: robot -> its pose, if known.
-        remarks: What was corrected or dropped -> how often.
+        remarks: Kind of correction or drop -> count.
     """
 
     poses: list[dict[int, CameraPose]]

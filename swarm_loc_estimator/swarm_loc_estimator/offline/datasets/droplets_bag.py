@@ -135,7 +135,7 @@ def _noise(exchanges: Sequence[Exchange]) -> float:
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """What the files do not contain.
+    """Settings of an import that the files do not contain.
 
     Attributes:
         platform: Packaged name or path of the board of all robots.
@@ -154,7 +154,7 @@ class DropletImport:
         exchanges: Their number.
         with_truth: Number of those with both robots' poses known.
         fiducials: Their orientation.
-        remarks: What was corrected and what was dropped, one sentence each.
+        remarks: Corrections and drops, one sentence each.
     """
 
     exchanges: int
@@ -173,7 +173,7 @@ def import_recording(
     Args:
         path: The recording, see `datasets.droplets`.
         folder: The bag to create.
-        settings: What the recording does not contain.
+        settings: Board and scale of the recording.
         progress: Called with the share done and what is being done.
 
     Raises:

@@ -2,7 +2,7 @@
 
 K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu: The UTIAS multi-robot cooperative localization and
 mapping dataset, The International Journal of Robotics Research 30(8), 2011. Subjects with odometry are
-robots, subjects with a surveyed position are landmarks; which files are there decides, not the set's number.
+robots, subjects with a surveyed position are landmarks, whatever the number of the set.
 """
 
 from __future__ import annotations

@@ -30,7 +30,7 @@ from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 ROBOT_TYPE = "create"
 WHEEL_SEPARATION = 0.258
-"""Of the iRobot Create [m]."""
+"""Wheel separation of the iRobot Create [m]."""
 TIMEOUT_S = 2.0
 """The logs pause for just over a second about every two minutes, while the robots keep driving."""
 
@@ -89,7 +89,7 @@ def convert(
     Args:
         dataset: The set; robots start where their ground truth begins.
         folder: The bag to create.
-        delay: How late detections arrive.
+        delay: Delay of detections.
         progress: Called with the share done, 0 to 1, and what is being done.
 
     Raises:

@@ -1,7 +1,7 @@
 """Run a graph as child processes in a ROS domain of its own, and record its poses and diagnostics.
 
-The graph is the one that commands and launch files start. Its ROS domain is used by nothing else and limited
-to this machine, so that it cannot mix with real robots.
+The graph is that of the commands and launch files. Its ROS domain is otherwise unused and limited
+to this machine, so that it cannot interfere with real robots.
 """
 
 from __future__ import annotations
@@ -229,8 +229,8 @@ class Recorder(Node):
         taken: Stamp of poses -> topic -> messages that the estimator had received by then, from /diagnostics,
             about once a second.
         inputs: Messages that the estimator has received, of all topics.
-        drops: Inputs that it has not used, by reason.
-        diagnostics: Messages of /diagnostics that have come from it.
+        drops: Dropped inputs of the estimator, by reason.
+        diagnostics: Number of /diagnostics messages from the estimator.
     """
 
     def __init__(self, **node_arguments: Any) -> None:

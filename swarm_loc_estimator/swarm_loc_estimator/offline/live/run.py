@@ -131,7 +131,7 @@ def play_live(
     """Play a whole bag into a live graph and record its poses.
 
     Args:
-        options: Of the graph, with the bag.
+        options: Options of the graph, with the bag.
         log: File for the output of the nodes.
         inputs_only: Whether only inputs of the estimator are played.
         watch: Called about once per event while the bag plays.
@@ -213,7 +213,7 @@ def _wait_for_the_rest(graph: LiveGraph, content: BagContent) -> None:
     inputs_at: dict[int, int] = {}  # number of diagnostics -> inputs received by then
 
     def has_all() -> bool:
-        """Whether all inputs are received, or none has come since the diagnostics before."""
+        """Whether all inputs are received, or none has been received since the previous diagnostics."""
         inputs_at[recorder.diagnostics] = recorder.inputs
         return recorder.inputs in (sent, inputs_at.get(recorder.diagnostics - 1))
 

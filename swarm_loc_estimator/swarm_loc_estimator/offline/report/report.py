@@ -59,7 +59,7 @@ class ReportFiles:
 
 
 def write_report(result: ReplayResult, folder: Path | str) -> ReportFiles:
-    """Write report.txt, report.html and overview.png; paths.png and errors.png where they apply.
+    """Write report.txt, report.html and overview.png, and if applicable paths.png and errors.png.
 
     Args:
         result: The run.
@@ -290,6 +290,6 @@ def _images(result: ReplayResult) -> Iterator[Frame]:
 
 
 def _thinned(things: Sequence[_Thing], most: int) -> list[_Thing]:
-    """At most so many of them, evenly spaced, always with the last."""
+    """At most `most` of them, evenly spaced, including the last."""
     stride = max(1, -(-len(things) // max(1, most)))
     return [*things[::-1][::stride]][::-1]

@@ -1,4 +1,4 @@
-"""Style of all plots: colours, axes, units and file format; and the map of a swarm that plots share."""
+"""Style of all plots: colours, axes, units, file format; and the common map of a swarm."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ _MARGIN = 0.05
 
 
 class WorldMap:
-    """Limits of a map that shows a result, and what is drawn on it; all lengths in metres.
+    """Draws a result on a map; all lengths in metres.
 
     Args:
         result: The run.
