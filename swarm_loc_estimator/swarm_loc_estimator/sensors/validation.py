@@ -33,13 +33,47 @@ def reject_reasons(measurements: MeasurementArray) -> IntArray:
 
 def is_about_swarm(measurements: MeasurementArray, robots: int, landmarks: int) -> BoolArray:
     """Whether measurements (m,) have a registered model, valid indices, and finite parameters."""
-    observer, target, landmark = (measurements[name] for name in ("observer", "target", "landmark"))
-    valid: BoolArray = np.isin(measurements["kind"], list(MODELS))
-    valid &= (observer >= NOBODY) & (observer < robots) & (target >= NOBODY) & (target < robots)
-    valid &= (landmark >= 0) & (landmark <= landmarks) & ((observer != target) | (observer == NOBODY))
-    valid &= np.isfinite(measurements["sensor"]).all(axis=1) & np.isfinite(measurements["marker"]).all(axis=1)
-    variance = measurements["stamp_variance"]
-    valid &= np.isfinite(variance) & (variance >= 0.0) & ~np.isnan(measurements["gate"])
+    return _are_about_swarm(
+        measurements["kind"],
+        measurements["observer"],
+        measurements["target"],
+        measurements["landmark"],
+        measurements["sensor"],
+        measurements["marker"],
+        measurements["stamp_variance"],
+        measurements["gate"],
+        np.array(list(MODELS)),
+        robots,
+        landmarks,
+    )
+
+
+@cached_njit
+def _are_about_swarm(
+    kind: IntArray,
+    observer: IntArray,
+    target: IntArray,
+    landmark: IntArray,
+    sensor: FloatArray,
+    marker: FloatArray,
+    stamp_variance: FloatArray,
+    gate: FloatArray,
+    models: IntArray,
+    robots: int,
+    landmarks: int,
+) -> BoolArray:
+    valid = np.zeros(kind.size, dtype=np.bool_)
+    for k in range(kind.size):
+        good = NOBODY <= observer[k] < robots and NOBODY <= target[k] < robots
+        good = good and 0 <= landmark[k] <= landmarks and (observer[k] != target[k] or observer[k] == NOBODY)
+        good = good and math.isfinite(stamp_variance[k]) and stamp_variance[k] >= 0.0
+        good = good and not math.isnan(gate[k])
+        for i in range(3):
+            good = good and math.isfinite(sensor[k, i]) and math.isfinite(marker[k, i])
+        known = False
+        for number in models:
+            known = known or kind[k] == number
+        valid[k] = good and known
     return valid
 
 
