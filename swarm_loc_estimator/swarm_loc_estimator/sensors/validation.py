@@ -33,48 +33,28 @@ def reject_reasons(measurements: MeasurementArray) -> IntArray:
 
 def is_about_swarm(measurements: MeasurementArray, robots: int, landmarks: int) -> BoolArray:
     """Whether measurements (m,) have a registered model, valid indices, and finite parameters."""
-    return _are_about_swarm(
-        measurements["kind"],
-        measurements["observer"],
-        measurements["target"],
-        measurements["landmark"],
-        measurements["sensor"],
-        measurements["marker"],
-        measurements["stamp_variance"],
-        measurements["gate"],
-        np.array(list(MODELS)),
-        robots,
-        landmarks,
-    )
+    valid = np.empty(measurements.size, dtype=np.bool_)
+    _check_parameters(measurements, np.array(list(MODELS)), robots, landmarks, valid)
+    return valid
 
 
 @cached_njit
-def _are_about_swarm(
-    kind: IntArray,
-    observer: IntArray,
-    target: IntArray,
-    landmark: IntArray,
-    sensor: FloatArray,
-    marker: FloatArray,
-    stamp_variance: FloatArray,
-    gate: FloatArray,
-    models: IntArray,
-    robots: int,
-    landmarks: int,
-) -> BoolArray:
-    valid = np.zeros(kind.size, dtype=np.bool_)
-    for k in range(kind.size):
-        good = NOBODY <= observer[k] < robots and NOBODY <= target[k] < robots
-        good = good and 0 <= landmark[k] <= landmarks and (observer[k] != target[k] or observer[k] == NOBODY)
-        good = good and math.isfinite(stamp_variance[k]) and stamp_variance[k] >= 0.0
-        good = good and not math.isnan(gate[k])
+def _check_parameters(
+    measurements: MeasurementArray, models: IntArray, robots: int, landmarks: int, valid: BoolArray
+) -> None:
+    for k in range(valid.size):
+        one = measurements[k]
+        good = NOBODY <= one.observer < robots and NOBODY <= one.target < robots
+        good = good and 0 <= one.landmark <= landmarks
+        good = good and (one.observer != one.target or one.observer == NOBODY)
+        good = good and math.isfinite(one.stamp_variance) and one.stamp_variance >= 0.0
+        good = good and not math.isnan(one.gate)
         for i in range(3):
-            good = good and math.isfinite(sensor[k, i]) and math.isfinite(marker[k, i])
+            good = good and math.isfinite(one.sensor[i]) and math.isfinite(one.marker[i])
         known = False
         for number in models:
-            known = known or kind[k] == number
+            known = known or one.kind == number
         valid[k] = good and known
-    return valid
 
 
 _BAD_COVARIANCE = REJECT_REASONS.index("bad_covariance")

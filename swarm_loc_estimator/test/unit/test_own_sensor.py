@@ -81,8 +81,10 @@ class RangeRows(NamedTuple):
 def columns(
     found: MessageColumns[Range], batch: MessageBatch, robot: IntArray, _known: Known
 ) -> tuple[RangeRows, dict[str, int]]:
-    target, distance = np.array([(one.target, one.distance) for one in found.messages]).T
-    return RangeRows(robot, found.stamp_ns, target.astype(np.int64), distance, batch.log_ns), {}
+    target = np.array([one.target for one in found.messages], dtype=np.int64)
+    distance = np.array([one.distance for one in found.messages], dtype=float)
+    stamp_ns, arrival_ns = found.stamp_ns[found.valid], batch.log_ns[found.valid]
+    return RangeRows(robot[found.valid], stamp_ns, target, distance, arrival_ns), {}
 
 
 def create_converter(swarm: Swarm, _settings: SensorSettings, _drops: Counter[str]) -> Converter:
@@ -243,12 +245,26 @@ def test_a_model_that_fails_is_gated_and_leaves_poses_finite(
     assert np.sqrt(np.square(error[..., :2]).mean()) < 0.1
 
 
+def test_malformed_messages_are_counted_and_the_others_are_read() -> None:
+    world = world_of(950)
+    ingest = Ingest(world.swarm)
+    handle = ingest.handle_of[f"{world.swarm.robots[0].name}/ranges"]
+    good = LAYOUT.pack(T0, -1, 2.0)
+    batch = MessageBatch.of([SerializedMessage(handle, one, T0) for one in (good, good[:7], b"", good)])
+    (part,) = ingest.read(batch)
+    assert part.rows["ranges"].distance.tolist() == [2.0, 2.0]
+    assert part.dropped == {"bad_message": 2}
+    (part,) = ingest.read(MessageBatch.of([SerializedMessage(handle, b"", T0)]))
+    assert part.rows["ranges"].robot.size == 0
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [
         ("kind", 77),
         ("observer", 99),
         ("observer", -2),
+        ("target", "observer"),
         ("target", 99),
         ("landmark", 99),
         ("landmark", -1),
@@ -259,14 +275,14 @@ def test_a_model_that_fails_is_gated_and_leaves_poses_finite(
     ],
 )
 def test_measurements_that_no_model_can_use_are_dropped_and_counted(
-    field: str, value: float, monkeypatch: pytest.MonkeyPatch
+    field: str, value: float | str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def create(swarm: Swarm, settings: SensorSettings, drops: Counter[str]) -> Converter:
         convert = create_converter(swarm, settings, drops)
 
         def spoiled(rows: RangeRows) -> Measured:
             found: Measured = convert(rows)
-            found.measurements[field] = value
+            found.measurements[field] = found.measurements[value] if isinstance(value, str) else value
             return found
 
         return spoiled

@@ -8,6 +8,7 @@ listen to and how fast a bag replays.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Generic, NamedTuple, Protocol, TypeVar
@@ -228,7 +229,7 @@ class EachReader(Generic[Message]):
 
     Args:
         topics: How many there are.
-        decode: The complete reader of one message.
+        decode: Decodes one message; raises ValueError, LookupError or struct.error if it is malformed.
 
     Attributes:
         frame_ids: Per topic the frame of the newest message, "" before the first.
@@ -245,7 +246,7 @@ class EachReader(Generic[Message]):
         for k, (topic, _, data) in enumerate(batch.messages()):
             try:
                 message = self._decode(data)
-            except CdrError:
+            except (ValueError, LookupError, struct.error):
                 valid[k] = False
                 continue
             stamp_ns[k], self.frame_ids[topic] = message.stamp_ns, message.frame_id
