@@ -94,7 +94,7 @@ def test_the_sentence_about_a_parameter(
 def test_parameters_describe_themselves_and_cannot_be_changed(node: EstimatorNode) -> None:
     descriptor = node.describe_parameter("horizon_s")
     assert descriptor.read_only
-    assert "late" in descriptor.description
+    assert "delay" in descriptor.description
     assert descriptor.floating_point_range[0].to_value == 60.0
     (result,) = node.set_parameters([Parameter("horizon_s", value=3.0)])
     assert not result.successful
