@@ -194,9 +194,12 @@ class Diagnostics:
             troubles.append(f"{lost}waiting for a sighting or a fix that locates it")
         if status is Status.STALE and not troubles:
             troubles.append("its odometry is silent")
+        sigma = np.sqrt(np.diagonal(estimate.covariances[index]))
+        if status is Status.UNCERTAIN:
+            size = f"{_figure(max(sigma[:2]))} m and {_figure(sigma[2])} rad"
+            troubles.append(f"its standard deviation, {size}, exceeds lost_sigma or lost_heading_sigma")
         values["status"] = status.name.lower()
         values["fix age [s]"] = _figure(estimate.fix_age_s[index])
-        sigma = np.sqrt(np.diagonal(estimate.covariances[index]))
         values["sigma x [m]"], values["sigma y [m]"] = _figure(sigma[0]), _figure(sigma[1])
         values["sigma theta [rad]"] = _figure(sigma[2])
         return Report(robot.name, "; ".join(troubles) or status.name.lower(), level_of(troubles), values)

@@ -32,7 +32,7 @@ from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gath
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline.estimate import estimate_at
+from swarm_loc_estimator.timeline.estimate import TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.settings import Settings
 
 _GATE = float(gate_threshold(0.9999))
@@ -63,7 +63,7 @@ class PictureFusion:
         self._tracks = tracks
         self._settings = settings
         self._moves = np.array([not robot.stands for robot in swarm.robots], dtype=bool)
-        self._timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
+        self._limits = TrackedLimits.of(swarm, settings)
         self._miss = min(3.0, -math.log1p(-settings.aerial_detection_probability))
         self._model = ChainModel(
             detection_probability=settings.aerial_detection_probability,
@@ -75,7 +75,7 @@ class PictureFusion:
         """Assign the detections (n,) of an image to localized robots; indices are of all robots (N,)."""
         stamp_ns = int(image["stamp_ns"][0])
         picture = picture_of(image)
-        estimate = estimate_at(state, self._tracks.arrays, self._timeout_s, stamp_ns)
+        estimate = estimate_at(state, self._tracks.arrays, self._limits, stamp_ns)
         robots = np.flatnonzero(state.tracked)
         poses, covariances = estimate.poses[robots], estimate.covariances[robots]
         state.images.see(picture.pose[:, :2], stamp_ns)
@@ -155,7 +155,7 @@ class PictureFusion:
         if not self._tracks.has_started(robot, stamp_ns):
             return Outcome.NO_ODOMETRY, None
         sample = self._tracks.at(np.array([robot]), np.array([stamp_ns]))
-        if sample.silence_s[0] > self._timeout_s[robot]:
+        if sample.silence_s[0] > self._limits.timeout_s[robot]:
             state.images.chains.pop(robot, None)
             return Outcome.NO_ODOMETRY, None
         point, picture = TrackPoint(sample.pose[0], sample.covariance[0]), picture_of(image)

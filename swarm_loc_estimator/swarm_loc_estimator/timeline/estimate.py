@@ -18,6 +18,8 @@ from swarm_loc_estimator.filter.prediction import new_scratch, write_predicted
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.odometry.look_up import look_up, new_sample
 from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.settings import Settings
 
 
 class Status(IntEnum):
@@ -28,10 +30,32 @@ class Status(IntEnum):
     STALE = 2  # localized, but its odometry has timed out
     UNCONFIRMED = 3  # initialized, but not confirmed by a sighting yet
     CONTRADICTED = 4  # its newest sightings contradict its pose
+    UNCERTAIN = 5  # localized, but its standard deviation exceeds lost_sigma or lost_heading_sigma
 
 
 _WAITING, _TRACKED, _STALE = int(Status.WAITING), int(Status.TRACKED), int(Status.STALE)
 _UNCONFIRMED, _CONTRADICTED = int(Status.UNCONFIRMED), int(Status.CONTRADICTED)
+_UNCERTAIN = int(Status.UNCERTAIN)
+
+
+class TrackedLimits(NamedTuple):
+    """Limits beyond which a localized robot is not reported as tracked.
+
+    Attributes:
+        timeout_s: (N,) age of the newest odometry [s].
+        position_sigma: Standard deviation of x and of y [m].
+        heading_sigma: Standard deviation of the heading [rad].
+    """
+
+    timeout_s: FloatArray
+    position_sigma: float
+    heading_sigma: float
+
+    @classmethod
+    def of(cls, swarm: Swarm, settings: Settings) -> TrackedLimits:
+        """Limits of a swarm's robots."""
+        timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
+        return cls(timeout_s, settings.lost_sigma, settings.lost_heading_sigma)
 
 
 class Estimate(NamedTuple):
@@ -54,17 +78,17 @@ class Estimate(NamedTuple):
     fix_age_s: FloatArray
 
 
-def estimate_at(state: SwarmState, tracks: TrackArrays, timeout_s: FloatArray, now_ns: int) -> Estimate:
+def estimate_at(state: SwarmState, tracks: TrackArrays, limits: TrackedLimits, now_ns: int) -> Estimate:
     """Predict the estimate to an instant.
 
     Args:
         state: State at the newest measurements.
         tracks: Odometry, used for the prediction.
-        timeout_s: (N,) age of the newest odometry after which a robot is stale [s].
+        limits: Decide which robots are tracked.
         now_ns: The instant.
     """
     estimate = _new_estimate(now_ns, state.tracked.size)
-    _write_all(state.arrays(), tracks, timeout_s, estimate)
+    _write_all(state.arrays(), tracks, limits, estimate)
     return estimate
 
 
@@ -82,7 +106,7 @@ def _new_estimate(now_ns: int, robots: int) -> Estimate:
 
 
 @cached_njit
-def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray, out: Estimate) -> None:
+def _write_all(belief: BeliefArrays, tracks: TrackArrays, limits: TrackedLimits, out: Estimate) -> None:
     """Write the predictions of all tracked robots to an estimate."""
     sample, scratch, t, error = new_sample(1), new_scratch(), np.empty(3), np.empty((3, 3))
     track, raw = sample.pose[0], sample.raw[0]
@@ -92,13 +116,13 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray,
         if not belief.tracked[i]:
             continue
         look_up(tracks, i, out.stamp_ns, sample, 0)
-        out.status[i] = _status(belief.integrity, i, sample.silence_s[0] > timeout_s[i])
         to = Preintegrated(out.stamp_ns, sample.covariance[0], sample.jacobian[0])
         write_predicted(belief, i, to, scratch, t, error)
         x, y, theta = composed(t[0], t[1], t[2], track[0], track[1], track[2])
         out.poses[i, 0], out.poses[i, 1], out.poses[i, 2] = x, y, wrap(theta)
         _pose_covariance(x, y, error, out.covariances[i])
         inflate_suspect_covariance(belief.integrity, i, out.covariances[i])
+        out.status[i] = _status(belief.integrity, i, sample.silence_s[0], limits, out.covariances[i])
         cos, sin = np.cos(theta - raw[2]), np.sin(theta - raw[2])
         out.map_to_odom[i, 0] = x - cos * raw[0] + sin * raw[1]
         out.map_to_odom[i, 1] = y - sin * raw[0] - cos * raw[1]
@@ -106,13 +130,20 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, timeout_s: FloatArray,
 
 
 @inlined_njit
-def _status(integrity: IntegrityArrays, robot: int, silent: bool) -> int:
-    """Status of a localized robot."""
-    if silent:
+def _status(
+    integrity: IntegrityArrays, robot: int, silence_s: float, limits: TrackedLimits, covariance: FloatArray
+) -> int:
+    """Status of a localized robot with the reported covariance (3, 3)."""
+    if silence_s > limits.timeout_s[robot]:
         return _STALE
     if integrity.confirmations[robot] < CONFIRMED:
         return _UNCONFIRMED
-    return _CONTRADICTED if is_contradicted(integrity, robot) else _TRACKED
+    if is_contradicted(integrity, robot):
+        return _CONTRADICTED
+    position = max(covariance[0, 0], covariance[1, 1])
+    if position > limits.position_sigma**2 or covariance[2, 2] > limits.heading_sigma**2:
+        return _UNCERTAIN
+    return _TRACKED
 
 
 @inlined_njit

@@ -19,7 +19,7 @@ from swarm_loc_estimator.sensors.sensor import joined
 from swarm_loc_estimator.sensors.validation import REJECT_REASONS, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradiction, contradictions
-from swarm_loc_estimator.timeline.estimate import Estimate, Status, estimate_at
+from swarm_loc_estimator.timeline.estimate import Estimate, Status, TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.fusion import Fusion, Verdict
 from swarm_loc_estimator.timeline.self_calibration import learned, learns
 from swarm_loc_estimator.timeline.settings import Settings
@@ -43,7 +43,7 @@ class Estimator:
     def __init__(self, swarm: Swarm, settings: Settings | None = None) -> None:
         self.swarm = swarm
         self.settings = (settings or Settings()).resolved_for(swarm)
-        self._timeout_s = np.array([robot.odometry.timeout_s for robot in swarm.robots])
+        self._limits = TrackedLimits.of(swarm, self.settings)
         self._tracks = OdometryTracks(swarm.robots)
         self._converter = InputConverter(swarm, self.settings)
         self._fusion = Fusion(swarm, self.settings, self._tracks)
@@ -234,4 +234,4 @@ class Estimator:
 
     def _estimate(self, now_ns: int) -> Estimate:
         state = self._fusion.starts.with_starts(self._timeline.state, now_ns)
-        return estimate_at(state, self._tracks.arrays, self._timeout_s, now_ns)
+        return estimate_at(state, self._tracks.arrays, self._limits, now_ns)

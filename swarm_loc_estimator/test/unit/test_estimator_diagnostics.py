@@ -153,6 +153,16 @@ def test_a_robot_is_told_apart_as_waiting_lost_silent_or_in_a_foreign_frame() ->
     assert b.message == "b/odom is in frame 'odom' but transforms are published for 'b/odom'"
 
 
+def test_a_robot_that_is_too_uncertain_is_named() -> None:
+    world = World()
+    world.odometry("b", 0, 0)
+    a, b, _ = world.reports(0, estimate(0, Status.TRACKED, Status.UNCERTAIN), recent(), {})
+    assert "deviation" not in a.message
+    assert b.warning
+    assert b.message == "its standard deviation, 2 m and 2 rad, exceeds lost_sigma or lost_heading_sigma"
+    assert b.values["status"] == "uncertain"
+
+
 @pytest.mark.parametrize(("period_s", "patience_s"), [(0.05, 10.0), (1.0, 10.0), (60.0, 300.0)])
 def test_a_detector_that_falls_silent_is_named_as_soon_as_its_period_allows(
     period_s: float, patience_s: float

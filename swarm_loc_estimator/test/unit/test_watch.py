@@ -16,8 +16,10 @@ from hypothesis import strategies as st
 from processor_wait import THIS_THREAD, waited_s
 
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.timeline.estimate import Status
 from swarm_loc_estimator.watch.access import Access, AccessError
 from swarm_loc_estimator.watch.frames import Frame, History, pack, unpack
+from swarm_loc_estimator.watch.markers import _COLOURS
 from swarm_loc_estimator.watch.page import about, content_security_policy, page
 from swarm_loc_estimator.watch.server import Answer, Command, ServerError, ServerLoad, WatchServer
 
@@ -109,6 +111,13 @@ def test_an_address_that_others_reach_needs_a_token() -> None:
 def test_a_short_token_is_refused(address: str) -> None:
     with pytest.raises(AccessError, match="parameter token is too short: it needs 8 characters or more"):
         Access(address, "seven77")
+
+
+def test_page_and_markers_show_each_status() -> None:
+    listed = re.search(r"const STATUS = \[(.*?)\]", page())
+    assert listed is not None
+    assert re.findall(r"\w+", listed[1]) == [status.name.lower() for status in Status]
+    assert len(_COLOURS) == len(Status)
 
 
 def test_the_page_is_whole_and_may_ask_nobody_else() -> None:

@@ -1,5 +1,5 @@
 // What moves: robots with heading and 95 % ellipse, what each sees, ground truth, goals, aerial detections.
-const STATUS = ["waiting", "tracked", "stale", "unconfirmed", "contradicted"];
+const STATUS = ["waiting", "tracked", "stale", "unconfirmed", "contradicted", "uncertain"];
 const VERDICT = ["kept", "used", "gated", "kept", "kept"]; // by number, as a colour; 0, 3 and 4 wait
 const CHI2_95 = 5.991; // of two degrees of freedom
 const SEEN_MS = 1500;

@@ -9,6 +9,7 @@ const SAY_STATUS = {
   stale: "its odometry is silent: the last known pose",
   unconfirmed: "where its description says; no sighting has confirmed it",
   contradicted: "its newest sightings do not agree with its pose",
+  uncertain: "its standard deviation is beyond the limit: too long unseen",
 };
 
 class Panel {
