@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.shared.bags import copy_beginning
+from bench.shared.bags import copy_part
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.offline.datasets.mrclam import read_dataset
@@ -43,7 +43,7 @@ def run_mrclam(folder: Path, work: Path, duration_s: float, rate: float) -> Outc
     """The first part of an MRCLAM set."""
     whole, part = work / "whole", work / f"{folder.name}_beginning"
     convert(read_dataset(folder), whole, Delay(0, 0, 0), lambda _share, _what: None)
-    copy_beginning(whole, part, duration_s)
+    copy_part(whole, part, duration_s)
     return run_bag(part, whole / "swarm.yaml", rate)
 
 

@@ -1,7 +1,8 @@
 """Integrity: are poses with status TRACKED correct under faults? Five simulated e-pucks on the eight.
 
 Each scenario injects one fault into a simulated run of a minute, see `scenarios.py`, or kills and restarts a
-process of the live graph in a rendered world, see `live.py`. A robot-second is
+process of the live graph in a rendered world, see `live.py`, or starts the estimator late while PushBots map,
+see `late_start.py`. A robot-second is
 misleading when the robot is TRACKED with an error beyond 5 sigma and 2 cm. In `kidnapped` no data shows the
 fault before the first sighting after it has arrived; this time is excluded.
 """
@@ -16,12 +17,13 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.integrity.late_start import LATE_START, run_late_start
 from bench.integrity.live import LIVE_SCENARIOS, run_live
 from bench.integrity.scenarios import SCENARIOS
 from bench.integrity.scoring import Score, score
 from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, table, write_figures
 
-_NAMES = (*SCENARIOS, *LIVE_SCENARIOS)
+_NAMES = (*SCENARIOS, LATE_START, *LIVE_SCENARIOS)
 _PLOTS_PER_FILE = 5
 _COLUMNS = ("scenario", "misleading", "worst seed", "tracked", "RMSE [cm]", "NEES", "recovery [s]")
 
@@ -52,6 +54,8 @@ def _run(name: str, seed: int) -> Score:
         return score(SCENARIOS[name](seed))
     folder = OUT / "integrity" / f"{name}{seed}"
     shutil.rmtree(folder, ignore_errors=True)
+    if name == LATE_START:
+        return run_late_start(seed, folder)
     say = ProgressLine(f"{name} seed {seed}")
     found = run_live(name, seed, folder, say)
     say("done")

@@ -85,9 +85,12 @@ def score(fault: Fault) -> Score:
 
 
 def scored(
-    estimated: Estimated, ends_s: float | None = None, hidden_s: tuple[float, float] | None = None
+    estimated: Estimated,
+    ends_s: float | None = None,
+    hidden_s: tuple[float, float] | None = None,
+    right_m: float = _RIGHT_M,
 ) -> Score:
-    """Score estimates; see `Fault` for the times."""
+    """Score estimates; see `Fault` for the times. A pose within `right_m` is right."""
     time_s, error, covariance, tracked = estimated
     distance: FloatArray = np.hypot(error[..., 0], error[..., 1])
     squared = np.full(distance.shape, np.nan)
@@ -104,7 +107,7 @@ def scored(
         tracked_share=float(tracked[time_s > _SETTLED_S].mean()),
         position_m=float(np.sqrt(np.mean(distance[used] ** 2))),
         nees=float(np.mean(nees(error[used], covariance[used]))),
-        recovery_s=_recovery_s(time_s, tracked & (distance < _RIGHT_M), ends_s),
+        recovery_s=_recovery_s(time_s, tracked & (distance < right_m), ends_s),
         time_s=time_s,
         error_m=distance,
         misleading=misleading,

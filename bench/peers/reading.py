@@ -20,7 +20,7 @@ from mcap.reader import make_reader
 from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from bench.mrclam.sets import import_set
-from bench.shared.bags import copy_beginning
+from bench.shared.bags import copy_part
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import typestore
@@ -242,7 +242,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if options.folder:
             whole, source, times = Path(work, "whole"), Path(work, "first"), 1
             import_set(options.folder, whole)
-            copy_beginning(whole, source, MRCLAM_S)
+            copy_part(whole, source, MRCLAM_S)
         results["odometry"] = measure(source, ODOMETRY, times)
     results["detections"] = measure(DEMO, DETECTIONS, options.times)
     report(results)

@@ -1,4 +1,4 @@
-"""Bags for benchmarks and tests: their beginnings, ground truth received live, messages of many robots."""
+"""Bags for benchmarks and tests: their parts, ground truth received live, messages of many robots."""
 
 from __future__ import annotations
 
@@ -23,13 +23,14 @@ from swarm_loc_estimator.offline.ground_truth import TruthReader
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 
-def copy_beginning(bag: Path, folder: Path, duration_s: float) -> int:
-    """Copy the first seconds of a bag to a new one.
+def copy_part(bag: Path, folder: Path, end_s: float, begin_s: float = 0.0) -> int:
+    """Copy some seconds of a bag to a new one.
 
     Args:
         bag: rosbag2 folder, .mcap or .db3 file, which a crash may have cut off.
         folder: The new bag, created; must not exist.
-        duration_s: How much to copy, by log time [s].
+        end_s: End of the part, by log time since the first message [s].
+        begin_s: Its begin [s].
 
     Returns:
         Number of messages.
@@ -39,15 +40,23 @@ def copy_beginning(bag: Path, folder: Path, duration_s: float) -> int:
     """
     count = 0
     with BagReader(bag) as reader, BagWriter(folder) as writer:
-        end_ns = reader.time_range_ns[0] + round(duration_s * 1e9)
+        begin_ns, end_ns = (reader.time_range_ns[0] + round(1e9 * at_s) for at_s in (begin_s, end_s))
         for topic in reader.topics:
             writer.add_topic(topic.name, topic.type)
         for name, _, log_ns, data in reader.messages():
             if log_ns > end_ns:
                 break
+            if log_ns < begin_ns:
+                continue
             writer.write(name, log_ns, bytes(data))
             count += 1
     return count
+
+
+def first_log_ns(bag: Path, topic: str) -> int:
+    """Log time of the first message of a topic [ns]."""
+    with BagReader(bag) as reader:
+        return next(log_ns for name, _, log_ns, _ in reader.messages() if name == topic)
 
 
 def read_truth(swarm: Swarm, messages: Mapping[str, Sequence[bytes]]) -> dict[str, Trajectory]:

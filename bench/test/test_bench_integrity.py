@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
+from bench.integrity.late_start import run_late_start
 from bench.integrity.scenarios import SCENARIOS
 from bench.integrity.scoring import score
 from swarm_loc_estimator.timeline.contradictions import Contradicted
@@ -52,3 +55,10 @@ def test_a_kidnapped_robot_comes_back() -> None:
     found = score(SCENARIOS["kidnapped"](SEED))
     assert found.misleading_share <= 0.6 / 300.0  # two more images, up to 0.3 s late, of 300 robot-seconds
     assert found.recovery_s <= 3.0
+
+
+def test_an_estimator_that_starts_late_locates_robots_that_map(tmp_path: Path) -> None:
+    found = run_late_start(SEED, tmp_path)
+    assert found.misleading_share <= 0.001
+    assert found.recovery_s <= 3.0
+    assert found.tracked_share >= 0.8

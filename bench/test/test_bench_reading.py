@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from bench.peers import reading
-from bench.shared.bags import copy_beginning
+from bench.shared.bags import copy_part
 from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
 
 
@@ -16,7 +16,7 @@ from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
 def second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The first second of the demo's bag."""
     monkeypatch.setattr(reading, "REPEATS", 1)
-    copy_beginning(reading.DEMO, tmp_path / "second", 1.0)
+    copy_part(reading.DEMO, tmp_path / "second", 1.0)
     return tmp_path / "second"
 
 

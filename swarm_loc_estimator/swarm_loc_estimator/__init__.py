@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.mapping.mapper import SCAN_TURN as SCAN_TURN
     from swarm_loc_estimator.mapping.mapper import START_TURN as START_TURN
     from swarm_loc_estimator.mapping.mapper import CooperativeMapper as CooperativeMapper
-    from swarm_loc_estimator.mapping.mapper_feed import FixCovariances as FixCovariances
+    from swarm_loc_estimator.mapping.mapper_feed import fix_covariance as fix_covariance
     from swarm_loc_estimator.mapping.messages import decode_laser as decode_laser
     from swarm_loc_estimator.mapping.scans import UNSEEN as UNSEEN
     from swarm_loc_estimator.mapping.scans import LightSightings as LightSightings
@@ -49,7 +49,7 @@ _MODULES = {
     "swarm_loc_estimator.mapping.exploration": ("Goal",),
     "swarm_loc_estimator.mapping.grid": ("OccupancyMap",),
     "swarm_loc_estimator.mapping.mapper": ("SCAN_TURN", "START_TURN", "CooperativeMapper"),
-    "swarm_loc_estimator.mapping.mapper_feed": ("FixCovariances",),
+    "swarm_loc_estimator.mapping.mapper_feed": ("fix_covariance",),
     "swarm_loc_estimator.mapping.messages": ("decode_laser",),
     "swarm_loc_estimator.mapping.scans": ("UNSEEN", "LightSightings", "Readings"),
     "swarm_loc_estimator.offline.metrics": ("Errors", "ErrorSummary"),

@@ -35,7 +35,7 @@ STARTS = {"pushbot1": (2.6, 1.5, math.pi), "pushbot2": (1.6, 1.2, 0.3)}
 SIMULATED = """
 fileversion: 1
 types:
-  pushbot: {odometry: {wheel_separation: 0.085}, camera: null}
+  pushbot: {odometry: {wheel_separation: 0.085}, camera: null, fix: {systematic_share: 1.0}}
 robots:
   a: {type: pushbot, start: {x: 2.0, y: 3.0, theta: 3.14159265}}
 """

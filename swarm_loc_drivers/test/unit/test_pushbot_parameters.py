@@ -25,7 +25,7 @@ DOC = Path(__file__).parents[2] / "doc"
 SWARM = """
 fileversion: 1
 types:
-  pushbot: {odometry: {wheel_separation: 0.085}, camera: null}
+  pushbot: {odometry: {wheel_separation: 0.085}, camera: null, fix: {systematic_share: 1.0}}
 robots:
   a: {type: pushbot, start: {x: 1.5, y: 1.5, theta: 0.0}}
   b: {type: pushbot, start: {x: 2.4, y: 1.1, theta: 0.0}}

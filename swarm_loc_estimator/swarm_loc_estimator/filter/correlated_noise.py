@@ -1,4 +1,4 @@
-"""Correlated errors of repeated measurements by one pair of robots.
+"""Correlated errors of repeated measurements by one pair of robots, and of absolute fixes of one robot.
 
 The error of an infrared exchange comes from the unknown gains of the elements much more than from noise, and
 the gains are the same in the next exchange. So a part s = b c of the variance c of a measurement is
@@ -24,6 +24,16 @@ mean decays as the predicted variance of their relative pose grows. It does not 
 other elements with other gains. Range, bearing and heading decay separately. Errors of pairs that share a
 robot are treated as independent, although they share its elements: ranges measured by, or to, one robot have
 a correlation of about 0.15.
+
+Fixes of a mapper are estimates that contain the robot's odometry and all earlier scans: what is wrong with
+the map is wrong with all of them. With the variance c of a fix, s = b c and the predicted variance p, the
+error s is in the prediction already, and the fix improves only the rest p - s, by its random part c - s:
+
+    p' = s + (p - s) (c - s) / (p - s + c - s)   where p > s, else p.
+
+The noise is inflated so that the update has this result, in the directions that diagonalise both covariances.
+With b = 0 it stays as it is; with b = 1 the variance becomes c, however many fixes there are, and a fix that
+is less sure than the prediction is ignored.
 """
 
 from __future__ import annotations
@@ -56,8 +66,8 @@ _NEGLIGIBLE = 1e-8
 
 
 def at_initialization(measurement: MeasurementArray) -> MeasurementArray:
-    """A measurement (1,) with the inflated noise for initialization."""
-    if not (measurement["systematic_share"] > 0.0).any():
+    """A measurement (1,) with the inflated noise for initialization; fixes are returned unchanged."""
+    if measurement["observer"][0] < 0 or not (measurement["systematic_share"] > 0.0).any():
         return measurement
     wider: MeasurementArray = measurement.copy()
     wider["covariance"] *= _INITIAL_INFLATION
@@ -108,6 +118,30 @@ def use_mean(
         _start_mean(noise, pair)
     for i in range(3):
         pair[_VARIANCE, i] *= noise[i, i] / (variances[i] + noise[i, i])
+
+
+@cached_njit
+def inflate_fix(share: float, predicted_covariance: FloatArray, noise: FloatArray) -> None:
+    """Inflate the noise of a fix so that it adds no more than what earlier ones with its errors lack.
+
+    Args:
+        share: Systematic share of its variance.
+        predicted_covariance: (3, 3) of the pose.
+        noise: (3, 3) covariance of the fix, changed.
+    """
+    root = cholesky3(noise)
+    inverse = _inverse(root)
+    ratio, axes = np.linalg.eigh(np.dot(inverse, np.dot(predicted_covariance, inverse.T)))
+    basis = np.dot(root, np.ascontiguousarray(axes))
+    scaled = np.empty((3, 3))
+    for i in range(3):
+        rest, new = ratio[i] - share, 0.0
+        if rest > 0.0:
+            after = share + rest * (1.0 - share) / (rest + 1.0 - share)
+            new = 1.0 / after - 1.0 / ratio[i]
+        for j in range(3):
+            scaled[j, i] = basis[j, i] / max(new, _NEGLIGIBLE)
+    assign_matrix(noise, np.dot(scaled, basis.T))
 
 
 @cached_njit

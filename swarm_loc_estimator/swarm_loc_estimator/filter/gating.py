@@ -20,6 +20,10 @@ def gate_threshold(probability: ArrayLike, degrees_of_freedom: int = 2) -> Float
     return threshold
 
 
+POSE_GATE = float(gate_threshold(0.9999, 3))
+"""Threshold of the squared distance of a pose whose heading is gated, too: fixes with systematic errors."""
+
+
 @inlined_njit
 def squared_distance(innovation: FloatArray, covariance: FloatArray) -> float:
     """Normalized innovation squared of an innovation (3,) with covariance (3, 3)."""

@@ -11,8 +11,13 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
 from swarm_loc_estimator.filter.belief import BeliefArrays, covariance_within, own_within
-from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS, use_mean
-from swarm_loc_estimator.filter.gating import position_distance, soften_heading, squared_distance
+from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS, inflate_fix, use_mean
+from swarm_loc_estimator.filter.gating import (
+    POSE_GATE,
+    position_distance,
+    soften_heading,
+    squared_distance,
+)
 from swarm_loc_estimator.filter.integrity.fault_detection import (
     cause_of,
     noise_of_frequent_looks,
@@ -174,6 +179,15 @@ def evaluate(
     for i in range(2):
         batch.whitened[row, i] = innovation[i] / math.sqrt(s[i, i] + small[i])
     batch.cause[row] = cause_of(measurements.kind[k], innovation, predicted)
+    share = measurements.systematic_share[k, 0] if measurements.observer[k] < 0 else 0.0
+    if share > 0.0:
+        batch.nis[row] = squared_distance(innovation, s)
+        batch.accepted[row] = batch.nis[row] <= POSE_GATE
+        for i in range(3):
+            for j in range(3):
+                s[i, j] -= noise[i, j]
+        inflate_fix(share, s, noise)
+        return
     if measurements.has_heading[k]:
         before = (noise[0, 2], noise[1, 2], noise[2, 2])
         soften_heading(innovation, s, noise)

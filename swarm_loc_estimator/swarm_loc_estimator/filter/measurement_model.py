@@ -135,6 +135,16 @@ def has_kernel(measurements: MeasurementColumns, k: int) -> bool:
     return 0 <= kind <= POLAR
 
 
+@inlined_njit
+def locates_alone(measurements: MeasurementColumns, k: int) -> bool:
+    """Whether measurement k is a whole pose in `map` whose errors the next ones have, too.
+
+    More of them would not confirm it, so a single one initializes a robot.
+    """
+    is_fix: bool = measurements.observer[k] < 0 and measurements.has_heading[k] > 0
+    return is_fix and measurements.systematic_share[k, 0] > 0.0
+
+
 class Prediction(NamedTuple):
     """Predicted value of a measurement with n components, n up to 3.
 

@@ -20,7 +20,7 @@ from swarm_loc_estimator.filter.integrity.divergence import (
     is_uncertain,
 )
 from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_excluded
-from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel
+from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel, locates_alone
 from swarm_loc_estimator.odometry.look_up import look_up, new_sample
 from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
 
@@ -54,7 +54,8 @@ def update_in_order(
         nis: (m,) normalized innovation squared, written.
 
     Returns:
-        Index of the first measurement not processed, the reason, and the robot or landmark concerned.
+        Index of the first measurement not processed, the reason, and the robot or landmark concerned. A fix
+        that locates alone the robot that is lost by it is processed again.
     """
     batch, sample, scratch, room = new_batch(1), new_sample(2), new_scratch(), prediction.new_scratch()
     pose = batch.pose[0]
@@ -84,9 +85,10 @@ def update_in_order(
             return k, CONTRADICTED, contradicted
         accepted, nis[k] = batch.accepted[0] and not is_excluded(measurements, k, belief), batch.nis[0]
         verdicts[k] = USED if accepted else GATED
+        following = k if locates_alone(measurements, k) and not accepted else k + 1
         contradicted = confirm(measurements, k, belief, accepted)
         if contradicted >= 0:
-            return k + 1, LOST, contradicted
+            return following, LOST, contradicted
         if accepted:
             noise, jacobian = batch.noise[0], batch.jacobian[0]
             record_pair(measurements, k, belief, batch.pair[0])
@@ -95,5 +97,5 @@ def update_in_order(
             )
         lost = count_gated(measurements, k, belief, accepted, limits)
         if lost >= 0:
-            return k + 1, LOST, lost
+            return following, LOST, lost
     return measurements.stamp_ns.size, FINISHED, -1

@@ -28,7 +28,7 @@ _RIVAL_SHARE = 0.8  # share of the best support from which another transform is 
 _MAX_RIVALS = 8
 _APART_M, _APART_RAD = 0.1, 0.1
 HEADING_SIGMA = 0.2
-_POSITION_SIGMA = 0.5
+POSITION_SIGMA = 0.5
 _REFINEMENTS = 5
 _MARGIN = 1e-6  # keeps the robot's own covariance positive definite
 _PRIOR = 1e-6  # keeps the information matrix regular in unobserved directions
@@ -57,7 +57,7 @@ def align(
     if np.count_nonzero(weight) < enough:
         return None
     position, heading = _uncertainty(constraints, track_noise, weight, transform, covariance)
-    if not (position < _POSITION_SIGMA and heading < heading_sigma):
+    if not (position < POSITION_SIGMA and heading < heading_sigma):
         return None
     rivals = hypotheses[support >= _RIVAL_SHARE * support[best]]
     limits = (_APART_M + 3.0 * position, _APART_RAD + 3.0 * heading)

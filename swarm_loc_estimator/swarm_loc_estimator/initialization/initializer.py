@@ -5,6 +5,7 @@ Each sighting between a robot without a pose and a localized side constrains one
 the transform in closed form (a rigid alignment); a sighting with heading determines it alone, or twice where
 it has a mirrored solution. The transform on which most constraints agree is refined by least squares. It is
 accepted when its covariance is small enough and no other transform explains the constraints about as well.
+A whole pose by a mapper locates a robot alone: it is an estimate, which its next poses would not confirm.
 """
 
 from __future__ import annotations
@@ -12,11 +13,22 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED
-from swarm_loc_estimator.filter.measurement_model import NOBODY, MeasurementArray
+from swarm_loc_estimator.filter.measurement_model import (
+    NOBODY,
+    MeasurementArray,
+    MeasurementColumns,
+    locates_alone,
+)
 from swarm_loc_estimator.filter.prediction import new_scratch, predict
-from swarm_loc_estimator.filter.state import SwarmState
-from swarm_loc_estimator.initialization.alignment import HEADING_SIGMA, MIN_CONSTRAINTS, align
+from swarm_loc_estimator.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.initialization.alignment import (
+    HEADING_SIGMA,
+    MIN_CONSTRAINTS,
+    POSITION_SIGMA,
+    align,
+)
 from swarm_loc_estimator.initialization.constraints import (
     NO_CONSTRAINTS,
     THE_MAP,
@@ -64,12 +76,19 @@ class Initializer:
         robot, other = (target, observer) if knows_observer else (observer, target)
         if knows_observer == knows_target or not self._tracks.has_started(robot, now_ns):
             return False
+        track = self._tracks.at(np.array([robot]), one["stamp_ns"])
+        at = Preintegrated(now_ns, track.covariance[0], track.jacobian[0])
+        if locates_alone(MeasurementColumns.of(one), 0) and self._is_sure(one["covariance"][0]):
+            pose, covariance = one["value"][0], one["covariance"][0]
+            transform = se2.compose(pose, se2.inverse(track.pose[0]))
+            state.initialize(
+                robot, InitialPose(transform, se2.error_covariance(pose, covariance)), at, CONFIRMED
+            )
+            return True
         old = state.constraints.get(robot, NO_CONSTRAINTS)
         same = old[(old["marker_id"] == one["marker_id"][0]) & (old["other"] == other)]
         if same.size and abs(now_ns - int(same["stamp_ns"][-1])) < _INDEPENDENT_NS:
             return True
-        track = self._tracks.at(np.array([robot]), one["stamp_ns"])
-        at = Preintegrated(now_ns, track.covariance[0], track.jacobian[0])
         camera = np.zeros(2) if observer == NOBODY else state.parameter[observer, [CAMERA_YAW, CAMERA_SCALE]]
         waiting, seen = Waiting(robot, track.pose[0], at.covariance), self._located(state, other, one)
         constraints = with_constraint(old, one, camera, waiting, seen, self._window_ns)
@@ -84,6 +103,11 @@ class Initializer:
             waited_ns = now_ns - int(constraints["stamp_ns"][0])
             state.next_attempt_ns[robot] = now_ns + min(_LONGEST_PAUSE_NS, waited_ns // _PAUSE_SHARE)
         return True
+
+    def _is_sure(self, covariance: FloatArray) -> bool:
+        """Whether a pose with a covariance (3, 3) may initialize a robot."""
+        x, y, heading = np.sqrt(np.diag(covariance)).tolist()
+        return bool(max(x, y) < POSITION_SIGMA and heading < self._heading_sigma)
 
     def _located(self, state: SwarmState, other: int, one: MeasurementArray) -> OtherSide:
         """The side of a measurement (1,) that is located, brought up to its stamp."""

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import astuple
 from enum import Enum
-from typing import Any
 
 import numpy as np
 
@@ -17,89 +15,24 @@ from swarm_loc_estimator.common.messages.definitions import LASER, LIGHTS, ODOME
 from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.se2 import between, compose, exp, log
-from swarm_loc_estimator.mapping.exploration import Goal
-from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.messages import decode_laser, decode_lights
 from swarm_loc_estimator.mapping.scans import UNSEEN, LightSightings, Readings
-from swarm_loc_estimator.odometry.preintegration import MODEL_DTYPE
-from swarm_loc_estimator.odometry.process_noise import OdometryStep, add_step_noise
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot
+from swarm_loc_estimator.swarm.swarm import Robot
 
 _LEAST_SIGMA = np.array([0.02, 0.02, 0.01])
 """Minimum standard deviations of a fix, for errors of the map that all fixes share [m, m, rad]."""
 _OPTIMISM = 2.5
 """Factor on variances of the graph, which assumes rigid scans although wheels slip unevenly."""
-_LEAST_SIGMA_MOVED = 0.003
-_LEAST_NEW = 0.02
-"""Minimum share of the mapper's information that a fix carries."""
 
 
-class FixCovariances:
-    """Covariances of successive fixes of one robot.
+def fix_covariance(covariance: FloatArray) -> FloatArray:
+    """Covariance (3, 3) of a fix, inflated from that of its stop in the graph (3, 3) [m, rad].
 
-    An error of the map shifts all poses in it, so successive fixes have correlated errors, and a filter that
-    fuses them as independent counts the same scans several times. Each fix therefore carries only the
-    information by which the mapper's pose exceeds that of the fix before, propagated by odometry (the common
-    information is subtracted, as in the information graphs of Chong, Mori and Chang, "Distributed multitarget
-    multisensor tracking", 1990). All fixes together have the information of the mapper.
-
-    The odometry model is that of the filter that fuses the fixes: the larger its noise, the less of the
-    fix before remains.
-
-    Args:
-        odometry: Of the robot, as the swarm description has it.
+    Successive fixes share most of their errors, which the estimator knows by `systematic_share`.
     """
-
-    def __init__(self, odometry: OdometryModel) -> None:
-        self._odometry: Any = np.array(astuple(odometry), MODEL_DTYPE)[()]  # argument of compiled code
-        self._last: tuple[Goal, FloatArray] | None = None
-
-    def next_covariance(self, goal: Goal, covariance: FloatArray) -> FloatArray:
-        """Covariance (3, 3) to publish with the newest fix.
-
-        Args:
-            goal: With pose and stamp.
-            covariance: (3, 3) of its stop in the graph [m, rad].
-        """
-        now = pose_covariance(covariance)
-        before, self._last = self._last, (goal, now)
-        if before is None or goal.number == 1:  # the first, or the first since odometry restarted
-            return now
-        known = self._carried_on(*before, goal)
-        return _new_alone(now, known)
-
-    def _carried_on(self, before: Goal, covariance: FloatArray, goal: Goal) -> FloatArray:
-        """Covariance (3, 3) at a goal from the previous one, the drive in between and the new scan."""
-        dx, dy = (goal.pose - before.pose)[:2].tolist()
-        path, duration_s = math.hypot(dx, dy), 1e-9 * (goal.stamp_ns - before.stamp_ns)
-        effect = np.eye(3)
-        effect[0, 2], effect[1, 2] = -dy, dx
-        carried: FloatArray = effect @ covariance @ effect.T + _LEAST_SIGMA_MOVED**2 * np.diag(
-            [1.0, 1.0, 0.0]
-        )
-        drive = OdometryStep(path, 0.0, 0.0, 0.0, 0.0, -0.5 * dx, -0.5 * dy, math.atan2(dy, dx))
-        scan = OdometryStep(0.0, 0.0, SCAN_TURN, 0.0, duration_s, 0.0, 0.0, 0.0)
-        for step in (drive, scan):
-            add_step_noise(self._odometry, step, carried)
-        return carried
-
-
-def pose_covariance(covariance: FloatArray) -> FloatArray:
-    """Covariance (3, 3) of a fix, inflated from that of its stop in the graph (3, 3) [m, rad]."""
     whole: FloatArray = _OPTIMISM * covariance + np.diag(_LEAST_SIGMA**2)
     return whole
-
-
-def _new_alone(now: FloatArray, known: FloatArray) -> FloatArray:
-    """Covariance (3, 3) of the measurement whose update reduces `known` (3, 3) to `now` (3, 3)."""
-    root = np.linalg.cholesky(now)
-    inverse = np.linalg.inv(root)
-    ratio, axes = np.linalg.eigh(inverse @ known @ inverse.T)  # ratio of variances, known over now
-    new = np.maximum(1.0 - 1.0 / ratio, _LEAST_NEW)
-    basis = root @ axes
-    whole = (basis / new) @ basis.T
-    symmetric: FloatArray = 0.5 * (whole + whole.T)
-    return symmetric
 
 
 MAX_WAITING = 500

@@ -31,7 +31,7 @@ from swarm_loc_estimator.mapping.exploration import Goal
 from swarm_loc_estimator.mapping.grid import CELL, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import MapFileError, load_map, save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.mapping.mapper_feed import FixCovariances, MapperFeed, MapperInput
+from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput, MapperInputError, fix_covariance
 from swarm_loc_estimator.mapping.messages import led_frequencies
 from swarm_loc_estimator.nodes.mapper_precompile import precompile
 from swarm_loc_estimator.nodes.parameters import (
@@ -66,6 +66,12 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         swarm = load_swarm(Path(self.params.swarm_file))
         names = chosen_robots(self.params.robots, list(swarm.index_of))
         self._robots = [swarm.robots[swarm.index_of[name]] for name in names]
+        independent = [robot.name for robot in self._robots if robot.fix.systematic_share < 1.0]
+        if independent:
+            raise MapperInputError(
+                f"robot '{independent[0]}' maps: its type in '{self.params.swarm_file}' needs"
+                " 'fix: {systematic_share: 1.0}', since an error of the map is in all of its fixes."
+            )
         self._frequencies = led_frequencies(self.params.led_frequencies, names)
         path = self.params.load_map
         self._background: OccupancyMap | None = load_map(Path(path), CELL) if path else None
@@ -92,7 +98,6 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self._mapper.background = self._background
         self.feed = MapperFeed(self._robots, self._mapper, self._frequencies)
         self._goal_stamps: dict[int, int] = {}
-        self._covariances = [FixCovariances(robot.odometry) for robot in self._robots]
         self._published: OccupancyMap | None = None
 
     def _create_publishers(self) -> None:
@@ -112,7 +117,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
             return
         self._goal_stamps[robot] = goal.stamp_ns
         frame = self.params.map_frame
-        covariance = self._covariances[robot].next_covariance(goal, self._mapper.covariance(number))
+        covariance = fix_covariance(self._mapper.covariance(number))
         self._fixes[robot].publish(fix_message(goal, covariance, frame))
         self._goals[robot].publish(goal_message(goal, frame))
 
@@ -203,7 +208,7 @@ def goal_message(goal: Goal, frame: str) -> PoseStamped:
 
 
 def fix_message(goal: Goal, covariance: FloatArray, frame: str) -> PoseWithCovarianceStamped:
-    """Pose of a robot when its goal was chosen, with a covariance (3, 3); see `FixCovariances`."""
+    """Pose of a robot when its goal was chosen, with a covariance (3, 3); see `fix_covariance`."""
     message = PoseWithCovarianceStamped()
     message.header.frame_id = frame
     message.header.stamp = Time(nanoseconds=goal.stamp_ns).to_msg()

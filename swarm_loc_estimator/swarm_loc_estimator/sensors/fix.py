@@ -112,9 +112,12 @@ def take_out_headings(measurements: MeasurementArray, without: NDArray[np.bool_]
     covariance[without, 2, :] = covariance[without, :, 2] = [0.0, 0.0, 1.0]
 
 
-def _create_converter(_swarm: Swarm, _settings: SensorSettings, _drops: Counter[str]) -> Converter:
+def _create_converter(swarm: Swarm, _settings: SensorSettings, _drops: Counter[str]) -> Converter:
+    share = np.array([robot.fix.systematic_share for robot in swarm.robots])
+
     def convert(rows: FixRows) -> Measured:
         fixes = about_robots(rows.robot, rows.stamp_ns, rows.pose, rows.covariance, Kind.CARTESIAN)
+        fixes["systematic_share"] = share[rows.robot][:, None]
         take_out_headings(fixes, np.isnan(rows.pose[:, 2]))
         return Measured(fixes, rows.arrival_ns)
 

@@ -252,6 +252,15 @@ class RandomWalk:
 
 
 @dataclass(frozen=True)
+class FixModel:
+    """Error model of a robot's absolute fixes, beside the covariance of each."""
+
+    systematic_share: float = number(
+        0.0, "1", 0.0, 1.0, "share of a fix's variance that earlier fixes have, too; 1: fixes of a mapper"
+    )
+
+
+@dataclass(frozen=True)
 class Robot:
     """One robot.
 
@@ -267,6 +276,7 @@ class Robot:
         start_sigma: Standard deviations of the start pose.
         stands: True if it has no odometry; it moves only by `random_walk`.
         random_walk: Random walk without odometry.
+        fix: Error model of its absolute fixes.
         ir: Infrared board; None if it has none.
     """
 
@@ -281,6 +291,7 @@ class Robot:
     start_sigma: StartSigma = StartSigma()
     stands: bool = False
     random_walk: RandomWalk = RandomWalk()
+    fix: FixModel = FixModel()
     ir: RobotIr | None = None
 
 

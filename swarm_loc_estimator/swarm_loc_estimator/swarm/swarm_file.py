@@ -2,7 +2,7 @@
 
 ```yaml
 fileversion: 1
-defaults:                 # any of odometry, random_walk, response, camera, sensor, ir, faces, start_sigma
+defaults:              # any of odometry, random_walk, response, camera, sensor, fix, ir, faces, start_sigma
   sensor: {range_sigma: 0.1}
   landmark: {size: 0.06, position_sigma: 0.01, yaw_sigma: 0.02}  # without sigmas: surveyed exactly
 types:
@@ -53,6 +53,7 @@ from swarm_loc_estimator.swarm.motion_response import MotionResponse, MotionResp
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
+    FixModel,
     Landmark,
     OdometryModel,
     Pose2,
@@ -71,7 +72,7 @@ if TYPE_CHECKING:
 FILE_VERSION = 1
 
 _SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks")
-_LAYER = ("odometry", "random_walk", "response", "camera", "sensor", "ir", "faces", "start_sigma")
+_LAYER = ("odometry", "random_walk", "response", "camera", "sensor", "fix", "ir", "faces", "start_sigma")
 _DEFAULTS = (*_LAYER, "landmark")
 _ROBOT = ("type", *_LAYER, "ids", "start")
 MODELS: dict[str, type] = {
@@ -79,6 +80,7 @@ MODELS: dict[str, type] = {
     "random_walk": RandomWalk,
     "camera": CameraMount,
     "sensor": SensorModel,
+    "fix": FixModel,
     "start_sigma": StartSigma,
 }
 _MAY_BE_NONE = ("odometry", "camera")

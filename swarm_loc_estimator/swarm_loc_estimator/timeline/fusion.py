@@ -33,6 +33,7 @@ from swarm_loc_estimator.filter.measurement_model import (
     Kind,
     MeasurementArray,
     MeasurementColumns,
+    locates_alone,
 )
 from swarm_loc_estimator.filter.model_evaluation import evaluate_by_records
 from swarm_loc_estimator.filter.sequential_update import update_in_order
@@ -231,10 +232,10 @@ class Fusion:
             self._fuse_part(state, measurements[part], verdicts[part], nis[part])
 
     def _parts(self, measurements: MeasurementArray) -> list[slice]:
-        """Split measurements (m,) into parts with at most one correlated measurement per pair."""
+        """Split measurements (m,) into parts with at most one correlated measurement per pair or robot."""
         edges, seen = [0], set[tuple[int, int]]()
-        if self._pairs:
-            comes_again: BoolArray = measurements["systematic_share"].max(axis=1) > 0.0
+        comes_again: BoolArray = measurements["systematic_share"].max(axis=1) > 0.0
+        if comes_again.any():
             pairs = zip(measurements["observer"].tolist(), measurements["target"].tolist(), strict=True)
             for k, pair in itertools.compress(enumerate(pairs), comes_again):
                 if pair in seen:
@@ -319,7 +320,11 @@ class Fusion:
             state.deinitialize(int(robot))
         for source in np.flatnonzero(contradicted).tolist():
             self._augment(state, source, newest_ns)
-        return np.where(accepted, Verdict.USED, Verdict.GATED).astype(np.uint8), batch.nis
+        verdicts = np.where(accepted, Verdict.USED, Verdict.GATED).astype(np.uint8)
+        for k in np.flatnonzero(~accepted & lost[fields.target]).tolist():
+            if locates_alone(fields, k) and not state.tracked[fields.target[k]]:
+                verdicts[k] = self._note(state, rows[k : k + 1])
+        return verdicts, batch.nis
 
     def _robots(self, state: SwarmState, stamp_ns: int) -> Robots:
         """Positions in `map` and tracked flags of all robots at an instant."""

@@ -12,7 +12,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from node_world import T0_NS, Ros
 from rclpy.time import Time
 
-from bench.shared.bags import copy_beginning
+from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.demo import main
 from swarm_loc_estimator.common.launch import GraphOptions, graph_nodes
 from swarm_loc_estimator.common.trajectory import interpolate
@@ -41,7 +41,7 @@ POSES = 40
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first seconds of the demo's bag."""
     folder = tmp_path_factory.mktemp("bags") / "short"
-    copy_beginning(DEMO, folder, 10.0)
+    copy_part(DEMO, folder, 10.0)
     return folder
 
 

@@ -28,6 +28,7 @@ from swarm_loc_msgs.msg import LaserDistance
 START = (1.0, 1.0, 0.3)
 YAML = """
 fileversion: 1
+defaults: {fix: {systematic_share: 1.0}}
 robots:
   alpha: {start: {x: 1.0, y: 1.0, theta: 0.3}, start_sigma: {x: 0.001, y: 0.001, theta: 0.001}}
   beta: {start: {x: 2.0, y: 1.0, theta: 0.0}}
@@ -126,6 +127,13 @@ def test_what_is_missing_and_what_is_wrong_is_told(ros: Ros, files: Path) -> Non
     ros.until(lambda: values_of(reports[-1].status[0])["<robot>/laser received"] == "2")
     assert values_of(reports[-1].status[0])["dropped: bad_message"] == "1"
     assert "alpha/laser" not in reports[-1].status[0].message
+
+
+def test_a_description_that_takes_fixes_for_independent_ends_the_start(ros: Ros, files: Path) -> None:
+    text = YAML.replace("systematic_share: 1.0", "systematic_share: 0.5")
+    (files / "swarm.yaml").write_text(text, encoding="utf-8")
+    with pytest.raises(UserError, match=r"robot 'alpha' maps: .* needs 'fix: {systematic_share: 1.0}'"):
+        mapper(ros, files)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 from machines import PORT, Machines, Radio
 
-from bench.shared.bags import copy_beginning
+from bench.shared.bags import copy_part
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, node_command
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_five_robots"
@@ -77,7 +77,7 @@ def estimator() -> list[str]:
 
 
 def player(folder: Path) -> list[str]:
-    copy_beginning(BAG, folder / "short", 3.0)
+    copy_part(BAG, folder / "short", 3.0)
     parameters: dict[str, ParameterValue] = {"bag": str(folder / "short"), "wait_for_subscribers": INPUTS}
     return node_command(NodeSpec("swarm_loc_estimator", "play", "player", parameters=parameters))
 

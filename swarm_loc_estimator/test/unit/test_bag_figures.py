@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.shared.bags import copy_beginning
+from bench.shared.bags import copy_part
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -33,7 +33,7 @@ def test_twenty_droplets_are_located_by_infrared_and_byte_for_byte_the_same_agai
     result = replayed("droplets_twenty")
     assert_good(result, 0.0045, 1.7, (1.0, 4.5))
     assert np.isfinite(result.poses[-1]).all()
-    copy_beginning(BAGS / "droplets_twenty", tmp_path / "beginning", BEGINNING_S)
+    copy_part(BAGS / "droplets_twenty", tmp_path / "beginning", BEGINNING_S)
     again = replay(tmp_path / "beginning", result.swarm)
     same = len(again.stamp_ns) - 3  # the last ones lack what the cut has taken
     assert same > 250

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from calibration_world import World, record, robot
 
-from bench.shared.bags import copy_beginning
+from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.calibrate import main
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
@@ -164,7 +164,7 @@ def test_a_recording_that_is_too_short_to_fit_is_named() -> None:
 def test_the_command_names_a_bag_that_is_cut_too_short(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    copy_beginning(BAGS / "eight_five_robots", tmp_path / "bag", 75.0)
+    copy_part(BAGS / "eight_five_robots", tmp_path / "bag", 75.0)
     out = tmp_path / "out.yaml"
     command = [str(tmp_path / "bag"), "--swarm", str(BAGS / "eight_five_robots" / "swarm.yaml")]
     assert main([*command, "--out", str(out), "--evaluations", "4"]) == 0

@@ -14,6 +14,7 @@ from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
+    FixModel,
     Landmark,
     OdometryModel,
     RandomWalk,
@@ -36,7 +37,9 @@ def table_of(cls: type, *required: str) -> str:
     return "\n".join(lines)
 
 
-@pytest.mark.parametrize("cls", [OdometryModel, RandomWalk, CameraMount, SensorModel, Face, StartSigma])
+@pytest.mark.parametrize(
+    "cls", [OdometryModel, RandomWalk, CameraMount, SensorModel, FixModel, Face, StartSigma]
+)
 def test_every_number_of_a_robot_has_its_place(cls: type) -> None:
     assert table_of(cls) in SWARM_DESCRIPTION
 

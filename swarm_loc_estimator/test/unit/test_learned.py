@@ -11,7 +11,7 @@ from core_messages import POSE, T0, detection
 from core_run import on_time, play, ticks
 from core_world import MOUNT, SENSOR, Plan, World, lasting_errors, simulate
 
-from bench.shared.bags import copy_beginning
+from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.replay import main
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
@@ -128,7 +128,7 @@ def test_a_robot_that_was_not_located_keeps_its_description() -> None:
 def test_the_replay_command_writes_what_it_learned_and_reports_it(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    copy_beginning(BAG, tmp_path / "bag", 15.0)
+    copy_part(BAG, tmp_path / "bag", 15.0)
     learned, command = tmp_path / "learned.yaml", [str(tmp_path / "bag"), "--out", str(tmp_path)]
     assert main([*command, "--swarm", str(BAG / "self_calibrating.yaml"), "--learned", str(learned)]) == 0
     before, after = load_swarm(BAG / "self_calibrating.yaml"), load_swarm(learned)
@@ -156,7 +156,7 @@ def test_the_replay_command_writes_what_it_learned_and_reports_it(
 def test_odometry_with_a_swapped_sign_is_named_and_not_written(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], what: str, description: str, key: str
 ) -> None:
-    copy_beginning(BAG, tmp_path / "right", 20.0)
+    copy_part(BAG, tmp_path / "right", 20.0)
     with BagReader(tmp_path / "right") as reader, BagWriter(tmp_path / "bag") as writer:
         for topic in reader.topics:
             writer.add_topic(topic.name, topic.type)

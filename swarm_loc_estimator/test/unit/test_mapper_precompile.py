@@ -8,7 +8,7 @@ from pathlib import Path
 
 from compiled_code import compiled_since, printed_by_process, signatures
 
-from swarm_loc_estimator.mapping.mapper_feed import FixCovariances
+from swarm_loc_estimator.mapping.mapper_feed import fix_covariance
 from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.nodes.mapper_precompile import precompile
 from swarm_loc_estimator.offline.map_replay import replay_map
@@ -28,11 +28,11 @@ def compiled_late() -> list[str]:
     before = signatures()
     robots = load_swarm(BAG / "swarm.yaml").robots
     mapper, feed = replay_map(BAG, robots, MapperSettings(), FREQUENCIES, lambda _share, _what: None)
-    for index, robot in enumerate(robots):
+    for index in range(len(robots)):
         number = feed.number(index)
         goal = None if number is None else mapper.goal(number)
         if number is not None and goal is not None:
-            FixCovariances(robot.odometry).next_covariance(goal, mapper.covariance(number))
+            fix_covariance(mapper.covariance(number))
         mapper.visits.on(mapper.occupancy())
     return compiled_since(before)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.shared.bags import copy_beginning
+from bench.shared.bags import copy_part
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.offline.replay import replay
@@ -22,7 +22,7 @@ DEMO = Path(__file__).parents[3] / "bags" / "eight_five_robots"
 def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first seconds of the demo's bag."""
     folder = tmp_path_factory.mktemp("bags") / "short"
-    copy_beginning(DEMO, folder, 10.0)
+    copy_part(DEMO, folder, 10.0)
     return folder
 
 

@@ -16,6 +16,7 @@ from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
+    FixModel,
     Landmark,
     OdometryModel,
     RandomWalk,
@@ -67,7 +68,7 @@ def swarms(draw: st.DrawFn) -> Swarm:
         st.lists(st.text(string.ascii_letters, min_size=1, max_size=6), unique=True, min_size=1, max_size=4)
     )
     robots: list[Robot] = []
-    kinds = (OdometryModel, RandomWalk, CameraMount, SensorModel, StartSigma)
+    kinds = (OdometryModel, RandomWalk, CameraMount, SensorModel, FixModel, StartSigma)
     pool = {cls: [cls(), draw(build(cls))] for cls in kinds}
     face_numbers = draw(st.lists(numbers(Face), max_size=3))
     for name in names:
@@ -85,6 +86,7 @@ def swarms(draw: st.DrawFn) -> Swarm:
                 start=draw(
                     st.none() | st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.floats(-6.28, 6.28))
                 ),
+                fix=draw(st.sampled_from(pool[FixModel])),
                 start_sigma=draw(st.sampled_from(pool[StartSigma])),
                 stands=stands,
                 random_walk=draw(st.sampled_from(pool[RandomWalk])) if stands else RandomWalk(),

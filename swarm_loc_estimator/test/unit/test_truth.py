@@ -11,7 +11,7 @@ import pytest
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
-from bench.shared.bags import copy_beginning, read_truth
+from bench.shared.bags import copy_part, read_truth
 from swarm_loc_estimator.cli.replay import main
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter
@@ -80,7 +80,7 @@ def rewritten(bag: Path, source: Path, types: Sequence[str]) -> Path:
 def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The first seconds of the demo's bag."""
     folder = tmp_path_factory.mktemp("bags") / "short"
-    copy_beginning(DEMO, folder, 4.0)
+    copy_part(DEMO, folder, 4.0)
     return folder
 
 

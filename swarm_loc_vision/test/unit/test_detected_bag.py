@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.shared.bags import copy_beginning
+from bench.shared.bags import copy_part
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
@@ -104,7 +104,7 @@ def test_the_detections_locate_the_robots(replayed: ReplayResult) -> None:
 
 
 def test_the_same_images_give_the_same_bytes(detected: Path, tmp_path: Path) -> None:
-    copy_beginning(BAG, tmp_path / "beginning", BEGINNING_S)
+    copy_part(BAG, tmp_path / "beginning", BEGINNING_S)
     shutil.copyfile(BAG / "swarm.yaml", tmp_path / "beginning" / "swarm.yaml")
     for part in ("one", "two"):
         (tmp_path / part).mkdir()

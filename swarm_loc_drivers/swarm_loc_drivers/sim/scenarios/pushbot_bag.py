@@ -32,11 +32,11 @@ from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.scenarios.bags import Stream, message_header, write_streams
 from swarm_loc_estimator import (
     CooperativeMapper,
-    FixCovariances,
     Goal,
     LightSightings,
     OccupancyMap,
     Readings,
+    fix_covariance,
 )
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
@@ -57,7 +57,7 @@ from swarm_loc_estimator.common.messages.poses import (
     encode_odometry,
     encode_pose_stamped,
 )
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, StartSigma, Swarm
+from swarm_loc_estimator.swarm.swarm import FixModel, OdometryModel, Robot, StartSigma, Swarm
 
 EVENTS = f"{MESSAGE_PACKAGE}/msg/EventPacket"
 EVENT_STEP_US = 5_000
@@ -122,7 +122,6 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
     exploration.on_readings = lambda robot, readings, lights: recorded[robot].append((readings, lights))
     goals: list[list[Goal]] = [[] for _ in robots]
     covariances: list[list[FloatArray]] = [[] for _ in robots]
-    published = [FixCovariances(_ODOMETRY) for _ in robots]
     maps: dict[int, bytes] = {}
 
     def record_fix(arrival: Arrival) -> None:
@@ -130,7 +129,7 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
         if goal is None:
             return
         goals[robot].append(goal)
-        covariances[robot].append(published[robot].next_covariance(goal, mapper.covariance(robot)))
+        covariances[robot].append(fix_covariance(mapper.covariance(robot)))
         stamp_ns = BEGIN_NS + goal.stamp_ns
         if not maps or stamp_ns >= max(maps) + _MAP_PERIOD_NS:
             maps[stamp_ns] = _encode_map(stamp_ns, mapper.occupancy())
@@ -166,6 +165,7 @@ def _described(number: int, exploration: Exploration) -> Robot:
         type="pushbot",
         odometry=_ODOMETRY,
         camera=None,
+        fix=FixModel(systematic_share=1.0),
         start=tuple(exploration.starts[number].tolist()),
         start_sigma=StartSigma(*(START_SIGMA if number else FIRST_SIGMA).tolist()),
     )
