@@ -11,13 +11,11 @@ from bench.integrity.faults import seconds
 from bench.integrity.scenarios import Fault
 from bench.shared.simulated_run import errors_of, inputs_between
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.offline.metrics import nees
+from swarm_loc_estimator.offline.metrics import is_misleading, nees
 from swarm_loc_estimator.timeline.contradictions import Contradicted
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 
 TICK_NS = 100_000_000
-_MISLEADING_SIGMAS = 5.0
-_MISLEADING_M = 0.02
 _RIGHT_M = 0.05
 _SETTLED_S = 1.0
 _STEADY_S = 3.0
@@ -93,11 +91,8 @@ def scored(
     """Score estimates; see `Fault` for the times. A pose within `right_m` is right."""
     time_s, error, covariance, tracked = estimated
     distance: FloatArray = np.hypot(error[..., 0], error[..., 1])
-    squared = np.full(distance.shape, np.nan)
-    located = np.isfinite(distance)
-    position, spread = error[located][:, :2], covariance[located][:, :2, :2]
-    squared[located] = np.einsum("ki,kij,kj->k", position, np.linalg.inv(spread), position)
-    misleading = tracked & (distance > _MISLEADING_M) & (squared > _MISLEADING_SIGMAS**2)
+    misleading = tracked & np.isfinite(distance)
+    misleading[misleading] = is_misleading(error[misleading], covariance[misleading])
     knowable = np.ones(time_s.size, dtype=bool)
     if hidden_s is not None:
         knowable = (time_s < hidden_s[0]) | (time_s >= hidden_s[1])

@@ -1,10 +1,11 @@
 """Five real robots (MRCLAM): calibrate on one set, evaluate on all.
 
     make bench-mrclam
-    make bench-mrclam ARGS="FOLDER --fit 1"
+    make bench-mrclam ARGS="FIT TEST..."
 
-FOLDER holds MRCLAM_Dataset<k> folders, or is one; robots and ground truth may be missing. Set 1 is used for
-calibration, from ../shared/data/mrclam if FOLDER does not hold it.
+FIT and TEST are numbers of sets in ../shared/data/mrclam or folders: a set, or several named
+MRCLAM_Dataset<k>. Robots and ground truth may be missing. Set 1 is fitted to if FIT is left out or holds
+several sets, which are tests then; without TEST all sets of ../shared/data/mrclam are.
 
 Errors are those of online poses at 10 Hz, started at the true pose. For "plain" only the noise is fitted, for
 "calibrated" everything. The smoother is the offline optimum with the same models and noise. In `blind_robots`
@@ -47,34 +48,59 @@ _PROCESSES = 2
 @exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark; returns its exit status."""
-    options = _parser().parse_args(arguments)
-    sets = find_sets(options.folder)
-    report(measure(sets, *chosen_to_fit(sets, options.fit)), sets)
+    fitted, tests = chosen_sets(_parser().parse_args(arguments).sets)
+    report(measure(tests, fitted), tests)
     return 0
 
 
-def chosen_to_fit(
-    sets: dict[int, Path], wanted: int | None, elsewhere: Path = DEFAULT_FOLDER
-) -> tuple[int, Path]:
-    """Number and folder of a set for calibration: the wanted one, or set 1 of either folder, or the first."""
-    others = find_sets(elsewhere) if elsewhere.is_dir() else {}
-    known = {**others, **sets}
-    number = 1 if wanted is None else wanted
-    if number in known:
-        return number, known[number]
-    if wanted is None:
-        return min(sets), sets[min(sets)]
-    raise NoSetsError(f"--fit {wanted}: there is no such set, only {', '.join(map(str, sorted(known)))}.")
+def chosen_sets(
+    arguments: Sequence[str], folder: Path = DEFAULT_FOLDER
+) -> tuple[tuple[int, Path], dict[int, Path]]:
+    """The set to fit to, as number and folder, and the folders of the sets to test by number.
+
+    Args:
+        arguments: As on the command line.
+        folder: Of the sets that are named by number.
+
+    Raises:
+        NoSetsError: A set is missing, or two tests have the same number.
+    """
+    wanted = [_sets_of(argument, folder) for argument in arguments]
+    known = find_sets(folder) if folder.is_dir() or not wanted else {}
+    if wanted and len(wanted[0]) == 1:
+        [fitted] = wanted.pop(0).items()
+    else:
+        every = {**known, **(wanted[0] if wanted else {})}
+        number = min(every, key=lambda k: (k != 1, k))
+        fitted = (number, every[number])
+    tests: dict[int, Path] = {}
+    for number, path in [one for sets in wanted for one in sets.items()] or known.items():
+        if tests.setdefault(number, path) != path:
+            raise NoSetsError(f"'{tests[number]}' and '{path}' are both set {number}; test one of them.")
+    if fitted[0] in tests and tests[fitted[0]] != fitted[1]:
+        raise NoSetsError(f"'{fitted[1]}' and '{tests[fitted[0]]}' are both set {fitted[0]}; rename one.")
+    return fitted, tests
 
 
-def measure(sets: Mapping[int, Path], fitted: int, fitted_folder: Path) -> Results:
-    """Import all sets, calibrate with one of them, and run all jobs."""
+def _sets_of(argument: str, folder: Path) -> dict[int, Path]:
+    """The sets that an argument names."""
+    if not argument.isdigit():
+        return find_sets(Path(argument))
+    known = find_sets(folder)
+    if int(argument) not in known:
+        names = ", ".join(map(str, known))
+        raise NoSetsError(f"There is no set {argument} in '{folder}', only {names}; name its folder.")
+    return {int(argument): known[int(argument)]}
+
+
+def measure(sets: Mapping[int, Path], fitted: tuple[int, Path]) -> Results:
+    """Import all sets, calibrate with one of them, given by number and folder, and run all jobs."""
     with ProcessPoolExecutor(_PROCESSES, mp_context=get_context("spawn")) as workers:
-        imported = {fitted: fitted_folder, **sets}
+        imported = dict([fitted, *sets.items()])
         for number, remarks in _done(workers, prepare, list(imported.items()), "import"):
             for remark in remarks:
                 print(f"set {number}: {remark}")
-        for _, line in _done(workers, fit, [(fitted, model) for model in MODELS], "fit"):
+        for _, line in _done(workers, fit, [(fitted[0], model) for model in MODELS], "fit"):
             print(line)
         jobs = [job for k in sets for job in jobs_of(k, load_swarm(bag_of(k) / "swarm.yaml"))]
         results = collected(_done(workers, run, [(job,) for job in jobs], "runs"))
@@ -102,10 +128,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument(
-        "folder", type=Path, nargs="?", default=DEFAULT_FOLDER, help="folder with MRCLAM_Dataset<k> folders"
-    )
-    parser.add_argument("--fit", type=int, help="number of the set to fit to (default: 1)")
+    parser.add_argument("sets", nargs="*", metavar="SET", help="FIT TEST...: numbers or folders of sets")
     return parser
 
 

@@ -67,6 +67,7 @@ class Sums:
         heading: Sum of squared heading errors [rad^2].
         nees: Sum of normalized errors squared.
         nees_count: Their number.
+        misleading: Number of poses TRACKED with an error beyond 5 sigma and 2 cm.
         early: Mean position error over the first 600 s [m].
     """
 
@@ -75,6 +76,7 @@ class Sums:
     heading: float
     nees: float
     nees_count: int
+    misleading: int
     early: float = math.nan
 
     def __add__(self, other: Sums) -> Sums:
@@ -84,6 +86,7 @@ class Sums:
             self.heading + other.heading,
             self.nees + other.nees,
             self.nees_count + other.nees_count,
+            self.misleading + other.misleading,
         )
 
     @property
@@ -93,6 +96,7 @@ class Sums:
             "position_rmse_m": math.sqrt(self.position / self.count),
             "heading_rmse_deg": math.degrees(math.sqrt(self.heading / self.count)),
             "nees": self.nees / self.nees_count,
+            "misleading_share": self.misleading / self.count,
         }
 
 
@@ -205,6 +209,7 @@ def sums_of(errors: Mapping[str, Errors]) -> Sums | None:
         float(np.sum(pooled.error[:, 2] ** 2)),
         float(np.nansum(pooled.nees)),
         int(np.sum(~np.isnan(pooled.nees))),
+        int(pooled.misleading.sum()),
         float(pooled.position[early].mean()),
     )
 

@@ -12,7 +12,7 @@ from bench.mrclam.jobs import MODELS, ONLINE, SMOOTHER, Results
 from bench.shared.common import new_plot, save_plot, table, write_figures
 
 COLUMNS = ("odometry", "landmarks", ONLINE, "unknown_start", SMOOTHER, "blind_robots")
-FIGURES = ("position_rmse_m", "heading_rmse_deg", "nees")
+FIGURES = ("position_rmse_m", "heading_rmse_deg", "nees", "misleading_share")
 PUBLISHED = (
     ("CoLo centralized EKF", 0.099),
     ("CoLo best decentralized", 0.107),
@@ -29,7 +29,7 @@ def report(results: Results, sets: Collection[int]) -> None:
         [f"set {number} {model}", *(_cell(results, (number, model, column)) for column in COLUMNS)]
         for number, model in itertools.product(sets, MODELS)
     ]
-    print("\nposition RMSE [m] / heading RMSE [deg] / NEES (ideal 3)")
+    print("\nposition RMSE [m] / heading RMSE [deg] / NEES (ideal 3) / misleading [%]")
     print(table(["", *COLUMNS], rows))
     for (number, model, column), why in sorted(results.failures.items()):
         print(f"set {number} {model}, {column} failed: {why}")
@@ -54,14 +54,15 @@ def _cell(results: Results, key: tuple[int, str, str]) -> str:
     values = [results.figures.get(f"set{number}.{model}.{column}.{name}") for name in FIGURES]
     if values[0] is None:
         return "-"
-    formats = ("{:.4f}", "{:.2f}", "{:.1f}")
+    values[3] = None if values[3] is None else 100.0 * values[3]
+    formats = ("{:.4f}", "{:.2f}", "{:.1f}", "{:.2f}")
     return "/".join("-" if v is None else f.format(v) for f, v in zip(formats, values, strict=True))
 
 
 def draw(results: Results, sets: Collection[int]) -> Path:
     """Plot errors and NEES by column, and ours beside published errors; returns the file."""
-    figure, axes = new_plot(4, width=5.8, height=4.4)
-    labels = ("position RMSE [m]", "heading RMSE [deg]", "NEES")
+    figure, axes = new_plot(5, width=5.8, height=4.4)
+    labels = ("position RMSE [m]", "heading RMSE [deg]", "NEES", "misleading share")
     for axis, name, label in zip(axes, FIGURES, labels, strict=False):
         _bars(axis, results.figures, list(itertools.product(sets, MODELS)), name)
         axis.set_ylabel(label)
@@ -72,9 +73,9 @@ def draw(results: Results, sets: Collection[int]) -> Path:
     axes[2].axhline(3.0, color="0.5", linestyle=":")
     rows = beside_published(results.early)[::-1]
     colours = ["0.6" if "CoLo" in name else "tab:blue" for name, _ in rows]
-    bars = axes[3].barh([name for name, _ in rows], [value for _, value in rows], color=colours)
-    axes[3].bar_label(bars, fmt="%.3f", fontsize=8)
-    axes[3].set_xlabel("mean position error, first 600 s [m]")
+    bars = axes[4].barh([name for name, _ in rows], [value for _, value in rows], color=colours)
+    axes[4].bar_label(bars, fmt="%.3f", fontsize=8)
+    axes[4].set_xlabel("mean position error, first 600 s [m]")
     return save_plot(figure, "mrclam")
 
 

@@ -86,31 +86,44 @@ def test_a_folder_without_sets_is_one_sentence(tmp_path: Path, capsys: pytest.Ca
 
 
 def test_sums_add_up_to_pooled_figures() -> None:
-    pooled = Sums(1, 0.01, 0.0, 3.0, 1) + Sums(3, 0.03, 0.0, 9.0, 3)
-    assert pooled.figures == pytest.approx({"position_rmse_m": 0.1, "heading_rmse_deg": 0.0, "nees": 3.0})
+    pooled = Sums(1, 0.01, 0.0, 3.0, 1, 1) + Sums(3, 0.03, 0.0, 9.0, 3, 0)
+    wanted = {"position_rmse_m": 0.1, "heading_rmse_deg": 0.0, "nees": 3.0, "misleading_share": 0.25}
+    assert pooled.figures == pytest.approx(wanted)
     assert len(jobs_of(1, SWARM)) == 2 * (5 + 3)
 
 
-def test_set_1_is_fitted_to_wherever_it_lies() -> None:
-    sets, elsewhere = {2: Path("b"), 7: Path("c")}, Path("nowhere")
-    assert mrclam.chosen_to_fit({1: Path("a"), **sets}, None, elsewhere) == (1, Path("a"))
-    assert mrclam.chosen_to_fit(sets, None, elsewhere) == (2, Path("b"))
-    assert mrclam.chosen_to_fit(sets, 7, elsewhere) == (7, Path("c"))
-    with pytest.raises(NoSetsError, match="--fit 5: there is no such set, only 2, 7"):
-        mrclam.chosen_to_fit(sets, 5, elsewhere)
+def folder_with(parent: Path, *numbers: int) -> Path:
+    """A folder with empty sets."""
+    for number in numbers:
+        (parent / f"MRCLAM_Dataset{number}").mkdir(parents=True)
+        (parent / f"MRCLAM_Dataset{number}" / "Robot1_Odometry.dat").touch()
+    return parent
 
 
-def test_set_1_of_another_folder_is_fitted_to_where_the_own_has_none(tmp_path: Path) -> None:
-    (tmp_path / "MRCLAM_Dataset1").mkdir()
-    (tmp_path / "MRCLAM_Dataset1" / "Robot1_Odometry.dat").touch()
-    assert mrclam.chosen_to_fit({7: Path("c")}, None, tmp_path) == (1, tmp_path / "MRCLAM_Dataset1")
-    assert mrclam.chosen_to_fit({1: Path("a")}, None, tmp_path) == (1, Path("a"))
+def test_sets_to_fit_and_to_test_are_numbers_or_folders(tmp_path: Path) -> None:
+    here, there = folder_with(tmp_path / "a", 1, 2), folder_with(tmp_path / "b", 2, 7)
+    own = {k: here / f"MRCLAM_Dataset{k}" for k in (1, 2)}
+    other = {k: there / f"MRCLAM_Dataset{k}" for k in (2, 7)}
+    choose = partial(mrclam.chosen_sets, folder=here)
+    assert choose([]) == ((1, own[1]), own)
+    assert choose(["2"]) == ((2, own[2]), own)
+    assert choose(["1", "2", str(other[7])]) == ((1, own[1]), {2: own[2], 7: other[7]})
+    assert choose([str(other[7]), "1"]) == ((7, other[7]), {1: own[1]})
+    assert choose([str(there)]) == ((1, own[1]), other)  # set 1 is fitted to where FIT holds several
+    assert mrclam.chosen_sets([str(there)], tmp_path / "nowhere") == ((2, other[2]), other)
+    assert choose(["1", str(there)]) == ((1, own[1]), other)
+    with pytest.raises(NoSetsError, match=r"no set 5 in .*, only 1, 2; name its folder"):
+        choose(["5"])
+    with pytest.raises(NoSetsError, match="are both set 2; test one of them"):
+        choose(["1", "2", str(there)])
+    with pytest.raises(NoSetsError, match="are both set 2; rename one"):
+        choose([str(other[2]), "2"])
 
 
 def test_a_job_that_fails_leaves_the_figures_of_the_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    sums = Sums(1, 0.01, np.radians(2.0) ** 2, 3.0, 1, 0.05)
+    sums = Sums(1, 0.01, np.radians(2.0) ** 2, 3.0, 1, 0, 0.05)
     all_done = [Done(job, sums) for job in jobs_of(1, SWARM) if job.column != "smoother"]
     all_done += [Done(Job(1, model, "smoother"), None, "gtsam: no solution.") for model in MODELS]
     results = collected(all_done)
@@ -121,6 +134,6 @@ def test_a_job_that_fails_leaves_the_figures_of_the_others(
     monkeypatch.setattr(reporting, "save_plot", partial(save_plot, folder=tmp_path))
     reporting.report(results, [1])
     shown = capsys.readouterr().out
-    assert shown.count("0.1000/2.00/3.0") == 2 * 5
+    assert shown.count("0.1000/2.00/3.0/0.00") == 2 * 5
     assert "set 1 plain, smoother failed: gtsam: no solution." in shown
     assert "set1.plain.odometry.nees" in (tmp_path / "mrclam.json").read_text(encoding="utf-8")

@@ -40,6 +40,13 @@ class IntegrityArrays(NamedTuple):
         gated_fix_ns: (N,) stamp of the last counted gated fix.
         noise_inflation: (N,) level of noise inflation of each robot's measurements, see
             `integrity/noise_inflation.py`.
+        drift_ns: (N, W) begin of each window in which the drift of odometry is observed, see
+            `integrity/motion_noise.py`.
+        drift_transform: (N, W, 3) T at that time.
+        drift_noise: (N, W, 3, 3) preintegrated covariance of the track at that time.
+        drift_variance: (N, W, 2) variances of position and heading at that time.
+        motion_likelihood: (N, scales) log-likelihood of each scale of the process noise.
+        motion_scale: (N,) scale of the process noise of each robot.
     """
 
     source: IntArray
@@ -61,6 +68,12 @@ class IntegrityArrays(NamedTuple):
     gated_fixes: IntArray
     gated_fix_ns: IntArray
     noise_inflation: FloatArray
+    drift_ns: IntArray
+    drift_transform: FloatArray
+    drift_noise: FloatArray
+    drift_variance: FloatArray
+    motion_likelihood: FloatArray
+    motion_scale: FloatArray
 
 
 class BeliefArrays(NamedTuple):

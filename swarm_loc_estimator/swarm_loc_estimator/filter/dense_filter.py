@@ -12,7 +12,7 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.small_matrix import assign_matrix, cholesky3, solve3
 from swarm_loc_estimator.filter.inversion import inverse, invert
 from swarm_loc_estimator.filter.joint_filter import Robots
-from swarm_loc_estimator.swarm.calibration_states import DRIVES, ParameterTable
+from swarm_loc_estimator.swarm.calibration_states import BLOCKS, DRIVES, ParameterTable
 
 
 class DenseFilter:
@@ -27,7 +27,7 @@ class DenseFilter:
     def __init__(self, size: int) -> None:
         self.covariance: FloatArray = np.eye(size)
         self.marginal: FloatArray = np.zeros((0, 3, 3))
-        self.transition: FloatArray = np.zeros((0, 4, DRIVES))
+        self.transition: FloatArray = np.zeros((0, 3 + BLOCKS, DRIVES))
 
     def copy(self) -> DenseFilter:
         """An independent copy."""

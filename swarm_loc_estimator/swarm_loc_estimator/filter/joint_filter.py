@@ -46,10 +46,10 @@ class JointFilter(Protocol):
 
     @property
     def transition(self) -> FloatArray:
-        """Transition (robots, 4, DRIVES) of the errors by predictions since the last update.
+        """Transition (robots, 3 + BLOCKS, DRIVES) of the errors by predictions since the last update.
 
         Jacobian of the pose by the parameters of its motion (3, DRIVES), then the decay factors of the
-        parameters (DRIVES,). Has no rows if it is not needed.
+        parameters by block (BLOCKS, DRIVES). Has no rows if it is not needed.
         """
 
     def copy(self) -> JointFilter:

@@ -8,7 +8,7 @@ with the parameters z of the robot's motion (`swarm/calibration_states.py`):
 The right-invariant error does not depend on z, only on the error of z: xi <- xi + Ad(exp(A z / 2)) A dz,
 which is F. So a common motion of all robots and landmarks stays unobservable. The bias of the turn rate is a
 first-order Gauss-Markov process: it decays, and between the two instants its mean over this interval is
-used.
+used. So may be the yaw of a camera, which does not act on the motion.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from swarm_loc_estimator.filter.belief import (
     own_covariance,
 )
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.swarm.calibration_states import DRIVES, TURN_BIAS
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, DRIVES, TURN_BIAS
 
 
 class _Drift(NamedTuple):
@@ -63,6 +63,8 @@ def predict(belief: BeliefArrays, robot: int, to: Preintegrated, scratch: FloatA
         return
     if _has_drives(belief, robot):
         _drive(belief, robot, to)
+    if belief.table.column[robot, CAMERA_YAW] >= 0 and math.isfinite(belief.table.time_s[robot, CAMERA_YAW]):
+        _sway(belief, robot, to.stamp_ns)
     whole, own, first = belief.covariance, belief.marginal, 3 * robot
     for i in range(3):
         for j in range(3):
@@ -121,9 +123,10 @@ def _write_drifted(
 
 @inlined_njit
 def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, scratch: FloatArray) -> bool:
-    """Write Ad(T) (G2 - G1) Ad(T)^T to `scratch[0]`, and return whether it is positive semidefinite.
+    """Write s Ad(T) (G2 - G1) Ad(T)^T to `scratch[0]`, and return whether it is positive semidefinite.
 
-    It is not if odometry from beyond the horizon arrives after a larger dropout noise was assumed.
+    s is the scale of the robot's process noise. The matrix is not positive semidefinite if odometry from
+    beyond the horizon arrives after a larger dropout noise was assumed.
     """
     before, difference, work = belief.preintegrated_covariance[robot], scratch[1], scratch[2]
     rounding = 1e-12
@@ -136,6 +139,10 @@ def _new_noise(belief: BeliefArrays, robot: int, noise: FloatArray, scratch: Flo
     first, _, second, _, _, third = factor_numbers(work)
     if not math.isfinite(first + second + third):
         return False
+    scale = belief.integrity.motion_scale[robot]
+    for i in range(3):
+        for j in range(3):
+            difference[i, j] *= scale
     carry(belief.transform[robot], difference, scratch[0])
     return True
 
@@ -152,7 +159,7 @@ def _has_drives(belief: BeliefArrays, robot: int) -> bool:
 @cached_njit
 def _new_drift(belief: BeliefArrays, robot: int, to: Preintegrated) -> _Drift:
     """Compute the drift of the pose until an instant."""
-    x = max(0, to.stamp_ns - belief.predicted_to_ns[robot]) * 1e-9 / belief.table.turn_bias_time_s[robot]
+    x = max(0, to.stamp_ns - belief.predicted_to_ns[robot]) * 1e-9 / belief.table.time_s[robot, TURN_BIAS]
     left, variance = math.exp(-x), belief.table.sigma[robot, TURN_BIAS] ** 2
     reach = -math.expm1(-x)  # integral of the decaying bias, in units of its time constant
     # process noise; a series for small x, where the closed form cancels
@@ -210,6 +217,8 @@ def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
     """Apply the drift to T, to its covariances with all states and to the turn bias."""
     drift = _new_drift(belief, robot, to)
     _move(drift.twist, belief.transform[robot])
+    for begin in belief.integrity.drift_transform[robot]:  # this is no correction by measurements
+        _move(drift.twist, begin)
     first, p = own_column(belief, robot, 0), own_covariance(belief, robot)
     size = p.shape[0]
     columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
@@ -237,6 +246,21 @@ def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
     for i in range(3):
         for j in range(3):
             p[first + i, first + j] = block[i, j]
+
+
+@cached_njit
+def _sway(belief: BeliefArrays, robot: int, stamp_ns: int) -> None:
+    """Predict the yaw of a camera that sways (a first-order Gauss-Markov process)."""
+    since_s = max(0, stamp_ns - belief.predicted_to_ns[robot]) * 1e-9
+    left = math.exp(-since_s / belief.table.time_s[robot, CAMERA_YAW])
+    column, p = own_column(belief, robot, 3 + CAMERA_YAW), own_covariance(belief, robot)
+    belief.parameter[robot, CAMERA_YAW] *= left
+    for j in range(p.shape[0]):
+        p[column, j] *= left
+        p[j, column] *= left
+    p[column, column] += belief.table.sigma[robot, CAMERA_YAW] ** 2 * (1.0 - left**2)
+    if not belief.is_dense:
+        belief.transition[robot, 3 + CAMERA_YAW // DRIVES, CAMERA_YAW % DRIVES] *= left
 
 
 @cached_njit

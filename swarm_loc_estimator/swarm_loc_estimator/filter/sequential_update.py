@@ -20,6 +20,7 @@ from swarm_loc_estimator.filter.integrity.divergence import (
     is_uncertain,
 )
 from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_excluded
+from swarm_loc_estimator.filter.integrity.motion_noise import learn
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel, locates_alone
 from swarm_loc_estimator.odometry.look_up import look_up, new_sample
 from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
@@ -95,6 +96,8 @@ def update_in_order(
             correct(
                 belief, update_one(belief.covariance, batch.columns[0], jacobian, batch.innovation[0], noise)
             )
+            for i in range(2):
+                learn(belief, sides[i], pose[i], measurements.stamp_ns[k])
         lost = count_gated(measurements, k, belief, accepted, limits)
         if lost >= 0:
             return following, LOST, lost

@@ -265,6 +265,7 @@ class SwarmState:
         """Reset the integrity statistics of robots (k,)."""
         self.integrity.gated_in_a_row[robots] = 0
         self.integrity.gated_fixes[robots] = 0
+        self.integrity.drift_ns[robots] = NEVER_NS // 2
         self.integrity.fault_score[robots] = 0.0
         self.integrity.confirmations[robots] = confirmations
         self.integrity.source[robots] = -1

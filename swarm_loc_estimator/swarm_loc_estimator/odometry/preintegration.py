@@ -253,7 +253,9 @@ def _true_motion(
     speed_share, turn_share = _response(tracks, robot, speed, abs(reported[2]) / duration_s)
     scale, turn_scale = model.distance_scale * speed_share, model.turn_scale * turn_share
     ahead, aside, turning = reported
-    true_rate = (scale * ahead / duration_s, scale * aside / duration_s, turn_scale * turning / duration_s)
+    is_moving = ahead != 0.0 or aside != 0.0 or turning != 0.0
+    turn_rate = turn_scale * turning / duration_s + (model.turn_bias if is_moving else 0.0)
+    true_rate = (scale * ahead / duration_s, scale * aside / duration_s, turn_rate)
     remaining, mean = 0.0, 0.0  # remaining share of the lag's transient: at the end, and mean over the step
     if model.lag_s > 0.0:
         remaining = math.exp(-duration_s / model.lag_s)

@@ -9,8 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
+
+MISLEADING_SIGMAS, MISLEADING_M = 5.0, 0.02
+"""A position is misleading beyond both limits: standard deviations, and [m]."""
 
 
 class MetricsError(ValueError):
@@ -27,12 +30,14 @@ class Errors:
         sigma: (N, 3) one standard deviation of x, y, theta as estimated; NaN where unknown.
         nees: (N,) squared error normalised by the covariance, ideally 3 on average; infinite where the
             covariance is not positive definite, NaN where there is none.
+        misleading: (N,) whether the position is wrong beyond its covariance, see `is_misleading`.
     """
 
     stamp_ns: IntArray
     error: FloatArray
     sigma: FloatArray
     nees: FloatArray
+    misleading: BoolArray
 
     @property
     def position(self) -> FloatArray:
@@ -103,15 +108,30 @@ def compare(
     used = np.concatenate([index, nearest])[order]
     matrices = np.full((len(used), 3, 3), np.nan) if covariance is None else covariance[used]
     sigma = np.sqrt(np.diagonal(matrices, axis1=1, axis2=2).clip(min=0.0))
-    return Errors(stamp_ns[order], error, sigma, nees(error, matrices))
+    return Errors(stamp_ns[order], error, sigma, nees(error, matrices), is_misleading(error, matrices))
+
+
+def is_misleading(error: FloatArray, covariance: FloatArray) -> BoolArray:
+    """Whether positions are wrong by more than 5 sigma and 2 cm.
+
+    Args:
+        error: (N, 3).
+        covariance: (N, 3, 3).
+
+    Returns:
+        (N,) False where the covariance is unknown.
+    """
+    far = np.hypot(error[:, 0], error[:, 1]) > MISLEADING_M
+    wrong: BoolArray = far & (nees(error[:, :2], covariance[:, :2, :2]) > MISLEADING_SIGMAS**2)
+    return wrong
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
     """Normalised squared errors.
 
     Args:
-        error: (N, 3).
-        covariance: (N, 3, 3).
+        error: (N, d).
+        covariance: (N, d, d).
 
     Returns:
         (N,) infinite where the covariance is not positive definite, NaN where it is unknown.
@@ -144,12 +164,14 @@ def summarise(errors: Errors) -> ErrorSummary:
 def pool(errors: Sequence[Errors]) -> Errors:
     """The errors of several robots as one, in the order given."""
     if not errors:
-        return Errors(np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, 3)), np.empty(0))
+        empty = np.empty((0, 3))
+        return Errors(np.empty(0, np.int64), empty, empty, np.empty(0), np.empty(0, np.bool_))
     return Errors(
         np.concatenate([one.stamp_ns for one in errors]),
         np.concatenate([one.error for one in errors]),
         np.concatenate([one.sigma for one in errors]),
         np.concatenate([one.nees for one in errors]),
+        np.concatenate([one.misleading for one in errors]),
     )
 
 

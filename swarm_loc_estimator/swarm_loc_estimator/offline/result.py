@@ -15,6 +15,7 @@ from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.messages import GridMessage, decode_occupancy_grid
 from swarm_loc_estimator.offline.metrics import Errors, ErrorSummary, compare, pool, summarise
 from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.estimate import Status
 from swarm_loc_estimator.timeline.sightings import Sightings
 
 
@@ -108,13 +109,15 @@ class ReplayResult:
 
     @cached_property
     def errors(self) -> Mapping[str, Errors]:
-        """Robot name -> estimate minus ground truth, for robots that have any."""
+        """Robot name -> estimate minus ground truth, for robots that have any; only TRACKED poses mislead."""
         found = {}
         for index, robot in enumerate(self.swarm.robots):
             if robot.name in self.truth:
                 known = np.isfinite(self.poses[:, index]).all(axis=1)
                 covariance = self.covariances[known, index]
-                found[robot.name] = compare(self.track(index), covariance, self.truth[robot.name])
+                errors = compare(self.track(index), covariance, self.truth[robot.name])
+                tracked = np.interp(errors.stamp_ns, self.stamp_ns, self.status[:, index] == Status.TRACKED)
+                found[robot.name] = replace(errors, misleading=errors.misleading & (tracked > 0.5))
         return found
 
     @cached_property

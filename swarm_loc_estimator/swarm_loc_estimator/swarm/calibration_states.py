@@ -27,7 +27,7 @@ DISTANCE_SCALE = 1
 TURN_SCALE = 2
 """Relative error of the turn."""
 CAMERA_YAW = 3
-"""Yaw offset of the camera, positive to the left [rad]."""
+"""Yaw offset of the camera, positive to the left [rad]; constant, or it changes slowly."""
 CAMERA_SCALE = 4
 """Relative error of distances measured by the camera."""
 
@@ -54,7 +54,7 @@ class ParameterTable(NamedTuple):
     Attributes:
         column: (N, PARAMETERS) filter column; -1: not estimated, value 0.
         sigma: (N, PARAMETERS) prior standard deviation; 0: never estimated.
-        turn_bias_time_s: (N,) time constant of TURN_BIAS; the other parameters are constant.
+        time_s: (N, PARAMETERS) time constants of parameters that vary; infinite for constant ones.
         survey_column: (L,) first of the three filter columns of each landmark; -1: not estimated.
         survey: (L, 3, 3) prior covariance of its right-invariant error.
         in_blocks: True if a robot's parameters have blocks of three columns, some of them unused.
@@ -62,7 +62,7 @@ class ParameterTable(NamedTuple):
 
     column: NDArray[np.int64]
     sigma: FloatArray
-    turn_bias_time_s: FloatArray
+    time_s: FloatArray
     survey_column: NDArray[np.int64]
     survey: FloatArray
     in_blocks: bool
@@ -72,19 +72,21 @@ class ParameterTable(NamedTuple):
         cls, robots: Sequence[Robot], landmarks: Sequence[Landmark] = (), *, in_blocks: bool = False
     ) -> ParameterTable:
         """Table of the parameters that the descriptions of robots and landmarks estimate from the start."""
-        sigma = np.zeros((len(robots), PARAMETERS))
+        sigma, time_s = np.zeros((len(robots), PARAMETERS)), np.zeros((len(robots), PARAMETERS))
         for i, robot in enumerate(robots):
             odometry = robot.odometry
+            time_s[i, TURN_BIAS] = odometry.turn_bias_time_s
             sigma[i, TURN_BIAS] = odometry.turn_bias_sigma
             sigma[i, DISTANCE_SCALE] = odometry.distance_scale_sigma
             sigma[i, TURN_SCALE] = odometry.turn_scale_sigma
             if robot.camera is not None:
                 sigma[i, CAMERA_YAW] = robot.camera.yaw_sigma
                 sigma[i, CAMERA_SCALE] = robot.sensor.distance_scale_sigma
+                time_s[i, CAMERA_YAW] = robot.camera.yaw_time_s
         wanted = sigma > 0.0
         doubted = np.where(wanted, sigma, _CONTRADICTED_SIGMA)
         doubted[[robot.camera is None for robot in robots], DRIVES:] = 0.0
-        times = np.array([robot.odometry.turn_bias_time_s for robot in robots], dtype=float)
+        times = np.where(time_s > 0.0, time_s, np.inf)
         surveys = np.array([_survey(mark) for mark in landmarks]).reshape(-1, 3, 3)
         column, survey_column = np.full(sigma.shape, -1), np.full(len(landmarks), -1)
         table = cls(column, doubted, times, survey_column, surveys, in_blocks).with_parameters(wanted)

@@ -34,10 +34,11 @@ class OdometryModel:
     """Error model of a robot's odometry: process noise, and calibration of the reported motion.
 
     The reported speed v and turn rate w of a step become distance_scale * v and turn_scale * w, further
-    scaled by the robot's `MotionResponse` if it has one. They take effect `delay_s` after their stamp,
-    through a first-order lag `lag_s`. base_link moves along `course_offset` and lies `axle_offset` ahead of
-    the wheels' axle. Errors that last - a bias of the turn rate, scales that are not quite known - are
-    estimated along with the pose where their sigma is not zero.
+    scaled by the robot's `MotionResponse` if it has one; turn_bias is added while the robot moves. They take
+    effect `delay_s` after their stamp, through a first-order lag `lag_s`. base_link moves along
+    `course_offset` and lies `axle_offset` ahead of the wheels' axle. Errors that last - a varying bias of the
+    turn rate, scales that are not quite known - are estimated along with the pose where their sigma is not
+    zero.
     """
 
     wheel_separation: float = number(0.053, "m", 0.001, 10.0, "distance between the two wheels")
@@ -68,10 +69,13 @@ class OdometryModel:
     turn_scale_sigma: float = number(
         0.0, "1", 0.0, 1.0, "relative standard deviation of turn_scale; 0: exact, else estimated"
     )
+    turn_bias: float = number(0.0, "rad/s", -1.0, 1.0, "true minus scaled turn rate while moving")
     turn_bias_sigma: float = number(
-        0.0, "rad/s", 0.0, 10.0, "standard deviation of a turn-rate bias while moving, estimated; 0: none"
+        0.0, "rad/s", 0.0, 10.0, "standard deviation of the variable part of turn_bias, estimated; 0: none"
     )
-    turn_bias_time_s: float = number(60.0, "s", 0.1, 1e6, "time constant of this bias (Gauss-Markov)")
+    turn_bias_time_s: float = number(
+        60.0, "s", 0.1, 1e6, "time constant of this variable part (Gauss-Markov)"
+    )
     course_offset: float = number(
         0.0, "rad", -math.pi, math.pi, "direction of motion against base_link's x axis"
     )
@@ -165,6 +169,9 @@ class CameraMount:
     yaw: float = number(0.0, "rad", -TURN, TURN, "turned to the left")
     yaw_sigma: float = number(
         0.0, "rad", 0.0, 1.0, "standard deviation of yaw; 0: exact, else estimated with the pose"
+    )
+    yaw_time_s: float = number(
+        0.0, "s", 0.0, 1e6, "time constant with which an estimated yaw varies (Gauss-Markov); 0: constant"
     )
     pitch: float = number(0.0, "rad", -TURN, TURN, "turned down")
     roll: float = number(0.0, "rad", -TURN, TURN, "turned about the optical axis")

@@ -25,6 +25,7 @@ from swarm_loc_estimator.filter.dense_filter import update_one
 from swarm_loc_estimator.filter.innovation import InnovationBatch, new_batch
 from swarm_loc_estimator.filter.integrity.divergence import WELL_CONFIRMED, LossLimits
 from swarm_loc_estimator.filter.integrity.fault_detection import is_kidnapped
+from swarm_loc_estimator.filter.integrity.motion_noise import learn_all
 from swarm_loc_estimator.filter.joint_filter import JointFilter, Robots
 from swarm_loc_estimator.filter.measurement_model import (
     MODELS,
@@ -220,6 +221,7 @@ class Fusion:
         if accepted[0]:
             evaluated = batch.columns[0], batch.jacobian[0], batch.innovation[0], batch.noise[0]
             correct(belief, update_one(belief.covariance, *evaluated))
+            learn_all(fields, belief, batch.pose)
         gone |= count_all_gated(fields, belief, accepted, self._limits)
         for robot in np.flatnonzero(gone).tolist():
             state.deinitialize(robot)
@@ -315,6 +317,7 @@ class Fusion:
             correction = state.filter.update(batch.columns[used], *evaluated)
             belief = state.arrays()  # the update may have reallocated them
             correct(belief, correction)
+            learn_all(fields, belief, batch.pose)
         lost |= count_all_gated(fields, belief, accepted, self._limits)
         for robot in np.flatnonzero(lost):
             state.deinitialize(int(robot))

@@ -49,7 +49,7 @@ BAGS = Path(__file__).parents[3] / "bags"
 DROPLETS, FAST = BAGS / "droplets_twenty", BAGS / "eight_one_robot_fast"
 TRUE = Robot(
     "true",
-    odometry=OdometryModel(course_offset=0.02, axle_offset=-0.03, delay_s=0.08, lag_s=0.2),
+    odometry=OdometryModel(turn_bias=-0.004, course_offset=0.02, axle_offset=-0.03, delay_s=0.08, lag_s=0.2),
     response=MotionResponse((0.0,), (0.0, 0.6), ((1.02, 0.8),), ((0.95, 0.95),)),
     camera=CameraMount(x=-0.03),
     sensor=SensorModel(
@@ -80,6 +80,7 @@ def test_models_are_recovered(seed: int) -> None:
         assert s.bearing_scale == pytest.approx(0.97, abs=0.01)
         assert s.time_offset_s == pytest.approx(-0.05, abs=0.02)
         assert o.delay_s + o.lag_s == pytest.approx(0.28, abs=0.03)
+        assert o.turn_bias == pytest.approx(-0.004, abs=0.001)
         assert o.course_offset == pytest.approx(0.02, abs=0.005)
         assert o.axle_offset == pytest.approx(-0.03, abs=0.005)
         response = found.response

@@ -10,12 +10,13 @@ from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.calibration_states import (
+    CAMERA_YAW,
     DISTANCE_SCALE,
     TURN_BIAS,
     TURN_SCALE,
     ParameterTable,
 )
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot
+from swarm_loc_estimator.swarm.swarm import CameraMount, OdometryModel, Robot, SensorModel
 
 BIAS_SIGMA, DISTANCE_SIGMA, TURN_SIGMA, BIAS_TIME_S = 0.005, 0.01, 0.005, 20.0
 STEP_NS = SECOND // 20
@@ -126,6 +127,26 @@ def test_the_spread_is_that_of_sampled_motion() -> None:
     scale = np.sqrt(np.outer(np.diag(spread), np.diag(spread)))
     predicted = se2.pose_covariance(pose, state.filter.covariance[:3, :3])
     np.testing.assert_allclose(predicted / scale, spread / scale, atol=0.08)
+
+
+def test_a_camera_that_sways_forgets_its_yaw_and_keeps_its_variance() -> None:
+    camera = CameraMount(yaw_sigma=0.02, yaw_time_s=5.0)
+    robots = [Robot("a", camera=camera, sensor=SensorModel(distance_scale_sigma=0.03))]
+    tracks, state = OdometryTracks(robots), SwarmState(ParameterTable.of(robots))
+    stamps = T0 + SECOND * np.arange(11, dtype=np.int64)
+    tracks.extend(np.zeros(11, dtype=np.int64), stamps, np.zeros((11, 3)))
+    state.initialize(0, InitialPose(np.zeros(3), PRIOR), Preintegrated.begin(T0))
+    state.parameter[0, CAMERA_YAW:] = [0.03, 0.01]
+    state.filter.covariance[3:, 3:] = [[1e-4, 2e-5], [2e-5, 4e-4]]
+    once = state.copy()
+    to(once, tracks, 4.0)
+    for seconds in np.linspace(0.5, 4.0, 8):
+        to(state, tracks, float(seconds))
+    left = np.exp(-4.0 / 5.0)
+    for found in (once, state):
+        np.testing.assert_allclose(found.parameter[0, CAMERA_YAW:], [0.03 * left, 0.01], rtol=1e-9)
+        wanted = [[1e-4 * left**2 + 4e-4 * (1.0 - left**2), 2e-5 * left], [2e-5 * left, 4e-4]]
+        np.testing.assert_allclose(found.filter.covariance[3:, 3:], wanted, rtol=1e-9)
 
 
 def test_parameters_not_asked_for_have_no_columns() -> None:

@@ -39,14 +39,15 @@ ODOMETRY = OdometryModel(
 CALIBRATED = Robot(
     "",
     odometry=ODOMETRY,
-    camera=CameraMount(yaw_sigma=0.03),
+    camera=CameraMount(yaw_sigma=0.03, yaw_time_s=2.0),
     sensor=SensorModel(distance_scale_sigma=0.04),
 )
 KINDS = (
     CALIBRATED,
     replace(CALIBRATED, odometry=OdometryModel()),
     replace(CALIBRATED, camera=CameraMount(), sensor=SensorModel()),
-    replace(CALIBRATED, camera=CameraMount(yaw_sigma=0.03), sensor=SensorModel()),
+    replace(CALIBRATED, camera=CameraMount(yaw_sigma=0.03, yaw_time_s=4.0), sensor=SensorModel()),
+    Robot("", camera=CameraMount(yaw_sigma=0.03, yaw_time_s=1.0)),
     Robot("", camera=CameraMount()),
 )
 """Everything is estimated of the first, of others only something, of the last nothing."""

@@ -17,6 +17,7 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
+from swarm_loc_estimator.filter.integrity.motion_noise import LOG_SCALES, WINDOWS
 from swarm_loc_estimator.filter.integrity.noise_inflation import inflate_noise
 from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementColumns
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW
@@ -81,6 +82,12 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         gated_fixes=np.zeros(robots, dtype=np.int64),
         gated_fix_ns=np.full(robots, NEVER_NS // 2),
         noise_inflation=np.zeros(robots),
+        drift_ns=np.full((robots, WINDOWS), NEVER_NS // 2),
+        drift_transform=np.zeros((robots, WINDOWS, 3)),
+        drift_noise=np.zeros((robots, WINDOWS, 3, 3)),
+        drift_variance=np.zeros((robots, WINDOWS, 2)),
+        motion_likelihood=np.zeros((robots, LOG_SCALES.size)),
+        motion_scale=np.ones(robots),
     )
 
 

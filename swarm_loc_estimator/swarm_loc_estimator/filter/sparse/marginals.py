@@ -25,7 +25,7 @@ class Marginals:
     Attributes:
         groups: Which bodies have blocks of parameters.
         current: (n, w, w) see `JointFilter.marginal`.
-        transition: (robots, 4, DRIVES) see `JointFilter.transition`.
+        transition: (robots, 3 + BLOCKS, DRIVES) see `JointFilter.transition`.
     """
 
     def __init__(self, groups: Groups) -> None:
@@ -65,7 +65,7 @@ class Marginals:
         """Take the present marginals of bodies (k,) as those of the newest factor."""
         self._settled[bodies] = self.current[bodies]
         robots = bodies[bodies < len(self.transition)]
-        self.transition[robots, :3], self.transition[robots, 3] = 0.0, 1.0
+        self.transition[robots, :3], self.transition[robots, 3:] = 0.0, 1.0
 
     def within(self, bodies: IntArray) -> Iterator[tuple[tuple[slice, slice], IntArray, IntArray, IntArray]]:
         """Pairs of parts of bodies (k,); a part is the body or one of its blocks.
@@ -98,16 +98,16 @@ class Marginals:
         moves = Moves(np.full(count, -1), np.zeros((count, 3, 3)), np.ones((count, 3)))
         if len(self.transition):
             of_robots = np.flatnonzero(bodies < len(self.transition))
-            robots, own = bodies[of_robots], np.arange(3, 3 + DRIVES)
-            transition, blocks = self.transition[robots], self.groups.member[robots, 1]
+            robots, own = bodies[of_robots], np.arange(3, before.shape[1])
+            transition, blocks = self.transition[robots], self.groups.member[robots, 1:]
             follow = np.tile(np.eye(before.shape[1]), (bodies.size, 1, 1))
             follow[of_robots, :3, _DRIVEN] = transition[:, :3]
-            follow[of_robots[:, None], own, own] = transition[:, 3]
+            follow[of_robots[:, None], own, own] = transition[:, 3:].reshape(robots.size, -1)
             before = follow @ before @ follow.transpose(0, 2, 1)
             moved = transition[:, :3].any(axis=(1, 2))
-            moves.beside[robots[moved]] = blocks[moved]
+            moves.beside[robots[moved]] = blocks[moved, 0]
             moves.gain[robots] = adjoint[of_robots] @ transition[:, :3]
-            moves.left[blocks[blocks >= 0]] = transition[blocks >= 0, 3]
+            moves.left[blocks[blocks >= 0]] = transition[:, 3:][blocks >= 0]
         noise = self.current[bodies] - before
         noise[:, :3] = adjoint @ noise[:, :3]
         noise[:, :, :3] = noise[:, :, :3] @ adjoint.transpose(0, 2, 1)
@@ -129,28 +129,30 @@ def _enlarged(known: FloatArray, groups: Groups) -> FloatArray:
 def _no_transition(groups: Groups) -> FloatArray:
     """The identity transition; for no robot where there are no parameters."""
     robots = len(groups.member) if _width(groups) > 3 else 0
-    return np.tile(np.vstack([np.zeros((3, DRIVES)), np.ones(DRIVES)]), (robots, 1, 1))
+    return np.tile(np.vstack([np.zeros((3, DRIVES)), np.ones((BLOCKS, DRIVES))]), (robots, 1, 1))
 
 
-def derived_by(moves: Moves, robot: int, block: int, noise: FloatArray, numbers: IntArray) -> list[Derived]:
+def derived_by(
+    moves: Moves, robot: int, blocks: IntArray, noise: FloatArray, numbers: IntArray
+) -> list[Derived]:
     """The blocks and the pose of one robot after a transition, to be appended.
 
     Args:
         moves: The transition.
         robot: The robot.
-        block: The block that changes its pose; -1: none.
-        noise: (w, w) process noise of the pose and the blocks; diagonal within `block`.
+        blocks: (BLOCKS,) its blocks, of which the first one changes its pose; -1: none.
+        noise: (w, w) process noise of the pose and the blocks; diagonal within the first block.
         numbers: (2 + BLOCKS,) of the pose and the blocks before, and of the next body; -1: none.
 
     Returns:
         The new blocks in their order, then the pose.
     """
     out: list[Derived] = []
-    gain, left = moves.gain[robot], moves.left[block]
+    gain, left = moves.gain[robot], moves.left[blocks[0]]
     for k in range(1, 1 + BLOCKS):
         if numbers[k] >= 0:
             own = noise[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
-            out.append(Derived(numbers[k : k + 1], np.diag(left) if k == 1 else np.eye(3), own))
+            out.append(Derived(numbers[k : k + 1], np.diag(moves.left[blocks[k - 1]]), own))
     if numbers[0] < 0:
         return out
     if numbers[1] < 0:

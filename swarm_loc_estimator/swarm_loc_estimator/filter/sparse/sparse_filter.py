@@ -196,14 +196,12 @@ class SparseFilter:
     def _take_in(self, body: int) -> None:
         """Append a body with the changes of its error since the newest factor, for others to share."""
         noise, moves = self._marginals.since(np.array([body]), self._place)
-        if not noise.any() and moves.beside[body] < 0:
+        if not noise.any() and not moves.any():
             return
         is_robot = body < len(self.transition)
         blocks = self._groups.member[body] if is_robot else np.array([body] + BLOCKS * [-1])
         numbers = np.where(blocks >= 0, self._number[blocks], -1)
-        derived = derived_by(
-            moves, int(body), int(blocks[1]), noise[0], np.append(numbers, self._next_number)
-        )
+        derived = derived_by(moves, int(body), blocks[1:], noise[0], np.append(numbers, self._next_number))
         present = blocks[[*range(1, 1 + BLOCKS), 0]]
         self._append(present[(present >= 0) & (self._number[present] >= 0)], derived)
         self._marginals.settle(np.array([body]))

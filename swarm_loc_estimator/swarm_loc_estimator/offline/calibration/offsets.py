@@ -1,4 +1,4 @@
-"""Calibrate the offsets between odometry and ground truth's reference point: course and axle."""
+"""Calibrate offsets of odometry: of the turn rate, of the course and of the axle."""
 
 from __future__ import annotations
 
@@ -18,10 +18,13 @@ from swarm_loc_estimator.offline.calibration.robust import (
     population,
     spread,
 )
+from swarm_loc_estimator.swarm.calibration_states import TURN_BIAS
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 _WIDE = np.array([0.05, 0.05])
 """Standard deviations of the prior of course offset [rad] and axle offset [m]."""
+_WIDE_BIAS = np.array([0.01])
+"""Standard deviation of the prior of the turn bias [rad/s]."""
 _WINDOW_NS = 2_000_000_000
 _STRIDE_NS = 500_000_000
 _SHORTEST_NS, _LONGEST_NS = 1_000_000_000, 20_000_000_000
@@ -29,12 +32,12 @@ _MIN_WINDOWS = 20
 
 
 @dataclass(frozen=True)
-class _Lateral:
-    """Linear regression of lateral motion in windows by the offsets.
+class _OffsetRegression:
+    """Linear regression of a robot's motion in windows by offsets (p,).
 
     Attributes:
-        wanted: (m,) motion to the left [m], per square root of a second.
-        basis: (m, 2) its derivatives by course offset and axle offset.
+        wanted: (m,) motion to the left [m] or turn [rad] that odometry misses, per square root of a second.
+        basis: (m, p) its derivatives by the offsets.
         independent_share: Share of independent windows.
     """
 
@@ -43,7 +46,7 @@ class _Lateral:
     independent_share: float
 
     def fit(self, mean: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Offsets (2,) and their standard deviations (2,)."""
+        """Offsets (p,) and their standard deviations (p,)."""
         scale = max(spread(self.wanted), 1e-5) / np.sqrt(self.independent_share)
         for _ in range(2):
             level = scale
@@ -58,45 +61,94 @@ class _Lateral:
 
 
 def fit_offsets(recording: Recording, swarm: Swarm, members: Sequence[int]) -> dict[int, Robot]:
-    """Fit course and axle offset of robots of one type; those with too little ground truth get the mean."""
-    laterals = {index: _lateral(recording, swarm, index) for index in members}
-    usable = {index: lateral for index, lateral in laterals.items() if lateral is not None}
+    """Fit the turn bias, then course and axle offset of robots of one type.
+
+    Robots with too little ground truth get the mean.
+    """
+    robots = {index: swarm.robots[index] for index in members}
+    motion = {index: _motion(recording, robot, recording.track(index)) for index, robot in robots.items()}
+    usable = {index: one for index, one in motion.items() if one is not None}
     if not usable:
         return {}
-    alone = [lateral.fit(np.zeros(2), _WIDE) for lateral in usable.values()]
-    mean, sigma = population(np.array([one[0] for one in alone]), np.array([one[1] for one in alone]), _WIDE)
-    found = dict.fromkeys(members, mean)
-    found |= {index: lateral.fit(mean, sigma)[0] for index, lateral in usable.items()}
-    calibrated = {}
-    for index, offsets in found.items():
-        robot, (course, axle) = swarm.robots[index], np.round(offsets, 5).tolist()
-        odometry = replace(robot.odometry, course_offset=course, axle_offset=axle)
-        calibrated[index] = replace(robot, odometry=odometry)
-    return calibrated
+    bias = _of_type({index: _turns(one) for index, one in usable.items()}, members, _WIDE_BIAS)
+    for index, robot in robots.items():
+        robots[index] = _with(robot, turn_bias=float(bias[index][0]))
+    usable = {i: one for i in usable if (one := _motion(recording, robots[i], recording.track(i)))}
+    offsets = _of_type({index: _laterals(one) for index, one in usable.items()}, members, _WIDE)
+    return {
+        index: _with(robot, course_offset=float(offsets[index][0]), axle_offset=float(offsets[index][1]))
+        for index, robot in robots.items()
+    }
 
 
-def _lateral(recording: Recording, swarm: Swarm, index: int) -> _Lateral | None:
-    """The regression of a robot; None with too little ground truth."""
-    robot, track = swarm.robots[index], recording.track(index)
+def _with(robot: Robot, **offsets: float) -> Robot:
+    rounded = {name: round(value, 5) for name, value in offsets.items()}
+    return replace(robot, odometry=replace(robot.odometry, **rounded))
+
+
+def _of_type(
+    regressions: dict[int, _OffsetRegression], members: Sequence[int], wide: FloatArray
+) -> dict[int, FloatArray]:
+    """Offsets (p,) of each member of a type, about the mean of the type, which those without data get."""
+    alone = [one.fit(np.zeros(wide.size), wide) for one in regressions.values()]
+    mean, sigma = population(np.array([one[0] for one in alone]), np.array([one[1] for one in alone]), wide)
+    return dict.fromkeys(members, mean) | {
+        index: one.fit(mean, sigma)[0] for index, one in regressions.items()
+    }
+
+
+@dataclass(frozen=True)
+class _Motion:
+    """Motion of a robot in windows (m,): calibrated odometry without course and axle offset, and the truth.
+
+    Attributes:
+        reported: (m, 3) x, y and theta in the frame of the beginning.
+        true: (m, 3) the same for the truth.
+        moving_s: (m,) time in motion.
+        length_s: (m,) of the windows.
+        independent_share: Share of independent windows.
+    """
+
+    reported: FloatArray
+    true: FloatArray
+    moving_s: FloatArray
+    length_s: FloatArray
+    independent_share: float
+
+
+def _motion(recording: Recording, robot: Robot, track: Trajectory) -> _Motion | None:
+    """The motion of a robot; None with too little ground truth."""
     truth = recording.truth.get(robot.name)
     if truth is None or track.stamp_ns.size < 2:
         return None
     first_ns, last_ns = _windows(truth, int(track.stamp_ns[0]), int(track.stamp_ns[-1]))
     if first_ns.size < _MIN_WINDOWS:
         return None
-    reported = se2.between(_odometry(robot, track, first_ns), _odometry(robot, track, last_ns))
+    (first, first_s), (last, last_s) = (_odometry(robot, track, ns) for ns in (first_ns, last_ns))
     true = se2.between(*(interpolate(truth, stamps, DENSE_GAP_NS)[0] for stamps in (first_ns, last_ns)))
-    half = 0.5 * np.column_stack([reported[:, 2], true[:, 2]])
+    overlap = min(1.0, float((last_ns[-1] - first_ns[0]) / np.sum(last_ns - first_ns)))
+    return _Motion(se2.between(first, last), true, last_s - first_s, (last_ns - first_ns) * 1e-9, overlap)
+
+
+def _turns(motion: _Motion) -> _OffsetRegression:
+    """The regression of the turn by the turn bias."""
+    per_root = 1.0 / np.sqrt(motion.length_s)
+    missed = se2.wrap_angle(motion.true[:, 2] - motion.reported[:, 2])
+    basis = (motion.moving_s * per_root)[:, None]
+    return _OffsetRegression(missed * per_root, basis, motion.independent_share)
+
+
+def _laterals(motion: _Motion) -> _OffsetRegression:
+    """The regression of lateral motion by course and axle offset."""
+    half = 0.5 * np.column_stack([motion.reported[:, 2], motion.true[:, 2]])
     to_left = [
         -np.sin(half[:, k]) * moved[:, 0] + np.cos(half[:, k]) * moved[:, 1]
-        for k, moved in enumerate((reported, true))
+        for k, moved in enumerate((motion.reported, motion.true))
     ]
-    forwards = np.cos(half[:, 0]) * reported[:, 0] + np.sin(half[:, 0]) * reported[:, 1]
-    length_s = (last_ns - first_ns) * 1e-9
-    per_root = 1.0 / np.sqrt(length_s)
+    forwards = np.cos(half[:, 0]) * motion.reported[:, 0] + np.sin(half[:, 0]) * motion.reported[:, 1]
+    per_root = 1.0 / np.sqrt(motion.length_s)
     basis = np.column_stack([forwards, 2.0 * np.sin(half[:, 1])]) * per_root[:, None]
-    overlap = min(1.0, float((last_ns[-1] - first_ns[0]) / np.sum(last_ns - first_ns)))
-    return _Lateral((to_left[1] - to_left[0]) * per_root, basis, overlap)
+    return _OffsetRegression((to_left[1] - to_left[0]) * per_root, basis, motion.independent_share)
 
 
 def _windows(truth: Trajectory, begin_ns: int, end_ns: int) -> tuple[IntArray, IntArray]:
@@ -113,10 +165,11 @@ def _windows(truth: Trajectory, begin_ns: int, end_ns: int) -> tuple[IntArray, I
     return inside[:-1][fit], inside[1:][fit]
 
 
-def _odometry(robot: Robot, track: Trajectory, stamp_ns: IntArray) -> FloatArray:
-    """Calibrated odometry (m, 3) without offsets."""
+def _odometry(robot: Robot, track: Trajectory, stamp_ns: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Calibrated odometry (m, 3) without course and axle offset, and the time in motion until then (m,)."""
     model = replace(robot.odometry, course_offset=0.0, axle_offset=0.0)
     tracks = OdometryTracks([replace(robot, odometry=model)])
     zeros = np.zeros(track.stamp_ns.size, dtype=np.int64)
     tracks.extend(zeros, track.stamp_ns, track.pose)
-    return tracks.at(np.zeros(stamp_ns.size, dtype=np.int64), stamp_ns).pose
+    sample = tracks.at(np.zeros(stamp_ns.size, dtype=np.int64), stamp_ns)
+    return sample.pose, sample.jacobian[:, 2, TURN_BIAS]
