@@ -83,6 +83,53 @@ def restarted_driver(run: SimulatedRun, robot: int, begin_s: float, end_s: float
     return replace(run, odometry=odometry).masked(~np.repeat(dark, run.frames["count"]))
 
 
+def reset_odometry(run: SimulatedRun, robot: int, at_s: float, pose: FloatArray) -> SimulatedRun:
+    """Let a robot's odometry go on from another pose (3,) in its odom frame."""
+    odometry = run.odometry.copy()
+    after = (odometry["robot"] == robot) & (seconds(run, odometry["stamp_ns"]) >= at_s)
+    first = odometry["pose"][after][np.argmin(odometry["stamp_ns"][after])].copy()
+    odometry["pose"][after] = se2.compose(pose, se2.between(first, odometry["pose"][after]))
+    return replace(run, odometry=odometry)
+
+
+def odometry_pose(run: SimulatedRun, robot: int, at_s: float) -> FloatArray:
+    """Pose (3,) of the first odometry of a robot from an instant on."""
+    rows = run.odometry[(run.odometry["robot"] == robot) & (seconds(run, run.odometry["stamp_ns"]) >= at_s)]
+    pose: FloatArray = rows["pose"][np.argmin(rows["stamp_ns"])]
+    return pose
+
+
+def twist_only(run: SimulatedRun, robot: int) -> SimulatedRun:
+    """Let a robot's odometry report its twist only."""
+    odometry = run.odometry.copy()
+    odometry["pose"][odometry["robot"] == robot] = 0.0
+    return replace(run, odometry=odometry)
+
+
+def with_twists(run: SimulatedRun) -> SimulatedRun:
+    """Fill the mean twist of the step before each odometry message, as wheel odometry does."""
+    dtype = np.dtype([*ODOMETRY_DTYPE.descr, ("twist", "<f8", (3,))])
+    odometry = np.zeros(len(run.odometry), dtype)
+    for name in ODOMETRY_DTYPE.names or ():
+        odometry[name] = run.odometry[name]
+    for robot in np.unique(odometry["robot"]):
+        rows = np.flatnonzero(odometry["robot"] == robot)
+        rows = rows[np.argsort(odometry["stamp_ns"][rows], kind="stable")]
+        duration_s = np.diff(odometry["stamp_ns"][rows]) * 1e-9
+        pose = odometry["pose"][rows]
+        odometry["twist"][rows[1:]] = se2.log(se2.between(pose[:-1], pose[1:])) / duration_s[:, None]
+    return replace(run, odometry=odometry)
+
+
+def hide(run: SimulatedRun, robot: int, begin_s: float, end_s: float) -> SimulatedRun:
+    """Remove all sightings of and by a robot for a while."""
+    ids = [face.id for face in run.swarm.robots[robot].faces]
+    of_frame = np.repeat(np.arange(len(run.frames)), run.frames["count"])
+    time_s = seconds(run, run.frames["stamp_ns"])[of_frame]
+    own = (run.frames["robot"][of_frame] == robot) | np.isin(run.sightings["marker_id"], ids)
+    return run.masked(~(own & (time_s >= begin_s) & (time_s < end_s)))
+
+
 def second_odometry(run: SimulatedRun, robot: int, begin_s: float, rate_hz: float) -> SimulatedRun:
     """Add a second publisher of a robot's odometry, with a constant other pose."""
     stamps_ns = _stamps(run, begin_s, run.duration_s - 1.0, rate_hz)

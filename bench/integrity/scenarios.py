@@ -112,6 +112,34 @@ def _two_odometry_sources(seed: int) -> Fault:
     return Fault(faults.second_odometry(_clean(seed).run, 0, FAULT_S[0], 20.0))
 
 
+_BLIND_S = 10.0
+"""Time without sightings of and by a robot whose odometry is reset."""
+
+
+def _reset_blind(seed: int, *, at_origin: bool) -> Fault:
+    """The odometry of an unseen robot is reset: near its origin, or its heading only."""
+    rng = np.random.default_rng([seed, 6])
+    at_s = float(rng.uniform(18.0, 30.0))
+    begin_s, end_s = at_s - 0.5, at_s + _BLIND_S
+    run = faults.with_twists(_clean(seed).run)
+    pose = faults.odometry_pose(run, 0, at_s)
+    if at_origin:
+        near = np.append(rng.normal(0.0, 0.02, 2), rng.uniform(-0.5, 0.5))
+        begin = faults.odometry_pose(run, 0, 0.0)
+        run = faults.reset_odometry(run, 0, 0.0, se2.compose(near, se2.between(pose, begin)))
+        run = faults.reset_odometry(run, 0, at_s, np.zeros(3))
+    else:
+        pose[2] += rng.choice([-1.0, 1.0]) * rng.uniform(0.15, 3.0)
+        run = faults.reset_odometry(run, 0, at_s, pose)
+    hidden = faults.hide(run, 0, begin_s, end_s)
+    return Fault(hidden, faults.next_sighting_s(hidden, 0, end_s))
+
+
+def _twist_only(seed: int) -> Fault:
+    run = faults.with_twists(_clean(seed).run)
+    return Fault(faults.twist_only(run, 0))
+
+
 def _odometry_flood(seed: int) -> Fault:
     return Fault(faults.second_odometry(_clean(seed).run, 0, FAULT_S[0], 1000.0))
 
@@ -158,6 +186,9 @@ SCENARIOS: Mapping[str, Callable[[int], Fault]] = {
     "turned_camera": _turned_camera,
     "two_odometry_sources": _two_odometry_sources,
     "odometry_flood": _odometry_flood,
+    "odometry_reset_origin_blind": lambda seed: _reset_blind(seed, at_origin=True),
+    "heading_reset_blind": lambda seed: _reset_blind(seed, at_origin=False),
+    "twist_only": _twist_only,
     "creeping_spoof": _creeping_spoof,
     "creeping_spoof_two": lambda seed: _creeping_spoof(seed, 2),
     "hidden_in_noise": _hidden_in_noise,

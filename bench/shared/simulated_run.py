@@ -62,7 +62,9 @@ def inputs_between(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> list[Batch]
     rows, frames = run.odometry, run.frames
     names = ("robot", "stamp_ns", "arrival_ns")
     robot, stamp_ns, arrival_ns = (rows[name].astype(np.int64) for name in names)
-    odometry = OdometryRows(robot, stamp_ns, rows["pose"].copy(), arrival_ns)
+    pose = rows["pose"].copy()
+    twist = rows["twist"].copy() if "twist" in (rows.dtype.names or ()) else np.full(pose.shape, np.nan)
+    odometry = OdometryRows(robot, stamp_ns, pose, twist, arrival_ns)
     robot, stamp_ns, arrival_ns = (
         np.repeat(frames[name].astype(np.int64), frames["count"]) for name in names
     )

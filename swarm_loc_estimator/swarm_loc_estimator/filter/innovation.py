@@ -26,7 +26,7 @@ from swarm_loc_estimator.filter.integrity.fault_detection import (
 from swarm_loc_estimator.filter.integrity.noise_inflation import add_noise_inflation, stamp_variance
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, predict_one, write_innovation
 from swarm_loc_estimator.odometry.look_up import rate_at
-from swarm_loc_estimator.odometry.preintegration import TrackArrays
+from swarm_loc_estimator.odometry.track_arrays import TrackArrays
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW
 
 DEPENDS_ON = 8

@@ -16,7 +16,7 @@ from swarm_loc_estimator.filter.innovation import InnovationBatch
 from swarm_loc_estimator.filter.joint_filter import JointFilter
 from swarm_loc_estimator.filter.measurement_model import MODELS, POLAR, MeasurementArray
 from swarm_loc_estimator.odometry.look_up import rate_at
-from swarm_loc_estimator.odometry.preintegration import TrackArrays
+from swarm_loc_estimator.odometry.track_arrays import TrackArrays
 
 _BODY: IntArray = np.arange(3)
 

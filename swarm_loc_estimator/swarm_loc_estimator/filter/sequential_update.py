@@ -23,7 +23,8 @@ from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_excl
 from swarm_loc_estimator.filter.integrity.motion_noise import learn
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel, locates_alone
 from swarm_loc_estimator.odometry.look_up import look_up, new_sample
-from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
+from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.odometry.track_arrays import TrackArrays
 
 OPEN, USED, GATED = 0, 1, 2
 """Verdicts, see `fusion.Verdict`."""

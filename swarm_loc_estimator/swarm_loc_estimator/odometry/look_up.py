@@ -10,8 +10,8 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
-from swarm_loc_estimator.odometry.preintegration import TrackArrays
 from swarm_loc_estimator.odometry.process_noise import add_dropout_noise
+from swarm_loc_estimator.odometry.track_arrays import TrackArrays
 
 
 class OdometrySample(NamedTuple):

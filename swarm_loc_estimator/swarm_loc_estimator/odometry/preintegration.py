@@ -3,32 +3,30 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit, norefcount_njit
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.common.small_matrix import add_scaled, assign, assign_matrix
+from swarm_loc_estimator.odometry.continuity import JUMP, NO_FAULT, RESET, check_step, update_unmoved
 from swarm_loc_estimator.odometry.process_noise import (
     OdometryStep,
     add_dropout_noise,
+    add_in_track_frame,
     add_step_jacobian,
     add_step_noise,
 )
+from swarm_loc_estimator.odometry.track_arrays import BEFORE_ALL_NS, LATEST_NS, TrackArrays
 from swarm_loc_estimator.swarm.swarm import OdometryModel
 
-UNCHANGED_NS = np.iinfo(np.int64).max
-BEFORE_ALL_NS = np.iinfo(np.int64).min
+UNCHANGED_NS = LATEST_NS
 
 _CONTRADICTORY_NS = 1_000_000_000
 """After two jumps within this time, odometry is ignored until it has been smooth for this time."""
-
-MODEL_DTYPE = np.dtype([(f.name, np.float64) for f in fields(OdometryModel)])
-"""Record of the numbers of an `OdometryModel`."""
 
 
 class Preintegrated(NamedTuple):
@@ -50,49 +48,30 @@ class Preintegrated(NamedTuple):
         return cls(stamp_ns, np.zeros((3, 3)), np.zeros((3, 3)))
 
 
-class TrackArrays(NamedTuple):
-    """Rows and models of all tracks, for compiled code.
+class NewRows(NamedTuple):
+    """Rows (k,) sorted by robot and stamp.
 
     Attributes:
-        filled: (N,) number of rows in use.
-        stamp_ns: (N, capacity) instants, calibrated for delay.
-        raw: (N, capacity, 3) poses as reported, headings unwrapped.
-        pose: (N, capacity, 3) calibrated poses O, headings unwrapped.
-        covariance: (N, capacity, 3, 3) preintegrated to the row, see `Preintegrated`.
-        jacobian: (N, capacity, 3, 3) preintegrated to the row; columns as in `estimated_parameters`.
-        rate: (N, capacity, 3) calibrated velocity forward and left [m/s] and turn rate [rad/s] at the row,
-            after the lag.
-        known_ns: (N, capacity) end of the known motion: the row's instant, or earlier after repeated jumps.
-        jump_ns: (N, capacity, 2) instants of the last two jumps, newest first.
-        delay_ns: (N,) delay of the stamps.
-        model: (N,) of MODEL_DTYPE.
-        response: (N, 2, V, W) shares of speed and of turn rate of `MotionResponse`.
-        response_speed: (N, V) speeds of its grid, padded with infinity.
-        response_turn_rate: (N, W) turn rates of its grid.
-        begin_ns: (N,) instant of the very first row.
-        begin_pose: (N, 3) pose of the very first row.
-        is_stationary: (N,) True for a robot without odometry: its track stays at the origin.
-        walk: (N, 2) its variances per second of position [m^2/s] and heading [rad^2/s].
+        robot: (k,) index of the robot.
+        stamp_ns: (k,) instants, calibrated for delay.
+        raw: (k, 3) poses as reported.
+        twist: (k, 3) twists as reported.
+        new: (k,) False for rows that are integrated again.
     """
 
-    filled: IntArray
+    robot: IntArray
     stamp_ns: IntArray
     raw: FloatArray
-    pose: FloatArray
-    covariance: FloatArray
-    jacobian: FloatArray
-    rate: FloatArray
-    known_ns: IntArray
-    jump_ns: IntArray
-    delay_ns: IntArray
-    model: NDArray[np.void]
-    response: FloatArray
-    response_speed: FloatArray
-    response_turn_rate: FloatArray
-    begin_ns: IntArray
-    begin_pose: FloatArray
-    is_stationary: NDArray[np.bool_]
-    walk: FloatArray
+    twist: FloatArray
+    new: NDArray[np.bool_]
+
+
+class Integrated(NamedTuple):
+    """Numbers of rows: dropped as duplicates, and new ones with a jump or a reset before them."""
+
+    duplicates: int
+    jumps: int
+    resets: int
 
 
 @cached_njit
@@ -102,14 +81,15 @@ def continue_tracks(
     robots: IntArray,
     stamps_ns: IntArray,
     raw: FloatArray,
+    twist: FloatArray,
     changed_from_ns: IntArray,
-) -> int:
+) -> Integrated:
     """Append rows (k,) if all are newer than their tracks and not older than `oldest_ns`.
 
     Stamps are as reported, not calibrated for delay. Writes `changed_from_ns` (N,), see `TrackChange`.
 
     Returns:
-        Number of jumps; -1, without any change, if some rows are not newer or there is no space.
+        Numbers of rows; -1 for each, without any change, if some rows are not newer or there is no space.
     """
     newest, filled = np.empty(tracks.filled.size, dtype=np.int64), tracks.filled.copy()
     for robot in range(newest.size):
@@ -125,19 +105,19 @@ def continue_tracks(
             or delayed[k] <= newest[robot]
             or filled[robot] > tracks.stamp_ns.shape[1]
         ):
-            return -1
+            return Integrated(-1, -1, -1)
         if changed_from_ns[robot] == UNCHANGED_NS:
             changed_from_ns[robot] = newest[robot]
         newest[robot] = delayed[k]
-    return integrate(tracks, robots, delayed, raw, np.ones(robots.size, dtype=np.bool_))[1]
+    rows = NewRows(robots, delayed, raw, twist, np.ones(robots.size, dtype=np.bool_))
+    return integrate(tracks, oldest_ns, rows, changed_from_ns)
 
 
 @cached_njit
-def integrate(
-    tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray, raw: FloatArray, new: NDArray[np.bool_]
-) -> tuple[int, int]:
-    """Append rows sorted by robot and stamp; return the numbers of duplicates and of new jumps."""
-    duplicates, jumps = 0, 0
+def integrate(tracks: TrackArrays, oldest_ns: int, rows: NewRows, changed_from_ns: IntArray) -> Integrated:
+    """Append rows; where the twist is integrated from now on, lower `changed_from_ns` (N,)."""
+    robots, stamps_ns, raw, twist, new = rows
+    duplicates, counts = 0, np.zeros(3, dtype=np.int64)
     for k in range(robots.size):
         robot = robots[k]
         row = tracks.filled[robot]
@@ -146,55 +126,63 @@ def integrate(
             continue
         tracks.stamp_ns[robot, row] = stamps_ns[k]
         assign(tracks.raw[robot, row], raw[k])
+        assign(tracks.twist[robot, row], twist[k])
         if row == 0:  # a track starts at the reported pose
             assign(tracks.pose[robot, 0], raw[k])
             tracks.covariance[robot, 0].fill(0.0)
             tracks.jacobian[robot, 0].fill(0.0)
             tracks.rate[robot, 0].fill(0.0)
+            tracks.agreed[robot, 0].fill(0)
+            tracks.fastest[robot, 0].fill(0.0)
+            tracks.unmoved[robot, 0].fill(0.0)
             assign(tracks.begin_pose[robot], raw[k])
             tracks.begin_ns[robot] = tracks.known_ns[robot, 0] = stamps_ns[k]
             tracks.jump_ns[robot, 0, 0] = tracks.jump_ns[robot, 0, 1] = BEFORE_ALL_NS // 2
         else:
             before = tracks.raw[robot, row - 1, 2]
             tracks.raw[robot, row, 2] = before + wrap(raw[k, 2] - before)
-            jumped = _integrate_step(tracks, robot, row)
-            jumps += jumped and new[k]
+            first = row
+            if update_unmoved(tracks, robot, row, oldest_ns):
+                stamps = tracks.stamp_ns[robot, :row]
+                first = max(1, np.searchsorted(stamps, tracks.twist_from_ns[robot], side="right"))
+                changed_from_ns[robot] = min(changed_from_ns[robot], stamps[first - 1])
+            for changed in range(first, row):
+                _integrate_step(tracks, robot, changed)
+            counts[_integrate_step(tracks, robot, row)] += new[k]
         tracks.filled[robot] = row + 1
-    return duplicates, jumps
+    return Integrated(duplicates, counts[JUMP], counts[RESET])
 
 
-@inlined_njit
-def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
-    """Integrate from the previous row to the raw pose of a row; return whether the step is a jump."""
+@norefcount_njit
+def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
+    """Integrate from the previous row to a row; return the fault of the step, see `check_step`."""
     model = tracks.model[robot]
-    before, after = tracks.raw[robot, row - 1], tracks.raw[robot, row]
-    duration_s = (tracks.stamp_ns[robot, row] - tracks.stamp_ns[robot, row - 1]) * 1e-9
-    turn = after[2] - before[2]
-    middle = before[2] + 0.5 * turn
-    dx, dy = after[0] - before[0], after[1] - before[1]
-    # tolerance of half a robot's width, because stamps jitter
-    jump = math.hypot(dx, dy) > model.max_speed * duration_s + 0.5 * model.wheel_separation
+    before_ns, stamp_ns = tracks.stamp_ns[robot, row - 1], tracks.stamp_ns[robot, row]
+    duration_s = (stamp_ns - before_ns) * 1e-9
+    by_twist = tracks.twist_from_ns[robot] < stamp_ns <= tracks.twist_until_ns[robot]
+    reported = _step_by_pose(tracks, robot, row)
+    if by_twist:
+        reported = _step_by_twist(tracks, robot, row, duration_s)
+    fault = check_step(tracks, robot, row, reported, duration_s)
     start, rate = tracks.pose[robot, row - 1], tracks.rate[robot, row]
     covariance, jacobian = tracks.covariance[robot, row], tracks.jacobian[robot, row]
     assign_matrix(covariance, tracks.covariance[robot, row - 1])
     assign_matrix(jacobian, tracks.jacobian[robot, row - 1])
-    stamp_ns, known_ns = tracks.stamp_ns[robot, row], tracks.known_ns[robot, row - 1]
+    known_ns = tracks.known_ns[robot, row - 1]
     jumps_ns = tracks.jump_ns[robot, row]
     jumps_ns[0], jumps_ns[1] = tracks.jump_ns[robot, row - 1, 0], tracks.jump_ns[robot, row - 1, 1]
-    if jump:
+    if fault != NO_FAULT:
         jumps_ns[0], jumps_ns[1] = stamp_ns, jumps_ns[0]
-    # one jump: the driver has restarted; several: two drivers publish conflicting odometry
+    # one fault: the driver has restarted; several: two drivers publish conflicting odometry
     contradictory = stamp_ns - jumps_ns[1] < _CONTRADICTORY_NS
-    if jump or contradictory or duration_s > model.timeout_s:  # the motion is unknown
+    if fault != NO_FAULT or contradictory or duration_s > model.timeout_s:  # the motion is unknown
         assign(tracks.pose[robot, row], start)
         rate.fill(0.0)
-        unknown_s = (tracks.stamp_ns[robot, row - 1] - known_ns) * 1e-9, (stamp_ns - known_ns) * 1e-9
+        unknown_s = (before_ns - known_ns) * 1e-9, (stamp_ns - known_ns) * 1e-9
         _add_unknown(model, unknown_s, start, rate, covariance)
         tracks.known_ns[robot, row] = known_ns if contradictory else stamp_ns
-        return bool(jump)
+        return fault
     tracks.known_ns[robot, row] = stamp_ns
-    cos, sin = math.cos(middle), math.sin(middle)
-    reported = (cos * dx + sin * dy, cos * dy - sin * dx, turn)
     before_rate = tracks.rate[robot, row - 1]
     forward, left, turn = _true_motion(tracks, robot, reported, duration_s, before_rate, rate)
     # displacement of the axle, then of base_link ahead of it
@@ -211,7 +199,33 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> bool:
     step = OdometryStep(forward, left, turn, changed, duration_s, x, y, middle)
     add_step_noise(model, step, covariance)
     add_step_jacobian(model, step, jacobian)
-    return False
+    if by_twist and before_ns <= tracks.twist_from_ns[robot]:  # the motion before is lost
+        lost = tracks.unmoved[robot, row - 1]
+        path, turned = lost[0] ** 2 + lost[1] ** 2, lost[2] ** 2
+        add_in_track_frame((start[0], start[1], start[2]), (path, path, turned, 0.0), covariance)
+    return fault
+
+
+@inlined_njit
+def _step_by_pose(tracks: TrackArrays, robot: int, row: int) -> tuple[float, float, float]:
+    """Displacement forward and left of the mean heading, and turn, between the reported poses of a step."""
+    before, after = tracks.raw[robot, row - 1], tracks.raw[robot, row]
+    turn = after[2] - before[2]
+    middle = before[2] + 0.5 * turn
+    dx, dy = after[0] - before[0], after[1] - before[1]
+    cos, sin = math.cos(middle), math.sin(middle)
+    return cos * dx + sin * dy, cos * dy - sin * dx, turn
+
+
+@inlined_njit
+def _step_by_twist(
+    tracks: TrackArrays, robot: int, row: int, duration_s: float
+) -> tuple[float, float, float]:
+    """The same step by the mean of the reported twists at both ends: the chord of an arc."""
+    before, after = tracks.twist[robot, row - 1], tracks.twist[robot, row]
+    half = 0.25 * (before[2] + after[2]) * duration_s
+    chord = 0.5 * duration_s * (math.sin(half) / half if half != 0.0 else 1.0)
+    return chord * (before[0] + after[0]), chord * (before[1] + after[1]), 2.0 * half
 
 
 @cached_njit

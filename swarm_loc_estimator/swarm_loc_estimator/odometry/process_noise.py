@@ -58,7 +58,7 @@ def add_step_noise(model: OdometryModel, step: OdometryStep, covariance: FloatAr
         heading += model.turn_drift * duration_s
     cross = 0.5 * wheel * (right_wheel - left_wheel) / separation
     course = step.theta + math.atan2(step.left, step.forward)
-    _add_in_track_frame((step.x, step.y, course), (along, across, heading, cross), covariance)
+    add_in_track_frame((step.x, step.y, course), (along, across, heading, cross), covariance)
 
 
 @cached_njit
@@ -110,11 +110,11 @@ def add_dropout_noise(
         along, across = min(along, model.speed_change**2 * walked), 0.0
         heading = min(heading, model.turn_rate_change**2 * walked)
     course = pose[2] + math.atan2(rate[1], rate[0])
-    _add_in_track_frame((pose[0], pose[1], course), (along, across, heading, 0.0), covariance)
+    add_in_track_frame((pose[0], pose[1], course), (along, across, heading, 0.0), covariance)
 
 
 @cached_njit
-def _add_in_track_frame(
+def add_in_track_frame(
     pose: tuple[float, float, float], body: tuple[float, float, float, float], covariance: FloatArray
 ) -> None:
     """Add Ad(pose) Q Ad(pose)^T for body variances along, across, heading and cov(along, heading)."""

@@ -19,14 +19,8 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.odometry.look_up import OdometrySample, look_up_all
-from swarm_loc_estimator.odometry.preintegration import (
-    BEFORE_ALL_NS,
-    MODEL_DTYPE,
-    UNCHANGED_NS,
-    TrackArrays,
-    continue_tracks,
-    integrate,
-)
+from swarm_loc_estimator.odometry.preintegration import UNCHANGED_NS, NewRows, continue_tracks, integrate
+from swarm_loc_estimator.odometry.track_arrays import BEFORE_ALL_NS, LATEST_NS, MODEL_DTYPE, TrackArrays
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import Robot
 
@@ -34,7 +28,20 @@ _IDEAL = MotionResponse(speeds=(0.0,), turn_rates=(0.0,), speed_share=((1.0,),),
 _FIRST_CAPACITY = 256
 _TRIM_EVERY_NS = 1_000_000_000
 _JUMPING_NS = 3_000_000_000
-_ROWS = ("stamp_ns", "raw", "pose", "covariance", "jacobian", "rate", "known_ns", "jump_ns")
+_ROWS = (
+    "stamp_ns",
+    "raw",
+    "pose",
+    "covariance",
+    "jacobian",
+    "rate",
+    "twist",
+    "agreed",
+    "fastest",
+    "unmoved",
+    "known_ns",
+    "jump_ns",
+)
 
 
 @dataclass(frozen=True)
@@ -45,13 +52,16 @@ class TrackChange:
         changed_from_ns: (N,) instant after which look-ups of each robot have changed, or UNCHANGED_NS.
         duplicates: Number of dropped rows with the stamp of another row of the robot.
         too_old: Number of dropped rows older than the oldest accepted stamp.
-        jumps: Number of new rows beyond the robot's maximum speed; their steps are unknown motion.
+        jumps: Number of new rows beyond the robot's maximum speed or turn rate.
+        resets: Number of new rows that contradict their twist, or restart at the origin. The steps to rows
+            with a jump or a reset are unknown motion.
     """
 
     changed_from_ns: IntArray
     duplicates: int
     too_old: int
     jumps: int
+    resets: int
 
 
 class OdometryTracks:
@@ -95,38 +105,54 @@ class OdometryTracks:
         """Whether robots (k,) are random walks, without odometry."""
         return np.asarray(self._walk[robots].any(axis=-1))
 
-    def has_conflicting_sources(self, now_ns: int) -> BoolArray:
-        """Whether the odometry of each robot (N,) has jumped repeatedly within the last seconds."""
-        arrays, robots = self.arrays, np.arange(self._robots)
-        before_last_ns = arrays.jump_ns[robots, np.maximum(arrays.filled - 1, 0), 1]
-        jumping: BoolArray = (arrays.filled > 0) & (now_ns - before_last_ns < _JUMPING_NS)
-        return jumping
+    def integrates_twist(self) -> BoolArray:
+        """Whether the twist of each robot (N,) is integrated, because its pose is constant."""
+        arrays = self.arrays
+        newest_ns = arrays.stamp_ns[np.arange(self._robots), np.maximum(arrays.filled - 1, 0)]
+        return (arrays.twist_from_ns < newest_ns) & (newest_ns <= arrays.twist_until_ns)
 
-    def extend(self, robots: IntArray, stamps_ns: IntArray, raw: FloatArray) -> TrackChange:
+    def had_fault(self, now_ns: int) -> BoolArray:
+        """Whether the odometry of each robot (N,) has jumped or was reset within the last seconds."""
+        return self._had_faults(now_ns, 0)
+
+    def has_conflicting_sources(self, now_ns: int) -> BoolArray:
+        """Whether the odometry of each robot (N,) has done so repeatedly within the last seconds."""
+        return self._had_faults(now_ns, 1)
+
+    def _had_faults(self, now_ns: int, before_last: int) -> BoolArray:
+        arrays, robots = self.arrays, np.arange(self._robots)
+        fault_ns = arrays.jump_ns[robots, np.maximum(arrays.filled - 1, 0), before_last]
+        recent: BoolArray = (arrays.filled > 0) & (now_ns - fault_ns < _JUMPING_NS)
+        return recent
+
+    def extend(
+        self, robots: IntArray, stamps_ns: IntArray, raw: FloatArray, twist: FloatArray | None = None
+    ) -> TrackChange:
         """Add rows in any order and of any age.
 
         Args:
             robots: (k,) robot index of each row.
             stamps_ns: (k,) acquisition stamps.
             raw: (k, 3) finite poses as the driver reports them, in its own odom frame.
+            twist: (k, 3) velocity forward and left [m/s] and turn rate [rad/s]; NaN or None: not known.
         """
+        twist = np.full(raw.shape, np.nan) if twist is None else twist
         changed_from = np.empty(self._robots, dtype=np.int64)
-        jumps = continue_tracks(self.arrays, self._oldest_ns, robots, stamps_ns, raw, changed_from)
-        if jumps >= 0:
-            return TrackChange(changed_from, 0, 0, jumps)
-        stamps = stamps_ns + self._delay_ns[robots]
+        found = continue_tracks(self.arrays, self._oldest_ns, robots, stamps_ns, raw, twist, changed_from)
+        if found.jumps >= 0:
+            return TrackChange(changed_from, 0, 0, found.jumps, found.resets)
         young = stamps_ns >= self._oldest_ns
-        robots, stamps, raw, new = robots[young], stamps[young], raw[young], young[young]
-        robots, stamps, raw, changed_from = self._take_back_later_rows(robots, stamps, raw)
+        rows = NewRows(robots, stamps_ns + self._delay_ns[robots], raw, twist, young)
+        rows, changed_from = self._take_back_later_rows(NewRows(*(column[young] for column in rows)))
+        robots, stamps, raw = rows[:3]
         order = np.lexsort((wrap_angle(raw[:, 2]), raw[:, 1], raw[:, 0], stamps, robots))
-        new = (np.arange(robots.size) < new.size)[order]  # False for rows taken from the tracks
-        robots, stamps, raw = robots[order], stamps[order], raw[order]
+        rows = NewRows(*(column[order] for column in rows))
         while np.any(
             self.arrays.filled + np.bincount(robots, minlength=self._robots) > self.arrays.stamp_ns.shape[1]
         ):
             self._grow()
-        duplicates, jumps = integrate(self.arrays, robots, stamps, raw, new)
-        return TrackChange(changed_from, duplicates, int((~young).sum()), jumps)
+        found = integrate(self.arrays, self._oldest_ns, rows, changed_from)
+        return TrackChange(changed_from, found.duplicates, int((~young).sum()), found.jumps, found.resets)
 
     def at(self, robots: IntArray, stamps_ns: IntArray) -> OdometrySample:
         """Look up tracks, see `look_up`.
@@ -162,8 +188,14 @@ class OdometryTracks:
             covariance=np.zeros((*shape, 3, 3)),
             jacobian=np.zeros((*shape, 3, 3)),
             rate=np.zeros((*shape, 3)),
+            twist=np.zeros((*shape, 3)),
+            agreed=np.zeros((*shape, 2), dtype=np.int64),
+            fastest=np.zeros((*shape, 2)),
+            unmoved=np.zeros((*shape, 3)),
             known_ns=np.zeros(shape, dtype=np.int64),
             jump_ns=np.zeros((*shape, 2), dtype=np.int64),
+            twist_from_ns=np.full(self._robots, LATEST_NS),
+            twist_until_ns=np.full(self._robots, LATEST_NS),
             delay_ns=self._delay_ns,
             model=self._model,
             response=self._response[0],
@@ -186,16 +218,14 @@ class OdometryTracks:
             getattr(rows, name)[:, :capacity] = getattr(old, name)
         self.arrays = old._replace(**{name: getattr(rows, name) for name in _ROWS})
 
-    def _take_back_later_rows(
-        self, robots: IntArray, stamps: IntArray, raw: FloatArray
-    ) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
+    def _take_back_later_rows(self, rows: NewRows) -> tuple[NewRows, IntArray]:
         """Merge new rows with later rows of the tracks, which are removed to be integrated again.
 
         Returns:
-            Robots, stamps, raw poses, and the instant (N,) after which each track changes.
+            The rows, and the instant (N,) after which each track changes.
         """
-        arrays = self.arrays
-        taken: list[tuple[IntArray, IntArray, FloatArray]] = [(robots, stamps, raw)]
+        arrays, (robots, stamps) = self.arrays, rows[:2]
+        taken = [rows]
         newest = arrays.stamp_ns[robots, np.maximum(arrays.filled[robots] - 1, 0)]
         late = (arrays.filled[robots] > 0) & (
             stamps <= newest
@@ -205,22 +235,16 @@ class OdometryTracks:
             first = int(
                 np.searchsorted(arrays.stamp_ns[robot, :count], stamps[late & (robots == robot)].min())
             )
-            rows = slice(first, count)
-            taken.append(
-                (
-                    np.full(count - first, robot),
-                    arrays.stamp_ns[robot, rows].copy(),
-                    arrays.raw[robot, rows].copy(),
-                )
-            )
+            later = (getattr(arrays, name)[robot, first:count] for name in ("stamp_ns", "raw", "twist"))
+            again = np.zeros(count - first, dtype=bool)
+            taken.append(NewRows(np.full(count - first, robot), *later, again))
             arrays.filled[robot] = first
         changed_from = np.full(self._robots, UNCHANGED_NS)
         last = np.maximum(arrays.filled[robots] - 1, 0)
         changed_from[robots] = np.where(
             arrays.filled[robots] > 0, arrays.stamp_ns[robots, last], BEFORE_ALL_NS
         )
-        columns = [np.concatenate(parts) for parts in zip(*taken, strict=True)]
-        return columns[0], columns[1], columns[2], changed_from
+        return NewRows(*map(np.concatenate, zip(*taken, strict=True))), changed_from
 
 
 def _stacked(responses: Sequence[MotionResponse]) -> tuple[FloatArray, FloatArray, FloatArray]:

@@ -28,6 +28,7 @@ from swarm_loc_estimator.sensors.ingest import MAX_PAUSE_NS
 from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.contradictions import Contradicted
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.self_calibration import swapped_signs
 from swarm_loc_estimator.timeline.settings import Settings
@@ -66,7 +67,8 @@ def replay(
     swarm = load_swarm(swarm_beside(bag)) if swarm is None else swarm
     periodic = PeriodicSchedule(round(tick_s * 1e9))
     schedule = periodic if stamp_ns is None else ListedSchedule(stamp_ns)
-    runner = Runner(Estimator(swarm, settings), schedule, keep_sightings=keep_sightings)
+    estimator = Estimator(swarm, settings)
+    runner = Runner(estimator, schedule, keep_sightings=keep_sightings)
     summary = read_bag(bag, swarm, runner.take, progress)
     if summary.unusable:
         raise BagError(
@@ -77,6 +79,8 @@ def replay(
     if periodic.jumps:
         jumps = f"The log time jumps ahead by more than an hour, {periodic.jumps} x"
         remarks.append(f"{jumps}; no poses are given meanwhile.")
+    found = estimator.contradictions(summary.range_ns[1])
+    remarks += [f"Note: {one.text}." for one in found if one.kind is Contradicted.CONSTANT]
     result = runner.result(bag.name, summary.range_ns, summary.truth, summary.received)
     if result.self_calibrated:
         remarks += swapped_signs(result.self_calibrated)

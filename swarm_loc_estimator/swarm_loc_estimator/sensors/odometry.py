@@ -38,27 +38,36 @@ class OdometryRows(NamedTuple):
         robot: (k,) index of the robot.
         stamp_ns: (k,) acquisition stamps.
         pose: (k, 3) x [m], y [m], yaw [rad] in the robot's own odom frame.
+        twist: (k, 3) velocity forward and left [m/s] and turn rate [rad/s] of base_link; NaN: not known.
         arrival_ns: (k,) arrival times.
     """
 
     robot: IntArray
     stamp_ns: IntArray
     pose: FloatArray
+    twist: FloatArray
     arrival_ns: IntArray
 
+    @classmethod
+    def without_twist(
+        cls, robot: IntArray, stamp_ns: IntArray, pose: FloatArray, arrival_ns: IntArray
+    ) -> OdometryRows:
+        """Messages of which only the poses are known."""
+        return cls(robot, stamp_ns, pose, np.full(pose.shape, np.nan), arrival_ns)
 
-NO_ODOMETRY = OdometryRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), NO_ROWS)
+
+NO_ODOMETRY = OdometryRows.without_twist(NO_ROWS, NO_ROWS, np.zeros((0, 3)), NO_ROWS)
 
 
 def _columns(
     found: PoseColumns, batch: MessageBatch, robot: IntArray, _known: Known
 ) -> tuple[OdometryRows, Mapping[str, int]]:
-    rows = OdometryRows(robot, found.stamp_ns, found.pose, batch.log_ns)
+    rows = OdometryRows(robot, found.stamp_ns, found.pose, found.twist, batch.log_ns)
     return rows if found.valid.all() else chosen(rows, found.valid), {}
 
 
 def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> OdometryRows:
-    return OdometryRows(message.robot, message.reading_ns, message.columns[0], arrival_ns)
+    return OdometryRows.without_twist(message.robot, message.reading_ns, message.columns[0], arrival_ns)
 
 
 def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: Counter[str]) -> Converter:

@@ -84,7 +84,7 @@ class OdometryModel:
     lag_s: float = number(0.0, "s", 0.0, 10.0, "time constant with which the motion follows the report")
     timeout_s: float = number(1.0, "s", 0.01, 60.0, "time without messages after which the motion is unknown")
     max_speed: float = number(1.0, "m/s", 0.001, 100.0, "steps that imply more are dropped")
-    max_turn_rate: float = number(10.0, "rad/s", 0.01, 1000.0, "bounds the turn while the motion is unknown")
+    max_turn_rate: float = number(10.0, "rad/s", 0.01, 1000.0, "steps that imply more are dropped")
     speed_change: float = number(
         0.1, "m/s/s^0.5", 0.0, 100.0, "random walk of the speed past the newest message"
     )

@@ -18,6 +18,8 @@ class Contradicted(Enum):
     """Contradicted property of a robot or landmark."""
 
     ODOMETRY = "odometry"
+    RESET = "odometry reset"
+    CONSTANT = "constant odometry"
     POSE = "pose"
     SIGHTINGS = "sightings"
     DESCRIPTION = "description"
@@ -46,17 +48,20 @@ def contradictions(
     Args:
         swarm: Gives the names.
         state: Newest state.
-        tracks: Odometry, to detect conflicting sources.
+        tracks: Odometry, to detect conflicting sources, resets and constant poses.
         now_ns: The instant.
     """
     names = [robot.name for robot in swarm.robots] + [f"landmark {mark.id}" for mark in swarm.landmarks]
-    jumping = np.flatnonzero(tracks.has_conflicting_sources(now_ns)).tolist()
+    conflicting = tracks.has_conflicting_sources(now_ns)
+    reset = tracks.had_fault(now_ns) & ~conflicting
     robots = np.flatnonzero(state.tracked).tolist()
     denied = [robot for robot in robots if is_contradicted(state.integrity, robot)]
     contradicted = np.flatnonzero(state.contradicted_ns > NEVER_NS).tolist()
     aside = excluded_pairs(state.integrity, now_ns)
     return [
-        *(_odometry(names[robot]) for robot in jumping),
+        *(_odometry(names[robot]) for robot in np.flatnonzero(conflicting).tolist()),
+        *(_reset(names[robot]) for robot in np.flatnonzero(reset).tolist()),
+        *(_constant(names[robot]) for robot in np.flatnonzero(tracks.integrates_twist()).tolist()),
         *(_pose(names[robot]) for robot in denied),
         *(_sightings(names[observer], names[source]) for observer, source in aside),
         *(_description(names[source], source, state) for source in contradicted),
@@ -67,6 +72,16 @@ def contradictions(
 def _odometry(name: str) -> Contradiction:
     text = f"the odometry of {name} jumps back and forth: it may have two sources"
     return Contradiction(name, Contradicted.ODOMETRY, text)
+
+
+def _reset(name: str) -> Contradiction:
+    text = f"the odometry of {name} jumped or was reset: its motion at that moment is unknown"
+    return Contradiction(name, Contradicted.RESET, text)
+
+
+def _constant(name: str) -> Contradiction:
+    text = f"the odometry of {name} has a constant pose but a twist: integrating the twist"
+    return Contradiction(name, Contradicted.CONSTANT, text)
 
 
 def _pose(name: str) -> Contradiction:

@@ -17,7 +17,8 @@ from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
 from swarm_loc_estimator.filter.prediction import new_scratch, write_predicted
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.odometry.look_up import look_up, new_sample
-from swarm_loc_estimator.odometry.preintegration import Preintegrated, TrackArrays
+from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.odometry.track_arrays import TrackArrays
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 

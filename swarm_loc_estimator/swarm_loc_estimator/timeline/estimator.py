@@ -215,10 +215,11 @@ class Estimator:
     def _use_odometry(self) -> None:
         rows = joined(self._odometry)
         self._odometry = []
-        change = self._tracks.extend(rows.robot, rows.stamp_ns, rows.pose)
+        change = self._tracks.extend(rows.robot, rows.stamp_ns, rows.pose, rows.twist)
         self.drop("odometry_duplicate", change.duplicates)
         self.drop("odometry_too_old", change.too_old)
         self.drop("odometry_jump", change.jumps)
+        self.drop("odometry_reset", change.resets)
         self._timeline.invalidate(change.changed_from_ns)
 
     def _timeline_drops(self) -> dict[str, int]:

@@ -83,7 +83,7 @@ def record(world: World) -> tuple[Recording, Swarm]:
             found = _seen(rng, world, places, true)
             if found.size:
                 pictures.append((index, stamp, found))
-    driven = OdometryRows(*_columns(odometry, [1] * len(odometry)))
+    driven = OdometryRows.without_twist(*_columns(odometry, [1] * len(odometry)))
     seen = DetectionRows(*_columns(pictures, [len(found) for _, _, found in pictures]))
     return Recording("world", driven, seen, truth), swarm
 

@@ -93,7 +93,9 @@ def give(estimator: Estimator, arrivals: Sequence[tuple[int, Event]]) -> None:
     if moved:
         *columns, poses = zip(*moved, strict=True)
         robot, stamp_ns, arrival_ns = np.array(columns, dtype=np.int64)
-        rows["odometry"] = OdometryRows(robot, stamp_ns, np.array(poses, dtype=float), arrival_ns)
+        rows["odometry"] = OdometryRows.without_twist(
+            robot, stamp_ns, np.array(poses, dtype=float), arrival_ns
+        )
     if seen:
         robot, stamp_ns, arrival_ns = np.array(list(zip(*seen, strict=True)), dtype=np.int64)
         detections = joined([event.detections for _, event in arrivals])

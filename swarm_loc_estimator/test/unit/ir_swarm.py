@@ -217,7 +217,7 @@ def messages(events: Sequence[Event], arrivals_ns: Sequence[int]) -> Batch:
     return Batch.of(
         arrivals_ns[0],
         arrivals_ns[-1],
-        odometry=OdometryRows(
+        odometry=OdometryRows.without_twist(
             column([e.robot for e, _ in moves]),
             column([e.stamp_ns for e, _ in moves]),
             np.array([e.pose for e, _ in moves]).reshape(-1, 3),

@@ -31,9 +31,12 @@ Pose = tuple[float, float, float]
 FRAMES = st.sampled_from(["", "a", "ab/odom", "robot17/odom", "r\u00f6/camera"])
 
 
+TWIST = (0.25, -0.125, 2.0)
+
+
 def odometry(frame: str, stamp_ns: int, pose: Pose, child: str = "base") -> bytes:
     (data,) = encode_odometry(
-        frame, child, np.array([stamp_ns]), np.array([pose]), np.zeros((1, 3)), np.eye(6), np.eye(6)
+        frame, child, np.array([stamp_ns]), np.array([pose]), np.array([TWIST]), np.eye(6), np.eye(6)
     )
     return data
 
@@ -79,6 +82,8 @@ def test_odometry_reads_as_by_the_complete_reader(
     expected = [decode_odometry(data) for data in messages]
     assert stamps == [message.stamp_ns for message in expected]
     assert poses == [message.pose for message in expected]
+    twists = [tuple(twist) for part in parts for twist in part.twist.tolist()]
+    assert twists == [message.twist for message in expected] == [TWIST] * len(rows)
     for topic, frame, *_ in rows:
         newest = [row for row in rows if row[0] == topic][-1]
         assert reader.frame_ids[topic] == newest[1], frame
@@ -141,6 +146,7 @@ def test_each_topic_is_read_and_counted_and_malformed_ones_go_no_further() -> No
         [1, 1],
         [10, 20],
         [[*pose], [*pose]],
+        [[*TWIST], [*TWIST]],
         [14, 30],
     ]
     assert read["detections"].detection["id"].tolist() == [7, 8]

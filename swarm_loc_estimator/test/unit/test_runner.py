@@ -44,7 +44,7 @@ def test_what_arrives_at_a_tick_counts_at_the_next_one() -> None:
     runner = Runner(Estimator(swarm), PeriodicSchedule(SECOND))
     stamps_ns = np.array([SECOND // 2, SECOND])
     pose = np.array([[0.0, 0.0, 0.0], [0.01, 0.0, 0.0]])
-    odometry = OdometryRows(np.zeros(2, dtype=np.int64), stamps_ns, pose, stamps_ns)
+    odometry = OdometryRows.without_twist(np.zeros(2, dtype=np.int64), stamps_ns, pose, stamps_ns)
     runner.take(Batch.of(int(stamps_ns[0]), int(stamps_ns[1]), odometry=odometry))
     runner.finish(int(stamps_ns[1]))
     result = runner.result("two", (0, SECOND), {}, {})

@@ -35,7 +35,9 @@ def images(stamp_ns: int, robots: Any, seen: int = SEEN) -> Batch:
     robot = np.repeat(np.array(robots, dtype=np.int64), seen)
     stamps_ns = np.full(robot.size, stamp_ns)
     marker = np.tile(np.arange(seen), len(robots))
-    drive = OdometryRows(np.arange(3), np.full(3, stamp_ns), np.zeros((3, 3)), np.full(3, stamp_ns))
+    drive = OdometryRows.without_twist(
+        np.arange(3), np.full(3, stamp_ns), np.zeros((3, 3)), np.full(3, stamp_ns)
+    )
     seen_now = sightings(robot, stamps_ns, marker)
     return Batch.of(stamp_ns, stamp_ns, odometry=drive, detections=seen_now)
 

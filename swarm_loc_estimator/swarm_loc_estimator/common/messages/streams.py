@@ -26,7 +26,13 @@ from swarm_loc_estimator.common.messages.detections import (
     decode_detections,
 )
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.poses import FixMessage, OdometryMessage, PoseMessage, yaw_of
+from swarm_loc_estimator.common.messages.poses import (
+    POSE_DOUBLES,
+    FixMessage,
+    OdometryMessage,
+    PoseMessage,
+    yaw_of,
+)
 
 BytesArray = NDArray[np.uint8]
 
@@ -49,6 +55,10 @@ _LITTLE_ENDIAN = b"\x00\x01"
 _NAMES = ENCAPSULATION + 8
 """Offset of the first frame name's length, behind the stamp."""
 _DETECTION_SIZE = DETECTION_DTYPE.itemsize
+_TWIST = tuple(8 * (POSE_DOUBLES + 36 + component) for component in (0, 1, 5))
+"""Offsets of x, y and yaw of the twist behind the start of the numbers of nav_msgs/Odometry."""
+_ODOMETRY_NUMBERS = 8 * (POSE_DOUBLES + 36 + 6 + 36)
+"""Size of these numbers [byte]; of other messages with a pose it is less."""
 
 
 class _Models(NamedTuple):
@@ -89,11 +99,13 @@ class PoseColumns:
     Attributes:
         stamp_ns: (n,).
         pose: (n, 3) x [m], y [m], yaw [rad]; yaw is NaN when the quaternion is zero.
+        twist: (n, 3) forward and left [m/s] and turn rate [rad/s] of nav_msgs/Odometry; NaN for other types.
         valid: (n,) whether the bytes were a whole message of the type.
     """
 
     stamp_ns: IntArray
     pose: FloatArray
+    twist: FloatArray
     valid: NDArray[np.bool_]
 
 
@@ -120,15 +132,18 @@ class PoseReader:
     def read(self, batch: MessageBatch) -> PoseColumns:
         """Read messages whose topics are numbered from 0 to `topics`."""
         n = batch.size
-        columns = PoseColumns(np.zeros(n, dtype=np.int64), np.full((n, 3), np.nan), np.ones(n, dtype=bool))
-        k = _read_poses(batch, self._models, 0, columns.stamp_ns, columns.pose)
+        pose, twist = np.full((2, n, 3), np.nan)
+        columns = PoseColumns(np.zeros(n, dtype=np.int64), pose, twist, np.ones(n, dtype=bool))
+        k = _read_poses(batch, self._models, 0, columns.stamp_ns, pose, twist)
         while k < n:
             try:
                 message = self._learn(int(batch.topic[k]), batch.message(k))
-                columns.stamp_ns[k], columns.pose[k] = message.stamp_ns, message.pose
+                columns.stamp_ns[k], pose[k] = message.stamp_ns, message.pose
+                if isinstance(message, OdometryMessage):
+                    twist[k] = message.twist
             except CdrError:
                 columns.valid[k] = False
-            k = _read_poses(batch, self._models, k + 1, columns.stamp_ns, columns.pose)
+            k = _read_poses(batch, self._models, k + 1, columns.stamp_ns, pose, twist)
         return columns
 
     def _learn(self, topic: int, data: bytes) -> OdometryMessage | PoseMessage | FixMessage:
@@ -261,8 +276,10 @@ def _behind_string(data: bytes, offset: int) -> int:
 
 
 @cached_njit
-def _read_poses(batch: MessageBatch, models: _Models, k: int, stamp_ns: IntArray, pose: FloatArray) -> int:
-    """Write stamps (n,) and poses (n, 3) from message k on; return the first that is not like its topic's."""
+def _read_poses(
+    batch: MessageBatch, models: _Models, k: int, stamp_ns: IntArray, pose: FloatArray, twist: FloatArray
+) -> int:
+    """Write stamps (n,), poses and twists (n, 3) from message k on; return the first unlike its topic's."""
     bits = np.empty(7, dtype=np.uint64)
     numbers = bits.view(np.float64)
     while k < batch.offset.size:
@@ -274,6 +291,10 @@ def _read_poses(batch: MessageBatch, models: _Models, k: int, stamp_ns: IntArray
         stamp_ns[k] = _stamp_ns(batch.data, offset)
         pose[k, 0], pose[k, 1] = numbers[0], numbers[1]
         pose[k, 2] = yaw_of(numbers[3], numbers[4], numbers[5], numbers[6])
+        if batch.length[k] >= start + _ODOMETRY_NUMBERS:
+            for i in range(3):
+                bits[i] = _word(batch.data, offset + start + _TWIST[i], 8)
+                twist[k, i] = numbers[i]
         k += 1
     return k
 
