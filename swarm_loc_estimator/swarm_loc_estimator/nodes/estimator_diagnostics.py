@@ -22,6 +22,14 @@ from swarm_loc_estimator.timeline.estimator import Estimate, Status
 from swarm_loc_estimator.timeline.fusion import Verdict
 
 _FULL_LOAD = 0.95
+_CAUSES = {
+    "future_stamp": "are stamped ahead of this computer's clock",
+    "odometry_too_old": "have stamps older than horizon_s: of another clock, or too late",
+    "bad_covariance": "have a covariance that is zero or not positive definite",
+    "non_finite": "are not finite",
+    "absurd": "are absurdly large",
+}
+"""Why messages of a robot are dropped."""
 _PATIENCE_S, _PATIENCE_PERIODS = 10.0, 5.0
 """Timeout of an expected input [s], and in its mean periods."""
 
@@ -118,6 +126,7 @@ class Diagnostics:
             inputs.append((handle, topic))
         self._was_located = np.zeros(len(swarm.robots), dtype=bool)
         self._received = [0] * len(ingest.topics)
+        self._dropped: list[Mapping[str, int]] = [{} for _ in swarm.robots]
         self._reported_ns: int | None = None
 
     def missing(self) -> list[InputTopic]:
@@ -134,7 +143,12 @@ class Diagnostics:
         return "; ".join(f"no messages received on {listed(names)}{cause}" for cause, names in causes)
 
     def reports(
-        self, now_ns: int, estimate: Estimate, recent: Recent, drops: Mapping[str, int]
+        self,
+        now_ns: int,
+        estimate: Estimate,
+        recent: Recent,
+        drops: Mapping[str, int],
+        drops_of: Sequence[Mapping[str, int]] = (),
     ) -> list[Report]:
         """Reports of the robots, then of the swarm's inputs and drops; begins a new interval.
 
@@ -143,6 +157,7 @@ class Diagnostics:
             estimate: The newest estimate.
             recent: The estimator's measurements with verdicts and normalized innovations squared.
             drops: Data not used, by reason.
+            drops_of: The same of each robot.
         """
         elapsed_s = (now_ns - self._reported_ns) * 1e-9 if self._reported_ns is not None else 0.0
         self._reported_ns = now_ns
@@ -152,7 +167,9 @@ class Diagnostics:
         self.duplicate_publishers = common.copy()
         reports = []
         for index, robot in enumerate(self._swarm.robots):
-            report = self._robot_report(index, robot, estimate, now_ns, elapsed_s)
+            lost = self._drop_troubles(index, drops_of[index]) if drops_of else []
+            report = self._robot_report(index, robot, estimate, now_ns, elapsed_s, lost)
+            report.values |= drop_values(drops_of[index]) if drops_of else {}
             report.values["measurements used"] = str(used[index])
             report.values["NIS mean"] = _figure(nis[index])
             reports.append(report)
@@ -177,12 +194,26 @@ class Diagnostics:
         some = {topic: names for topic, names in found.items() if names}
         return [f"{topic} has {len(names)} publishers: {listed(names)}" for topic, names in some.items()]
 
+    def _drop_troubles(self, robot: int, drops: Mapping[str, int]) -> list[str]:
+        """One sentence for each reason for which messages of a robot were dropped in the interval."""
+        before, self._dropped[robot] = self._dropped[robot], dict(drops)
+        grown = {reason: drops.get(reason, 0) - before.get(reason, 0) for reason in _CAUSES}
+        some = [(reason, count) for reason, count in grown.items() if count]
+        return [f"dropped {count} of its data: they {_CAUSES[reason]}" for reason, count in some]
+
     def _robot_report(
-        self, index: int, robot: Robot, estimate: Estimate, now_ns: int, elapsed_s: float
+        self,
+        index: int,
+        robot: Robot,
+        estimate: Estimate,
+        now_ns: int,
+        elapsed_s: float,
+        dropped: Sequence[str],
     ) -> Report:
-        """State and inputs of one robot."""
-        troubles = self._duplicates_on([topic.name for _, topic in self._inputs_of[index]])
-        self.duplicate_publishers += troubles
+        """State and inputs of one robot, with sentences about its dropped data."""
+        duplicates = self._duplicates_on([topic.name for _, topic in self._inputs_of[index]])
+        self.duplicate_publishers += duplicates
+        troubles = [*duplicates, *dropped]
         values: dict[str, object] = {}
         for handle, topic in self._inputs_of[index]:
             troubles += self._input_troubles(handle, topic, robot, now_ns)

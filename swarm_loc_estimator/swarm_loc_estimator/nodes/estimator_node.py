@@ -64,7 +64,6 @@ _ORDINARY_DROPS = frozenset(
         "ir_too_weak",
         "ir_undetermined",
         "odometry_duplicate",
-        "odometry_too_old",
         "reset",
         "too_old",
         "not_localized",
@@ -227,7 +226,8 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         if self._estimate is None:
             return [merged(causes, "estimator")]
         now_ns = self._time_ns()
-        reports = self._diagnostics.reports(now_ns, self._estimate, self._estimator.recent(), drops)
+        own = [self._estimator.drops_of(robot) for robot in range(len(self._swarm.robots))]
+        reports = self._diagnostics.reports(now_ns, self._estimate, self._estimator.recent(), drops, own)
         contradictions = self._estimator.contradictions(now_ns)
         add_contradictions(reports, contradictions)
         add_identities(reports, self._estimator.identities)

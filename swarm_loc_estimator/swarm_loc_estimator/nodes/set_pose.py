@@ -99,12 +99,15 @@ class PoseCommands:
     def _on_initial_pose(self, robot: int, message: PoseWithCovarianceStamped) -> None:
         name, frame = self._swarm.robots[robot].name, message.header.frame_id
         try:
-            self._check_frame(frame)
+            self._check_message(frame, message.pose)
             self._node.get_logger().info(f"by {name}/initialpose: {self._set_pose(robot, message.pose)}")
         except SetPoseError as error:
             self._node.get_logger().warning(f"by {name}/initialpose nothing was changed: {error}")
 
-    def _check_frame(self, frame: str) -> None:
+    def _check_message(self, frame: str, pose: PoseWithCovariance) -> None:
+        if not np.any(pose.covariance):
+            self._estimator.drop("bad_covariance")
+            raise SetPoseError("the covariance is zero.")
         if frame != self._map_frame:
             raise SetPoseError(f"the pose is in frame '{frame}' but must be in '{self._map_frame}'.")
 

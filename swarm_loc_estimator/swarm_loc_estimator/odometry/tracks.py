@@ -51,7 +51,7 @@ class TrackChange:
     Attributes:
         changed_from_ns: (N,) instant after which look-ups of each robot have changed, or UNCHANGED_NS.
         duplicates: Number of dropped rows with the stamp of another row of the robot.
-        too_old: Number of dropped rows older than the oldest accepted stamp.
+        too_old: (k,) robots of dropped rows older than the oldest accepted stamp.
         jumps: Number of new rows beyond the robot's maximum speed or turn rate.
         resets: Number of new rows that contradict their twist, or restart at the origin. The steps to rows
             with a jump or a reset are unknown motion.
@@ -59,7 +59,7 @@ class TrackChange:
 
     changed_from_ns: IntArray
     duplicates: int
-    too_old: int
+    too_old: IntArray
     jumps: int
     resets: int
 
@@ -140,8 +140,9 @@ class OdometryTracks:
         changed_from = np.empty(self._robots, dtype=np.int64)
         found = continue_tracks(self.arrays, self._oldest_ns, robots, stamps_ns, raw, twist, changed_from)
         if found.jumps >= 0:
-            return TrackChange(changed_from, 0, 0, found.jumps, found.resets)
+            return TrackChange(changed_from, 0, robots[:0], found.jumps, found.resets)
         young = stamps_ns >= self._oldest_ns
+        too_old = robots[~young]
         rows = NewRows(robots, stamps_ns + self._delay_ns[robots], raw, twist, young)
         rows, changed_from = self._take_back_later_rows(NewRows(*(column[young] for column in rows)))
         robots, stamps, raw = rows[:3]
@@ -152,7 +153,7 @@ class OdometryTracks:
         ):
             self._grow()
         found = integrate(self.arrays, self._oldest_ns, rows, changed_from)
-        return TrackChange(changed_from, found.duplicates, int((~young).sum()), found.jumps, found.resets)
+        return TrackChange(changed_from, found.duplicates, too_old, found.jumps, found.resets)
 
     def at(self, robots: IntArray, stamps_ns: IntArray) -> OdometrySample:
         """Look up tracks, see `look_up`.

@@ -38,11 +38,13 @@ class InputConverter:
 
     Attributes:
         drops: Number of dropped readings by reason.
+        drops_of: The same of each robot, where a reason concerns all its messages.
         accumulators: Accumulators by sensor.
     """
 
     def __init__(self, swarm: Swarm, settings: SensorSettings) -> None:
         self.drops: Counter[str] = Counter()
+        self.drops_of: list[Counter[str]] = [Counter() for _ in swarm.robots]
         self.accumulators: dict[str, Accumulator] = {
             name: sensor.create_accumulator(swarm)
             for name, sensor in SENSORS.items()
@@ -67,7 +69,7 @@ class InputConverter:
                 continue
             late = rows.stamp_ns > rows.arrival_ns + self._future_ns
             if late.any():
-                self.drops["future_stamp"] += int(np.count_nonzero(late))
+                self.drop_of("future_stamp", rows.robot[late])
                 rows = chosen(rows, ~late)
             found = self._converters[name](rows) if name in self._converters else rows
             if isinstance(found, Measured):
@@ -76,12 +78,18 @@ class InputConverter:
                 kept[name] = found
         return Measurements(batch.begin_ns, batch.end_ns, *_in_order_of_arrival(parts), kept)
 
+    def drop_of(self, reason: str, robots: IntArray) -> None:
+        """Count dropped readings of robots (k,); -1: of none of them."""
+        self.drops[reason] += robots.size
+        for robot in robots[robots >= 0].tolist():
+            self.drops_of[robot][reason] += 1
+
     def _valid(self, found: Measured) -> Measured:
         """Select valid measurements; count the others in `drops`."""
         reasons = reject_reasons(found.measurements)
         reasons[~is_about_swarm(found.measurements, self._robots, self._landmarks)] = BAD_MEASUREMENT
-        counts = np.bincount(reasons, minlength=len(REJECT_REASONS)).tolist()
-        self.drops.update({REJECT_REASONS[k]: counts[k] for k in range(1, len(REJECT_REASONS)) if counts[k]})
+        for k in set(reasons[reasons != VALID].tolist()):
+            self.drop_of(REJECT_REASONS[k], found.measurements["received_from"][reasons == k])
         return chosen(found, reasons == VALID)
 
 

@@ -26,7 +26,7 @@ MAX_PAUSE_NS = 3_600_000_000_000
 
 _STATISTICS_DTYPE = np.dtype(
     [
-        (name, np.int64)
+        (name, np.float64 if name == "late_sum_ns" else np.int64)  # a sum of absurd delays exceeds int64
         for name in (
             "received",
             "malformed",

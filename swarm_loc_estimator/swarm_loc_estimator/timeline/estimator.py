@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -143,6 +144,10 @@ class Estimator:
             total += accumulator.drops
         return {reason: count for reason, count in sorted(total.items()) if count}
 
+    def drops_of(self, robot: int) -> Mapping[str, int]:
+        """Numbers of a robot's dropped data by reason, where a reason tends to concern all its messages."""
+        return self._converter.drops_of[robot]
+
     @property
     def used(self) -> int:
         """Number of measurements used since the last reset."""
@@ -217,7 +222,7 @@ class Estimator:
         self._odometry = []
         change = self._tracks.extend(rows.robot, rows.stamp_ns, rows.pose, rows.twist)
         self.drop("odometry_duplicate", change.duplicates)
-        self.drop("odometry_too_old", change.too_old)
+        self._converter.drop_of("odometry_too_old", change.too_old)
         self.drop("odometry_jump", change.jumps)
         self.drop("odometry_reset", change.resets)
         self._timeline.invalidate(change.changed_from_ns)

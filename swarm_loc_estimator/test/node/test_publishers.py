@@ -141,6 +141,10 @@ def test_a_pose_estimate_of_rviz_sets_a_robot(ros: Ros, robots: Robots) -> None:
     publisher.publish(pose)
     ros.until(lambda: any("in frame 'odom' but must be in 'map'" in entry.msg for entry in log))
     pose.header.frame_id = "map"
+    covariance, pose.pose.covariance = pose.pose.covariance, [0.0] * 36
+    publisher.publish(pose)
+    ros.until(lambda: any("nothing was changed: the covariance is zero." in entry.msg for entry in log))
+    pose.pose.covariance = covariance
     publisher.publish(pose)
     ros.until(lambda: any("by beta/initialpose: Robot 'beta' is at x 3.000 m" in entry.msg for entry in log))
     robots.tell_time(T0_NS + 2 * STEP_NS)

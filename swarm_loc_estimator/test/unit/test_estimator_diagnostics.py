@@ -153,6 +153,34 @@ def test_a_robot_is_told_apart_as_waiting_lost_silent_or_in_a_foreign_frame() ->
     assert b.message == "b/odom is in frame 'odom' but transforms are published for 'b/odom'"
 
 
+@pytest.mark.parametrize(
+    ("reason", "cause"),
+    [
+        ("future_stamp", "they are stamped ahead of this computer's clock"),
+        ("odometry_too_old", "they have stamps older than horizon_s: of another clock, or too late"),
+        ("bad_covariance", "they have a covariance that is zero or not positive definite"),
+    ],
+)
+def test_a_waiting_robot_whose_data_are_dropped_is_told_why(reason: str, cause: str) -> None:
+    world = World()
+    world.odometry("b", 0, 0)
+    waiting = estimate(0, Status.TRACKED, Status.WAITING)
+    _, b, _ = world.reports(0, waiting, recent(), {reason: 20}, [{}, {reason: 20}])
+    assert (b.warning, b.message) == (True, f"dropped 20 of its data: {cause}")
+    assert b.values[f"dropped: {reason}"] == 20
+    _, b, _ = world.reports(0, waiting, recent(), {reason: 20}, [{}, {reason: 20}])
+    assert b.message == "waiting for a sighting or a fix that locates it"
+
+
+def test_delays_of_another_clock_do_not_overflow() -> None:
+    world, now_ns = World(), 1_700_000_000 * SECOND
+    for _ in range(20):
+        world.odometry("b", 0, now_ns)
+    tracked = estimate(now_ns, Status.TRACKED, Status.TRACKED)
+    _, b, _ = world.reports(now_ns, tracked, recent(), {})
+    assert float(str(b.values["odom lateness mean [s]"])) == pytest.approx(1.7e9)
+
+
 def test_a_robot_that_is_too_uncertain_is_named() -> None:
     world = World()
     world.odometry("b", 0, 0)

@@ -308,7 +308,7 @@ def test_trimming_and_growing_keep_look_ups() -> None:
             )
     assert trimmed.arrays.stamp_ns.shape[1] == capacity
     assert kept.arrays.stamp_ns.shape[1] > capacity
-    assert feed(trimmed, np.array([T0 + 100 * SECOND]), np.zeros((1, 3))).too_old == 1
+    assert feed(trimmed, np.array([T0 + 100 * SECOND]), np.zeros((1, 3))).too_old.size == 1
 
 
 def test_calibration_scales_and_delays_the_motion() -> None:

@@ -12,6 +12,7 @@ from core_world import MOUNT, Plan, World, simulate
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -296,3 +297,17 @@ def test_memory_stays_bounded_over_a_long_run() -> None:
     assert len({size[0] for size in sizes}) == 1
     assert max(size[1] for size in sizes) <= 45
     assert max(size[2] for size in sizes[3:]) <= 1.5 * sizes[2][2]
+
+
+def test_drops_are_counted_for_the_robot_whose_data_they_are() -> None:
+    estimator = Estimator(Swarm((Robot("a"), Robot("b"), Robot("c"))))
+    now_ns = T0 + 10 * SECOND
+    stamps_ns = {0: now_ns + 3 * SECOND, 1: now_ns - 1000 * SECOND, 2: now_ns}
+    estimator.tick(now_ns)
+    for robot, stamp_ns in stamps_ns.items():
+        Event(robot, stamp_ns, (0.0, 0.0, 0.0)).give(estimator, now_ns)
+    give_fix(estimator, 2, now_ns, np.zeros(3), np.zeros((3, 3)), now_ns)
+    estimator.tick(now_ns)
+    expected = [{"future_stamp": 1}, {"odometry_too_old": 1}, {"bad_covariance": 1}]
+    assert [dict(estimator.drops_of(robot)) for robot in range(3)] == expected
+    assert estimator.drops == {"bad_covariance": 1, "future_stamp": 1, "odometry_too_old": 1}
