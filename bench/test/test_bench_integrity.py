@@ -20,6 +20,9 @@ SEED = 23
         ("false_sightings", "epuck1", Contradicted.SIGHTINGS),
         ("turned_camera", "epuck1", Contradicted.DESCRIPTION),
         ("two_odometry_sources", "epuck1", Contradicted.ODOMETRY),
+        ("odometry_reset_origin_blind", "epuck1", Contradicted.RESET),
+        ("heading_reset_blind", "epuck1", Contradicted.RESET),
+        ("twist_only", "epuck1", Contradicted.CONSTANT),
     ],
 )
 def test_a_fault_is_named_and_misleads_nobody(scenario: str, about: str, kind: Contradicted) -> None:
