@@ -17,6 +17,8 @@ from bench.shared.common import Cell, table
 PLANS = ("corridor", "office", "ring")
 UNSEEN = ("bend", "atrium", "tee")
 """Halls that nothing was developed in."""
+WIDE = ("open12", "corridor25")
+"""Halls whose walls are out of the laser's range, or do not tell how far along a robot is."""
 SLIPS = (0.0, 0.02, 0.05)
 _SPEED_ROBOTS = (1, 2, 5, 10)
 _SPEED_MINUTES = 5.0
@@ -71,6 +73,7 @@ def planned(effort: MappingEffort) -> dict[str, list[RunSettings]]:
     whole, half = effort.minutes, 0.5 * effort.minutes
     jobs = {plan: seeds(effort.seeds, whole, plan) for plan in PLANS}
     jobs |= {plan: seeds(effort.team_seeds, whole, plan) for plan in UNSEEN}
+    jobs |= {plan: seeds(effort.team_seeds, half, plan, robots=2, checks_covariances=True) for plan in WIDE}
     jobs["corridor.printed"] = seeds(effort.team_seeds, whole, "corridor", printed=True)
     jobs["corridor.px3"] = seeds(effort.team_seeds, whole, "corridor", pixel=0.3)
     jobs["one_robot"] = seeds(effort.team_seeds, half, "corridor")
@@ -94,13 +97,17 @@ def figures_of(results: Mapping[str, Sequence[RunResult]]) -> dict[str, float]:
         figures[f"{name}.good_share"] = float(np.mean([one.is_good for one in runs]))
         reached = [math.isfinite(one.coverage_90_s) for one in runs]
         figures[f"{name}.coverage_90_share"] = float(np.mean(reached))
+        if name in WIDE:
+            figures[f"{name}.misleading_share"] = float(np.mean([one.misleading_share for one in runs]))
+            unreported = sum(one.is_diverged_unreported for one in runs)
+            figures[f"{name}.diverged_unreported"] = float(unreported)
     return figures
 
 
 def report(results: Mapping[str, Sequence[RunResult]]) -> None:
     """Print a table of medians."""
     head = ["runs", "n", "diverged", "online", "good", "position cm", "deg", "worst", "online cm"]
-    head += ["aligned cm", "wall cm", "aligned", "coverage", "90 % s", "CPU s/s", "bumps"]
+    head += ["aligned cm", "wall cm", "aligned", "coverage", "90 % s", "CPU s/s", "bumps", "misleading"]
     rows: list[list[Cell]] = []
     for name, runs in _mapped(results):
         numbers: list[Cell] = [
@@ -115,7 +122,8 @@ def report(results: Mapping[str, Sequence[RunResult]]) -> None:
         ]
         keys = ["online_position_cm", "aligned_cm", "wall_cm", "wall_aligned_cm", "coverage"]
         numbers += [_median(runs, key) for key in [*keys, "coverage_90_s", "cpu_s_per_s"]]
-        rows.append([*numbers, float(np.mean([one.bumps for one in runs]))])
+        numbers.append(float(np.mean([one.bumps for one in runs])))
+        rows.append([*numbers, float(np.mean([one.misleading_share for one in runs]))])
     print(table(head, rows))
 
 

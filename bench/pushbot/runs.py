@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -14,6 +14,7 @@ from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.mapper_feed import fix_covariance
 
 DIVERGED_CM = 30.0
 GOOD_CM, GOOD_DEG = 10.0, 2.0
@@ -21,6 +22,7 @@ COVERED_M = 0.06
 """A piece of wall is covered if a cell so near is occupied."""
 COVERED_SHARE = 0.9
 _LOOK_EVERY_S = 10.0
+_MISLEADING_SIGMAS, _MISLEADING_M, _UNREPORTED_SIGMAS = 5.0, 0.02, 3.0
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,7 @@ class RunSettings:
         pixel: Noise of the tracker [px].
         lights: Whether LEDs of other robots are seen.
         printed: Whether the paper's method makes the map.
+        checks_covariances: Whether poses are compared with their covariances when they are told.
     """
 
     plan: str
@@ -46,6 +49,7 @@ class RunSettings:
     pixel: float = 0.1
     lights: bool = True
     printed: bool = False
+    checks_covariances: bool = False
 
 
 @dataclass(frozen=True)
@@ -68,6 +72,8 @@ class RunResult:
         bumps: How often a robot hit something.
         cells: (n, 2) occupied cells [m].
         path: (m, 3) robot, x, y of all poses [m].
+        misleading_share: Share of poses off by more than 5 sigma and 2 cm when told; NaN: not compared.
+        is_diverged_unreported: Whether one was off by more than `DIVERGED_CM` and 3 sigma.
     """
 
     settings: RunSettings
@@ -85,6 +91,8 @@ class RunResult:
     bumps: int
     cells: FloatArray
     path: FloatArray
+    misleading_share: float = math.nan
+    is_diverged_unreported: bool = False
 
     @property
     def is_diverged(self) -> bool:
@@ -113,15 +121,31 @@ def run(settings: RunSettings) -> RunResult:
         share = 1.0 if settings.robots == 1 else 0.5 + 0.5 * number / (settings.robots - 1)
         exploration.join(PushBotNoise(slip=settings.slip * share, pixel=settings.pixel))
     places: list[tuple[int, float]] = []
+    covariances: list[FloatArray] = []
     covered = _Covered(plan, mapper)
 
     def note(arrival: Arrival) -> None:
         places.append(_place(mapper, arrival))
+        if settings.checks_covariances and isinstance(mapper, CooperativeMapper):
+            covariances.append(fix_covariance(mapper.covariance(arrival.robot)))
         covered.look(arrival.time_s)
 
     exploration.run(60.0 * settings.minutes, note)
     mapper.finish()
-    return _score(settings, plan, exploration, mapper, _final(mapper, exploration, places), covered.since_s)
+    found = _score(settings, plan, exploration, mapper, _final(mapper, exploration, places), covered.since_s)
+    return _compared(found, exploration, np.array(covariances)) if covariances else found
+
+
+def _compared(result: RunResult, exploration: Exploration, covariances: FloatArray) -> RunResult:
+    """A result with the poses (n,) of all arrivals compared with their covariances (n, 3, 3)."""
+    off = np.array([(one.online - one.truth)[:2] for one in exploration.arrivals])
+    squared = np.einsum("ki,kij,kj->k", off, np.linalg.inv(covariances[:, :2, :2]), off)
+    distance = np.hypot(off[:, 0], off[:, 1])
+    misleading = (distance > _MISLEADING_M) & (squared > _MISLEADING_SIGMAS**2)
+    unreported = (100.0 * distance > DIVERGED_CM) & (squared > _UNREPORTED_SIGMAS**2)
+    return replace(
+        result, misleading_share=float(misleading.mean()), is_diverged_unreported=bool(unreported.any())
+    )
 
 
 class _Covered:

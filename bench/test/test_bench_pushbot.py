@@ -71,6 +71,17 @@ def test_figures_count_what_diverged_and_what_never_came() -> None:
     assert not any(name.startswith("speed1") for name in figures)
 
 
+def test_a_laser_that_sees_no_walls_at_first_misleads_nobody() -> None:
+    """The covariance says that the heading gets lost, and the first wall tells how the wheels slipped."""
+    settings = RunSettings("open12", 0.05, 7, minutes=4.0, checks_covariances=True)
+    found = run(settings)
+    figures = figures_of({"open12": [found]})
+    assert figures["open12.misleading_share"] == 0.0
+    assert figures["open12.diverged_unreported"] == 0.0
+    assert found.worst_cm < 100.0
+    assert found.heading_deg < 15.0
+
+
 def test_a_short_run_is_scored_and_comes_out_the_same_twice() -> None:
     settings = RunSettings("office", 0.02, 5, minutes=2.0)
     first, second = run(settings), run(settings)

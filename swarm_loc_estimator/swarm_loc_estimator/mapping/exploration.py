@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
@@ -180,6 +180,10 @@ _LATTICE, _CANDIDATES = 0.2, 260
 _MIN_PATH = 0.3
 _REACH_SHARE = 0.72
 """Share of the laser's range within which walls are measured accurately."""
+_OPEN_WEIGHT = 0.2
+"""Weight of places without a wall in sight, where the heading gets lost, beside others."""
+_MIN_WALL = 0.6
+"""Length of the walls in sight of a place below which it is in the open; false echoes are shorter [m]."""
 _CROWD_RADIUS, _GOAL_RADIUS, _GOAL_WEIGHT = 0.45, 2.0, 0.8
 
 
@@ -214,11 +218,17 @@ def next_stop(
     if not len(cells):
         return position, position
     points = grid.corner + (cells + 0.5) * grid.cell
+    reach = int(_REACH_SHARE * settings.max_range / grid.cell)
+    size = 2 * reach + 1
+    walls = size**2 * uniform_filter((grid.state == WALL).astype(float), size, mode="constant")
+    sees_walls = walls[tuple(cells.T)] * grid.cell > _MIN_WALL
     if home is not None:
         values = -np.hypot(*(points - home).T)
+    elif not sees_walls.any():  # straight away from all former stops, until a wall is in sight
+        values = np.hypot(*(points - stops.mean(axis=0)).T)
     else:
-        reach = int(_REACH_SHARE * settings.max_range / grid.cell)
         gains = information_gain(grid.state, grid.evidence, cells, reach)
+        gains *= np.where(sees_walls, 1.0, _OPEN_WEIGHT)
         crowd = (np.hypot(*(points[:, None] - stops).transpose(2, 0, 1)) < _CROWD_RADIUS).sum(axis=1)
         values = (gains + 2.0) / (1.0 + crowd) / (length[tuple(cells.T)] * grid.cell + 1.0)
         for goal in goals:

@@ -11,7 +11,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import between, wrap_angle
-from swarm_loc_estimator.mapping.matching import Lattice, accumulate, search_offsets
+from swarm_loc_estimator.mapping.matching import Lattice, accumulate, agreement, search_offsets
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
 from swarm_loc_estimator.mapping.scans import LightSightings
 from swarm_loc_estimator.mapping.stops import ScanStop
@@ -110,6 +110,56 @@ def align_all(graph: PoseGraph) -> None:
         graph.fit(stop)
 
 
+_KNOWN_SLIP, _SLIP_SIGMAS, _SLIP_STEP = 0.006, 3.5, 0.002
+"""Standard deviation below which a slip counts as known, how far it is searched, and in which steps."""
+_MIN_SLIP_BEAMS, _OFF_LOSS, _SLIP_WEIGHT = 50, 1.3, 0.5
+"""Minimum number of matched beams, loss of a beam off its line, and weight of the losses (shared errors)."""
+
+
+def find_slip(graph: PoseGraph, begin: int, stop: int) -> bool:
+    """Search the slip of a robot that saw no wall twice so far, by its two newest scans.
+
+    In the open nothing tells how much the wheels slip, and the heading becomes unknown with every scan. The
+    slip that makes two scans of the same walls agree tells all headings since the start.
+
+    Returns:
+        Whether the slip is known, so that scans can be matched at the poses that odometry predicts.
+    """
+    robot = int(graph.robot[stop])
+    if robot in graph.known_slips:
+        return True
+    sigma = graph.slip_sigma(robot)
+    count = math.ceil(_SLIP_SIGMAS * sigma / _SLIP_STEP)
+    changes = _SLIP_STEP * np.arange(-count, count + 1)
+    before = graph.states[[begin, stop]].copy()
+    costs, matched = np.zeros((2, changes.size))
+    for number, change in enumerate(changes.tolist()):
+        graph.change_slip(robot, change, (begin, stop))
+        costs[number], matched[number] = _misfit(graph, begin, stop)
+        graph.states[[begin, stop]] = before
+    graph.change_slip(robot, 0.0, (begin, stop))
+    chances = np.exp(-_SLIP_WEIGHT * (costs - costs.min()) - 0.5 * (changes / sigma) ** 2)
+    mean = float(np.average(changes, weights=chances))
+    spread = math.sqrt(float(np.average((changes - mean) ** 2, weights=chances)))
+    if matched[np.argmin(costs)] < _MIN_SLIP_BEAMS or spread > _KNOWN_SLIP:
+        return False
+    graph.known_slips.add(robot)
+    graph.slip[robot] += mean
+    graph.change_slip(robot, mean)
+    for one in (begin, stop):
+        graph.targets[one] = graph.neighbours(one, _TARGETS, _MIN_OVERLAP)
+        graph.match_both_ways(one)
+    graph.solve(6, gate=_GATE)
+    return True
+
+
+def _misfit(graph: PoseGraph, begin: int, stop: int) -> tuple[float, int]:
+    """Loss of the beams of two stops at the lines of the other one, and number of those that match."""
+    pairs = [agreement(graph.scans, *pair, 0.0, 1) for pair in ((begin, stop), (stop, begin))]
+    matched, tried, loss = (sum(values) for values in zip(*pairs, strict=True))
+    return loss + _OFF_LOSS * (tried - matched), matched
+
+
 _RADIUS, _MIN_AGE, _MIN_STOPS = 1.8, 10, 12
 _REACH, _MIN_REACH, _SIGMAS = 0.55, 0.15, 3.5
 _TURN_REACH, _MIN_TURN_REACH = math.radians(9.0), math.radians(3.0)
@@ -170,7 +220,7 @@ def refine(graph: PoseGraph, stop: int, against: list[int]) -> bool:
     for _ in range(4):
         H, g, fit = np.zeros((8, 8)), np.zeros(8), 0.0
         for other in against:
-            matched, tried = accumulate(graph.scans, stop, other, _LOOP_GATE, 1, H, g)
+            matched, tried, _ = accumulate(graph.scans, stop, other, _LOOP_GATE, 1, H, g)
             fit = max(fit, matched / max(1, tried))
         held = H[:3, :3] + np.diag([1.0 / 0.05**2, 1.0 / 0.05**2, 1.0 / 0.03**2])
         graph.states[stop, :3] += np.linalg.solve(held, g[:3])

@@ -23,6 +23,7 @@ from swarm_loc_estimator.mapping.localization import (
     align_all,
     align_start,
     close_loop,
+    find_slip,
 )
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
 from swarm_loc_estimator.mapping.scans import LightSightings, Readings, turn_ratio
@@ -268,14 +269,17 @@ class CooperativeMapper:
         motion = between(track.left, stop.arrival)
         sigma = self._motion_sigma(track.path, abs(float(motion[2])))
         pose = self._driven(track, stop.arrival)
+        begin = track.node
         if track.passes:
             node = self._replace(track.node, pose, sigma, stop.sigma)
         else:
-            begin, node = track.node, self.graph.add_stop(robot, pose, stop.sigma)
+            node = self.graph.add_stop(robot, pose, stop.sigma)
             self.graph.constraints.add_departure(begin, node, self.graph.turned[begin], motion, sigma)
         self.begin_ns[node] = int(stop.stamp_ns[0])
         self.graph.set_scan(node, stop.turn[:count], stop.inverse[:count])
         track.node, track.passes = node, self.graph.count > self.settings.max_stops
+        if node != begin and not find_slip(self.graph, begin, node):
+            return
         if not align(self.graph, node, track.path):
             self.counters["scans_refused"] += 1
         if close_loop(self.graph, node):
@@ -309,6 +313,7 @@ class CooperativeMapper:
         ratio = turn_ratio(turn, inverse, stop.sigma)
         if not math.isnan(ratio):
             self.graph.slip[robot] = 1.0 - ratio
+            self.graph.known_slips.add(robot)
         cuts = np.searchsorted(furthest, np.array(_START_PARTS) + 1e-6)
         bounds = sorted({0, *cuts[cuts < count].tolist(), count})
         nodes: list[int] = []
@@ -328,6 +333,7 @@ class CooperativeMapper:
             nodes.append(node)
         track.node = nodes[-1]
         self.graph.starts.update(nodes)
+        self.graph.place[nodes] = nodes[0]
         align_start(self.graph, nodes, track.prior_sigma)
 
     def _choose_goal(self, robot: int, track: _Track, stop: ScanStop) -> None:
@@ -356,7 +362,7 @@ class CooperativeMapper:
         track.goal = Goal(number, hop, there, int(stop.stamp_ns[stop.looked - 1]), pose)
 
     def _look_for_home(self, track: _Track, node: int) -> None:
-        """Send a robot with a large position sigma back to an old stop nearby."""
+        """Send a robot with a large position sigma back to an old stop nearby from which walls were seen."""
         graph = self.graph
         if track.home is not None and math.dist(track.home, graph.states[node, :2]) < _AT_HOME:
             track.home = None
@@ -366,7 +372,7 @@ class CooperativeMapper:
         if variances.max() <= _LOST_SIGMA**2:
             return
         away = graph.distances(node)
-        old = (away < _HOME_RADIUS) & (np.arange(graph.count) < node - _HOME_AGE)
+        old = (away < _HOME_RADIUS) & (np.arange(graph.count) < node - _HOME_AGE) & graph.sees_walls
         if old.any():
             cost = np.where(old, away + 0.02 * np.arange(graph.count), np.inf)
             track.home = graph.states[int(np.argmin(cost)), :2].copy()

@@ -29,9 +29,14 @@ _OPTIMISM = 2.5
 def fix_covariance(covariance: FloatArray) -> FloatArray:
     """Covariance (3, 3) of a fix, inflated from that of its stop in the graph (3, 3) [m, rad].
 
-    Successive fixes share most of their errors, which the estimator knows by `systematic_share`.
+    Successive fixes share most of their errors, which the estimator knows by `systematic_share`. The graph is
+    linear in the heading: a way d is off by t J d if the heading is off by t. Of this way, which follows from
+    the covariance of position and heading, the error is t^2 d / 2 along it, with a second moment of 3/4 of
+    the squared variance of t.
     """
     whole: FloatArray = _OPTIMISM * covariance + np.diag(_LEAST_SIGMA**2)
+    cross = _OPTIMISM * covariance[:2, 2]
+    whole[:2, :2] += 0.75 * np.outer((cross[1], -cross[0]), (cross[1], -cross[0]))
     return whole
 
 

@@ -26,6 +26,8 @@ _ROUGHNESS = 0.004
 """Standard deviation of walls from straight lines [m]."""
 _GATE_VARIANCES = 16.0
 _RANGE_SIGMAS = 2.5
+_IMITATED = 5.0
+"""Information along lines over what errors of their normals imitate, below which it is no information."""
 
 OFF, UNUSABLE, FIT = 0, 1, 2
 """Result for a beam: off the line; not comparable; on the line."""
@@ -113,12 +115,15 @@ def agreement(scans: Scans, k: int, j: int, gate: float, stride: int) -> tuple[i
 @cached_njit
 def accumulate(
     scans: Scans, k: int, j: int, gate: float, stride: int, H: FloatArray, g: FloatArray
-) -> tuple[int, int]:
-    """Add the normal equations of a pair of stops to H (8, 8) and g (8,); returns matched and tried beams.
+) -> tuple[int, int, float]:
+    """Add the normal equations of a pair of stops to H (8, 8) and g (8,).
 
     The unknowns are x, y, theta, ratio of stop k, then those of stop j; H dx = g is the Gauss-Newton step.
+
+    Returns:
+        Matched and tried beams, and the information along the lines that errors of their normals imitate.
     """
-    matched, tried = 0, 0
+    matched, tried, imitated = 0, 0, 0.0
     row = np.zeros(8)
     for i in range(0, scans.beams.counts[k], stride):
         if scans.beams.inverse[k, i] <= 0.0:
@@ -133,11 +138,12 @@ def accumulate(
         _jacobian(scans, k, i, j, distance, nx, ny, row)
         row[7] = row[6] * scans.lines.turn[j, int(m)]
         weight = 1.0 / (variance * (1.0 + residual * residual / variance / CAUCHY))
+        imitated += weight * per_metre * per_metre * scans.lines.normal_variance[j, int(m)]
         for a in range(8):
             g[a] += weight * row[a] * residual
             for b in range(8):
                 H[a, b] += weight * row[a] * row[b]
-    return matched, tried
+    return matched, tried, imitated
 
 
 @cached_njit
@@ -159,24 +165,54 @@ def _jacobian(
 
 @cached_njit
 def match_pairs(
-    scans: Scans, pairs: IntArray, weights: FloatArray, gate: float, stride: int
+    scans: Scans, pairs: IntArray, places: IntArray, weights: FloatArray, gate: float, stride: int
 ) -> tuple[FloatArray, FloatArray]:
     """Weighted normal equations (p, 8, 8) and (p, 8) of pairs (p, 2) of stops: beams of one, lines of other.
 
     Args:
         scans: All stops.
         pairs: (p, 2).
+        places: (p,) number from 0 on of the place of the stop whose beams are matched.
         weights: (p,) weight of each pair, since its beams share errors.
         gate: See `beam_residual` [m].
         stride: Every `stride`-th beam is used, with `stride` times the weight.
     """
     H, g = np.zeros((len(pairs), 8, 8)), np.zeros((len(pairs), 8))
+    at_place = np.zeros((places.max() + 1, 4))  # information on x, x and y, y; what is imitated
     for p in range(len(pairs)):
-        matched, _ = accumulate(scans, pairs[p, 0], pairs[p, 1], gate, stride, H[p], g[p])
+        matched, _, imitated = accumulate(scans, pairs[p, 0], pairs[p, 1], gate, stride, H[p], g[p])
         scale = weights[p] * stride if matched * stride >= MIN_MATCHED else 0.0
         H[p] *= scale
         g[p] *= scale
+        for i, value in enumerate((H[p, 0, 0], H[p, 0, 1], H[p, 1, 1], scale * imitated)):
+            at_place[places[p], i] += value
+    for p in range(len(pairs)):
+        xx, xy, yy, imitated = at_place[places[p]]
+        if 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy) < _IMITATED * imitated:
+            _remove_direction(H[p], g[p], 0.5 * math.atan2(2.0 * xy, xx - yy) + 0.5 * math.pi)
     return H, g
+
+
+@cached_njit
+def _remove_direction(H: FloatArray, g: FloatArray, angle: float) -> None:
+    """Remove the information of a pair on its offset in the direction of an angle.
+
+    In a corridor no wall is across. What the lines seem to tell of the way along it are errors of their
+    normals, which are small but add up over many beams, and would be taken for measurements.
+    """
+    x, y = math.cos(angle), math.sin(angle)
+    for first in (0, 4):
+        along = x * g[first] + y * g[first + 1]
+        g[first] -= along * x
+        g[first + 1] -= along * y
+        for c in range(8):
+            along = x * H[first, c] + y * H[first + 1, c]
+            H[first, c] -= along * x
+            H[first + 1, c] -= along * y
+        for r in range(8):
+            along = x * H[r, first] + y * H[r, first + 1]
+            H[r, first] -= along * x
+            H[r, first + 1] -= along * y
 
 
 _APART_M = 0.2

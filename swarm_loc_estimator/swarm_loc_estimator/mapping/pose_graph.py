@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.se2 import compose
 from swarm_loc_estimator.mapping import constraints as model
 from swarm_loc_estimator.mapping.constraints import STOP_UNKNOWNS, NormalEquations, NormalFactor
 from swarm_loc_estimator.mapping.matching import Scans, agreement, match_pairs
@@ -53,6 +54,10 @@ class ConstraintLists:
         for rows in (self._priors, self._departures, self._ties, self._bearings):
             rows[:] = [one for one in rows if stop not in one[:2]]
 
+    def departures(self) -> Iterator[_Row]:
+        """Stop of departure, of arrival, and turn, motion and sigmas, see `constraints.Departures`."""
+        yield from self._departures
+
     def linearised(self, states: FloatArray) -> Iterator[model.Linearised]:
         """Linearize all constraints at states (k, 4)."""
         if self._priors:
@@ -83,6 +88,8 @@ _SMALL_STEP = (1e-3, 1e-3, 5e-4)
 MATCH_GATE = 0.03
 """Maximum distance of a matched beam from its line in the final solution [m]."""
 _OVERLAP_STRIDE = 6
+_MIN_SEEN_BINS = 15
+"""Directions with a usable line, one degree each, from which a stop sees walls."""
 
 
 class PoseGraph:
@@ -96,11 +103,13 @@ class PoseGraph:
         count: Number of stops.
         states: (capacity, 4) x [m], y [m], theta on arrival [rad], true turn over turn by odometry.
         robot: (capacity,) number of the robot of each stop.
+        place: (capacity,) first stop at the same place; parts of a first scan share one.
         turned: (capacity,) turn by odometry at the stop so far [rad].
         slip: (R,) share of turns lost to wheel slip, per robot.
         constraints: All constraints except beam matches.
         targets: Stop -> stops against whose lines its beams are matched.
         starts: Stops of first scans.
+        known_slips: Robots whose slip scans have told.
     """
 
     def __init__(self, settings: MapperSettings) -> None:
@@ -108,11 +117,13 @@ class PoseGraph:
         self.count = 0
         self.states = np.zeros((64, 4))
         self.robot: IntArray = np.zeros(64, dtype=np.int64)
+        self.place: IntArray = np.zeros(64, dtype=np.int64)
         self.turned = np.zeros(64)
         self.slip = np.zeros(0)
         self.constraints = ConstraintLists()
         self.targets: dict[int, list[int]] = {}
         self.starts: set[int] = set()
+        self.known_slips: set[int] = set()
         self._turned_all = np.zeros(64)
         self._fitted_ratio = np.ones(64)
         self._beams, self._lines = no_beams(64), no_lines(64)
@@ -129,6 +140,12 @@ class PoseGraph:
         """(count, 3) of all stops on arrival, in map."""
         return self.states[: self.count, :3]
 
+    @property
+    def sees_walls(self) -> BoolArray:
+        """(count,) whether walls that scans can be matched with were seen from each stop."""
+        seen: BoolArray = self._lines.usable[: self.count].sum(axis=1) >= _MIN_SEEN_BINS
+        return seen
+
     def add_robot(self) -> int:
         """Add a robot; returns its number."""
         self.slip = np.append(self.slip, self.settings.usual_slip)
@@ -142,7 +159,7 @@ class PoseGraph:
         k = self.count
         self.count += 1
         self.states[k] = (*pose[:3], 1.0 - self.slip[robot])
-        self.robot[k] = robot
+        self.robot[k], self.place[k] = robot, k
         self._beams.sigma[k] = sigma
         return k
 
@@ -165,6 +182,23 @@ class PoseGraph:
         self.turned[stop] = turn[-1]
         self._turned_all[stop] = np.abs(turn).max()
         self.fit(stop)
+
+    def slip_sigma(self, robot: int) -> float:
+        """Standard deviation of the slip of a robot."""
+        variance = self._factor_of_all().covariance(np.array([STOP_UNKNOWNS * self.count + robot]))
+        return math.sqrt(max(float(variance[0, 0]), 0.0))
+
+    def change_slip(self, robot: int, change: float, stops: Iterable[int] | None = None) -> None:
+        """Change the slip of a robot at some or all of its stops, which move as by odometry."""
+        moved = set(np.flatnonzero(self.robot[: self.count] == robot).tolist() if stops is None else stops)
+        self.states[list(moved), 3] -= change
+        for begin, end, row in self.constraints.departures():
+            if begin in moved and end in moved:
+                x, y, theta, ratio = self.states[begin]
+                self.states[end, :3] = compose(np.array([x, y, theta + ratio * row[0]]), row[1:4])
+                self.states[end, 2] = theta + ratio * (row[0] + row[3])
+        for stop in moved:
+            self.fit(stop)
 
     def heading_at_departure(self, stop: int) -> float:
         """The heading after all turns at a stop [rad]."""
@@ -278,13 +312,14 @@ class PoseGraph:
                     weights.append(min(1.0, (_START_WEIGHT if start else _MATCH_WEIGHT) / len(targets)))
         if pairs:
             index = np.array(pairs, dtype=np.int64)
-            squares, gradient = match_pairs(self.scans, index, np.array(weights), gate, stride)
+            places: IntArray = np.unique(self.place[index[:, 0]], return_inverse=True)[1]
+            squares, gradient = match_pairs(self.scans, index, places, np.array(weights), gate, stride)
             unknowns = STOP_UNKNOWNS * index[:, :, None] + np.arange(STOP_UNKNOWNS)
             equations.add_blocks(unknowns.reshape(-1, 8), squares, gradient)
 
     def _grow(self) -> None:
         """Double the capacity."""
-        self.states, self.robot = _doubled(self.states), _doubled(self.robot)
+        self.states, self.robot, self.place = map(_doubled, (self.states, self.robot, self.place))
         self.turned, self._turned_all = _doubled(self.turned), _doubled(self._turned_all)
         self._fitted_ratio = _doubled(self._fitted_ratio)
         self._beams = Beams(*(_doubled(one) for one in self._beams))

@@ -115,6 +115,7 @@ class Lines(NamedTuple):
         distance: (k, BINS) along the direction [m].
         variance: (k, BINS) of the line's inverse distance along the direction [1/m^2].
         turn: (k, BINS) turn by odometry at which the direction was scanned [rad].
+        normal_variance: (k, BINS) of the direction of the normal [rad^2].
         usable: (k, BINS) whether the normal is accurate enough for scan matching.
     """
 
@@ -124,14 +125,15 @@ class Lines(NamedTuple):
     distance: FloatArray
     variance: FloatArray
     turn: FloatArray
+    normal_variance: FloatArray
     usable: NDArray[np.bool_]
 
 
 def no_lines(capacity: int) -> Lines:
     """Memory for the lines of `capacity` stops."""
     shape = (capacity, BINS)
-    a, b, distance, variance, turn = np.zeros((5, *shape))
-    return Lines(np.zeros(shape, dtype=np.int8), a, b, distance, variance, turn, np.zeros(shape, dtype=bool))
+    numbers = np.zeros((6, *shape))
+    return Lines(np.zeros(shape, dtype=np.int8), *numbers, np.zeros(shape, dtype=bool))
 
 
 @cached_njit
@@ -214,6 +216,7 @@ def _fit_bin(stop: int, m: int, total: FloatArray, sigma: float, least: float, l
             lines.distance[stop, m] = 1.0 / y
             lines.variance[stop, m] = c * c * vaa + 2.0 * c * s * vab + s * s * vbb
             normal_variance = (b * b * vaa - 2.0 * a * b * vab + a * a * vbb) / (square * square)
+            lines.normal_variance[stop, m] = normal_variance
             lines.usable[stop, m] = normal_variance < _MAX_NORMAL_SIGMA**2
         if best < math.inf:
             lines.kind[stop, m] = LINE
@@ -272,7 +275,7 @@ _OUTLIER = 9.0
 
 @cached_njit
 def turn_ratio(turn: FloatArray, inverse: FloatArray, sigma: float) -> float:
-    """The turn ratio at which beams (n,) agree best with those one turn later; NaN if too few overlap.
+    """The turn ratio at which beams (n,) agree best with those one turn later; NaN if too few see a wall.
 
     Args:
         turn: (n,) by odometry, increasing or decreasing throughout [rad].
@@ -281,6 +284,8 @@ def turn_ratio(turn: FloatArray, inverse: FloatArray, sigma: float) -> float:
     """
     forward = np.abs(turn - turn[0])
     best, found = math.inf, math.nan
+    if np.sum(inverse > 0.0) < 2 * MIN_OVERLAP:
+        return found
     for m in range(round((_HIGH - _LOW) / _STEP) + 1):
         ratio = _HIGH - m * _STEP
         cost, count = _disagreement(forward, inverse, sigma, 2.0 * math.pi / ratio)

@@ -131,6 +131,19 @@ def test_whenever_the_estimator_starts_the_first_fix_of_a_mapper_locates_a_robot
         assert errors.position_rmse < 0.25
 
 
+@pytest.mark.parametrize("sigma", [0.1, 0.5, 1.0, 2.0])
+def test_a_fix_with_a_poor_heading_says_where_the_robot_may_be(sigma: float) -> None:
+    """Positions lie on an arc about where the heading was last known; the graph knows the tangent only."""
+    way, turns = np.array([4.0, -3.0]), sigma * np.random.default_rng(3).standard_normal(2000)
+    lever = np.array([3.0, 4.0, 1.0])
+    covariance = fix_covariance(sigma**2 * np.outer(lever, lever) + np.diag([0.02, 0.02, 0.01]) ** 2)
+    x, y = np.cos(turns) - 1.0, np.sin(turns)
+    off = np.column_stack([x * way[0] - y * way[1], y * way[0] + x * way[1]])
+    squared = np.einsum("ki,ij,kj->k", off, np.linalg.inv(covariance[:2, :2]), off)
+    assert squared.mean() < 2.5
+    assert (squared > 25.0).mean() <= 0.001
+
+
 def test_the_covariance_of_a_fix_is_that_of_the_mapper_and_never_smaller() -> None:
     stop = np.diag([0.01, 0.02, 0.01]) ** 2
     assert np.linalg.eigvalsh(fix_covariance(stop) - stop).min() > 0.0

@@ -74,6 +74,17 @@ def test_robots_spread_and_keep_off_each_other() -> None:
     assert math.dist(blocked, free) > 2.0 * SETTINGS.robot_radius
 
 
+def test_where_no_wall_is_in_sight_a_robot_goes_straight_on() -> None:
+    """Not about, since its heading gets lost with every scan; single false echoes are no walls."""
+    evidence = np.full((400, 400), -2.0)
+    evidence[150, 260] = evidence[260, 150] = 2.0
+    occupancy = OccupancyMap(np.array([-4.0, -4.0]), CELL, evidence)
+    stops = np.array([[-0.8, 0.0], [-0.4, 0.0], [0.0, 0.0]])
+    hop, goal = next_stop(occupancy, stops[-1], stops, NOBODY, NOBODY, SETTINGS)
+    assert goal[0] > 3.0
+    assert hop[0] > 0.5
+
+
 def test_a_robot_with_no_way_out_stays() -> None:
     occupancy = OccupancyMap(np.zeros(2), CELL, np.zeros((100, 100)))
     position = np.array([1.0, 1.0])

@@ -19,6 +19,7 @@ from swarm_loc_estimator.mapping.matching import (
     accumulate,
     agreement,
     beam_residual,
+    match_pairs,
     search_offsets,
 )
 from swarm_loc_estimator.mapping.scans import (
@@ -110,7 +111,7 @@ def test_jacobians_are_those_of_finite_differences(change: list[float], beam: in
 
     one = found._replace(states=found.states + here.reshape(2, 4), beams=only(found, beam))
     H, g = np.zeros((8, 8)), np.zeros(8)
-    assert accumulate(one, 0, 1, 10.0, 1, H, g) == (1, 1)
+    assert accumulate(one, 0, 1, 10.0, 1, H, g)[:2] == (1, 1)
     weight = 1.0 / (variance * (1.0 + residual**2 / variance / CAUCHY))
     assert np.allclose(H, weight * np.outer(numeric, numeric), atol=1e-4 * np.abs(H).max())
     assert np.allclose(g, weight * numeric * residual, atol=1e-4 * np.abs(g).max())
@@ -122,6 +123,34 @@ def only(found: Scans, beam: int) -> Beams:
     set_beams(beams, 0, found.beams.turn[0, beam : beam + 1], found.beams.inverse[0, beam : beam + 1])
     beams.sigma[:] = SIGMA
     return beams
+
+
+def in_corridor(rng: np.random.Generator) -> Scans:
+    """Two stops between two endless walls along x, 2.6 m apart."""
+    beams, lines = no_beams(2), no_lines(2)
+    for stop, pose in enumerate(POSES):
+        sine = np.sin(pose[2] + TURN)
+        distance = np.where(sine > 0.0, 2.6 - pose[1], pose[1]) / np.maximum(np.abs(sine), 1e-9)
+        seen = distance < MAX_RANGE
+        beams.sigma[stop] = SIGMA
+        set_beams(beams, stop, TURN, seen / distance + seen * SIGMA * rng.standard_normal(len(TURN)))
+        fit_lines(stop, 1.0, MAX_RANGE, beams, lines)
+    return Scans(np.column_stack([POSES, [1.0, 1.0]]), beams, lines, MAX_RANGE)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_walls_along_a_corridor_tell_nothing_of_the_way_along_it(seed: int) -> None:
+    """Errors of their normals imitate information, as of a wall across."""
+    rng = np.random.default_rng(seed)
+    pairs, places = np.array([[0, 1], [1, 0]]), np.array([0, 0])
+    corridor, room = (
+        match_pairs(found, pairs, places, np.ones(2), 0.03, 1)[0].sum(axis=0)
+        for found in (in_corridor(rng), scans(rng))
+    )
+    along, across = np.linalg.eigvalsh(corridor[:2, :2])
+    assert along < 1e-6 * across
+    assert across > 1e3
+    assert np.linalg.eigvalsh(room[:2, :2])[0] > 1e3
 
 
 def test_search_finds_an_offset_and_no_second_place() -> None:
