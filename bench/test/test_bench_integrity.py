@@ -60,6 +60,7 @@ def test_a_kidnapped_robot_comes_back() -> None:
     assert found.recovery_s <= 3.0
 
 
+@pytest.mark.timeout(400)
 def test_an_estimator_that_starts_late_locates_robots_that_map(tmp_path: Path) -> None:
     found = run_late_start(SEED, tmp_path)
     assert found.misleading_share <= 0.001

@@ -180,8 +180,6 @@ _LATTICE, _CANDIDATES = 0.2, 260
 _MIN_PATH = 0.3
 _REACH_SHARE = 0.72
 """Share of the laser's range within which walls are measured accurately."""
-_OPEN_WEIGHT = 0.2
-"""Weight of places without a wall in sight, where the heading gets lost, beside others."""
 _MIN_WALL = 0.6
 """Length of the walls in sight of a place below which it is in the open; false echoes are shorter [m]."""
 _CROWD_RADIUS, _GOAL_RADIUS, _GOAL_WEIGHT = 0.45, 2.0, 0.8
@@ -228,7 +226,6 @@ def next_stop(
         values = np.hypot(*(points - stops.mean(axis=0)).T)
     else:
         gains = information_gain(grid.state, grid.evidence, cells, reach)
-        gains *= np.where(sees_walls, 1.0, _OPEN_WEIGHT)
         crowd = (np.hypot(*(points[:, None] - stops).transpose(2, 0, 1)) < _CROWD_RADIUS).sum(axis=1)
         values = (gains + 2.0) / (1.0 + crowd) / (length[tuple(cells.T)] * grid.cell + 1.0)
         for goal in goals:

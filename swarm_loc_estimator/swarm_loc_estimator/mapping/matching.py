@@ -172,23 +172,24 @@ def match_pairs(
     Args:
         scans: All stops.
         pairs: (p, 2).
-        places: (p,) number from 0 on of the place of the stop whose beams are matched.
+        places: (p,) number from 0 on of the first scan that the stop with the beams is part of; -1: none.
         weights: (p,) weight of each pair, since its beams share errors.
         gate: See `beam_residual` [m].
         stride: Every `stride`-th beam is used, with `stride` times the weight.
     """
     H, g = np.zeros((len(pairs), 8, 8)), np.zeros((len(pairs), 8))
-    at_place = np.zeros((places.max() + 1, 4))  # information on x, x and y, y; what is imitated
+    at_place = np.zeros((len(pairs), 4))  # information on x, x and y, y; what is imitated
     for p in range(len(pairs)):
         matched, _, imitated = accumulate(scans, pairs[p, 0], pairs[p, 1], gate, stride, H[p], g[p])
         scale = weights[p] * stride if matched * stride >= MIN_MATCHED else 0.0
         H[p] *= scale
         g[p] *= scale
-        for i, value in enumerate((H[p, 0, 0], H[p, 0, 1], H[p, 1, 1], scale * imitated)):
-            at_place[places[p], i] += value
+        if places[p] >= 0:
+            for i, value in enumerate((H[p, 0, 0], H[p, 0, 1], H[p, 1, 1], scale * imitated)):
+                at_place[places[p], i] += value
     for p in range(len(pairs)):
-        xx, xy, yy, imitated = at_place[places[p]]
-        if 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy) < _IMITATED * imitated:
+        xx, xy, yy, imitated = at_place[max(places[p], 0)]
+        if places[p] >= 0 and 0.5 * (xx + yy) - math.hypot(0.5 * (xx - yy), xy) < _IMITATED * imitated:
             _remove_direction(H[p], g[p], 0.5 * math.atan2(2.0 * xy, xx - yy) + 0.5 * math.pi)
     return H, g
 

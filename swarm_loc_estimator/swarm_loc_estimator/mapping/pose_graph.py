@@ -109,7 +109,7 @@ class PoseGraph:
         constraints: All constraints except beam matches.
         targets: Stop -> stops against whose lines its beams are matched.
         starts: Stops of first scans.
-        known_slips: Robots whose slip scans have told.
+        known_slips: Robots whose slip is known from scans.
     """
 
     def __init__(self, settings: MapperSettings) -> None:
@@ -312,7 +312,8 @@ class PoseGraph:
                     weights.append(min(1.0, (_START_WEIGHT if start else _MATCH_WEIGHT) / len(targets)))
         if pairs:
             index = np.array(pairs, dtype=np.int64)
-            places: IntArray = np.unique(self.place[index[:, 0]], return_inverse=True)[1]
+            first = [self.place[stop] if stop in self.starts else -1 for stop, _ in pairs]
+            places: IntArray = np.unique([-1, *first], return_inverse=True)[1][1:] - 1
             squares, gradient = match_pairs(self.scans, index, places, np.array(weights), gate, stride)
             unknowns = STOP_UNKNOWNS * index[:, :, None] + np.arange(STOP_UNKNOWNS)
             equations.add_blocks(unknowns.reshape(-1, 8), squares, gradient)
