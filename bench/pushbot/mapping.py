@@ -99,7 +99,7 @@ def figures_of(results: Mapping[str, Sequence[RunResult]]) -> dict[str, float]:
         figures[f"{name}.coverage_90_share"] = float(np.mean(reached))
         if name in WIDE:
             figures[f"{name}.misleading_share"] = float(np.mean([one.misleading_share for one in runs]))
-            unreported = sum(one.is_diverged_unreported for one in runs)
+            unreported = sum(one.diverged_unreported for one in runs)
             figures[f"{name}.diverged_unreported"] = float(unreported)
     return figures
 

@@ -73,7 +73,7 @@ class RunResult:
         cells: (n, 2) occupied cells [m].
         path: (m, 3) robot, x, y of all poses [m].
         misleading_share: Share of poses off by more than 5 sigma and 2 cm when told; NaN: not compared.
-        is_diverged_unreported: Whether one was off by more than `DIVERGED_CM` and 3 sigma.
+        diverged_unreported: 1 if one was off by more than `DIVERGED_CM` and 3 sigma, else 0.
     """
 
     settings: RunSettings
@@ -92,7 +92,7 @@ class RunResult:
     cells: FloatArray
     path: FloatArray
     misleading_share: float = math.nan
-    is_diverged_unreported: bool = False
+    diverged_unreported: float = 0.0
 
     @property
     def is_diverged(self) -> bool:
@@ -144,7 +144,7 @@ def _compared(result: RunResult, exploration: Exploration, covariances: FloatArr
     misleading = (distance > _MISLEADING_M) & (squared > _MISLEADING_SIGMAS**2)
     unreported = (100.0 * distance > DIVERGED_CM) & (squared > _UNREPORTED_SIGMAS**2)
     return replace(
-        result, misleading_share=float(misleading.mean()), is_diverged_unreported=bool(unreported.any())
+        result, misleading_share=float(misleading.mean()), diverged_unreported=float(unreported.any())
     )
 
 

@@ -132,8 +132,9 @@ class Lines(NamedTuple):
 def no_lines(capacity: int) -> Lines:
     """Memory for the lines of `capacity` stops."""
     shape = (capacity, BINS)
-    numbers = np.zeros((6, *shape))
-    return Lines(np.zeros(shape, dtype=np.int8), *numbers, np.zeros(shape, dtype=bool))
+    a, b, distance, variance, turn, normal = np.zeros((6, *shape))
+    kind, usable = np.zeros(shape, dtype=np.int8), np.zeros(shape, dtype=bool)
+    return Lines(kind, a, b, distance, variance, turn, normal, usable)
 
 
 @cached_njit
