@@ -23,6 +23,7 @@ from swarm_loc_estimator.offline.datasets.droplets import (
 from swarm_loc_estimator.offline.datasets.droplets_bag import (
     METRES_PER_PIXEL,
     ImportSettings,
+    find_fiducials,
     import_recording,
 )
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
@@ -149,6 +150,30 @@ def test_the_bag_holds_the_truth_however_the_image_is_turned(tmp_path: Path, mir
         np.testing.assert_allclose(pose[0], math.hypot(dx, dy), atol=1e-6)
         off = se2.wrap_angle(pose[1:] - [math.atan2(dy, dx), heading])
         np.testing.assert_allclose(off, 0.0, atol=2e-3)  # orientations are printed to a tenth of a degree
+
+
+@pytest.mark.parametrize(("seed", "robot"), [(0, ROOT), (1, ROOT), (2, 0xB)])
+def test_a_fiducial_that_is_misread_while_its_robot_stands_at_one_place_is_corrected(
+    seed: int, robot: int
+) -> None:
+    """All robots move aside every 30 s; at two of these stands the fiducial is read turned by a half."""
+    ones = []
+    for stand in range(6):
+        for k, one in enumerate(exchanges(seed + 10 * stand, count=24)):
+            turn = 2 * QUARTER if stand in (2, 4) else 0.0
+            seen = tuple(
+                replace(s, x=s.x + 8.0 * stand, orientation=s.orientation + (turn if s.id == robot else 0.0))
+                for s in one.sightings
+            )
+            ones.append(replace(one, time_s=100.0 + 40.0 * stand + k, sightings=seen))
+    truth = clean(ones)
+    fiducials = find_fiducials(ones, truth.poses, np.array(load_ir_platform("droplet_2016").angles))
+    assert len(fiducials.misread) == 2
+    for where in truth.poses:
+        for one, seen in where.items():
+            heading = fiducials.pose(one, seen, METRES_PER_PIXEL)[2]
+            expected = PLACES[one][2] + (2 if one == ROOT else 1) * QUARTER
+            assert abs(float(se2.wrap_angle(heading - expected))) < 1e-6
 
 
 def test_a_file_that_is_no_recording_is_refused(tmp_path: Path) -> None:

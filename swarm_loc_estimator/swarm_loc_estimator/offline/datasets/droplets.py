@@ -183,11 +183,19 @@ class Place:
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Pose of a standing robot in the image: x, y [px], orientation [rad], as in `Sighting`."""
+    """Pose of a standing robot in the image.
+
+    Attributes:
+        x: [px], to the right.
+        y: [px], downwards.
+        orientation: As in `Sighting` [rad].
+        stand: Number of the place at which the robot stands; poses of one place have the same quarter turn.
+    """
 
     x: float
     y: float
     orientation: float
+    stand: int
 
 
 @dataclass
@@ -213,9 +221,11 @@ def clean(exchanges: Sequence[Exchange]) -> CleanTruth:
         else:
             owned.setdefault(place.owner, []).append(place)
     poses: list[dict[int, CameraPose]] = [{} for _ in exchanges]
+    stand = 0
     for owner, places in owned.items():
         for place in _without_overlaps(places, remarks):
-            _write(place, owner, poses, remarks)
+            stand += 1
+            _write(place, owner, stand, poses, remarks)
     return CleanTruth(poses, remarks)
 
 
@@ -256,6 +266,7 @@ def _without_overlaps(places: list[Place], remarks: Counter[str]) -> list[Place]
 def _write(
     place: Place,
     owner: int,
+    stand: int,
     poses: list[dict[int, CameraPose]],
     remarks: Counter[str],
 ) -> None:
@@ -269,7 +280,7 @@ def _write(
         )
         until = place.moments[k + 1] if k + 1 < len(place.moments) else moment + 1
         for between in range(moment, until):
-            poses[between][owner] = CameraPose(seen.x, seen.y, turned)
+            poses[between][owner] = CameraPose(seen.x, seen.y, turned, stand)
 
 
 def _within_quarter(angle: float) -> float:

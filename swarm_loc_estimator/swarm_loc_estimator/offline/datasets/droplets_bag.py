@@ -4,7 +4,8 @@ The orientation of the fiducials on the robots is found from the brightness matr
 
 The sums of a brightness matrix over sensors and emitters point to the other robot whatever the board's curves
 are, eqs (5)-(10) of the Droplet paper. The mean of each robot gives the quarter turn of its fiducial, and all
-together whether the image is mirrored.
+together whether the image is mirrored. The mean while a robot stood at one place shows whether its fiducial
+was misread there.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
@@ -52,6 +54,9 @@ _CLEAR = 8.0
 """Matrices whose brightest reading is not this far above the noise are not used [sigma]."""
 _ONE_WAY = 0.5
 """If the mean vector of all directions is shorter, matrices and camera contradict each other."""
+_VOTES, _AGREED, _NEAR_QUARTER = 5, 0.7, math.radians(30.0)
+"""A fiducial was misread at a stand if at least this number of directions have a mean vector of at least this
+length within this angle of another quarter turn. Dark elements turn directions by up to 60 degrees."""
 
 
 @dataclass(frozen=True)
@@ -61,14 +66,16 @@ class Fiducials:
     Attributes:
         handedness: 1 if x and y of the image are those of map, -1 if y points the other way.
         turn_of: Robot -> from the orientation of its fiducial to its own [rad], a multiple of a quarter turn.
+        misread: `CameraPose.stand` -> additional turn where the fiducial was misread [rad].
     """
 
     handedness: int
     turn_of: Mapping[int, float]
+    misread: Mapping[int, float]
 
     def pose(self, robot: int, seen: CameraPose, metres_per_pixel: float) -> Pose2:
         """The robot's pose x, y [m], heading [rad] in map."""
-        turned = self.handedness * seen.orientation + self.turn_of[robot]
+        turned = self.handedness * seen.orientation + self.turn_of[robot] + self.misread.get(seen.stand, 0.0)
         x, y = metres_per_pixel * seen.x, self.handedness * metres_per_pixel * seen.y
         return x, y, float(wrap_angle(turned))
 
@@ -93,38 +100,69 @@ def find_fiducials(
         if one.receiver in where and one.transmitter in where and one.readings.max() > floor
     ]
     clear, there = [exchanges[k] for k in rows], [poses[k] for k in rows]
-    found = [(*_turns(clear, there, angles, sign), sign) for sign in (1, -1)]
-    share, turns, handedness = max(found, key=lambda one: one[0])
+    found = [(_directions(clear, there, angles, sign), sign) for sign in (1, -1)]
+    directions, handedness = max(found, key=lambda one: _share(one[0]))
+    share = _share(directions)
     if share < _ONE_WAY:
         raise DropletRecordingError(
             f"brightness matrices and camera contradict each other: directions agree to {share:.2f}"
             f" of 1 in {len(rows)} exchanges, at least {_ONE_WAY} is needed."
         )
+    turns = {robot: _QUARTER * round(np.angle(_sum(of)) / _QUARTER) for robot, of in directions.items()}
+    misread = {
+        stand: turn
+        for robot, of_stands in directions.items()
+        for stand, of_stand in of_stands.items()
+        if (turn := _misread_turn(np.array(of_stand) * np.exp(-1j * turns[robot])))
+    }
     usual = float(np.median(list(turns.values())))
     everybody = {robot for where in poses for robot in where}
-    return Fiducials(handedness, {robot: turns.get(robot, usual) for robot in everybody})
+    return Fiducials(handedness, {robot: turns.get(robot, usual) for robot in everybody}, misread)
 
 
-def _turns(
+Directions = dict[int, dict[int, list[complex]]]
+"""Unit vectors from the orientation of a fiducial to the robot's heading, by robot and stand."""
+
+
+def _directions(
     exchanges: Sequence[Exchange], poses: Sequence[Mapping[int, CameraPose]], angles: FloatArray, sign: int
-) -> tuple[float, dict[int, float]]:
-    """Length of the mean vector of all directions, at most 1, and the turn of each robot."""
-    found: dict[int, list[complex]] = {}
+) -> Directions:
+    """Directions of all robots; each depends on the positions of both robots but on one orientation only."""
+    found: Directions = {}
     units = np.exp(1j * angles)
     for one, where in zip(exchanges, poses, strict=True):
         light = np.clip(one.readings, 0.0, None)
         bearing = np.angle(units @ light.sum(axis=1))
         heading = np.angle(-(units @ light @ units.conj()))
         receiver, transmitter = where[one.receiver], where[one.transmitter]
-        along = math.atan2(sign * (transmitter.y - receiver.y), transmitter.x - receiver.x)
-        forward = along - bearing
-        found.setdefault(one.receiver, []).append(np.exp(1j * (forward - sign * receiver.orientation)))
-        turned = forward + heading - sign * transmitter.orientation
-        found.setdefault(one.transmitter, []).append(np.exp(1j * turned))
-    sums = {robot: sum(values) for robot, values in found.items()}
-    turns = {robot: _QUARTER * round(np.angle(total) / _QUARTER) for robot, total in sums.items()}
-    share = sum(abs(total) for total in sums.values()) / max(sum(map(len, found.values())), 1)
-    return share, turns
+        forward = math.atan2(sign * (transmitter.y - receiver.y), transmitter.x - receiver.x) - bearing
+        for robot, there, by_matrix in (
+            (one.receiver, receiver, forward),
+            (one.transmitter, transmitter, forward + heading),
+        ):
+            turn = np.exp(1j * (by_matrix - sign * there.orientation))
+            found.setdefault(robot, {}).setdefault(there.stand, []).append(turn)
+    return found
+
+
+def _sum(of_stands: Mapping[int, Sequence[complex]]) -> complex:
+    """Sum of all directions of a robot."""
+    return sum((direction for of_stand in of_stands.values() for direction in of_stand), 0j)
+
+
+def _share(directions: Directions) -> float:
+    """Length of the mean vector of all directions, at most 1."""
+    count = sum(len(of_stand) for of_stands in directions.values() for of_stand in of_stands.values())
+    return sum(abs(_sum(of_stands)) for of_stands in directions.values()) / max(count, 1)
+
+
+def _misread_turn(directions: NDArray[np.complex128]) -> float:
+    """Multiple of a quarter turn that the directions (k,) of one stand clearly show [rad]; 0: none."""
+    mean = np.mean(directions)
+    off = float(np.angle(mean))
+    turn = _QUARTER * round(off / _QUARTER)
+    clear = len(directions) >= _VOTES and abs(mean) >= _AGREED and abs(off - turn) < _NEAR_QUARTER
+    return turn if clear else 0.0
 
 
 def _noise(exchanges: Sequence[Exchange]) -> float:
@@ -188,6 +226,9 @@ def import_recording(
     progress(0.3, "cleaning")
     truth = clean(sized)
     fiducials = find_fiducials(sized, truth.poses, np.array(platform.angles))
+    truth.remarks["orientations contradicted by brightness matrices, corrected"] = sum(
+        seen.stand in fiducials.misread for where in truth.poses for seen in where.values()
+    )
     swarm = _describe(sized, truth.poses, settings.platform, platform)
     progress(0.6, "writing")
     places = [
