@@ -11,6 +11,10 @@ from swarm_loc_estimator.common.jit import inlined_njit
 from swarm_loc_estimator.common.small_matrix import factor_numbers
 
 _STUDENT_DOF = 4.0
+_MISREAD = 0.25 * np.pi
+"""Minimum error of the heading of a misread fiducial [rad]."""
+NO_HEADING = 1e4
+"""Variance of a heading that is not used [rad^2]."""
 
 
 def gate_threshold(probability: ArrayLike, degrees_of_freedom: int = 2) -> FloatArray:
@@ -55,6 +59,16 @@ def position_distance(
     x, y = innovation[0], innovation[1]
     distance: float = (d * x * x - 2.0 * b * x * y + a * y * y) / (a * d - b * b)
     return distance
+
+
+@inlined_njit
+def is_misread(innovation: float, variance: float, gate: float) -> bool:
+    """Whether a fix has the heading of a fiducial that was misread, turned by a quarter or a half.
+
+    Such errors last for seconds, so down-weighting each of them does not suffice.
+    """
+    misread: bool = abs(innovation) > _MISREAD and innovation * innovation > gate * variance
+    return misread
 
 
 @inlined_njit

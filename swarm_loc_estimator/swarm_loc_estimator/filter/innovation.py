@@ -13,7 +13,9 @@ from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
 from swarm_loc_estimator.filter.belief import BeliefArrays, covariance_within, own_within
 from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS, inflate_fix, use_mean
 from swarm_loc_estimator.filter.gating import (
+    NO_HEADING,
     POSE_GATE,
+    is_misread,
     position_distance,
     soften_heading,
     squared_distance,
@@ -190,7 +192,11 @@ def evaluate(
         return
     if measurements.has_heading[k]:
         before = (noise[0, 2], noise[1, 2], noise[2, 2])
-        soften_heading(innovation, s, noise)
+        if measurements.observer[k] < 0 and is_misread(innovation[2], s[2, 2], measurements.gate[k]):
+            noise[0, 2] = noise[1, 2] = noise[2, 0] = noise[2, 1] = 0.0
+            noise[2, 2] = NO_HEADING
+        else:
+            soften_heading(innovation, s, noise)
         for i in range(3):
             s[i, 2] += noise[i, 2] - before[i]
             if i < 2:

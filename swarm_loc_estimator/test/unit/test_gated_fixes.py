@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
+from core_geometry import wrapped
 from core_messages import SECOND, T0, give_fix
+from ir_swarm import DROPLET, Place, exchange, messages
 
 from swarm_loc_estimator.filter.integrity.divergence import LossLimits, count_gated
 from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, NOBODY, MeasurementColumns
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
+from swarm_loc_estimator.swarm.ir_board import RobotIr
 from swarm_loc_estimator.swarm.swarm import RandomWalk, Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradicted
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
@@ -18,6 +22,9 @@ from swarm_loc_estimator.timeline.settings import Settings
 ROOT, NEIGHBOUR = 0, 1
 LIMITS = LossLimits(1.0, 0.3, 12, 10.0)
 WALKER = Swarm((Robot("root", camera=None, stands=True, random_walk=RandomWalk(1e-6, 1e-4)),))
+WALKING = RandomWalk(5e-6, 3e-2)
+IRS = [RobotIr(k + 1, DROPLET, "droplet") for k in range(5)]
+RING = 0.5 * np.pi * np.arange(-1, 4)
 NOISE = np.diag(np.square([0.002, 0.002, 0.02]))
 HERE, THERE = np.array([0.1, 0.2, 0.3]), np.array([0.4, 0.0, 1.3])
 
@@ -79,3 +86,32 @@ def test_a_robot_that_was_carried_away_is_not_told_as_tracked_until_it_is_found(
     assert told[9] == told[17] == (True, True)
     assert named[10]
     assert {one.kind for one in estimator.contradictions(T0 + 17 * SECOND)} <= {Contradicted.DESCRIPTION}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_fiducial_read_turned_for_half_a_minute_moves_no_neighbour(seed: int) -> None:
+    """One robot reads all others and alone has fixes; for a spell their headings are turned by a half."""
+    rng = np.random.default_rng(seed)
+    swarm = Swarm(
+        tuple(
+            Robot(f"droplet{k}", camera=None, stands=True, random_walk=WALKING, ir=IRS[k]) for k in range(5)
+        )
+    )
+    poses = np.column_stack([0.13 * np.cos(RING), 0.13 * np.sin(RING), rng.uniform(-np.pi, np.pi, 5)])
+    poses[ROOT] = 0.0
+    estimator, errors = Estimator(swarm, Settings(lost_heading_sigma=1.5, fix_window_s=60.0)), list[float]()
+    for second in range(100):
+        stamp_ns = T0 + second * SECOND
+        turned = np.array([0.0, 0.0, np.pi if 45 <= second < 75 else 0.0])
+        lit = 1 + second % (3 if second < 45 else 4)  # the last one is not heard before
+        lights = exchange(rng, poses, lit, stamp_ns)
+        events = [Place(ROOT, stamp_ns, poses[ROOT] + turned), *(one for one in lights if one.robot == ROOT)]
+        estimator.receive(messages(events, [stamp_ns] * len(events)))
+        estimate = estimator.tick(stamp_ns)
+        tracked = estimate.status == Status.TRACKED
+        error = wrapped(estimate.poses - poses)
+        errors += np.hypot(error[:, 0], error[:, 1])[tracked].tolist()
+        if tracked[ROOT]:
+            assert abs(error[ROOT, 2]) < 0.5
+    assert tracked.all()
+    assert max(errors) < 0.02
