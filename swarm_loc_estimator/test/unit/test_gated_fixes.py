@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from core_geometry import wrapped
 from core_messages import SECOND, T0, give_fix
-from ir_swarm import DROPLET, Place, exchange, messages
+from ir_swarm import DROPLET, Event, Place, exchange, messages
 
 from swarm_loc_estimator.filter.integrity.divergence import LossLimits, count_gated
 from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
@@ -105,7 +105,10 @@ def test_a_fiducial_read_turned_for_half_a_minute_moves_no_neighbour(seed: int) 
         turned = np.array([0.0, 0.0, np.pi if 45 <= second < 75 else 0.0])
         lit = 1 + second % (3 if second < 45 else 4)  # the last one is not heard before
         lights = exchange(rng, poses, lit, stamp_ns)
-        events = [Place(ROOT, stamp_ns, poses[ROOT] + turned), *(one for one in lights if one.robot == ROOT)]
+        events: list[Event] = [
+            Place(ROOT, stamp_ns, poses[ROOT] + turned),
+            *(one for one in lights if one.robot == ROOT),
+        ]
         estimator.receive(messages(events, [stamp_ns] * len(events)))
         estimate = estimator.tick(stamp_ns)
         tracked = estimate.status == Status.TRACKED

@@ -170,9 +170,9 @@ def test_a_fiducial_that_is_misread_while_its_robot_stands_at_one_place_is_corre
     fiducials = find_fiducials(ones, truth.poses, np.array(load_ir_platform("droplet_2016").angles))
     assert len(fiducials.misread) == 2
     for where in truth.poses:
-        for one, seen in where.items():
-            heading = fiducials.pose(one, seen, METRES_PER_PIXEL)[2]
-            expected = PLACES[one][2] + (2 if one == ROOT else 1) * QUARTER
+        for name, pose in where.items():
+            heading = fiducials.pose(name, pose, METRES_PER_PIXEL)[2]
+            expected = PLACES[name][2] + (2 if name == ROOT else 1) * QUARTER
             assert abs(float(se2.wrap_angle(heading - expected))) < 1e-6
 
 
