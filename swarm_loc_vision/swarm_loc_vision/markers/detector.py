@@ -131,11 +131,13 @@ class MarkerDetector:
         for family, ids in families.items():
             used = np.arange(len(family.words)) if ids is None else ids
             by_side.setdefault(family.side, {})[family] = used
+        self._touching = any(family.touching for family in families)
         self._dictionaries = {side: Dictionary(used) for side, used in by_side.items()}
 
     def detect(self, gray: Gray) -> Detections:
         """The markers in an image (height, width)."""
-        quads = find_quads(gray, self._settings.min_side_px, self._settings.min_contrast)
+        settings = self._settings
+        quads = find_quads(gray, settings.min_side_px, settings.min_contrast, touching=self._touching)
         surplus = max(len(quads) - _MAX_CANDIDATES, 0)
         if surplus:
             quads = quads[np.sort(np.argsort(_diagonals(quads))[surplus:])]

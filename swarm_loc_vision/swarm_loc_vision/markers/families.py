@@ -54,12 +54,14 @@ class Family:
         code: FAMILY_* of swarm_loc_msgs/MarkerDetection.
         border: Width of the black border [cells].
         words: (N,) words of the ids.
+        touching: Whether the corners touch those of other dark squares, as in Kalibr's grids.
     """
 
     name: str
     code: int
     border: int
     words: NDArray[np.uint64]
+    touching: bool = False
 
     @property
     def side(self) -> int:
@@ -120,6 +122,7 @@ def families() -> dict[str, Family]:
         Family("artoolkit_bch_thick", CODE_ARTOOLKIT_BCH, 3, words),
         Family("aruco_mip_36h12", CODE_ARUCO_MIP_36H12, 1, mip),
         Family("apriltag_36h11", CODE_APRILTAG_36H11, 1, tags),
+        Family("apriltag_36h11_thick", CODE_APRILTAG_36H11, 2, tags, touching=True),
     )
     return {family.name: family for family in known}
 

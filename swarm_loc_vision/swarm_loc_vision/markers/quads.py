@@ -51,17 +51,20 @@ _LEFT = 4
 """Index of the direction to the left; the eight directions count counter-clockwise from the right."""
 _LONGEST_OUTLINE = 4
 """Maximum number of points of an outline, relative to height plus width of the image."""
+_CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 WINDOWS = ((7, 25), (35,))
 """Sides of the neighbourhoods of the local mean [px], in full and in half resolution."""
 
 
-def find_quads(gray: Gray, min_side: float, min_contrast: float) -> FloatArray:
+def find_quads(gray: Gray, min_side: float, min_contrast: float, *, touching: bool = False) -> FloatArray:
     """Find dark quadrangles in full and in half resolution, without duplicates.
 
     Args:
         gray: (height, width).
         min_side: Minimum side of a quadrangle [px].
         min_contrast: Minimum difference from the local mean [counts]; raised for noisy images.
+        touching: Whether quadrangles may touch others at their corners: the dark areas are then eroded by a
+            pixel, and the sides lie up to a pixel too far inside.
 
     Returns:
         (N, 4, 2) corners, clockwise in the image, on the boundary between dark and light [px].
@@ -78,7 +81,10 @@ def find_quads(gray: Gray, min_side: float, min_contrast: float) -> FloatArray:
             scaled = cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
         contrast = max(min_contrast, _NOISE_SIGMAS * _noise(scaled))
         for window in windows:
-            quads = _quads(_dark(scaled, window, contrast), min_side / scale)
+            dark = _dark(scaled, window, contrast)
+            if touching:
+                dark = np.asarray(cv2.erode(dark, _CROSS), np.uint8)
+            quads = _quads(dark, min_side / scale)
             found.append((quads + 0.5) * scale - 0.5)
     return _distinct(np.concatenate([np.zeros((0, 4, 2)), *found]))
 

@@ -40,7 +40,14 @@ def match(detections: Detections, truths: list[Truth]) -> list[tuple[int, Truth]
 
 
 @pytest.mark.parametrize(
-    "name", ["artoolkit_bch_thin", "artoolkit_bch_thick", "aruco_mip_36h12", "apriltag_36h11"]
+    "name",
+    [
+        "artoolkit_bch_thin",
+        "artoolkit_bch_thick",
+        "aruco_mip_36h12",
+        "apriltag_36h11",
+        "apriltag_36h11_thick",
+    ],
 )
 def test_markers_of_all_families_are_found_where_they_are(name: str) -> None:
     family = family_named(name)
@@ -52,6 +59,52 @@ def test_markers_of_all_families_are_found_where_they_are(name: str) -> None:
     errors = [detections.corners[row] - truth.corners for row, truth in pairs]
     assert math.sqrt(np.mean(np.sum(np.square(errors), axis=2))) < 0.06
     assert (detections.family == family.code).all()
+
+
+CELL_PX = 10
+TAG_PX, GAP_PX = 10 * CELL_PX, 3 * CELL_PX
+
+
+def kalibr_grid(rows: int, columns: int) -> NDArray[np.uint8]:
+    """A grid as Kalibr prints it: tags with a border of two cells, dark squares at their corners."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    pitch = TAG_PX + GAP_PX
+    grid = np.full((rows * pitch + 5 * GAP_PX, columns * pitch + 5 * GAP_PX), 255, np.uint8)
+    for row, column in np.ndindex(rows + 1, columns + 1):
+        y, x = 2 * GAP_PX + row * pitch, 2 * GAP_PX + column * pitch
+        grid[y : y + GAP_PX, x : x + GAP_PX] = 0
+        if row < rows and column < columns:
+            tag = cv2.aruco.generateImageMarker(dictionary, row * columns + column, TAG_PX, borderBits=2)
+            inside = np.s_[y + GAP_PX : y + GAP_PX + TAG_PX, x + GAP_PX : x + GAP_PX + TAG_PX]
+            grid[inside] = np.rot90(tag, 2)  # OpenCV has them upside down
+    return grid
+
+
+@pytest.mark.parametrize("width", [300, 480, 960])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_all_tags_of_a_grid_of_kalibr_are_found_where_they_are(width: int, seed: int) -> None:
+    rng, grid = np.random.default_rng(seed), kalibr_grid(2, 4)
+    scale = width / grid.shape[1]
+    outline = np.array([[0, 0], [grid.shape[1], 0], [grid.shape[1], grid.shape[0]], [0, grid.shape[0]]])
+    seen = outline * scale + 40.0 + rng.uniform(-0.2, 0.2, (4, 2)) * scale * grid.shape[0]
+    to_image = cv2.getPerspectiveTransform(outline.astype(np.float32), seen.astype(np.float32))
+    size = (width + 80, round(grid.shape[0] * scale) + 80)
+    # a pixel of the image is the mean of 4 x 4; pixels have their origin in their middle
+    middle = np.array([[1, 0, 0.5], [0, 1, 0.5], [0, 0, 1]])
+    finer = np.linalg.inv(middle) @ np.diag([4, 4, 1]) @ to_image @ middle
+    drawn = cv2.warpPerspective(grid, finer, (4 * size[0], 4 * size[1]), borderValue=255)
+    image = cv2.GaussianBlur(cv2.resize(drawn, size, interpolation=cv2.INTER_AREA), (0, 0), 0.7)
+    noisy = np.clip(30 + 0.7 * image + rng.normal(0.0, 3.0, image.shape), 0, 255).astype(np.uint8)
+    family = family_named("apriltag_36h11_thick")
+    found = MarkerDetector(DetectorSettings(), {family: None}).detect(noisy)
+    assert sorted(found.id.tolist()) == [*range(8)]
+    pitch = TAG_PX + GAP_PX
+    corner = np.array([[0, 0], [TAG_PX, 0], [TAG_PX, TAG_PX], [0, TAG_PX]])
+    place = np.stack([found.id % 4, found.id // 4], axis=1) * pitch + 3 * GAP_PX
+    true = cv2.perspectiveTransform((corner + place[:, None]).astype(float), to_image) - 0.5
+    error = found.corners - true
+    assert math.sqrt(np.mean(np.sum(np.square(error), axis=2))) < 0.12
+    assert np.abs(error).max() < 0.5
 
 
 def test_corners_and_poses_are_as_sure_as_they_say() -> None:
