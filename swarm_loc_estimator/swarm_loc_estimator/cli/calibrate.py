@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from swarm_loc_estimator.common.command_line import (
     ProgressLine,
     add_bag,
+    add_remap,
     command_parser,
     exit_with_message,
     number_in,
@@ -36,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = Options(plain=options.plain, response=not options.no_response, evaluations=options.evaluations)
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
     with ProgressLine() as progress:
-        recording = read_recording(options.bag, swarm, progress)
+        recording = read_recording(options.bag, swarm, progress, options.remap)
         done = calibrate(recording, swarm, chosen, progress)
     save_swarm(done.swarm, options.out, f"Calibrated with {options.bag.name}. {done.warning}".rstrip())
     print("\n".join([text_of(done), *recording.remarks, *_unused(recording)]))
@@ -55,6 +56,7 @@ def _parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = command_parser("calibrate", __doc__)
     add_bag(parser, " with <robot>/ground_truth")
+    add_remap(parser)
     parser.add_argument("--out", type=yaml_to_write, required=True, help="swarm description to write")
     parser.add_argument("--plain", action="store_true", help="fit only noise, calibrate nothing")
     parser.add_argument(

@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from swarm_loc_estimator.common.command_line import (
     ProgressLine,
     add_bag,
+    add_remap,
     command_parser,
     exit_with_message,
     swarm_beside,
@@ -42,7 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.board is not None:
         return _board(options, swarm)
     with ProgressLine() as progress:
-        recording = read_recording(options.bag, swarm, progress)
+        recording = read_recording(options.bag, swarm, progress, options.remap)
         done = calibrate_infrared(recording, swarm, progress, with_truth=not options.without_truth)
     save_swarm(done.swarm, options.out, f"Infrared gains calibrated with {options.bag.name}.")
     print("\n".join([text_of(done), *recording.remarks]))
@@ -53,7 +54,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _board(options: argparse.Namespace, swarm: Swarm) -> int:
     """Fit the parameters of the board, and write it and a swarm description that uses it."""
     with ProgressLine() as progress:
-        recording = read_recording(options.bag, swarm, progress)
+        recording = read_recording(options.bag, swarm, progress, options.remap)
         board, done = calibrate_from(recording, swarm, progress)
     said = f"Infrared board calibrated with {options.bag.name}."
     save_ir_platform(done.model.platform, options.board, said)
@@ -68,6 +69,7 @@ def _parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = command_parser("calibrate_ir", __doc__)
     add_bag(parser, " with <robot>/brightness")
+    add_remap(parser)
     parser.add_argument(
         "--out",
         type=yaml_to_write,

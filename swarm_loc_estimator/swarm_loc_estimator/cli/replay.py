@@ -24,6 +24,7 @@ import numpy as np
 from swarm_loc_estimator.common.command_line import (
     ProgressLine,
     add_bag,
+    add_remap,
     add_set,
     command_parser,
     exit_with_message,
@@ -35,7 +36,7 @@ from swarm_loc_estimator.common.command_line import (
     yaml_to_write,
 )
 from swarm_loc_estimator.offline.export import write_mcap
-from swarm_loc_estimator.offline.replay import TICK_S, replay
+from swarm_loc_estimator.offline.replay import TICK_S, TICKS_S, replay
 from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -60,7 +61,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
     with ProgressLine() as progress:
         result = replay(
-            options.bag, swarm, settings, tick_s=options.tick, keep_sightings=True, progress=progress
+            options.bag,
+            swarm,
+            settings,
+            tick_s=options.tick,
+            remap=options.remap,
+            keep_sightings=True,
+            progress=progress,
         )
         progress(1.0, "writing the report")
         files = write_report(result, options.out)
@@ -101,6 +108,7 @@ def _parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = command_parser("replay", __doc__)
     add_bag(parser)
+    add_remap(parser)
     parser.add_argument("--out", type=folder_to_write, default="out/replay", help="folder for the report")
     parser.add_argument(
         "--learned", type=yaml_to_write, metavar="FILE", help="where to write what was learned"
@@ -109,7 +117,7 @@ def _parser() -> argparse.ArgumentParser:
         "--mcap", type=mcap_to_write, metavar="FILE", help="where to write poses, /tf and markers for viewers"
     )
     parser.add_argument(
-        "--tick", type=number_in(1e-3, 3600.0, "s"), default=TICK_S, help="seconds between outputs"
+        "--tick", type=number_in(*TICKS_S, "s"), default=TICK_S, help="seconds between outputs"
     )
     add_set(parser, "parameter of the estimator")
     return parser

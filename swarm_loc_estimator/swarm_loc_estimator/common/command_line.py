@@ -12,7 +12,7 @@ from functools import wraps
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
-from typing import ParamSpec, TextIO, TypeVar
+from typing import Any, ParamSpec, TextIO, TypeVar
 
 from typing_extensions import Self
 
@@ -129,6 +129,20 @@ def add_bag(parser: argparse.ArgumentParser, content: str = "") -> None:
     """Add the arguments of a command that reads a bag: the bag itself, and its swarm description."""
     parser.add_argument("bag", type=Path, help=f"rosbag2 folder, .mcap or .db3 file{content}")
     parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
+
+
+def add_remap(parser: argparse.ArgumentParser) -> None:
+    """Add `--remap EXPECTED:=TOPIC`, which may be given several times; the options hold a dictionary."""
+
+    class Remap(argparse.Action):
+        def __call__(self, parser: argparse.ArgumentParser, options: Any, value: Any, *_: object) -> None:
+            own, separator, stored = value.partition(":=")
+            if not (own and separator and stored):
+                parser.error(f"argument --remap: '{value}' must be EXPECTED:=TOPIC")
+            options.remap = {**options.remap, own: stored}
+
+    said = "topic of the bag to read in place of an expected one, such as '<robot>/odom:=<robot>/odometry'"
+    parser.add_argument("--remap", action=Remap, default={}, metavar="EXPECTED:=TOPIC", help=said)
 
 
 def swarm_beside(bag: Path) -> Path:

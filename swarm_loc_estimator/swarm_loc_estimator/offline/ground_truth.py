@@ -48,6 +48,11 @@ _READ: Mapping[str, tuple[Callable[[bytes], OdometryMessage | PoseMessage | FixM
 """Type of a message -> its reader, and the number of frame names before its pose."""
 
 
+def truth_topics(swarm: Swarm) -> list[str]:
+    """The topic of the ground truth of each robot."""
+    return [f"{robot.name}/ground_truth" for robot in swarm.robots]
+
+
 class TruthReader:
     """Collects `<robot>/ground_truth`: PoseStamped, PoseWithCovarianceStamped, Odometry or TransformStamped.
 
@@ -60,7 +65,7 @@ class TruthReader:
     """
 
     def __init__(self, swarm: Swarm, recorded: Iterable[BagTopic]) -> None:
-        self.topics = [f"{robot.name}/ground_truth" for robot in swarm.robots]
+        self.topics = truth_topics(swarm)
         self._names = [robot.name for robot in swarm.robots]
         declared = {topic.name: topic.type for topic in recorded}
         self._types = [declared.get(topic, "") for topic in self.topics]

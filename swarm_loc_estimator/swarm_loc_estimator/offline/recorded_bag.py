@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
-from swarm_loc_estimator.common.bags.reader import BagReader, BagTopic
+from swarm_loc_estimator.common.bags.reader import BagError, BagReader, BagTopic
+from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.messages.cdr import CdrError
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
-from swarm_loc_estimator.offline.ground_truth import TruthReader
+from swarm_loc_estimator.offline.ground_truth import TruthReader, truth_topics
 from swarm_loc_estimator.offline.result import RecordedMap
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import Batch, kinds
@@ -51,7 +53,13 @@ class BagSummary:
     goals: Mapping[str, Trajectory] = field(default_factory=dict)
 
 
-def read_bag(bag: Path, swarm: Swarm, take: Callable[[Batch], None], progress: Progress) -> BagSummary:
+def read_bag(
+    bag: Path,
+    swarm: Swarm,
+    take: Callable[[Batch], None],
+    progress: Progress,
+    remap: Mapping[str, str] = MappingProxyType({}),
+) -> BagSummary:
     """Read a bag once.
 
     Args:
@@ -59,23 +67,27 @@ def read_bag(bag: Path, swarm: Swarm, take: Callable[[Batch], None], progress: P
         swarm: Robots whose messages are read.
         take: Called with the inputs, in order of arrival.
         progress: Called now and then.
+        remap: Expected topic -> topic of the bag, see `renamed_topics`.
 
     Raises:
-        BagError: Nothing in the bag can be read.
+        BagError: Nothing in the bag can be read, or a topic cannot be mapped.
     """
-    with BagReader(bag) as reader:
-        ingest, truth, maps = Ingest(swarm), TruthReader(swarm, reader.topics), MapReader(swarm)
+    ingest, maps = Ingest(swarm), MapReader(swarm)
+    known = [*ingest.handle_of, *truth_topics(swarm), *maps.topics]
+    with BagReader(bag, renamed_topics(remap, swarm, known)) as reader:
+        truth = TruthReader(swarm, reader.topics)
         first_truth = len(ingest.topics)
         first_map = first_truth + len(truth.topics)
         range_ns = reader.time_range_ns
-        for batch in reader.batches([*ingest.handle_of, *truth.topics, *maps.topics]):
+        foreign = _foreign(reader.topics, ingest)
+        for batch in reader.batches(["" if name in foreign else name for name in known]):
             for inputs in ingest.read(batch.chosen(batch.topic < first_truth)):
                 take(inputs)
             truth.add(_from(batch.chosen(batch.topic < first_map), first_truth))
             maps.add(_from(batch, first_map))
             progress(reader.progress, "reading")
         unusable = _unusable(reader.topics, ingest, swarm)
-        found = (*_strangers(reader.topics, ingest), *_missing(ingest), *unusable)
+        found = (*foreign.values(), *_strangers(reader.topics, ingest), *_missing(ingest, foreign), *unusable)
         remarks = (*reader.losses, *found, *truth.remarks(), *maps.remarks())
         unusable = () if any(one.received > one.malformed for one in ingest.statistics) else unusable
         tracks, shown = truth.tracks(), (maps.maps(), maps.goals())
@@ -88,14 +100,54 @@ def _from(batch: MessageBatch, first: int) -> MessageBatch:
     return others._replace(topic=others.topic - first)
 
 
-def _missing(ingest: Ingest) -> list[str]:
+def renamed_topics(remap: Mapping[str, str], swarm: Swarm, known: Collection[str]) -> dict[str, str]:
+    """Topic of a bag -> the topic as which it is read.
+
+    Args:
+        remap: Expected topic -> topic of the bag, such as robot1/odom -> /robot1/odometry/filtered;
+            `<robot>` in both stands for each robot.
+        swarm: The robots.
+        known: Expected topics.
+
+    Raises:
+        BagError: An expected topic is unknown, or two of them have the same topic of the bag.
+    """
+    renamed: dict[str, str] = {}
+    for own, stored in remap.items():
+        names = [robot.name for robot in swarm.robots] if "<robot>" in own else [""]
+        for name in names:
+            target, source = (text.replace("<robot>", name).lstrip("/") for text in (own, stored))
+            if target not in known:
+                raise BagError(f"remap {own}:={stored}: {target} is none of the topics {listed([*known])}.")
+            if renamed.setdefault(source, target) != target:
+                raise BagError(f"remap {own}:={stored}: {source} is mapped to {renamed[source]} already.")
+    return renamed
+
+
+def _same_type(one: str, other: str) -> bool:
+    """Whether two names of types are the same; some writers leave /msg/ out."""
+    return one.replace("/msg/", "/") == other.replace("/msg/", "/")
+
+
+def _foreign(topics: Sequence[BagTopic], ingest: Ingest) -> dict[str, str]:
+    """Topics of another type than expected, which are not read, with a sentence each."""
+    expected = {topic.name: topic.kind.message_type for topic in ingest.topics}
+    return {
+        topic.name: f"{topic.name} has the type {topic.type}, expected is {expected[topic.name]}: not read."
+        for topic in topics
+        if topic.type and topic.name in expected and not _same_type(topic.type, expected[topic.name])
+    }
+
+
+def _missing(ingest: Ingest, foreign: Collection[str]) -> list[str]:
     """One sentence for every expected topic without messages, unless a topic that robots share has some."""
     pairs = [*zip(ingest.topics, ingest.statistics, strict=True)]
     shared = {topic.kind.stands_for for topic, statistics in pairs if statistics.received}
     return [
         f"The bag holds no message on {topic.name}."
         for topic, statistics in pairs
-        if topic.expected and not statistics.received and topic.kind.rows not in shared
+        if topic.expected and not statistics.received and topic.name not in foreign
+        if topic.kind.rows not in shared
     ]
 
 
@@ -113,7 +165,7 @@ def _unusable(topics: Sequence[BagTopic], ingest: Ingest, swarm: Swarm) -> tuple
     used = {topic.kind.rows for topic, statistics in pairs if statistics.received > statistics.malformed}
     sentences = []
     for kind in kinds().values():
-        if not kind.of_each or kind.rows in used or not any(map(kind.expected_of, swarm.robots)):
+        if not kind.of_each or kind.rows in used or not kind.is_expected_of(swarm):
             continue
         own = {
             topic.name: statistics.malformed for topic, statistics in pairs if topic.kind.rows == kind.rows
@@ -121,19 +173,18 @@ def _unusable(topics: Sequence[BagTopic], ingest: Ingest, swarm: Swarm) -> tuple
         others = [
             topic
             for topic in topics
-            if topic.type.replace("/msg/", "/")
-            == kind.message_type.replace("/msg/", "/")  # ROS 1 has no /msg/
+            if _same_type(topic.type, kind.message_type)
             and topic.name not in ingest.handle_of
             and not topic.name.endswith("/ground_truth")
         ]
         if malformed := sum(own.values()):
             found = f"none of the {malformed} messages on {_listed([t for t in topics if t.name in own])}"
-            found += (
-                " is one as ROS 2 serializes it: convert a bag of ROS 1 or JSON first, as by rosbags-convert"
-            )
+            found += " is one as ROS 2 serializes it"
+        elif wrong := [topic for topic in topics if topic.name in own]:
+            found = f"the bag has another type on {_listed(wrong)}"
         elif others:
-            found = f"the bag has this type on {_listed(others)}: rename the robots of the swarm description,"
-            found += " or play the bag with --remap and record it again"
+            found = f"the bag has this type on {_listed(others)}: map topics,"
+            found += f" such as --remap '{_rule(kind.pattern, others[0].name, swarm)}'"
         elif not used:
             found = "the bag has no topic of this type"
         else:
@@ -142,10 +193,17 @@ def _unusable(topics: Sequence[BagTopic], ingest: Ingest, swarm: Swarm) -> tuple
     return tuple(sentences)
 
 
+def _rule(pattern: str, stored: str, swarm: Swarm) -> str:
+    """A rule that maps an expected topic to one of the bag, for all robots if its name begins with one."""
+    first, _, rest = stored.partition("/")
+    if first in (robot.name for robot in swarm.robots):
+        return f"{pattern}:=<robot>/{rest}"
+    return f"{pattern.replace('<robot>', swarm.robots[0].name)}:={stored}"
+
+
 def _listed(topics: Sequence[BagTopic]) -> str:
     """Names and types of a few topics."""
-    shown = ", ".join(f"{topic.name} ({topic.type or 'no type'})" for topic in topics[:6])
-    return shown + (f" and {len(topics) - 6} others" if len(topics) > 6 else "")
+    return listed([f"{topic.name} ({topic.type or 'no type'})" for topic in topics])
 
 
 MAX_MAP_BYTES = 48_000_000

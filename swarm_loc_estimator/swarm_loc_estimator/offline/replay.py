@@ -9,7 +9,9 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import replace
+from numbers import Real
 from pathlib import Path
+from types import MappingProxyType
 from typing import Protocol
 
 import numpy as np
@@ -18,6 +20,7 @@ import numpy.typing as npt
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.bag_file import BagError
 from swarm_loc_estimator.common.command_line import swarm_beside
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.offline.recorded_bag import Progress, read_bag, unwatched
@@ -36,6 +39,8 @@ from swarm_loc_estimator.timeline.sightings import Sightings, newest_sightings
 
 TICK_S = 0.1
 """Default time between two outputs [s]."""
+TICKS_S = (1e-3, 3600.0)
+"""Range of it [s]."""
 
 
 def replay(
@@ -45,6 +50,7 @@ def replay(
     *,
     tick_s: float = TICK_S,
     stamp_ns: npt.NDArray[np.int64] | None = None,
+    remap: Mapping[str, str] = MappingProxyType({}),
     keep_sightings: bool = False,
     progress: Progress = unwatched,
 ) -> ReplayResult:
@@ -56,20 +62,22 @@ def replay(
         settings: Of the estimator.
         tick_s: Time between two outputs [s].
         stamp_ns: (T,) increasing; outputs at these instants instead, such as those of a live run.
+        remap: Expected topic -> topic of the bag to read instead; `<robot>` in both stands for each robot.
         keep_sightings: Whether sightings and aerial images are kept for display, too.
         progress: Called now and then with the share done and what is being done.
 
     Raises:
         BagError: Nothing in the bag can be read, or no message of it can be used.
+        ScheduleError: `tick_s` is out of range, or `stamp_ns` are not increasing whole numbers.
         SwarmFileError: The swarm description cannot be used.
     """
     bag = Path(bag)
     swarm = load_swarm(swarm_beside(bag)) if swarm is None else swarm
-    periodic = PeriodicSchedule(round(tick_s * 1e9))
-    schedule = periodic if stamp_ns is None else ListedSchedule(stamp_ns)
+    periodic = PeriodicSchedule(_period_ns(tick_s))
+    schedule = periodic if stamp_ns is None else ListedSchedule(_increasing(stamp_ns))
     estimator = Estimator(swarm, settings)
     runner = Runner(estimator, schedule, keep_sightings=keep_sightings)
-    summary = read_bag(bag, swarm, runner.take, progress)
+    summary = read_bag(bag, swarm, runner.take, progress, remap)
     if summary.unusable:
         raise BagError(
             "\n".join([f"'{bag}' holds no message that the estimator can use.", *summary.unusable])
@@ -85,6 +93,26 @@ def replay(
     if result.self_calibrated:
         remarks += swapped_signs(result.self_calibrated)
     return replace(result, remarks=tuple(remarks), maps=summary.maps, goals=summary.goals)
+
+
+class ScheduleError(UserError):
+    """Outputs that cannot be scheduled; the message is one sentence."""
+
+
+def _period_ns(tick_s: float) -> int:
+    """The period of outputs [ns]."""
+    low, high = TICKS_S
+    if not isinstance(tick_s, Real) or not low <= tick_s <= high:
+        raise ScheduleError(f"tick_s = {tick_s!r} must be a number in [{low:g}, {high:g}] s.")
+    return round(tick_s * 1e9)
+
+
+def _increasing(stamp_ns: npt.ArrayLike) -> npt.NDArray[np.int64]:
+    """Times of outputs (T,) [ns]."""
+    stamps = np.asarray(stamp_ns)
+    if stamps.ndim != 1 or stamps.dtype.kind not in "iu" or np.any(stamps[1:] <= stamps[:-1]):
+        raise ScheduleError("stamp_ns must be increasing whole numbers (T,) [ns].")
+    return stamps.astype(np.int64)
 
 
 MAX_DETECTIONS = 200_000

@@ -6,6 +6,7 @@ Readings of a sensor are a NamedTuple of columns of equal length, sorted by arri
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -76,8 +77,40 @@ class Reader(Protocol):
         """
 
 
-def _never(_: Robot) -> bool:
+def of_every(_: Robot) -> bool:
+    """A topic that is expected of every robot."""
+    return True
+
+
+def of_none(_: Robot) -> bool:
+    """A topic that is optional."""
     return False
+
+
+class Guard:
+    """A context in which an error of a sensor's code costs the readings of this sensor and no others.
+
+    A warning describes the error.
+
+    Args:
+        sensor: Its name.
+        readings: How many are lost.
+        drops: Where they are counted, by the sensor and the type of the error.
+    """
+
+    def __init__(self, sensor: str, readings: int, drops: Counter[str]) -> None:
+        self._sensor, self._readings, self._drops = sensor, readings, drops
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> bool:
+        if kind is None or not isinstance(error, Exception):
+            return False
+        self._drops[f"{self._sensor}_{kind.__name__}"] += self._readings
+        said = f"the code of the sensor '{self._sensor}' raised {kind.__name__}: {error}"
+        warnings.warn(said, RuntimeWarning, stacklevel=2)
+        return True
 
 
 @dataclass(frozen=True)
@@ -102,7 +135,7 @@ class InputKind:
     message_type: str
     create_reader: Callable[[int, Known], Reader]
     columns_of: Callable[[Any, MessageBatch, IntArray, Known], tuple[Any, Mapping[str, int]]]
-    expected_of: Callable[[Robot], bool] = _never
+    expected_of: Callable[[Robot], bool] = of_every
     of_each: bool = True
     in_map: bool = False
     stands_for: str = ""
@@ -111,6 +144,10 @@ class InputKind:
     def rows(self) -> str:
         """Name of the sensor of its readings."""
         return self.stands_for or self.name
+
+    def is_expected_of(self, swarm: Swarm) -> bool:
+        """Whether any robot of a swarm should have the topic, or readings on it."""
+        return any(map(self.expected_of, swarm.robots))
 
     @property
     def pattern(self) -> str:

@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from bench.shared.bags import copy_part, read_truth
 from swarm_loc_estimator.cli.replay import main
-from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.bags.reader import BagError, BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
 from swarm_loc_estimator.offline.calibration.recording import read_recording
@@ -149,9 +149,10 @@ def test_a_bag_with_other_topics_fails_and_names_the_candidates(
     first, odometry, detections = error_of(capsys, bag, tmp_path / "out")
     assert first.endswith("holds no message that the estimator can use.")
     assert f"Expected {ODOMETRY} on <robot>/odom; the bag has this type on epuck" in odometry
-    assert odometry.count("/odometry/filtered") == 5
+    assert odometry.count("/odometry/filtered (") == 5
     assert "ground_truth" not in odometry
-    assert detections.count("/markers") == 5
+    assert odometry.endswith("map topics, such as --remap '<robot>/odom:=<robot>/odometry/filtered'.")
+    assert detections.count("/markers (") == 5
 
 
 def ros1_odometry() -> bytes:
@@ -185,10 +186,90 @@ def test_a_bag_of_ros_1_or_json_fails_and_says_so(
         for log_ns in range(10):
             writer.add_message(channel, log_ns, data, log_ns)
         writer.finish()  # type: ignore[no-untyped-call]
-    _, odometry, detections = error_of(capsys, bag, tmp_path / "out")
-    assert f"none of the 10 messages on epuck1/odom ({schema}) is one as ROS 2 serializes it" in odometry
-    assert "convert a bag of ROS 1 or JSON first" in odometry
-    assert detections.endswith("the bag has no topic of this type.")
+    (said,) = error_of(capsys, bag, tmp_path / "out")
+    assert (
+        f"bag.mcap: the messages on epuck1/odom are serialized as {encoding}, not as cdr as in ROS 2" in said
+    )
+    assert ("rosbags-convert" if encoding == "ros1" else "record them again") in said
+
+
+def test_messages_of_another_type_are_not_read(
+    tmp_path: Path, short: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def rename(topic: str, message_type: str, data: bytes) -> tuple[str, str, bytes]:
+        return topic, POSE_STAMPED if topic.endswith("/odom") else message_type, data
+
+    bag = renamed(tmp_path / "bag", short, rename)
+    error_of(capsys, bag, tmp_path / "out")
+    report = (tmp_path / "out" / "report.txt").read_text(encoding="utf-8")
+    assert f"epuck1/odom has the type {POSE_STAMPED}, expected is {ODOMETRY}: not read." in report
+    assert "no message on epuck1/odom" not in report
+    assert f"<robot>/odom; the bag has another type on epuck1/odom ({POSE_STAMPED})" in report
+    assert "bad_message" not in report
+
+
+@pytest.mark.parametrize(
+    "remap", [{}, {"<robot>/odom": "/<robot>/odometry/filtered"}], ids=["rules", "<robot>"]
+)
+def test_mapped_topics_give_the_same_poses(
+    tmp_path: Path, short: Path, remap: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    def rename(topic: str, message_type: str, data: bytes) -> tuple[str, str, bytes]:
+        return topic.replace("/odom", "/odometry/filtered"), message_type, data
+
+    swarm = load_swarm(DEMO / "swarm.yaml")
+    remap = remap or {f"{r.name}/odom": f"{r.name}/odometry/filtered" for r in swarm.robots}
+    bag, expected = renamed(tmp_path / "bag", short, rename), replay(short, swarm)
+    result = replay(bag, swarm, remap=remap)
+    assert result.poses.tobytes() == expected.poses.tobytes()
+    assert not result.remarks
+    rules = [text for own, stored in remap.items() for text in ("--remap", f"{own}:={stored}")]
+    assert main([str(bag), "--swarm", str(DEMO / "swarm.yaml"), "--out", str(tmp_path / "out"), *rules]) == 0
+    assert "filtered" not in capsys.readouterr().out
+    read = read_recording(bag, swarm, remap=remap).odometry
+    assert read.stamp_ns.tobytes() == read_recording(short, swarm).odometry.stamp_ns.tobytes()
+
+
+def test_a_mapped_topic_takes_the_place_of_the_expected_one(short: Path) -> None:
+    swarm = load_swarm(DEMO / "swarm.yaml")
+    plain = read_recording(short, swarm).odometry
+    swapped = read_recording(short, swarm, remap={"epuck1/odom": "epuck2/odom", "epuck2/odom": "epuck1/odom"})
+    replaced = read_recording(short, swarm, remap={"epuck1/odom": "epuck2/odom"})
+    first, second = plain.robot == 0, plain.robot == 1
+    for read, robot in ((swapped, 0), (replaced, 0)):
+        rows = read.odometry.robot == robot
+        np.testing.assert_array_equal(read.odometry.pose[rows], plain.pose[second])
+    np.testing.assert_array_equal(swapped.odometry.pose[swapped.odometry.robot == 1], plain.pose[first])
+    assert "The bag holds no message on epuck2/odom." in replaced.remarks
+
+
+@pytest.mark.parametrize(
+    ("remap", "sentence"),
+    [
+        ({"epuck1/odometry": "epuck1/odom"}, "epuck1/odometry is none of the topics epuck1/odom, "),
+        ({"<robot>/odom": "odom"}, "odom is mapped to epuck1/odom already"),
+        (
+            {"<robot>/odom": "<robot>/odo"},
+            "has no topic epuck1/odo, epuck2/odo, .* it has epuck1/detections, ",
+        ),
+    ],
+)
+def test_rules_that_cannot_be_used_are_refused(short: Path, remap: dict[str, str], sentence: str) -> None:
+    with pytest.raises(BagError, match=sentence):
+        replay(short, load_swarm(DEMO / "swarm.yaml"), remap=remap)
+
+
+def test_a_rule_without_a_topic_in_the_bag_is_named(short: Path) -> None:
+    remap = {"epuck1/odom": "epuck1/odom", "epuck2/odom": "epuck2/odo"}
+    result = replay(short, load_swarm(DEMO / "swarm.yaml"), remap=remap)
+    assert "short: there is no topic epuck2/odo, which epuck2/odom is mapped to." in result.remarks
+
+
+@pytest.mark.parametrize("rule", ["odom", ":=odom", "epuck1/odom:="])
+def test_a_rule_that_is_none_is_refused(rule: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit, match="2"):
+        main([str(DEMO), "--remap", rule])
+    assert f"--remap: '{rule}' must be EXPECTED:=TOPIC" in capsys.readouterr().err
 
 
 def test_a_replay_that_locates_nobody_fails(

@@ -23,10 +23,17 @@ class BagError(UserError):
 
 
 class BagTopic(NamedTuple):
-    """A topic of a bag: its name, such as robot1/odom, and its type, such as nav_msgs/msg/Odometry."""
+    """A topic of a bag.
+
+    Attributes:
+        name: Such as robot1/odom.
+        type: Such as nav_msgs/msg/Odometry.
+        encoding: How its messages are serialized: cdr in ROS 2; "" if nothing is said.
+    """
 
     name: str
     type: str
+    encoding: str = "cdr"
 
 
 class ReadErrors(list[str]):

@@ -208,9 +208,9 @@ class McapFile:
                 self._schemas[schema.id] = schema.name
             elif opcode == Opcode.CHANNEL:
                 channel = Channel.read(stream)
-                self._channels[channel.id] = BagTopic(
-                    channel.topic.lstrip("/"), self._schemas.get(channel.schema_id, "")
-                )
+                message_type = self._schemas.get(channel.schema_id, "")
+                topic = BagTopic(channel.topic.lstrip("/"), message_type, channel.message_encoding)
+                self._channels[channel.id] = topic
             elif opcode == Opcode.CHUNK_INDEX:
                 chunk = ChunkIndex.read(stream)
                 self._index.append((chunk.message_start_time, chunk.message_end_time))

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import itertools
+import tempfile
+from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import parse_qos
 from typing_extensions import Self
 
-from swarm_loc_estimator.common.bags.bag_file import BagError, BagFile, BagTopic, RawMessage
+from swarm_loc_estimator.common.bags.bag_file import BagError, BagFile, BagTopic, RawMessage, ReadErrors
 from swarm_loc_estimator.common.bags.mcap_file import McapFile
+from swarm_loc_estimator.common.bags.packed import PACKED, unpack_file, unpack_messages
 from swarm_loc_estimator.common.bags.sqlite_file import SqliteFile
+from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch, merge_streams
 from swarm_loc_estimator.common.yaml_tree import YamlTreeError, read_tree
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping, Sequence
-    from pathlib import Path
     from types import TracebackType
 
     from rosbags.interfaces import Qos
@@ -27,6 +31,9 @@ __all__ = ["BagError", "BagReader", "BagTopic", "RawMessage"]
 _STORAGES: dict[str, type[McapFile | SqliteFile]] = {".mcap": McapFile, ".db3": SqliteFile}
 _METADATA_BYTES = 20_000_000
 """Larger metadata are not read; the three thousand topics of a thousand robots take a tenth of it."""
+_ENCODINGS = ("cdr", "")
+_EXPECTED = "expected a rosbag2 folder, or an .mcap or .db3 file, plain or compressed as .zstd, .zst or .lz4"
+_ROS_1 = "convert bags of ROS 1 first: rosbags-convert --src NAME.bag --dst NAME"
 
 
 class BagReader:
@@ -35,7 +42,8 @@ class BagReader:
     Topic names come without the leading slash, as `robot1/odom`.
 
     Args:
-        path: A rosbag2 folder, or an .mcap or .db3 file.
+        path: A rosbag2 folder, or an .mcap or .db3 file, plain or compressed.
+        renamed: Topic of the bag -> the name that it has here; a topic of that name in the bag is hidden.
 
     Attributes:
         offered_qos: Topic -> what its publishers offered, as far as a folder's metadata know it.
@@ -44,22 +52,26 @@ class BagReader:
         BagError: There is nothing to read.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, renamed: Mapping[str, str] = MappingProxyType({})) -> None:
         self._path = path
+        self._renamed = renamed
         self.offered_qos: dict[str, list[Qos]] = {}
         self._files: list[BagFile] = []
-        self._own_losses: list[str] = []
+        self._own_losses = ReadErrors(path.name)
+        self._unpacked: tempfile.TemporaryDirectory[str] | None = None
         paths = self._find()
         try:
             self._open(paths)
+            self._check_encodings()
+            self._check_names()
         except BaseException:
             self.close()
             raise
 
     @property
     def topics(self) -> list[BagTopic]:
-        """The topics of all files."""
-        return list(dict.fromkeys(topic for file in self._files for topic in file.topics))
+        """The readable topics of all files, by their names here."""
+        return list(dict.fromkeys(here for topic in self._stored() if (here := self._here(topic))))
 
     @property
     def message_count(self) -> int:
@@ -95,7 +107,7 @@ class BagReader:
         chosen = [topic for topic in self.topics if wanted is None or topic.name in wanted]
         for batch in self._batches({topic: number for number, topic in enumerate(chosen)}):
             for number, log_ns, data in batch.messages():
-                yield *chosen[number], log_ns, data
+                yield chosen[number].name, chosen[number].type, log_ns, data
 
     def batches(self, topics: Sequence[str]) -> Iterator[MessageBatch]:
         """All messages of some topics in order of log time, many at once.
@@ -107,16 +119,36 @@ class BagReader:
         return self._batches({t: number_of[t.name] for t in self.topics if t.name in number_of})
 
     def _batches(self, number_of: Mapping[BagTopic, int]) -> Iterator[MessageBatch]:
+        stored = {
+            topic: number_of[here]
+            for topic in self._stored()
+            if (here := self._here(topic)) and here in number_of
+        }
         ends = [file.time_range_ns for file in self._files]
-        streams = [file.batches(number_of) for file in self._files]
+        streams = [unpack_messages(file.batches(stored), file.losses) for file in self._files]
         if all(before[1] < after[0] for before, after in itertools.pairwise(ends)):
             return itertools.chain.from_iterable(streams)
         return merge_streams(streams)
 
+    def _stored(self) -> list[BagTopic]:
+        """The topics of all files."""
+        return list(dict.fromkeys(topic for file in self._files for topic in file.topics))
+
+    def _here(self, topic: BagTopic) -> BagTopic | None:
+        """A topic by its name here; None if it is hidden or cannot be read."""
+        if topic.encoding not in _ENCODINGS:
+            return None
+        name = self._renamed.get(topic.name)
+        if name is None:
+            return None if topic.name in self._renamed.values() else topic
+        return topic._replace(name=name)
+
     def close(self) -> None:
-        """Close all files; may be called twice."""
+        """Close all files, and remove what was unpacked; may be called twice."""
         for file in self._files:
             file.close()
+        if self._unpacked:
+            self._unpacked.cleanup()
 
     def __enter__(self) -> Self:
         return self
@@ -131,34 +163,69 @@ class BagReader:
         errors: list[BagError] = []
         for path in paths:
             try:
-                self._files.append(_STORAGES[path.suffix](path))
+                self._files.append(self._open_file(path))
             except BagError as error:  # each file may fail on its own
                 errors.append(error)
         if not self._files:
             raise errors[0]
         self._own_losses += [str(error) for error in errors]
 
+    def _open_file(self, path: Path) -> BagFile:
+        """Open a file; a compressed one is unpacked into a temporary folder first."""
+        if path.suffix in _STORAGES:
+            return _STORAGES[path.suffix](path)
+        self._unpacked = self._unpacked or tempfile.TemporaryDirectory(prefix="unpacked_bag_")
+        plain = unpack_file(path, Path(self._unpacked.name), self._own_losses)
+        try:
+            return _STORAGES[plain.suffix](plain)
+        except BagError as error:
+            raise BagError(str(error).replace(str(plain), str(path))) from error
+
+    def _check_encodings(self) -> None:
+        """Name topics that are not serialized as in ROS 2; raises BagError if there are no others."""
+        stored = self._stored()
+        for encoding in dict.fromkeys(topic.encoding for topic in stored):
+            if encoding in _ENCODINGS:
+                continue
+            names = [topic.name for topic in stored if topic.encoding == encoding]
+            advice = _ROS_1 if encoding == "ros1" else "publish them in ROS 2 and record them again"
+            said = f"the messages on {listed(names)} are serialized as {encoding}, not as cdr as in ROS 2"
+            self._own_losses.add(f"{said}; {advice}.")
+        if stored and not any(topic.encoding in _ENCODINGS for topic in stored):
+            raise BagError("\n".join(self._own_losses))
+
+    def _check_names(self) -> None:
+        """Name renamed topics that are not in the bag; raises BagError if none is."""
+        names = {topic.name for topic in self._stored()}
+        missing = [name for name in self._renamed if name not in names]
+        if missing and len(missing) == len(self._renamed):
+            said = f"'{self._path}' has no topic {listed(missing)}"
+            raise BagError(f"{said}; it has {listed(sorted(names)) or 'none'}.")
+        for name in missing:
+            self._own_losses.add(f"there is no topic {name}, which {self._renamed[name]} is mapped to.")
+
     def _find(self) -> list[Path]:
         """The storage files."""
-        if not self._path.exists():
-            raise BagError(f"There is no bag '{self._path}'.")
-        if not self._path.is_dir():
-            if self._path.is_file() and self._path.suffix in _STORAGES:
-                return [self._path]
-            raise BagError(f"'{self._path}' is no bag: expected a rosbag2 folder, an .mcap or a .db3 file.")
-        listed = self._listed()
-        paths = sorted((path for path in self._path.iterdir() if path.suffix in _STORAGES), key=_part_number)
+        path = self._path
+        if not path.exists():
+            raise BagError(f"There is no bag '{path}'.")
+        if not path.is_dir():
+            if path.is_file() and _is_storage(path):
+                return [path]
+            hint = _ROS_1.replace("NAME", str(path.with_suffix(""))) if path.suffix == ".bag" else _EXPECTED
+            raise BagError(f"'{path}' is no bag: {hint}.")
+        recorded = self._listed()
+        paths = sorted(filter(_is_storage, path.iterdir()), key=_part_number)
+        paths = [one for one in paths if one.suffix in _STORAGES or one.with_suffix("") not in paths]
         self._own_losses += [
             f"{name}: the file is missing, its messages are lost."
-            for name in listed
+            for name in recorded
             if not (self._path / name).exists()
         ]
         if not paths:
-            packed = [
-                path.name for path in self._path.iterdir() if path.name.endswith((".mcap.zstd", ".db3.zstd"))
-            ]
-            hint = f"; unpack it first: zstd -d {packed[0]}" if packed else ""
-            raise BagError(f"'{self._path}' holds no .mcap or .db3 file{hint}.")
+            ros_1 = any(one.suffix == ".bag" for one in path.iterdir())
+            hint = _ROS_1 if ros_1 else _EXPECTED
+            raise BagError(f"'{path}' holds no .mcap or .db3 file: {hint}.")
         return paths
 
     def _listed(self) -> list[str]:
@@ -173,18 +240,19 @@ class BagReader:
         if not isinstance(info, dict):
             self._own_losses.append(f"'{self._path}' has no metadata: its recording was not finished.")
             return []
-        if str(info.get("compression_mode") or "").lower() == "message":
-            raise BagError(
-                f"'{self._path}' is compressed message by message; convert it first: ros2 bag convert."
-            )
         self.offered_qos = offered_qos(info)
         files = info.get("relative_file_paths")
         return [str(name) for name in files] if isinstance(files, list) else []
 
 
+def _is_storage(path: Path) -> bool:
+    """Whether the name is that of a storage file, plain or compressed."""
+    return (path if path.suffix not in PACKED else path.with_suffix("")).suffix in _STORAGES
+
+
 def _part_number(path: Path) -> tuple[int, str]:
     """Parts are numbered without leading zeros: bag_10 comes behind bag_9."""
-    number = path.stem.rpartition("_")[2]
+    number = path.name.partition(".")[0].rpartition("_")[2]
     return (int(number) if number.isdecimal() else 0, path.name)
 
 

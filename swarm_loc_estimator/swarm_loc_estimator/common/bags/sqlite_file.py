@@ -27,8 +27,9 @@ _TIMED = f"WHERE typeof(timestamp) = 'integer' AND timestamp BETWEEN 0 AND {MAX_
 _MESSAGES = f"SELECT topic_id, timestamp, data FROM messages {_TIMED} ORDER BY timestamp, id"  # noqa: S608
 _VIEWS = """SELECT name FROM sqlite_master
 WHERE type = 'view' AND lower(name) IN ('topics', 'messages')"""  # they may take for ever
+_TOPICS = "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
 _TABLES = """
-CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT);
+CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
 CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGER, data BLOB);
 """
 
@@ -94,10 +95,13 @@ class SqliteFile:
 
     def _open(self) -> None:
         """Read topics, count and times; raises when a page is damaged, or a column's name."""
-        rows = self._connection.execute("SELECT id, name, type FROM topics ORDER BY id").fetchall()
+        rows = self._connection.execute(_TOPICS).fetchall()
         if self._connection.execute("PRAGMA integrity_check(1)").fetchone() != ("ok",):
             raise sqlite3.DatabaseError("database disk image is malformed")
-        self._topics = {number: BagTopic(str(name).lstrip("/"), str(kind)) for number, name, kind in rows}
+        self._topics = {
+            number: BagTopic(str(name).lstrip("/"), str(kind), str(encoding))
+            for number, name, kind, encoding in rows
+        }
         self._connection.execute(f"EXPLAIN {_MESSAGES}")
         (stored,) = self._connection.execute("SELECT count(*) FROM messages").fetchone()
         query = f"SELECT count(*), min(timestamp), max(timestamp) FROM messages {_TIMED}"  # noqa: S608
@@ -168,8 +172,7 @@ def _connect(path: Path) -> sqlite3.Connection:
 def _copy_readable(source: sqlite3.Connection, target: sqlite3.Connection) -> None:
     """Copy topics and all messages that can be read."""
     target.execute("BEGIN")
-    topics = source.execute("SELECT id, name, type FROM topics").fetchall()
-    target.executemany("INSERT INTO topics VALUES (?, ?, ?)", topics)
+    target.executemany("INSERT INTO topics VALUES (?, ?, ?, ?)", source.execute(_TOPICS).fetchall())
     last = _last_id(source)
     next_id: int | None = 0
     while next_id is not None:

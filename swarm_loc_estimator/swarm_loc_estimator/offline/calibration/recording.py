@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -90,19 +91,25 @@ class Recording:
         return _each_stamp_once(rows.stamp_ns, rows.pose)
 
 
-def read_recording(bag: Path, swarm: Swarm, progress: Progress = unwatched) -> Recording:
+def read_recording(
+    bag: Path,
+    swarm: Swarm,
+    progress: Progress = unwatched,
+    remap: Mapping[str, str] = MappingProxyType({}),
+) -> Recording:
     """Read a bag once.
 
     Args:
         bag: rosbag2 folder, .mcap or .db3 file.
         swarm: Robots whose messages are read.
         progress: Called now and then with the share done and what is being done.
+        remap: Expected topic -> topic of the bag, see `renamed_topics`.
 
     Raises:
-        BagError: Nothing in the bag can be read.
+        BagError: Nothing in the bag can be read, or a topic cannot be mapped.
     """
     parts: list[Batch] = []
-    summary = read_bag(bag, swarm, parts.append, progress)
+    summary = read_bag(bag, swarm, parts.append, progress, remap)
     converter = InputConverter(swarm, Settings())
     odometry = [converter.convert(part).rows.get("odometry", NO_ODOMETRY) for part in parts]
     detections = [part["detections"] for part in parts if part["detections"].robot.size]

@@ -1,0 +1,156 @@
+"""Bags that are compressed as whole files or message by message, and those of other systems."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import lz4.frame  # type: ignore[import-untyped]
+import numpy as np
+import pytest
+import zstandard
+from mcap.writer import Writer as McapWriter
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
+from test_bags import START, TOPICS, expected, read, some_messages, write_bag, write_mcap, write_sqlite
+
+from swarm_loc_estimator.common.bags import packed
+from swarm_loc_estimator.common.bags.bag_file import ReadErrors
+from swarm_loc_estimator.common.bags.packed import unpack_messages
+from swarm_loc_estimator.common.bags.reader import BagError, BagReader
+from swarm_loc_estimator.common.bags.writer import typestore
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+
+PACK = {".zst": zstandard.compress, ".zstd": zstandard.compress, ".lz4": lz4.frame.compress}
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where temporary files are made."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
+@pytest.mark.parametrize("suffix", PACK)
+@pytest.mark.parametrize("storage", ["mcap", "db3"])
+def test_a_compressed_file_is_read_and_leaves_nothing(
+    tmp_path: Path, temporary: Path, suffix: str, storage: str
+) -> None:
+    messages, plain = some_messages(300), tmp_path / "x.mcap"
+    if storage == "mcap":
+        write_mcap(plain, messages)
+    else:
+        plain = write_sqlite(tmp_path / "bag", messages)
+    path = tmp_path / f"y.{storage}{suffix}"
+    path.write_bytes(PACK[suffix](plain.read_bytes()))
+    assert read(path) == (expected(messages), [])
+    assert not list(temporary.iterdir())
+
+
+@pytest.mark.parametrize("plugin", StoragePlugin)
+@pytest.mark.parametrize("mode", [CompressionMode.FILE, CompressionMode.MESSAGE])
+def test_bags_compressed_by_file_or_message(
+    tmp_path: Path, temporary: Path, plugin: StoragePlugin, mode: CompressionMode
+) -> None:
+    messages = some_messages(300)
+    writer = Writer(tmp_path / "bag", version=9, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer as bag:
+        topics = {
+            name: bag.add_connection("/" + name, kind, typestore=typestore()) for name, kind in TOPICS.items()
+        }
+        for topic, log_ns, data in messages:
+            bag.write(topics[topic], log_ns, data)
+    assert read(tmp_path / "bag") == (expected(messages), [])
+    assert not list(temporary.iterdir())
+
+
+def test_a_file_that_was_unpacked_by_hand_is_read_once(tmp_path: Path) -> None:
+    write_bag(tmp_path / "bag", some_messages(30))
+    file = tmp_path / "bag" / "bag.mcap"
+    file.with_suffix(".mcap.zstd").write_bytes(zstandard.compress(file.read_bytes()))
+    assert read(tmp_path / "bag") == (expected(some_messages(30)), [])
+
+
+@pytest.mark.parametrize("suffix", [".zst", ".lz4"])
+def test_a_compressed_file_that_is_cut_off_gives_what_was_there(tmp_path: Path, suffix: str) -> None:
+    rng = np.random.default_rng(1)
+    messages = [("a/odom", START + k, rng.bytes(4000)) for k in range(500)]
+    write_mcap(tmp_path / "x.mcap", messages, use_chunking=False)
+    data = PACK[suffix]((tmp_path / "x.mcap").read_bytes())
+    path = tmp_path / f"y.mcap{suffix}"
+    path.write_bytes(data[: len(data) // 2])
+    found, losses = read(path)
+    assert found == expected(messages)[: len(found)]
+    assert 150 < len(found) < 260
+    assert any("y.mcap: it was cut off" in loss for loss in losses)
+
+
+def test_a_compressed_file_of_something_else_is_refused_by_its_own_name(
+    tmp_path: Path, temporary: Path
+) -> None:
+    path = tmp_path / "x.mcap.zst"
+    for content in (b"", b"no zstd at all", zstandard.compress(b"hello world, this is no bag")):
+        path.write_bytes(content)
+        with pytest.raises(BagError, match=rf"{path} is (no MCAP file|empty)\."):
+            BagReader(path)
+    assert not list(temporary.iterdir())
+
+
+def test_a_file_that_would_fill_the_disk_is_refused(
+    tmp_path: Path, temporary: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: SimpleNamespace(free=20_000_000))
+    path = tmp_path / "x.mcap.zst"
+    path.write_bytes(zstandard.compress(bytes(100_000_000)))
+    with pytest.raises(BagError, match="unpacks to more than half of the free space"):
+        BagReader(path)
+    assert not list(temporary.iterdir())
+
+
+def test_messages_that_cannot_be_unpacked_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(packed, "MAX_MESSAGE", 1000)
+    good, plain = zstandard.compress(bytes(1000)), b"\0\1\0\0 as it is"
+    contents = [plain, good, good[:4] + b"damage", zstandard.compress(bytes(1001)), b"", plain]
+    batch = MessageBatch.of([SerializedMessage(k, data, k) for k, data in enumerate(contents)])
+    losses = ReadErrors("x.db3")
+    (unpacked,) = unpack_messages(iter([batch]), losses)
+    assert [*unpacked.messages()] == [(0, 0, plain), (1, 1, bytes(1000)), (4, 4, b""), (5, 5, plain)]
+    assert losses == ["x.db3: 2 messages whose compression is damaged were skipped."]
+
+
+def test_batches_are_split_where_messages_unpack_to_much(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(packed, "_MAX_BATCH", 2500)
+    message = zstandard.compress(bytes(1000))
+    batch = MessageBatch.of([SerializedMessage(0, message, k) for k in range(8)])
+    sizes = [part.size for part in unpack_messages(iter([batch]), ReadErrors("x"))]
+    assert sizes == [3, 3, 2]
+
+
+@pytest.mark.parametrize("make", [lambda path: path, lambda path: path / "old.bag"])
+def test_a_bag_of_ros_1_is_named_with_the_tool_that_converts_it(tmp_path: Path, make: Any) -> None:
+    (tmp_path / "old.bag").write_bytes(b"#ROSBAG V2.0\n")
+    with pytest.raises(BagError, match=r"convert bags of ROS 1 first: rosbags-convert --src .*\.bag --dst "):
+        BagReader(make(tmp_path))
+
+
+def test_topics_of_another_encoding_are_named_and_the_others_read(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    with path.open("wb") as stream:
+        writer = McapWriter(stream)
+        writer.start("ros2", "test")
+        for name, encoding in (("a/odom", "cdr"), ("b/odom", "json"), ("c/odom", "ros1"), ("d/odom", "ros1")):
+            schema = writer.register_schema(TOPICS["a/odom"], "ros2msg", b"")
+            channel = writer.register_channel("/" + name, encoding, schema)
+            writer.add_message(channel, START, b"\0\1\0\0" + name.encode(), START)
+        writer.finish()  # type: ignore[no-untyped-call]
+    found, losses = read(path)
+    assert found == [("a/odom", TOPICS["a/odom"], START, b"\0\1\0\0a/odom")]
+    json, ros_1 = losses
+    assert json.startswith("x.mcap: the messages on b/odom are serialized as json, not as cdr as in ROS 2;")
+    assert "on c/odom, d/odom are serialized as ros1" in ros_1
