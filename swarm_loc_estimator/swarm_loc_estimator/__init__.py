@@ -82,4 +82,4 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     """The names of the API."""
-    return [*_MODULE_OF, *globals()]
+    return sorted({*_MODULE_OF, *globals()})

@@ -39,6 +39,7 @@ _DIGEST_SIZE = 32
 _FOREIGN = {*sys.stdlib_module_names, "numpy", "numba", "scipy", "llvmlite"}
 _PLAIN = (int, float, complex, str, bytes, type(None), type(...), np.generic, np.dtype)
 _core: Any = core  # most of it has no types
+_core.config.DISABLE_JIT = 0  # NUMBA_DISABLE_JIT has no effect: only compiled code reads records
 _types = _core.types
 _OPTIONS = f"numba {numba.__version__}, Python {sys.version}"
 
@@ -104,9 +105,7 @@ def _compiled(
         error_model="numpy", fastmath=fastmath, forceinline=forceinline, _nrt=nrt
     )
     dispatcher: Any = compiler(function)
-    if isinstance(dispatcher, Dispatcher):  # else compilation is disabled
-        cached: Any = dispatcher
-        cached._cache = _ContentCache(dispatcher)  # noqa: SLF001 - numba has no other way in
+    dispatcher._cache = _ContentCache(dispatcher)  # noqa: SLF001 - numba has no other way in
     return cast("Function", dispatcher)
 
 

@@ -9,6 +9,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from types import FrameType
 from typing import Any, Generic, TypeVar
 
@@ -55,6 +56,23 @@ _CLOCK_THROTTLE_S = 10.0
 _DIAGNOSTICS_PERIOD_S = 1.0
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 """Name of a node that the middleware has not discovered yet, though its publisher."""
+
+
+def message_class(message_type: str) -> Any:
+    """The class of messages of a type, such as nav_msgs/msg/Odometry.
+
+    Raises:
+        MessageTypeError: It is not installed.
+    """
+    package, _, name = message_type.replace("/msg/", "/").partition("/")
+    try:
+        return getattr(import_module(f"{package}.msg"), name)
+    except (ImportError, AttributeError) as error:
+        raise MessageTypeError(f"There is no message type {message_type} here.") from error
+
+
+class MessageTypeError(UserError):
+    """A message type that is not installed; the message is one sentence."""
 
 
 class RosArgumentsError(UserError):

@@ -24,7 +24,7 @@ _MAX_BYTES = 200_000_000
 _MAX_CELLS = 50_000_000
 """Maximum number of cells: 400 MB, or 141 x 141 m with cells of 2 cm."""
 _NUMBERS = {
-    "resolution": NumberSpec("m", 0.0, 10.0, True, "side of a pixel"),
+    "resolution": NumberSpec("m", 1e-4, 10.0, False, "side of a pixel"),
     "occupied_thresh": NumberSpec("1", 0.0, 1.0, False, "cells above are occupied"),
     "free_thresh": NumberSpec("1", 0.0, 1.0, False, "cells below are free"),
 }

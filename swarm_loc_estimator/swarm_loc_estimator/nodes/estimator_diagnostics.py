@@ -14,6 +14,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import Level, Report, drop_values, level_of, listed
 from swarm_loc_estimator.filter.measurement_model import MeasurementArray
 from swarm_loc_estimator.identification.memory import Identities
+from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
 from swarm_loc_estimator.sensors.registry import InputTopic
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
@@ -102,7 +103,7 @@ class Diagnostics:
     Args:
         swarm: The robots.
         ingest: The inputs; each of its topics should have one publisher.
-        odom_frame: Expected frame of the odometry, below the robot's name.
+        parameters: Expected frames of the odometry.
         graph: Publishers of topics.
         sole: Other topics that should have one publisher.
 
@@ -111,12 +112,17 @@ class Diagnostics:
     """
 
     def __init__(
-        self, swarm: Swarm, ingest: Ingest, odom_frame: str, graph: Graph, sole: Sequence[str]
+        self,
+        swarm: Swarm,
+        ingest: Ingest,
+        parameters: EstimatorParameters,
+        graph: Graph,
+        sole: Sequence[str],
     ) -> None:
         self.duplicate_publishers: list[str] = []
         self._swarm = swarm
         self._ingest = ingest
-        self._odom_frame = odom_frame
+        self._parameters = parameters
         self._graph = graph
         self._sole = sole
         self._inputs_of: list[list[tuple[int, InputTopic]]] = [[] for _ in swarm.robots]
@@ -250,7 +256,8 @@ class Diagnostics:
         map_frame = self._ingest.map_frame
         if topic.kind.in_map and found != map_frame:
             troubles.append(f"{topic.name} is in frame '{found}' but must be in '{map_frame}'")
-        odom_frame = f"{robot.name}/{self._odom_frame}" if robot is not None else self._odom_frame
+        one = self._parameters
+        odom_frame = one.odom_frame if robot is None else one.odom_frame_of(robot.name)
         if topic.kind.rows == "odometry" and found != odom_frame:
             troubles.append(
                 f"{topic.name} is in frame '{found}' but transforms are published for '{odom_frame}'"

@@ -6,7 +6,7 @@ It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness`, `<r
 `<robot>/initialpose` of the robots in the swarm description, and to `aerial/detections`; with `shared_topics`
 to `swarm/odom`, `swarm/detections` and `swarm/fixes` in their place. It publishes
 `swarm/poses`, `<robot>/pose`, `aerial/identities`, `/diagnostics`, and `/tf` (map to `<robot>/odom`, which no
-other node may publish).
+other node may publish) or, with `tf_per_robot`, `<robot>/tf`.
 Services: `~/reset`, `~/set_robot_pose`. Parameters: see `doc/estimator_node.md`.
 """
 
@@ -103,7 +103,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._outputs = EstimateOutputs(self, self._swarm, self.params)
         self._reported_s = time.monotonic()
         self._lost = 0
-        self._static_transforms = StaticTransforms(self, self._owned_frames())
+        self._static_transforms = StaticTransforms(self, self._swarm, self.params)
         self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop)
         self.create_service(Trigger, "~/reset", self._on_reset)
         frame = self.params.map_frame
@@ -123,12 +123,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
 
     def _create_diagnostics(self) -> Diagnostics:
         sole = ["swarm/poses", *(["/clock"] if self.get_clock().ros_time_is_active else [])]
-        return Diagnostics(self._swarm, self._ingest, self.params.odom_frame, self, sole)
-
-    def _owned_frames(self) -> list[str]:
-        """Child frames of the transforms that only this node may publish; none without publish_tf."""
-        robots = self._swarm.robots if self.params.publish_tf else ()
-        return [f"{robot.name}/{self.params.odom_frame}" for robot in robots]
+        return Diagnostics(self._swarm, self._ingest, self.params, self, sole)
 
     def _start_timers(self) -> None:
         self._ticks = Ticks(self, self.params.tick_period_s, self._on_tick)

@@ -4,39 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
-from nav_msgs.msg import Odometry
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 
+from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.detections import encode_identities
 from swarm_loc_estimator.common.messages.estimates import SwarmPosesEncoder, TransformsEncoder
 from swarm_loc_estimator.common.messages.message_batch import SerializedMessage
 from swarm_loc_estimator.common.messages.poses import encode_poses
+from swarm_loc_estimator.common.node import message_class
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.registry import InputTopic
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.sightings import encode_sightings, newest_sightings
-from swarm_loc_msgs.msg import (
-    AnonymousDetectionArray,
-    BrightnessMatrix,
-    MarkerDetectionArray,
-    RobotIdentities,
-    SwarmDetections,
-    SwarmFixes,
-    SwarmOdometry,
-    SwarmPoses,
-    SwarmSightings,
-)
+from swarm_loc_msgs.msg import RobotIdentities, SwarmPoses, SwarmSightings
 
 DEPTH = 1000
 """Queue length of a topic, which is emptied at each tick: enough for the horizon."""
@@ -48,16 +41,6 @@ _MIN_PER_TOPIC = 100
 """Least limit per topic: the messages of the usual horizon. With less, an estimator that has fallen behind
 would get ever older data, which cost more to fuse, and never catch up."""
 
-_MESSAGE_CLASSES = {
-    "odometry": Odometry,
-    "detections": MarkerDetectionArray,
-    "brightness": BrightnessMatrix,
-    "fixes": PoseWithCovarianceStamped,
-    "aerial": AnonymousDetectionArray,
-    "swarm_odometry": SwarmOdometry,
-    "swarm_detections": SwarmDetections,
-    "swarm_fixes": SwarmFixes,
-}
 _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
 """Drop reason of messages that are missing in a publisher's sequence."""
 _TF_STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -128,7 +111,7 @@ class EstimatorInputs:
     def _subscribe(self, handle: int, reliability: ReliabilityPolicy) -> Subscription:
         topic = self._topics[handle]
         return self._node.create_subscription(
-            _MESSAGE_CLASSES[topic.kind.name],
+            message_class(topic.kind.message_type),
             topic.name,
             lambda _: None,
             QoSProfile(depth=_SHARED_DEPTH if topic.kind.stands_for else DEPTH, reliability=reliability),
@@ -168,33 +151,53 @@ def newest_time_ns(node: Node) -> int:
     return int(node.get_clock().now().nanoseconds)
 
 
+def _children_by_topic(swarm: Swarm, parameters: EstimatorParameters) -> dict[str, dict[str, int]]:
+    """Topic of transforms -> child frames of the transforms on it, with the index of each robot."""
+    # tf2 uses the absolute name, whatever the namespace, unless it is remapped to that of each robot
+    topics: dict[str, dict[str, int]] = {}
+    for index, robot in enumerate(swarm.robots):
+        topic = f"{robot.name}/tf" if parameters.tf_per_robot else "/tf"
+        topics.setdefault(topic, {})[parameters.odom_frame_of(robot.name)] = index
+    return topics if parameters.publish_tf else {}
+
+
 class StaticTransforms:
-    """Listens to `/tf_static` for transforms into the estimator's own frames, which tf2 would accept.
+    """Listens for static transforms into the estimator's own frames, which tf2 would accept.
 
     Args:
-        node: Has the subscription.
-        owned: Frames whose parent only this node may publish.
+        node: Has the subscriptions.
+        swarm: Names of the robots.
+        parameters: Frames, and topics of transforms.
     """
 
-    def __init__(self, node: Node, owned: Collection[str]) -> None:
-        self._parents: dict[str, str] = {}
-        self._owned = frozenset(owned)
-        # tf2 uses this absolute name, whatever the namespace
-        node.create_subscription(TFMessage, "/tf_static", self._on_transforms, _TF_STATIC)
+    def __init__(self, node: Node, swarm: Swarm, parameters: EstimatorParameters) -> None:
+        self._parents: dict[tuple[str, str], str] = {}
+        for name, children in _children_by_topic(swarm, parameters).items():
+            topic = f"{name}_static"
+            listener = partial(self._on_transforms, topic, frozenset(children))
+            node.create_subscription(TFMessage, topic, listener, _TF_STATIC)
 
     @property
     def foreign(self) -> list[str]:
         """One sentence for each owned frame for which another node publishes a static parent."""
         return [
-            f"/tf_static has a transform from '{parent}' to '{child}', which only the estimator may publish"
-            for child, parent in self._parents.items()
+            f"{topic} has a transform from '{parent}' to '{child}', which only the estimator may publish"
+            for (topic, child), parent in self._parents.items()
         ]
 
-    def _on_transforms(self, message: TFMessage) -> None:
+    def _on_transforms(self, topic: str, owned: Collection[str], message: TFMessage) -> None:
         for transform in message.transforms:
             child = transform.child_frame_id.lstrip("/")
-            if child in self._owned:
-                self._parents[child] = transform.header.frame_id.lstrip("/")[:_MAX_FRAME_LENGTH]
+            if child in owned:
+                self._parents[topic, child] = transform.header.frame_id.lstrip("/")[:_MAX_FRAME_LENGTH]
+
+
+class _Transforms(NamedTuple):
+    """Publisher of the transforms of some robots, with their indices (n,)."""
+
+    publisher: Publisher
+    encoder: TransformsEncoder
+    robots: IntArray
 
 
 class EstimateOutputs:
@@ -221,9 +224,15 @@ class EstimateOutputs:
             node.create_publisher(PoseWithCovarianceStamped, f"{name}/pose", _RELIABLE)
             for name in (names if parameters.publish_robot_poses and not parameters.shared_topics else [])
         ]
-        # tf2's listeners know this one absolute name, whatever the namespace
-        self._tf = node.create_publisher(TFMessage, "/tf", _TF) if parameters.publish_tf else None
-        self._tf_encoder = TransformsEncoder(frame, [f"{name}/{parameters.odom_frame}" for name in names])
+        self._transforms = [
+            _Transforms(
+                node.create_publisher(TFMessage, topic, _TF),
+                TransformsEncoder(frame, [*children]),
+                np.array([*children.values()]),
+            )
+            for topic, children in _children_by_topic(swarm, parameters).items()
+        ]
+        self._tolerance_ns = round(parameters.transform_tolerance_s * 1e9)
 
     def publish(self, estimate: Estimate) -> None:
         """Publish all poses; robots that are not localized are in `swarm/poses` only, with status waiting."""
@@ -232,8 +241,10 @@ class EstimateOutputs:
         self._swarm_poses.publish(
             self._swarm_poses_encoder.encode(e.stamp_ns, e.poses, e.covariances, e.fix_age_s, e.status)
         )
-        if self._tf is not None and located.any():
-            self._tf.publish(self._tf_encoder.encode(e.stamp_ns, located, e.map_to_odom))
+        stamp_ns = e.stamp_ns + self._tolerance_ns
+        for publisher, encoder, robots in self._transforms:
+            if located[robots].any():
+                publisher.publish(encoder.encode(stamp_ns, located[robots], e.map_to_odom[robots]))
         # publishing one topic per robot is the largest cost of a large swarm, and few have subscribers
         heard = [k for k, one in enumerate(self._robot_poses) if located[k] and one.get_subscription_count()]
         if heard:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from nav_msgs.msg import OccupancyGrid, Odometry
+from nav_msgs.msg import OccupancyGrid
 from rclpy.qos import DurabilityPolicy, QoSProfile
 from rclpy.time import Time
 from std_msgs.msg import Header
@@ -26,7 +26,7 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of, listed
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.messages.poses import PLANE, planar_covariance
-from swarm_loc_estimator.common.node import BACKWARDS, ConfiguredNode, run_node
+from swarm_loc_estimator.common.node import BACKWARDS, ConfiguredNode, message_class, run_node
 from swarm_loc_estimator.mapping.exploration import Goal
 from swarm_loc_estimator.mapping.grid import CELL, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import MapFileError, load_map, save_map
@@ -39,16 +39,10 @@ from swarm_loc_estimator.nodes.parameters import (
     chosen_robots,
 )
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_msgs.msg import LaserDistance, LightBearingArray
 
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _INPUT_QOS = QoSProfile(depth=200)
 _OUTPUT_QOS = QoSProfile(depth=10)
-_MESSAGE_CLASSES = {
-    MapperInput.ODOMETRY: Odometry,
-    MapperInput.LASER: LaserDistance,
-    MapperInput.LIGHTS: LightBearingArray,
-}
 
 
 class MapperNode(ConfiguredNode[MapperParameters]):
@@ -84,7 +78,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
             for kind in MapperInput if self._frequencies else (MapperInput.ODOMETRY, MapperInput.LASER):
                 take = partial(self._on_message, index, kind)
                 topic = f"{robot.name}/{kind.topic}"
-                self.create_subscription(_MESSAGE_CLASSES[kind], topic, take, _INPUT_QOS, raw=True)
+                self.create_subscription(message_class(kind.message_type), topic, take, _INPUT_QOS, raw=True)
         self.create_service(Trigger, "~/save_map", self._on_save)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._jumps = self.get_clock().create_jump_callback(BACKWARDS, post_callback=self._on_jump)

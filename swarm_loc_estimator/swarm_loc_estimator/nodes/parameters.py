@@ -26,12 +26,23 @@ class EstimatorParameters:
         "odom", "transforms go from map_frame to <robot>/odom_frame, the frame of its odometry", required=True
     )
     publish_tf: bool = flag(True, "publish these transforms")
+    tf_per_robot: bool = flag(
+        False,
+        "publish them on <robot>/tf, to odom_frame without <robot>/, as Nav2 with several robots expects",
+    )
+    transform_tolerance_s: float = number(
+        0.0, "s", 0.0, 10.0, "time by which transforms are post-dated, as by AMCL"
+    )
     publish_robot_poses: bool = flag(True, "publish <robot>/pose beside swarm/poses, unless shared_topics")
     shared_topics: bool = flag(
         False,
         "listen to swarm/odom, swarm/detections and swarm/fixes in place of topics of each robot",
     )
     settings: Settings = field(default_factory=Settings, metadata={"numbers_of": Settings})
+
+    def odom_frame_of(self, robot: str) -> str:
+        """Frame of a robot's odometry."""
+        return self.odom_frame if self.tf_per_robot else f"{robot}/{self.odom_frame}"
 
 
 @dataclass(frozen=True)

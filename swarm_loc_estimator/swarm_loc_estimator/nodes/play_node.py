@@ -11,7 +11,6 @@ import sys
 import time
 from collections.abc import Sequence
 from functools import partial
-from importlib import import_module
 from itertools import takewhile
 from pathlib import Path
 from typing import Any
@@ -26,7 +25,7 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from swarm_loc_estimator.common.bags.reader import BagReader, BagTopic, RawMessage
 from swarm_loc_estimator.common.health import listed
-from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node
+from swarm_loc_estimator.common.node import ConfiguredNode, MessageTypeError, Stop, message_class, run_node
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_estimator.nodes.parameters import PlayerParameters
 from swarm_loc_estimator.nodes.playback import STEP_S, PlayedSoFar, play
@@ -120,14 +119,13 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
 
     def _add_publisher(self, topic: BagTopic) -> None:
         """Create the publisher of a topic, if its type is installed."""
-        package, _, name = topic.type.replace("/msg/", "/").partition("/")
         try:
-            message_class = getattr(import_module(f"{package}.msg"), name)
-        except (ImportError, AttributeError):
+            publishes = message_class(topic.type)
+        except MessageTypeError:
             self.get_logger().warning(f"{topic.name} is not played: there is no type {topic.type} here")
             return
         qos = playing_qos(topic.name, self._reader.offered_qos.get(topic.name, ()))
-        self._publisher_of[topic.name] = self.create_publisher(message_class, topic.name, qos)
+        self._publisher_of[topic.name] = self.create_publisher(publishes, topic.name, qos)
 
     def _play_once(self, stop: Stop) -> None:
         messages = takewhile(lambda _: not stop.requested, self._reader.messages(self._publisher_of))

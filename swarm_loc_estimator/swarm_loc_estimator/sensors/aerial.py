@@ -23,6 +23,7 @@ from swarm_loc_estimator.sensors.sensor import (
     Measured,
     Sensor,
     SensorSettings,
+    of_none,
 )
 from swarm_loc_estimator.swarm.swarm import Swarm
 
@@ -103,6 +104,7 @@ AERIAL = Sensor(
             ANONYMOUS_DETECTIONS,
             lambda n, _: EachReader(n, decode_anonymous),
             _columns,
+            of_none,
             of_each=False,
             in_map=True,
         ),

@@ -15,6 +15,7 @@ from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Accumulator,
     Converter,
+    Guard,
     Measured,
     SensorSettings,
     chosen,
@@ -71,11 +72,12 @@ class InputConverter:
             if late.any():
                 self.drop_of("future_stamp", rows.robot[late])
                 rows = chosen(rows, ~late)
-            found = self._converters[name](rows) if name in self._converters else rows
-            if isinstance(found, Measured):
-                parts.append(self._valid(found))
-            elif found.robot.size:
-                kept[name] = found
+            with Guard(name, rows.robot.size, self.drops):
+                found = self._converters[name](rows) if name in self._converters else rows
+                if isinstance(found, Measured):
+                    parts.append(self._valid(found))
+                elif found.robot.size:
+                    kept[name] = found
         return Measurements(batch.begin_ns, batch.end_ns, *_in_order_of_arrival(parts), kept)
 
     def drop_of(self, reason: str, robots: IntArray) -> None:

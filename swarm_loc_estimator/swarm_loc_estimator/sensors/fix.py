@@ -33,12 +33,15 @@ from swarm_loc_estimator.sensors.sensor import (
     Sensor,
     SensorSettings,
     chosen,
+    of_none,
 )
 from swarm_loc_estimator.sensors.shared_topics import FOREIGN_FRAME, shared_kind
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 HEADING_UNKNOWN = math.pi**2
 """Variance from which a heading counts as not measured [rad^2]; it exceeds that of uniform headings."""
+NO_COVARIANCE = "fix_without_covariance"
+"""Reason to drop a fix without covariance of a robot whose description has no `fix.position_sigma`."""
 _GATE = float(MODELS[Kind.CARTESIAN].gate(0.9999))
 
 
@@ -49,7 +52,8 @@ class FixRows(NamedTuple):
         robot: (f,) index of the robot.
         stamp_ns: (f,) time of measurement.
         pose: (f, 3) x [m], y [m], heading [rad] in `map`; heading NaN: not measured.
-        covariance: (f, 3, 3) of the pose; the part of a heading not measured is ignored.
+        covariance: (f, 3, 3) of the pose; the part of a heading not measured is ignored. With variances 0 of
+            x and y it is unknown, and that of the swarm description is used.
         arrival_ns: (f,) arrival times.
     """
 
@@ -63,9 +67,16 @@ class FixRows(NamedTuple):
 NO_FIXES = FixRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros((0, 3, 3)), NO_ROWS)
 
 
+def is_unknown(covariance: FloatArray) -> NDArray[np.bool_]:
+    """Whether covariances (f, 3, 3) are unset (f,): zeros, or -1 in the first element, as in ROS."""
+    first = covariance[:, 0, 0]
+    return np.asarray(((first == 0.0) | (first == -1.0)) & (covariance[:, 1, 1] == 0.0))
+
+
 def has_heading(covariance: FloatArray) -> NDArray[np.bool_]:
-    """Whether fixes with covariances (f, 3, 3) include a heading (f,)."""
-    return np.asarray((covariance[:, 2, 2] > 0.0) & (covariance[:, 2, 2] < HEADING_UNKNOWN))
+    """Whether fixes with covariances (f, 3, 3) may include a heading (f,)."""
+    known = (covariance[:, 2, 2] > 0.0) & (covariance[:, 2, 2] < HEADING_UNKNOWN)
+    return np.asarray(known | is_unknown(covariance))
 
 
 def _columns(
@@ -112,20 +123,42 @@ def take_out_headings(measurements: MeasurementArray, without: NDArray[np.bool_]
     covariance[without, 2, :] = covariance[without, :, 2] = [0.0, 0.0, 1.0]
 
 
-def _create_converter(swarm: Swarm, _settings: SensorSettings, _drops: Counter[str]) -> Converter:
+def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: Counter[str]) -> Converter:
+    sigmas = [
+        (robot.fix.position_sigma, robot.fix.position_sigma, robot.fix.heading_sigma)
+        for robot in swarm.robots
+    ]
+    default = np.array(sigmas).reshape(-1, 3, 1) ** 2 * np.eye(3)
     share = np.array([robot.fix.systematic_share for robot in swarm.robots])
 
     def convert(rows: FixRows) -> Measured:
+        unknown = is_unknown(rows.covariance)
+        if unknown.any():
+            rows, unknown = _with_covariance(rows, unknown), unknown & (default[rows.robot, 0, 0] == 0.0)
+            drops[NO_COVARIANCE] += int(np.count_nonzero(unknown))
+            rows = chosen(rows, ~unknown)
         fixes = about_robots(rows.robot, rows.stamp_ns, rows.pose, rows.covariance, Kind.CARTESIAN)
         fixes["systematic_share"] = share[rows.robot][:, None]
         take_out_headings(fixes, np.isnan(rows.pose[:, 2]))
         return Measured(fixes, rows.arrival_ns)
 
+    def _with_covariance(rows: FixRows, unknown: NDArray[np.bool_]) -> FixRows:
+        pose, covariance = rows.pose.copy(), rows.covariance.copy()
+        covariance[unknown] = default[rows.robot[unknown]]
+        pose[unknown & (covariance[:, 2, 2] == 0.0), 2] = np.nan
+        return rows._replace(pose=pose, covariance=covariance)
+
     return convert
 
 
 _OWN = InputKind(
-    "fixes", "fix", POSE_WITH_COVARIANCE, lambda n, _: EachReader(n, decode_fix), _columns, in_map=True
+    "fixes",
+    "fix",
+    POSE_WITH_COVARIANCE,
+    lambda n, _: EachReader(n, decode_fix),
+    _columns,
+    of_none,
+    in_map=True,
 )
 _decode_shared = partial(decode_shared_numbers, widths=(3, 9))
 _SHARED = shared_kind(_OWN, "swarm/fixes", SWARM_FIXES, _decode_shared, _shared_rows, NO_FIXES)

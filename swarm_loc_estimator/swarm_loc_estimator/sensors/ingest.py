@@ -18,7 +18,7 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.detections import swarm_key
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.sensors.registry import Batch, InputTopic, input_topics, kinds
-from swarm_loc_estimator.sensors.sensor import Known, in_order_of_arrival
+from swarm_loc_estimator.sensors.sensor import Guard, Known, in_order_of_arrival
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 MAX_PAUSE_NS = 3_600_000_000_000
@@ -160,14 +160,15 @@ class Ingest:
             if not present[number]:
                 continue
             part = batch if present[number] == batch.size else batch.chosen(of_message == number)
-            found = reader.read(part)
-            _count(self._counted, part.topic, part.log_ns, found.stamp_ns, found.valid)
-            read, unused = kind.columns_of(found, part, self._robot[part.topic], self._known)
-            # a sensor may have both topics of single robots and shared ones
-            before = rows.get(kind.rows)
-            rows[kind.rows] = read if before is None else in_order_of_arrival([before, read])
-            dropped.update(unused)
-            dropped["bad_message"] += int(np.sum(~found.valid))
+            with Guard(kind.name, part.size, dropped):
+                found = reader.read(part)
+                _count(self._counted, part.topic, part.log_ns, found.stamp_ns, found.valid)
+                read, unused = kind.columns_of(found, part, self._robot[part.topic], self._known)
+                # a sensor may have both topics of single robots and shared ones
+                before = rows.get(kind.rows)
+                rows[kind.rows] = read if before is None else in_order_of_arrival([before, read])
+                dropped.update(unused)
+                dropped["bad_message"] += int(np.sum(~found.valid))
         return Batch(int(batch.log_ns[0]), int(batch.log_ns[-1]), rows, +dropped)
 
 

@@ -59,7 +59,7 @@ def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
         if kind.of_each
     )
     of_swarm = (
-        InputTopic(kind.topic, kind, THE_SWARM, expected=False)
+        InputTopic(kind.topic, kind, THE_SWARM, not kind.stands_for and kind.is_expected_of(swarm))
         for kind in kinds().values()
         if not kind.of_each
     )
@@ -72,9 +72,7 @@ def live_topics(swarm: Swarm, *, shared: bool) -> tuple[InputTopic, ...]:
     if not shared:
         return tuple(topic for topic in input_topics(swarm) if not topic.kind.stands_for)
     return tuple(
-        replace(topic, expected=any(map(topic.kind.expected_of, swarm.robots)))
-        if topic.kind.stands_for
-        else topic
+        replace(topic, expected=topic.kind.is_expected_of(swarm)) if topic.kind.stands_for else topic
         for topic in input_topics(swarm)
         if topic.kind.rows == "aerial" or topic.kind.stands_for or _is_sent(topic, swarm, stood_for)
     )
@@ -103,7 +101,17 @@ class Batch:
 
     @classmethod
     def of(cls, begin_ns: int, end_ns: int, **rows: Any) -> Batch:
-        """Create a batch; keywords are names of sensors."""
+        """Create a batch; keywords are names of sensors.
+
+        Raises:
+            TypeError: There is no such sensor, or readings are not its columns of equal length.
+        """
+        for name, given in rows.items():
+            if name not in SENSORS:
+                raise TypeError(f"there is no sensor '{name}', only {', '.join(SENSORS)}")
+            columns = type(SENSORS[name].nothing)
+            if not isinstance(given, columns) or len({len(column) for column in given}) != 1:
+                raise TypeError(f"{name} must be {columns.__name__} with columns of equal length")
         return cls(begin_ns, end_ns, rows)
 
     def __getitem__(self, sensor: str) -> Any:

@@ -39,11 +39,18 @@ class Estimator:
     Args:
         swarm: Robots and landmarks.
         settings: Horizon, periods and thresholds; defaults if None.
+
+    Raises:
+        TypeError: One of them is of another type.
     """
 
     def __init__(self, swarm: Swarm, settings: Settings | None = None) -> None:
+        settings = Settings() if settings is None else settings
+        for name, value, expected in (("swarm", swarm, Swarm), ("settings", settings, Settings)):
+            if not isinstance(value, expected):
+                raise TypeError(f"{name} must be a {expected.__name__}, not {value!r}")
         self.swarm = swarm
-        self.settings = (settings or Settings()).resolved_for(swarm)
+        self.settings = settings.resolved_for(swarm)
         self._limits = TrackedLimits.of(swarm, self.settings)
         self._tracks = OdometryTracks(swarm.robots)
         self._converter = InputConverter(swarm, self.settings)

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseWithCovarianceStamped
+from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from node_world import (
+    SETTINGS,
     STEP_NS,
     T0_NS,
     TRUE_POSES,
@@ -25,6 +27,8 @@ from node_world import (
     values_of,
 )
 from rcl_interfaces.msg import Log
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, QoSProfile
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
@@ -84,6 +88,35 @@ def test_poses_and_transforms_of_a_known_and_of_an_unknown_robot(ros: Ros, robot
     # beta's odometry stands at its true pose, so its odom frame lies in map as the estimate errs
     beta = se2.compose(planar(by_child["beta/odom"].transform), np.array(TRUE_POSES["beta"]))
     assert beta == pytest.approx(xytheta(robots.newest("beta")), abs=1e-9)
+
+
+def test_transforms_per_robot_are_post_dated_and_have_no_prefix(ros: Ros, swarm_file: Path) -> None:
+    """As Nav2 has them with several robots: each robot's on <robot>/tf, between map and odom."""
+    own = {"tf_per_robot": True, "transform_tolerance_s": 0.25, **SETTINGS}
+    parameters = overrides(swarm_file=str(swarm_file), use_sim_time=True, **own)
+    ros.add(EstimatorNode(parameter_overrides=parameters))
+    robots = Robots(ros)
+    robots.wait_for_estimator()
+    heard = {name: ros.listen(TFMessage, f"{name}/tf") for name in TRUE_POSES}
+    common, log = ros.listen(TFMessage, "/tf"), ros.listen(Log, "/rosout")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    static = TransformStamped(child_frame_id="odom")
+    static.header.frame_id = "world"
+    ros.add(Node("other")).create_publisher(TFMessage, "beta/tf_static", latched).publish(
+        TFMessage(transforms=[static])
+    )
+    ros.until(lambda: all(ros.tester.count_publishers(f"{name}/tf") for name in TRUE_POSES))
+    now_ns = robots.run(T0_NS, 20)
+    post_dated_ns = now_ns + 250_000_000
+    ros.until(lambda: all(one and stamp_ns(one[-1].transforms[0]) == post_dated_ns for one in heard.values()))
+    for name, messages in heard.items():
+        (transform,) = messages[-1].transforms
+        assert (transform.header.frame_id, transform.child_frame_id) == ("map", "odom")
+        located = se2.compose(planar(transform.transform), np.array(TRUE_POSES[name]))
+        assert located == pytest.approx(xytheta(robots.newest(name)), abs=1e-9)
+    sentence = "beta/tf_static has a transform from 'world' to 'odom', which only the estimator may publish"
+    ros.until(lambda: any(entry.msg == sentence for entry in log))
+    assert not common
 
 
 def test_a_waiting_robot_has_a_status_but_no_pose(ros: Ros, robots: Robots) -> None:

@@ -10,16 +10,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.cdr import CdrError
 from swarm_loc_estimator.common.messages.definitions import BRIGHTNESS, POSE_WITH_COVARIANCE
 from swarm_loc_estimator.common.messages.detections import decode_brightness, encode_brightness
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import decode_fix, encode_fix, encode_odometry
+from swarm_loc_estimator.sensors.conversion import InputConverter
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import Batch
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import FixModel, OdometryModel, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
+from swarm_loc_estimator.timeline.settings import Settings
 
 SECOND = 1_000_000_000
 T0 = 1_000 * SECOND
@@ -126,6 +129,31 @@ def test_every_kind_of_input_comes_in_columns_of_its_own() -> None:
     assert ingest.frame_id(ingest.handle_of["b/fix"]) == "odom"
     assert ingest.statistics[ingest.handle_of["b/brightness"]].malformed == 1
     assert ingest.statistics[ingest.handle_of["b/fix"]].received == 2
+
+
+@pytest.mark.parametrize("unset", [np.diag([0.0, 0.0, 0.0]), np.diag([-1.0, 0.0, 0.0])])
+@pytest.mark.parametrize(
+    ("noise", "used"),
+    [({}, ""), ({"position_sigma": 0.1}, "position"), ({"position_sigma": 0.1, "heading_sigma": 0.2}, "all")],
+)
+def test_fixes_without_covariance_have_that_of_the_description(
+    unset: FloatArray, noise: dict[str, float], used: str
+) -> None:
+    swarm = Swarm((Robot("a"), Robot("b", fix=FixModel(**noise))))
+    ingest, converter = Ingest(swarm), InputConverter(swarm, Settings())
+    handle = ingest.handle_of["b/fix"]
+    fixes = [encode_fix("map", T0 + k, (1.0, 2.0, 3.0), c) for k, c in enumerate((unset, COVARIANCE))]
+    messages = [SerializedMessage(handle, data, T0 + 10) for data in fixes]
+    (batch,) = ingest.read(MessageBatch.of(messages))
+    measured = converter.convert(batch).measurements
+    assert converter.drops == ({} if used else {"fix_without_covariance": 1})
+    *first, last = measured
+    np.testing.assert_array_equal(last["covariance"], COVARIANCE)
+    assert [bool(one["has_heading"]) for one in first] == {"": [], "position": [False], "all": [True]}[used]
+    for one in first:
+        variance = [0.1**2, 0.1**2, 0.2**2 if used == "all" else 1.0]
+        np.testing.assert_allclose(one["covariance"], np.diag(variance))
+        np.testing.assert_allclose(one["value"], [1.0, 2.0, 3.0 if used == "all" else 0.0])
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ from swarm_loc_estimator.common.messages.message_batch import MessageBatch, Seri
 from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE
 from swarm_loc_estimator.nodes.estimator_diagnostics import Diagnostics, Recent, TickCost, load_report
+from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
@@ -38,10 +39,11 @@ class Graph:
 class World:
     """Diagnostics of a swarm of two, fed by hand."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, tf_per_robot: bool = False) -> None:
+        parameters = EstimatorParameters(tf_per_robot=tf_per_robot)
         self.ingest = Ingest(SWARM)
         self.graph = Graph()
-        self.diagnostics = Diagnostics(SWARM, self.ingest, "odom", self.graph, ["swarm/poses"])
+        self.diagnostics = Diagnostics(SWARM, self.ingest, parameters, self.graph, ["swarm/poses"])
         self.reports = self.diagnostics.reports
 
     def detections(self, now_ns: int) -> None:
@@ -179,6 +181,14 @@ def test_delays_of_another_clock_do_not_overflow() -> None:
     tracked = estimate(now_ns, Status.TRACKED, Status.TRACKED)
     _, b, _ = world.reports(now_ns, tracked, recent(), {})
     assert float(str(b.values["odom lateness mean [s]"])) == pytest.approx(1.7e9)
+
+
+def test_with_transforms_per_robot_frames_have_no_prefix() -> None:
+    world, now_ns = World(tf_per_robot=True), 10 * SECOND
+    for frame, message in (("odom", "tracked"), ("b/odom", "b/odom is in frame 'b/odom' but transforms are")):
+        world.odometry("b", now_ns, now_ns, frame=frame)
+        tracked = estimate(now_ns, Status.TRACKED, Status.TRACKED)
+        assert world.reports(now_ns, tracked, recent(), {})[1].message.startswith(message)
 
 
 def test_a_robot_that_is_too_uncertain_is_named() -> None:

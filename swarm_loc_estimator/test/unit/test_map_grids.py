@@ -137,7 +137,8 @@ def test_maps_survive_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "said"),
     [
-        ("resolution: 0.02", "resolution: 0", r"resolution is 0 but must lie in \(0, 10\] m"),
+        ("resolution: 0.02", "resolution: 0", r"resolution is 0 but must lie in \[0.0001, 10\] m"),
+        ("resolution: 0.02", "resolution: 1.0e-300", "resolution is 1e-300 but must lie in"),
         ("resolution: 0.02", "resolution: " + "9" * 400, "resolution is .* but must lie in"),
         ("resolution: 0.02", "resolution: 10.0", "may have 50000000"),
         ("resolution: 0.02", "other: 0.02", "the file lacks resolution"),

@@ -5,7 +5,8 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from dataclasses import replace
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -28,6 +29,7 @@ from swarm_loc_estimator.filter.measurement_model import (
     Prediction,
     register,
 )
+from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import SENSORS
 from swarm_loc_estimator.sensors.sensor import (
@@ -40,10 +42,12 @@ from swarm_loc_estimator.sensors.sensor import (
     SensorSettings,
 )
 from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.scheduling import Policy
 from swarm_loc_estimator.timeline.settings import Settings
 
+BAG = Path(__file__).parents[3] / "bags" / "eight_one_robot_slow"
 SIGMA_M = 0.03
 
 
@@ -256,6 +260,43 @@ def test_malformed_messages_are_counted_and_the_others_are_read() -> None:
     assert part.dropped == {"bad_message": 2}
     (part,) = ingest.read(MessageBatch.of([SerializedMessage(handle, b"", T0)]))
     assert part.rows["ranges"].robot.size == 0
+
+
+@pytest.mark.parametrize("place", ["decoder", "columns", "converter", "measurements"])
+def test_an_error_of_a_sensor_costs_its_own_readings_only_and_is_named(
+    place: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> Any:
+        raise ZeroDivisionError("by my sensor")
+
+    def create(*_: object) -> Converter:
+        return fail if place == "converter" else lambda rows: Measured(None, rows.arrival_ns)  # type: ignore[arg-type]
+
+    (kind,) = RANGES.kinds
+    if place == "decoder":
+        broken = replace(RANGES, kinds=(replace(kind, create_reader=lambda n, _: EachReader(n, fail)),))
+    elif place == "columns":
+        broken = replace(RANGES, kinds=(replace(kind, columns_of=fail),))
+    else:
+        broken = replace(RANGES, create_converter=create)
+    monkeypatch.setitem(SENSORS, RANGES.name, broken)
+    world = world_of(960)
+    measured = ranges(world, 5)
+    error = "TypeError" if place == "measurements" else "ZeroDivisionError"
+    with pytest.warns(RuntimeWarning, match=f"the code of the sensor 'ranges' raised {error}"):
+        estimator, estimates = run(world, measured, IN_ORDER)
+    assert estimator.drops == {f"ranges_{error}": len(measured)}
+    monkeypatch.setitem(SENSORS, RANGES.name, RANGES)
+    np.testing.assert_array_equal(estimates[-1].poses, run(world, [], IN_ORDER)[1][-1].poses)
+
+
+def test_a_sensor_without_any_message_in_a_bag_is_named() -> None:
+    swarm = load_swarm(BAG / "swarm.yaml")
+    summary = read_bag(BAG, swarm, lambda _: None, unwatched)
+    assert [f"The bag holds no message on {robot.name}/ranges." for robot in swarm.robots] == [
+        remark for remark in summary.remarks if "no message on" in remark
+    ]
+    assert not summary.unusable
 
 
 @pytest.mark.parametrize(

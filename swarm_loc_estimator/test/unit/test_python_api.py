@@ -3,31 +3,36 @@
 from __future__ import annotations
 
 import ast
+import math
 import os
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import swarm_loc_estimator
-from swarm_loc_estimator import ReplayResult, replay
+from swarm_loc_estimator import Batch, Estimator, OdometryRows, ReplayResult, Robot, Swarm, replay
 from swarm_loc_estimator.offline.report.table import text_report
 
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "swarm_loc_estimator" / "doc" / "python_api.md"
 EXAMPLE = ROOT / "swarm_loc_estimator" / "examples" / "replay_errors.py"
 BAG = ROOT / "bags" / "eight_five_robots"
+SWARM = Swarm((Robot("robot1"),))
+ROWS = OdometryRows(*np.zeros((2, 2), np.int64), np.zeros((2, 3)), np.zeros(2, np.int64))
 NAMES = set(swarm_loc_estimator._MODULE_OF)
 
 
-def run(*arguments: str) -> str:
+def run(*arguments: str, **environment: str) -> str:
     """What a Python process at the root of the workspace prints."""
     done = subprocess.run(
         [sys.executable, *arguments],
         cwd=ROOT,
-        env={**os.environ},
+        env={**os.environ, **environment},
         capture_output=True,
         text=True,
         check=False,
@@ -56,8 +61,41 @@ def test_type_checkers_see_the_same_names_in_the_same_modules() -> None:
 def test_all_names_load_and_no_others() -> None:
     assert all(hasattr(swarm_loc_estimator, name) for name in NAMES)
     assert set(dir(swarm_loc_estimator)) >= NAMES
+    assert len(dir(swarm_loc_estimator)) == len(set(dir(swarm_loc_estimator)))
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
         _ = swarm_loc_estimator.nothing
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda: replay(BAG, tick_s=0.0), r"tick_s = 0.0 must be a number in \[0.001, 3600\] s"),
+        (lambda: replay(BAG, tick_s=-0.1), "tick_s = -0.1 must be a number"),
+        (lambda: replay(BAG, tick_s=math.nan), "tick_s = nan must be a number"),
+        (lambda: replay(BAG, tick_s="0.1"), "tick_s = '0.1' must be a number"),  # type: ignore[arg-type]
+        (lambda: replay(BAG, stamp_ns=np.array([2, 1])), "stamp_ns must be increasing whole numbers"),
+        (lambda: replay(BAG, stamp_ns=np.array([1, 1])), "stamp_ns must be increasing whole numbers"),
+        (lambda: replay(BAG, stamp_ns=np.array([1.0, 2.0])), "stamp_ns must be"),  # type: ignore[arg-type]
+        (lambda: replay(BAG, stamp_ns=np.ones((2, 2), np.int64)), "stamp_ns must be"),
+        (lambda: replay(BAG, "swarm.yaml"), "swarm must be a Swarm, not 'swarm.yaml'"),  # type: ignore[arg-type]
+        (lambda: replay(BAG, SWARM, {"x": 1}), "settings must be a Settings, not {'x': 1}"),  # type: ignore[arg-type]
+        (lambda: Estimator(SWARM, 2.0), "settings must be a Settings, not 2.0"),  # type: ignore[arg-type]
+        (lambda: Batch.of(0, 1, odometri=ROWS), "no sensor 'odometri', only odometry, detections, "),
+        (lambda: Batch.of(0, 1, fixes=ROWS), "fixes must be FixRows with columns of equal length"),
+        (
+            lambda: Batch.of(0, 1, odometry=ROWS._replace(pose=np.zeros((1, 3)))),
+            "odometry must be OdometryRows with columns of equal length",
+        ),
+    ],
+)
+def test_wrong_arguments_are_named(call: Callable[[], object], sentence: str) -> None:
+    with pytest.raises((ValueError, TypeError), match=sentence):
+        call()
+
+
+def test_numba_disable_jit_has_no_effect() -> None:
+    code = f"from swarm_loc_estimator import replay; print(len(replay('{BAG}').stamp_ns))"
+    assert int(run("-c", code, NUMBA_DISABLE_JIT="1")) > 100
 
 
 @pytest.mark.parametrize("name", ["Swarm", "Goal", "Settings"])

@@ -110,7 +110,7 @@ GOOD = np.array([0.3, 0.2, 0.1])
         ([1e200, 0.0, 0.0], np.eye(3), "absurd"),
         (GOOD, -np.eye(3), "bad_covariance"),
         (GOOD, math.nan * np.eye(3), "bad_covariance"),
-        (GOOD, np.zeros((3, 3)), "bad_covariance"),
+        (GOOD, np.diag([0.0, 1.0, 1.0]), "bad_covariance"),
         (GOOD, [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]], "bad_covariance"),
         (GOOD, [[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], "bad_covariance"),
     ],
