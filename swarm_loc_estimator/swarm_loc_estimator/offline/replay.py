@@ -9,7 +9,6 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping
 from dataclasses import replace
-from numbers import Real
 from pathlib import Path
 from types import MappingProxyType
 from typing import Protocol
@@ -99,10 +98,10 @@ class ScheduleError(UserError):
     """Outputs that cannot be scheduled; the message is one sentence."""
 
 
-def _period_ns(tick_s: float) -> int:
+def _period_ns(tick_s: object) -> int:
     """The period of outputs [ns]."""
     low, high = TICKS_S
-    if not isinstance(tick_s, Real) or not low <= tick_s <= high:
+    if not isinstance(tick_s, int | float) or not low <= tick_s <= high:
         raise ScheduleError(f"tick_s = {tick_s!r} must be a number in [{low:g}, {high:g}] s.")
     return round(tick_s * 1e9)
 
