@@ -23,7 +23,8 @@ PAGE = ROOT / "swarm_loc_estimator" / "doc" / "python_api.md"
 EXAMPLE = ROOT / "swarm_loc_estimator" / "examples" / "replay_errors.py"
 BAG = ROOT / "bags" / "eight_five_robots"
 SWARM = Swarm((Robot("robot1"),))
-ROWS = OdometryRows(*np.zeros((2, 2), np.int64), np.zeros((2, 3)), np.zeros(2, np.int64))
+TWO = np.zeros(2, np.int64)
+ROWS = OdometryRows(TWO, TWO, np.zeros((2, 3)), TWO)
 NAMES = set(swarm_loc_estimator._MODULE_OF)
 
 
@@ -75,7 +76,7 @@ def test_all_names_load_and_no_others() -> None:
         (lambda: replay(BAG, tick_s="0.1"), "tick_s = '0.1' must be a number"),  # type: ignore[arg-type]
         (lambda: replay(BAG, stamp_ns=np.array([2, 1])), "stamp_ns must be increasing whole numbers"),
         (lambda: replay(BAG, stamp_ns=np.array([1, 1])), "stamp_ns must be increasing whole numbers"),
-        (lambda: replay(BAG, stamp_ns=np.array([1.0, 2.0])), "stamp_ns must be"),  # type: ignore[arg-type]
+        (lambda: replay(BAG, stamp_ns=np.array([1.0, 2.0])), "stamp_ns must be"),
         (lambda: replay(BAG, stamp_ns=np.ones((2, 2), np.int64)), "stamp_ns must be"),
         (lambda: replay(BAG, "swarm.yaml"), "swarm must be a Swarm, not 'swarm.yaml'"),  # type: ignore[arg-type]
         (lambda: replay(BAG, SWARM, {"x": 1}), "settings must be a Settings, not {'x': 1}"),  # type: ignore[arg-type]
