@@ -135,7 +135,8 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: Counter[st
         unknown = is_unknown(rows.covariance)
         if unknown.any():
             rows, unknown = _with_covariance(rows, unknown), unknown & (default[rows.robot, 0, 0] == 0.0)
-            drops[NO_COVARIANCE] += int(np.count_nonzero(unknown))
+            if lost := int(np.count_nonzero(unknown)):
+                drops[NO_COVARIANCE] += lost
             rows = chosen(rows, ~unknown)
         fixes = about_robots(rows.robot, rows.stamp_ns, rows.pose, rows.covariance, Kind.CARTESIAN)
         fixes["systematic_share"] = share[rows.robot][:, None]
