@@ -28,6 +28,7 @@ _FAR = 1.2
 """Widths of the image, at its middle, to either side of map's origin up to which the floor is painted."""
 _POSE_SIGMA = 1e-6
 _WHITE = 235.0
+_EXPOSURES, _PARTS = 13, 14
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,8 @@ class Look:
     Attributes:
         diameter_px: Of robots in the middle of the picture.
         robots: How many.
-        kind: `pattern`, or plain discs: `dark`, `bright`; `led`, a bright spot with soft rims.
+        kind: `pattern`, or plain discs: `dark`, `bright`; `board`, dark with bright parts; `led`, a bright
+            spot with soft rims.
         tilt: Of the camera [rad].
         barrel: Radial distortion k1 of the lens.
         field_of_view: Across [rad].
@@ -49,6 +51,12 @@ class Look:
         texture: Of the floor, one standard deviation of its brightness.
         clutter: Things on the floor that are no robots.
         blur_px: Of the optics, one standard deviation.
+        height: Of the robots [m].
+        wall: Brightness of their sides.
+        slices: Discs that make their sides; 2: the sides have a gap between the top and the floor.
+        taper: Share of the diameter that is missing at the floor.
+        motion: Way of each robot while the shutter is open, in any direction, in diameters.
+        boards: One standard deviation of the brightness of the floor's boards.
     """
 
     diameter_px: float = 24.0
@@ -65,6 +73,12 @@ class Look:
     texture: float = 0.02
     clutter: int = 6
     blur_px: float = 0.6
+    height: float = 0.0
+    wall: float = 0.06
+    slices: int = 12
+    taper: float = 0.0
+    motion: float = 0.0
+    boards: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -115,9 +129,13 @@ def draw_picture(look: Look, seed: int) -> Picture:
     plan = _Plan(low, fine, (rows, columns), rng)
     plan.paint_floor(look)
     plan.scatter(look, poses)
-    for pose in poses:
-        plan.put_robot(look, pose)
-    plan.light(look, poses)
+    # whatever is over the floor hides a place that is farther from the foot of the camera
+    foot, lift = ground.centre[:2], ground.centre[2] / (ground.centre[2] - look.height)
+    tops = poses.copy()
+    tops[:, :2] = foot + lift * (poses[:, :2] - foot)
+    for row in np.argsort(-np.linalg.norm(tops[:, :2] - foot, axis=1), kind="stable"):
+        plan.put_robot(look, poses[row], tops[row], lift)
+    plan.light(look, poses, tops)
     cells = np.nan_to_num((view - low) / fine - 0.5, nan=-1.0).astype(np.float32)
     light = cv2.remap(
         plan.image, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -189,6 +207,32 @@ def _fits(place: FloatArray, poses: list[list[float]], ground: GroundCamera, loo
     return bool(inside.all()) and seen > 0.6 * look.diameter_px
 
 
+def _lay(image: Plain, depth: FloatArray, shade: float) -> None:
+    """Paint where a depth [cells] is above 0."""
+    share = np.clip(0.5 + depth, 0.0, 1.0).astype(np.float32)
+    image[:] = image * (1.0 - share) + shade * share
+
+
+def _paint_top(
+    image: Plain, offset: FloatArray, radius: float, look: Look, heading: float, parts: FloatArray
+) -> None:
+    """Paint a robot's top at offsets (rows, columns, 2) from its centre, in its radii [cells]."""
+    distance = np.linalg.norm(offset, axis=-1)
+    if look.kind == "led":
+        image += (0.95 * np.exp(-0.5 * (distance / 0.85) ** 8) * (1.0 - image)).astype(np.float32)
+    elif look.kind == "pattern":
+        cos, sin = math.cos(heading), math.sin(heading)
+        if look.floor < 0.3:
+            _lay(image, (1.0 + MARGIN - distance) * radius, 0.9)
+        _lay(image, (1.0 - distance) * radius, 0.06)
+        _lay(image, inside_mark(offset @ np.array([[cos, -sin], [sin, cos]])) * radius, 0.9)
+    else:
+        _lay(image, (1.0 - distance) * radius, 0.92 if look.kind == "bright" else 0.12)
+    for part in parts:
+        away = np.linalg.norm(offset - 0.8 * part / max(1.0, float(np.linalg.norm(part))), axis=-1)
+        _lay(image, (0.09 - away) * radius, 0.7)
+
+
 class _Plan:
     """A floor plan that is painted, brightness 0 to 1."""
 
@@ -208,6 +252,13 @@ class _Plan:
             floor += cv2.resize(rough, (columns, rows), interpolation=cv2.INTER_CUBIC)
         floor *= look.texture / max(float(floor.std()), 1e-9)
         self.image[:] = look.floor + floor
+        if look.boards > 0.0:
+            wide = round(0.9 * DIAMETER / self._step)
+            for number, left in enumerate(range(0, columns, wide)):
+                begin = -int(self._rng.integers(5 * wide)) if number else 0
+                for upper in range(begin, rows, 5 * wide):
+                    part = self.image[max(upper, 0) : upper + 5 * wide, left : left + wide]
+                    part += look.boards * self._rng.standard_normal()
         if look.texture > 0.0:
             pitch = round(2.7 * DIAMETER / self._step)
             for line in range(int(self._rng.integers(pitch)), columns, pitch):
@@ -232,39 +283,39 @@ class _Plan:
                 box = cv2.boxPoints(((x, y), (size, across), angle))
                 cv2.fillConvexPoly(self.image, np.rint(box).astype(np.int32), shade, cv2.LINE_AA)
 
-    def put_robot(self, look: Look, pose: FloatArray) -> None:
-        """One disc, in a window around it."""
-        centre = (pose[:2] - self._low) / self._step - 0.5
+    def put_robot(self, look: Look, pose: FloatArray, top: FloatArray, lift: float) -> None:
+        """One robot, in a window around it: the floor that its top and its sides hide while it moves."""
         radius = 0.5 * DIAMETER / self._step
-        reach = math.ceil(1.6 * radius)
-        left, top = (math.floor(c) - reach for c in centre)
-        right, bottom = left + 2 * reach + 2, top + 2 * reach + 2
+        way = np.zeros(2)
+        if look.motion > 0.0:
+            angle = self._rng.uniform(-math.pi, math.pi)
+            way = look.motion * DIAMETER / self._step * np.array([math.cos(angle), math.sin(angle)])
+        base, centre = ((place[:2] - self._low) / self._step - 0.5 for place in (pose, top))
+        reach = 1.6 * radius * lift + np.abs(way)
         rows, columns = self.image.shape
-        left, top, right, bottom = max(left, 0), max(top, 0), min(right, columns), min(bottom, rows)
-        grid = np.stack(np.meshgrid(np.arange(left, right), np.arange(top, bottom)), axis=-1)
-        offset = (grid - centre) / radius
-        distance = np.linalg.norm(offset, axis=-1)
-        window = self.image[top:bottom, left:right]
+        left, upper = np.clip(np.floor(np.minimum(base, centre) - reach), 0, [columns, rows]).astype(int)
+        right, lower = np.clip(np.ceil(np.maximum(base, centre) + reach), 0, [columns, rows]).astype(int)
+        if left >= right or upper >= lower:
+            return
+        grid = np.stack(np.meshgrid(np.arange(left, right), np.arange(upper, lower)), axis=-1)
+        window = self.image[upper:lower, left:right]
+        parts = self._rng.uniform(-1.0, 1.0, (_PARTS, 2)) if look.kind == "board" else np.zeros((0, 2))
+        shares = np.linspace(-0.5, 0.5, _EXPOSURES) if look.motion > 0.0 else np.zeros(1)
+        exposures = []
+        for share in shares:
+            one = window.copy()
+            shift = share * way
+            if look.height > 0.0:
+                for rise in np.linspace(0.0, 1.0, look.slices):
+                    size = radius * (1.0 + rise * (lift - 1.0) - (1.0 - rise) * look.taper)
+                    away = np.linalg.norm(grid - shift - base - rise * (centre - base), axis=-1)
+                    _lay(one, size - away, look.wall)
+            offset = (grid - shift - centre) / (radius * lift)
+            _paint_top(one, offset, radius * lift, look, pose[2], parts)
+            exposures.append(one)
+        window[:] = np.mean(exposures, axis=0)
 
-        def lay(depth: FloatArray, shade: float) -> None:
-            share = np.clip(0.5 + depth * radius, 0.0, 1.0).astype(np.float32)
-            window[:] = window * (1.0 - share) + shade * share
-
-        if look.kind == "led":
-            window += (0.95 * np.exp(-0.5 * (distance / 0.85) ** 8) * (1.0 - window)).astype(np.float32)
-        elif look.kind == "bright":
-            lay(1.0 - distance, 0.92)
-        elif look.kind == "dark":
-            lay(1.0 - distance, 0.12)
-        else:
-            cos, sin = math.cos(pose[2]), math.sin(pose[2])
-            turned = offset @ np.array([[cos, -sin], [sin, cos]])
-            if look.floor < 0.3:
-                lay(1.0 + MARGIN - distance, 0.9)
-            lay(1.0 - distance, 0.06)
-            lay(inside_mark(turned), 0.9)
-
-    def light(self, look: Look, poses: FloatArray) -> None:
+    def light(self, look: Look, poses: FloatArray, tops: FloatArray) -> None:
         """Uneven light over all, shadows beside robots and of things that are not seen."""
         rows, columns = self.image.shape
         if look.gradient < 1.0:
@@ -290,8 +341,8 @@ class _Plan:
             hull = cv2.convexHull(corners.astype(np.float32)).astype(np.int32)
             cv2.fillConvexPoly(shade, hull, 1.0, cv2.LINE_AA)
         soft = cv2.GaussianBlur(shade, (0, 0), 0.08 * size)
-        tops = np.zeros((rows, columns), np.float32)
-        for pose in poses:
-            centre = np.rint((pose[:2] - self._low) / self._step).astype(int)
-            cv2.circle(tops, centre.tolist(), round(0.5 * size), 1.0, -1, cv2.LINE_AA)
-        self.image *= 1.0 - look.shadow * soft * (1.0 - tops)
+        lit = np.zeros((rows, columns), np.float32)
+        for top in tops:
+            centre = np.rint((top[:2] - self._low) / self._step).astype(int)
+            cv2.circle(lit, centre.tolist(), round(0.5 * size), 1.0, -1, cv2.LINE_AA)
+        self.image *= 1.0 - look.shadow * soft * (1.0 - lit)

@@ -97,8 +97,12 @@ _NOISES = 0.5
 _SLACK_PX = 0.03
 """Error of an edge that its neighbours share [px], on top of the residuals."""
 
+_OVAL_RIDGE = 1.0
+"""Prior information on the oval, in edges: half a rim says little of it."""
+
 _ANGLES = 2.0 * np.pi * np.arange(RAYS) / RAYS
 DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
+_OVALS = np.stack([np.cos(2.0 * _ANGLES), np.sin(2.0 * _ANGLES)], axis=1)
 _SHARES = np.linspace(_NEAREST, _FARTHEST, _SAMPLES)
 
 
@@ -108,10 +112,12 @@ class Circles(NamedTuple):
     Attributes:
         centre: (C, 2) column and row [px].
         radius: (C,) [px].
-        coverage: (C,) share of the rays that meet an edge of the circle.
+        coverage: (C,) share of the rays that meet an edge of the outline.
         contrast: (C,) median step of these edges, of the logarithm of brightness.
-        spread: (C,) root mean square distance of these edges from the circle [px].
+        spread: (C,) root mean square distance of these edges from the outline [px].
+        oval: (C, 2) cosine and sine of the second harmonic of the outline, as left by motion [px].
         covariance: (C, 2, 2) of the centre [px^2].
+        kind: (C,) `TOP`, `SIDES` or `PARTLY`: what the outline is.
     """
 
     centre: FloatArray
@@ -119,11 +125,62 @@ class Circles(NamedTuple):
     coverage: FloatArray
     contrast: FloatArray
     spread: FloatArray
+    oval: FloatArray
     covariance: FloatArray
+    kind: NDArray[np.int64]
 
     def chosen(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Circles:
         """Some of the rows."""
         return Circles(*(column[rows] for column in self))
+
+    def replaced(self, rows: NDArray[np.bool_], other: Circles) -> Circles:
+        """These candidates, but others (C,) where `rows`."""
+        pairs = zip(self, other, strict=True)
+        return Circles(*(np.where(rows.reshape(-1, *(1,) * (old.ndim - 1)), new, old) for old, new in pairs))
+
+
+TOP, SIDES, PARTLY = range(3)
+"""What the outline of a robot is: its top, top and sides, or the top and sides that are narrower below."""
+
+
+class Sides(NamedTuple):
+    """Sides of upright cylinders of one height, seen on the rectified plane of their tops.
+
+    A cylinder hides the hull of its top and of its base, which is a smaller circle nearer to the foot.
+
+    Attributes:
+        foot: (2,) column and row below the camera.
+        share: Height of the cylinders over that of the camera.
+    """
+
+    foot: FloatArray
+    share: float
+
+    def outline(
+        self, centre: FloatArray, radius: FloatArray, kind: NDArray[np.int64]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Length of the rays (C, R) from centres to the outline, in radii, and its normals (C, R, 2) there."""
+        length, normal = np.ones((len(centre), RAYS)), np.tile(DIRECTIONS, (len(centre), 1, 1))
+        base = (self.foot - centre) * (self.share / radius)[:, None]
+        away = np.linalg.norm(base, axis=1)
+        rows = np.flatnonzero((kind != TOP) & (away > self.share))  # otherwise the top hides the base
+        base, away, size = base[rows], away[rows], 1.0 - self.share
+        along = base @ DIRECTIONS.T
+        # where a ray meets the base's circle, and the tangent of both circles on its side
+        far = along + np.sqrt(np.maximum(size**2 - away[:, None] ** 2 + along**2, 0.0))
+        of_base = (far[..., None] * DIRECTIONS - base[:, None]) / size
+        towards = base / away[:, None]
+        cos = self.share / away
+        aside = np.stack([-towards[:, 1], towards[:, 0]], axis=1)
+        side = np.where(aside @ DIRECTIONS.T < 0.0, -1.0, 1.0)[..., None]
+        of_line = (cos[:, None] * towards)[:, None] + side * (np.sqrt(1.0 - cos**2)[:, None] * aside)[:, None]
+        is_base = np.einsum("cri,ci->cr", of_base, base) >= self.share
+        beyond = along > self.share
+        found = np.where(is_base[..., None], of_base, of_line)
+        reach = np.where(is_base, far, 1.0 / np.einsum("cri,ri->cr", of_line, DIRECTIONS))
+        length[rows] = np.where(beyond, reach, 1.0)
+        normal[rows] = np.where(beyond[..., None], found, DIRECTIONS)
+        return length, normal
 
 
 def sampled(image: Plain, cells: FloatArray) -> FloatArray:
@@ -148,7 +205,7 @@ def likely(
 ) -> FloatArray:
     """The candidates (C, 2) with enough edges around to be discs of about a radius [px]."""
     rims = Rims(image, polarity, min_contrast)
-    is_edge = rims.edges(centres, np.full(len(centres), radius), every=_EVERY)[2]
+    is_edge = rims.edges(centres, np.full((len(centres), RAYS // _EVERY), radius), every=_EVERY)[2]
     return np.asarray(centres[is_edge.mean(axis=1) >= _LIKELY], float)
 
 
@@ -160,36 +217,56 @@ class Rims:
         image: The image.
         polarity: Polarity of the discs.
         min_contrast: Least step of an edge in the logarithm of brightness.
+        sides: The discs' sides; a share of 0: they are flat.
     """
 
     image: Brightness
     polarity: float
     min_contrast: float
+    sides: Sides = Sides(np.zeros(2), 0.0)
 
-    def measure(self, centre: FloatArray, radius: FloatArray, without: Light | None = None) -> Circles:
-        """Fit circles near centres (C, 2) of about radii (C,) [px]."""
+    def measure(
+        self,
+        centre: FloatArray,
+        radius: FloatArray,
+        kind: NDArray[np.int64],
+        without: Light | None = None,
+    ) -> Circles:
+        """Fit outlines near centres (C, 2) of about radii (C,) [px]."""
         low, high = (1.0 - _WIDEST) * radius, (1.0 + _WIDEST) * radius
         found = radius
         for _ in range(_ROUNDS):
             start = np.clip(found, low, high)
-            edge, step, is_edge = self.edges(centre, start, without=without)
-            shift, found, covariance, spread, own = _fit(edge, is_edge, start)
+            length, normal = self.sides.outline(centre, start, kind)
+            reach = start[:, None] * length
+            edge, step, is_edge = self.edges(centre, reach, without=without, radius=start)
+            away = edge - reach
+            # narrower sides end anywhere between the rim of the top and those of a cylinder
+            hidden = (kind[:, None] == PARTLY) & (length > 1.0)
+            loose = hidden & (edge >= (1.0 - _OFF) * start[:, None]) & (away <= _OFF * start[:, None]) & is_edge
+            shift, found, oval, covariance, spread, own = _fit(away, is_edge & ~hidden, start, normal)
             centre = centre + shift
-        coverage = np.where((found >= low) & (found <= high), own.mean(axis=1), 0.0)
+        coverage = np.where((found >= low) & (found <= high), (own | loose).mean(axis=1), 0.0)
         contrast = _masked_median(step, own, np.zeros(len(step)))
-        return Circles(centre, found, coverage, contrast, spread, covariance)
+        return Circles(centre, found, coverage, contrast, spread, oval, covariance, kind)
 
     def edges(
-        self, centre: FloatArray, radius: FloatArray, *, every: int = 1, without: Light | None = None
+        self,
+        centre: FloatArray,
+        reach: FloatArray,
+        *,
+        every: int = 1,
+        without: Light | None = None,
+        radius: FloatArray | None = None,
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """The strongest edge on each `every`-th ray: its radius (C, R) [px], its step, whether it counts."""
-        places = _SHARES[:, None] * DIRECTIONS[::every, None]
-        cells = centre[:, None, None] + radius[:, None, None, None] * places
-        if without is None:
+        """The strongest edge on each `every`-th ray near `reach` (C, R) [px]: where, its step, whether it counts."""
+        places = reach[..., None, None] * (_SHARES[:, None] * DIRECTIONS[::every, None])
+        cells = centre[:, None, None] + places
+        if without is None or radius is None:
             values = sampled(self.image.log, cells)
         else:
-            values = logarithm(sampled(self.image.plain, cells) - without(places))
-        return _strongest(values, radius, self.polarity, self._least)
+            values = logarithm(sampled(self.image.plain, cells) - without(places / radius[:, None, None, None]))
+        return _strongest(values, reach, self.polarity, self._least)
 
     def _least(self, darkest: FloatArray) -> FloatArray:
         """Least steps of edges by the logarithm of brightness on their darker side."""
@@ -203,7 +280,7 @@ def _masked_median(values: FloatArray, mask: NDArray[np.bool_], otherwise: Float
 
 
 def _strongest(
-    values: FloatArray, radius: FloatArray, polarity: float, least: Callable[[FloatArray], FloatArray]
+    values: FloatArray, reach: FloatArray, polarity: float, least: Callable[[FloatArray], FloatArray]
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """`Rims.edges` from values (C, R, S) along the rays."""
     sums = np.concatenate([np.zeros((*values.shape[:2], 1)), np.cumsum(values, axis=2)], axis=2)
@@ -223,31 +300,37 @@ def _strongest(
     step = steps[rows[0], rows[1], best]
     darkest = np.minimum(inner.min(axis=2), outer.min(axis=2))
     inside = (best > 0) & (best < steps.shape[2] - 1)
-    return share * radius[:, None], step, inside & (step > least(darkest))
+    return share * reach, step, inside & (step > least(darkest))
 
 
 def _fit(
-    edge: FloatArray, is_edge: NDArray[np.bool_], radius: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
-    """Fit circles to edges: shift of the centre (C, 2), radius, covariance, spread, and the edges used."""
-    design = np.concatenate([DIRECTIONS, np.ones((RAYS, 1))], axis=1)
-    solution = np.zeros((len(edge), 3))
-    solution[:, 2] = radius
-    middle = _masked_median(edge, is_edge, radius)
-    residual = edge - middle[:, None]
+    away: FloatArray, is_edge: NDArray[np.bool_], radius: FloatArray, normal: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Fit outlines to edges, from their distances (C, R) along the rays and the normals (C, R, 2) there.
+
+    Returns shift of the centre (C, 2), radius, second harmonic (C, 2), covariance of the centre, spread, and
+    the edges used.
+    """
+    # along a ray an outline moves by its motion along the normal over the cosine to it
+    slope = 1.0 / np.einsum("cri,ri->cr", normal, DIRECTIONS)[..., None]
+    design = np.concatenate([slope * normal, slope, np.broadcast_to(_OVALS, normal.shape)], axis=2)
+    ridge = np.diag([1e-6, 1e-6, 1e-6, _OVAL_RIDGE, _OVAL_RIDGE])
+    middle = _masked_median(away, is_edge, np.zeros(len(away)))
+    size = (radius + middle)[:, None]
+    residual = away - middle[:, None]
     for limit in (0.3, 0.2, _OFF):
-        weight = is_edge * (np.abs(residual) <= limit * middle[:, None])
-        normal = np.einsum("cr,ri,rj->cij", weight, design, design) + 1e-6 * np.eye(3)
-        solution = np.linalg.solve(normal, np.einsum("cr,ri,cr->ci", weight, design, edge)[..., None])[..., 0]
-        residual = edge - solution @ design.T
-    own = is_edge & (np.abs(residual) <= _OFF * middle[:, None])
+        used = design * (is_edge & (np.abs(residual) <= limit * size))[..., None]
+        weights = np.swapaxes(used, 1, 2)
+        solution = np.linalg.solve(weights @ design + ridge, weights @ away[..., None])
+        residual = away - (design @ solution)[..., 0]
+    own = is_edge & (np.abs(residual) <= _OFF * size)
     count = own.sum(axis=1)
-    spread = np.sqrt(np.sum(own * residual**2, axis=1) / np.maximum(count - 3, 1))
-    normal = np.einsum("cr,ri,rj->cij", own.astype(float), design, design) + 1e-6 * np.eye(3)
+    spread = np.sqrt(np.sum(own * residual**2, axis=1) / np.maximum(count - 5, 1))
+    used = design * own[..., None]
     # neighbouring rays share pixels: about every other ray is an independent measurement
     variance = 2.0 * spread**2 + _SLACK_PX**2
-    covariance = variance[:, None, None] * np.linalg.inv(normal)[:, :2, :2]
+    covariance = variance[:, None, None] * np.linalg.inv(np.swapaxes(used, 1, 2) @ design + ridge)[:, :2, :2]
     few = count < _MIN_RAYS
     own[few] = False
-    shift = np.where(few[:, None], 0.0, solution[:, :2])
-    return shift, np.where(few, radius, solution[:, 2]), covariance, spread, own
+    solution = np.where(few[:, None], 0.0, solution[..., 0])
+    return solution[:, :2], radius + solution[:, 2], solution[:, 3:], covariance, spread, own

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.aerial.circles import Circles, Edges, Rims, likely, peaks
+from swarm_loc_vision.aerial.circles import PARTLY, SIDES, TOP, Circles, Edges, Rims, Sides, likely, peaks
 from swarm_loc_vision.aerial.ground_camera import GroundCamera
 from swarm_loc_vision.aerial.parameters import POLARITIES, AerialSettings
 from swarm_loc_vision.aerial.pattern import Marks, find_marks
@@ -33,6 +33,10 @@ _APART = 0.75
 """Least distance of two robots, in diameters."""
 _MAX_SPREAD, _MAX_SPREAD_PX = 0.03, 0.2
 """Largest rms distance of a disc's rim from a circle: a share of the radius, plus pixels."""
+_MAX_OVAL = 0.15
+"""Largest second harmonic of a disc's outline, over its radius: what motion leaves."""
+_PARTLY = 0.6
+"""Weight of an outline that leaves the sides open."""
 _SAME_SIZE = 0.2
 """Largest relative difference of a disc's radius from the others in the image."""
 _SAME_CONTRAST = 0.45
@@ -130,10 +134,15 @@ class AerialDetector:
         for polarity in self._polarities:
             centres = peaks(edges.votes(wide, polarity), wide, most)
             centres = likely(image, centres, 0.5 * wide, polarity, settings.min_contrast)
-            rims = Rims(image, polarity, settings.min_contrast)
-            circles = rims.measure(centres, np.full(len(centres), 0.5 * wide))
+            rims = Rims(image, polarity, settings.min_contrast, self._sides(grid))
+            circles = _outlined(rims, centres, np.full(len(centres), 0.5 * wide))
             kinds.append(self._chosen(rims, circles, grid))
         return max(kinds, key=lambda kind: kind[0].score)
+
+    def _sides(self, grid: Rectification) -> Sides:
+        """The sides of the robots on a grid."""
+        foot = self._ground.centre
+        return Sides((foot[:2] - grid.origin) / grid.metres_per_px, max(grid.height, 0.0) / foot[2])
 
     def _chosen(self, rims: Rims, circles: Circles, grid: Rectification) -> tuple[_Found, dict[str, int]]:
         """Select discs that do not overlap and are alike."""
@@ -162,14 +171,8 @@ class AerialDetector:
         is_strong = circles.contrast >= _SAME_CONTRAST * commonest(circles.contrast, _quality(circles))
         for _ in range(_MARK_ROUNDS):
             marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
-            again = rims.measure(circles.centre, circles.radius, marks.light)
-            is_better = (marks.step != 0.0) & (again.coverage >= settings.min_coverage)
-            circles = Circles(
-                *(
-                    np.where(is_better.reshape(-1, *(1,) * (new.ndim - 1)), new, old)
-                    for new, old in zip(again, circles, strict=True)
-                )
-            )
+            again = rims.measure(circles.centre, circles.radius, circles.kind, marks.light)
+            circles = circles.replaced((marks.step != 0.0) & (again.coverage >= settings.min_coverage), again)
         marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
         has_mark = np.isfinite(marks.theta)
         is_strong |= has_mark  # a shadow may weaken a rim, but shows no mark
@@ -208,10 +211,21 @@ class AerialDetector:
         return commonest(np.concatenate(diameters), np.concatenate(scores))
 
 
+def _outlined(rims: Rims, centre: FloatArray, radius: FloatArray) -> Circles:
+    """Measured discs (C,), each with the outline that fits best."""
+    best = rims.measure(centre, radius, np.full(len(centre), TOP))
+    if rims.sides.share > 0.0:
+        for kind, share in ((SIDES, 1.0), (PARTLY, _PARTLY)):
+            other = rims.measure(centre, radius, np.full(len(centre), kind))
+            best = best.replaced(share * _quality(other) > _quality(best), other)
+    return best
+
+
 def _quality(circles: Circles) -> FloatArray:
     """(C,) quality of discs, 0 to 1, from the coverage and the roundness of their rims."""
     limit = _MAX_SPREAD * circles.radius + _MAX_SPREAD_PX
-    return np.asarray(circles.coverage**2 * np.maximum(1.0 - (circles.spread / limit) ** 2, 0.0))
+    misfit = (circles.spread / limit) ** 2 + np.sum(circles.oval**2, axis=1) / (_MAX_OVAL * circles.radius) ** 2
+    return np.asarray(circles.coverage**2 * np.maximum(1.0 - misfit, 0.0))
 
 
 def _whole(circles: Circles) -> NDArray[np.bool_]:

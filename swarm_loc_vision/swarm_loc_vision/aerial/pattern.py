@@ -58,8 +58,8 @@ class Marks(NamedTuple):
     softness: FloatArray
 
     def light(self, places: FloatArray) -> FloatArray:
-        """(C, ...) light of the marks at places (..., 2) in radii of their discs [counts]."""
-        shape = (-1, *(1,) * (places.ndim - 1))
+        """(C, R, S) light of the marks at places (C, R, S, 2) in radii of their discs [counts]."""
+        shape = (-1, 1, 1)
         theta = np.nan_to_num(self.theta).reshape(shape)
         return self.step.reshape(shape) * _model(places, theta, self.softness.reshape(shape))
 
