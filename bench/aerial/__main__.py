@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from bench.aerial import calibration, detector, driving, rendered, straight, turning
+from bench.aerial import calibration, cases, detector, driving, rendered, straight, turning
 from bench.aerial.rates import SWARMS, Results
 from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
 
@@ -45,6 +45,7 @@ def main() -> None:
     ]
     print(table(["time [us per robot and image]", *(f"n = {n}" for n in SWARMS)], times))
     seen = detector.measure(seed, max(2, round(detector.SEEDS * share)))
+    seen |= cases.measure()
     seen |= rendered.measure(seed, max(1, round(rendered.WORLDS_RUN * share)))
     print(write_figures("aerial", {**results.figures(), **seen}))
     print(_drawn(results), _reliability_drawn(reliability), sep="\n")

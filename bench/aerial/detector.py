@@ -40,6 +40,15 @@ LOOKS: Mapping[str, Look] = {
     "bright_discs": Look(kind="bright", floor=0.3),
     "lights_in_the_dark": Look(kind="led", floor=0.12, diameter_px=12.0),
     "dark_floor": Look(floor=0.12),
+    **{f"height_{mm}mm": Look(height=1e-3 * mm, shadow=0.3) for mm in (30, 60)},
+    "height_40mm_touching": Look(height=0.04, touching=0.6, robots=24),
+    "height_40mm_boards": Look(height=0.04, kind="board", tilt=0.4),
+    "height_60mm_narrower_below": Look(height=0.06, taper=0.35, shadow=0.3),
+    "height_50mm_grey_sides": Look(height=0.05, wall=0.3),
+    **{f"motion_{percent}percent": Look(motion=0.01 * percent) for percent in (15, 25)},
+    "motion_20percent_boards": Look(motion=0.2, kind="board", diameter_px=30.0),
+    "motion_20percent_height_30mm": Look(motion=0.2, height=0.03, touching=0.3),
+    "brown_on_parquet": Look(kind="dark", floor=0.26, boards=0.025, diameter_px=28.0),
     "all_at_once": Look(
         tilt=0.4,
         field_of_view=1.5,
@@ -90,13 +99,17 @@ class Score:
 
 
 def score_picture(picture: Picture, found: AerialDetections, seconds: float = 0.0) -> Score:
-    """Detections beside a picture's truth, each robot's nearest one."""
-    poses = picture.poses
+    """Detections beside a picture's truth."""
+    return score_places(picture.poses, DIAMETER, found, seconds)
+
+
+def score_places(poses: FloatArray, diameter: float, found: AerialDetections, seconds: float) -> Score:
+    """Detections beside true poses (N, 3) of robots, each robot's nearest one."""
     away = np.linalg.norm(found.place[:, None] - poses[None, :, :2], axis=2)
     pairs: dict[int, int] = {}
     for robot in range(len(poses)):
         nearest = int(np.argmin(away[:, robot])) if len(found) else -1
-        if nearest >= 0 and away[nearest, robot] < _MATCHED * DIAMETER and nearest not in pairs:
+        if nearest >= 0 and away[nearest, robot] < _MATCHED * diameter and nearest not in pairs:
             pairs[nearest] = robot
     rows, robots = list(pairs), list(pairs.values())
     error = found.place[rows] - poses[robots, :2]
@@ -125,7 +138,8 @@ def measure(seed: int, seeds: int = SEEDS) -> dict[str, float]:
     rows: list[list[Cell]] = []
     for name, look in LOOKS.items():
         say(name)
-        score = reduce(Score.joined, (_scored(draw_picture(look, seed + k)) for k in range(seeds)))
+        pictures = (draw_picture(look, seed + k) for k in range(seeds))
+        score = reduce(Score.joined, (_scored(picture, look.height) for picture in pictures))
         values = _values(score, seeds)
         told = {key: value for key, value in values.items() if math.isfinite(value)}
         figures |= {f"detector.{name}.{key}": value for key, value in told.items()}
@@ -155,9 +169,9 @@ def _values(score: Score, pictures: int) -> dict[str, float]:
     }
 
 
-def _scored(picture: Picture) -> Score:
+def _scored(picture: Picture, height: float) -> Score:
     """A detector that has seen the picture before, so that what is done once does not count."""
-    detector = AerialDetector(AerialSettings(robot_diameter=DIAMETER), picture.ground)
+    detector = AerialDetector(AerialSettings(robot_diameter=DIAMETER, robot_height=height), picture.ground)
     detector.detect(picture.gray)
     begin_s = time.process_time()
     found = detector.detect(picture.gray)

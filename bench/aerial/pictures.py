@@ -28,7 +28,7 @@ _FAR = 1.2
 """Widths of the image, at its middle, to either side of map's origin up to which the floor is painted."""
 _POSE_SIGMA = 1e-6
 _WHITE = 235.0
-_EXPOSURES, _PARTS = 13, 14
+_SLICES, _EXPOSURES, _PARTS = 12, 13, 14
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,6 @@ class Look:
         blur_px: Of the optics, one standard deviation.
         height: Of the robots [m].
         wall: Brightness of their sides.
-        slices: Discs that make their sides; 2: the sides have a gap between the top and the floor.
         taper: Share of the diameter that is missing at the floor.
         motion: Way of each robot while the shutter is open, in any direction, in diameters.
         boards: One standard deviation of the brightness of the floor's boards.
@@ -75,7 +74,6 @@ class Look:
     blur_px: float = 0.6
     height: float = 0.0
     wall: float = 0.06
-    slices: int = 12
     taper: float = 0.0
     motion: float = 0.0
     boards: float = 0.0
@@ -306,7 +304,7 @@ class _Plan:
             one = window.copy()
             shift = share * way
             if look.height > 0.0:
-                for rise in np.linspace(0.0, 1.0, look.slices):
+                for rise in np.linspace(0.0, 1.0, _SLICES):
                     size = radius * (1.0 + rise * (lift - 1.0) - (1.0 - rise) * look.taper)
                     away = np.linalg.norm(grid - shift - base - rise * (centre - base), axis=-1)
                     _lay(one, size - away, look.wall)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -97,6 +97,8 @@ _NOISES = 0.5
 _SLACK_PX = 0.03
 """Error of an edge that its neighbours share [px], on top of the residuals."""
 
+_RAMP = 16
+"""Samples on each side of a blurred edge that show its ends: 0.4 of the radius."""
 _OVAL_RIDGE = 1.0
 """Prior information on the oval, in edges: half a rim says little of it."""
 
@@ -118,6 +120,7 @@ class Circles(NamedTuple):
         oval: (C, 2) cosine and sine of the second harmonic of the outline, as left by motion [px].
         covariance: (C, 2, 2) of the centre [px^2].
         kind: (C,) `TOP`, `SIDES` or `PARTLY`: what the outline is.
+        soft: (C,) whether the edges are taken for blurred ones.
     """
 
     centre: FloatArray
@@ -128,15 +131,19 @@ class Circles(NamedTuple):
     oval: FloatArray
     covariance: FloatArray
     kind: NDArray[np.int64]
+    soft: NDArray[np.bool_]
 
     def chosen(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Circles:
         """Some of the rows."""
-        return Circles(*(column[rows] for column in self))
+        columns: list[NDArray[Any]] = [column[rows] for column in self]
+        return Circles(*columns)
 
-    def replaced(self, rows: NDArray[np.bool_], other: Circles) -> Circles:
-        """These candidates, but others (C,) where `rows`."""
-        pairs = zip(self, other, strict=True)
-        return Circles(*(np.where(rows.reshape(-1, *(1,) * (old.ndim - 1)), new, old) for old, new in pairs))
+    def updated(self, rows: NDArray[np.int64], others: Circles) -> Circles:
+        """These candidates, but others (len(rows),) in some rows."""
+        columns: list[NDArray[Any]] = [column.copy() for column in self]
+        for column, new in zip(columns, others, strict=True):
+            column[rows] = new
+        return Circles(*columns)
 
 
 TOP, SIDES, PARTLY = range(3)
@@ -159,7 +166,7 @@ class Sides(NamedTuple):
     def outline(
         self, centre: FloatArray, radius: FloatArray, kind: NDArray[np.int64]
     ) -> tuple[FloatArray, FloatArray]:
-        """Length of the rays (C, R) from centres to the outline, in radii, and its normals (C, R, 2) there."""
+        """Length of rays (C, R) from centres to the outline, in radii, and its normals (C, R, 2) there."""
         length, normal = np.ones((len(centre), RAYS)), np.tile(DIRECTIONS, (len(centre), 1, 1))
         base = (self.foot - centre) * (self.share / radius)[:, None]
         away = np.linalg.norm(base, axis=1)
@@ -200,15 +207,6 @@ Light = Callable[[FloatArray], FloatArray]
 """Light to subtract from discs: (C, ...) counts at places (..., 2) in their radii."""
 
 
-def likely(
-    image: Brightness, centres: FloatArray, radius: float, polarity: float, min_contrast: float
-) -> FloatArray:
-    """The candidates (C, 2) with enough edges around to be discs of about a radius [px]."""
-    rims = Rims(image, polarity, min_contrast)
-    is_edge = rims.edges(centres, np.full((len(centres), RAYS // _EVERY), radius), every=_EVERY)[2]
-    return np.asarray(centres[is_edge.mean(axis=1) >= _LIKELY], float)
-
-
 @dataclass(frozen=True)
 class Rims:
     """Measures rims of discs.
@@ -223,13 +221,14 @@ class Rims:
     image: Brightness
     polarity: float
     min_contrast: float
-    sides: Sides = Sides(np.zeros(2), 0.0)
+    sides: Sides
 
     def measure(
         self,
         centre: FloatArray,
         radius: FloatArray,
         kind: NDArray[np.int64],
+        soft: NDArray[np.bool_],
         without: Light | None = None,
     ) -> Circles:
         """Fit outlines near centres (C, 2) of about radii (C,) [px]."""
@@ -239,16 +238,18 @@ class Rims:
             start = np.clip(found, low, high)
             length, normal = self.sides.outline(centre, start, kind)
             reach = start[:, None] * length
-            edge, step, is_edge = self.edges(centre, reach, without=without, radius=start)
+            edge, step, is_edge = self.edges(centre, reach, without=without, radius=start, soft=soft)
             away = edge - reach
             # narrower sides end anywhere between the rim of the top and those of a cylinder
             hidden = (kind[:, None] == PARTLY) & (length > 1.0)
-            loose = hidden & (edge >= (1.0 - _OFF) * start[:, None]) & (away <= _OFF * start[:, None]) & is_edge
+            loose = (
+                hidden & (edge >= (1.0 - _OFF) * start[:, None]) & (away <= _OFF * start[:, None]) & is_edge
+            )
             shift, found, oval, covariance, spread, own = _fit(away, is_edge & ~hidden, start, normal)
             centre = centre + shift
         coverage = np.where((found >= low) & (found <= high), (own | loose).mean(axis=1), 0.0)
         contrast = _masked_median(step, own, np.zeros(len(step)))
-        return Circles(centre, found, coverage, contrast, spread, oval, covariance, kind)
+        return Circles(centre, found, coverage, contrast, spread, oval, covariance, kind, soft)
 
     def edges(
         self,
@@ -258,19 +259,28 @@ class Rims:
         every: int = 1,
         without: Light | None = None,
         radius: FloatArray | None = None,
+        soft: NDArray[np.bool_] | None = None,
     ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """The strongest edge on each `every`-th ray near `reach` (C, R) [px]: where, its step, whether it counts."""
+        """The strongest edge on each `every`-th ray near `reach` (C, R) [px]: where, its step, if valid."""
         places = reach[..., None, None] * (_SHARES[:, None] * DIRECTIONS[::every, None])
         cells = centre[:, None, None] + places
         if without is None or radius is None:
             values = sampled(self.image.log, cells)
         else:
-            values = logarithm(sampled(self.image.plain, cells) - without(places / radius[:, None, None, None]))
-        return _strongest(values, reach, self.polarity, self._least)
+            values = logarithm(
+                sampled(self.image.plain, cells) - without(places / radius[:, None, None, None])
+            )
+        return _strongest(values, reach, self.polarity, self._least, soft)
 
     def _least(self, darkest: FloatArray) -> FloatArray:
         """Least steps of edges by the logarithm of brightness on their darker side."""
         return np.maximum(self.min_contrast, _NOISES * self.image.log_noise(darkest))
+
+
+def likely(rims: Rims, centres: FloatArray, radius: float) -> FloatArray:
+    """The candidates (C, 2) with enough edges around to be discs of about a radius [px]."""
+    is_edge = rims.edges(centres, np.full((len(centres), RAYS // _EVERY), radius), every=_EVERY)[2]
+    return np.asarray(centres[is_edge.mean(axis=1) >= _LIKELY], float)
 
 
 def _masked_median(values: FloatArray, mask: NDArray[np.bool_], otherwise: FloatArray) -> FloatArray:
@@ -280,7 +290,11 @@ def _masked_median(values: FloatArray, mask: NDArray[np.bool_], otherwise: Float
 
 
 def _strongest(
-    values: FloatArray, reach: FloatArray, polarity: float, least: Callable[[FloatArray], FloatArray]
+    values: FloatArray,
+    reach: FloatArray,
+    polarity: float,
+    least: Callable[[FloatArray], FloatArray],
+    soft: NDArray[np.bool_] | None,
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """`Rims.edges` from values (C, R, S) along the rays."""
     sums = np.concatenate([np.zeros((*values.shape[:2], 1)), np.cumsum(values, axis=2)], axis=2)
@@ -297,10 +311,27 @@ def _strongest(
     offset = np.clip(offset, -1.0, 1.0)
     pitch = _SHARES[1] - _SHARES[0]
     share = _SHARES[0] + pitch * (between + offset + _SIDE - 0.5)
+    if soft is not None and soft.any():
+        share[soft] = _halfway(np.exp(values[soft]), best[soft] + _SIDE, polarity)
     step = steps[rows[0], rows[1], best]
     darkest = np.minimum(inner.min(axis=2), outer.min(axis=2))
     inside = (best > 0) & (best < steps.shape[2] - 1)
     return share * reach, step, inside & (step > least(darkest))
+
+
+def _halfway(values: FloatArray, near: NDArray[np.int64], polarity: float) -> FloatArray:
+    """Where counts (C, R, S) along rays are halfway between those on both sides of blurred edges, in `reach`.
+
+    Motion makes an edge a ramp, the middle of which is the rim; the logarithm is steepest at its dark end.
+    """
+    window = np.clip(near[..., None] + np.arange(-_RAMP, _RAMP + 1), 0, values.shape[2] - 1)
+    counts = polarity * np.take_along_axis(values, window, axis=2)
+    above = counts - 0.5 * (counts[..., :1] + counts[..., -1:])
+    last = np.clip(np.argmax(above < 0.0, axis=2), 1, 2 * _RAMP)[..., None]
+    before, after = (np.take_along_axis(above, last - k, axis=2)[..., 0] for k in (1, 0))
+    part = np.clip(before / np.maximum(before - after, 1e-9), 0.0, 1.0)
+    index = np.take_along_axis(window, last - 1, axis=2)[..., 0] + part
+    return np.asarray(_SHARES[0] + (_SHARES[1] - _SHARES[0]) * index)
 
 
 def _fit(

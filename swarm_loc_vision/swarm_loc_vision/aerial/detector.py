@@ -35,8 +35,11 @@ _MAX_SPREAD, _MAX_SPREAD_PX = 0.03, 0.2
 """Largest rms distance of a disc's rim from a circle: a share of the radius, plus pixels."""
 _MAX_OVAL = 0.15
 """Largest second harmonic of a disc's outline, over its radius: what motion leaves."""
-_PARTLY = 0.6
-"""Weight of an outline that leaves the sides open."""
+_FLAT = ((TOP, True, 0.6),)
+_TALL = ((SIDES, False, 1.0), (PARTLY, False, 0.6), (TOP, True, 0.6), (SIDES, True, 0.6), (PARTLY, True, 0.4))
+"""Outlines that are tried where the quality is below their weight: kind, if edges are blurred, weight."""
+_PART, _SURE = 0.3, 0.2
+"""Least coverage of discs for which other outlines are tried, and least weighted quality of these."""
 _SAME_SIZE = 0.2
 """Largest relative difference of a disc's radius from the others in the image."""
 _SAME_CONTRAST = 0.45
@@ -133,8 +136,8 @@ class AerialDetector:
         kinds: list[tuple[_Found, dict[str, int]]] = []
         for polarity in self._polarities:
             centres = peaks(edges.votes(wide, polarity), wide, most)
-            centres = likely(image, centres, 0.5 * wide, polarity, settings.min_contrast)
             rims = Rims(image, polarity, settings.min_contrast, self._sides(grid))
+            centres = likely(rims, centres, 0.5 * wide)
             circles = _outlined(rims, centres, np.full(len(centres), 0.5 * wide))
             kinds.append(self._chosen(rims, circles, grid))
         return max(kinds, key=lambda kind: kind[0].score)
@@ -171,8 +174,9 @@ class AerialDetector:
         is_strong = circles.contrast >= _SAME_CONTRAST * commonest(circles.contrast, _quality(circles))
         for _ in range(_MARK_ROUNDS):
             marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
-            again = rims.measure(circles.centre, circles.radius, circles.kind, marks.light)
-            circles = circles.replaced((marks.step != 0.0) & (again.coverage >= settings.min_coverage), again)
+            again = rims.measure(circles.centre, circles.radius, circles.kind, circles.soft, marks.light)
+            better = (marks.step != 0.0) & (again.coverage >= settings.min_coverage)
+            circles = circles.updated(np.flatnonzero(better), again.chosen(better))
         marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
         has_mark = np.isfinite(marks.theta)
         is_strong |= has_mark  # a shadow may weaken a rim, but shows no mark
@@ -213,18 +217,21 @@ class AerialDetector:
 
 def _outlined(rims: Rims, centre: FloatArray, radius: FloatArray) -> Circles:
     """Measured discs (C,), each with the outline that fits best."""
-    best = rims.measure(centre, radius, np.full(len(centre), TOP))
-    if rims.sides.share > 0.0:
-        for kind, share in ((SIDES, 1.0), (PARTLY, _PARTLY)):
-            other = rims.measure(centre, radius, np.full(len(centre), kind))
-            best = best.replaced(share * _quality(other) > _quality(best), other)
+    best = rims.measure(centre, radius, np.full(len(centre), TOP), np.zeros(len(centre), np.bool_))
+    for kind, soft, weight in _TALL if rims.sides.share > 0.0 else _FLAT:
+        rows = np.flatnonzero((_quality(best) < weight) & (best.coverage >= _PART))
+        other = rims.measure(centre[rows], radius[rows], np.full(len(rows), kind), np.full(len(rows), soft))
+        better = weight * _quality(other) > np.maximum(_quality(best)[rows], _SURE)
+        best = best.updated(rows[better], other.chosen(better))
     return best
 
 
 def _quality(circles: Circles) -> FloatArray:
     """(C,) quality of discs, 0 to 1, from the coverage and the roundness of their rims."""
     limit = _MAX_SPREAD * circles.radius + _MAX_SPREAD_PX
-    misfit = (circles.spread / limit) ** 2 + np.sum(circles.oval**2, axis=1) / (_MAX_OVAL * circles.radius) ** 2
+    misfit = (circles.spread / limit) ** 2 + np.sum(circles.oval**2, axis=1) / (
+        _MAX_OVAL * circles.radius
+    ) ** 2
     return np.asarray(circles.coverage**2 * np.maximum(1.0 - misfit, 0.0))
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from bench.aerial.detector import Score, score_picture
 from bench.aerial.pictures import DIAMETER, Look, Picture, draw_picture
+from swarm_loc_vision.aerial.circles import DIRECTIONS, SIDES, TOP, Sides
 from swarm_loc_vision.aerial.detector import AerialDetector
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.aerial.rectification import RectificationError
@@ -29,6 +30,11 @@ LOOKS = {
     "lights in the dark": Look(kind="led", floor=0.12, diameter_px=12.0),
     "pattern on a dark floor": Look(floor=0.12),
     "noise": Look(noise=10.0, texture=0.05),
+    "tall with black sides": Look(height=0.05, shadow=0.3),
+    "tall and touching": Look(height=0.03, touching=0.6),
+    "tall and narrower below": Look(height=0.06, taper=0.35),
+    "moving": Look(motion=0.2),
+    "moving boards": Look(motion=0.15, kind="board", diameter_px=30.0),
 }
 
 
@@ -40,7 +46,7 @@ def scored(picture: Picture, settings: AerialSettings = SETTINGS, polarity: str 
 @pytest.mark.parametrize("name", LOOKS)
 def test_all_robots_are_found_and_nothing_else(name: str) -> None:
     picture = draw_picture(LOOKS[name], seed=11)
-    score = scored(picture)
+    score = scored(picture, replace(SETTINGS, robot_height=LOOKS[name].height))
     assert score.missed == 0
     assert score.false == 0
     assert score.position_m.max() < 0.1 * DIAMETER
@@ -49,6 +55,27 @@ def test_all_robots_are_found_and_nothing_else(name: str) -> None:
         assert np.abs(score.heading).max() < math.radians(8.0)
     else:
         assert len(score.heading) == 0
+
+
+def test_outlines_of_tall_robots_are_hulls_of_top_and_base() -> None:
+    rng = np.random.default_rng(4)
+    sides = Sides(rng.normal(0.0, 5.0, 2), 0.08)
+    centre, radius = rng.uniform(-150.0, 150.0, (40, 2)), rng.uniform(8.0, 16.0, 40)
+    length, normal = sides.outline(centre, radius, np.full(40, SIDES))
+    assert 1.3 < length.max() < 2.5
+    rim = centre[:, None] + radius[:, None, None] * length[..., None] * DIRECTIONS
+    depth = np.full(length.shape, -np.inf)
+    for share in np.linspace(0.0, sides.share, 2001):
+        slices = centre + share * (sides.foot - centre)
+        away = np.linalg.norm(rim - slices[:, None], axis=-1)
+        depth = np.maximum(depth, radius[:, None] * (1.0 - share) - away)
+    assert np.abs(depth).max() < 0.01
+    # the rim bends away from its tangents
+    inwards = np.roll(rim, 1, axis=1) - rim
+    assert np.einsum("cri,cri->cr", inwards, normal).max() < 0.01
+    flat, straight = sides.outline(centre, radius, np.full(40, TOP))
+    assert (flat == 1.0).all()
+    assert (straight == DIRECTIONS).all()
 
 
 @pytest.mark.parametrize("kind", ["dark", "bright"])

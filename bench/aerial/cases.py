@@ -1,0 +1,89 @@
+"""The aerial detector on pictures of others: tall robots seen from the side, and moving ones.
+
+The pictures are no part of the workspace. They lie beside it, in `../shared/cases/aerial_*`, each with its
+camera and control points, and all show the same robots at the same places.
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from functools import reduce
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from bench.aerial.detector import Score, score_places
+from bench.shared.common import Cell, table
+from swarm_loc_vision.aerial.control_points import solve_pose
+from swarm_loc_vision.aerial.detector import AerialDetector
+from swarm_loc_vision.aerial.ground_file import load_ground
+from swarm_loc_vision.aerial.parameters import AerialSettings
+
+FOLDER = Path(__file__).parents[3] / "shared" / "cases"
+_DIAMETER = 0.08
+_FLAT_HEIGHT = 0.03
+"""Height of the tops of robots without visible sides, by their parallax [m]."""
+_PLACES = np.array(
+    [
+        [-1.2704, -0.5216],
+        [-1.2027, -0.4631],
+        [-0.8267, -0.4943],
+        [-0.7094, -1.0455],
+        [-0.3642, 0.5316],
+        [-0.0868, -0.4633],
+        [-0.0154, 0.1767],
+        [-0.0004, -0.4476],
+        [0.4283, -1.0675],
+        [0.4666, 0.6138],
+        [0.9035, 1.1310],
+        [1.0240, 0.8830],
+        [1.3277, 0.1516],
+        [1.3918, 0.6857],
+    ]
+)
+"""Where the robots stand [m]: means over the two pictures with white margins, in which all rims are clear."""
+
+
+def measure() -> dict[str, float]:
+    """Print a table of the pictures; the figures by name, none where there are no pictures."""
+    pictures = sorted(FOLDER.glob("aerial_*/*.png"))
+    if not pictures:
+        print(f"No pictures in {FOLDER}: the cases are skipped.")
+        return {}
+    scores = [_scored(path) for path in pictures]
+    rows: list[list[Cell]] = [
+        [path.stem, score.robots - score.missed, score.false, _rms_mm(score), 1e3 * score.seconds]
+        for path, score in zip(pictures, scores, strict=True)
+    ]
+    print(table(["picture", f"found of {len(_PLACES)}", "false", "rms [mm]", "CPU [ms]"], rows))
+    score = reduce(Score.joined, scores)
+    return {
+        "cases.recall": 1.0 - score.missed / score.robots,
+        "cases.false_detections": float(score.false),
+        "cases.position_mm": _rms_mm(score),
+    }
+
+
+def _scored(path: Path) -> Score:
+    """One picture; a number of millimetres in its name is the robots' height."""
+    height = re.search(r"(\d+)_mm", path.stem)
+    settings = AerialSettings(
+        robot_diameter=_DIAMETER, robot_height=1e-3 * int(height[1]) if height else _FLAT_HEIGHT
+    )
+    ground = load_ground(path.with_suffix(".yaml"))
+    if ground.camera is None:
+        raise ValueError(f"{path.with_suffix('.yaml')} has no camera.")
+    detector = AerialDetector(settings, solve_pose(ground.camera, ground.points, settings).ground)
+    gray = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
+    detector.detect(gray)
+    begin_s = time.process_time()
+    found = detector.detect(gray)
+    poses = np.concatenate([_PLACES, np.zeros((len(_PLACES), 1))], axis=1)
+    return score_places(poses, _DIAMETER, found, time.process_time() - begin_s)
+
+
+def _rms_mm(score: Score) -> float:
+    """Error of the places that were found [mm]."""
+    return 1e3 * float(np.sqrt(np.mean(score.position_m**2)))
