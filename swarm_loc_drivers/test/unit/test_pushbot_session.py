@@ -74,7 +74,7 @@ def test_a_firmware_without_such_timestamps_is_named() -> None:
 def test_a_board_that_is_no_pushbot_is_named() -> None:
     wire = PushbotWire(pushbot_params())
     say = wire.firmware.board.say
-    wire.firmware.board.say = lambda text: say(text.replace(" 28 268435456 MOTOR SENSORS 2\n", ""))  # type: ignore[method-assign]
+    wire.firmware.board.say = lambda text: say(text.replace(" 28  268435456 MOTOR SENSORS   2\n", ""))  # type: ignore[method-assign]
     wire.run(0.5)
     assert "no wheels" in wire.errors[0]
 
@@ -107,9 +107,8 @@ def deaf_to_stops(wire: PushbotWire) -> None:
     """Let a robot ignore duty cycles."""
     drive = wire.firmware.board.drive
 
-    def drive_only(motor: int, value: int, kind: str, *, decays: bool) -> None:
-        if kind == "velocity":
-            drive(motor, value, kind, decays=decays)
+    def drive_only(motor: int, value: int, unit: str, *, decays: bool) -> bool:
+        return unit != "velocity" or drive(motor, value, "velocity", decays=decays)
 
     wire.firmware.board.drive = drive_only  # type: ignore[method-assign]
 
