@@ -14,6 +14,8 @@ from swarm_loc_drivers.common.link import Link, LinkError
 from swarm_loc_drivers.common.session import Session, SessionError
 
 _MIN_PAUSE_S, _MAX_PAUSE_S = 0.1, 2.0
+NO_CLOCK = "waiting for simulated time: nothing on /clock yet"
+"""Why a driver has not tried to connect yet: a simulated robot has its link when time begins."""
 MAX_STOP_S = 3.0
 """How long the driver tries to stop a robot that may be moving before it gives up."""
 
@@ -26,6 +28,7 @@ class RobotDriver(ABC, Generic[SomeSession]):
 
     Args:
         name: Name of the robot's link in messages.
+        clock: The time [ns]; may be simulated, and 0 means no time.
 
     Attributes:
         counts: `connections`, `link_failures`, and the counts of the sessions.
@@ -34,7 +37,8 @@ class RobotDriver(ABC, Generic[SomeSession]):
         may_run: Whether the robot may be moving after the driver has been stopped.
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, clock: Callable[[], int]) -> None:
+        self._clock = clock
         self.counts: Counter[str] = Counter()
         self.trouble = f"connecting to {name}"
         self.warning = ""
@@ -76,6 +80,12 @@ class RobotDriver(ABC, Generic[SomeSession]):
         """The link is being closed."""
 
     def _run(self) -> None:
+        connecting = self.trouble
+        while self._clock() <= 0:
+            self.trouble = NO_CLOCK
+            if self._stopping.wait(_MIN_PAUSE_S):
+                return
+        self.trouble = connecting
         pause_s, give_up_s = _MIN_PAUSE_S, math.inf
         while True:
             connections = self.counts["connections"]

@@ -10,13 +10,15 @@ from typing import Any, Protocol, TypeVar
 from geometry_msgs.msg import Twist
 from rclpy.qos import QoSProfile
 
-from swarm_loc_drivers.common.robot_driver import RobotDriver
+from swarm_loc_drivers.common.robot_driver import NO_CLOCK, RobotDriver
 from swarm_loc_drivers.common.ros_messages import OdometryOutput, transform_publisher
 from swarm_loc_drivers.common.velocity_command import Velocity
 from swarm_loc_estimator.common.health import PATIENCE_S, Level, Report, level_of
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop
 
 _COMMAND_QOS = QoSProfile(depth=1)
+_CLOCK_PATIENCE_S = 30.0
+"""Silence about a simulation that is starting: its nodes may take long on a busy machine."""
 
 
 class DriverParameters(Protocol):
@@ -117,7 +119,8 @@ class RobotDriverNode(ConfiguredNode[Parameters]):
 
     def _log(self, trouble: str, counts: Counter[str]) -> None:
         # a robot that is being switched on, or a simulation that starts, does not answer at once
-        patience_s = 0.0 if counts["connections"] else PATIENCE_S
+        first_s = _CLOCK_PATIENCE_S if trouble == NO_CLOCK else PATIENCE_S
+        patience_s = 0.0 if counts["connections"] else first_s
         self.health.warn_of("link", {trouble: trouble} if trouble else {}, patience_s)
         if self._was_in_trouble and not trouble:
             self.get_logger().info(f"connected to {self._address}")

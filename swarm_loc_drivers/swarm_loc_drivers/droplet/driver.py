@@ -47,10 +47,9 @@ class DropletDriver(RobotDriver[DropletSession]):
     def __init__(
         self, params: DropletParameters, listeners: DropletListeners, clock: Callable[[], int]
     ) -> None:
-        super().__init__(params.address)
+        super().__init__(params.address, clock)
         self._params = params
         self._listeners = listeners
-        self._clock = clock
         self._requested = threading.Event()
         self._odometry_due_ns = 0
         relayed = params.relayed_ids

@@ -50,10 +50,9 @@ class EpuckDriver(RobotDriver[EpuckSession]):
     """
 
     def __init__(self, params: EpuckParameters, listeners: EpuckListeners, clock: Callable[[], int]) -> None:
-        super().__init__(str(params.link_address))
+        super().__init__(str(params.link_address), clock)
         self._params = params
         self._listeners = listeners
-        self._clock = clock
         self._command = VelocityCommand(params.cmd_vel_timeout_s, clock, self.counts)
         self._odometry = WheelOdometry(params.geometry, params.wheel_noise, self.counts)
         self._tick = threading.Event()

@@ -46,10 +46,9 @@ class PushbotDriver(RobotDriver[PushbotSession]):
     def __init__(
         self, params: PushbotParameters, listeners: PushbotListeners, clock: Callable[[], int]
     ) -> None:
-        super().__init__(str(params.link_address))
+        super().__init__(str(params.link_address), clock)
         self._params = params
         self._listeners = listeners
-        self._clock = clock
         self._command = VelocityCommand(params.cmd_vel_timeout_s, clock, self.counts)
         self._odometry = PushbotOdometry(params.geometry, params.wheel_noise, self.counts)
         self._read_s = 0.0

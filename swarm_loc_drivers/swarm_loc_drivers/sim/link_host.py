@@ -6,6 +6,7 @@ Everything happens in the thread that calls `poll`, so a world that steps its bo
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import os
 import pty
 import selectors
@@ -31,6 +32,9 @@ class _Port(Protocol):
 
     def on_cycle(self) -> None:
         """Send pending output."""
+
+    def is_used(self) -> bool:
+        """Whether a client is connected."""
 
     def close(self) -> None:
         """Close the descriptor."""
@@ -83,6 +87,15 @@ class _PtyPort:
 
     def on_cycle(self) -> None:
         self._send(self._unsent or self._firmware.stream())
+
+    def is_used(self) -> bool:
+        """Whether a client has locked the terminal, as drivers do."""
+        try:
+            fcntl.flock(self._slave, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        fcntl.flock(self._slave, fcntl.LOCK_UN)
+        return False
 
     def _send(self, data: bytes) -> None:
         with contextlib.suppress(BlockingIOError):
@@ -149,6 +162,9 @@ class _TcpPort:
         except OSError:
             self._drop_client()
 
+    def is_used(self) -> bool:
+        return self._client is not None
+
     def _drop_client(self) -> None:
         assert self._client is not None  # noqa: S101
         self._selector.unregister(self._client)
@@ -202,6 +218,10 @@ class FirmwareHost:
             key.data()
         for port in self._ports:
             port.on_cycle()
+
+    def is_used(self) -> bool:
+        """Whether a driver is connected to any robot."""
+        return any(port.is_used() for port in self._ports)
 
     def close(self) -> None:
         """Close all links."""

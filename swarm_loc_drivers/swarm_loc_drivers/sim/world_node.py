@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
+from swarm_loc_drivers.common.robot_driver import MAX_STOP_S
 from swarm_loc_drivers.common.ros_messages import stamp_message
 from swarm_loc_drivers.sim.link_host import FirmwareHost
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -25,6 +27,11 @@ _TRUTH_QOS = QoSProfile(depth=10)
 _HELD_WAKE_S = 0.002
 _MAX_LAG_S = 0.1
 """A world that cannot keep up continues from now and does not catch up."""
+_QUIET_S, _FAREWELL_S = 0.5, MAX_STOP_S + 1.0
+"""A world that is to stop goes on until no driver has been connected for so long, and at most so long [s].
+
+The first is longer than a driver's pause before it connects again.
+"""
 
 
 class WorldNode(ConfiguredNode[Parameters]):
@@ -34,6 +41,7 @@ class WorldNode(ConfiguredNode[Parameters]):
         super().__init__(name, parameters, **node_arguments)
         self.host = FirmwareHost()
         self._steps = 0
+        self._asked_s, self._used_s = math.inf, 0.0
 
     def begin(
         self,
@@ -105,11 +113,15 @@ class WorldNode(ConfiguredNode[Parameters]):
         self._steps += 1
 
     def run(self, stop: Stop) -> int:
-        """Step and answer drivers until asked to stop; returns the exit status."""
+        """Step and answer drivers until asked to stop and their robots stand; returns the exit status.
+
+        All processes of a simulation get the signal to stop at once, and a robot whose world has ended
+        cannot be stopped.
+        """
         executor = EventsExecutor()
         executor.add_node(self)
         due_s = time.monotonic()
-        while not stop.requested:
+        while not stop.requested or self._is_needed():
             self.step()
             due_s = max(due_s + self._step_s / self._rate, time.monotonic() - _MAX_LAG_S)
             self.host.poll(0.0)
@@ -121,6 +133,14 @@ class WorldNode(ConfiguredNode[Parameters]):
                 executor.spin_once(timeout_sec=_HELD_WAKE_S)
         executor.shutdown()
         return 0
+
+    def _is_needed(self) -> bool:
+        """Whether drivers may have to stop their robots after this node was asked to stop."""
+        now_s = time.monotonic()
+        self._asked_s = min(self._asked_s, now_s)
+        if self.host.is_used():
+            self._used_s = now_s
+        return now_s < min(max(self._asked_s, self._used_s) + _QUIET_S, self._asked_s + _FAREWELL_S)
 
     def destroy_node(self) -> None:
         """Close the robots' links, too."""

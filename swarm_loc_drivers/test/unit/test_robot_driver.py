@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import pty
 import termios
+import threading
+from collections.abc import Callable
 from typing import Any
 
 import pytest
 
 from swarm_loc_drivers.common.link import LinkError, SerialLink
-from swarm_loc_drivers.common.robot_driver import RobotDriver
+from swarm_loc_drivers.common.robot_driver import NO_CLOCK, RobotDriver
 
 
 @pytest.mark.parametrize("call", ["tcsetattr", "tcflush"])
@@ -45,8 +47,8 @@ class Still:
 class Failing(RobotDriver[Still]):
     """A driver that cannot cope with what its robot has measured."""
 
-    def __init__(self) -> None:
-        super().__init__("/dev/robot")
+    def __init__(self, clock: Callable[[], int] = lambda: 1) -> None:
+        super().__init__("/dev/robot", clock)
         self.sent: list[bytes] = []
 
     def _open(self) -> Any:
@@ -77,3 +79,35 @@ def test_a_mistake_that_ends_the_conversation_for_ever_is_told_and_the_robot_sta
     driver.stop()
     assert driver.trouble == "the driver has failed: ValueError('seven is no even number')"
     assert driver.sent[-1] == b"stand"
+
+
+def test_a_driver_connects_when_time_begins_and_not_before() -> None:
+    """A simulated robot has no link before: trying would be reported as a fault."""
+    asked, begun = threading.Event(), threading.Event()
+
+    def clock() -> int:
+        asked.set()
+        return int(begun.is_set())
+
+    driver = Failing(clock)
+    opened = threading.Event()
+    driver._open = lambda: opened.set() or driver  # type: ignore[func-returns-value, method-assign]
+    driver._serve = lambda _: None  # type: ignore[method-assign]
+    driver.start()
+    assert asked.wait(5.0)
+    asked.clear()
+    assert asked.wait(5.0)  # it has asked again, so it has not gone on
+    assert driver.trouble == NO_CLOCK
+    assert not opened.is_set()
+    begun.set()
+    assert opened.wait(5.0)
+    driver.stop()
+    assert driver.sent[-1] == b"stand"
+
+
+def test_a_driver_without_time_ends_at_once() -> None:
+    driver = Failing(lambda: 0)
+    driver.start()
+    driver.stop()
+    assert not driver.sent
+    assert not driver.may_run

@@ -298,6 +298,7 @@ class Program:
         parameters: ROS parameters.
         arguments: Further ROS arguments.
         package: Whose executable.
+        options: Arguments before those of ROS.
     """
 
     def __init__(
@@ -307,9 +308,11 @@ class Program:
         parameters: dict[str, object],
         arguments: Sequence[str] = (),
         package: str = "swarm_loc_estimator",
+        options: Sequence[str] = (),
     ) -> None:
         self.log = log
-        command = [str(executable_path(package, name)), "--ros-args", *arguments]
+        command = [str(executable_path(package, name)), *options]
+        command += ["--ros-args", *arguments] if arguments or parameters else []
         for key, value in parameters.items():
             command += ["-p", f"{key}:={value}"]
         with log.open("wb") as out:
