@@ -25,7 +25,7 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("seed", default_value="1", description="random seed of the world's errors"),
             DeclareLaunchArgument("speed", default_value="0.06", description="speed along the eight [m/s]"),
             DeclareLaunchArgument("rate", default_value="1.0", description="simulated seconds per second"),
-            DeclareLaunchArgument("plan", default_value="corridor", description="the hall of PushBots"),
+            DeclareLaunchArgument("plan", default_value="corridor", description="hall of PushBots or a file"),
             DeclareLaunchArgument(
                 "aerial", default_value="false", description="locate by an overhead camera alone"
             ),

@@ -146,7 +146,11 @@ def _parser() -> argparse.ArgumentParser:
     aerial.add_argument("--start-known", action="store_true", help="write start poses to swarm.yaml")
     pushbots = _swarm(swarms, "pushbots", "PushBots that map a hall", 1, 5, 300.0)
     pushbots.set_defaults(write=_pushbots)
-    pushbots.add_argument("--plan", choices=sorted(FLOOR_PLANS), default="corridor", help="the hall")
+    pushbots.add_argument(
+        "--plan",
+        default="corridor",
+        help=f"the hall: {', '.join(FLOOR_PLANS)}, or the path of a floor plan (default: %(default)s)",
+    )
     pushbots.add_argument(
         "--slip", type=number_in(0.0, 0.1), default=0.02, help="share of every turn that is lost by slip"
     )

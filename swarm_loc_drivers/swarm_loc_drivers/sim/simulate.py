@@ -53,9 +53,9 @@ def parse(arguments: Sequence[str] | None) -> SimulationOptions:
         )
     parser.add_argument(
         "--plan",
-        choices=sorted(FLOOR_PLANS),
         default=defaults.plan,
-        help=f"the hall of PushBots (default: {defaults.plan})",
+        help=f"the hall of PushBots: {', '.join(FLOOR_PLANS)}, or the path of a floor plan"
+        f" (default: {defaults.plan})",
     )
     parser.add_argument(
         "--aerial",

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from swarm_loc_drivers.sim.droplet.world import check_droplets
 from swarm_loc_drivers.sim.epuck.world import check_swarm
-from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
+from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import MAX_ROBOTS, laser_hz, led_hz
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
@@ -54,7 +54,7 @@ class SimulationOptions:
         seed: Random seed of these errors.
         speed: Speed of e-pucks along the eight [m/s].
         rate: Simulated seconds per second, as far as the machine keeps up.
-        plan: The hall of PushBots.
+        plan: The hall of PushBots, see `floor_plan`.
         aerial: Whether e-pucks are located by an overhead camera only, which cannot tell them apart.
         parameter_file: Path of a ROS parameter file for all nodes, None for none.
     """
@@ -112,8 +112,7 @@ def simulated_swarm(options: SimulationOptions) -> Swarm:
     Raises:
         UserError: A file cannot be used, or the swarm cannot be simulated.
     """
-    if options.plan not in FLOOR_PLANS:
-        raise ParameterError(f"argument plan = '{options.plan}' must be one of {', '.join(FLOOR_PLANS)}.")
+    floor_plan(options.plan)
     check_parameter_file(options.parameter_file)
     swarm = load_swarm(Path(options.swarm_file))
     kind = robot_type_of(swarm)

@@ -73,7 +73,7 @@ def test_robots_start_inside_closed_halls(name: str) -> None:
 
 
 def test_an_unknown_hall_is_told() -> None:
-    with pytest.raises(FloorPlanError, match="no floor plan 'cave'; there are corridor,"):
+    with pytest.raises(FloorPlanError, match="no floor plan 'cave': it must be one of corridor,"):
         floor_plan("cave")
 
 

@@ -11,6 +11,7 @@ import pytest
 
 from bench.shared.parameter_table import markdown_table
 from swarm_loc_drivers.pushbot.parameters import ExplorationParameters, PushbotParameters
+from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlanError
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.pushbot.world import (
     PushbotWorldParameters,
@@ -135,5 +136,5 @@ def test_a_swarm_that_is_not_one_of_pushbots_is_named(
 
 
 def test_a_hall_that_is_not_there_is_named(swarm_file: Path) -> None:
-    with pytest.raises(ParameterError, match="argument plan = 'attic' must be one of corridor, office"):
+    with pytest.raises(FloorPlanError, match="no floor plan 'attic': it must be one of corridor, office"):
         simulated_swarm(SimulationOptions(str(swarm_file), plan="attic"))

@@ -1,26 +1,37 @@
-"""Floor plans: halls as walls in the plane, with places where robots start, and distances in them."""
+"""Floor plans: halls as walls in the plane, with places where robots start, and distances in them.
+
+See doc/floor_plans.md for the files.
+"""
 
 from __future__ import annotations
 
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.common.parameters import NumberSpec, UserError
+from swarm_loc_estimator.common.yaml_tree import Tree, read_tree
+from swarm_loc_estimator.mapping.map_file import load_map
+from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 
 Rectangle = tuple[float, float, float, float]
 """Left, lower, right and upper edge [m]."""
-Point = tuple[float, float]
+_SUFFIXES = (".yaml", ".yml", ".json")
+_KEYS = ("about", "free", "solid", "polygons", "columns", "segments", "starts")
+_RESOLUTION = NumberSpec("m", 0.001, 10.0, False, "side of a pixel")
+_MAX_WALLS, _MAX_RECTANGLES = 2000, 200
+"""Each step of a world compares every corner with every wall."""
 
 
 class FloorPlanError(UserError):
-    """There is no such floor plan; the message is one sentence."""
+    """A floor plan that cannot be used; the message is one sentence."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +62,7 @@ def outline(free: Sequence[Rectangle], solid: Sequence[Rectangle]) -> FloatArray
     return np.array(walls)
 
 
-def polygon(corners: Sequence[Point]) -> FloatArray:
+def polygon(corners: Sequence[tuple[float, ...]]) -> FloatArray:
     """The walls (S, 4) of a closed polygon."""
     points = np.array(corners, dtype=float)
     return np.hstack([points, np.roll(points, -1, axis=0)])
@@ -71,30 +82,117 @@ def _within(x: FloatArray, y: FloatArray, rectangles: Sequence[Rectangle]) -> Bo
     return inside
 
 
+def floor_plan(plan: str) -> FloorPlan:
+    """A floor plan by its name, or from a file.
+
+    Args:
+        plan: A key of `FLOOR_PLANS`, or the path of a YAML or JSON file: either walls with the keys of
+            `floor_plans.json`, or a map of ROS's map_server.
+
+    Raises:
+        UserError: There is no such plan, or the file cannot be used.
+    """
+    if plan in FLOOR_PLANS:
+        return FLOOR_PLANS[plan]
+    path = Path(plan)
+    if path.suffix not in _SUFFIXES:
+        raise FloorPlanError(
+            f"There is no floor plan '{plan}': it must be one of {', '.join(FLOOR_PLANS)},"
+            f" or the path of a file with the ending {' or '.join(_SUFFIXES)}."
+        )
+    tree = read_tree(path)
+    is_map = isinstance(tree, dict) and "image" in tree
+    return _plan_of_map(path, tree) if is_map else _plan_of(plan, tree, TreeChecks(path, FloorPlanError))
+
+
+def _plan_of(name: str, tree: Tree, checks: TreeChecks) -> FloorPlan:
+    """A floor plan from its description.
+
+    Raises:
+        FloorPlanError: The description cannot be used.
+    """
+    about = checks.mapping(tree, WHOLE_FILE, _KEYS)
+
+    def rows(tree: Tree, key: str, width: int) -> list[tuple[float, ...]]:
+        """A list of rows of numbers."""
+        table = [checks.list_of_numbers(row, f"{key}[{k}]") for k, row in enumerate(checks.items(tree, key))]
+        for k, row in enumerate(table):
+            if len(row) != width:
+                raise checks.error(f"{key}[{k}]", list(row), f"must have {width} numbers")
+        return table
+
+    def rectangles(key: str) -> list[Rectangle]:
+        found = [(row[0], row[1], row[2], row[3]) for row in rows(about.get(key, []), key, 4)]
+        for k, (left, low, right, high) in enumerate(found):
+            if not (left < right and low < high):
+                raise checks.error(f"{key}[{k}]", list(found[k]), "must be [left, lower, right, upper]")
+        if len(found) > _MAX_RECTANGLES:
+            raise checks.said(f"{key} has {len(found)} rectangles but may have {_MAX_RECTANGLES}")
+        return found
+
+    free, solid = rectangles("free"), rectangles("solid")
+    walls = [np.array(rows(about.get("segments", []), "segments", 4)).reshape(-1, 4)]
+    walls += [outline(free, solid)] if free else []
+    for k, corners in enumerate(checks.items(about.get("polygons", []), "polygons")):
+        walls.append(polygon(rows(corners, f"polygons[{k}]", 2)))
+    walls += [outline([column], []) for column in rectangles("columns")]
+    starts = np.array(rows(about.get("starts", []), "starts", 2)).reshape(-1, 2)
+    return _checked(FloorPlan(name, np.vstack(walls), starts), checks)
+
+
+def _plan_of_map(path: Path, about: dict[str, Tree]) -> FloorPlan:
+    """The walls around the occupied cells of a map; where its image ends is a wall, too.
+
+    Raises:
+        UserError: The map cannot be used.
+    """
+    checks = TreeChecks(path, FloorPlanError)
+    cell = checks.number(about.get("resolution"), "resolution", _RESOLUTION) or 0.0
+    occupied = load_map(path, cell).occupied
+    corner = np.array(about["origin"][:2], dtype=float)
+    walls = cell * _boundaries(occupied) + np.tile(corner, 2)
+    return _checked(FloorPlan(str(path), walls, np.zeros((0, 2))), checks)
+
+
+def _checked(plan: FloorPlan, checks: TreeChecks) -> FloorPlan:
+    """A plan without walls of no length.
+
+    Raises:
+        FloorPlanError: It has no walls, or too many.
+    """
+    lengths = np.hypot(*(plan.walls[:, 2:] - plan.walls[:, :2]).T)
+    walls = plan.walls[lengths > 0.0]
+    if not 0 < len(walls) <= _MAX_WALLS:
+        raise checks.said(f"the plan has {len(walls)} walls but must have 1 to {_MAX_WALLS}")
+    return replace(plan, walls=walls)
+
+
+def _boundaries(solid: BoolArray) -> FloatArray:
+    """Lines (S, 4) between solid and free cells of a grid (nx, ny), in cells; all around it is solid."""
+    padded = np.pad(solid, 1, constant_values=True)
+    x, low, high = _runs(padded[1:] != padded[:-1]).T
+    y, left, right = _runs((padded[:, 1:] != padded[:, :-1]).T).T
+    upright = np.column_stack([x, low - 1, x, high - 1])
+    level = np.column_stack([left - 1, y, right - 1, y])
+    return np.vstack([upright, level]).astype(float)
+
+
+def _runs(rows: BoolArray) -> NDArray[np.int64]:
+    """Row, begin and end (R, 3) of the runs of True in each row (n, m)."""
+    flips = np.diff(np.pad(rows, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    row, begin = np.nonzero(flips > 0)
+    return np.column_stack([row, begin, np.nonzero(flips < 0)[1]])
+
+
 def _load() -> dict[str, FloorPlan]:
-    """The plans of `floor_plans.json`: free rectangles without solid ones, polygons, rectangular columns."""
-    plans = {}
-    data = Path(__file__).with_name("floor_plans.json").read_text(encoding="utf-8")
-    for name, plan in json.loads(data).items():
-        walls = [outline(plan["free"], plan["solid"])] if "free" in plan else []
-        walls += [polygon(corners) for corners in plan.get("polygons", ())]
-        walls += [outline([column], []) for column in plan.get("columns", ())]
-        plans[name] = FloorPlan(name, np.vstack(walls), np.array(plan["starts"]))
-    return plans
+    """The plans of `floor_plans.json`."""
+    path = Path(__file__).with_name("floor_plans.json")
+    checks = TreeChecks(path, FloorPlanError)
+    plans = json.loads(path.read_text(encoding="utf-8"))
+    return {name: _plan_of(name, plan, checks) for name, plan in plans.items()}
 
 
 FLOOR_PLANS = _load()
-
-
-def floor_plan(name: str) -> FloorPlan:
-    """The floor plan of a name.
-
-    Raises:
-        FloorPlanError: There is none.
-    """
-    if name not in FLOOR_PLANS:
-        raise FloorPlanError(f"There is no floor plan '{name}'; there are {', '.join(FLOOR_PLANS)}.")
-    return FLOOR_PLANS[name]
 
 
 _PARALLEL = 1e-12

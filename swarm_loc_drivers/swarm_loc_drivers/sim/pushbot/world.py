@@ -70,7 +70,7 @@ class PushbotWorldParameters:
     """Parameters of `pushbot_world_node`; the event cameras' are those of `CameraNoise`."""
 
     swarm_file: str = text("", "path of the swarm description; every robot needs a start", required=True)
-    plan: str = choice("corridor", tuple(FLOOR_PLANS), "the hall")
+    plan: str = text("corridor", f"the hall: {', '.join(FLOOR_PLANS)}, or the path of a floor plan")
     seed: int = number(1, "1", 0, 2**31 - 1, "fixes the assembly of the robots, and all noise")
     rate: float = number(
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
@@ -212,8 +212,7 @@ def make_pushbot_world(params: PushbotWorldParameters) -> tuple[Swarm, PushbotWo
     """The swarm as described, and its world.
 
     Raises:
-        ParameterError: A parameter cannot be used.
-        SwarmFileError: The swarm description cannot be used.
+        UserError: A parameter, the swarm description or the floor plan cannot be used.
     """
     swarm = load_swarm(Path(params.swarm_file))
     try:

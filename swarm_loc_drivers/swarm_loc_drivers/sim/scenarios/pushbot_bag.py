@@ -19,7 +19,7 @@ from swarm_loc_drivers.sim.pushbot.exploration import (
     Exploration,
     PushBotNoise,
 )
-from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
+from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlanError, floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import (
     CAMERA_X_M,
     HallSight,
@@ -85,7 +85,7 @@ class PushbotBagSettings:
         seed: Of all noise.
         duration_s: How long [s].
         robots: How many.
-        plan: Name of the floor plan.
+        plan: The floor plan, see `floor_plan`.
         slip: Share of turns that wheels lose.
         events_s: Events of so long at the begin [s].
     """
@@ -112,9 +112,11 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
         Number of messages.
 
     Raises:
-        BagError: The folder is there already, or cannot be created.
+        UserError: The floor plan cannot be used, or the folder is there already or cannot be created.
     """
     plan = floor_plan(settings.plan)
+    if len(plan.starts) < settings.robots:
+        raise FloorPlanError(f"The floor plan '{settings.plan}' has starts for {len(plan.starts)} robots.")
     mapper = CooperativeMapper()
     exploration = Exploration(plan, mapper, np.random.default_rng(settings.seed))
     robots = range(settings.robots)

@@ -1,0 +1,136 @@
+"""Floor plans from files: walls, maps as images, and what is wrong with a file in one sentence."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from swarm_loc_drivers.sim.generate_bag import main as generate_bag
+from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan, ray_distance
+from swarm_loc_drivers.sim.pushbot.world import PushbotWorldParameters, make_pushbot_world
+from swarm_loc_drivers.sim.simulation import SimulationOptions, simulated_swarm
+from swarm_loc_drivers.sim.worlds import WorldError
+from swarm_loc_estimator.common.parameters import ParameterError, UserError
+
+SWARM = """
+fileversion: 1
+types: {pushbot: {odometry: {wheel_separation: 0.085}, camera: null}}
+robots: {a: {type: pushbot, start: {x: 1.0, y: 1.0, theta: 0.0}}}
+"""
+MAP = """
+image: room.png
+resolution: 0.05
+origin: [-1.013, -0.5, 0.0]
+negate: 0
+occupied_thresh: 0.65
+free_thresh: 0.196
+"""
+
+
+def written(folder: Path, text: str, name: str = "plan.yaml") -> str:
+    """The path of a file with a text."""
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return str(path)
+
+
+def free_way(plan: FloorPlan, x: float, y: float, angle: float) -> float:
+    """Distance to the first wall [m]."""
+    return float(ray_distance(plan.walls, np.zeros((0, 2)), 0.06, x, y, angle))
+
+
+@pytest.mark.parametrize("name", ["plan.yaml", "plan.json"])
+def test_walls_come_from_a_file(tmp_path: Path, name: str) -> None:
+    content = {
+        "free": [[0, 0, 4, 3]],
+        "solid": [[3, 2, 4, 3]],
+        "columns": [[1.8, 1.2, 2.1, 1.5]],
+        "polygons": [[[0.5, 2.0], [0.9, 2.0], [0.5, 2.4], [0.5, 2.0]]],
+        "segments": [[0, 0.5, 1, 0.5]],
+        "starts": [[1, 1]],
+    }
+    plan = floor_plan(written(tmp_path, json.dumps(content), name))
+    assert free_way(plan, 1.0, 1.3, 0.0) == pytest.approx(0.8)
+    assert free_way(plan, 2.5, 2.5, 0.0) == pytest.approx(0.5)
+    assert free_way(plan, 0.6, 1.0, -math.pi / 2) == pytest.approx(0.5)
+    assert free_way(plan, 0.6, 1.0, math.pi / 2) == pytest.approx(1.0)
+    assert plan.starts.tolist() == [[1.0, 1.0]]
+
+
+@pytest.mark.parametrize("ending", ["png", "pgm"])
+def test_walls_come_from_a_map(tmp_path: Path, ending: str) -> None:
+    """A room of 40 x 20 pixels with a block in it; its first row is the uppermost."""
+    pixels = np.full((20, 40), 254, np.uint8)
+    pixels[[0, -1], :], pixels[:, [0, -1]] = 0, 0
+    pixels[4:8, 30:34] = 0
+    pixels[10, 10] = 205
+    Image.fromarray(pixels).save(tmp_path / f"room.{ending}")
+    plan = floor_plan(written(tmp_path, MAP.replace("png", ending)))
+    assert len(plan.walls) == 8
+    x, y = -1.013, -0.5
+    assert free_way(plan, x + 0.5, y + 0.3, 0.0) == pytest.approx(1.95 - 0.5)
+    assert free_way(plan, x + 0.5, y + 0.3, -math.pi / 2) == pytest.approx(0.25)
+    assert free_way(plan, x + 0.5, y + 0.7, 0.0) == pytest.approx(1.5 - 0.5)
+    assert free_way(plan, x + 1.6, y + 0.3, math.pi / 2) == pytest.approx(0.6 - 0.3)
+
+
+def test_the_hall_ends_where_a_map_ends(tmp_path: Path) -> None:
+    Image.fromarray(np.full((20, 40), 254, np.uint8)).save(tmp_path / "room.png")
+    plan = floor_plan(written(tmp_path, MAP))
+    assert len(plan.walls) == 4
+    assert free_way(plan, 0.0, 0.0, math.pi) == pytest.approx(1.013)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("walls: []", "'walls' is not a known key"),
+        ("free: [[0, 0, 4]]", r"free\[0\] is \[0.0, 0.0, 4.0\] but must have 4 numbers"),
+        ("free: [[4, 0, 0, 3]]", r"free\[0\] is .* but must be \[left, lower, right, upper\]"),
+        ("free: 3", "free is 3 but must be a list"),
+        ("segments: [[0, 0, 1, .nan]]", r"segments\[0\]\[3\] is nan but must be a number"),
+        ("polygons: [[1, 2]]", r"polygons\[0\]\[0\] is 1 but must be a list"),
+        ("{}", "the plan has 0 walls but must have 1 to 2000"),
+        ("segments: [[1, 1, 1, 1]]", "the plan has 0 walls"),
+        (f"segments: {[[0, k, 1, k] for k in range(2001)]}", "the plan has 2001 walls"),
+        (f"free: {[[0, k, 1, k + 1] for k in range(201)]}", "free has 201 rectangles but may have 200"),
+        ("[1, 2]", "must be a mapping"),
+        ("free: [", "is not YAML"),
+        ("image: room.png", "resolution is None but must be a number"),
+        (MAP.replace("0.05", "0"), "resolution is 0 but must lie in"),
+        (MAP, "room.png cannot be read"),
+    ],
+)
+def test_a_file_that_cannot_be_used_is_named_in_one_sentence(
+    tmp_path: Path, text: str, sentence: str
+) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(UserError, match=sentence) as caught:
+        floor_plan(path)
+    assert str(tmp_path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_simulation_world_and_bags_take_a_file(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    swarm_file = written(tmp_path, SWARM, "swarm.yaml")
+    plan = written(tmp_path, "free: [[0, 0, 2, 2]]\n")
+    assert len(simulated_swarm(SimulationOptions(swarm_file, plan=plan)).robots) == 1
+    _, world = make_pushbot_world(PushbotWorldParameters(swarm_file=swarm_file, plan=plan))
+    assert world.sight.distance(0, world.poses) == pytest.approx(1.0, abs=0.1)
+    assert generate_bag(["pushbots", str(tmp_path / "bag"), "--robots", "1", "--plan", plan]) == 1
+    assert "has starts for 0 robots" in capsys.readouterr().err
+    missing = str(tmp_path / "missing.yaml")
+    with pytest.raises(UserError, match=r"missing\.yaml cannot be read"):
+        simulated_swarm(SimulationOptions(swarm_file, plan=missing))
+
+
+def test_a_robot_in_a_wall_of_a_file_is_named(tmp_path: Path) -> None:
+    swarm_file = written(tmp_path, SWARM, "swarm.yaml")
+    plan = written(tmp_path, "free: [[0, 0, 2, 2]]\ncolumns: [[0.9, 0.9, 1.02, 1.02]]\n")
+    with pytest.raises((ParameterError, WorldError), match="robot 1 of the swarm begins within a wall"):
+        make_pushbot_world(PushbotWorldParameters(swarm_file=swarm_file, plan=plan))
