@@ -23,7 +23,7 @@ SETTINGS = DropletRunSettings(seed=SEED, robots=ROBOTS, start_known=True)
 
 @pytest.mark.timeout(400)
 def test_droplets_that_nobody_sees_are_located_by_infrared(tmp_path: Path) -> None:
-    """A tracker sees the first and the last of four, the estimator knows no starts, the second one wanders."""
+    """A tracker sees the first and the last of four, no start is known, and the second one wanders."""
     there = starts(SETTINGS)
     known, unknown = tmp_path / "swarm.yaml", tmp_path / "without_starts.yaml"
     save_swarm(describe_droplets(SETTINGS, there), known)
