@@ -6,9 +6,9 @@ import json
 import math
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
-from PIL import Image
 
 from swarm_loc_drivers.sim.generate_bag import main as generate_bag
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan, ray_distance
@@ -69,7 +69,7 @@ def test_walls_come_from_a_map(tmp_path: Path, ending: str) -> None:
     pixels[[0, -1], :], pixels[:, [0, -1]] = 0, 0
     pixels[4:8, 30:34] = 0
     pixels[10, 10] = 205
-    Image.fromarray(pixels).save(tmp_path / f"room.{ending}")
+    cv2.imwrite(str(tmp_path / f"room.{ending}"), pixels)
     plan = floor_plan(written(tmp_path, MAP.replace("png", ending)))
     assert len(plan.walls) == 8
     x, y = -1.013, -0.5
@@ -80,7 +80,7 @@ def test_walls_come_from_a_map(tmp_path: Path, ending: str) -> None:
 
 
 def test_the_hall_ends_where_a_map_ends(tmp_path: Path) -> None:
-    Image.fromarray(np.full((20, 40), 254, np.uint8)).save(tmp_path / "room.png")
+    cv2.imwrite(str(tmp_path / "room.png"), np.full((20, 40), 254, np.uint8))
     plan = floor_plan(written(tmp_path, MAP))
     assert len(plan.walls) == 4
     assert free_way(plan, 0.0, 0.0, math.pi) == pytest.approx(1.013)
@@ -101,9 +101,12 @@ def test_the_hall_ends_where_a_map_ends(tmp_path: Path) -> None:
         (f"free: {[[0, k, 1, k + 1] for k in range(201)]}", "free has 201 rectangles but may have 200"),
         ("[1, 2]", "must be a mapping"),
         ("free: [", "is not YAML"),
-        ("image: room.png", "resolution is None but must be a number"),
+        ("image: room.png", "lacks resolution"),
         (MAP.replace("0.05", "0"), "resolution is 0 but must lie in"),
+        (MAP.replace("0.0]", "0.5]"), "origin is .* but must be x, y and a yaw of 0"),
+        (MAP + "mode: raw", "mode must be trinary or scale"),
         (MAP, "room.png cannot be read"),
+        (MAP.replace("room.png", "plan.yaml"), "image is 'plan.yaml' but is no image that can be decoded"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named_in_one_sentence(

@@ -11,14 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError
-from swarm_loc_estimator.common.yaml_tree import Tree, read_tree
-from swarm_loc_estimator.mapping.map_file import load_map
+from swarm_loc_estimator.common.yaml_tree import Tree, read_file, read_tree
 from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 
 Rectangle = tuple[float, float, float, float]
@@ -26,6 +26,8 @@ Rectangle = tuple[float, float, float, float]
 _SUFFIXES = (".yaml", ".yml", ".json")
 _KEYS = ("about", "free", "solid", "polygons", "columns", "segments", "starts")
 _RESOLUTION = NumberSpec("m", 0.001, 10.0, False, "side of a pixel")
+_THRESHOLD = NumberSpec("1", 0.0, 1.0, False, "darker pixels are occupied")
+_MAX_IMAGE_BYTES = 50_000_000
 _MAX_WALLS, _MAX_RECTANGLES = 2000, 200
 """Each step of a world compares every corner with every wall."""
 
@@ -147,9 +149,24 @@ def _plan_of_map(path: Path, about: dict[str, Tree]) -> FloorPlan:
         UserError: The map cannot be used.
     """
     checks = TreeChecks(path, FloorPlanError)
-    cell = checks.number(about.get("resolution"), "resolution", _RESOLUTION) or 0.0
-    occupied = load_map(path, cell).occupied
-    corner = np.array(about["origin"][:2], dtype=float)
+    checks.mapping(about, WHOLE_FILE, required=("image", "resolution", "origin"))
+    cell = checks.number(about["resolution"], "resolution", _RESOLUTION) or 0.0
+    threshold = checks.number(about.get("occupied_thresh", 0.65), "occupied_thresh", _THRESHOLD) or 0.0
+    origin = checks.list_of_numbers(about["origin"], "origin")
+    if len(origin) != 3 or origin[2] != 0.0:
+        raise checks.error("origin", list(origin), "must be x, y and a yaw of 0")
+    if about.get("mode", "trinary") == "raw" or about.get("negate", 0) not in (0, 1):
+        raise checks.said("mode must be trinary or scale, and negate 0 or 1")
+    data = read_file(path.parent / str(about["image"]), _MAX_IMAGE_BYTES)
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:  # an empty file, or one with too many pixels
+        pixels = None
+    if pixels is None:
+        raise checks.error("image", about["image"], "is no image that can be decoded")
+    darkness = (pixels if about.get("negate", 0) else 255 - pixels) / 255.0
+    occupied = (darkness > threshold)[::-1].T
+    corner = np.array(origin[:2])
     walls = cell * _boundaries(occupied) + np.tile(corner, 2)
     return _checked(FloorPlan(str(path), walls, np.zeros((0, 2))), checks)
 
