@@ -144,10 +144,10 @@ class OdometryTracks:
         young = stamps_ns >= self._oldest_ns
         too_old = robots[~young]
         rows = NewRows(robots, stamps_ns + self._delay_ns[robots], raw, twist, young)
-        rows, changed_from = self._take_back_later_rows(NewRows(*(column[young] for column in rows)))
+        rows, changed_from = self._take_back_later_rows(NewRows._make(column[young] for column in rows))
         robots, stamps, raw = rows[:3]
         order = np.lexsort((wrap_angle(raw[:, 2]), raw[:, 1], raw[:, 0], stamps, robots))
-        rows = NewRows(*(column[order] for column in rows))
+        rows = NewRows._make(column[order] for column in rows)
         while np.any(
             self.arrays.filled + np.bincount(robots, minlength=self._robots) > self.arrays.stamp_ns.shape[1]
         ):
@@ -238,7 +238,7 @@ class OdometryTracks:
             )
             later = (getattr(arrays, name)[robot, first:count] for name in ("stamp_ns", "raw", "twist"))
             again = np.zeros(count - first, dtype=bool)
-            taken.append(NewRows(np.full(count - first, robot), *later, again))
+            taken.append(NewRows._make([np.full(count - first, robot), *later, again]))
             arrays.filled[robot] = first
         changed_from = np.full(self._robots, UNCHANGED_NS)
         last = np.maximum(arrays.filled[robots] - 1, 0)

@@ -24,7 +24,7 @@ EXAMPLE = ROOT / "swarm_loc_estimator" / "examples" / "replay_errors.py"
 BAG = ROOT / "bags" / "eight_five_robots"
 SWARM = Swarm((Robot("robot1"),))
 TWO = np.zeros(2, np.int64)
-ROWS = OdometryRows(TWO, TWO, np.zeros((2, 3)), TWO)
+ROWS = OdometryRows.without_twist(TWO, TWO, np.zeros((2, 3)), TWO)
 NAMES = set(swarm_loc_estimator._MODULE_OF)
 
 

@@ -127,7 +127,8 @@ def _motion(recording: Recording, robot: Robot, track: Trajectory) -> _Motion | 
     (first, first_s), (last, last_s) = (_odometry(robot, track, ns) for ns in (first_ns, last_ns))
     true = se2.between(*(interpolate(truth, stamps, DENSE_GAP_NS)[0] for stamps in (first_ns, last_ns)))
     overlap = min(1.0, float((last_ns[-1] - first_ns[0]) / np.sum(last_ns - first_ns)))
-    return _Motion(se2.between(first, last), true, last_s - first_s, (last_ns - first_ns) * 1e-9, overlap)
+    length_s = np.multiply(last_ns - first_ns, 1e-9, dtype=float)
+    return _Motion(se2.between(first, last), true, last_s - first_s, length_s, overlap)
 
 
 def _turns(motion: _Motion) -> _OffsetRegression:

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.optimize import least_squares
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.offline.calibration.camera import CameraFit
 from swarm_loc_estimator.offline.calibration.robust import spread
 from swarm_loc_estimator.swarm.swarm import Robot
@@ -62,7 +62,8 @@ def _numbers(fit: CameraFit) -> dict[str, float]:
     polar, value = fit.sightings.polar, fit.sightings.value
     far = np.maximum(value[:, 0], 0.1)
     bearing = np.where(polar, fit.after[:, 1], fit.after[:, 1] / far)
-    sway, time_s = sway_of(fit.sightings.stamp_ns * 1e-9, fit.sightings.marker_id, bearing)
+    seconds = np.multiply(fit.sightings.stamp_ns, 1e-9, dtype=float)
+    sway, time_s = sway_of(seconds, fit.sightings.marker_id, bearing)
     own = np.sqrt(max(spread(bearing) ** 2 - sway**2, 0.1 * spread(bearing) ** 2))
     numbers = {"yaw_sigma": sway, "yaw_time_s": time_s}
     if polar.any():
@@ -75,7 +76,7 @@ def _numbers(fit: CameraFit) -> dict[str, float]:
     return numbers
 
 
-def sway_of(time_s: FloatArray, marker: FloatArray, bearing: FloatArray) -> tuple[float, float]:
+def sway_of(time_s: FloatArray, marker: IntArray, bearing: FloatArray) -> tuple[float, float]:
     """Standard deviation [rad] and time constant [s] of bearing errors that different markers share.
 
     Args:
