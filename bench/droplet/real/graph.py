@@ -71,7 +71,7 @@ class Outcome:
             "position_p90_cm": float(np.quantile(self.position_cm, 0.9)),
             "heading_deg": float(np.median(self.heading_deg)),
             "nees": self.score.nees,
-            "misleading": self.score.misleading_share,
+            "misleading_share": self.score.misleading_share,
         }
 
 

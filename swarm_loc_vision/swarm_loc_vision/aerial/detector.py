@@ -35,6 +35,8 @@ _MAX_SPREAD, _MAX_SPREAD_PX = 0.03, 0.2
 """Largest rms distance of a disc's rim from a circle: a share of the radius, plus pixels."""
 _MAX_OVAL = 0.15
 """Largest second harmonic of a disc's outline, over its radius: what motion leaves."""
+_MOTION_SHARE = 4.0
+"""Variance of the place along the motion, in squares of the second harmonic."""
 _FLAT = ((TOP, True, 0.6),)
 _TALL = ((SIDES, False, 1.0), (PARTLY, False, 0.6), (TOP, True, 0.6), (SIDES, True, 0.6), (PARTLY, True, 0.4))
 """Outlines that are tried where the quality is below their weight: kind, if edges are blurred, weight."""
@@ -185,7 +187,8 @@ class AerialDetector:
         kept = alike & is_strong
         circles, marks = circles.chosen(kept), Marks(*(column[kept] for column in marks))
         places = grid.places(circles.centre)
-        of_pixel = self._ground.pixel_covariances(places, circles.covariance * grid.metres_per_px**2)
+        of_outline = circles.covariance + _of_motion(circles.oval)
+        of_pixel = self._ground.pixel_covariances(places, of_outline * grid.metres_per_px**2)
         of_pixel = of_pixel + settings.pixel_sigma**2 * np.eye(2)
         spread = self._ground.covariances(places, of_pixel, settings.robot_height_sigma)
         return AerialDetections(
@@ -272,6 +275,21 @@ def _apart(circles: Circles) -> NDArray[np.int64]:
         if (away >= 2.0 * _APART * circles.radius[row]).all():
             kept.append(row)
     return np.array(kept, np.int64)
+
+
+def _of_motion(oval: FloatArray) -> FloatArray:
+    """(N, 2, 2) covariance [px^2] of centres whose outlines have second harmonics (N, 2) [px].
+
+    Motion during the exposure draws an outline out. Where the robot was at the stamp is uncertain by about
+    as much, along the motion.
+    """
+    size, (cos, sin) = np.hypot(*oval.T), oval.T
+    return (
+        0.5
+        * _MOTION_SHARE
+        * size[:, None, None]
+        * np.array([[size + cos, sin], [sin, size - cos]]).transpose(2, 0, 1)
+    )
 
 
 def _with_heading(spread: FloatArray, turned: Marks) -> FloatArray:
