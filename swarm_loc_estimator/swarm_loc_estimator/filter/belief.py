@@ -47,6 +47,7 @@ class IntegrityArrays(NamedTuple):
         drift_variance: (N, W, 2) variances of position and heading at that time.
         motion_likelihood: (N, scales) log-likelihood of each scale of the process noise.
         motion_scale: (N,) scale of the process noise of each robot.
+        motion_explained: (N,) True if it stays 1, as scales of the robot's motion are described as estimated.
     """
 
     source: IntArray
@@ -74,6 +75,7 @@ class IntegrityArrays(NamedTuple):
     drift_variance: FloatArray
     motion_likelihood: FloatArray
     motion_scale: FloatArray
+    motion_explained: BoolArray
 
 
 class BeliefArrays(NamedTuple):

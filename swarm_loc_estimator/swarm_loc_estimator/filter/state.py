@@ -18,7 +18,12 @@ from swarm_loc_estimator.filter.joint_filter import JointFilter
 from swarm_loc_estimator.filter.measurement_model import NOBODY
 from swarm_loc_estimator.identification.memory import IdentityMemory
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.swarm.calibration_states import PARAMETERS, ParameterTable
+from swarm_loc_estimator.swarm.calibration_states import (
+    DISTANCE_SCALE,
+    PARAMETERS,
+    TURN_SCALE,
+    ParameterTable,
+)
 
 _DOUBTED_POSE_SIGMA = (0.02, 0.02, 0.03)
 """Standard deviation added to the pose of a contradicted robot [m], [m], [rad]."""
@@ -110,6 +115,7 @@ class SwarmState:
         self.start_pending: NDArray[np.bool_] = np.ones(robots, dtype=bool)
         self.last_fix_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.integrity = new_integrity(robots, landmarks)
+        self.integrity.motion_explained[:] = (table.column[:, [DISTANCE_SCALE, TURN_SCALE]] >= 0).any(axis=1)
         self.contradicted_ns: IntArray = np.full(robots + landmarks, NEVER_NS)
         self.all_augmented = False
         self.pair_robot: NDArray[np.int64] = np.full((robots, pairs), -1)

@@ -81,13 +81,11 @@ def add_spread(table: StartTable, work: StartWorkspace, pose: FloatArray, covari
 
 _DIRECTIONS = (16, 24)
 """Minimum and maximum number of bearings, and of headings; in between, two per element."""
-_LEVELS = (16, 22)
-"""Number of ranges; more where readings may be too bright."""
+_LEVELS = 16
 _KNEE = 10.0
 """Brightness above which compression is logarithmic instead of linear [sigma]."""
-_SHOWN = (2.0, 0.5)
-"""Brightness of an aligned pair at the maximum range of the table [sigma]; less where readings may be too
-bright, since stray light on dark readings of a far pair looks like a near one."""
+_SHOWN = 2.0
+"""Brightness of an aligned pair at the maximum range of the table [sigma]."""
 
 _BLOCKED = np.float32(0.2)
 """Maximum contribution of a blocked reading to the misfit."""
@@ -174,16 +172,15 @@ def _soft(curve: AngleCurve) -> TabulatedCurve:
 def start_table(platform: IrPlatform) -> StartTable:
     """The table of a platform; about a megabyte."""
     model = platform.model
-    two_sided = int(model.errors.bright < math.inf)
-    farthest, levels = distance_at(model.amplitudes[0], _SHOWN[two_sided] * model.noise), _LEVELS[two_sided]
-    ranges = np.geomspace(2.0 * platform.radius, min(max(farthest, 4.0 * platform.radius), 1e3), levels)
+    farthest = distance_at(model.amplitudes[0], _SHOWN * model.noise)
+    ranges = np.geomspace(2.0 * platform.radius, min(max(farthest, 4.0 * platform.radius), 1e3), _LEVELS)
     directions = min(max(_DIRECTIONS[0], 2 * platform.n), _DIRECTIONS[1])
     angles: FloatArray = np.linspace(-np.pi, np.pi, directions, endpoint=False)
     bearing, heading, distance = np.meshgrid(angles, angles, ranges, indexing="ij")
     poses = np.stack([distance, bearing, heading], axis=-1).reshape(-1, 3)
     readings = np.minimum(expected_brightness(platform, poses), model.saturation)
     patterns = np.arcsinh(readings / (_KNEE * model.noise)).astype(np.float32)
-    patterns = patterns.reshape(directions**2, levels, -1)
+    patterns = patterns.reshape(directions**2, _LEVELS, -1)
     totals: Float32Array = np.sum(patterns, axis=-1)
     return StartTable(ranges.astype(np.float64), angles, patterns, totals)
 

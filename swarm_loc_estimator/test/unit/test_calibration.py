@@ -26,6 +26,7 @@ from swarm_loc_estimator.offline.calibration.motion import (
     true_motion,
 )
 from swarm_loc_estimator.offline.calibration.noise import (
+    NEES_AIM,
     TICK_S,
     Score,
     score,
@@ -317,9 +318,10 @@ def test_a_table_has_to_earn_its_numbers(seed: int) -> None:
 
 
 def test_the_score_counts_error_consistency_and_poses_not_given() -> None:
-    fair = Score(0.02, 0.01, 2.5, 1.0)
+    fair = Score(0.02, 0.01, NEES_AIM, 1.0)
     assert replace(fair, position_rmse=0.021).cost > fair.cost
-    assert replace(fair, nees=5.0).cost == pytest.approx(replace(fair, nees=1.25).cost)
-    assert replace(fair, nees=5.0).cost > fair.cost
+    assert fair.cost < replace(fair, heading_rmse=0.0105).cost < replace(fair, position_rmse=0.021).cost
+    assert replace(fair, nees=2.0 * NEES_AIM).cost == pytest.approx(replace(fair, nees=0.5 * NEES_AIM).cost)
+    assert replace(fair, nees=2.0 * NEES_AIM).cost > fair.cost
     assert replace(fair, given=0.99).cost > fair.cost
     assert Score(np.nan, np.nan, np.nan, 0.0).cost > 10.0

@@ -25,7 +25,7 @@ from swarm_loc_estimator.swarm.swarm import (
     StartSigma,
     Swarm,
 )
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.swarm_file import RESERVED_NAMES, load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 RESPONSE = MotionResponse(
@@ -65,7 +65,12 @@ def boards(board_id: int) -> st.SearchStrategy[RobotIr]:
 def swarms(draw: st.DrawFn) -> Swarm:
     ids = iter(draw(st.lists(st.integers(0, 2**32 - 1), unique=True, min_size=40, max_size=40)))
     names = draw(
-        st.lists(st.text(string.ascii_letters, min_size=1, max_size=6), unique=True, min_size=1, max_size=4)
+        st.lists(
+            st.text(string.ascii_letters, min_size=1, max_size=6).filter(lambda n: n not in RESERVED_NAMES),
+            unique=True,
+            min_size=1,
+            max_size=4,
+        )
     )
     robots: list[Robot] = []
     kinds = (OdometryModel, RandomWalk, CameraMount, SensorModel, FixModel, StartSigma)

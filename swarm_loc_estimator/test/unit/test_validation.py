@@ -306,7 +306,7 @@ def test_drops_are_counted_for_the_robot_whose_data_they_are() -> None:
     estimator.tick(now_ns)
     for robot, stamp_ns in stamps_ns.items():
         Event(robot, stamp_ns, (0.0, 0.0, 0.0)).give(estimator, now_ns)
-    give_fix(estimator, 2, now_ns, np.zeros(3), np.zeros((3, 3)), now_ns)
+    give_fix(estimator, 2, now_ns, np.zeros(3), np.diag([1.0, 1.0, 0.0]), now_ns)
     estimator.tick(now_ns)
     expected = [{"future_stamp": 1}, {"odometry_too_old": 1}, {"bad_covariance": 1}]
     assert [dict(estimator.drops_of(robot)) for robot in range(3)] == expected

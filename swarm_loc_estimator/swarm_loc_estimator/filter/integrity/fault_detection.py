@@ -88,6 +88,7 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         drift_variance=np.zeros((robots, WINDOWS, 2)),
         motion_likelihood=np.zeros((robots, LOG_SCALES.size)),
         motion_scale=np.ones(robots),
+        motion_explained=np.zeros(robots, dtype=bool),
     )
 
 

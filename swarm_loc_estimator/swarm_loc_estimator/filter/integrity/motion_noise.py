@@ -7,7 +7,8 @@ described. A robot that slips drifts by much more, one on a good floor by less. 
 of s; they are multiplied for a grid of scales and forgotten with a time constant.
 
 Two windows run in parallel: the short one reacts fast, the long one sees slow drifts. While nothing measures
-a robot, its scale stays.
+a robot, its scale stays. Robots whose scales of distance or turn are estimated by description keep scale 1:
+their parameters explain a drift.
 """
 
 from __future__ import annotations
@@ -66,6 +67,8 @@ def learn(belief: BeliefArrays, robot: int, pose: FloatArray, stamp_ns: int) -> 
     if robot < 0 or not belief.tracked[robot]:
         return
     state = belief.integrity
+    if state.motion_explained[robot]:
+        return
     for window in range(WINDOWS):
         since_ns = stamp_ns - state.drift_ns[robot, window]
         if 0 <= since_ns < _WINDOW_NS[window]:

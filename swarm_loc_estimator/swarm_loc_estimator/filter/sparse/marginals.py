@@ -102,7 +102,7 @@ class Marginals:
             transition, blocks = self.transition[robots], self.groups.member[robots, 1:]
             follow = np.tile(np.eye(before.shape[1]), (bodies.size, 1, 1))
             follow[of_robots, :3, _DRIVEN] = transition[:, :3]
-            follow[of_robots[:, None], own, own] = transition[:, 3:].reshape(robots.size, -1)
+            follow[of_robots[:, None], own, own] = transition[:, 3:].reshape(robots.size, own.size)
             before = follow @ before @ follow.transpose(0, 2, 1)
             moved = transition[:, :3].any(axis=(1, 2))
             moves.beside[robots[moved]] = blocks[moved, 0]
