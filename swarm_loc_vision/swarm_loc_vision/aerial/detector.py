@@ -284,12 +284,13 @@ def _of_motion(oval: FloatArray) -> FloatArray:
     as much, along the motion.
     """
     size, (cos, sin) = np.hypot(*oval.T), oval.T
-    return (
+    along: FloatArray = (
         0.5
         * _MOTION_SHARE
         * size[:, None, None]
         * np.array([[size + cos, sin], [sin, size - cos]]).transpose(2, 0, 1)
     )
+    return along
 
 
 def _with_heading(spread: FloatArray, turned: Marks) -> FloatArray:
