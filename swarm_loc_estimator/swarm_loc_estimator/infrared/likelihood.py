@@ -1,9 +1,8 @@
 """Maximum likelihood estimate of the relative pose of two robots, from all readings of all powers.
 
 `search` starts at the poses of `start_table` to find the global minimum. The covariance is the inverse
-information, inflated where residuals exceed the platform's noise; residuals of outliers count where readings
-may be too bright. Unknown gains are estimated together with the pose, so the covariance includes their
-uncertainty.
+information, inflated where residuals exceed the platform's noise. Unknown gains are estimated together with
+the pose, so the covariance includes their uncertainty.
 """
 
 from __future__ import annotations
@@ -186,13 +185,11 @@ def _solve_one(
         return _MISFIT
     if not determined:
         return _UNDETERMINED
-    share, excess = 0.0 if two_sided else odds / (1.0 + odds), max(misfit, 1.0)
-    if two_sided:  # many outliers mean that the readings have errors of another kind
-        excess = max(excess, work.full.tally[2] / max(measured - 3.0, 1.0))
+    share = 0.0 if two_sided else odds / (1.0 + odds)
     for p in range(3):
         for q in range(3):
             apart = _apart(best, other, p) * _apart(best, other, q) if share > 0.0 else 0.0
-            covariance[p, q] = models.exact.scale * excess * covariance[p, q] + share * apart
+            covariance[p, q] = models.exact.scale * max(misfit, 1.0) * covariance[p, q] + share * apart
     if two_sided:
         if add_spread(models.table, work.start, best, covariance) > _WIDEST_OF_ALL**2:
             return _UNDETERMINED

@@ -86,16 +86,3 @@ def test_the_costs_gradient_is_its_slope_also_of_outliers(seed: int) -> None:
         step[p] = 1e-7
         slope = (cost_at(pose[0] + step)[0] - cost_at(pose[0] - step)[0]) / 2e-7
         assert gradient[p] == pytest.approx(slope, rel=1e-3, abs=0.05)
-
-
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_a_sensor_with_another_baseline_widens_the_covariance(seed: int) -> None:
-    poses = random_poses(600, seed, low=0.06, high=0.18)
-    readings = readings_of(BOARD, poses, seed)
-    shifted = readings.copy()
-    shifted[:, 0, seed] += 200.0
-    as_is, off = ESTIMATOR.solve(readings), ESTIMATOR.solve(shifted)
-    found = off.outcomes == IrOutcome.FOUND
-    errors = pose_errors(off.poses[found], poses[found])
-    assert np.mean(as_is.outcomes == IrOutcome.FOUND) > 0.9
-    assert np.mean(nees(errors, off.covariances[found]) > _CHI_SQUARE_99) < 0.05
