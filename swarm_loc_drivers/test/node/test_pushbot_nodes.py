@@ -245,6 +245,7 @@ def test_the_page_of_the_calibration_has_its_parameters() -> None:
     assert markdown_table(CalibrateLaserParameters) in page.read_text(encoding="utf-8")
 
 
+@pytest.mark.timeout(300)  # a minute of the simulation, however slow the machine
 def test_a_simulated_swarm_maps_its_hall_and_is_tracked(ros: Ros, tmp_path: Path) -> None:
     """The whole graph of `simulate`: serial ports, lasers, trackers, mapper, estimator, and who drives."""
     swarm = tmp_path / "swarm.yaml"
@@ -259,16 +260,18 @@ def test_a_simulated_swarm_maps_its_hall_and_is_tracked(ros: Ros, tmp_path: Path
             log = tmp_path / f"{spec.name}.log"
             running.enter_context(Program(spec.executable, log, {}, spec.ros_arguments()[1:], spec.package))
         ros.until(lambda: sum(one.distance > 0.0 for one in distances) > 20)
-        ros.until(lambda: len(goals) > 1, patience_s=90.0)  # it has looked around twice
+        # The second look around ends after 62 s of simulated time, which passes as fast as the machine allows.
+        ros.until(lambda: len(goals) > 1 or (truths and stamp_ns(truths[-1]) > 90e9), patience_s=240.0)
+        assert len(goals) > 1
         ros.until(lambda: truths and way_from(2.0, 3.0, truths[-1]) > 0.2)
         ros.until(lambda: poses and poses[-1].robots[0].status == SwarmPose.STATUS_TRACKED)
-        told, told_ns = poses[-1].robots[0], stamp_ns(poses[-1])
-        ros.until(lambda: stamp_ns(truths[-1]) >= told_ns)
+        pose, pose_ns = poses[-1].robots[0], stamp_ns(poses[-1])
+        ros.until(lambda: stamp_ns(truths[-1]) >= pose_ns)
     known = np.array([(one.distance, one.sigma) for one in distances if one.distance > 0.0])[:20]
     # the cabinet of the corridor's left end, 1.6 m before the robot
     assert abs(known[:, 0].mean() - 1.6) < 3.0 * known[:, 1].mean()
-    truth = min(truths, key=lambda one: abs(stamp_ns(one) - told_ns)).pose.position  # it may be driving
-    assert math.hypot(told.x - truth.x, told.y - truth.y) < 0.1
+    truth = min(truths, key=lambda one: abs(stamp_ns(one) - pose_ns)).pose.position  # it may be driving
+    assert math.hypot(pose.x - truth.x, pose.y - truth.y) < 0.1
 
 
 def test_a_laser_is_calibrated_by_a_drive_at_a_wall(ros: Ros, tmp_path: Path, swarm_file: Path) -> None:
