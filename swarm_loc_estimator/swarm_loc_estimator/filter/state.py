@@ -221,6 +221,7 @@ class SwarmState:
         self.filter.set_prior(columns[new], np.diag(variances[new]))
         doubt = error_covariance(pose, np.diag(np.square(_DOUBTED_POSE_SIGMA)))
         self.filter.add(robot_columns(np.array([source]))[0], doubt)
+        self._restart_drift(source)
 
     def augment_all(self, poses: FloatArray) -> None:
         """Reset all parameters to their priors and re-estimate them.
@@ -243,6 +244,11 @@ class SwarmState:
         self._set_described_priors()
         self.integrity.fault_score[:], self.integrity.evidence[:] = 0.0, 0.0
         inflate_all_noise(self.integrity)
+        self._restart_drift(np.arange(robots))
+
+    def _restart_drift(self, robots: int | IntArray) -> None:
+        """End the windows in which drift is observed: a pose that is no longer trusted says nothing of wheels."""
+        self.integrity.drift_ns[robots] = NEVER_NS // 2
 
     def _use_table(self, table: ParameterTable) -> None:
         """Extend the filter to the columns of a larger table."""
@@ -271,7 +277,7 @@ class SwarmState:
         """Reset the integrity statistics of robots (k,)."""
         self.integrity.gated_in_a_row[robots] = 0
         self.integrity.gated_fixes[robots] = 0
-        self.integrity.drift_ns[robots] = NEVER_NS // 2
+        self._restart_drift(robots)
         self.integrity.fault_score[robots] = 0.0
         self.integrity.confirmations[robots] = confirmations
         self.integrity.source[robots] = -1

@@ -3,8 +3,9 @@
 Over a window, measurements move the transform T from `map` to a robot's odometry track by the drift of its
 odometry. In a consistent filter this correction is normal with variance s Q + P_begin - P_end, where Q is the
 described process noise of the window, P the variance of the pose, and s the scale of the noise, which is 1 as
-described. A robot that slips drifts by much more, one on a good floor by less. Each window gives a likelihood
-of s; they are multiplied for a grid of scales and forgotten with a time constant.
+described. A robot that slips drifts by much more. Each window gives a likelihood of s; they are multiplied
+for a grid of scales and forgotten with a time constant. The scale that is used is never below 1: a minute on a
+good floor says little of the next metre.
 
 Two windows run in parallel: the short one reacts fast, the long one sees slow drifts. While nothing measures
 a robot, its scale stays. Robots whose scales of distance or turn are estimated by description keep scale 1:
@@ -29,7 +30,10 @@ _WINDOW_NS = (2_000_000_000, 8_000_000_000)
 _LONGEST = 4.0
 """A window that no measurement has ended after this many of its lengths says nothing."""
 LOG_SCALES = math.log(2.0) * np.arange(-1.0, 7.5, 0.5)
-"""Logarithms of the scales of the process noise, from one half to 128."""
+"""Logarithms of the scales of the process noise, from one half to 128.
+
+Those below 1 take up what chance adds: without them, the mean of a robot as described would exceed 1.
+"""
 _PRIOR = 3.0
 """Decrease of the log-likelihood per factor of e from scale 1."""
 _MEMORY_S = 30.0
