@@ -260,7 +260,7 @@ def test_a_simulated_swarm_maps_its_hall_and_is_tracked(ros: Ros, tmp_path: Path
             log = tmp_path / f"{spec.name}.log"
             running.enter_context(Program(spec.executable, log, {}, spec.ros_arguments()[1:], spec.package))
         ros.until(lambda: sum(one.distance > 0.0 for one in distances) > 20)
-        # The second look around ends after 62 s of simulated time, which passes as fast as the machine allows.
+        # The second look around ends at 62 s of simulated time, which passes as fast as the machine allows.
         ros.until(lambda: len(goals) > 1 or (truths and stamp_ns(truths[-1]) > 90e9), patience_s=240.0)
         assert len(goals) > 1
         ros.until(lambda: truths and way_from(2.0, 3.0, truths[-1]) > 0.2)

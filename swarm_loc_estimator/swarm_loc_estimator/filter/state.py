@@ -247,7 +247,7 @@ class SwarmState:
         self._restart_drift(np.arange(robots))
 
     def _restart_drift(self, robots: int | IntArray) -> None:
-        """End the windows in which drift is observed: a pose that is no longer trusted says nothing of wheels."""
+        """End the windows in which drift is observed: a pose that is not trusted says nothing of wheels."""
         self.integrity.drift_ns[robots] = NEVER_NS // 2
 
     def _use_table(self, table: ParameterTable) -> None:

@@ -27,6 +27,9 @@ _CAUSES = {
     "future_stamp": "are stamped ahead of this computer's clock",
     "odometry_too_old": "have stamps older than horizon_s: of another clock, or too late",
     "bad_covariance": "have a covariance that is zero or not positive definite",
+    "fix_without_covariance": "have no covariance, and fix.position_sigma of its description is 0",
+    "no_camera": "are detections, and its description has no camera",
+    "no_odometry": "are odometry, and its description says that it stands",
     "non_finite": "are not finite",
     "absurd": "are absurdly large",
 }

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -18,6 +17,7 @@ from swarm_loc_estimator.sensors.fix import about_robots, take_out_headings
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Converter,
+    DropCounts,
     InputKind,
     Known,
     Measured,
@@ -80,7 +80,7 @@ def _columns(
     return rows, dropped
 
 
-def _create_converter(_swarm: Swarm, settings: SensorSettings, _drops: Counter[str]) -> Converter:
+def _create_converter(_swarm: Swarm, settings: SensorSettings, _drops: DropCounts) -> Converter:
     sigma, heading_sigma = settings.aerial_position_sigma, settings.aerial_heading_sigma
     noise = np.diag(np.square([sigma, sigma, heading_sigma]))
 

@@ -8,7 +8,6 @@ mount's pitch and roll removed.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import NamedTuple
@@ -41,6 +40,7 @@ from swarm_loc_estimator.filter.measurement_model import (
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Converter,
+    DropCounts,
     InputKind,
     Known,
     Measured,
@@ -90,13 +90,13 @@ class Conversion:
     Attributes:
         measurements: (m,) of MEASUREMENT_DTYPE.
         measured: (d,) True for detections that were converted.
-        dropped: Number of dropped detections by reason: `unknown_id`, `own_marker`, `no_camera`,
+        dropped: Robots (k,) of the dropped detections by reason: `unknown_id`, `own_marker`, `no_camera`,
             `bad_content`, `non_finite` and `absurd`.
     """
 
     measurements: MeasurementArray
     measured: NDArray[np.bool_]
-    dropped: dict[str, int]
+    dropped: dict[str, IntArray]
 
 
 class _Cameras(NamedTuple):
@@ -186,8 +186,8 @@ class SightingConverter:
             measurements["marker_id"],
             outcomes,
         )
-        counts = np.bincount(outcomes, minlength=len(_OUTCOMES)).tolist()
-        dropped = {_OUTCOMES[k]: counts[k] for k in range(1, len(_OUTCOMES)) if counts[k]}
+        found = np.flatnonzero(np.bincount(outcomes, minlength=len(_OUTCOMES))).tolist()
+        dropped = {_OUTCOMES[k]: robots[outcomes == k] for k in found if k != _MEASURED}
         measured: NDArray[np.bool_] = outcomes == _MEASURED
         measurements = measurements[measured]
         self._note_stamp_variance(measurements)
@@ -368,12 +368,13 @@ def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> DetectionRows:
     return DetectionRows(message.robot, message.reading_ns, message.columns[0], arrival_ns)
 
 
-def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: Counter[str]) -> Converter:
+def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts) -> Converter:
     converter = SightingConverter(swarm)
 
     def convert(rows: DetectionRows) -> Measured:
         found = converter.convert(rows.robot, rows.stamp_ns, rows.detection)
-        drops.update(found.dropped)
+        for reason, robots in found.dropped.items():
+            drops.add(reason, robots)
         return Measured(found.measurements, rows.arrival_ns[found.measured])
 
     return convert
@@ -389,10 +390,5 @@ _OWN = InputKind(
 _SHARED = shared_kind(
     _OWN, "swarm/detections", SWARM_DETECTIONS, decode_shared_detections, _shared_rows, NO_DETECTIONS
 )
-DETECTIONS = Sensor(
-    "detections",
-    NO_DETECTIONS,
-    (_OWN, _SHARED),
-    _create_converter,
-)
+DETECTIONS = Sensor("detections", NO_DETECTIONS, (_OWN, _SHARED), _create_converter)
 """The sensor, see `registry.SENSORS`."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from typing import Any
 
 import numpy as np
@@ -15,6 +14,7 @@ from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Accumulator,
     Converter,
+    DropCounts,
     Guard,
     Measured,
     SensorSettings,
@@ -38,14 +38,12 @@ class InputConverter:
         settings: Default noise of sensors, and tolerance of stamps in the future.
 
     Attributes:
-        drops: Number of dropped readings by reason.
-        drops_of: The same of each robot, where a reason concerns all its messages.
+        drops: Counts dropped readings.
         accumulators: Accumulators by sensor.
     """
 
     def __init__(self, swarm: Swarm, settings: SensorSettings) -> None:
-        self.drops: Counter[str] = Counter()
-        self.drops_of: list[Counter[str]] = [Counter() for _ in swarm.robots]
+        self.drops = DropCounts(len(swarm.robots))
         self.accumulators: dict[str, Accumulator] = {
             name: sensor.create_accumulator(swarm)
             for name, sensor in SENSORS.items()
@@ -61,7 +59,7 @@ class InputConverter:
 
     def convert(self, batch: Batch) -> Measurements:
         """Convert valid readings; count the others in `drops`."""
-        self.drops.update(batch.dropped)
+        self.drops.total.update(batch.dropped)
         parts: list[Measured] = []
         kept: dict[str, Any] = {}
         for name in SENSORS:
@@ -70,9 +68,9 @@ class InputConverter:
                 continue
             late = rows.stamp_ns > rows.arrival_ns + self._future_ns
             if late.any():
-                self.drop_of("future_stamp", rows.robot[late])
+                self.drops.add("future_stamp", rows.robot[late])
                 rows = chosen(rows, ~late)
-            with Guard(name, rows.robot.size, self.drops):
+            with Guard(name, rows.robot.size, self.drops.total):
                 found = self._converters[name](rows) if name in self._converters else rows
                 if isinstance(found, Measured):
                     parts.append(self._valid(found))
@@ -80,18 +78,12 @@ class InputConverter:
                     kept[name] = found
         return Measurements(batch.begin_ns, batch.end_ns, *_in_order_of_arrival(parts), kept)
 
-    def drop_of(self, reason: str, robots: IntArray) -> None:
-        """Count dropped readings of robots (k,); -1: of none of them."""
-        self.drops[reason] += robots.size
-        for robot in robots[robots >= 0].tolist():
-            self.drops_of[robot][reason] += 1
-
     def _valid(self, found: Measured) -> Measured:
         """Select valid measurements; count the others in `drops`."""
         reasons = reject_reasons(found.measurements)
         reasons[~is_about_swarm(found.measurements, self._robots, self._landmarks)] = BAD_MEASUREMENT
         for k in set(reasons[reasons != VALID].tolist()):
-            self.drop_of(REJECT_REASONS[k], found.measurements["received_from"][reasons == k])
+            self.drops.add(REJECT_REASONS[k], found.measurements["received_from"][reasons == k])
         return chosen(found, reasons == VALID)
 
 

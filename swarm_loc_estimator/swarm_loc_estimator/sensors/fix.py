@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Mapping
 from functools import partial
 from typing import NamedTuple
@@ -27,6 +26,7 @@ from swarm_loc_estimator.filter.measurement_model import (
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Converter,
+    DropCounts,
     InputKind,
     Known,
     Measured,
@@ -123,7 +123,7 @@ def take_out_headings(measurements: MeasurementArray, without: NDArray[np.bool_]
     covariance[without, 2, :] = covariance[without, :, 2] = [0.0, 0.0, 1.0]
 
 
-def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: Counter[str]) -> Converter:
+def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts) -> Converter:
     sigmas = [
         (robot.fix.position_sigma, robot.fix.position_sigma, robot.fix.heading_sigma)
         for robot in swarm.robots
@@ -135,8 +135,7 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: Counter[st
         unknown = is_unknown(rows.covariance)
         if unknown.any():
             rows, unknown = _with_covariance(rows, unknown), unknown & (default[rows.robot, 0, 0] == 0.0)
-            if lost := int(np.count_nonzero(unknown)):
-                drops[NO_COVARIANCE] += lost
+            drops.add(NO_COVARIANCE, rows.robot[unknown])
             rows = chosen(rows, ~unknown)
         fixes = about_robots(rows.robot, rows.stamp_ns, rows.pose, rows.covariance, Kind.CARTESIAN)
         fixes["systematic_share"] = share[rows.robot][:, None]
@@ -163,10 +162,5 @@ _OWN = InputKind(
 )
 _decode_shared = partial(decode_shared_numbers, widths=(3, 9))
 _SHARED = shared_kind(_OWN, "swarm/fixes", SWARM_FIXES, _decode_shared, _shared_rows, NO_FIXES)
-FIXES = Sensor(
-    "fixes",
-    NO_FIXES,
-    (_OWN, _SHARED),
-    _create_converter,
-)
+FIXES = Sensor("fixes", NO_FIXES, (_OWN, _SHARED), _create_converter)
 """The sensor, see `registry.SENSORS`."""

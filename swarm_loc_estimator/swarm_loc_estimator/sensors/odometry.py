@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Mapping
 from functools import partial
 from typing import NamedTuple
@@ -19,6 +18,7 @@ from swarm_loc_estimator.common.messages.streams import PoseColumns, PoseReader
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Converter,
+    DropCounts,
     InputKind,
     Known,
     Sensor,
@@ -70,7 +70,7 @@ def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> OdometryRows:
     return OdometryRows.without_twist(message.robot, message.reading_ns, message.columns[0], arrival_ns)
 
 
-def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: Counter[str]) -> Converter:
+def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts) -> Converter:
     """Create a filter for finite poses of plausible size, of robots with odometry."""
     stands = np.array([robot.stands for robot in swarm.robots], dtype=bool)
 
@@ -83,7 +83,7 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: Counter[st
         good = np.ones(rows.robot.size, dtype=bool)
         for reason, bad in reasons.items():
             if bad.any():
-                drops[reason] += int(np.count_nonzero(good & bad))
+                drops.add(reason, rows.robot[good & bad])
                 good &= ~bad
         return rows if good.all() else chosen(rows, good)
 
@@ -99,11 +99,5 @@ _OWN = InputKind(
 )
 _decode_shared = partial(decode_shared_numbers, widths=(3,))
 _SHARED = shared_kind(_OWN, "swarm/odom", SWARM_ODOMETRY, _decode_shared, _shared_rows, NO_ODOMETRY)
-ODOMETRY = Sensor(
-    "odometry",
-    NO_ODOMETRY,
-    (_OWN, _SHARED),
-    _create_converter,
-    unit=None,
-)
+ODOMETRY = Sensor("odometry", NO_ODOMETRY, (_OWN, _SHARED), _create_converter, unit=None)
 """The sensor, see `registry.SENSORS`."""

@@ -87,6 +87,30 @@ def of_none(_: Robot) -> bool:
     return False
 
 
+class DropCounts:
+    """Numbers of dropped readings by reason.
+
+    Args:
+        robots: Number of robots.
+
+    Attributes:
+        total: Of all readings.
+        of_robot: Of each robot's own readings.
+    """
+
+    def __init__(self, robots: int) -> None:
+        self.total: Counter[str] = Counter()
+        self.of_robot: list[Counter[str]] = [Counter() for _ in range(robots)]
+
+    def add(self, reason: str, robots: IntArray) -> None:
+        """Count dropped readings of robots (k,); -1: of none of them."""
+        if not robots.size:
+            return
+        self.total[reason] += robots.size
+        for robot, count in zip(*np.unique(robots[robots >= 0], return_counts=True), strict=True):
+            self.of_robot[robot][reason] += int(count)
+
+
 class Guard:
     """A context in which an error of a sensor's code costs the readings of this sensor and no others.
 
@@ -239,7 +263,7 @@ class Sensor:
     name: str
     nothing: tuple[NDArray[Any], ...]
     kinds: tuple[InputKind, ...]
-    create_converter: Callable[[Swarm, SensorSettings, Counter[str]], Converter] | None = None
+    create_converter: Callable[[Swarm, SensorSettings, DropCounts], Converter] | None = None
     create_accumulator: Callable[[Swarm], Accumulator] | None = None
     unit: tuple[str, ...] | None = ()
     keeps_units: bool = False

@@ -265,12 +265,8 @@ class FixModel:
     systematic_share: float = number(
         0.0, "1", 0.0, 1.0, "share of a fix's variance that earlier fixes have, too; 1: fixes of a mapper"
     )
-    position_sigma: float = number(
-        0.0, "m", 0.0, 1e3, "of x and y, for fixes without covariance; 0: they are dropped"
-    )
-    heading_sigma: float = number(
-        0.0, "rad", 0.0, 10.0, "of the heading, for fixes without covariance; 0: it is not used"
-    )
+    position_sigma: float = number(0.0, "m", 0.0, 1e3, "of x and y, for fixes without covariance; 0: dropped")
+    heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "of the heading, for such fixes; 0: it is not used")
 
 
 @dataclass(frozen=True)

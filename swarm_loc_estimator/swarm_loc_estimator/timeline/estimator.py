@@ -74,7 +74,7 @@ class Estimator:
     def reset(self) -> None:
         """Discard all data and restart at the configured starts; counters in `drops` are kept."""
         self.drop("reset", sum(rows.robot.size for rows in self._odometry) + self._timeline.waiting)
-        self._converter.drops.update(self._timeline_drops())
+        self._converter.drops.total.update(self._timeline_drops())
         self._tracks.clear()
         self._timeline.restart(self._fusion.new_state())
         for accumulator in self._converter.accumulators.values():
@@ -141,19 +141,19 @@ class Estimator:
     def drop(self, reason: str, count: int = 1) -> None:
         """Count data that were dropped before they reached the estimator."""
         if count:
-            self._converter.drops[reason] += count
+            self._converter.drops.total[reason] += count
 
     @property
     def drops(self) -> dict[str, int]:
         """Number of unused data by reason, since construction."""
-        total = self._converter.drops + Counter(self._timeline_drops())
+        total = self._converter.drops.total + Counter(self._timeline_drops())
         for accumulator in self._converter.accumulators.values():
             total += accumulator.drops
         return {reason: count for reason, count in sorted(total.items()) if count}
 
     def drops_of(self, robot: int) -> Mapping[str, int]:
-        """Numbers of a robot's dropped data by reason, where a reason tends to concern all its messages."""
-        return self._converter.drops_of[robot]
+        """Numbers of a robot's dropped data by reason, where they are known to be its own."""
+        return self._converter.drops.of_robot[robot]
 
     @property
     def used(self) -> int:
@@ -229,7 +229,7 @@ class Estimator:
         self._odometry = []
         change = self._tracks.extend(rows.robot, rows.stamp_ns, rows.pose, rows.twist)
         self.drop("odometry_duplicate", change.duplicates)
-        self._converter.drop_of("odometry_too_old", change.too_old)
+        self._converter.drops.add("odometry_too_old", change.too_old)
         self.drop("odometry_jump", change.jumps)
         self.drop("odometry_reset", change.resets)
         self._timeline.invalidate(change.changed_from_ns)

@@ -38,7 +38,7 @@ def converted(
     count = detections.size
     received = np.frombuffer(detections.tobytes(), dtype=DETECTION_DTYPE)
     result = SightingConverter(swarm).convert(np.full(count, robot), np.full(count, T0), received)
-    return result.measurements, result.dropped
+    return result.measurements, {reason: robots.size for reason, robots in result.dropped.items()}
 
 
 def planar(mount: CameraMount, base: FloatArray, mark: FloatArray) -> FloatArray:

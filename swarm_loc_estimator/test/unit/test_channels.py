@@ -146,7 +146,7 @@ def test_fixes_without_covariance_have_that_of_the_description(
     messages = [SerializedMessage(handle, data, T0 + 10) for data in fixes]
     (batch,) = ingest.read(MessageBatch.of(messages))
     measured = converter.convert(batch).measurements
-    assert converter.drops == ({} if used else {"fix_without_covariance": 1})
+    assert converter.drops.total == ({} if used else {"fix_without_covariance": 1})
     *first, last = measured
     np.testing.assert_array_equal(last["covariance"], COVARIANCE)
     assert [bool(one["has_heading"]) for one in first] == {"": [], "position": [False], "all": [True]}[used]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -35,6 +34,7 @@ from swarm_loc_estimator.sensors.registry import SENSORS
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Converter,
+    DropCounts,
     InputKind,
     Known,
     Measured,
@@ -91,7 +91,7 @@ def columns(
     return RangeRows(robot[found.valid], stamp_ns, target, distance, arrival_ns), {}
 
 
-def create_converter(swarm: Swarm, _settings: SensorSettings, _drops: Counter[str]) -> Converter:
+def create_converter(swarm: Swarm, _settings: SensorSettings, _drops: DropCounts) -> Converter:
     anchors = np.array([(mark.x, mark.y, 0.0) for mark in swarm.landmarks])
 
     def convert(rows: RangeRows) -> Measured:
@@ -318,7 +318,7 @@ def test_a_sensor_without_any_message_in_a_bag_is_named() -> None:
 def test_measurements_that_no_model_can_use_are_dropped_and_counted(
     field: str, value: float | str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def create(swarm: Swarm, settings: SensorSettings, drops: Counter[str]) -> Converter:
+    def create(swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> Converter:
         convert = create_converter(swarm, settings, drops)
 
         def spoiled(rows: RangeRows) -> Measured:

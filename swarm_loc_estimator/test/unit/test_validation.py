@@ -307,7 +307,12 @@ def test_drops_are_counted_for_the_robot_whose_data_they_are() -> None:
     for robot, stamp_ns in stamps_ns.items():
         Event(robot, stamp_ns, (0.0, 0.0, 0.0)).give(estimator, now_ns)
     give_fix(estimator, 2, now_ns, np.zeros(3), np.diag([1.0, 1.0, 0.0]), now_ns)
+    give_fix(estimator, 1, now_ns, np.zeros(3), np.zeros((3, 3)), now_ns)
     estimator.tick(now_ns)
-    expected = [{"future_stamp": 1}, {"odometry_too_old": 1}, {"bad_covariance": 1}]
+    expected: list[dict[str, int]] = [
+        {"future_stamp": 1},
+        {"fix_without_covariance": 1, "odometry_too_old": 1},
+        {"bad_covariance": 1},
+    ]
     assert [dict(estimator.drops_of(robot)) for robot in range(3)] == expected
-    assert estimator.drops == {"bad_covariance": 1, "future_stamp": 1, "odometry_too_old": 1}
+    assert estimator.drops == {reason: 1 for of_one in expected for reason in of_one}

@@ -4,8 +4,8 @@ Over a window, measurements move the transform T from `map` to a robot's odometr
 odometry. In a consistent filter this correction is normal with variance s Q + P_begin - P_end, where Q is the
 described process noise of the window, P the variance of the pose, and s the scale of the noise, which is 1 as
 described. A robot that slips drifts by much more. Each window gives a likelihood of s; they are multiplied
-for a grid of scales and forgotten with a time constant. The scale that is used is never below 1: a minute on a
-good floor says little of the next metre.
+for a grid of scales and forgotten with a time constant. The scale that is used is never below 1: a minute on
+a good floor says little of the next metre.
 
 Two windows run in parallel: the short one reacts fast, the long one sees slow drifts. While nothing measures
 a robot, its scale stays. Robots whose scales of distance or turn are estimated by description keep scale 1:

@@ -113,7 +113,7 @@ def read_recording(
     converter = InputConverter(swarm, Settings())
     odometry = [converter.convert(part).rows.get("odometry", NO_ODOMETRY) for part in parts]
     detections = [part["detections"] for part in parts if part["detections"].robot.size]
-    unused = (f"{count} inputs are not used: {reason}." for reason, count in converter.drops.items())
+    unused = (f"{count} inputs are not used: {reason}." for reason, count in converter.drops.total.items())
     return Recording(
         bag.name,
         joined([NO_ODOMETRY, *odometry]),
