@@ -15,6 +15,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import fix_covariance
+from swarm_loc_estimator.offline.metrics import is_misleading, nees
 
 DIVERGED_CM = 30.0
 GOOD_CM, GOOD_DEG = 10.0, 2.0
@@ -22,7 +23,7 @@ COVERED_M = 0.06
 """A piece of wall is covered if a cell so near is occupied."""
 COVERED_SHARE = 0.9
 _LOOK_EVERY_S = 10.0
-_MISLEADING_SIGMAS, _MISLEADING_M, _UNREPORTED_SIGMAS = 5.0, 0.02, 3.0
+_UNREPORTED_SIGMAS = 3.0
 
 
 @dataclass(frozen=True)
@@ -38,7 +39,7 @@ class RunSettings:
         pixel: Noise of the tracker [px].
         lights: Whether LEDs of other robots are seen.
         printed: Whether the paper's method makes the map.
-        checks_covariances: Whether poses are compared with their covariances when they are told.
+        checks_covariances: Whether poses are compared with their covariances at each arrival.
     """
 
     plan: str
@@ -138,13 +139,13 @@ def run(settings: RunSettings) -> RunResult:
 
 def _compared(result: RunResult, exploration: Exploration, covariances: FloatArray) -> RunResult:
     """A result with the poses (n,) of all arrivals compared with their covariances (n, 3, 3)."""
-    off = np.array([(one.online - one.truth)[:2] for one in exploration.arrivals])
-    squared = np.einsum("ki,kij,kj->k", off, np.linalg.inv(covariances[:, :2, :2]), off)
-    distance = np.hypot(off[:, 0], off[:, 1])
-    misleading = (distance > _MISLEADING_M) & (squared > _MISLEADING_SIGMAS**2)
-    unreported = (100.0 * distance > DIVERGED_CM) & (squared > _UNREPORTED_SIGMAS**2)
+    error = np.array([one.online - one.truth for one in exploration.arrivals])
+    far = 100.0 * np.hypot(error[:, 0], error[:, 1]) > DIVERGED_CM
+    unreported = far & (nees(error[:, :2], covariances[:, :2, :2]) > _UNREPORTED_SIGMAS**2)
     return replace(
-        result, misleading_share=float(misleading.mean()), diverged_unreported=float(unreported.any())
+        result,
+        misleading_share=float(is_misleading(error, covariances).mean()),
+        diverged_unreported=float(unreported.any()),
     )
 
 

@@ -23,7 +23,7 @@ _TWIST_PATH_SLACK = 0.1
 """Tolerance of a displacement outside the twists, in wheel separations."""
 _LEAST_RATE = 0.05
 """Share of the maximum rates by which rates may vary in a step, until the robot has reported larger ones."""
-_PROVEN, _PROVEN_WELL, _DOUBT = 20, 60, 30
+_AGREED_ENOUGH, _AGREED_MOST, _AGREED_LOSS = 20, 60, 30
 """Number of agreeing steps from which the twist is used, its maximum, and its loss at a contradiction."""
 _RESTART_GAP = 2.5
 """Pause before a restart at the origin, in previous steps."""
@@ -37,7 +37,7 @@ _UNMOVED_S = 10.0
 
 
 @norefcount_njit
-def check_step(
+def fault_of_step(
     tracks: TrackArrays, robot: int, row: int, step: tuple[float, float, float], duration_s: float
 ) -> int:
     """Fault of a step forward, left [m] and turn [rad] to a row; updates the row's evidence of the twist."""
@@ -67,11 +67,11 @@ def check_step(
     moves = (speeds[0] + speeds[1] > 0.0 and arc > 0.0), (rates[0] + rates[1] > 0.0 and step[2] != 0.0)
     for i, contradicts in enumerate((away > slack, turned > turn_slack)):
         if contradicts:
-            if agreed[i] >= _PROVEN and fault == NO_FAULT:
+            if agreed[i] >= _AGREED_ENOUGH and fault == NO_FAULT:
                 fault = RESET
-            agreed[i] = max(0, agreed[i] - _DOUBT)
+            agreed[i] = max(0, agreed[i] - _AGREED_LOSS)
         elif moves[i]:
-            agreed[i] = min(_PROVEN_WELL, agreed[i] + 1)
+            agreed[i] = min(_AGREED_MOST, agreed[i] + 1)
     return fault
 
 

@@ -12,7 +12,7 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit, norefcount_njit
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.common.small_matrix import add_scaled, assign, assign_matrix
-from swarm_loc_estimator.odometry.continuity import JUMP, NO_FAULT, RESET, check_step, update_unmoved
+from swarm_loc_estimator.odometry.continuity import JUMP, NO_FAULT, RESET, fault_of_step, update_unmoved
 from swarm_loc_estimator.odometry.process_noise import (
     OdometryStep,
     add_dropout_noise,
@@ -155,7 +155,7 @@ def integrate(tracks: TrackArrays, oldest_ns: int, rows: NewRows, changed_from_n
 
 @norefcount_njit
 def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
-    """Integrate from the previous row to a row; return the fault of the step, see `check_step`."""
+    """Integrate from the previous row to a row; return the fault of the step, see `fault_of_step`."""
     model = tracks.model[robot]
     before_ns, stamp_ns = tracks.stamp_ns[robot, row - 1], tracks.stamp_ns[robot, row]
     duration_s = (stamp_ns - before_ns) * 1e-9
@@ -163,7 +163,7 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
     reported = _step_by_pose(tracks, robot, row)
     if by_twist:
         reported = _step_by_twist(tracks, robot, row, duration_s)
-    fault = check_step(tracks, robot, row, reported, duration_s)
+    fault = fault_of_step(tracks, robot, row, reported, duration_s)
     start, rate = tracks.pose[robot, row - 1], tracks.rate[robot, row]
     covariance, jacobian = tracks.covariance[robot, row], tracks.jacobian[robot, row]
     assign_matrix(covariance, tracks.covariance[robot, row - 1])

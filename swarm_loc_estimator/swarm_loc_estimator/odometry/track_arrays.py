@@ -30,7 +30,7 @@ class TrackArrays(NamedTuple):
         rate: (N, capacity, 3) calibrated velocity forward and left [m/s] and turn rate [rad/s] at the row,
             after the lag.
         twist: (N, capacity, 3) reported velocity forward, left [m/s] and turn rate [rad/s]; NaN: not known.
-        agreed: (N, capacity, 2) evidence that twists agree with displacements and turns, see `check_step`.
+        agreed: (N, capacity, 2) evidence that twists agree with displacements and turns, see `fault_of_step`.
         fastest: (N, capacity, 2) largest speed [m/s] and turn rate [rad/s] of the twists so far.
         unmoved: (N, capacity, 3) displacement [m] and turn [rad] by the twists while the pose is constant;
             NaN after the pose has changed.
