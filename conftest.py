@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import faulthandler
 import gc
 import os
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 import pytest
+from _pytest.faulthandler import fault_handler_stderr_fd_key
 from hypothesis import HealthCheck, settings
 
 from swarm_loc_estimator.common.jit import is_precompiled
@@ -53,10 +55,12 @@ def _own_ros_domain(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
 
 
 @pytest.fixture
-def ros() -> Iterator[Ros]:
+def ros(pytestconfig: pytest.Config) -> Iterator[Ros]:
     """ROS, for one node test."""
     from node_world import Ros  # noqa: PLC0415 - unit tests do without ROS
 
     ros = Ros()
+    # rclpy's executor directs the stacks of a crash to sys.stderr, which pytest captures and loses.
+    faulthandler.enable(pytestconfig.stash[fault_handler_stderr_fd_key])
     yield ros
     ros.close()
