@@ -31,7 +31,9 @@ _CAUSES = {
     "no_camera": "are detections, and its description has no camera",
     "no_odometry": "are odometry, and its description says that it stands",
     "non_finite": "are not finite",
+    "odometry_non_finite": "are odometry that is not finite",
     "absurd": "are absurdly large",
+    "odometry_absurd": "are odometry that is absurdly large",
 }
 """Why messages of a robot are dropped."""
 _PATIENCE_S, _PATIENCE_PERIODS = 10.0, 5.0

@@ -124,12 +124,10 @@ def take_out_headings(measurements: MeasurementArray, without: NDArray[np.bool_]
 
 
 def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts) -> Converter:
-    sigmas = [
-        (robot.fix.position_sigma, robot.fix.position_sigma, robot.fix.heading_sigma)
-        for robot in swarm.robots
-    ]
+    models = [robot.fix for robot in swarm.robots]
+    sigmas = [(one.position_sigma, one.position_sigma, one.heading_sigma) for one in models]
     default = np.array(sigmas).reshape(-1, 3, 1) ** 2 * np.eye(3)
-    share = np.array([robot.fix.systematic_share for robot in swarm.robots])
+    share = np.array([one.systematic_share for one in models])
 
     def convert(rows: FixRows) -> Measured:
         unknown = is_unknown(rows.covariance)

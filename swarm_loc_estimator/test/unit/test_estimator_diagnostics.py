@@ -161,6 +161,10 @@ def test_a_robot_is_told_apart_as_waiting_lost_silent_or_in_a_foreign_frame() ->
         ("future_stamp", "they are stamped ahead of this computer's clock"),
         ("odometry_too_old", "they have stamps older than horizon_s: of another clock, or too late"),
         ("bad_covariance", "they have a covariance that is zero or not positive definite"),
+        ("fix_without_covariance", "they have no covariance, and fix.position_sigma of its description is 0"),
+        ("no_camera", "they are detections, and its description has no camera"),
+        ("no_odometry", "they are odometry, and its description says that it stands"),
+        ("odometry_non_finite", "they are odometry that is not finite"),
     ],
 )
 def test_a_waiting_robot_whose_data_are_dropped_is_told_why(reason: str, cause: str) -> None:
