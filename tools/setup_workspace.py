@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+from contextlib import nullcontext
 
 from workspace import build, host, install
 from workspace.layout import WorkspaceError
@@ -19,7 +20,7 @@ def ensure(*, bench: bool = False, compiled: bool = False) -> None:
 
     Args:
         bench: Whether to install the benchmarks' requirements.
-        compiled: Whether to compile the estimator's inner loops.
+        compiled: Whether to compile the inner loops of the estimator of a small swarm.
 
     Raises:
         WorkspaceError: Something is missing, or a step failed.
@@ -27,9 +28,8 @@ def ensure(*, bench: bool = False, compiled: bool = False) -> None:
     host.check_python_age()
     with only_one():
         install.ensure(bench=bench)
-        build.ensure()
-        if compiled:
-            build.compile_estimator()
+        with build.compiling() if compiled else nullcontext():
+            build.ensure()
 
 
 def main() -> int:

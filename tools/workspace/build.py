@@ -7,13 +7,14 @@ import os
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator, Mapping
+import time
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 from workspace import install, tf2_msgs
 from workspace.layout import LOGS, PACKAGES, ROOT, STATE, VENV_PYTHON, WorkspaceError
-from workspace.progress import run_logged, say
+from workspace.progress import run_logged, say, step
 from workspace.stamps import Stamp, digest, write_whole
 
 BUILD = STATE / "build"
@@ -34,12 +35,13 @@ COPIED = (
 """Files of a package that a build copies; all others are linked."""
 LINKED_ONE_BY_ONE = "launch/*"
 
-_NOT_YET = 3
-_IS_PRECOMPILED = f"""
-import sys
+_COMPILE = """
+from functools import partial
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.precompile import precompile
-sys.exit(0 if is_precompiled(precompile) else {_NOT_YET})
+small = partial(precompile, "small", False)
+if not is_precompiled(small):
+    small()
 """
 
 
@@ -72,47 +74,41 @@ def ensure() -> None:
     write_whole(OVERLAY, json.dumps(_prepended(), indent=1))
 
 
-def compile_estimator() -> None:
-    """Compile the estimator's inner loops, which would otherwise take three minutes at its first run.
+@contextmanager
+def compiling() -> Iterator[None]:
+    """Compile beside a build what the estimator of a small swarm needs; all else is compiled when it is used.
 
     Raises:
         WorkspaceError: The estimator does not run.
     """
-    sources = (ROOT / "swarm_loc_estimator" / "swarm_loc_estimator").rglob("*.py")
-    inputs = digest(sources, str(ROOT), install.identity())
+    source = ROOT / "swarm_loc_estimator"
+    inputs = digest((source / "swarm_loc_estimator").rglob("*.py"), str(ROOT), install.identity())
     stamp = Stamp(STATE / "stamps" / "compiled")
     if stamp.read() == inputs:
+        yield
         return
-    env = environment()
-    if subprocess.run([VENV_PYTHON, "-c", _IS_PRECOMPILED], env=env, check=False).returncode == _NOT_YET:
-        say("  compiling the estimator, about two minutes")
-        program = "from swarm_loc_estimator.precompile import precompile; precompile()"
-        with _compiling_beside(env):
-            status, output = run_logged([VENV_PYTHON, "-c", program], "compile.log", lambda _: None, env)
-            if status:
-                reason = output.strip().splitlines()[-1:] or ["no output"]
-                raise WorkspaceError(
-                    f"The estimator does not start: {reason[0]} (whole output: {LOGS / 'compile.log'})."
-                )
+    env = {**install.base_environment(), "PYTHONPATH": str(source)}
+    begun = time.monotonic()
+    LOGS.mkdir(parents=True, exist_ok=True)
+    with (LOGS / "compile.log").open("w", encoding="utf-8") as log:
+        process = subprocess.Popen([VENV_PYTHON, "-c", _COMPILE], env=env, stdout=log, stderr=log)
+        with process:
+            try:
+                yield
+                if process.poll() is None:
+                    say("  compiling the estimator, begun with the build")
+                process.wait()
+            except BaseException:
+                process.kill()
+                raise
+    if process.returncode:
+        lines = (LOGS / "compile.log").read_text(encoding="utf-8").split("\n")
+        reason = next(filter(None, reversed(lines)), "no output")
+        raise WorkspaceError(
+            f"The estimator does not start: {reason} (whole output: {LOGS / 'compile.log'})."
+        )
+    say(f"    compiled after {time.monotonic() - begun:.0f} s")
     stamp.write(inputs)
-
-
-@contextmanager
-def _compiling_beside(env: Mapping[str, str]) -> Iterator[None]:
-    """Compile the last functions of the estimator, and the detector, in another process.
-
-    If it fails, they are compiled when they are first needed.
-    """
-    program = "from swarm_loc_estimator.precompile import precompile_infrared; precompile_infrared()\n"
-    program += "from swarm_loc_vision.markers.detector import precompile; precompile()"
-    silent = subprocess.DEVNULL
-    beside = subprocess.Popen([VENV_PYTHON, "-c", program], env=env, stdout=silent, stderr=silent)
-    with beside:
-        try:
-            yield
-        except BaseException:
-            beside.kill()
-            raise
 
 
 def environment() -> dict[str, str]:
@@ -140,11 +136,11 @@ def _copied(folder: Path) -> Iterator[Path]:
 def _colcon_build(sources: dict[str, Path], env: dict[str, str]) -> None:
     if not sources:
         return
-    say(f"  building {', '.join(sources)}")
     command: list[str | Path] = [VENV_PYTHON, "-m", "colcon", "--log-base", LOGS / "colcon"]
     command += ["build", "--symlink-install"]
     command += ["--build-base", BUILD, "--install-base", INSTALL, "--paths", *sources.values()]
-    status, output = run_logged(command, "build.log", _colcon_status, env, ROOT)
+    with step(f"building {', '.join(sources)}"):
+        status, output = run_logged(command, "build.log", _colcon_status, env, ROOT)
     if status:
         failed = ", ".join(re.findall(r"^Failed\s+<<< (\S+)", output, re.MULTILINE)) or "the packages"
         raise WorkspaceError(f"colcon could not build {failed}: the reason stands in {LOGS / 'build.log'}.")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 from workspace.layout import LOGS
@@ -17,6 +18,15 @@ SHOWN_EVERY_S = 5.0
 def say(text: str) -> None:
     """Print a line and flush it."""
     print(text, flush=True)
+
+
+@contextmanager
+def step(text: str) -> Iterator[None]:
+    """Print what a step does before it begins, and how long it took after it."""
+    begun = time.monotonic()
+    say(f"  {text}")
+    yield
+    say(f"    done in {time.monotonic() - begun:.0f} s")
 
 
 class StatusLine:
