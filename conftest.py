@@ -5,7 +5,10 @@ from __future__ import annotations
 import faulthandler
 import gc
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
 from typing import TYPE_CHECKING
 
 import pytest
@@ -13,7 +16,9 @@ from _pytest.faulthandler import fault_handler_stderr_fd_key
 from hypothesis import HealthCheck, settings
 
 from swarm_loc_estimator.common.jit import is_precompiled
-from swarm_loc_vision.markers.detector import precompile
+from swarm_loc_estimator.nodes.mapper_precompile import precompile as precompile_mapper
+from swarm_loc_estimator.precompile import precompile, precompile_infrared
+from swarm_loc_vision.markers.detector import precompile as precompile_detector
 
 if TYPE_CHECKING:
     from node_world import Ros  # unit tests do without ROS
@@ -26,13 +31,27 @@ settings.register_profile(
 settings.load_profile("workspace")
 
 
+_PRECOMPILED: tuple[Callable[[], None], ...] = (
+    partial(precompile, "small", False),
+    precompile_infrared,
+    precompile_detector,
+    precompile_mapper,
+    *(partial(precompile, size, infrared) for infrared in (False, True) for size in ("large", "sparse")),
+)
+"""What tests run; two processes compile it side by side."""
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
-    """Compile before any test's time runs, once and not in every worker; `make setup` does the estimator."""
-    if hasattr(session.config, "workerinput"):
+    """Compile before any test's time runs, once and not in every worker."""
+    if hasattr(session.config, "workerinput") or all(map(is_precompiled, _PRECOMPILED)):
         return
-    if not is_precompiled(precompile):
-        print("compiling the marker detector for this machine: about half a minute", flush=True)
-        precompile()
+    print("compiling all inner loops for this machine: about two minutes", flush=True)
+    with ProcessPoolExecutor(2, get_context("spawn")) as processes:
+        list(processes.map(_call, _PRECOMPILED))
+
+
+def _call(precompile: Callable[[], None]) -> None:
+    precompile()
 
 
 def pytest_collection_finish() -> None:

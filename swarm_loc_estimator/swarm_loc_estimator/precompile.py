@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ProcessPoolExecutor, wait
 from dataclasses import replace
+from functools import partial
+from multiprocessing import get_context
+from typing import Literal
 
 import numpy as np
 
-from swarm_loc_estimator.common.jit import note_precompiled
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.jit import is_precompiled, note_precompiled
 from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,
     encode_brightness,
@@ -20,6 +25,7 @@ from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, Meas
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
@@ -27,67 +33,111 @@ from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.ir_board import IrMethod, RobotIr
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, OdometryModel, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.fusion import Fusion
+from swarm_loc_estimator.timeline.scheduling import Policy
 from swarm_loc_estimator.timeline.settings import Settings
 
 _SECOND = 1_000_000_000
 _FIRST_LANDMARK = 10
 _LANDMARKS = 30  # three robots see more than are fused one by one where many may be fused together
-_DROPLET = load_ir_platform("droplet")
-_LIGHT = expected_brightness(_DROPLET, (0.1, 0.3, 1.0))[0]
 _FACING = (0.0, 1.0, 0.0, 0.0)  # x y z w: a marker that looks at the camera
 _AWAY = (0.0, 0.7, 0.0, 0.7)
 
 
-def precompile() -> None:
-    """Run small estimators through all that they do: three minutes unless `is_precompiled`, then a second.
+Size = Literal["small", "large", "sparse"]
 
-    Infrared comes last: another process may have done `precompile_infrared` by then.
+_SETTINGS: dict[Size, tuple[Settings, ...]] = {
+    "small": (Settings(),),
+    "large": (Settings(), Settings(fusion_period_s=0.1, policy=Policy(large_from=2))),
+    "sparse": (Settings(sparse_from=2),),
+}
+
+
+def size_of(swarm: Swarm, settings: Settings) -> Size:
+    """The size of a swarm, by which its measurements are fused."""
+    if settings.resolved_for(swarm).is_sparse(swarm):
+        return "sparse"
+    return "large" if len(swarm.robots) >= settings.policy.large_from else "small"
+
+
+def precompile(size: Size, infrared: bool) -> None:
+    """Run small estimators through all that a swarm of some size does; takes a second once compiled.
+
+    Args:
+        size: Of the swarm.
+        infrared: Whether its robots measure each other by infrared light, which takes as long again.
     """
-    for infrared in (False, True):
-        for fusion_period_s in (0.0, 0.1):
-            _run(Settings(fusion_period_s=fusion_period_s), infrared=infrared)
-        _run(Settings(sparse_from=2), infrared=infrared)
-    note_precompiled(precompile)
+    compiled = partial(precompile, size, infrared)
+    if not is_precompiled(compiled):
+        with ProcessPoolExecutor(1, get_context("spawn")) as beside:
+            updates = beside.submit(_compile_updates)
+            _run(Settings(), infrared=False, fused=False)
+            if infrared:
+                precompile_infrared()
+            wait([updates])  # if it failed, this process compiles what is missing
+    for settings in _SETTINGS[size]:
+        _run(settings, infrared=infrared)
+    note_precompiled(compiled)
+
+
+def _compile_updates() -> None:
+    """Fuse no measurements: the sequential update takes as long to compile as all that comes before it."""
+    swarm = _swarm(infrared=False)
+    fusion = Fusion(swarm, Settings().resolved_for(swarm), OdometryTracks(swarm.robots))
+    none = np.zeros(0, MEASUREMENT_DTYPE)
+    fusion.step(fusion.new_state(), none, np.zeros(0, np.uint8), np.zeros(0))
 
 
 def precompile_infrared() -> None:
     """Solve an exchange: that takes a third of the time to compile, and can be done in a process beside."""
-    MaximumLikelihood(_DROPLET).solve(_LIGHT[None])
+    MaximumLikelihood(load_ir_platform("droplet")).solve(_light()[None])
+    note_precompiled(precompile_infrared)
 
 
-def _run(settings: Settings, *, infrared: bool) -> None:
+def _swarm(*, infrared: bool) -> Swarm:
+    """Three robots, one with calibrated odometry and a start, and landmarks."""
     robots = [Robot(name, faces=(Face("front", k, yaw=0.0),)) for k, name in enumerate("ab")]
     calibrated = OdometryModel(distance_scale_sigma=0.01)
     robots.append(Robot("c", odometry=calibrated, faces=(Face("front", 2, yaw=0.0),), start=(0.0, 0.0, 0.0)))
     if infrared:
-        robots = [replace(robot, ir=_board(k)) for k, robot in enumerate(robots)]
+        droplet = load_ir_platform("droplet")
+        # one reads by likelihood, the next by the closed form
+        boards = (RobotIr(1 + k, droplet, "droplet", list(IrMethod)[k % 2]) for k in range(len(robots)))
+        robots = [replace(robot, ir=board) for robot, board in zip(robots, boards, strict=True)]
     places = range(_LANDMARKS)
     marks = tuple(Landmark(_FIRST_LANDMARK + k, x=1.0, y=0.2 * k, yaw=3.1) for k in places)
-    swarm = Swarm(tuple(robots), marks)
+    return Swarm(tuple(robots), marks)
+
+
+def _run(settings: Settings, *, infrared: bool, fused: bool = True) -> None:
+    """Run an estimator for two seconds; if not `fused`, measurements are read only."""
+    swarm = _swarm(infrared=infrared)
     estimator, ingest = Estimator(swarm, settings), Ingest(swarm)
+    light = _light() if infrared else np.zeros((0, 6, 6))
     for step in range(8):
         now_ns = 10 * _SECOND + step * _SECOND // 4
-        backlog = []
-        for robot in robots:
-            x, yaw = 0.01 * step, 0.001 * step
-            backlog.append((ingest.handle_of[f"{robot.name}/odom"], _odometry(now_ns, x, yaw), now_ns))
-            seen = encode_detections("", now_ns - _SECOND // 8, _sight(robots.index(robot)))
-            backlog.append((ingest.handle_of[f"{robot.name}/detections"], seen, now_ns))
-        # one measurement alone is compiled apart: its columns are contiguous
-        one = encode_detections("", now_ns - _SECOND // 16, _sight(0)[:1])
-        backlog.append((ingest.handle_of["a/detections"], one, now_ns))
-        fix = encode_fix("map", now_ns, (0.0, 0.0, 0.0), np.eye(3))
-        backlog.append((ingest.handle_of["a/fix"], fix, now_ns))
-        # the powers of an exchange in different steps
-        for number, robot in enumerate(robots[:2] if infrared else ()):
-            for power, stamp_ns in enumerate((now_ns, now_ns - _SECOND // 4)):
-                light = encode_brightness("", stamp_ns, (1 + number, 3), _LIGHT[power], power)
-                backlog.append((ingest.handle_of[f"{robot.name}/brightness"], light, now_ns))
+        moved, seen = list[tuple[str, bytes]](), list[tuple[str, bytes]]()
+        for index, robot in enumerate(swarm.robots):
+            moved.append((f"{robot.name}/odom", _odometry(now_ns, 0.01 * step, 0.001 * step)))
+            sight = encode_detections("", now_ns - _SECOND // 8, _sight(index))
+            seen.append((f"{robot.name}/detections", sight))
         # what came late is taken in by code of its own
-        late_ns = now_ns - _SECOND // 8
-        backlog.append((ingest.handle_of["a/odom"], _odometry(late_ns, 0.01 * step, 0.001 * step), now_ns))
-        for messages in ingest.read(MessageBatch.of([SerializedMessage(*one) for one in backlog])):
-            estimator.receive(messages)
+        moved.append(("a/odom", _odometry(now_ns - _SECOND // 8, 0.01 * step, 0.001 * step)))
+        # one measurement alone is compiled apart: its columns are contiguous
+        seen.append(("a/detections", encode_detections("", now_ns - _SECOND // 16, _sight(0)[:1])))
+        seen.append(("a/fix", encode_fix("map", now_ns, (0.0, 0.0, 0.0), np.eye(3))))
+        # the powers of an exchange in different steps
+        for power, matrix in enumerate(light):
+            stamp_ns = now_ns - power * _SECOND // 4
+            seen += [
+                (f"{robot.name}/brightness", encode_brightness("", stamp_ns, (1 + k, 3), matrix, power))
+                for k, robot in enumerate(swarm.robots[:2])
+            ]
+        for backlog, is_taken in ((moved + seen, True),) if fused else ((moved, True), (seen, False)):
+            messages = [SerializedMessage(ingest.handle_of[topic], data, now_ns) for topic, data in backlog]
+            for batch in ingest.read(MessageBatch.of(messages)):
+                if is_taken:
+                    estimator.receive(batch)
         estimator.tick(now_ns)
         estimator.contradictions(now_ns)
     _call_rare(swarm)
@@ -101,9 +151,10 @@ def _call_rare(swarm: Swarm) -> None:
     record_pair(columns, 0, state.arrays(), np.zeros((PAIR_ROWS, 3)))
 
 
-def _board(number: int) -> RobotIr:
-    """One that reads by likelihood, the next by the closed form."""
-    return RobotIr(1 + number, _DROPLET, "droplet", list(IrMethod)[number % 2])
+def _light() -> FloatArray:
+    """Brightness matrices (2, 6, 6) of an exchange at both powers."""
+    light: FloatArray = expected_brightness(load_ir_platform("droplet"), (0.1, 0.3, 1.0))[0]
+    return light
 
 
 def _odometry(stamp_ns: int, x: float, yaw: float) -> bytes:

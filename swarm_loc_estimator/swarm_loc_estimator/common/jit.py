@@ -19,6 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, TypeVar, cast
@@ -40,6 +41,7 @@ _FOREIGN = {*sys.stdlib_module_names, "numpy", "numba", "scipy", "llvmlite"}
 _PLAIN = (int, float, complex, str, bytes, type(None), type(...), np.generic, np.dtype)
 _core: Any = core  # most of it has no types
 _core.config.DISABLE_JIT = 0  # NUMBA_DISABLE_JIT has no effect: only compiled code reads records
+_registry: Any = core.registry
 _types = _core.types
 _OPTIONS = f"numba {numba.__version__}, Python {sys.version}"
 
@@ -73,7 +75,7 @@ def reassociated_njit(function: Function) -> Function:
 
 
 def is_precompiled(precompile: Callable[[], None]) -> bool:
-    """Whether the cache has the compiled code of a function and of all functions that it calls."""
+    """Whether the cache has the compiled code of a function (or partial call) and of all that it calls."""
     return _mark(precompile).exists()
 
 
@@ -101,12 +103,63 @@ def _compiled(
     function: Function, *, fastmath: bool | set[str] = False, forceinline: bool = False, nrt: bool = True
 ) -> Function:
     # without _nrt a function would count references, or not, as the one that happens to call it first
-    compiler = numba.njit(  # type: ignore[call-overload]  # its stubs lack _nrt
-        error_model="numpy", fastmath=fastmath, forceinline=forceinline, _nrt=nrt
-    )
-    dispatcher: Any = compiler(function)
-    dispatcher._cache = _ContentCache(dispatcher)  # noqa: SLF001 - numba has no other way in
-    return cast("Function", dispatcher)
+    options = {
+        "error_model": "numpy",
+        "fastmath": fastmath,
+        "forceinline": forceinline,
+        "no_cfunc_wrapper": True,
+        "nopython": True,
+        "_nrt": nrt,
+    }
+    return cast("Function", _Function(function, targetoptions=options))
+
+
+class _Function(_registry.CPUDispatcher):
+    """A compiled function, for each signature first compiled for its first caller: compiled code or Python.
+
+    Compiled callers need no wrapper that unpacks Python's arguments. Most functions have no other callers,
+    and the wrapper takes as long to compile as a small function.
+    """
+
+    def __init__(self, function: Callable[..., object], targetoptions: dict[str, Any]) -> None:
+        super().__init__(function, targetoptions=targetoptions)
+        self._cache = _ContentCache(self)
+        self._for_compiled_caller = False
+        self._without_wrapper: set[tuple[Any, ...]] = set()
+        self._compiler._customize_flags = self._customize_flags  # noqa: SLF001 - numba has no other way in
+
+    def _customize_flags(self, flags: Any) -> Any:
+        flags.no_cpython_wrapper = self._for_compiled_caller
+        return flags
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """What a compiled caller needs to know of this function; compiles it for such callers."""
+        self._for_compiled_caller = True
+        try:
+            return super().get_call_template(args, kws)
+        finally:
+            self._for_compiled_caller = False
+
+    def compile(self, sig: Any) -> Any:
+        """Compile one signature; again for a call from Python if only compiled code has called it so far."""
+        arguments, _ = _core.sigutils.normalize_signature(sig)
+        if not self._for_compiled_caller and tuple(arguments) in self._without_wrapper:
+            self._without_wrapper.remove(tuple(arguments))
+            del self.overloads[tuple(arguments)]
+        return super().compile(sig)
+
+    def add_overload(self, cres: Any) -> None:
+        """Keep compiled code, and let Python find it unless it has no wrapper."""
+        if self._for_compiled_caller:
+            self.overloads[tuple(cres.signature.args)] = cres
+            self._without_wrapper.add(tuple(cres.signature.args))
+        else:
+            super().add_overload(cres)
+
+    @property
+    def caller(self) -> str:
+        """For whom a function is being compiled."""
+        return "compiled" if self._for_compiled_caller else "Python"
 
 
 class _ContentCache(NullCache):
@@ -149,7 +202,12 @@ class _ContentCache(NullCache):
 
     def _file(self, sig: Any, codegen: Any) -> Path:
         arguments, _ = _core.sigutils.normalize_signature(sig)
-        parts = [_name(self._dispatcher), *map(_described_type, arguments), *_contents([self._dispatcher])]
+        parts = [
+            self._dispatcher.caller,
+            _name(self._dispatcher),
+            *map(_described_type, arguments),
+            *_contents([self._dispatcher]),
+        ]
         name = re.sub(r"\W", "", self._dispatcher.py_func.__name__)
         return _folder() / f"{name}-{_digest(parts, codegen)}.nbc"
 
@@ -253,7 +311,9 @@ def _described_type(argument: Any) -> str:
 def _mark(precompile: Callable[[], None]) -> Path:
     """Path of the file that marks a function as precompiled; its name is the hash of the code."""
     modules: dict[str, ModuleType] = {}
-    left = [precompile.__module__]
+    called = precompile.func if isinstance(precompile, partial) else precompile
+    kind = precompile.args if isinstance(precompile, partial) else ()
+    left = [called.__module__]
     while left:
         name = left.pop()
         if name not in modules:
@@ -265,7 +325,7 @@ def _mark(precompile: Callable[[], None]) -> Path:
             left += [one for one in used if str(one).startswith("swarm_loc_") and one in sys.modules]
     functions = [function for module in modules.values() for function in _functions_of(module)]
     codegen = _core.registry.cpu_target.target_context.codegen()
-    return _folder() / f"precompiled-{_digest([_name(precompile), *_contents(functions)], codegen)}"
+    return _folder() / f"precompiled-{_digest([_name(called), repr(kind), *_contents(functions)], codegen)}"
 
 
 def _functions_of(module: ModuleType) -> Iterator[Any]:

@@ -45,7 +45,7 @@ from swarm_loc_estimator.nodes.estimator_topics import (
 from swarm_loc_estimator.nodes.load import FusionPace, Shedding
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.nodes.set_pose import NO_CLOCK, PoseCommands
-from swarm_loc_estimator.precompile import precompile
+from swarm_loc_estimator.precompile import precompile, size_of
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import live_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -87,9 +87,11 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
     def __init__(self, create_estimator: CreateEstimator = Estimator, **node_arguments: Any) -> None:
         super().__init__("estimator", EstimatorParameters, **node_arguments)
         self._swarm = load_swarm(Path(self.params.swarm_file))
-        if not is_precompiled(precompile):
-            self.get_logger().info("compiling the estimator for this machine: about three minutes")
-        precompile()
+        has_infrared = any(robot.ir is not None for robot in self._swarm.robots)
+        compiled = partial(precompile, size_of(self._swarm, self.params.settings), has_infrared)
+        if not is_precompiled(compiled):
+            self.get_logger().info("compiling the estimator for this machine: one to three minutes")
+        compiled()
         self._estimator = create_estimator(self._swarm, self.params.settings)
         shared = self.params.shared_topics
         self._ingest = Ingest(self._swarm, self.params.map_frame, live_topics(self._swarm, shared=shared))

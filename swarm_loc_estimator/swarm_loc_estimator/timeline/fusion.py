@@ -93,7 +93,8 @@ class Fusion:
             settings.lost_sigma, settings.lost_heading_sigma, settings.lost_after, settings.max_fault_score
         )
         self._period_ns = round(settings.fusion_period_s * 1e9)
-        self.is_sparse = self._period_ns > 0 and len(swarm.robots) >= settings.sparse_from
+        self.is_sparse = settings.is_sparse(swarm)
+        self._is_large = len(swarm.robots) >= self._policy.large_from
         self.starts = ConfiguredStarts(swarm, tracks)
         surer = settings.lost_heading_sigma / _SURER_AT_FIRST
         self._initializer = Initializer(tracks, settings.fix_window_s, surer)
@@ -139,7 +140,8 @@ class Fusion:
         """Fuse measurements of identified robots."""
         measured = measurements["command"] == Command.NONE
         if state.filter.is_dense:
-            if self._period_ns and measurements.size >= self._policy.batch_from and measured.all():
+            many = self._is_large and measurements.size >= self._policy.batch_from
+            if self._period_ns and many and measured.all():
                 self._fuse_together(state, measurements, verdicts, nis)
             else:
                 self._fuse_in_order(state, measurements, verdicts, nis)

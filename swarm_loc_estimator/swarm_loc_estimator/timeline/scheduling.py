@@ -20,6 +20,7 @@ class Policy:
     """Sizes at which the estimator changes its strategy; users set only `Settings.sparse_from`.
 
     Attributes:
+        large_from: Minimum number of robots for batch updates; a smaller swarm has few measurements.
         batch_from: Minimum number of measurements per fusion period for a batch update; sequential updates
             of fewer measurements are faster.
         delay_from: Minimum number of robots to fuse a period only `fusion_delay_s` after its end; a smaller
@@ -30,6 +31,7 @@ class Policy:
             largest number first.
     """
 
+    large_from: int = 16
     batch_from: int = 64
     delay_from: int = 64
     reopen_all_up_to: int = 30

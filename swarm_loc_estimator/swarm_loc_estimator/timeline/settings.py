@@ -113,3 +113,7 @@ class Settings:
             return self
         calibrated = sum(robot.odometry.is_calibrated for robot in swarm.robots)
         return replace(self, fusion_period_s=self.policy.fusion_period_s(calibrated))
+
+    def is_sparse(self, swarm: Swarm) -> bool:
+        """Whether the sparse filter estimates a swarm: only covariances of neighbours are kept."""
+        return self.fusion_period_s > 0.0 and len(swarm.robots) >= self.sparse_from

@@ -12,12 +12,13 @@ from pathlib import Path
 from numba.core.dispatcher import Dispatcher
 
 
-def printed_by_process(script: str) -> list[str]:
+def printed_by_process(script: str, *arguments: str) -> list[str]:
     """The names that a script prints, run by itself: in this process other tests have compiled already."""
     root = str(Path(__file__).parents[3])  # for `bench`, as in this process
     path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
     env = {**os.environ, "PYTHONPATH": path}
-    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=False, env=env)
+    command = [sys.executable, script, *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
     assert done.returncode == 0, done.stderr
     names: list[str] = json.loads(done.stdout)
     return names

@@ -41,7 +41,7 @@ def test_a_run_leaves_no_array_behind(many: int) -> None:
     world = simulate(Plan(3, 4.0), 1)
     counts = []
     for _ in range(3):
-        estimator = Estimator(world.swarm, Settings(policy=Policy(batch_from=many)))
+        estimator = Estimator(world.swarm, Settings(policy=Policy(large_from=1, batch_from=many)))
         play(estimator, on_time(world), ticks(T0, int(world.stamp_ns[-1])))
         assert settled(estimator)["USED"] > 20
         del estimator

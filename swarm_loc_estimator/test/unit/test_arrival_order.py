@@ -121,7 +121,9 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
         state_period_s=state_period_s,
         lost_after=lost_after,
         # so that a small swarm's measurements are fused together, too, and wait
-        policy=Policy(batch_from=5) if delay_s is None else Policy(batch_from=5, delay_from=1),
+        policy=Policy(large_from=1, batch_from=5)
+        if delay_s is None
+        else Policy(large_from=1, batch_from=5, delay_from=1),
     )
     events = [event for event in world.events if rng.uniform() < 0.9]
     silent = rng.integers(robots)  # for longer than its motion counts as known
@@ -160,7 +162,7 @@ def test_fusing_a_few_steps_at_each_tick_gives_the_same(
         sparse_from=2 if sparse else 250,
         horizon_s=20.0,
         lost_after=2,
-        policy=Policy(batch_from=5),
+        policy=Policy(large_from=1, batch_from=5),
     )
     arrivals = [(event.stamp_ns + int(rng.uniform(0, late_s) * SECOND), event) for event in world.events]
     at_ns = ticks(T0, T0 + 6 * SECOND, 0.09)

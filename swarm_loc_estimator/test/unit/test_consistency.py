@@ -34,7 +34,7 @@ def errors(world: World, settings: Settings, period_s: float) -> tuple[FloatArra
 
 def batched(batch_from: int) -> Settings:
     """Settings that fuse so many measurements of a period and more together."""
-    return Settings(policy=Policy(batch_from=batch_from))
+    return Settings(policy=Policy(large_from=1, batch_from=batch_from))
 
 
 def assert_chi_square(squared: Sequence[FloatArray]) -> None:

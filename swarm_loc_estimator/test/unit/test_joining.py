@@ -141,7 +141,9 @@ def test_a_robot_too_unsure_after_a_silence_waits_and_is_found_again(
 ) -> None:
     world, silent_ns, heard_ns = simulate(Plan(1, 8.0), 1), T0 + 2 * SECOND, T0 + 7 * SECOND // 2
     limits = Settings(
-        lost_sigma=lost_sigma, lost_heading_sigma=lost_heading_sigma, policy=Policy(batch_from=many)
+        lost_sigma=lost_sigma,
+        lost_heading_sigma=lost_heading_sigma,
+        policy=Policy(large_from=1, batch_from=many),
     )
     arrivals = [(t, e) for t, e in on_time(world) if not silent_ns < t < heard_ns]
     estimates = play(Estimator(world.swarm, limits), arrivals, ticks(T0, T0 + 8 * SECOND))

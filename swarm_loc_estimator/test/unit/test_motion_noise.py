@@ -38,7 +38,7 @@ def run(world: World, settings: Settings) -> tuple[FloatArray, FloatArray]:
 
 @pytest.mark.parametrize("batch_from", [5, 1000])
 def test_noise_that_is_described_too_small_is_scaled_up(batch_from: int) -> None:
-    settings = Settings(policy=Policy(batch_from=batch_from))
+    settings = Settings(policy=Policy(large_from=1, batch_from=batch_from))
     scales, late = [], []
     for seed in range(4):
         squared, scale = run(described(simulate(PLAN, 300 + seed), 0.02), settings)

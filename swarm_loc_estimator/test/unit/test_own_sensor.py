@@ -138,7 +138,7 @@ def ranges(world: World, seed: int, outliers: float = 0.0) -> list[tuple[int, Ra
 
 
 IN_ORDER = Settings(fusion_period_s=0.0)
-TOGETHER = Settings(fusion_period_s=0.2, policy=Policy(batch_from=2))
+TOGETHER = Settings(fusion_period_s=0.2, policy=Policy(large_from=1, batch_from=2))
 SPARSE = Settings(fusion_period_s=0.2, sparse_from=2)
 ALL = pytest.mark.parametrize("settings", [IN_ORDER, TOGETHER, SPARSE], ids=["order", "batch", "sparse"])
 

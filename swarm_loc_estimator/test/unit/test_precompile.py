@@ -7,8 +7,10 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import cast
 
 import numpy as np
+import pytest
 from compiled_code import compiled_since, printed_by_process, signatures
 
 from bench.shared.bags import encode_shared_detections, encode_shared_numbers
@@ -19,12 +21,13 @@ from swarm_loc_estimator.common.messages.detections import (
 )
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
-from swarm_loc_estimator.precompile import precompile
+from swarm_loc_estimator.precompile import Size, precompile, size_of
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.scheduling import Policy
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.thinning import Thinning
 
@@ -38,22 +41,45 @@ class EnoughError(Exception):
     """The beginning of a bag is enough."""
 
 
-def test_nothing_is_compiled_once_data_come() -> None:
-    assert printed_by_process(__file__) == []
+@pytest.mark.parametrize("size", ["small", "large", "sparse"])
+def test_nothing_is_compiled_once_data_come(size: Size) -> None:
+    assert printed_by_process(__file__, size) == []
 
 
-def compiled_late() -> list[str]:
+@pytest.mark.parametrize(
+    ("name", "settings", "size"),
+    [
+        ("eight_five_robots", Settings(), "small"),
+        ("droplets_twenty", Settings(), "large"),
+        ("droplets_twenty", Settings(sparse_from=20), "sparse"),
+        ("droplets_twenty", Settings(sparse_from=20, fusion_period_s=0.0), "large"),
+    ],
+)
+def test_what_is_compiled_follows_the_size_of_the_swarm(name: str, settings: Settings, size: Size) -> None:
+    assert size_of(load_swarm(BAGS / name / "swarm.yaml"), settings) == size
+
+
+def compiled_late(size: Size) -> list[str]:
     """What is compiled when robots are replayed though all is warm; in a process of its own."""
-    precompile()
+    for infrared in (False, True):
+        precompile(size, infrared)
     before = signatures()
-    for name in RECORDED:
-        for settings in (Settings(), Settings(fusion_period_s=0.1)):
-            run(BAGS / name, settings)
-    run(BAGS / "eight_five_robots", Settings(), late=True)
-    run(BAGS / "eight_five_robots", Settings(sparse_from=2))
-    run(BAGS / "eight_five_robots", Settings(), moved_landmarks=True)
-    for settings in (Settings(fusion_period_s=0.1), Settings(sparse_from=2)):
-        run(BAGS / "eight_five_robots", settings, relayed=True)
+    eight = BAGS / "eight_five_robots"
+    if size == "sparse":
+        run(eight, Settings(sparse_from=2))
+        run(eight, Settings(sparse_from=2), relayed=True)
+        run(BAGS / "droplets_twenty", Settings(sparse_from=2))
+    elif size == "large":
+        together = Settings(fusion_period_s=0.1, policy=Policy(large_from=2))
+        for name in RECORDED:
+            run(BAGS / name, together)
+        run(eight, together, relayed=True)
+    else:
+        for name in RECORDED:
+            run(BAGS / name, Settings(policy=Policy(large_from=100)))
+        run(eight, Settings(), late=True)
+        run(eight, Settings(), moved_landmarks=True)
+        run(eight, Settings(), relayed=True)
     return compiled_since(before)
 
 
@@ -125,4 +151,4 @@ def _quietly(work: Callable[[], object]) -> None:
 
 
 if __name__ == "__main__":
-    json.dump(compiled_late(), sys.stdout)
+    json.dump(compiled_late(cast("Size", sys.argv[1])), sys.stdout)

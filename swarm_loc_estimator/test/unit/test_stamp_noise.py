@@ -140,7 +140,7 @@ def mean_nees(world: World, swarm: Swarm, settings: Settings) -> FloatArray:
 
 @pytest.mark.parametrize("many", [5, 1000])
 def test_errors_are_admitted_where_stamps_err_and_are_not_by_who_trusts_them(many: int) -> None:
-    settings = Settings(policy=Policy(batch_from=many))
+    settings = Settings(policy=Policy(large_from=1, batch_from=many))
     knowing, trusting = [], []
     for seed in range(12):
         rng = np.random.default_rng([seed, 7])
