@@ -1,4 +1,4 @@
-"""What all tests share: code compiled before, and for each node test ROS in a domain that no other has."""
+"""What all tests share: the same examples in CI, and for each node test ROS in a domain that no other has."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
+from importlib.util import find_spec
 from multiprocessing import get_context
 from typing import TYPE_CHECKING
 
@@ -18,7 +19,6 @@ from hypothesis import HealthCheck, settings
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.nodes.mapper_precompile import precompile as precompile_mapper
 from swarm_loc_estimator.precompile import precompile, precompile_infrared
-from swarm_loc_vision.markers.detector import precompile as precompile_detector
 
 if TYPE_CHECKING:
     from node_world import Ros  # unit tests do without ROS
@@ -31,14 +31,17 @@ settings.register_profile(
 settings.load_profile("workspace")
 
 
-_PRECOMPILED: tuple[Callable[[], None], ...] = (
+_PRECOMPILED: list[Callable[[], None]] = [
     partial(precompile, "small", False),
     precompile_infrared,
-    precompile_detector,
     precompile_mapper,
     *(partial(precompile, size, infrared) for infrared in (False, True) for size in ("large", "sparse")),
-)
+]
 """What tests run; two processes compile it side by side."""
+if find_spec("swarm_loc_vision"):  # colcon tests the estimator without it
+    from swarm_loc_vision.markers.detector import precompile as precompile_detector
+
+    _PRECOMPILED.insert(2, precompile_detector)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterable
+from configparser import ConfigParser
 from pathlib import Path
 
 import pytest
@@ -62,6 +63,15 @@ def test_what_is_imported_is_declared(name: str) -> None:
     package = ROOT / name
     assert imported(package, [name, "launch"]) == declared(package, "exec_depend")
     assert imported(package, ["test"]) <= declared(package, "exec_depend") | declared(package, "test_depend")
+
+
+@pytest.mark.parametrize("name", ["swarm_loc_estimator", "swarm_loc_vision", "swarm_loc_drivers"])
+def test_colcon_runs_the_tests_by_pytest(name: str) -> None:
+    config = ConfigParser()
+    config.read(ROOT / name / "setup.cfg", encoding="utf-8")
+    extras = config["options.extras_require"]["test"].split()
+    assert "pytest" in extras  # else colcon looks for unittest, finds none, and reports success
+    assert {f"python3-{extra}" for extra in extras} <= declared(ROOT / name, "test_depend")
 
 
 @pytest.mark.parametrize("name", ["swarm_loc_vision", "swarm_loc_drivers"])
