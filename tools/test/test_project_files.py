@@ -1,4 +1,4 @@
-"""The project's own files parse and name what exists: workflow, hooks, citation, container."""
+"""The project's own files parse and name what exists: workflow, hooks, citation, papers, container."""
 
 from __future__ import annotations
 
@@ -64,6 +64,18 @@ def test_every_paper_of_the_citation_stands_in_the_readme() -> None:
     readme = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split()).lower()
     papers = [paper["title"].partition(":")[0].lower() for paper in read_yaml("CITATION.cff")["references"]]
     assert [title for title in papers if title not in readme] == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_the_papers_of_a_package_are_found(package: str) -> None:
+    folder = ROOT / package
+    assert "<rosdoc2>rosdoc2.yaml</rosdoc2>" in (folder / "package.xml").read_text(encoding="utf-8")
+    kind, content = YAML(typ="safe").load_all((folder / "rosdoc2.yaml").read_text(encoding="utf-8"))
+    assert kind["type"] == "rosdoc2 config"
+    assert [one["sphinx"]["name"] for one in content["builders"]] == [package]
+    declaration = (folder / "QUALITY_DECLARATION.md").read_text(encoding="utf-8")
+    (level,) = re.findall(r"quality level (\d)", declaration)
+    assert f"Quality level: {level} of REP 2004" in (folder / "README.md").read_text(encoding="utf-8")
 
 
 def test_the_container_starts_what_there_is() -> None:
