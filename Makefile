@@ -2,6 +2,7 @@
 # make test     lint, types, unit tests without ROS, node tests over DDS
 # make bench-NAME [ARGS="..."]   prints a table, draws it under out/, writes out/bench/NAME.json
 # make house     prints the figures of the layout, writes out/bench/house.json
+# make docs      builds the documentation site: out/docs/index.html
 # make setup | lint | types | unit | node | clean
 
 PYTHON ?= python3
@@ -12,7 +13,7 @@ MYPY := ./run -- mypy --num-workers 2
 PYTEST := ./run -- env -u PYTHONDONTWRITEBYTECODE PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 pytest \
     -p xdist.plugin -p pytest_timeout -p _hypothesis_pytestplugin --numprocesses 2 --dist worksteal
 
-.PHONY: demo test lint types unit node house setup clean
+.PHONY: demo test lint types unit node house docs setup clean
 
 demo: setup
 	@./run swarm_loc_estimator demo $(ARGS)
@@ -26,7 +27,7 @@ lint:
 
 # Tests are a call of their own, since two files named conftest.py cannot be of one.
 types:
-	$(MYPY) conftest.py bench tools $(join $(PACKAGES:=/),$(PACKAGES))
+	$(MYPY) conftest.py bench docs tools $(join $(PACKAGES:=/),$(PACKAGES))
 	$(MYPY) $(wildcard $(PACKAGES:=/launch) $(PACKAGES:=/test))
 
 unit: setup
@@ -41,8 +42,15 @@ setup:
 house:
 	@$(PYTHON) tools/house.py $(ARGS)
 
+# The README is the start page, under its own name for links and as the index.
+docs:
+	@$(PYTHON) tools/setup_workspace.py --extra docs
+	@./run -- sphinx-build --quiet --fail-on-warning --keep-going -c docs --doctree-dir .workspace/doctrees . out/docs
+	@cp out/docs/README.html out/docs/index.html
+	@echo "Written: out/docs/index.html"
+
 bench-%:
-	@$(PYTHON) tools/setup_workspace.py --bench
+	@$(PYTHON) tools/setup_workspace.py --extra bench
 	@./run -- python -m bench $* $(ARGS)
 
 clean:

@@ -15,11 +15,11 @@ from workspace.layout import WorkspaceError
 from workspace.stamps import only_one
 
 
-def ensure(*, bench: bool = False, compiled: bool = False) -> None:
+def ensure(*, extra: str | None = None, compiled: bool = False) -> None:
     """Run the steps of the set-up that are not done yet.
 
     Args:
-        bench: Whether to install the benchmarks' requirements.
+        extra: Requirements to add, one of `install.EXTRAS`.
         compiled: Whether to compile the inner loops of the estimator of a small swarm.
 
     Raises:
@@ -27,7 +27,7 @@ def ensure(*, bench: bool = False, compiled: bool = False) -> None:
     """
     host.check_python_age()
     with only_one():
-        install.ensure(bench=bench)
+        install.ensure(extra=extra)
         with build.compiling() if compiled else nullcontext():
             build.ensure()
 
@@ -35,10 +35,10 @@ def ensure(*, bench: bool = False, compiled: bool = False) -> None:
 def main() -> int:
     """Run from the command line; returns 0, or 1 after one sentence about a failure."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--bench", action="store_true", help="add what the benchmarks compare with")
+    parser.add_argument("--extra", choices=install.EXTRAS, help="requirements to add")
     arguments = parser.parse_args()
     try:
-        ensure(bench=arguments.bench, compiled=True)
+        ensure(extra=arguments.extra, compiled=arguments.extra != "docs")
     except WorkspaceError as error:
         print(error, file=sys.stderr)
         return 1

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from workspace.layout import PACKAGES, ROOT
+from workspace import install
+from workspace.layout import PACKAGES, REQUIREMENTS, ROOT
 
 
 def read_yaml(name: str) -> Any:
@@ -29,6 +30,12 @@ def test_the_workflow_runs_what_continuous_integration_runs() -> None:
     assert os.access(ROOT / ".ci" / "run", os.X_OK)
     packages = {"cmake", "g++", "make", "python3-venv", "python3-dev"}
     assert packages <= set(shlex.split(lines[0]))
+
+
+def test_what_make_adds_to_the_set_up_has_requirements() -> None:
+    added = re.findall(r"--extra (\w+)", (ROOT / "Makefile").read_text(encoding="utf-8"))
+    assert sorted(added) == sorted(install.EXTRAS)
+    assert [name for name in added if not (REQUIREMENTS / f"{name}.txt").is_file()] == []
 
 
 def test_hooks_are_the_lint_of_the_makefile() -> None:

@@ -18,6 +18,9 @@ from workspace.stamps import Stamp, digest, write_whole
 
 STAMP = Stamp(VENV / "workspace.stamp")
 
+EXTRAS = ("bench", "docs")
+"""Requirements that are installed when they are first needed, and kept up to date from then on."""
+
 UV = "uv>=0.5,<1"
 """Installs all wheels in ten seconds, where pip asks for one after the other and takes two minutes."""
 
@@ -40,11 +43,11 @@ def _wanted(groups: tuple[str, ...]) -> dict[str, str]:
     return facts
 
 
-def ensure(*, bench: bool) -> None:
+def ensure(*, extra: str | None) -> None:
     """Create or update `.venv` from the requirements.
 
     Args:
-        bench: Whether to install the benchmarks' requirements.
+        extra: One of `EXTRAS`; None: only those that are installed already.
 
     Raises:
         WorkspaceError: Something is missing, or pip failed.
@@ -52,8 +55,7 @@ def ensure(*, bench: bool) -> None:
     found = json.loads(STAMP.read() or "{}")
     ros = host.ros_prefix()
     groups: tuple[str, ...] = ("workspace",) if ros else ("ros", "workspace")
-    if bench or "group.bench" in found:
-        groups += ("bench",)
+    groups += tuple(name for name in EXTRAS if name == extra or f"group.{name}" in found)
     wanted = _wanted(groups)
     if found == wanted and VENV_PYTHON.exists():
         return

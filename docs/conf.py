@@ -1,0 +1,85 @@
+"""The documentation site: the Markdown of the repository where it lies, and an API from docstrings."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sphinx.application import Sphinx
+
+ROOT = Path(__file__).parents[1]
+
+project = html_title = "Swarm localization"
+author = "Swarm localization maintainers"
+root_doc = "README"
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+include_patterns = ["*.md", "*/*.md", "*/doc/*.md", "docs/api/*.md", "*/CHANGELOG.rst"]
+exclude_patterns = ["docs/navigation.md", "out", "build", "install", "log", ".*"]
+myst_heading_anchors = 3
+highlight_language = "none"
+smartquotes_action = "D"
+default_role = "code"
+
+html_theme = "furo"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_copyright = False
+
+autodoc_default_options = {"members": True}
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_type_aliases = {
+    name: name for name in ("ArrayLike", "BoolArray", "FloatArray", "IntArray", "NDArray", "npt.NDArray")
+}
+napoleon_use_ivar = True
+python_maximum_signature_line_length = 160
+
+
+def setup(app: Sphinx) -> None:
+    """Connect the hooks."""
+    app.connect("source-read", _read_source)
+    app.connect("autodoc-process-signature", _shorten_signature)
+    app.connect("autodoc-process-docstring", _prepare_docstring, priority=100)  # before napoleon
+    app.connect("autodoc-skip-member", _skip_field)
+
+
+def _read_source(_app: Sphinx, docname: str, source: list[str]) -> None:
+    """Add what GitHub would show as code: the navigation on the start page, messages on that of theirs."""
+    if docname == root_doc:
+        source[0] += (ROOT / "docs" / "navigation.md").read_text(encoding="utf-8")
+    if docname == "swarm_loc_msgs/README":
+        for path in sorted([*ROOT.glob("swarm_loc_msgs/msg/*.msg"), *ROOT.glob("swarm_loc_msgs/srv/*.srv")]):
+            source[0] += f"\n## {path.stem}\n\n```{{literalinclude}} /{path.relative_to(ROOT)}\n```\n"
+    # A link to the file of a message leads there.
+    message = r"\]\(([./\w]*)(?:msg|srv)/(\w+)\.(?:msg|srv)\)"
+    source[0] = re.sub(message, lambda link: f"]({link[1]}README.md#{link[2].lower()})", source[0])
+
+
+def _shorten_signature(*event: Any) -> tuple[str | None, str | None]:
+    """Show a default without its own arguments, and a function or factory by its name."""
+    signature, returned = event[-2:]
+    if signature:
+        signature = re.sub(r"= (\w+)\([^()]*\)", r"= \1()", signature)
+        signature = re.sub(r"= <(?:function )?(\w+)[^>]*>", r"= \1", signature)
+    return signature, returned
+
+
+def _prepare_docstring(
+    _app: Sphinx, what: str, _name: str, obj: Any, _options: Any, lines: list[str]
+) -> None:
+    """Describe the numbers of a dataclass by their specs; let no colon of an attribute name a type."""
+    if what in {"attribute", "data", "property"}:
+        lines.insert(0, "")
+    if isinstance(obj, type) and is_dataclass(obj) and "Attributes:" not in lines:
+        specs = [(one.name, one.metadata["spec"]) for one in fields(obj) if "spec" in one.metadata]
+        numbers = [f"    {name}: {spec.doc}, in {spec.range_text}." for name, spec in specs]
+        lines += ["Attributes:", *numbers, ""] if numbers else []
+
+
+def _skip_field(*event: Any) -> bool | None:
+    """Leave out the fields of named tuples, which their classes describe."""
+    return True if type(event[3]).__name__ == "_tuplegetter" else None
