@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from ruamel.yaml import YAML
 
-from workspace import install
+from workspace import host, install
 from workspace.layout import PACKAGES, REQUIREMENTS, ROOT
 
 
@@ -23,13 +23,25 @@ def make_targets() -> set[str]:
 
 
 def test_the_workflow_runs_what_continuous_integration_runs() -> None:
-    (job,) = read_yaml(".github/workflows/ci.yml")["jobs"].values()
+    job = read_yaml(".github/workflows/ci.yml")["jobs"]["test"]
     assert job["runs-on"] == "ubuntu-24.04"
     lines = [step["run"] for step in job["steps"] if "run" in step]
     assert lines[-1] == ".ci/run"
     assert os.access(ROOT / ".ci" / "run", os.X_OK)
     packages = {"cmake", "g++", "make", "python3-venv", "python3-dev"}
     assert packages <= set(shlex.split(lines[0]))
+
+
+def test_the_jobs_of_the_workflow_name_what_there_is() -> None:
+    jobs = read_yaml(".github/workflows/ci.yml")["jobs"]
+    lines = "\n".join(step["run"] for job in jobs.values() for step in job["steps"] if "run" in step)
+    called = re.findall(r"^make (.+)$", lines, re.MULTILINE)
+    targets = {word for line in called for word in line.split() if "=" not in word}
+    assert targets == {"unit", "node", "docs"}
+    assert targets <= make_targets()
+    assert [name for name in re.findall(r"requirements/\w+\.txt", lines) if not (ROOT / name).is_file()] == []
+    versions = [tuple(map(int, one.split("."))) for one in jobs["python"]["strategy"]["matrix"]["python"]]
+    assert versions == [host.LOWEST_PYTHON, host.HIGHEST_WHEEL_PYTHON]
 
 
 def test_what_make_adds_to_the_set_up_has_requirements() -> None:
