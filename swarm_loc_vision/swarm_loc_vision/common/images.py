@@ -9,7 +9,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from cv2.typing import MatLike
 from numpy.typing import NDArray
 
 Gray = NDArray[np.uint8]
@@ -169,7 +168,7 @@ def decoded_image(message: Any) -> Gray:
     return _highest_bits(gray)
 
 
-def _decoded(raw: NDArray[np.uint8]) -> MatLike | None:
+def _decoded(raw: NDArray[np.uint8]) -> NDArray[Any] | None:
     """The image that OpenCV decodes; None: none, or it would be too large."""
     try:
         return cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -99,28 +99,22 @@ def rotated(words: NDArray[np.uint64], quarters: int) -> NDArray[np.uint64]:
     return packed(np.rot90(unpacked(words), quarters, axes=(1, 2)))
 
 
-def _opencv_words(dictionary: int, *, quarters: int) -> NDArray[np.uint64]:
-    """The words of one of OpenCV's dictionaries, turned by quarter turns."""
-    source = cv2.aruco.getPredefinedDictionary(dictionary)
-    count = len(source.bytesList)
-    images = np.stack([source.generateImageMarker(i, CELLS + 2) for i in range(count)])
-    cells = (images[:, 1:-1, 1:-1] > 0).astype(np.uint8)
-    return rotated(packed(cells), quarters)
+def _published_words(name: str) -> NDArray[np.uint64]:
+    """(N,) words of a family from its file in `words/`, where it says who published them."""
+    lines = (Path(__file__).parent / "words" / f"{name}.txt").read_text(encoding="ascii").splitlines()
+    words = [int(word, 16) for line in lines if not line.startswith("#") for word in line.split()]
+    return np.array(words, np.uint64)
 
 
 @lru_cache(maxsize=1)
 def families() -> dict[str, Family]:
-    """All families by name.
-
-    AprilTags are upright as published; OpenCV has them upside down.
-    """
+    """All families by name; AprilTags are upright as published, not as in OpenCV."""
     words = bch_words()
-    mip = _opencv_words(cv2.aruco.DICT_ARUCO_MIP_36h12, quarters=0)
-    tags = _opencv_words(cv2.aruco.DICT_APRILTAG_36h11, quarters=2)
+    tags = _published_words("apriltag_36h11")
     known = (
         Family("artoolkit_bch_thin", CODE_ARTOOLKIT_BCH, 1, words),
         Family("artoolkit_bch_thick", CODE_ARTOOLKIT_BCH, 3, words),
-        Family("aruco_mip_36h12", CODE_ARUCO_MIP_36H12, 1, mip),
+        Family("aruco_mip_36h12", CODE_ARUCO_MIP_36H12, 1, _published_words("aruco_mip_36h12")),
         Family("apriltag_36h11", CODE_APRILTAG_36H11, 1, tags),
         Family("apriltag_36h11_thick", CODE_APRILTAG_36H11, 2, tags, touching=True),
     )

@@ -9,10 +9,10 @@ resolution for blurred ones.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import cv2
 import numpy as np
-from cv2.typing import MatLike
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
@@ -69,7 +69,7 @@ def find_quads(gray: Gray, min_side: float, min_contrast: float, *, touching: bo
     Returns:
         (N, 4, 2) corners, clockwise in the image, on the boundary between dark and light [px].
     """
-    scaled: MatLike = cv2.GaussianBlur(gray, (3, 3), _SMOOTHING_PX)
+    scaled: NDArray[Any] = cv2.GaussianBlur(gray, (3, 3), _SMOOTHING_PX)
     found: list[FloatArray] = []
     for halvings, windows in enumerate(WINDOWS):
         scale = 1 << halvings
@@ -100,7 +100,7 @@ def _distinct(quads: FloatArray) -> FloatArray:
     return quads[[near[0] == i for i, near in enumerate(same)]]
 
 
-def _dark(gray: MatLike, window: int, contrast: float) -> NDArray[np.uint8]:
+def _dark(gray: NDArray[Any], window: int, contrast: float) -> NDArray[np.uint8]:
     """255 where an image is darker than the local mean; its frame is 0, so that outlines stay inside."""
     mean = cv2.blur(gray, (window, window))
     dark = cv2.threshold(cv2.subtract(mean, gray), contrast - 0.5, _DARK, cv2.THRESH_BINARY)[1]
@@ -112,7 +112,7 @@ def _dark(gray: MatLike, window: int, contrast: float) -> NDArray[np.uint8]:
     return np.asarray(dark, np.uint8)
 
 
-def _noise(gray: MatLike) -> float:
+def _noise(gray: NDArray[Any]) -> float:
     """Standard deviation of the noise [counts], from second differences, which suppress the image itself."""
     rows = gray[::_NOISE_ROWS].astype(np.int16)
     return _DEVIATION * float(np.median(np.abs(rows[:, :-2] - 2 * rows[:, 1:-1] + rows[:, 2:])))

@@ -45,19 +45,50 @@ def test_turning_four_quarters_changes_nothing() -> None:
     ).all()
 
 
-@pytest.mark.parametrize(
-    ("name", "dictionary", "first_corner"),
+def dictionary_of_opencv(name: str) -> cv2.aruco.Dictionary:
+    """A dictionary of the installed OpenCV; skips the test where that is too old for it."""
+    aruco = getattr(cv2, "aruco", None)
+    if not hasattr(aruco, name) or not hasattr(aruco, "ArucoDetector"):
+        pytest.skip(f"OpenCV {cv2.__version__} does not have {name}")
+    return cv2.aruco.getPredefinedDictionary(getattr(aruco, name))
+
+
+OPENCV = pytest.mark.parametrize(
+    ("name", "of_opencv", "quarters"),
     [
-        ("aruco_mip_36h12", cv2.aruco.DICT_ARUCO_MIP_36h12, 0),
-        ("apriltag_36h11", cv2.aruco.DICT_APRILTAG_36h11, 2),  # OpenCV turns these by half a turn
+        ("aruco_mip_36h12", "DICT_ARUCO_MIP_36h12", 0),
+        ("apriltag_36h11", "DICT_APRILTAG_36h11", 2),  # OpenCV turns these by half a turn
     ],
 )
-def test_opencv_reads_what_is_drawn(name: str, dictionary: int, first_corner: int) -> None:
-    detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(dictionary))
+
+
+@OPENCV
+def test_words_are_those_of_opencv(name: str, of_opencv: str, quarters: int) -> None:
+    dictionary, family = dictionary_of_opencv(of_opencv), family_named(name)
+    assert len(family.words) == len(dictionary.bytesList)
+    for marker_id in range(len(family.words)):
+        drawn = np.rot90(dictionary.generateImageMarker(marker_id, family.side), quarters)
+        assert (drawn == 255 * family.pattern(marker_id)).all()
+
+
+@OPENCV
+def test_opencv_reads_what_is_drawn(name: str, of_opencv: str, quarters: int) -> None:
+    dictionary = dictionary_of_opencv(of_opencv)
+    detector = cv2.aruco.ArucoDetector(dictionary)
     for marker_id in (0, 7, 101, 249):
         corners, ids, _ = detector.detectMarkers(draw_marker(family_named(name), marker_id, 8, 2))
         assert np.ravel(ids).tolist() == [marker_id]
-        assert np.ravel(corners[0])[2 * first_corner : 2 * first_corner + 2] == pytest.approx([16, 16], abs=1)
+        assert np.ravel(corners[0])[2 * quarters : 2 * quarters + 2] == pytest.approx([16, 16], abs=1)
+
+
+@pytest.mark.parametrize(
+    ("name", "count", "apart"), [("aruco_mip_36h12", 250, 12), ("apriltag_36h11", 587, 11)]
+)
+def test_published_words_are_apart_in_all_orientations(name: str, count: int, apart: int) -> None:
+    words = family_named(name).words
+    assert len(words) == count
+    turned = np.concatenate([rotated(words, quarters) for quarters in range(4)])
+    assert min(sorted(distances(word, turned))[1] for word in words) == apart
 
 
 def test_sizes_of_images_and_borders() -> None:
