@@ -22,9 +22,9 @@ from swarm_loc_drivers.pushbot.event_packets import EventPacket
 from swarm_loc_drivers.pushbot.event_parser import precompile
 from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
 from swarm_loc_drivers.pushbot.parameters import PushbotParameters
+from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS
 from swarm_loc_estimator.common.messages.event_encoding import ENCODING
-from swarm_loc_estimator.common.node import run_node
-from swarm_loc_msgs.msg import EventPacket as EventPacketMessage
+from swarm_loc_estimator.common.node import message_class, run_node
 
 EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Holds half a second of packets."""
@@ -52,7 +52,8 @@ class PushbotDriverNode(RobotDriverNode[PushbotParameters]):
         precompile()
         odometry = self._odometry_output("odom", self._prefix)
         self._camera_frame = f"{self._prefix}event_camera_optical_frame"
-        self._events = self.create_publisher(EventPacketMessage, "events", EVENT_QOS)
+        self._packet_class = message_class(EVENT_PACKETS[0])
+        self._events = self.create_publisher(self._packet_class, "events", EVENT_QOS)
         self._driver = PushbotDriver(
             self.params, PushbotListeners(odometry.publish, self._publish), self._now_ns
         )
@@ -60,7 +61,7 @@ class PushbotDriverNode(RobotDriverNode[PushbotParameters]):
         self._follow("cmd_vel", self._driver.set_velocity)
 
     def _publish(self, packet: EventPacket) -> None:
-        message = EventPacketMessage(
+        message = self._packet_class(
             header=Header(stamp=stamp_message(packet.stamp_ns), frame_id=self._camera_frame),
             height=SENSOR_PX,
             width=SENSOR_PX,

@@ -26,7 +26,9 @@ from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import FOCAL_PX
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldParameters
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
-from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearingArray, SwarmPose, SwarmPoses
+from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS
+from swarm_loc_estimator.common.node import message_class
+from swarm_loc_msgs.msg import LaserDistance, LightBearingArray, SwarmPose, SwarmPoses
 from swarm_loc_vision.laser.calibrate_laser_node import CalibrateLaserParameters
 from swarm_loc_vision.laser.calibration import LaserCalibration, load_laser, save_laser
 
@@ -84,9 +86,9 @@ class Hall:
         self.laser: list[LaserDistance] = ros.listen(LaserDistance, "pushbot1/laser")
         self.lights: list[LightBearingArray] = ros.listen(LightBearingArray, "pushbot1/lights")
         self.diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
-        self.packets: list[EventPacket] = []
+        self.packets: list[Any] = []
         ros.tester.create_subscription(
-            EventPacket, "pushbot1/events", self.packets.append, qos_profile_sensor_data
+            message_class(EVENT_PACKETS[0]), "pushbot1/events", self.packets.append, qos_profile_sensor_data
         )
         self.velocity = (0.0, 0.0)
         self._publisher = ros.tester.create_publisher(Twist, "pushbot1/cmd_vel", 1)

@@ -9,6 +9,7 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from importlib import import_module
 from types import FrameType
 from typing import Any, Generic, TypeVar
@@ -32,6 +33,7 @@ from rclpy.time_source import TimeSource
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from swarm_loc_estimator.common.health import Health, Report
+from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS
 from swarm_loc_estimator.common.parameters import (
     ParameterSpec,
     UserError,
@@ -61,14 +63,16 @@ _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
 def message_class(message_type: str) -> Any:
     """The class of messages of a type, such as nav_msgs/msg/Odometry.
 
+    Of either of `EVENT_PACKETS` it is the one that nodes use.
+
     Raises:
         MessageTypeError: It is not installed.
     """
-    package, _, name = message_type.replace("/msg/", "/").partition("/")
-    try:
-        return getattr(import_module(f"{package}.msg"), name)
-    except (ImportError, AttributeError) as error:
-        raise MessageTypeError(f"There is no message type {message_type} here.") from error
+    for candidate in EVENT_PACKETS if message_type in EVENT_PACKETS else (message_type,):
+        package, _, name = candidate.replace("/msg/", "/").partition("/")
+        with suppress(ImportError, AttributeError):
+            return getattr(import_module(f"{package}.msg"), name)
+    raise MessageTypeError(f"There is no message type {message_type} here.")
 
 
 class MessageTypeError(UserError):

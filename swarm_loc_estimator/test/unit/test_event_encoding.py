@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS, SEQUENCE, fields_of
 from swarm_loc_estimator.common.messages.event_encoding import (
     ENCODING,
     MAX_SPAN_NS,
@@ -40,6 +41,14 @@ def test_the_layout_is_that_of_event_camera_msgs() -> None:
     """Time in the lowest 32 bits, then column and row, polarity in the highest bit."""
     one = Events(np.array([37], np.uint16), np.array([100], np.uint16), np.array([True]), np.array([5000]))
     assert encode_events(one) == (1 << 63 | 100 << 48 | 37 << 32 | 5000).to_bytes(8, "little")
+
+
+def test_our_copy_of_the_message_has_the_fields_of_event_camera_msgs() -> None:
+    expected = {"header": "std_msgs/msg/Header", "height": "I", "width": "I", "seq": "Q", "time_base": "Q"}
+    expected |= {"encoding": "string", "is_bigendian": "?", "events": "B"}
+    fields = fields_of(EVENT_PACKETS[-1])
+    assert [(one.name, one.type) for one in fields] == [*expected.items()]
+    assert [one.name for one in fields if one.size == SEQUENCE] == ["events"]
 
 
 def test_the_other_order_of_bytes_is_read() -> None:

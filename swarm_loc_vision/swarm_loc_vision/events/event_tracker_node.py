@@ -22,9 +22,10 @@ from std_msgs.msg import Header
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
+from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS
 from swarm_loc_estimator.common.messages.event_encoding import EventError, decode_events
-from swarm_loc_estimator.common.node import ConfiguredNode, run_node
-from swarm_loc_msgs.msg import EventPacket, LaserDistance, LightBearing, LightBearingArray
+from swarm_loc_estimator.common.node import ConfiguredNode, message_class, run_node
+from swarm_loc_msgs.msg import LaserDistance, LightBearing, LightBearingArray
 from swarm_loc_vision.events.parameters import EventTrackerParameters, laser_calibration, light_sources
 from swarm_loc_vision.events.tracker import (
     LightTracker,
@@ -60,10 +61,12 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
         self._packet_s = self._laser_s = time.monotonic()
         self._laser = self.create_publisher(LaserDistance, "laser", _OUTPUT_QOS)
         self._lights = self.create_publisher(LightBearingArray, "lights", _OUTPUT_QOS)
-        self.create_subscription(EventPacket, "events", self._on_events, EVENT_QOS)
+        packet_class = message_class(EVENT_PACKETS[0])
+        self._packet_type = f"{packet_class.__module__.partition('.')[0]}/msg/{packet_class.__name__}"
+        self.create_subscription(packet_class, "events", self._on_events, EVENT_QOS)
         self.start_diagnostics(self._on_diagnostics)
 
-    def _on_events(self, message: EventPacket) -> None:
+    def _on_events(self, message: Any) -> None:
         self._packet_s = time.monotonic()
         self._counts["packets"] += 1
         if self._next_seq is not None and message.seq > self._next_seq:
@@ -157,7 +160,8 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
         if now_s > self._packet_s + PATIENCE_S:
             self._laser_s = now_s
             topic = self.resolve_topic_name("events")
-            return f"no messages received on {topic} for {PATIENCE_S:g} s and more"
+            why = self.why_missing(topic, self._packet_type)
+            return f"no messages received on {topic}{why} for {PATIENCE_S:g} s and more"
         has_seen = self._counts["reports"] > self._counts["windows without the laser"]
         patience_s = _SEEN_PATIENCE_S if has_seen else _LASER_PATIENCE_S
         if self._has_laser and now_s > self._laser_s + patience_s:

@@ -37,6 +37,8 @@ SWARM_POSES = f"{MESSAGE_PACKAGE}/msg/SwarmPoses"
 SWARM_SIGHTINGS = f"{MESSAGE_PACKAGE}/msg/SwarmSightings"
 LASER = f"{MESSAGE_PACKAGE}/msg/LaserDistance"
 LIGHTS = f"{MESSAGE_PACKAGE}/msg/LightBearingArray"
+EVENT_PACKETS = ("event_camera_msgs/msg/EventPacket", f"{MESSAGE_PACKAGE}/msg/EventPacket")
+"""The type of events and our copy of it, with the same fields: nodes use the first one that is installed."""
 
 STANDARD = """
 builtin_interfaces/Time: int32 sec, uint32 nanosec
