@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from swarm_loc_estimator.common.command_line import program
+from swarm_loc_estimator.common.command_line import Program
 
-droplet_driver_node = program("swarm_loc_drivers.droplet.droplet_driver_node")
-droplet_fleet_node = program("swarm_loc_drivers.droplet.droplet_fleet_node")
-droplet_steering_node = program("swarm_loc_drivers.sim.scenarios.droplet_steering_node")
-droplet_world_node = program("swarm_loc_drivers.sim.droplet.droplet_world_node")
-eight_steering_node = program("swarm_loc_drivers.sim.scenarios.eight_steering_node")
-epuck_driver_node = program("swarm_loc_drivers.epuck.epuck_driver_node")
-epuck_world_node = program("swarm_loc_drivers.sim.epuck.epuck_world_node")
-exploration_node = program("swarm_loc_drivers.pushbot.exploration_node")
-generate_bag = program("swarm_loc_drivers.sim.generate_bag")
-pushbot_driver_node = program("swarm_loc_drivers.pushbot.pushbot_driver_node")
-pushbot_world_node = program("swarm_loc_drivers.sim.pushbot.pushbot_world_node")
-simulate = program("swarm_loc_drivers.sim.simulate")
+droplet_driver_node = Program("swarm_loc_drivers.droplet.droplet_driver_node")
+droplet_fleet_node = Program("swarm_loc_drivers.droplet.droplet_fleet_node")
+droplet_steering_node = Program("swarm_loc_drivers.sim.scenarios.droplet_steering_node")
+droplet_world_node = Program("swarm_loc_drivers.sim.droplet.droplet_world_node")
+eight_steering_node = Program("swarm_loc_drivers.sim.scenarios.eight_steering_node")
+epuck_driver_node = Program("swarm_loc_drivers.epuck.epuck_driver_node")
+epuck_world_node = Program("swarm_loc_drivers.sim.epuck.epuck_world_node")
+exploration_node = Program("swarm_loc_drivers.pushbot.exploration_node")
+generate_bag = Program("swarm_loc_drivers.sim.generate_bag")
+pushbot_driver_node = Program("swarm_loc_drivers.pushbot.pushbot_driver_node")
+pushbot_world_node = Program("swarm_loc_drivers.sim.pushbot.pushbot_world_node")
+simulate = Program("swarm_loc_drivers.sim.simulate")

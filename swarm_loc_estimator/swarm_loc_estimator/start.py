@@ -1,20 +1,50 @@
-"""The executables of this package, each imported only when it is started."""
+"""The executables of this package, each imported only when it is started; `swarm-loc` starts each by name."""
 
 from __future__ import annotations
 
-from swarm_loc_estimator.common.command_line import program
+import sys
+from pathlib import Path
 
-calibrate = program("swarm_loc_estimator.cli.calibrate")
-calibrate_ir = program("swarm_loc_estimator.cli.calibrate_ir")
-demo = program("swarm_loc_estimator.cli.demo")
-estimator_node = program("swarm_loc_estimator.nodes.estimator_node")
-graph = program("swarm_loc_estimator.cli.graph")
-import_droplets = program("swarm_loc_estimator.cli.import_droplets")
-import_mrclam = program("swarm_loc_estimator.cli.import_mrclam")
-mapper_node = program("swarm_loc_estimator.nodes.mapper_node")
-markers_node = program("swarm_loc_estimator.watch.markers_node")
-play = program("swarm_loc_estimator.nodes.play_node")
-replay = program("swarm_loc_estimator.cli.replay")
-replay_map = program("swarm_loc_estimator.cli.replay_map")
-watch = program("swarm_loc_estimator.cli.watch")
-watch_node = program("swarm_loc_estimator.watch.watch_node")
+from swarm_loc_estimator.common.command_line import Program
+
+calibrate = Program("swarm_loc_estimator.cli.calibrate")
+calibrate_ir = Program("swarm_loc_estimator.cli.calibrate_ir")
+demo = Program("swarm_loc_estimator.cli.demo")
+estimator_node = Program("swarm_loc_estimator.nodes.estimator_node")
+graph = Program("swarm_loc_estimator.cli.graph")
+import_droplets = Program("swarm_loc_estimator.cli.import_droplets")
+import_mrclam = Program("swarm_loc_estimator.cli.import_mrclam")
+mapper_node = Program("swarm_loc_estimator.nodes.mapper_node")
+markers_node = Program("swarm_loc_estimator.watch.markers_node")
+play = Program("swarm_loc_estimator.nodes.play_node")
+replay = Program("swarm_loc_estimator.cli.replay")
+replay_map = Program("swarm_loc_estimator.cli.replay_map")
+watch = Program("swarm_loc_estimator.cli.watch")
+watch_node = Program("swarm_loc_estimator.watch.watch_node")
+
+WITHOUT_ROS = (calibrate, calibrate_ir, import_droplets, import_mrclam, replay, replay_map)
+
+
+def swarm_loc() -> int:
+    """`swarm-loc NAME ARGUMENTS...` does what `ros2 run swarm_loc_estimator NAME ARGUMENTS...` does."""
+    programs = {name: value for name, value in globals().items() if isinstance(value, Program)}
+    name = sys.argv[1] if len(sys.argv) > 1 else "--help"
+    if name in programs:
+        sys.argv[:2] = [f"{sys.argv[0]} {name}"]
+        return programs[name]()
+    if name not in ("-h", "--help"):
+        print(f"swarm-loc has no command '{name}'; swarm-loc --help lists them.", file=sys.stderr)
+        return 2
+    print("swarm-loc COMMAND ARGUMENTS...; swarm-loc COMMAND --help shows the arguments of a command.")
+    for title, has_ros in (("Without ROS 2", False), ("With ROS 2", True)):
+        print(f"\n{title}:")
+        for name, program in programs.items():
+            if (program not in WITHOUT_ROS) == has_ros:
+                print(f"  {name:16} {_summary(program.module)}")
+    return 0
+
+
+def _summary(module: str) -> str:
+    """First line of a module's docstring, without importing it."""
+    path = Path(__file__).parent.joinpath(*module.split(".")[1:]).with_suffix(".py")
+    return path.read_text(encoding="utf-8").partition("\n")[0].strip('"')

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from swarm_loc_estimator.common.command_line import program
+from swarm_loc_estimator.common.command_line import Program
 
-calibrate_laser = program("swarm_loc_vision.laser.calibrate_laser_node")
-aerial_camera_node = program("swarm_loc_vision.aerial.aerial_camera_node")
-detect = program("swarm_loc_vision.markers.detect")
-event_tracker_node = program("swarm_loc_vision.events.event_tracker_node")
-marker_detector_node = program("swarm_loc_vision.markers.marker_detector_node")
+calibrate_laser = Program("swarm_loc_vision.laser.calibrate_laser_node")
+aerial_camera_node = Program("swarm_loc_vision.aerial.aerial_camera_node")
+detect = Program("swarm_loc_vision.markers.detect")
+event_tracker_node = Program("swarm_loc_vision.events.event_tracker_node")
+marker_detector_node = Program("swarm_loc_vision.markers.marker_detector_node")

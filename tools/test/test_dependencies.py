@@ -17,10 +17,7 @@ KEYS = {
     "PIL": "python3-pil",
     "cv2": "python3-opencv",
     "llvmlite": "python3-numba",  # which stands on it
-    "rosbags": "python3-rosbags-pip",
     "ruamel": "python3-ruamel.yaml",
-    # rosdep has no keys of these three: they come with this one
-    **dict.fromkeys(("lz4", "mcap", "zstandard"), "mcap-ros2-support"),
 } | {
     module: f"python3-{module.replace('_', '-')}"
     for module in (
@@ -36,6 +33,10 @@ KEYS = {
     )
 }
 """What rosdep calls modules that are no ROS packages."""
+FOR_BAGS = {"lz4", "mcap", "rosbags", "zstandard"}
+"""rosdep knows no packages of them but by pip, and bloom refuses a package that depends on such ones."""
+PIP_NAMES = {"python3-pil": "pillow"}
+"""What pip calls packages in which rosdep's name is another one."""
 LOADED_BY_NAME = {"swarm_loc_estimator": {"event_camera_msgs"}}
 """Packages that `message_class` imports."""
 HERE = {"_typeshed", "bench", "workspace"} | {path.stem for path in ROOT.glob("swarm_loc_*/test/**/*.py")}
@@ -52,7 +53,8 @@ def imported(package: Path, folders: Iterable[str]) -> set[str]:
         elif isinstance(node, ast.ImportFrom) and not node.level:
             names.add(node.module or "")
     modules = {name.partition(".")[0] for name in names}
-    return {KEYS.get(module, module) for module in modules - {package.name} - HERE - sys.stdlib_module_names}
+    modules -= {package.name} | HERE | sys.stdlib_module_names
+    return {KEYS.get(module, module) for module in modules - FOR_BAGS}
 
 
 def declared(package: Path, kind: str) -> set[str]:
@@ -77,6 +79,27 @@ def test_colcon_runs_the_tests_by_pytest(name: str) -> None:
     assert {f"python3-{extra}" for extra in extras} <= declared(ROOT / name, "test_depend")
 
 
+def least_versions(*lines: str) -> dict[str, str]:
+    """Package -> its lower bound, of lines such as numpy>=1.24,<3."""
+    found = (re.match(r"([\w.-]+)>=([\w.]+)", line) for line in lines)
+    return {one[1]: one[2] for one in found if one}
+
+
+def test_a_wheel_of_the_estimator_requires_what_it_imports_as_the_workspace_does() -> None:
+    config = ConfigParser()
+    config.read(ROOT / "swarm_loc_estimator" / "setup.cfg", encoding="utf-8")
+    required = config["options"]["install_requires"].splitlines()
+    required += [line for lines in config["options.extras_require"].values() for line in lines.splitlines()]
+    of_wheel = least_versions(*required)
+    workspace = least_versions(*(ROOT / "requirements" / "workspace.txt").read_text("utf-8").splitlines())
+    assert {name: workspace[name] for name in of_wheel} == of_wheel
+    keys = imported(ROOT / "swarm_loc_estimator", ["swarm_loc_estimator"])
+    from_pip = {
+        PIP_NAMES.get(key, key.removeprefix("python3-")) for key in keys if key.startswith("python3-")
+    }
+    assert {name.replace("_", "-") for name in of_wheel} == from_pip | FOR_BAGS
+
+
 @pytest.mark.parametrize("name", ["swarm_loc_vision", "swarm_loc_drivers"])
 def test_of_the_estimator_others_import_only_common_swarm_and_the_public_api(name: str) -> None:
     allowed = re.compile(r"swarm_loc_estimator(\.(common|swarm)(\..+)?)?")
@@ -97,3 +120,43 @@ def test_a_driver_loads_neither_the_filter_nor_what_pages_and_plots_need(node: s
     assert module in loaded
     unwanted = {"aiohttp", "matplotlib", "swarm_loc_estimator.filter", "swarm_loc_estimator.timeline"}
     assert not unwanted & loaded
+
+
+NODES = [
+    ".".join(path.relative_to(ROOT).with_suffix("").parts[1:])
+    for path in sorted(ROOT.glob("swarm_loc_*/swarm_loc_*/**/*_node.py"))
+]
+LIVE = {
+    *NODES,
+    "swarm_loc_estimator.cli.graph",
+    "swarm_loc_estimator.cli.watch",
+    "swarm_loc_drivers.sim.simulate",
+}
+LIVE -= {"swarm_loc_estimator.nodes.play_node"}
+IMPORT_WITHOUT_BAGS = f"""
+import importlib, sys
+
+class Refused:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {FOR_BAGS}:
+            raise ImportError(f"{{name}} is refused")
+
+sys.meta_path.insert(0, Refused())
+for module in sys.argv[1:]:
+    importlib.import_module(module)
+"""
+
+
+def import_without_bags(*modules: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", IMPORT_WITHOUT_BAGS, *modules]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+def test_live_nodes_need_nothing_that_only_bags_need() -> None:
+    assert len(LIVE) > 20
+    done = import_without_bags(*sorted(LIVE))
+    assert done.returncode == 0, done.stderr
+
+
+def test_the_refusal_refuses() -> None:
+    assert "rosbags is refused" in import_without_bags("swarm_loc_estimator.nodes.play_node").stderr

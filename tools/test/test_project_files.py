@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import xml.etree.ElementTree as ET
+from configparser import ConfigParser
 from typing import Any
 
 import pytest
@@ -77,6 +79,19 @@ def test_the_citation_has_version_and_license_of_the_packages(package: str) -> N
     manifest = (ROOT / package / "package.xml").read_text(encoding="utf-8")
     assert f"<version>{citation['version']}</version>" in manifest
     assert f"<license>{citation['license']}</license>" in manifest
+
+
+@pytest.mark.parametrize("package", PACKAGES[1:])
+def test_pip_and_ros_say_the_same_of_a_package(package: str) -> None:
+    config = ConfigParser(interpolation=None)
+    config.read(ROOT / package / "setup.cfg", encoding="utf-8")
+    manifest = ET.parse(ROOT / package / "package.xml").getroot()  # noqa: S314 - our own file
+    said = {name: manifest.findtext(name) for name in ("name", "version", "description", "license")}
+    maintainer = manifest.find("maintainer")
+    assert maintainer is not None
+    said |= {"author": maintainer.text, "author_email": maintainer.get("email")}
+    assert {name: config["metadata"][name] for name in said} == said
+    assert [{"name": said["author"]}] == read_yaml("CITATION.cff")["authors"]
 
 
 def test_every_paper_of_the_citation_stands_in_the_readme() -> None:

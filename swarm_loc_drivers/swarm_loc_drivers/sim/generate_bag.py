@@ -113,7 +113,7 @@ def _pushbots(options: argparse.Namespace, comment: str) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = command_parser("generate_bag", __doc__)
+    parser = command_parser(__doc__)
     swarms = parser.add_subparsers(dest="swarm", required=True, metavar="SWARM")
     eight = _swarm(swarms, "eight", "e-pucks that drive along an eight among wall markers", 5, 9, 54.0)
     eight.set_defaults(write=_eight)

@@ -33,7 +33,7 @@ from swarm_loc_vision.markers.detector import precompile
 
 def parse(arguments: Sequence[str] | None) -> SimulationOptions:
     """Read the command line."""
-    parser = command_parser("simulate", __doc__)
+    parser = command_parser(__doc__)
     parser.add_argument("swarm_file", metavar="SWARM_FILE", help="the swarm description")
     defaults = SimulationOptions("")
     parser.add_argument(

@@ -54,7 +54,7 @@ def _unused(recording: Recording) -> list[str]:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = command_parser("calibrate", __doc__)
+    parser = command_parser(__doc__)
     add_bag(parser, " with <robot>/ground_truth")
     add_remap(parser)
     parser.add_argument("--out", type=yaml_to_write, required=True, help="swarm description to write")

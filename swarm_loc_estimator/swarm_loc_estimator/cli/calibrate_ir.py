@@ -67,7 +67,7 @@ def _board(options: argparse.Namespace, swarm: Swarm) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = command_parser("calibrate_ir", __doc__)
+    parser = command_parser(__doc__)
     add_bag(parser, " with <robot>/brightness")
     add_remap(parser)
     parser.add_argument(

@@ -179,7 +179,7 @@ class _Progress:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = command_parser("demo", __doc__)
+    parser = command_parser(__doc__)
     parser.add_argument("bag", nargs="?", type=Path, default=BAG, help=f"what to play (default: {BAG})")
     parser.add_argument(
         "--rate", type=number_in(0.1, 100.0), default=RATE, help=f"speed of the bag (default: {RATE:g})"

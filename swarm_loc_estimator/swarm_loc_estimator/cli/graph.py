@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.command_line import exit_with_message, number_in
+from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
 from swarm_loc_estimator.common.launch import GraphOptions, check_parameter_file, graph_nodes, run_graph
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
 def parse(arguments: Sequence[str]) -> GraphOptions:
     """Read the command line."""
-    parser = argparse.ArgumentParser(prog="graph", description=__doc__)
+    parser = command_parser(__doc__)
     parser.add_argument("swarm_file", metavar="SWARM_FILE", help="the swarm description")
     parser.add_argument("--bag", help="play this bag into the graph, which then runs on the bag's clock")
     parser.add_argument(
@@ -38,6 +36,8 @@ def check_graph(options: GraphOptions) -> None:
     """
     load_swarm(Path(options.swarm_file))
     if options.bag is not None:
+        from swarm_loc_estimator.common.bags.reader import BagReader  # noqa: PLC0415 - live graphs read no bag
+
         with BagReader(Path(options.bag)):
             pass
     check_parameter_file(options.parameter_file)

@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = command_parser("import_droplets", __doc__)
+    parser = command_parser(__doc__)
     parser.add_argument("recording", type=Path, help="text file, one exchange a line")
     parser.add_argument("bag", type=Path, help="bag folder to create")
     parser.add_argument(

@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = command_parser("import_mrclam", __doc__)
+    parser = command_parser(__doc__)
     parser.add_argument("folder", type=Path, help="folder with Robot*_Odometry.dat and the other files")
     parser.add_argument("bag", type=Path, help="bag folder to create")
     parser.add_argument(

@@ -106,7 +106,7 @@ def write_poses(result: ReplayResult, path: Path) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = command_parser("replay", __doc__)
+    parser = command_parser(__doc__)
     add_bag(parser)
     add_remap(parser)
     parser.add_argument("--out", type=folder_to_write, default="out/replay", help="folder for the report")

@@ -105,7 +105,7 @@ def write_stops(mapper: CooperativeMapper, name_of: Mapping[int, str], path: Pat
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = command_parser("replay_map", __doc__)
+    parser = command_parser(__doc__)
     add_bag(parser)
     parser.add_argument("--out", type=folder_to_write, default="out/map", help="folder for map and picture")
     parser.add_argument("--walls", type=Path, help="floor plan to draw below the map: x0,y0,x1,y1 a line")

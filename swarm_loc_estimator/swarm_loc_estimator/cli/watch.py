@@ -66,7 +66,7 @@ def watch_nodes(options: argparse.Namespace) -> list[NodeSpec]:
 
 def parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = command_parser("watch", __doc__)
+    parser = command_parser(__doc__)
     parser.add_argument("source", metavar="SWARM_FILE|BAG", type=Path, help="swarm description, or a bag")
     parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
     parser.add_argument("--address", default=_DEFAULT.address, help="what to listen on (default: 127.0.0.1)")

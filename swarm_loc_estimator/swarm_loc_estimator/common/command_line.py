@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import wraps
 from importlib import import_module
 from pathlib import Path
@@ -33,25 +34,46 @@ _INTERRUPTED = 130
 """Exit status of a program that SIGINT has ended, as shells count."""
 _REDRAW_S = 0.1
 _WIDTH = 30
+_ROS = ("ament_index_python", "launch", "launch_ros", "rclpy")
+_FOR_BAGS = ("lz4", "mcap", "rosbags", "zstandard")
+"""Only for bags; rosdep knows no packages of them but by pip, so package.xml does not name them."""
 
 
-def program(module: str) -> Callable[[], int]:
+@dataclass(frozen=True)
+class Program:
     """An entry point that imports a module only when it is called, and then runs its `main`.
 
-    A signal during the import ends the process with status 128 + n and without a traceback.
+    A signal during the import ends the process with status 128 + n and without a traceback, a missing package
+    of others with one sentence and status 1.
 
-    Args:
+    Attributes:
         module: Full name of the module.
     """
 
-    def start() -> int:
-        handlers = {number: signal.signal(number, lambda n, _: os._exit(128 + n)) for number in _SIGNALS}
-        main: Callable[[], int] = import_module(module).main
-        for number, handler in handlers.items():
-            signal.signal(number, handler)
-        return main()
+    module: str
 
-    return start
+    def __call__(self) -> int:
+        """Run the program; returns its exit status."""
+        handlers = {number: signal.signal(number, lambda n, _: os._exit(128 + n)) for number in _SIGNALS}
+        try:
+            main: Callable[[], int] = import_module(self.module).main
+            for number, handler in handlers.items():
+                signal.signal(number, handler)
+            return main()
+        except ModuleNotFoundError as error:
+            missing = (error.name or "").partition(".")[0]
+            if missing == self.module.partition(".")[0]:
+                raise
+            print(f"{Path(sys.argv[0]).name} {_needs(missing)}.", file=sys.stderr)
+            return 1
+
+
+def _needs(missing: str) -> str:
+    """What a program needs that cannot import a package, and how to get it."""
+    if missing in _ROS or missing.endswith("_msgs"):
+        return f"needs ROS 2 and this workspace, built and sourced: there is no Python package {missing}"
+    advice = f": pip install {' '.join(_FOR_BAGS)}" if missing in _FOR_BAGS else ""
+    return f"needs the Python package {missing}, which is not installed{advice}"
 
 
 def exit_with_message(main: Callable[Arguments, int]) -> Callable[Arguments, int]:
@@ -73,10 +95,10 @@ def exit_with_message(main: Callable[Arguments, int]) -> Callable[Arguments, int
     return wrapped
 
 
-def command_parser(name: str, description: str | None) -> argparse.ArgumentParser:
+def command_parser(description: str | None) -> argparse.ArgumentParser:
     """The parser of a command, whose description keeps its line breaks."""
     formatter = argparse.RawDescriptionHelpFormatter
-    return argparse.ArgumentParser(prog=name, description=description, formatter_class=formatter)
+    return argparse.ArgumentParser(description=description, formatter_class=formatter)
 
 
 def number_in(low: Number, high: Number, unit: str = "") -> Callable[[str], Number]:

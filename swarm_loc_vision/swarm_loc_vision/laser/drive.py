@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from swarm_loc_estimator import decode_laser
-from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.cdr import CdrError
 from swarm_loc_estimator.common.messages.definitions import LASER, ODOMETRY
 from swarm_loc_estimator.common.messages.poses import decode_odometry
@@ -92,6 +91,8 @@ def recorded_drive(bag: Path, robot: str, drive: WallDrive) -> WallDrive:
         CalibrationError: A topic has no usable message, or the robot turns on its way.
         UserError: The bag cannot be read.
     """
+    from swarm_loc_estimator.common.bags.reader import BagReader  # noqa: PLC0415 - a live drive reads no bag
+
     prefix = f"{robot}/" if robot else ""
     types = {f"{prefix}odom": ODOMETRY, f"{prefix}laser": LASER}
     seen = dict.fromkeys(types, 0)

@@ -194,7 +194,7 @@ def _summary(name: str, camera: CameraDetector) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
-    parser = command_parser("detect", __doc__)
+    parser = command_parser(__doc__)
     add_bag(parser)
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="the new bag")
     add_set(parser, "parameter of marker_detector_node")

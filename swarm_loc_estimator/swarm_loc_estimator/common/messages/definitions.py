@@ -128,18 +128,19 @@ SEQUENCE = -1
 def message_folder() -> Path:
     """The folder with this workspace's `.msg` files.
 
-    In a source tree it lies beside this package; an installed one is found as ROS does, on AMENT_PREFIX_PATH.
+    It lies in this package: as a link in a source tree, with its content in a wheel. In a package that was
+    built without its neighbours the link leads nowhere; then it is found as ROS does, on AMENT_PREFIX_PATH.
 
     Raises:
         DefinitionsNotFoundError: It is in neither place.
     """
-    beside = Path(__file__).resolve().parents[4] / MESSAGE_PACKAGE / "msg"
+    own = Path(__file__).parent / "msg"
     prefixes = [one for one in os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep) if one]
-    for folder in (beside, *(Path(prefix, "share", MESSAGE_PACKAGE, "msg") for prefix in prefixes)):
+    for folder in (own, *(Path(prefix, "share", MESSAGE_PACKAGE, "msg") for prefix in prefixes)):
         if any(folder.glob("*.msg")):
             return folder
     raise DefinitionsNotFoundError(
-        f"The message definitions of {MESSAGE_PACKAGE} are neither in '{beside}' nor under a prefix on"
+        f"The message definitions of {MESSAGE_PACKAGE} are neither in '{own}' nor under a prefix on"
         " AMENT_PREFIX_PATH; build the workspace and source its set-up first."
     )
 

@@ -298,7 +298,7 @@ def _fitted(level: FloatArray, error: FloatArray, start: float) -> tuple[float, 
         kept = error**2 < _TRIM**2 * variance
         weighted = terms[:, kept] / variance[kept] ** 2
         normal, right = weighted @ terms[:, kept].T, weighted @ (error[kept] ** 2 / _TRIMMED)
-        parts = np.linalg.lstsq(normal, right)[0]  # singular for a sensor that is never lit
+        parts = np.linalg.lstsq(normal, right, rcond=None)[0]  # singular for a sensor that is never lit
         if parts.min() < 0.0:
             single = np.maximum(right / np.maximum(np.diag(normal), _TINY), 1e-9)
             parts = np.where(parts < 0.0, 0.0, single)
