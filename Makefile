@@ -1,6 +1,7 @@
 # make demo     sets up what is missing, then localizes a simulated swarm through the live graph
 # make test     lint, types, unit tests without ROS, node tests over DDS
 # make bench-NAME [ARGS="..."]   prints a table, draws it under out/, writes out/bench/NAME.json
+# make test-lowest   unit tests with the oldest versions that requirements/workspace.txt allows
 # make house     prints the figures of the layout, writes out/bench/house.json
 # make docs      builds the documentation site: out/docs/index.html
 # make setup | lint | types | unit | node | clean
@@ -13,7 +14,7 @@ MYPY := ./run -- mypy --num-workers 2
 PYTEST := ./run -- env -u PYTHONDONTWRITEBYTECODE PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 pytest \
     -p xdist.plugin -p pytest_timeout -p _hypothesis_pytestplugin --numprocesses 2 --dist worksteal
 
-.PHONY: demo test lint types unit node house docs setup clean
+.PHONY: demo test lint types unit node test-lowest house docs setup clean
 
 demo: setup
 	@./run swarm_loc_estimator demo $(ARGS)
@@ -35,6 +36,16 @@ unit: setup
 
 node: setup
 	@$(PYTEST) $(wildcard $(PACKAGES:=/test/node)) $(ARGS)
+
+# The oldest numba supports Python 3.11 at most.
+LOWEST := .workspace/lowest
+test-lowest: setup
+	@./run -- uv venv --quiet --allow-existing --python 3.11 $(LOWEST)
+	@./run -- uv pip install --quiet --python $(LOWEST) --resolution lowest-direct --requirement requirements/workspace.txt
+	@env PYTHONPATH="$(CURDIR)/swarm_loc_estimator:$(CURDIR)/swarm_loc_vision:$(CURDIR)/swarm_loc_drivers" \
+	    PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 $(LOWEST)/bin/python -m pytest \
+	    -p xdist.plugin -p pytest_timeout -p _hypothesis_pytestplugin --numprocesses 2 --dist worksteal --timeout 600 \
+	    -W ignore::DeprecationWarning $(wildcard $(PACKAGES:=/test/unit)) $(ARGS)
 
 setup:
 	@$(PYTHON) tools/setup_workspace.py
