@@ -42,9 +42,9 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import encode
 from swarm_loc_estimator.common.messages.definitions import (
+    EVENT_PACKETS,
     LASER,
     LIGHTS,
-    MESSAGE_PACKAGE,
     OCCUPANCY_GRID,
     ODOMETRY,
     POSE_STAMPED,
@@ -59,7 +59,6 @@ from swarm_loc_estimator.common.messages.poses import (
 )
 from swarm_loc_estimator.swarm.swarm import FixModel, OdometryModel, Robot, StartSigma, Swarm
 
-EVENTS = f"{MESSAGE_PACKAGE}/msg/EventPacket"
 EVENT_STEP_US = 5_000
 """Time of an event packet, as the driver makes them."""
 BEGIN_NS = 1_700_000_000_000_000_000
@@ -291,7 +290,7 @@ def _events(names: list[str], poses: FloatArray, cameras: HallSight) -> list[Str
                 events = Events(x, y, seen.polarity == 0, since_ns)
                 data.append(_encode_packet(name, stamps[-1], len(data), events))
         arrival_ns = np.array(stamps, dtype=np.int64) + 1000 * EVENT_STEP_US
-        streams.append(Stream(f"{name}/events", EVENTS, arrival_ns, data))
+        streams.append(Stream(f"{name}/events", EVENT_PACKETS[0], arrival_ns, data))
     return streams
 
 
@@ -305,7 +304,7 @@ def _encode_packet(name: str, stamp_ns: int, number: int, events: Events) -> byt
         "encoding": ENCODING,
         "events": encode_events(events),
     }
-    return encode(message, EVENTS)
+    return encode(message, EVENT_PACKETS[1])
 
 
 def _encode_map(stamp_ns: int, occupancy: OccupancyMap) -> bytes:

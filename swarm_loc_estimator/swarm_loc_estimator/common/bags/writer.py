@@ -27,7 +27,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from typing_extensions import Self
 
 from swarm_loc_estimator.common.bags.bag_file import BagError
-from swarm_loc_estimator.common.messages.definitions import MESSAGE_PACKAGE, message_folder
+from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS, MESSAGE_PACKAGE, message_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -66,6 +66,7 @@ def typestore() -> Typestore:
     for path in sorted(message_folder().glob("*.msg")):
         name = f"{MESSAGE_PACKAGE}/msg/{path.stem}"
         types.update(get_types_from_msg(path.read_text(encoding="utf-8"), name))
+    types[EVENT_PACKETS[0]] = types[EVENT_PACKETS[1]]
     store.register(types)
     return store
 
