@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import io
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from PIL import Image
@@ -72,9 +73,11 @@ def broken(stamp_ns: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> np
 def save(figure: Figure, path: Path) -> None:
     """Write a PNG with few colours and without version or time: equal results give equal files."""
     figure.set_layout_engine("constrained", w_pad=_PAD_IN, h_pad=_PAD_IN)
-    drawn = io.BytesIO()
-    figure.savefig(drawn, dpi=_DPI, format="png")
-    Image.open(drawn).convert("RGB").quantize(_PALETTE).save(path, format="png", optimize=True)
+    figure.set_dpi(_DPI)
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()  # savefig would draw twice, the first time only to arrange the axes
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    image.quantize(_PALETTE).save(path, format="png", optimize=True)
 
 
 _MAX_POINTS = 8000
