@@ -24,7 +24,7 @@ class DropletTraits:
         "droplet", tuple(DROPLET_MODELS), "an audio_droplet moves only ahead, back and in turns"
     )
     reply_timeout_s: float = number(0.3, "s", 0.01, 10.0, "how long an echo or an answer may take")
-    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "without cmd_vel for so long the robot stops")
+    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "time without cmd_vel until the robot stops")
     stride_s: float = number(
         2.0, "s", 0.2, 60.0, "duration of a commanded motion, which continues for so long if the driver dies"
     )

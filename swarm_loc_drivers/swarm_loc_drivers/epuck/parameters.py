@@ -41,13 +41,13 @@ class EpuckParameters:
         "1/s",
         0.1,
         200.0,
-        "readings that are wanted; a serial robot is asked so often and at each cmd_vel,"
-        " of a stream's 50 some are used",
+        "rate of used readings: a serial robot is polled at it and at each cmd_vel,"
+        " of a stream's 50 the others are skipped",
     )
     reply_timeout_s: float = number(
         0.5, "s", 0.01, 10.0, "how long an answer may take; a stream may be silent 1.5 s longer"
     )
-    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "without cmd_vel for so long the robot stops")
+    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "time without cmd_vel until the robot stops")
     wheel_diameter: float = number(0.041, "m", 0.001, 1.0, "diameter of the wheels")
     wheel_separation: float = number(
         _ODOMETRY.wheel_separation, "m", 0.001, 10.0, "distance between the two wheels"

@@ -38,7 +38,7 @@ class PushbotParameters:
     reply_timeout_s: float = number(
         0.5, "s", 0.05, 10.0, "how long an answer, or the next wheel ticks, may take"
     )
-    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "without cmd_vel for so long the robot stops")
+    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "time without cmd_vel until the robot stops")
     metres_per_tick: float = number(1e-4, "m", 1e-6, 1e-2, "path of a wheel per tick")
     wheel_separation: float = number(0.085, "m", 0.01, 1.0, "distance between the two wheels")
     wheel_noise: float = number(
@@ -87,7 +87,7 @@ class ExplorationParameters:
     """Parameters of `exploration_node`; how the robots move is in its settings."""
 
     swarm_file: str = text("", "path of the swarm description", required=True)
-    robots: tuple[str, ...] = texts("those that are driven; empty: all of the description")
+    robots: tuple[str, ...] = texts("robots that are driven; empty: all of the description")
     wait_for_poses: bool = flag(False, "begin only when swarm/poses is announced, too")
     settings: StopAndGoSettings = field(
         default_factory=StopAndGoSettings, metadata={"numbers_of": StopAndGoSettings}

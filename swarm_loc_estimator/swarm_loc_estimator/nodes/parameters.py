@@ -50,13 +50,13 @@ class MapperParameters:
     """Parameters of `mapper_node`; those of the mapper itself are its settings."""
 
     swarm_file: str = text("", "path of the swarm description", required=True)
-    robots: tuple[str, ...] = texts("those that map; empty: all of the description")
+    robots: tuple[str, ...] = texts("robots that map; empty: all of the description")
     led_frequencies: tuple[str, ...] = texts(
         "of the robots' LEDs, such as pushbot1=1000 [Hz]; empty: lights are not used"
     )
     map_frame: str = text("map", "frame of the map, the fixes and the goals", required=True)
     map_period_s: float = number(2.0, "s", 0.1, 60.0, "period in which a changed map is published")
-    load_map: str = text("", "path of a map's YAML that is put below what the robots see; empty: none")
+    load_map: str = text("", "path of the YAML of an earlier map, the background of the new one; empty: none")
     save_map: str = text("map.yaml", "path of the files that ~/save_map writes", required=True)
     settings: MapperSettings = field(default_factory=MapperSettings, metadata={"numbers_of": MapperSettings})
 
@@ -98,7 +98,7 @@ class WatchParameters:
         "127.0.0.1", "what to listen on; any but a loopback address needs a token", required=True
     )
     port: int = number(8420, "1", 0, 65535, "where to listen; 0: any port that is free")
-    token: str = text("", "what browsers must give as ?token=, 8 characters or more; empty: nothing")
+    token: str = text("", "token that browsers must send as ?token=, 8 characters or more; empty: none")
     rate: float = number(20.0, "Hz", 0.5, 60.0, "how often a page gets new poses, at most")
     commands: bool = flag(
         True, "whether pages may reset the estimator and set poses, each time after a question"

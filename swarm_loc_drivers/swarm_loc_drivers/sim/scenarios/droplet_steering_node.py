@@ -27,7 +27,7 @@ class DropletSteeringParameters:
 
     swarm_file: str = text("", "path of the swarm description; every robot needs a start", required=True)
     seed: int = number(1, "1", 0, 2**31 - 1, "fixes where they go")
-    every: int = number(2, "1", 1, 10_000, "every so many-th robot wanders, the others stand")
+    every: int = number(2, "1", 1, 10_000, "2: every second robot wanders, and so on; the others stand")
 
 
 class DropletSteeringNode(ConfiguredNode[DropletSteeringParameters]):
