@@ -61,7 +61,7 @@ class _OffsetRegression:
 
 
 def fit_offsets(recording: Recording, swarm: Swarm, members: Sequence[int]) -> dict[int, Robot]:
-    """Fit the turn bias, then course and axle offset of robots of one type.
+    """Fit the turn bias, in addition to the described one, then course and axle offset of robots of one type.
 
     Robots with too little ground truth get the mean.
     """
@@ -72,7 +72,7 @@ def fit_offsets(recording: Recording, swarm: Swarm, members: Sequence[int]) -> d
         return {}
     bias = _of_type({index: _turns(one) for index, one in usable.items()}, members, _WIDE_BIAS)
     for index, robot in robots.items():
-        robots[index] = _with(robot, turn_bias=float(bias[index][0]))
+        robots[index] = _with(robot, turn_bias=robot.odometry.turn_bias + float(bias[index][0]))
     usable = {i: one for i in usable if (one := _motion(recording, robots[i], recording.track(i)))}
     offsets = _of_type({index: _laterals(one) for index, one in usable.items()}, members, _WIDE)
     return {
