@@ -19,7 +19,7 @@ PYTEST := ./run -- env -u PYTHONDONTWRITEBYTECODE PYTEST_DISABLE_PLUGIN_AUTOLOAD
 demo: setup
 	@./run swarm_loc_estimator demo $(ARGS)
 
-test: lint unit node
+test: setup lint unit node
 
 lint:
 	./run -- ruff check

@@ -50,11 +50,8 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         return
     print("compiling all inner loops for this machine: about two minutes", flush=True)
     with ProcessPoolExecutor(2, get_context("spawn")) as processes:
-        list(processes.map(_call, _PRECOMPILED))
-
-
-def _call(precompile: Callable[[], None]) -> None:
-    precompile()
+        for done in [processes.submit(one) for one in _PRECOMPILED]:
+            done.result()
 
 
 def pytest_collection_finish() -> None:
