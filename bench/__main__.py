@@ -11,6 +11,7 @@ BENCHMARKS = {
     "droplet": "bench.droplet",
     "droplet_real": "bench.droplet.real",
     "epuck": "bench.epuck",
+    "inputs": "bench.inputs",
     "integrity": "bench.integrity",
     "large_swarms": "bench.graph.large_swarms",
     "live": "bench.graph.live",

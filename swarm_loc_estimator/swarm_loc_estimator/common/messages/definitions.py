@@ -35,6 +35,7 @@ SWARM_DETECTIONS = f"{MESSAGE_PACKAGE}/msg/SwarmDetections"
 SWARM_FIXES = f"{MESSAGE_PACKAGE}/msg/SwarmFixes"
 SWARM_POSES = f"{MESSAGE_PACKAGE}/msg/SwarmPoses"
 SWARM_SIGHTINGS = f"{MESSAGE_PACKAGE}/msg/SwarmSightings"
+RANGES = f"{MESSAGE_PACKAGE}/msg/RangeArray"
 LASER = f"{MESSAGE_PACKAGE}/msg/LaserDistance"
 LIGHTS = f"{MESSAGE_PACKAGE}/msg/LightBearingArray"
 EVENT_PACKETS = ("event_camera_msgs/msg/EventPacket", f"{MESSAGE_PACKAGE}/msg/EventPacket")

@@ -1,0 +1,35 @@
+"""Inputs: how well each kind of sensor locates a swarm, compared with its bound.
+
+A part is a module with a function `measure(seeds, say)`, which returns figures by name and draws plots.
+
+    make bench-inputs
+    make bench-inputs ARGS="--parts uwb mocap --seeds 2"
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+
+from bench.shared.common import ProgressLine, table, write_figures
+
+PARTS: Mapping[str, Callable[[Sequence[int], ProgressLine], Mapping[str, float]]] = {}
+"""Part -> its function. Figures start with the name of the part."""
+
+
+def main() -> None:
+    """Run the parts, print the table, write the figures."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seeds", type=int, default=5, help="runs of each part")
+    parser.add_argument("--parts", nargs="+", choices=[*PARTS], default=[*PARTS])
+    arguments = parser.parse_args()
+    seeds, figures = range(1, arguments.seeds + 1), {}
+    for part in arguments.parts:
+        figures.update(PARTS[part](seeds, ProgressLine(part)))
+        print()
+    print(table(("figure", "value"), list(figures.items())))
+    print(write_figures("inputs", figures))
+
+
+if __name__ == "__main__":
+    main()
