@@ -61,7 +61,10 @@ def pytest_collection_finish() -> None:
 
 @pytest.fixture(autouse=True)
 def _own_ros_domain(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Give a test under `test/node` a domain that no other test on this machine has at the same time."""
+    """Give a test under `test/node` a domain that no other test on this machine has at the same time.
+
+    Tests kill processes. Where Fast DDS 2.14 shares memory with one that was killed, it may crash at its end.
+    """
     if "node" not in request.path.parts:
         yield
         return
@@ -70,6 +73,7 @@ def _own_ros_domain(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
     with domain_id() as domain:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(domain))
         monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        monkeypatch.setenv("FASTDDS_BUILTIN_TRANSPORTS", "UDPv4")
         yield
 
 
