@@ -8,7 +8,7 @@ code.
 from __future__ import annotations
 
 import struct
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, Protocol
@@ -29,7 +29,7 @@ TIME = "builtin_interfaces/msg/Time"
 
 _LITTLE_ENDIAN = b"\x00\x01\x00\x00"
 _ORDERS = {b"\x00\x00": ">", b"\x00\x01": "<"}
-_PRIMITIVES = {order + letter: struct.Struct(order + letter) for order in "<>" for letter in "?bBhHiIqQfd"}
+_struct = lru_cache(maxsize=256)(struct.Struct)
 
 
 class CdrError(ValueError):
@@ -153,6 +153,24 @@ def renamed(dtype: np.dtype[np.void], **shapes: tuple[int, ...]) -> np.dtype[np.
     return np.dtype(layout)  # type: ignore[call-overload,no-any-return]
 
 
+@lru_cache(maxsize=256)
+def _numbers(message_type: str) -> str:
+    """Letters of the numbers of a message that has nothing but single numbers of one type; "": another."""
+    columns = _columns(message_type) or ()
+    is_plain = not any(field.is_array for field in fields_of(message_type))
+    letters = "".join(letter * count for _, letter, count in columns)
+    inner = [field.type for field in fields_of(message_type) if len(field.type) > 1]
+    return letters if is_plain and len(set(letters)) == 1 and all(map(_numbers, inner)) else ""
+
+
+def _filled(message_type: str, numbers: Iterator[Any]) -> SimpleNamespace:
+    """A message with numbers in the order of its fields."""
+    fields = fields_of(message_type)
+    return SimpleNamespace(
+        **{f.name: next(numbers) if len(f.type) == 1 else _filled(f.type, numbers) for f in fields}
+    )
+
+
 @lru_cache(maxsize=4096)
 def _text(raw: bytes) -> str:
     """The characters of a string field, its terminating zero included in `raw`."""
@@ -177,7 +195,13 @@ class _CdrReader:
 
     def message(self, message_type: str, path: str = "") -> Any:
         """The fields of a message."""
-        message = SimpleNamespace(**{one.name: self._field(one, path) for one in fields_of(message_type)})
+        letters = _numbers(message_type) if self._places is None else ""
+        if letters:  # several times faster than one after the other
+            numbers = _struct(self._order + letters)
+            begin = self._take(numbers.size, numbers.size // len(letters))
+            message = _filled(message_type, iter(numbers.unpack_from(self._data, begin)))
+        else:
+            message = SimpleNamespace(**{one.name: self._field(one, path) for one in fields_of(message_type)})
         if message_type == TIME and message.nanosec >= SECOND_NS:
             raise CdrError(f"stamp has {message.nanosec} nanoseconds, more than a second.")
         return message
@@ -203,7 +227,7 @@ class _CdrReader:
     def _value(self, letter: str, place: str) -> Any:
         if len(letter) > 1 and letter != "string":
             return self.message(letter, f"{place}.")
-        number = _PRIMITIVES[self._order + ("I" if letter == "string" else letter)]
+        number = _struct(self._order + ("I" if letter == "string" else letter))
         begin = self._take(number.size, number.size)
         if self._places is not None:
             self._places.setdefault(place, []).append(begin)
@@ -283,7 +307,7 @@ class _CdrWriter:
             self._value("I", len(text))
             self.data += text
         elif len(letter) == 1:
-            number = _PRIMITIVES["<" + letter]
+            number = _struct("<" + letter)
             self._append(number.pack(0 if value is None else value), number.size)
         else:
             self.message({} if value is None else value, letter)

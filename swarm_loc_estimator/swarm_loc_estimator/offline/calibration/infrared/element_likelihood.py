@@ -153,9 +153,10 @@ def _marginalize(
     """
     shares, poses, n = table.shape[0], table.shape[1], stable.shape[1]
     sides, logs, tops = np.empty((poses, 2, n)), np.empty(poses), np.empty((2, n))
-    dark, changed = np.empty((2, n)), np.empty((2, n, shares))
+    dark, changed = np.empty((2, n)), np.empty((shares, 2, n))
     for k in range(stable.shape[0]):
-        _by_side(table[0, 0], stable[k], kinds[k], outlier[k], dark)
+        _likelihoods(table[0, 0], stable[k], kinds[k], outlier[k], changed[0])  # the same at all poses
+        dark[:] = np.log(changed[0])
         tops[:] = -math.inf
         best[k] = 0
         for g in range(poses):
@@ -170,13 +171,15 @@ def _marginalize(
         for g in range(poses):
             if not _counts(logs[g], base, sides[g], dark, tops):
                 continue
-            for s in range(shares):
-                _by_side(table[s, g], stable[k], kinds[k], outlier[k], changed[:, :, s])
+            changed[WHOLE] = np.exp(sides[g])
+            for s in range(1, shares):
+                if s != WHOLE:
+                    _likelihoods(table[s, g], stable[k], kinds[k], outlier[k], changed[s])
             for side in range(2):
                 for e in range(n):
+                    others = math.exp(logs[g] - sides[g, side, e] - base)
                     for s in range(shares):
-                        log = logs[g] - sides[g, side, e] + changed[side, e, s]
-                        found[k, side, e, s] += math.exp(log - base)
+                        found[k, side, e, s] += others * changed[s, side, e]
         for side in range(2):
             for e in range(n):
                 for s in range(shares):
@@ -204,7 +207,24 @@ def _by_side(
     sides: FloatArray,
 ) -> float:
     """Write the log likelihood of each sensor's and each emitter's readings (2, n); returns the total."""
-    n, total = stable.shape[0], 0.0
+    _likelihoods(light, stable, kinds, outlier, sides)
+    total = 0.0
+    for e in range(stable.shape[0]):
+        sides[0, e], sides[1, e] = math.log(sides[0, e]), math.log(sides[1, e])
+        total += sides[0, e]
+    return total
+
+
+@cached_njit
+def _likelihoods(
+    light: Float32Array,
+    stable: FloatArray,
+    kinds: NDArray[np.int8],
+    outlier: FloatArray,
+    sides: FloatArray,
+) -> None:
+    """Write the likelihood of each sensor's and each emitter's readings (2, n), at least `LOWEST`."""
+    n = stable.shape[0]
     for e in range(n):
         sides[1, e] = 1.0
     for i in range(n):
@@ -219,8 +239,6 @@ def _by_side(
                 density += PEAK * math.exp(-0.5 * off * off)
             row *= density
             sides[1, j] *= density
-        sides[0, i] = math.log(max(row, LOWEST))
-        total += sides[0, i]
+        sides[0, i] = max(row, LOWEST)
     for e in range(n):
-        sides[1, e] = math.log(max(sides[1, e], LOWEST))
-    return total
+        sides[1, e] = max(sides[1, e], LOWEST)
