@@ -15,7 +15,7 @@ import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -50,12 +50,18 @@ class Module:
         """Its syntax tree."""
         return ast.parse(self.text)
 
+    @cached_property
+    def nodes(self) -> list[ast.AST]:
+        """All nodes of its syntax tree."""
+        return list(ast.walk(self.tree))
+
     @property
     def line_count(self) -> int:
         """All lines, blank ones and comments included."""
         return len(self.text.splitlines())
 
 
+@cache
 def product_modules(root: Path = ROOT) -> list[Module]:
     """All modules of the three packages, tests excluded."""
     found = []
@@ -74,7 +80,7 @@ def import_graph(modules: Sequence[Module]) -> dict[str, set[str]]:
     graph: dict[str, set[str]] = {}
     for module in modules:
         found: set[str] = set()
-        for node in ast.walk(module.tree):
+        for node in module.nodes:
             if isinstance(node, ast.Import):
                 found |= {one.name for one in node.names}
             elif isinstance(node, ast.ImportFrom) and not node.level and node.module:
@@ -114,7 +120,7 @@ def duplicate_classes(modules: Sequence[Module]) -> list[str]:
     """Class names that a package defines more than once, with their modules."""
     places: dict[tuple[str, str], list[str]] = defaultdict(list)
     for module in modules:
-        for node in ast.walk(module.tree):
+        for node in module.nodes:
             if isinstance(node, ast.ClassDef):
                 places[module.name.split(".")[0], node.name].append(module.name)
     return [f"{name}: {', '.join(where)}" for (_, name), where in sorted(places.items()) if len(where) > 1]
@@ -125,7 +131,7 @@ def tuple_parameters(modules: Sequence[Module]) -> list[str]:
     return [
         f"{module.name}:{node.lineno} {node.name}({one.arg}: {ast.unparse(one.annotation)})"
         for module in modules
-        for node in ast.walk(module.tree)
+        for node in module.nodes
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
         for one in (*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs)
         if one.annotation is not None and _has_unlike_tuple(one.annotation)
@@ -155,6 +161,7 @@ def private_words(root: Path = ROOT) -> Iterator[str]:
                 yield f"{path.relative_to(root)}:{number} {match[0]}"
 
 
+@cache
 def places(root: Path = ROOT) -> dict[str, list[str]]:
     """Figure -> the places that it counts."""
     modules = product_modules(root)

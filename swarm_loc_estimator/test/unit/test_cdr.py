@@ -41,6 +41,8 @@ ANGLE = st.floats(-3.1, 3.1)
 NAMES = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=17)
 STAMPS = st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9 + 999_999_999)
 TYPES = typestore().types
+MAX_CUTS = 200
+"""Lengths at which a message is cut off; a message has up to 10 000 bytes, and 100 are drawn."""
 
 
 def encode(message: Any, message_type: str) -> bytes:
@@ -92,13 +94,14 @@ def some_message(message_type: str, random: np.random.Generator) -> dict[str, An
 def test_every_type_is_written_and_read_as_by_the_type_store(
     message_type: str, seed: int, little_endian: bool
 ) -> None:
-    data = our_encode(some_message(message_type, np.random.default_rng(seed)), message_type)
+    random = np.random.default_rng(seed)
+    data = our_encode(some_message(message_type, random), message_type)
     message = typestore().deserialize_cdr(data, message_type)
     assert encode(message, message_type) == data
     sent = bytes(typestore().serialize_cdr(message, message_type, little_endian=little_endian))
     found = decode(sent, message_type)
     assert our_encode(found, message_type) == data
-    for length in range(len(sent)):
+    for length in random.permutation(len(sent))[:MAX_CUTS].tolist():
         with pytest.raises(CdrError):
             decode(sent[:length], message_type)
 
