@@ -11,15 +11,18 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 
+from bench.inputs import imu
 from bench.shared.common import ProgressLine, table, write_figures
 
-PARTS: Mapping[str, Callable[[Sequence[int], ProgressLine], Mapping[str, float]]] = {}
+PARTS: Mapping[str, Callable[[Sequence[int], ProgressLine], Mapping[str, float]]] = {"imu": imu.measure}
 """Part -> its function. Figures start with the name of the part."""
 
 
 def main() -> None:
     """Run the parts, print the table, write the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--seeds", type=int, default=5, help="runs of each part")
     parser.add_argument("--parts", nargs="+", choices=[*PARTS], default=[*PARTS])
     arguments = parser.parse_args()

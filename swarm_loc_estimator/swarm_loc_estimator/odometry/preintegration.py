@@ -13,6 +13,7 @@ from swarm_loc_estimator.common.jit import cached_njit, inlined_njit, norefcount
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.common.small_matrix import add_scaled, assign, assign_matrix
 from swarm_loc_estimator.odometry.continuity import JUMP, NO_FAULT, RESET, fault_of_step, update_unmoved
+from swarm_loc_estimator.odometry.gyro import turn_by_gyro
 from swarm_loc_estimator.odometry.process_noise import (
     OdometryStep,
     add_dropout_noise,
@@ -153,6 +154,18 @@ def integrate(tracks: TrackArrays, oldest_ns: int, rows: NewRows, changed_from_n
     return Integrated(duplicates, counts[JUMP], counts[RESET])
 
 
+@cached_njit
+def integrate_again(tracks: TrackArrays, from_ns: IntArray, changed_from_ns: IntArray) -> None:
+    """Integrate the rows of each robot behind an instant (N,) again; lower `changed_from_ns` (N,)."""
+    for robot in range(from_ns.size):
+        stamps = tracks.stamp_ns[robot, : tracks.filled[robot]]
+        first = max(1, np.searchsorted(stamps, from_ns[robot], side="right"))
+        for row in range(first, stamps.size):
+            _integrate_step(tracks, robot, row)
+        if first < stamps.size:
+            changed_from_ns[robot] = min(changed_from_ns[robot], stamps[first - 1])
+
+
 @norefcount_njit
 def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
     """Integrate from the previous row to a row; return the fault of the step, see `fault_of_step`."""
@@ -185,6 +198,15 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
     tracks.known_ns[robot, row] = stamp_ns
     before_rate = tracks.rate[robot, row - 1]
     forward, left, turn = _true_motion(tracks, robot, reported, duration_s, before_rate, rate)
+    has_imu, turn_variance = tracks.imu[robot].turn_noise_density > 0.0, math.nan
+    if has_imu:
+        is_moving = reported[0] != 0.0 or reported[1] != 0.0 or reported[2] != 0.0
+        turned = turn_by_gyro(tracks, robot, before_ns, stamp_ns, is_moving)
+        if not math.isnan(turned):
+            turn, rate[2] = turned, turned / duration_s
+            turn_variance = 0.0
+            if is_moving or turned != 0.0:
+                turn_variance = tracks.imu[robot].turn_noise_density ** 2 * duration_s
     # displacement of the axle, then of base_link ahead of it
     cos, sin = math.cos(model.course_offset), math.sin(model.course_offset)
     way_x, way_y = cos * forward - sin * left, sin * forward + cos * left + model.axle_offset * turn
@@ -196,7 +218,8 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
     tracks.pose[robot, row, 2] = start[2] + turn
     changed = abs(rate[2] - before_rate[2])
     x, y = start[0] + 0.5 * step_x, start[1] + 0.5 * step_y
-    step = OdometryStep(forward, left, turn, changed, duration_s, x, y, middle)
+    estimates_turn = not (has_imu and math.isnan(turn_variance))
+    step = OdometryStep(forward, left, turn, changed, duration_s, x, y, middle, turn_variance, estimates_turn)
     add_step_noise(model, step, covariance)
     add_step_jacobian(model, step, jacobian)
     if by_twist and before_ns <= tracks.twist_from_ns[robot]:  # the motion before is lost

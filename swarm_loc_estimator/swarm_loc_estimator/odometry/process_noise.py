@@ -24,6 +24,8 @@ class OdometryStep(NamedTuple):
         duration_s: Duration [s].
         x: Position on the track in the middle of the step [m], as is y.
         theta: Heading in the middle of the step [rad].
+        turn_variance: Variance of a turn that a gyroscope measured [rad^2]; NaN: of the wheels.
+        estimates_turn: Whether the estimated scale and bias of turns are those of the sensor of this turn.
     """
 
     forward: float
@@ -34,6 +36,8 @@ class OdometryStep(NamedTuple):
     x: float
     y: float
     theta: float
+    turn_variance: float
+    estimates_turn: bool
 
 
 @cached_njit
@@ -57,6 +61,8 @@ def add_step_noise(model: OdometryModel, step: OdometryStep, covariance: FloatAr
         across += model.lateral_drift * duration_s
         heading += model.turn_drift * duration_s
     cross = 0.5 * wheel * (right_wheel - left_wheel) / separation
+    if not math.isnan(step.turn_variance):
+        heading, cross = step.turn_variance, 0.0
     course = step.theta + math.atan2(step.left, step.forward)
     add_in_track_frame((step.x, step.y, course), (along, across, heading, cross), covariance)
 
@@ -76,6 +82,8 @@ def add_step_jacobian(model: OdometryModel, step: OdometryStep, jacobian: FloatA
     cos, sin = math.cos(step.theta + model.course_offset), math.sin(step.theta + model.course_offset)
     jacobian[0, DISTANCE_SCALE] += cos * forward - sin * left
     jacobian[1, DISTANCE_SCALE] += sin * forward + cos * left
+    if not step.estimates_turn:
+        return
     # when the axle turns, base_link ahead of it also moves sideways
     turned_x = step.y - math.sin(step.theta) * model.axle_offset
     turned_y = -step.x + math.cos(step.theta) * model.axle_offset

@@ -9,12 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.swarm.swarm import OdometryModel
+from swarm_loc_estimator.swarm.swarm import ImuModel, OdometryModel
 
 BEFORE_ALL_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 MODEL_DTYPE = np.dtype([(f.name, np.float64) for f in fields(OdometryModel)])
 """Record of the numbers of an `OdometryModel`."""
+IMU_DTYPE = np.dtype([(f.name, np.float64) for f in fields(ImuModel)])
+"""Record of the numbers of an `ImuModel`."""
 
 
 class TrackArrays(NamedTuple):
@@ -46,6 +48,12 @@ class TrackArrays(NamedTuple):
         begin_ns: (N,) instant of the very first row.
         begin_pose: (N, 3) pose of the very first row.
         is_stationary: (N,) True for a robot without odometry: its track stays at the origin.
+        imu: (N,) of IMU_DTYPE.
+        gyro_filled: (N,) number of turn rates in use.
+        gyro_ns: (N, G) their instants, calibrated for delay.
+        gyro_rate: (N, G) measured turn rates about the vertical [rad/s].
+        gyro_angle: (N, G) their integral [rad].
+        gyro_piece: (N, G) number of the pause before, beyond which nothing is integrated.
         walk: (N, 2) its variances per second of position [m^2/s] and heading [rad^2/s].
     """
 
@@ -72,4 +80,10 @@ class TrackArrays(NamedTuple):
     begin_ns: IntArray
     begin_pose: FloatArray
     is_stationary: NDArray[np.bool_]
+    imu: NDArray[np.void]
+    gyro_filled: IntArray
+    gyro_ns: IntArray
+    gyro_rate: FloatArray
+    gyro_angle: FloatArray
+    gyro_piece: IntArray
     walk: FloatArray

@@ -18,9 +18,22 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.odometry.gyro import insert_rates
 from swarm_loc_estimator.odometry.look_up import OdometrySample, look_up_all
-from swarm_loc_estimator.odometry.preintegration import UNCHANGED_NS, NewRows, continue_tracks, integrate
-from swarm_loc_estimator.odometry.track_arrays import BEFORE_ALL_NS, LATEST_NS, MODEL_DTYPE, TrackArrays
+from swarm_loc_estimator.odometry.preintegration import (
+    UNCHANGED_NS,
+    NewRows,
+    continue_tracks,
+    integrate,
+    integrate_again,
+)
+from swarm_loc_estimator.odometry.track_arrays import (
+    BEFORE_ALL_NS,
+    IMU_DTYPE,
+    LATEST_NS,
+    MODEL_DTYPE,
+    TrackArrays,
+)
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import Robot
 
@@ -42,6 +55,7 @@ _ROWS = (
     "known_ns",
     "jump_ns",
 )
+_GYRO_ROWS = ("gyro_ns", "gyro_rate", "gyro_angle", "gyro_piece")
 
 
 @dataclass(frozen=True)
@@ -77,9 +91,14 @@ class OdometryTracks:
         self._response = _stacked([robot.response or _IDEAL for robot in robots])
         names = MODEL_DTYPE.names or ()
         self._model = np.array([tuple(getattr(m, name) for name in names) for m in models], dtype=MODEL_DTYPE)
+        self._imu = np.array(
+            [tuple(getattr(robot.imu, name) for name in IMU_DTYPE.names or ()) for robot in robots],
+            dtype=IMU_DTYPE,
+        )
         self._is_stationary = np.array([robot.stands for robot in robots], dtype=bool)
         walks = [robot.random_walk for robot in robots]
         self._walk = np.array([(walk.position, walk.heading) for walk in walks]).reshape(-1, 2)
+        self._imu_delay_ns = np.rint(1e9 * self._imu["delay_s"]).astype(np.int64)
         self._delay_ns = np.array([round(m.delay_s * 1e9) for m in models], dtype=np.int64)
         self.clear()
 
@@ -87,13 +106,15 @@ class OdometryTracks:
         """Remove all rows."""
         self._oldest_ns = BEFORE_ALL_NS
         self._trimmed_ns = BEFORE_ALL_NS
-        self.arrays = self._allocated(_FIRST_CAPACITY)
+        has_imu = bool(np.any(self._imu["turn_noise_density"] > 0.0))
+        self.arrays = self._allocated(_FIRST_CAPACITY, _FIRST_CAPACITY if has_imu else 0)
 
     @property
     def lookback_ns(self) -> int:
         """Maximum time before its stamp at which a row may change look-ups [ns]."""
         timeout_ns = np.ceil(self._model["timeout_s"] * 1e9).astype(np.int64)
-        return int(np.max(timeout_ns - np.minimum(0, self._delay_ns), initial=0))
+        delay_ns = np.minimum(self._delay_ns, self._imu_delay_ns)
+        return int(np.max(timeout_ns - np.minimum(0, delay_ns), initial=0))
 
     def has_started(self, robots: IntArray | int, stamps_ns: IntArray | int) -> BoolArray:
         """Whether robots (k,) have odometry before instants (k,); always True for robots without odometry."""
@@ -151,9 +172,30 @@ class OdometryTracks:
         while np.any(
             self.arrays.filled + np.bincount(robots, minlength=self._robots) > self.arrays.stamp_ns.shape[1]
         ):
-            self._grow()
+            self._grow(_ROWS)
         found = integrate(self.arrays, self._oldest_ns, rows, changed_from)
         return TrackChange(changed_from, found.duplicates, too_old, found.jumps, found.resets)
+
+    def extend_turns(self, robots: IntArray, stamps_ns: IntArray, rates: FloatArray) -> TrackChange:
+        """Add turn rates of gyroscopes in any order and of any age.
+
+        Args:
+            robots: (k,) index of robots with an IMU.
+            stamps_ns: (k,) acquisition stamps.
+            rates: (k,) finite turn rates about the vertical as measured [rad/s].
+        """
+        young = stamps_ns >= self._oldest_ns
+        too_old = robots[~young]
+        robots, rates = robots[young], rates[young]
+        stamps_ns = stamps_ns[young] + self._imu_delay_ns[robots]
+        needed = np.max(self.arrays.gyro_filled + np.bincount(robots, minlength=self._robots), initial=0)
+        while needed > self.arrays.gyro_ns.shape[1]:
+            self._grow(_GYRO_ROWS)
+        from_ns, changed_from = np.empty((2, self._robots), dtype=np.int64)
+        duplicates = insert_rates(self.arrays, robots, stamps_ns, rates, from_ns)
+        changed_from.fill(UNCHANGED_NS)
+        integrate_again(self.arrays, from_ns, changed_from)
+        return TrackChange(changed_from, duplicates, too_old, 0, 0)
 
     def at(self, robots: IntArray, stamps_ns: IntArray) -> OdometrySample:
         """Look up tracks, see `look_up`.
@@ -170,17 +212,22 @@ class OdometryTracks:
         if kept_ns < self._trimmed_ns + _TRIM_EVERY_NS:
             return
         self._trimmed_ns = kept_ns
-        capacity = self.arrays.stamp_ns.shape[1]
-        for robot in np.flatnonzero(self.arrays.filled > capacity // 2):
-            count = self.arrays.filled[robot]
-            first = int(np.searchsorted(self.arrays.stamp_ns[robot, :count], kept_ns, side="right")) - 2
-            if first > capacity // 4:
-                for rows in (getattr(self.arrays, name) for name in _ROWS):
-                    rows[robot, : count - first] = rows[robot, first:count].copy()
-                self.arrays.filled[robot] = count - first
+        arrays = self.arrays
+        for stamp_ns, filled, names in (
+            (arrays.stamp_ns, arrays.filled, _ROWS),
+            (arrays.gyro_ns, arrays.gyro_filled, _GYRO_ROWS),
+        ):
+            capacity = stamp_ns.shape[1]
+            for robot in np.flatnonzero(filled > capacity // 2):
+                count = filled[robot]
+                first = int(np.searchsorted(stamp_ns[robot, :count], kept_ns, side="right")) - 2
+                if first > capacity // 4:
+                    for rows in (getattr(arrays, name) for name in names):
+                        rows[robot, : count - first] = rows[robot, first:count].copy()
+                    filled[robot] = count - first
 
-    def _allocated(self, capacity: int) -> TrackArrays:
-        shape = (self._robots, capacity)
+    def _allocated(self, capacity: int, rates: int) -> TrackArrays:
+        shape, gyro_shape = (self._robots, capacity), (self._robots, rates)
         arrays = TrackArrays(
             filled=np.zeros(self._robots, dtype=np.int64),
             stamp_ns=np.zeros(shape, dtype=np.int64),
@@ -205,19 +252,23 @@ class OdometryTracks:
             begin_ns=np.zeros(self._robots, dtype=np.int64),
             begin_pose=np.zeros((self._robots, 3)),
             is_stationary=self._is_stationary,
+            imu=self._imu,
+            gyro_filled=np.zeros(self._robots, dtype=np.int64),
+            gyro_ns=np.zeros(gyro_shape, dtype=np.int64),
+            gyro_rate=np.zeros(gyro_shape),
+            gyro_angle=np.zeros(gyro_shape),
+            gyro_piece=np.zeros(gyro_shape, dtype=np.int64),
             walk=self._walk,
         )
         for name in _ROWS:  # touch the memory now, so that page faults do not delay the first data
             getattr(arrays, name).fill(0)
         return arrays
 
-    def _grow(self) -> None:
-        old = self.arrays
-        capacity = old.stamp_ns.shape[1]
-        rows = self._allocated(2 * capacity)
-        for name in _ROWS:
-            getattr(rows, name)[:, :capacity] = getattr(old, name)
-        self.arrays = old._replace(**{name: getattr(rows, name) for name in _ROWS})
+    def _grow(self, names: Sequence[str]) -> None:
+        """Double the capacity of rows."""
+        old = {name: getattr(self.arrays, name) for name in names}
+        new = {name: np.concatenate([rows, np.zeros_like(rows)], axis=1) for name, rows in old.items()}
+        self.arrays = self.arrays._replace(**new)
 
     def _take_back_later_rows(self, rows: NewRows) -> tuple[NewRows, IntArray]:
         """Merge new rows with later rows of the tracks, which are removed to be integrated again.

@@ -13,13 +13,14 @@ from swarm_loc_estimator.filter.measurement_model import MeasurementArray
 from swarm_loc_estimator.sensors.aerial import AERIAL
 from swarm_loc_estimator.sensors.camera import DETECTIONS
 from swarm_loc_estimator.sensors.fix import FIXES
+from swarm_loc_estimator.sensors.imu import TURN_RATES
 from swarm_loc_estimator.sensors.infrared import BRIGHTNESS
 from swarm_loc_estimator.sensors.odometry import ODOMETRY
 from swarm_loc_estimator.sensors.sensor import InputKind, Sensor, chosen
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 SENSORS: dict[str, Sensor] = {
-    sensor.name: sensor for sensor in (ODOMETRY, DETECTIONS, BRIGHTNESS, FIXES, AERIAL)
+    sensor.name: sensor for sensor in (TURN_RATES, ODOMETRY, DETECTIONS, BRIGHTNESS, FIXES, AERIAL)
 }
 """All sensors by name. Simultaneous measurements are fused in this order."""
 

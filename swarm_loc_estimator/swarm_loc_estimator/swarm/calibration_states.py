@@ -21,7 +21,7 @@ from swarm_loc_estimator.common.se2 import error_covariance
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot
 
 TURN_BIAS = 0
-"""Bias of the turn rate while moving [rad/s]; it changes slowly."""
+"""Bias of the turn rate while moving, or of the gyroscope [rad/s]; it changes slowly."""
 DISTANCE_SCALE = 1
 """Relative error of the distance driven."""
 TURN_SCALE = 2
@@ -74,11 +74,11 @@ class ParameterTable(NamedTuple):
         """Table of the parameters that the descriptions of robots and landmarks estimate from the start."""
         sigma, time_s = np.zeros((len(robots), PARAMETERS)), np.zeros((len(robots), PARAMETERS))
         for i, robot in enumerate(robots):
-            odometry = robot.odometry
-            time_s[i, TURN_BIAS] = odometry.turn_bias_time_s
-            sigma[i, TURN_BIAS] = odometry.turn_bias_sigma
-            sigma[i, DISTANCE_SCALE] = odometry.distance_scale_sigma
-            sigma[i, TURN_SCALE] = odometry.turn_scale_sigma
+            turns = robot.turn_sensor
+            time_s[i, TURN_BIAS] = turns.turn_bias_time_s
+            sigma[i, TURN_BIAS] = turns.turn_bias_sigma
+            sigma[i, DISTANCE_SCALE] = robot.odometry.distance_scale_sigma
+            sigma[i, TURN_SCALE] = turns.turn_scale_sigma
             if robot.camera is not None:
                 sigma[i, CAMERA_YAW] = robot.camera.yaw_sigma
                 sigma[i, CAMERA_SCALE] = robot.sensor.distance_scale_sigma

@@ -92,10 +92,42 @@ class OdometryModel:
         2.0, "rad/s/s^0.5", 0.0, 1000.0, "random walk of the turn rate past the newest message"
     )
 
+
+@dataclass(frozen=True)
+class ImuModel:
+    """Error model of the gyroscope of a robot's IMU, which measures the turns in place of the wheels.
+
+    The turn rate w about the vertical becomes turn_scale * w + turn_bias. Errors that last are estimated
+    along with the pose where their sigma is not zero; those of the wheels' turns are then not estimated.
+    """
+
+    turn_noise_density: float = number(
+        0.0, "rad/s/Hz^0.5", 0.0, 1.0, "white noise of the turn rate; 0: the robot has no IMU"
+    )
+    turn_scale: float = number(1.0, "1", -10.0, 10.0, "true turn per measured turn; -1: mounted upside down")
+    turn_scale_sigma: float = number(
+        0.0, "1", 0.0, 1.0, "relative standard deviation of turn_scale; 0: exact, else estimated"
+    )
+    turn_bias: float = number(0.0, "rad/s", -1.0, 1.0, "true minus scaled turn rate")
+    turn_bias_sigma: float = number(
+        0.0, "rad/s", 0.0, 10.0, "standard deviation of the variable part of turn_bias, estimated; 0: none"
+    )
+    turn_bias_time_s: float = number(
+        600.0, "s", 0.1, 1e6, "time constant of this variable part (Gauss-Markov)"
+    )
+    roll: float = number(
+        0.0, "rad", -TURN, TURN, "mount: the IMU turned about base_link's x axis, before pitch"
+    )
+    pitch: float = number(0.0, "rad", -TURN, TURN, "mount: turned about base_link's y axis")
+    delay_s: float = number(0.0, "s", -2.0, 2.0, "the turn happens this much after its stamp")
+    timeout_s: float = number(
+        0.25, "s", 0.001, 10.0, "time between two messages from which the turn of the wheels is used"
+    )
+
     @property
-    def is_calibrated(self) -> bool:
-        """Whether any of its parameters is estimated from the start."""
-        return max(self.distance_scale_sigma, self.turn_scale_sigma, self.turn_bias_sigma) > 0.0
+    def is_used(self) -> bool:
+        """Whether the robot has an IMU."""
+        return self.turn_noise_density > 0.0
 
 
 @dataclass(frozen=True)
@@ -277,6 +309,7 @@ class Robot:
         name: Namespace of its topics and prefix of its frames.
         type: Name of its type; "" if it has none.
         odometry: Error model of its odometry.
+        imu: Error model of its IMU.
         response: True share of the reported motion; None: all of it.
         camera: Pose of its camera; None if it has none.
         sensor: Error model of its sightings.
@@ -292,6 +325,7 @@ class Robot:
     name: str
     type: str = ""
     odometry: OdometryModel = OdometryModel()
+    imu: ImuModel = ImuModel()
     response: MotionResponse | None = None
     camera: CameraMount | None = CameraMount()
     sensor: SensorModel = SensorModel()
@@ -302,6 +336,17 @@ class Robot:
     random_walk: RandomWalk = RandomWalk()
     fix: FixModel = FixModel()
     ir: RobotIr | None = None
+
+    @property
+    def turn_sensor(self) -> OdometryModel | ImuModel:
+        """The error model with the scale and bias of its turns that are estimated."""
+        return self.imu if self.imu.is_used else self.odometry
+
+    @property
+    def estimates_motion(self) -> bool:
+        """Whether any parameter of its motion is estimated from the start."""
+        turns = self.turn_sensor
+        return max(self.odometry.distance_scale_sigma, turns.turn_scale_sigma, turns.turn_bias_sigma) > 0.0
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 ```yaml
 fileversion: 1
-defaults:              # any of odometry, random_walk, response, camera, sensor, fix, ir, faces, start_sigma
+defaults:              # odometry, imu, random_walk, response, camera, sensor, fix, ir, faces, start_sigma
   sensor: {range_sigma: 0.1}
   landmark: {size: 0.06, position_sigma: 0.01, yaw_sigma: 0.02}  # without sigmas: surveyed exactly
 types:
@@ -54,6 +54,7 @@ from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
     FixModel,
+    ImuModel,
     Landmark,
     OdometryModel,
     Pose2,
@@ -72,11 +73,23 @@ if TYPE_CHECKING:
 FILE_VERSION = 1
 
 _SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks")
-_LAYER = ("odometry", "random_walk", "response", "camera", "sensor", "fix", "ir", "faces", "start_sigma")
+_LAYER = (
+    "odometry",
+    "imu",
+    "random_walk",
+    "response",
+    "camera",
+    "sensor",
+    "fix",
+    "ir",
+    "faces",
+    "start_sigma",
+)
 _DEFAULTS = (*_LAYER, "landmark")
 _ROBOT = ("type", *_LAYER, "ids", "start")
 MODELS: dict[str, type] = {
     "odometry": OdometryModel,
+    "imu": ImuModel,
     "random_walk": RandomWalk,
     "camera": CameraMount,
     "sensor": SensorModel,
@@ -351,9 +364,9 @@ def _state_count(robots: tuple[Robot, ...], landmarks: tuple[Landmark, ...]) -> 
         sigma
         for robot in robots
         for sigma in (
-            robot.odometry.turn_bias_sigma,
+            robot.turn_sensor.turn_bias_sigma,
             robot.odometry.distance_scale_sigma,
-            robot.odometry.turn_scale_sigma,
+            robot.turn_sensor.turn_scale_sigma,
             *((robot.camera.yaw_sigma, robot.sensor.distance_scale_sigma) if robot.camera else ()),
         )
     ]

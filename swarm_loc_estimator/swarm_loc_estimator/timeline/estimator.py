@@ -14,6 +14,7 @@ from swarm_loc_estimator.identification.memory import Identities, Outcome
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.conversion import InputConverter
 from swarm_loc_estimator.sensors.fix import about_robots
+from swarm_loc_estimator.sensors.imu import TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.odometry import ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.registry import Batch, Measurements
 from swarm_loc_estimator.sensors.sensor import joined
@@ -70,10 +71,13 @@ class Estimator:
     def _begin(self) -> None:
         self._now_ns: int | None = None
         self._odometry: list[OdometryRows] = []
+        self._turn_rates: list[TurnRateRows] = []
 
     def reset(self) -> None:
         """Discard all data and restart at the configured starts; counters in `drops` are kept."""
-        self.drop("reset", sum(rows.robot.size for rows in self._odometry) + self._timeline.waiting)
+        waiting = sum(rows.robot.size for rows in self._odometry)
+        waiting += sum(rows.robot.size for rows in self._turn_rates)
+        self.drop("reset", waiting + self._timeline.waiting)
         self._converter.drops.total.update(self._timeline_drops())
         self._tracks.clear()
         self._timeline.restart(self._fusion.new_state())
@@ -108,6 +112,8 @@ class Estimator:
                 continue
             if name == ODOMETRY.name:
                 self._odometry.append(rows)
+            elif name == TURN_RATES.name:
+                self._turn_rates.append(rows)
             else:
                 change = self._converter.accumulators[name].take(rows)
                 self._timeline.add(change.added)
@@ -119,8 +125,7 @@ class Estimator:
         Returns:
             "" on success, else a reason of `drops`, such as "not_localized" before its first odometry.
         """
-        if self._odometry:
-            self._use_odometry()
+        self._use_odometry()
         command = about_robots(robot, stamp_ns, np.array([pose]), np.array([covariance]), NO_MODEL)
         command["command"] = Command.SET_POSE
         fault = REJECT_REASONS[reject_reasons(command)[0]] or (
@@ -208,8 +213,7 @@ class Estimator:
         newest_ns = self._check_clock(now_ns)
         oldest_ns = newest_ns - self._horizon_ns
         self._tracks.trim(oldest_ns, self._timeline.oldest_due_ns(oldest_ns) - 2 * self._lookback_ns)
-        if self._odometry:
-            self._use_odometry()
+        self._use_odometry()
         if fuse:
             self._timeline.advance(newest_ns, has_budget)
             for accumulator in self._converter.accumulators.values():
@@ -225,8 +229,15 @@ class Estimator:
         return self._now_ns
 
     def _use_odometry(self) -> None:
-        rows = joined(self._odometry)
-        self._odometry = []
+        if self._turn_rates:  # first, so that they are known when the steps are integrated
+            rates, self._turn_rates = joined(self._turn_rates), []
+            change = self._tracks.extend_turns(rates.robot, rates.stamp_ns, rates.rate)
+            self.drop("imu_duplicate", change.duplicates)
+            self._converter.drops.add("imu_too_old", change.too_old)
+            self._timeline.invalidate(change.changed_from_ns)
+        if not self._odometry:
+            return
+        rows, self._odometry = joined(self._odometry), []
         change = self._tracks.extend(rows.robot, rows.stamp_ns, rows.pose, rows.twist)
         self.drop("odometry_duplicate", change.duplicates)
         self._converter.drops.add("odometry_too_old", change.too_old)

@@ -61,15 +61,20 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
     value, sigma = state.parameter[index].tolist(), state.parameter_sigma(index).tolist()
     odometry, camera, sensor = robot.odometry, robot.camera, robot.sensor
     path, turn, seen = (1.0 + value[which] for which in (DISTANCE_SCALE, TURN_SCALE, CAMERA_SCALE))
+    turns = robot.turn_sensor
+    turning = {
+        "turn_scale": turn * turns.turn_scale,
+        "turn_scale_sigma": min(1.0, sigma[TURN_SCALE] / abs(turn)),
+    }
     return replace(
         robot,
         odometry=replace(
             odometry,
             distance_scale=path * odometry.distance_scale,
             distance_scale_sigma=min(1.0, sigma[DISTANCE_SCALE] / abs(path)),
-            turn_scale=turn * odometry.turn_scale,
-            turn_scale_sigma=min(1.0, sigma[TURN_SCALE] / abs(turn)),
+            **({} if robot.imu.is_used else turning),
         ),
+        imu=replace(robot.imu, **(turning if robot.imu.is_used else {})),
         camera=camera
         and replace(
             camera,

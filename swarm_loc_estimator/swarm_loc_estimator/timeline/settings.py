@@ -111,7 +111,7 @@ class Settings:
         """Settings with the default fusion period of a swarm if `fusion_period_s` is negative."""
         if self.fusion_period_s >= 0.0:
             return self
-        calibrated = sum(robot.odometry.is_calibrated for robot in swarm.robots)
+        calibrated = sum(robot.estimates_motion for robot in swarm.robots)
         return replace(self, fusion_period_s=self.policy.fusion_period_s(calibrated))
 
     def is_sparse(self, swarm: Swarm) -> bool:

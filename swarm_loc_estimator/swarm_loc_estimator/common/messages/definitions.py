@@ -18,6 +18,7 @@ from swarm_loc_estimator.common.parameters import UserError
 MESSAGE_PACKAGE = "swarm_loc_msgs"
 
 ODOMETRY = "nav_msgs/msg/Odometry"
+IMU = "sensor_msgs/msg/Imu"
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -65,6 +66,9 @@ nav_msgs/Odometry: Header header, string child_frame_id, geometry_msgs/PoseWithC
 sensor_msgs/CompressedImage: Header header, string format, uint8[] data
 sensor_msgs/Image: Header header, uint32 height, uint32 width, string encoding, uint8 is_bigendian,
     uint32 step, uint8[] data
+sensor_msgs/Imu: Header header, geometry_msgs/Quaternion orientation, float64[9] orientation_covariance,
+    geometry_msgs/Vector3 angular_velocity, float64[9] angular_velocity_covariance,
+    geometry_msgs/Vector3 linear_acceleration, float64[9] linear_acceleration_covariance
 sensor_msgs/RegionOfInterest: uint32 x_offset, uint32 y_offset, uint32 height, uint32 width, bool do_rectify
 sensor_msgs/CameraInfo: Header header, uint32 height, uint32 width, string distortion_model, float64[] d,
     float64[9] k, float64[9] r, float64[12] p, uint32 binning_x, uint32 binning_y, RegionOfInterest roi

@@ -1,0 +1,57 @@
+"""Simulated gyroscopes: true turn rates with white noise, a bias that walks, and a wrong scale."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from swarm_loc_drivers.sim.run import LivedRun, Trajectories
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.sensors.imu import TurnRateRows
+from swarm_loc_estimator.swarm.swarm import ImuModel
+
+RATE_HZ = 50.0
+"""Rate of the messages of an IMU."""
+
+
+def simulate_gyroscopes(
+    rng: np.random.Generator, run: LivedRun, imu: ImuModel, late_s: tuple[float, float]
+) -> TurnRateRows:
+    """Readings of an IMU on each robot that the description draws: bias and scale from their sigmas.
+
+    Args:
+        rng: Draws errors and delays.
+        run: Gives the true motion.
+        imu: Error model of all robots.
+        late_s: Bounds of the delay of a message [s].
+    """
+    stamp_ns = np.arange(run.start_ns, run.end_ns, round(1e9 / RATE_HZ))
+    parts = [_readings(rng, run.truth, robot, stamp_ns, imu) for robot in range(len(run.swarm.robots))]
+    robots = np.repeat(np.arange(len(parts)), stamp_ns.size)
+    stamps, rate = np.tile(stamp_ns, len(parts)), np.concatenate(parts)
+    arrival_ns = stamps + np.rint(1e9 * rng.uniform(*late_s, stamps.size)).astype(np.int64)
+    order = np.argsort(arrival_ns, kind="stable")
+    velocity = np.column_stack([np.zeros((rate.size, 2)), rate])
+    columns = (robots, stamps, velocity, np.full(rate.size, np.nan), arrival_ns)
+    return TurnRateRows(*(column[order] for column in columns))
+
+
+def _readings(
+    rng: np.random.Generator, truth: Trajectories, robot: int, stamp_ns: IntArray, imu: ImuModel
+) -> FloatArray:
+    """Turn rates (k,) that the IMU of one robot measures, each the mean over its period."""
+    period_s = 1.0 / RATE_HZ
+    heading = truth.at(robot, stamp_ns)[:, 2]
+    turn = np.gradient(np.unwrap(wrap_angle(heading)), period_s)
+    # a Gauss-Markov bias, in its stationary distribution
+    kept = math.exp(-period_s / imu.turn_bias_time_s)
+    bias, step = np.empty(stamp_ns.size), imu.turn_bias_sigma * math.sqrt(1.0 - kept**2)
+    bias[0] = imu.turn_bias_sigma * rng.standard_normal()
+    for k, noise in enumerate(step * rng.standard_normal(stamp_ns.size - 1)):
+        bias[k + 1] = kept * bias[k] + noise
+    white = imu.turn_noise_density * math.sqrt(RATE_HZ) * rng.standard_normal(stamp_ns.size)
+    scale = imu.turn_scale * (1.0 + imu.turn_scale_sigma * rng.standard_normal())
+    measured: FloatArray = (turn - bias - imu.turn_bias) / scale + white
+    return measured
