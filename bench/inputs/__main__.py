@@ -26,7 +26,8 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5, help="runs of each part")
     parser.add_argument("--parts", nargs="+", choices=[*PARTS], default=[*PARTS])
     arguments = parser.parse_args()
-    seeds, figures = range(1, arguments.seeds + 1), {}
+    seeds = range(1, arguments.seeds + 1)
+    figures: dict[str, float] = {}
     for part in arguments.parts:
         figures.update(PARTS[part](seeds, ProgressLine(part)))
         print()

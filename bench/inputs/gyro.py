@@ -10,7 +10,8 @@ from swarm_loc_drivers.sim.run import LivedRun, Trajectories
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.sensors.imu import TurnRateRows
-from swarm_loc_estimator.swarm.swarm import ImuModel
+from swarm_loc_estimator.sensors.sensor import chosen
+from swarm_loc_estimator.swarm.imu_model import ImuModel
 
 RATE_HZ = 50.0
 """Rate of the messages of an IMU."""
@@ -34,8 +35,7 @@ def simulate_gyroscopes(
     arrival_ns = stamps + np.rint(1e9 * rng.uniform(*late_s, stamps.size)).astype(np.int64)
     order = np.argsort(arrival_ns, kind="stable")
     velocity = np.column_stack([np.zeros((rate.size, 2)), rate])
-    columns = (robots, stamps, velocity, np.full(rate.size, np.nan), arrival_ns)
-    return TurnRateRows(*(column[order] for column in columns))
+    return chosen(TurnRateRows(robots, stamps, velocity, np.full(rate.size, np.nan), arrival_ns), order)
 
 
 def _readings(

@@ -84,7 +84,6 @@ def _columns(
 def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts) -> Converter:
     """Create a filter for finite turn rates of robots with an IMU, which turns them to the vertical."""
     models = [robot.imu for robot in swarm.robots]
-    has_imu = np.array([one.is_used for one in models], dtype=bool)
     # last row of Ry(pitch) Rx(roll): what rates about the axes of the IMU turn about the vertical
     vertical = np.array(
         [
@@ -100,7 +99,6 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
     def valid(rows: TurnRateRows) -> TurnRateRows:
         rows = rows._replace(rate=np.sum(vertical[rows.robot] * rows.velocity, axis=1))
         reasons = {
-            "no_imu": ~has_imu[rows.robot],
             "imu_non_finite": ~np.isfinite(rows.velocity).all(axis=1),
             "imu_absurd": np.abs(rows.rate) > _MAX_RATE,
         }
@@ -117,7 +115,9 @@ def _has_imu(robot: Robot) -> bool:
     return robot.imu.is_used
 
 
-_OWN = InputKind("imu", "imu", IMU, lambda n, _: EachReader(n, decode_imu), _columns, _has_imu)
+_OWN = InputKind(
+    "imu", "imu", IMU, lambda n, _: EachReader(n, decode_imu), _columns, _has_imu, only_expected=True
+)
 TURN_RATES = Sensor(
     "imu",
     TurnRateRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros(0), NO_ROWS),

@@ -20,7 +20,7 @@ from swarm_loc_estimator.sensors.sensor import InputKind, Sensor, chosen
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 SENSORS: dict[str, Sensor] = {
-    sensor.name: sensor for sensor in (TURN_RATES, ODOMETRY, DETECTIONS, BRIGHTNESS, FIXES, AERIAL)
+    sensor.name: sensor for sensor in (ODOMETRY, TURN_RATES, DETECTIONS, BRIGHTNESS, FIXES, AERIAL)
 }
 """All sensors by name. Simultaneous measurements are fused in this order."""
 
@@ -57,7 +57,7 @@ def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
         InputTopic(f"{robot.name}/{kind.topic}", kind, index, kind.expected_of(robot))
         for index, robot in enumerate(swarm.robots)
         for kind in kinds().values()
-        if kind.of_each
+        if kind.of_each and (kind.expected_of(robot) or not kind.only_expected)
     )
     of_swarm = (
         InputTopic(kind.topic, kind, THE_SWARM, not kind.stands_for and kind.is_expected_of(swarm))

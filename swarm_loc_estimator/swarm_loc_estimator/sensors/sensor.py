@@ -25,8 +25,8 @@ NO_ROWS: IntArray = np.zeros(0, dtype=np.int64)
 NO_MEASUREMENTS: MeasurementArray = np.zeros(0, dtype=MEASUREMENT_DTYPE)
 
 
-def chosen(rows: Rows, some: slice | NDArray[np.bool_]) -> Rows:
-    """Select rows of a tuple of columns by a slice or a mask."""
+def chosen(rows: Rows, some: slice | NDArray[np.bool_] | IntArray) -> Rows:
+    """Select rows of a tuple of columns by a slice, a mask or indices."""
     return type(rows)(*(column[some] for column in rows))
 
 
@@ -150,6 +150,7 @@ class InputKind:
             readings; also returns the number of unused valid readings by reason.
         expected_of: True if a missing topic of the robot is an error.
         of_each: True if each robot has its own topic.
+        only_expected: True if robots of which it is not expected have no such topic.
         in_map: True if readings must be in the frame `map`.
         stands_for: Name of the sensor whose topics of single robots it replaces; "" if none.
     """
@@ -161,6 +162,7 @@ class InputKind:
     columns_of: Callable[[Any, MessageBatch, IntArray, Known], tuple[Any, Mapping[str, int]]]
     expected_of: Callable[[Robot], bool] = of_every
     of_each: bool = True
+    only_expected: bool = False
     in_map: bool = False
     stands_for: str = ""
 

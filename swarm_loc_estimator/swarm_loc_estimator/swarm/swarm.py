@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from swarm_loc_estimator.common.parameters import number
+from swarm_loc_estimator.swarm.imu_model import ImuModel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -91,43 +92,6 @@ class OdometryModel:
     turn_rate_change: float = number(
         2.0, "rad/s/s^0.5", 0.0, 1000.0, "random walk of the turn rate past the newest message"
     )
-
-
-@dataclass(frozen=True)
-class ImuModel:
-    """Error model of the gyroscope of a robot's IMU, which measures the turns in place of the wheels.
-
-    The turn rate w about the vertical becomes turn_scale * w + turn_bias. Errors that last are estimated
-    along with the pose where their sigma is not zero; those of the wheels' turns are then not estimated.
-    """
-
-    turn_noise_density: float = number(
-        0.0, "rad/s/Hz^0.5", 0.0, 1.0, "white noise of the turn rate; 0: the robot has no IMU"
-    )
-    turn_scale: float = number(1.0, "1", -10.0, 10.0, "true turn per measured turn; -1: mounted upside down")
-    turn_scale_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "relative standard deviation of turn_scale; 0: exact, else estimated"
-    )
-    turn_bias: float = number(0.0, "rad/s", -1.0, 1.0, "true minus scaled turn rate")
-    turn_bias_sigma: float = number(
-        0.0, "rad/s", 0.0, 10.0, "standard deviation of the variable part of turn_bias, estimated; 0: none"
-    )
-    turn_bias_time_s: float = number(
-        600.0, "s", 0.1, 1e6, "time constant of this variable part (Gauss-Markov)"
-    )
-    roll: float = number(
-        0.0, "rad", -TURN, TURN, "mount: the IMU turned about base_link's x axis, before pitch"
-    )
-    pitch: float = number(0.0, "rad", -TURN, TURN, "mount: turned about base_link's y axis")
-    delay_s: float = number(0.0, "s", -2.0, 2.0, "the turn happens this much after its stamp")
-    timeout_s: float = number(
-        0.25, "s", 0.001, 10.0, "time between two messages from which the turn of the wheels is used"
-    )
-
-    @property
-    def is_used(self) -> bool:
-        """Whether the robot has an IMU."""
-        return self.turn_noise_density > 0.0
 
 
 @dataclass(frozen=True)
@@ -374,7 +338,7 @@ class Swarm:
 
     Raises:
         SwarmError: A robot name, a marker id or the id of an infrared board appears twice, or a robot with
-            odometry has a random walk.
+            odometry has a random walk or one without has an IMU.
     """
 
     robots: tuple[Robot, ...] = ()
@@ -401,6 +365,8 @@ class Swarm:
             raise SwarmError(
                 f"robot '{walking[0]}' has a random_walk, which must be 0 where odometry is not null."
             )
+        if turned := [r.name for r in self.robots if r.imu.is_used and r.stands]:
+            raise SwarmError(f"robot '{turned[0]}' has no odometry, so its imu.turn_noise_density must be 0.")
 
     @cached_property
     def index_of(self) -> Mapping[str, int]:

@@ -48,13 +48,13 @@ from typing import TYPE_CHECKING, Any
 
 from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
+from swarm_loc_estimator.swarm.imu_model import ImuModel
 from swarm_loc_estimator.swarm.ir_section import IrSection, Values
 from swarm_loc_estimator.swarm.motion_response import MotionResponse, MotionResponseError
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
     FixModel,
-    ImuModel,
     Landmark,
     OdometryModel,
     Pose2,

@@ -11,6 +11,7 @@ import pytest
 
 from swarm_loc_estimator.cli import calibrate, calibrate_ir, import_mrclam, replay, replay_map, watch
 from swarm_loc_estimator.common.parameters import number_specs
+from swarm_loc_estimator.swarm.imu_model import ImuModel
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
@@ -38,7 +39,7 @@ def table_of(cls: type, *required: str) -> str:
 
 
 @pytest.mark.parametrize(
-    "cls", [OdometryModel, RandomWalk, CameraMount, SensorModel, FixModel, Face, StartSigma]
+    "cls", [OdometryModel, ImuModel, RandomWalk, CameraMount, SensorModel, FixModel, Face, StartSigma]
 )
 def test_every_number_of_a_robot_has_its_place(cls: type) -> None:
     assert table_of(cls) in SWARM_DESCRIPTION

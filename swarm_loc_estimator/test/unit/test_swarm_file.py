@@ -332,3 +332,14 @@ def test_mutated_files_load_or_say_one_sentence(tmp_path: Path, data: st.DataObj
         sentence_of(tmp_path, error)
     else:
         assert all(math.isfinite(value) for robot in swarm.robots for value in robot.start or ())
+
+
+def test_an_imu_needs_odometry(tmp_path: Path) -> None:
+    path = tmp_path / "swarm.yaml"
+    path.write_text(
+        "fileversion: 1\nrobots: {a: {odometry: null, camera: null, imu: {turn_noise_density: 0.01}}}\n"
+    )
+    with pytest.raises(
+        SwarmFileError, match="robot 'a' has no odometry, so its imu.turn_noise_density must be 0"
+    ):
+        load_swarm(path)
