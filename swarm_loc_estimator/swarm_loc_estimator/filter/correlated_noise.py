@@ -38,11 +38,12 @@ is less sure than the prediction is ignored.
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.se2_scalar import between, composed, wrap
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix, cholesky3
@@ -376,3 +377,17 @@ def _keep(
     belief.pair_robot[observer, place] = measurements.target[k]
     belief.pair_stamp_ns[observer, place] = measurements.stamp_ns[k]
     assign_matrix(belief.pair_history[observer, place], pair)
+
+
+def without_repeats(measurements: MeasurementArray) -> list[slice]:
+    """Split measurements (m,) into parts with at most one correlated measurement per pair or robot."""
+    edges, seen = [0], set[tuple[int, int]]()
+    comes_again: BoolArray = measurements["systematic_share"].max(axis=1) > 0.0
+    if comes_again.any():
+        pairs = zip(measurements["observer"].tolist(), measurements["target"].tolist(), strict=True)
+        for k, pair in itertools.compress(enumerate(pairs), comes_again):
+            if pair in seen:
+                edges.append(k)
+                seen.clear()
+            seen.add(pair)
+    return [slice(begin, end) for begin, end in itertools.pairwise([*edges, measurements.size])]

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import error_covariance
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
@@ -31,6 +32,17 @@ _REOPENED_POSE_SIGMA = (0.06, 0.06, 0.12)
 """Standard deviation of poses after all parameters are reset to their priors [m], [m], [rad]."""
 _ALONE: IntArray = np.zeros(0, dtype=np.int64)
 _NO_SHARES: FloatArray = np.zeros((0, 3, 3))
+
+
+IN_MAP = -1
+"""Origin of poses in `map`."""
+
+
+class Meetings(NamedTuple):
+    """Pairs of robots that have seen each other while nobody was located, and when the first did."""
+
+    first_ns: int = NEVER_NS
+    pairs: frozenset[tuple[int, int]] = frozenset()
 
 
 class InitialPose(NamedTuple):
@@ -97,6 +109,9 @@ class SwarmState:
         constraints: Stored sightings per robot that is not tracked (see `initializer.py`).
         next_attempt_ns: (N,) earliest instant of the next attempt to initialize the robot.
         images: Memory of aerial images.
+        origin: Robot whose pose was the origin when a local frame began, see `local_frame.py`; IN_MAP: none.
+        frame_moves: How often all poses have moved from a local frame to `map`.
+        meetings: Robots that have met while nobody was located.
     """
 
     def __init__(self, table: ParameterTable, pairs: int = 0, joint: JointFilter | None = None) -> None:
@@ -124,13 +139,14 @@ class SwarmState:
         self.constraints: dict[int, NDArray[np.void]] = {}
         self.next_attempt_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.images = IdentityMemory()
+        self.origin, self.frame_moves, self.meetings = IN_MAP, 0, Meetings()
 
     def copy(self) -> SwarmState:
         """Return an independent copy."""
         other = SwarmState.__new__(SwarmState)
         for name, value in vars(self).items():
-            # the table is immutable; the arrays inside `constraints` are replaced, never written to
-            setattr(other, name, value if name in {"_table", "integrity", "all_augmented"} else value.copy())
+            # tuples and numbers are immutable; the arrays inside `constraints` are replaced, never written to
+            setattr(other, name, value if isinstance(value, tuple | int) else value.copy())
         other.integrity = IntegrityArrays(*(column.copy() for column in self.integrity))
         return other
 
@@ -189,6 +205,34 @@ class SwarmState:
         self._trust(robots, confirmations)
         for robot in robots.tolist():
             self.constraints.pop(robot, None)
+
+    def move(self, robot: int, initial: InitialPose) -> None:
+        """Move all poses rigidly such that one robot, predicted to the same instant, is at an initial pose.
+
+        Its errors e are then those of the initial pose, which all others share: with the error xi_i of
+        robot i before and Ad of the motion, e_i = e + Ad (xi_i - xi_robot). The filter must be dense.
+        """
+        motion = se2.compose(initial.transform, se2.inverse(self.transform[robot]))
+        tracked = np.flatnonzero(self.tracked)
+        self.transform[tracked] = se2.compose(motion, self.transform[tracked])
+        columns, own = robot_columns(tracked), robot_columns(np.array([robot]))[0]
+        mapping = np.eye(self.filter.covariance.shape[0])
+        for one in columns:
+            mapping[np.ix_(one, one)] = se2.adjoint(motion)
+            mapping[np.ix_(one, own)] -= se2.adjoint(motion)
+        covariance = mapping @ self.filter.covariance @ mapping.T
+        others = (initial.columns[:, None] + np.arange(3)).reshape(-1)
+        shares = initial.shares.transpose(1, 0, 2).reshape(3, -1)
+        shared = initial.covariance + shares @ covariance[np.ix_(others, others)] @ shares.T
+        rows = columns.reshape(-1)
+        covariance[np.ix_(rows, rows)] += np.tile(shared, (len(columns), len(columns)))
+        if others.size:
+            cross = np.tile(shares @ covariance[others], (len(columns), 1))
+            covariance[rows] += cross
+            covariance[:, rows] += cross.T
+        self.filter.covariance[:] = 0.5 * (covariance + covariance.T)
+        self.constraints.clear()
+        self._restart_drift(tracked)
 
     def deinitialize(self, robot: int) -> None:
         """Remove the robot from the estimate until a fix initializes it."""

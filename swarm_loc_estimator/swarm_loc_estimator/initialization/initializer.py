@@ -10,6 +10,8 @@ A whole pose by a mapper locates a robot alone: it is an estimate, which its nex
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from swarm_loc_estimator.common import se2
@@ -51,6 +53,16 @@ Counted in stamps, so that attempts do not depend on the order of arrival.
 """
 
 
+Keep = Callable[[SwarmState, MeasurementArray], bool]
+"""Keeps a measurement (1,); returns whether it helps to locate a robot."""
+Located = Callable[[SwarmState, int, InitialPose, Preintegrated], None]
+"""Called with a robot, the pose of its track, and the instant."""
+
+
+def _initialize(state: SwarmState, robot: int, initial: InitialPose, at: Preintegrated) -> None:
+    state.initialize(robot, initial, at, CONFIRMED)
+
+
 class Initializer:
     """Collects constraints and initializes robots.
 
@@ -76,14 +88,30 @@ class Initializer:
         robot, other = (target, observer) if knows_observer else (observer, target)
         if knows_observer == knows_target or not self._tracks.has_started(robot, now_ns):
             return False
+        return self.constrain(state, robot, other, one, _initialize)
+
+    def constrain(
+        self, state: SwarmState, robot: int, other: int, one: MeasurementArray, located: Located
+    ) -> bool:
+        """Keep a measurement (1,) between a robot with odometry and a located side.
+
+        Args:
+            state: Keeps it.
+            robot: The robot.
+            other: The located side: a robot, or NOBODY for `map`.
+            one: The measurement.
+            located: Called when the measurements determine the pose of the robot.
+
+        Returns:
+            True.
+        """
+        observer, now_ns = int(one["observer"][0]), int(one["stamp_ns"][0])
         track = self._tracks.at(np.array([robot]), one["stamp_ns"])
         at = Preintegrated(now_ns, track.covariance[0], track.jacobian[0])
         if locates_alone(MeasurementColumns.of(one), 0) and self._is_sure(one["covariance"][0]):
             pose, covariance = one["value"][0], one["covariance"][0]
             transform = se2.compose(pose, se2.inverse(track.pose[0]))
-            state.initialize(
-                robot, InitialPose(transform, se2.error_covariance(pose, covariance)), at, CONFIRMED
-            )
+            located(state, robot, InitialPose(transform, se2.error_covariance(pose, covariance)), at)
             return True
         old = state.constraints.get(robot, NO_CONSTRAINTS)
         same = old[(old["marker_id"] == one["marker_id"][0]) & (old["other"] == other)]
@@ -98,7 +126,7 @@ class Initializer:
             return True
         initial = align(refreshed(constraints, state.arrays()), at.covariance, self._heading_sigma)
         if initial is not None:
-            state.initialize(robot, initial, at, CONFIRMED)
+            located(state, robot, initial, at)
         else:
             waited_ns = now_ns - int(constraints["stamp_ns"][0])
             state.next_attempt_ns[robot] = now_ns + min(_LONGEST_PAUSE_NS, waited_ns // _PAUSE_SHARE)

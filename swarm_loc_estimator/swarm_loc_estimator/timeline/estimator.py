@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 
 from swarm_loc_estimator.filter.belief import NEVER_NS
 from swarm_loc_estimator.filter.measurement_model import NO_MODEL, Command
+from swarm_loc_estimator.filter.state import IN_MAP
 from swarm_loc_estimator.identification.memory import Identities, Outcome
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.conversion import InputConverter
@@ -198,6 +199,17 @@ class Estimator:
     def learned(self) -> Swarm:
         """Swarm with the estimated parameters of cameras, odometry and landmarks."""
         return learned(self.swarm, self._timeline.state)
+
+    @property
+    def origin(self) -> str:
+        """Robot whose pose was the origin when a local frame began; "" if poses are in `map`."""
+        origin = self._timeline.state.origin
+        return "" if origin == IN_MAP else self.swarm.robots[origin].name
+
+    @property
+    def frame_moves(self) -> int:
+        """How often all poses have moved from a local frame to `map` since the last reset."""
+        return self._timeline.state.frame_moves
 
     @property
     def is_fusing(self) -> bool:

@@ -20,7 +20,12 @@ from swarm_loc_estimator.filter.batch_update import (
     related_columns,
 )
 from swarm_loc_estimator.filter.belief import correct
-from swarm_loc_estimator.filter.correlated_noise import at_initialization, record_constraint, record_pair
+from swarm_loc_estimator.filter.correlated_noise import (
+    at_initialization,
+    record_constraint,
+    record_pair,
+    without_repeats,
+)
 from swarm_loc_estimator.filter.dense_filter import update_one
 from swarm_loc_estimator.filter.innovation import InnovationBatch, new_batch
 from swarm_loc_estimator.filter.integrity.divergence import WELL_CONFIRMED, LossLimits
@@ -39,9 +44,10 @@ from swarm_loc_estimator.filter.measurement_model import (
 from swarm_loc_estimator.filter.model_evaluation import evaluate_by_records
 from swarm_loc_estimator.filter.sequential_update import update_in_order
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
-from swarm_loc_estimator.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.filter.state import IN_MAP, InitialPose, Meetings, SwarmState
 from swarm_loc_estimator.identification.assignment import AMBIGUOUS
-from swarm_loc_estimator.initialization.initializer import Initializer
+from swarm_loc_estimator.initialization.initializer import Initializer, Keep
+from swarm_loc_estimator.initialization.local_frame import LocalFrame
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.sensor import chosen
@@ -98,6 +104,7 @@ class Fusion:
         self.starts = ConfiguredStarts(swarm, tracks)
         surer = settings.lost_heading_sigma / _SURER_AT_FIRST
         self._initializer = Initializer(tracks, settings.fix_window_s, surer)
+        self._local = LocalFrame(swarm, tracks, self._initializer, settings.origin_after_s)
         self._pictures = PictureFusion(swarm, settings, tracks)
         self._table = ParameterTable.of(swarm.robots, swarm.landmarks, in_blocks=self.is_sparse)
         self._pairs = _PAIRS_PER_ROBOT if any(robot.ir is not None for robot in swarm.robots) else 0
@@ -137,7 +144,20 @@ class Fusion:
     def _fuse(
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
-        """Fuse measurements of identified robots."""
+        """Fuse measurements of identified robots, in `map` or in a local frame."""
+        for part, is_absolute in self._local.parts(state, measurements):
+            some = measurements[part]
+            if not is_absolute:
+                self._fuse_in_frame(state, some, verdicts[part], nis[part])
+            elif some["command"][0] != Command.NONE:
+                verdicts[part] = self._apply_command(state, some)
+            else:
+                verdicts[part] = self._note(state, some, self._local.collect)
+
+    def _fuse_in_frame(
+        self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        """Fuse measurements, all of them in the frame of the poses."""
         measured = measurements["command"] == Command.NONE
         if state.filter.is_dense:
             many = self._is_large and measurements.size >= self._policy.batch_from
@@ -158,6 +178,10 @@ class Fusion:
         self, state: SwarmState, image: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
         """Fuse the anonymous detections of an aerial image."""
+        if state.origin != IN_MAP:  # images are in `map`, where they identify robots by their motion
+            state.frame_moves += 1
+            self._local.leave(state)
+        state.meetings = Meetings()
         self.starts.initialize_pending(state, int(image["stamp_ns"][0]))
         assignment = self._pictures.assigned(state, image)
         known = assignment.robot >= 0
@@ -232,21 +256,8 @@ class Fusion:
     def _fuse_together(
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
-        for part in self._parts(measurements):
+        for part in without_repeats(measurements):
             self._fuse_part(state, measurements[part], verdicts[part], nis[part])
-
-    def _parts(self, measurements: MeasurementArray) -> list[slice]:
-        """Split measurements (m,) into parts with at most one correlated measurement per pair or robot."""
-        edges, seen = [0], set[tuple[int, int]]()
-        comes_again: BoolArray = measurements["systematic_share"].max(axis=1) > 0.0
-        if comes_again.any():
-            pairs = zip(measurements["observer"].tolist(), measurements["target"].tolist(), strict=True)
-            for k, pair in itertools.compress(enumerate(pairs), comes_again):
-                if pair in seen:
-                    edges.append(k)
-                    seen.clear()
-                seen.add(pair)
-        return [slice(begin, end) for begin, end in itertools.pairwise([*edges, measurements.size])]
 
     def _fuse_part(
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
@@ -340,10 +351,10 @@ class Fusion:
         robots = np.arange(state.tracked.size)
         return se2.compose(state.transform, self._tracks.at(robots, np.full(robots.size, stamp_ns)).pose)
 
-    def _note(self, state: SwarmState, one: MeasurementArray) -> Verdict:
-        """Store a measurement (1,) as a constraint if it can initialize a robot."""
-        constraint = MODELS[int(one["kind"][0])].constraint
-        if constraint is None or not self._initializer.note(state, at_initialization(constraint(one))):
+    def _note(self, state: SwarmState, one: MeasurementArray, keep: Keep | None = None) -> Verdict:
+        """Store a measurement (1,) as a constraint if it can initialize a robot, or what `keep` does."""
+        constraint, keep = MODELS[int(one["kind"][0])].constraint, keep or self._initializer.note
+        if constraint is None or not keep(state, at_initialization(constraint(one))):
             return Verdict.NOT_LOCALIZED
         sides = np.array([one["observer"][0], one["target"][0]])
         if self._pairs and (sides >= 0).all() and one["kind"][0] <= POLAR:
@@ -382,5 +393,8 @@ class Fusion:
         transform = se2.compose(pose, se2.inverse(track.pose[0]))
         at = Preintegrated(stamp_ns, track.covariance[0], track.jacobian[0])
         initial = InitialPose(transform, se2.error_covariance(pose, covariance))
-        state.initialize(robot, initial, at, WELL_CONFIRMED)
+        if state.origin == IN_MAP:
+            state.initialize(robot, initial, at, WELL_CONFIRMED)
+        else:
+            self._local.move_to_map(state, robot, initial, at)
         return Verdict.USED

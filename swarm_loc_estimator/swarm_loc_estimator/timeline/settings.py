@@ -79,6 +79,13 @@ class Settings:
         "fault score above which the parameters of a robot or landmark are re-estimated; 1e9: never",
     )
     fix_window_s: float = number(20.0, "s", 0.1, 600.0, "maximum age of sightings that initialize a robot")
+    origin_after_s: float = number(
+        10.0,
+        "s",
+        0.0,
+        3600.0,
+        "time without start, landmark and fix after which the best connected robot is the origin; 0: never",
+    )
 
     aerial_probability: float = number(
         0.99, "1", 0.5, 0.999999, "minimum probability to identify a robot in aerial images"

@@ -340,6 +340,6 @@ def test_an_imu_needs_odometry(tmp_path: Path) -> None:
         "fileversion: 1\nrobots: {a: {odometry: null, camera: null, imu: {turn_noise_density: 0.01}}}\n"
     )
     with pytest.raises(
-        SwarmFileError, match="robot 'a' has no odometry, so its imu.turn_noise_density must be 0"
+        SwarmFileError, match=r"robot 'a' has no odometry, so its imu.turn_noise_density must be 0"
     ):
         load_swarm(path)
