@@ -97,6 +97,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._ingest = Ingest(self._swarm, self.params.map_frame, live_topics(self._swarm, shared=shared))
         self._estimate: Estimate | None = None
         self._jumps = 0
+        self._origin = ""
         self._pace = FusionPace(self.params.fusion_load, self.params.settings.horizon_s)
         self._shedding = Shedding(self.params.fusion_load, self.params.settings.horizon_s)
         self._thinning = self._create_thinning()
@@ -150,6 +151,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         now_ns = self._time_ns()
         self._estimate, fusing_s = self._estimate_at(now_ns, begin_s)
         self._log_time_jumps()
+        self._follow_frame()
         self._outputs.publish(self._estimate)
         self._outputs.publish_identities(self._estimator.identities)
         self._outputs.publish_sightings(self._estimator, now_ns)
@@ -192,6 +194,23 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             self._jumps = self._estimator.time_jumps
             self.get_logger().warning("clock jumped back; estimator reset")
 
+    def _follow_frame(self) -> None:
+        """Publish in the frame that the poses are in: `map_frame`, or that of the origin of a local frame."""
+        if self._estimator.origin == self._origin:
+            return
+        before, self._origin = self._frame, self._estimator.origin
+        self._outputs.use_frame(self._frame)
+        if self._origin:
+            text = f"no start, landmark or fix: poses are relative to {self._origin}, in '{self._frame}'"
+            self.get_logger().warning(text)
+        else:
+            self.get_logger().info(f"all poses have moved from '{before}' to '{self._frame}'")
+
+    @property
+    def _frame(self) -> str:
+        """Frame of all poses."""
+        return f"{self._origin}/start" if self._origin else self.params.map_frame
+
     def _on_diagnostics(self) -> None:
         begin_s = time.perf_counter()
         now_s = time.monotonic()
@@ -229,7 +248,8 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         add_contradictions(reports, contradictions)
         add_identities(reports, self._estimator.identities)
         *robots, whole = reports
-        whole.values |= {"time jumps": self._estimator.time_jumps, **self._estimator.counters}
+        frames = {"frame": self._frame, "frame moves": self._estimator.frame_moves}
+        whole.values |= {"time jumps": self._estimator.time_jumps, **frames, **self._estimator.counters}
         foreign = self._static_transforms.foreign
         lost, self._lost = drops.get("overload", 0) - self._lost, drops.get("overload", 0)
         causes += [overload_report(lost)] if lost else []

@@ -211,10 +211,7 @@ class EstimateOutputs:
 
     def __init__(self, node: Node, swarm: Swarm, parameters: EstimatorParameters) -> None:
         names = [robot.name for robot in swarm.robots]
-        frame = parameters.map_frame
         self._swarm_poses = node.create_publisher(SwarmPoses, "swarm/poses", _RELIABLE)
-        self._swarm_poses_encoder = SwarmPosesEncoder(names, frame)
-        self._frame = frame
         self._names = names
         self._sightings = node.create_publisher(SwarmSightings, "swarm/sightings", _RELIABLE)
         self._sightings_ns = 0
@@ -224,15 +221,19 @@ class EstimateOutputs:
             node.create_publisher(PoseWithCovarianceStamped, f"{name}/pose", _RELIABLE)
             for name in (names if parameters.publish_robot_poses and not parameters.shared_topics else [])
         ]
-        self._transforms = [
-            _Transforms(
-                node.create_publisher(TFMessage, topic, _TF),
-                TransformsEncoder(frame, [*children]),
-                np.array([*children.values()]),
-            )
-            for topic, children in _children_by_topic(swarm, parameters).items()
-        ]
+        self._children = _children_by_topic(swarm, parameters)
+        self._tf = [node.create_publisher(TFMessage, topic, _TF) for topic in self._children]
         self._tolerance_ns = round(parameters.transform_tolerance_s * 1e9)
+        self.use_frame(parameters.map_frame)
+
+    def use_frame(self, frame: str) -> None:
+        """Publish all poses in a frame from now on."""
+        self._frame = frame
+        self._swarm_poses_encoder = SwarmPosesEncoder(self._names, frame)
+        self._transforms = [
+            _Transforms(publisher, TransformsEncoder(frame, [*children]), np.array([*children.values()]))
+            for publisher, children in zip(self._tf, self._children.values(), strict=True)
+        ]
 
     def publish(self, estimate: Estimate) -> None:
         """Publish all poses; robots that are not localized are in `swarm/poses` only, with status waiting."""

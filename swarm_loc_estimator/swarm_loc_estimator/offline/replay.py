@@ -89,6 +89,12 @@ def replay(
     found = estimator.contradictions(summary.range_ns[1])
     remarks += [f"Note: {one.text}." for one in found if one.kind is Contradicted.CONSTANT]
     result = runner.result(bag.name, summary.range_ns, summary.truth, summary.received)
+    if estimator.origin:
+        remarks.append(
+            f"No start, landmark or fix: poses are relative to {estimator.origin}, without errors."
+        )
+    elif result.is_local.any():
+        remarks.append("Poses before the first landmark or fix are relative to a robot, without errors.")
     if result.self_calibrated:
         remarks += swapped_signs(result.self_calibrated)
     return replace(result, remarks=tuple(remarks), maps=summary.maps, goals=summary.goals)
@@ -209,6 +215,7 @@ class Runner:
         self._pose = np.zeros((_TICKS_AT_ONCE, robots, 3))
         self._covariance = np.zeros((_TICKS_AT_ONCE, robots, 3, 3))
         self._status = np.zeros((_TICKS_AT_ONCE, robots), dtype=np.uint8)
+        self._is_local = np.zeros(_TICKS_AT_ONCE, dtype=bool)
         self._sightings_left = _MAX_SIGHTINGS if keep_sightings else 0
         self._sightings: list[tuple[int, Sightings]] = []
         self._images = AerialImages() if keep_sightings else None
@@ -252,6 +259,7 @@ class Runner:
             title=title,
             swarm=estimator.swarm,
             stamp_ns=self._spool.array("stamp_ns", np.int64),
+            is_local=self._spool.array("is_local", np.bool_),
             poses=self._spool.array("pose", np.float64, robots, 3),
             covariances=self._spool.array("covariance", np.float64, robots, 3, 3),
             status=self._spool.array("status", np.uint8, robots),
@@ -272,7 +280,7 @@ class Runner:
         estimate = self._estimator.tick(now_ns)
         k, self._filled = self._filled, self._filled + 1
         self._stamp_ns[k], self._pose[k], self._covariance[k] = now_ns, estimate.poses, estimate.covariances
-        self._status[k] = estimate.status
+        self._status[k], self._is_local[k] = estimate.status, bool(self._estimator.origin)
         if self._images is not None:
             self._images.note(self._estimator.identities)
         if self._sightings_left > 0 and now_ns % _SIGHTINGS_PERIOD_NS == 0:
@@ -285,7 +293,7 @@ class Runner:
     def _flush(self) -> None:
         """Move the ticks in memory to the temporary file."""
         filled, self._filled = slice(self._filled), 0
-        for name in ("stamp_ns", "pose", "covariance", "status"):
+        for name in ("stamp_ns", "pose", "covariance", "status", "is_local"):
             self._spool.append(name, getattr(self, f"_{name}")[filled])
 
 

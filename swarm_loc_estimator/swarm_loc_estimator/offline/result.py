@@ -68,6 +68,8 @@ class ReplayResult:
         images: Aerial images with the identities of their detections; empty: none, or not kept.
         maps: Recorded messages of `map`.
         goals: Robot name -> its recorded goals; robots without are missing.
+        is_local: (T,) True while poses are relative to a robot instead of in map, and have no errors; empty:
+            never.
     """
 
     title: str
@@ -86,6 +88,7 @@ class ReplayResult:
     images: tuple[AerialImage, ...] = ()
     maps: tuple[RecordedMap, ...] = ()
     goals: Mapping[str, Trajectory] = field(default_factory=dict)
+    is_local: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     @property
     def speed_factor(self) -> float:
@@ -100,6 +103,7 @@ class ReplayResult:
             poses=self.poses[rows],
             covariances=self.covariances[rows],
             status=self.status[rows],
+            is_local=self.is_local[rows] if self.is_local.size else self.is_local,
         )
 
     def track(self, index: int) -> Trajectory:
@@ -114,8 +118,10 @@ class ReplayResult:
         for index, robot in enumerate(self.swarm.robots):
             if robot.name in self.truth:
                 known = np.isfinite(self.poses[:, index]).all(axis=1)
-                covariance = self.covariances[known, index]
-                errors = compare(self.track(index), covariance, self.truth[robot.name])
+                if self.is_local.size:
+                    known &= ~self.is_local
+                track = Trajectory(self.stamp_ns[known], self.poses[known, index])
+                errors = compare(track, self.covariances[known, index], self.truth[robot.name])
                 tracked = np.interp(errors.stamp_ns, self.stamp_ns, self.status[:, index] == Status.TRACKED)
                 found[robot.name] = replace(errors, misleading=errors.misleading & (tracked > 0.5))
         return found

@@ -1,0 +1,156 @@
+"""Swarms without a map: poses relative to one robot, and their move to the map when landmarks come.
+
+Five simulated e-pucks drive the eight for a minute with unknown starts. In the first part they see each other
+only; errors are those after a rigid fit at each instant, compared with a run in which one start is known. In
+the second part, robots of two groups do not see each other for half a minute, and landmarks come after 40 s.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from bench.integrity.scenarios import CLEAN
+from bench.shared.common import ProgressLine, new_plot, save_plot
+from bench.shared.simulated_run import errors_of, inputs_between
+from swarm_loc_drivers.sim.run import SimulatedRun
+from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.offline.metrics import is_misleading
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
+
+TICK_NS, SETTLED_S, TOGETHER_S, LANDMARKS_S = 100_000_000, 25.0, 30.0, 40.0
+_GROUP = (0, 1)
+
+
+def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
+    """Relative errors without a map, and misleading poses after the move to the map."""
+    relative: dict[str, list[FloatArray]] = {"no map": [], "one start known": []}
+    moved: list[tuple[FloatArray, BoolArray]] = []
+    wrong, tracked, moves = [], [], []
+    for seed in seeds:
+        say(f"seed {seed}")
+        run = _unknown_starts(simulate_eight(EightSettings(seed=seed, duration_s=60.0, errors=CLEAN)))
+        blind = run.masked(~_of_landmarks(run))
+        relative["no map"].append(_relative_errors(blind))
+        relative["one start known"].append(_relative_errors(_with_start(blind)))
+        apart = (_between_groups(run) & (_time_s(run) < TOGETHER_S)) | (
+            _of_landmarks(run) & (_time_s(run) < LANDMARKS_S)
+        )
+        error, misleading, is_tracked, count = _in_map(run.masked(~apart))
+        moved.append((error, misleading))
+        wrong.append(misleading.mean())
+        tracked.append(is_tracked[-10:].mean())
+        moves.append(count)
+    rms = {name: 100.0 * _rms(np.concatenate(errors)) for name, errors in relative.items()}
+    _plot(relative, moved)
+    return {
+        "no_map.relative_cm": rms["no map"],
+        "no_map.known_frame_relative_cm": rms["one start known"],
+        "no_map.ratio_to_known_frame": rms["no map"] / rms["one start known"],
+        "merge.misleading_share": float(np.mean(wrong)),
+        "merge.tracked_share_at_end": float(np.mean(tracked)),
+        "merge.frame_moves": float(np.mean(moves)),
+    }
+
+
+def _unknown_starts(run: SimulatedRun) -> SimulatedRun:
+    robots = tuple(replace(robot, start=None) for robot in run.swarm.robots)
+    return replace(run, swarm=replace(run.swarm, robots=robots))
+
+
+def _with_start(run: SimulatedRun) -> SimulatedRun:
+    """The run in which the robot with the most sightings has its true start."""
+    robot = int(np.argmax(np.bincount(_observers(run), minlength=len(run.swarm.robots))))
+    x, y, theta = run.truth.poses[0, robot].tolist()
+    robots = [*run.swarm.robots]
+    robots[robot] = replace(robots[robot], start=(x, y, theta))
+    return replace(run, swarm=replace(run.swarm, robots=tuple(robots)))
+
+
+def _observers(run: SimulatedRun) -> IntArray:
+    return np.asarray(np.repeat(run.frames["robot"], run.frames["count"]), dtype=np.int64)
+
+
+def _time_s(run: SimulatedRun) -> FloatArray:
+    return np.asarray((np.repeat(run.frames["stamp_ns"], run.frames["count"]) - run.start_ns) * 1e-9)
+
+
+def _of_landmarks(run: SimulatedRun) -> BoolArray:
+    return np.isin(run.sightings["marker_id"], [mark.id for mark in run.swarm.landmarks])
+
+
+def _between_groups(run: SimulatedRun) -> BoolArray:
+    """Whether each sighting (S,) is between robots of the two groups."""
+    ids = [face.id for robot in _GROUP for face in run.swarm.robots[robot].faces]
+    return np.isin(_observers(run), _GROUP) != np.isin(run.sightings["marker_id"], ids)
+
+
+def _relative_errors(run: SimulatedRun) -> FloatArray:
+    """Distances (T, N) from the truth after a rigid fit of all robots at each tick, once settled [m]."""
+    errors = []
+    for estimate, _ in _estimates(run):
+        if (estimate.stamp_ns - run.start_ns) * 1e-9 >= SETTLED_S:
+            truth = run.truth.all_at(np.array([estimate.stamp_ns]))[0]
+            errors.append(_fitted(estimate.poses[:, :2], truth[:, :2]))
+    return np.array(errors)
+
+
+def _fitted(places: FloatArray, truth: FloatArray) -> FloatArray:
+    """Distances (N,) after the rigid motion of places (N, 2) that fits the truth best."""
+    known = np.isfinite(places).all(axis=1)
+    a, b = places - places[known].mean(axis=0), truth - truth[known].mean(axis=0)
+    turn = np.arctan2(
+        np.sum(a[known, 0] * b[known, 1] - a[known, 1] * b[known, 0]), np.sum(a[known] * b[known])
+    )
+    moved = se2.transform_points([0.0, 0.0, turn], a)
+    return np.asarray(np.hypot(*(moved - b).T))
+
+
+def _in_map(run: SimulatedRun) -> tuple[FloatArray, BoolArray, BoolArray, int]:
+    """Errors (T, N, 3) in map and whether they mislead, tracked flags, and number of moves to the map."""
+    errors, misleading, tracked, moves = [], [], [], 0
+    for estimate, estimator in _estimates(run):
+        is_tracked = (estimate.status == Status.TRACKED) & (not estimator.origin)
+        error = errors_of(estimate.poses[None], run, np.array([estimate.stamp_ns]))[0]
+        errors.append(np.full_like(error, np.nan) if estimator.origin else error)
+        tracked.append(is_tracked)
+        misleading.append(is_misleading(error, estimate.covariances) & is_tracked)
+        moves = estimator.frame_moves
+    return np.array(errors), np.array(misleading), np.array(tracked), moves
+
+
+def _estimates(run: SimulatedRun) -> Iterator[tuple[Estimate, Estimator]]:
+    """Estimates at all ticks, and the estimator at that moment."""
+    tick_ns = np.arange(run.start_ns + 10 * TICK_NS, run.end_ns + 1, TICK_NS)
+    estimator = Estimator(run.swarm)
+    for now_ns, inputs in zip(tick_ns.tolist(), inputs_between(run, tick_ns), strict=True):
+        estimator.receive(inputs)
+        yield estimator.tick(now_ns), estimator
+
+
+def _rms(errors: FloatArray) -> float:
+    return float(np.sqrt(np.nanmean(np.square(errors))))
+
+
+def _plot(
+    relative: Mapping[str, Sequence[FloatArray]], moved: Sequence[tuple[FloatArray, BoolArray]]
+) -> None:
+    figure, (left, right) = new_plot(2, width=5.2)
+    for (name, errors), colour in zip(relative.items(), ("tab:blue", "tab:orange"), strict=True):
+        time_s = SETTLED_S + 0.1 * np.arange(len(errors[0]))
+        rows = np.concatenate(errors, axis=1)
+        left.plot(time_s, 100.0 * np.sqrt(np.nanmean(rows**2, axis=1)), color=colour, label=name)
+    left.set(xlabel="time [s]", ylabel="RMS after a rigid fit [cm]", ylim=(0.0, None))
+    left.legend()
+    for error, misleading in moved:
+        time_s, distance = 1.0 + 0.1 * np.arange(len(error)), 100.0 * np.hypot(*error[..., :2].T).T
+        right.semilogy(time_s, distance, color="0.6", linewidth=0.5)
+        ticks, robots = np.nonzero(misleading)
+        right.semilogy(time_s[ticks], distance[ticks, robots], "r.", markersize=3)
+    right.axvline(LANDMARKS_S, color="tab:green", linewidth=0.8)
+    right.set(xlabel="time [s]", ylabel="error in map [cm]", title="landmarks come after 40 s")
+    save_plot(figure, "inputs-no_map")
