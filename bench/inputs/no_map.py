@@ -86,7 +86,7 @@ def _of_landmarks(run: SimulatedRun) -> BoolArray:
 def _between_groups(run: SimulatedRun) -> BoolArray:
     """Whether each sighting (S,) is between robots of the two groups."""
     ids = [face.id for robot in _GROUP for face in run.swarm.robots[robot].faces]
-    return np.isin(_observers(run), _GROUP) != np.isin(run.sightings["marker_id"], ids)
+    return np.asarray(np.isin(_observers(run), _GROUP) != np.isin(run.sightings["marker_id"], ids))
 
 
 def _relative_errors(run: SimulatedRun) -> FloatArray:

@@ -8,7 +8,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -95,11 +95,15 @@ def odometry_bytes(robot: str, stamp_ns: int, pose: tuple[float, float, float] =
     return data
 
 
-def sight(pose: tuple[float, float, float], ids: Sequence[int] = tuple(LANDMARKS)) -> NDArray[np.void]:
-    """What a camera at a pose sees of landmarks; an unknown id is seen where the first landmark is."""
+def sight(
+    pose: tuple[float, float, float],
+    ids: Sequence[int] = tuple(LANDMARKS),
+    markers: Mapping[int, tuple[float, float, float]] = LANDMARKS,
+) -> NDArray[np.void]:
+    """What a camera at a pose sees of markers; an unknown id is seen where the first landmark is."""
     detections = np.zeros(len(ids), DETECTION_DTYPE)
     for row, marker_id in zip(detections, ids, strict=True):
-        seen = se2.between(np.array(pose), np.array(LANDMARKS.get(marker_id, LANDMARKS[100])))
+        seen = se2.between(np.array(pose), np.array(markers.get(marker_id, LANDMARKS[100])))
         row["id"], row["content"] = marker_id, CONTENT_POSE
         row["position"] = (-seen[1], 0.0, seen[0])
         row["orientation"] = (0.0, math.sin(-seen[2] / 2.0), 0.0, math.cos(-seen[2] / 2.0))
