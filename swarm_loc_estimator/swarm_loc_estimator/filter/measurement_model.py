@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.jit import inlined_njit
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.se2_scalar import composed, wrap
 from swarm_loc_estimator.filter.gating import gate_threshold
 
@@ -255,11 +255,23 @@ def predict(
     value, jacobian = np.zeros((measurements.size, 3)), np.zeros((measurements.size, 3, 5))
     errors = np.zeros((measurements.size, 2)) if camera is None else camera
     columns = MeasurementColumns.of(measurements)
-    for k in range(measurements.size):
-        predict_one(
-            columns, k, observer_pose[k], target_pose[k], (errors[k, 0], errors[k, 1]), value[k], jacobian[k]
-        )
+    _predict_all(columns, observer_pose, target_pose, errors, value, jacobian)
     return value, jacobian
+
+
+@cached_njit
+def _predict_all(
+    measurements: MeasurementColumns,
+    observer_pose: FloatArray,
+    target_pose: FloatArray,
+    camera: FloatArray,
+    value: FloatArray,
+    jacobian: FloatArray,
+) -> None:
+    """Write `predict` for all measurements."""
+    for k in range(observer_pose.shape[0]):
+        errors = (camera[k, 0], camera[k, 1])
+        predict_one(measurements, k, observer_pose[k], target_pose[k], errors, value[k], jacobian[k])
 
 
 @inlined_njit

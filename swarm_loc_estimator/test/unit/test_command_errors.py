@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.cli import calibrate, calibrate_ir, replay
+from swarm_loc_estimator.cli import calibrate, calibrate_ir, replay, survey
 from swarm_loc_estimator.common.command_line import exit_with_message, folder_to_write
 from swarm_loc_estimator.common.parameters import UserError
 
@@ -43,7 +43,7 @@ def test_faults_of_the_program_are_not_hidden() -> None:
         main()
 
 
-@pytest.mark.parametrize("main", [replay.main, calibrate.main, calibrate_ir.main])
+@pytest.mark.parametrize("main", [replay.main, calibrate.main, calibrate_ir.main, survey.main])
 def test_a_bag_that_is_not_there_is_said(
     main: Callable[[list[str]], int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.cli import calibrate, calibrate_ir, import_mrclam, replay, replay_map, watch
+from swarm_loc_estimator.cli import calibrate, calibrate_ir, import_mrclam, replay, replay_map, survey, watch
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.swarm.imu_model import ImuModel
 from swarm_loc_estimator.swarm.swarm import (
@@ -49,7 +49,9 @@ def test_every_number_of_a_landmark_has_its_place() -> None:
     assert table_of(Landmark, "x", "y") in SWARM_DESCRIPTION
 
 
-@pytest.mark.parametrize("command", [replay, replay_map, calibrate, calibrate_ir, import_mrclam, watch])
+@pytest.mark.parametrize(
+    "command", [replay, replay_map, calibrate, calibrate_ir, import_mrclam, survey, watch]
+)
 def test_every_option_of_a_command_has_its_place(command: object, capsys: pytest.CaptureFixture[str]) -> None:
     main: Callable[[list[str]], int] = command.main  # type: ignore[attr-defined]
     with pytest.raises(SystemExit):

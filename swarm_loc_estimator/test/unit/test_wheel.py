@@ -33,7 +33,7 @@ def run(*arguments):
     except SystemExit as end:
         return end.code
 """
-COMMANDS = {"calibrate", "calibrate_ir", "import_droplets", "import_mrclam", "replay", "replay_map"}
+COMMANDS = {"calibrate", "calibrate_ir", "import_droplets", "import_mrclam", "replay", "replay_map", "survey"}
 NODES = {"estimator_node", "mapper_node", "markers_node", "play", "watch_node"}
 STARTERS = {"demo", "graph", "watch"}
 """Commands that start nodes."""

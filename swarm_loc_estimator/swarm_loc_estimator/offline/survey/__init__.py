@@ -1,0 +1,1 @@
+"""Places of landmarks from a recording of robots that drive around, by batch least squares."""

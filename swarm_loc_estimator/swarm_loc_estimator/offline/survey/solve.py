@@ -1,0 +1,353 @@
+"""Robust batch least squares over SE(2): transforms of tracks, landmarks, cameras and odometry scales.
+
+Errors are right-invariant, X = exp(xi) X_hat, as in the filter, whose measurement models and odometry noise
+are used. Weights of Geman and McClure of whole sightings limit the influence of wrong ids; they are wide at
+first, when places are far off (graduated non-convexity). Steps are those of Levenberg and Marquardt, with
+sparse LU (SuperLU) of the normal equations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_matrix, csc_matrix
+from scipy.sparse.linalg import SuperLU, splu
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.filter.measurement_model import predict
+from swarm_loc_estimator.offline.survey.problem import Problem
+from swarm_loc_estimator.offline.survey.start import Start
+from swarm_loc_estimator.swarm.swarm import Swarm
+
+PRIORS: FloatArray = np.array([0.01, 0.03, 0.05, 0.05, 0.02])
+"""Standard deviations of turn bias [rad/s], scales of path and of turn, camera yaw [rad] and camera scale."""
+_SCALES = (50.0, 20.0, 10.0, 5.0)
+"""Residuals at which the weight of a sighting is a quarter [sigma], one after the other."""
+_ITERATIONS, _CONVERGED, _NEARLY = 15, 1e-2, 1e-3
+"""Of each scale: most steps, and the decrease of the cost that ends them; at first a share of the cost."""
+_ORIGIN_SIGMA = 1e-5
+_YAW_SIGMA = 1.0
+"""Of the heading of a landmark without one, which nothing determines [rad]."""
+_DAMPING = (1e-14, 1e-2)
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass
+class Solution:
+    """Estimates with the covariance of their right-invariant errors.
+
+    Attributes:
+        knot: (k, 3) transforms of the tracks at the knots.
+        landmark: (L, 3) poses.
+        parameter: (N, 5) errors of turn bias, path scale, turn scale, camera yaw and camera scale.
+        parameter_sigma: (N, 5) their standard deviations.
+        landmark_covariance: (L, 3, 3) of x, y, yaw.
+        weight: (m,) of the sightings, from 0 for wrong ones to 1.
+        used: (m,) whether both sides of the sighting are connected with the origin.
+        variance_ratio: Mean squared residual of sightings by the described noise; 1 is ideal.
+    """
+
+    knot: FloatArray
+    landmark: FloatArray
+    parameter: FloatArray
+    parameter_sigma: FloatArray
+    landmark_covariance: FloatArray
+    weight: FloatArray
+    used: BoolArray
+    variance_ratio: float
+
+
+class Solver:
+    """Solves one problem.
+
+    Args:
+        problem: Sightings and odometry.
+        start: Where to begin; what is not connected there is left out.
+    """
+
+    def __init__(self, problem: Problem, start: Start) -> None:
+        self._problem, knots = problem, problem.knots
+        robots, landmarks = len(problem.swarm.robots), len(problem.swarm.landmarks)
+        self._knot, self._landmark = start.transform[knots.robot], start.landmark.copy()
+        self._parameter = np.zeros((robots, PRIORS.size))
+        is_placed = np.isfinite(self._knot[:, 0])
+        self._mark = problem.sightings["landmark"].astype(np.int64) - 1
+        targets = np.where(self._mark >= 0, np.isfinite(self._landmark[self._mark, 0]), True)
+        for side in range(2):
+            targets &= (problem.sides[:, side] < 0) | is_placed[problem.sides[:, side]]
+        self.used: BoolArray = np.asarray(targets)
+        self._rows = np.flatnonzero(self.used)
+        # exactly described landmarks have no columns
+        free = np.isfinite(self._landmark[:, 0]) & ~(problem.is_known & _is_exact(problem.swarm))
+        self._knot_column, next_column = _numbered(is_placed, 0)
+        self._landmark_column, next_column = _numbered(free, next_column)
+        self._parameter_column = next_column + np.arange(robots * PRIORS.size).reshape(robots, -1)
+        self._size = next_column + robots * PRIORS.size
+        self._pairs = _steps(problem, is_placed)
+        self._weight, self._is_rigid = np.ones(self._rows.size), True
+        self._robots, self._landmarks = robots, landmarks
+
+    def solve(self, progress: Progress) -> Solution:
+        """Solve, and compute covariances."""
+        flexible, self._knot_column = self._knot_column, self._rigid()
+        self._descend(_SCALES[0])
+        self._knot_column, self._is_rigid = flexible, False
+        for k, scale in enumerate(_SCALES):
+            progress(k / len(_SCALES), "solving")
+            self._descend(scale)
+        return self._solution(*self._normal(_SCALES[-1])[:1])
+
+    def _rigid(self) -> IntArray:
+        """Columns of the knots where odometry is exact: those of a robot's first knot for all."""
+        first = np.searchsorted(self._problem.knots.robot, self._problem.knots.robot)
+        return np.asarray(self._knot_column[first])
+
+    def _descend(self, scale: float) -> None:
+        """Minimize the cost at one scale of the weights."""
+        damping, is_last = _DAMPING[0], scale == _SCALES[-1]
+        matrix, gradient, cost = self._normal(scale)
+        for _ in range(_ITERATIONS):
+            step = _factor(matrix, damping).solve(gradient)
+            before = self._knot, self._landmark, self._parameter
+            self._apply(step)
+            new_matrix, new_gradient, new_cost = self._normal(scale)
+            if new_cost > cost:
+                self._knot, self._landmark, self._parameter = before
+                damping = 100.0 * damping
+                if damping > _DAMPING[1]:
+                    return
+                continue
+            damping = max(_DAMPING[0], 0.01 * damping)
+            has_converged = cost - new_cost < (_CONVERGED if is_last else _NEARLY * cost)
+            matrix, gradient, cost = new_matrix, new_gradient, new_cost
+            if has_converged:
+                return
+
+    def _apply(self, step: FloatArray) -> None:
+        """Move all estimates by a step (n,)."""
+        self._knot, self._landmark = self._knot.copy(), self._landmark.copy()
+        for pose, column in ((self._knot, self._knot_column), (self._landmark, self._landmark_column)):
+            rows = np.flatnonzero(column >= 0)
+            twist = step[column[rows][:, None] + np.arange(3)]
+            pose[rows] = se2.compose(se2.exp(twist), pose[rows])
+        self._parameter = self._parameter + step[self._parameter_column]
+
+    def _normal(self, scale: float) -> tuple[csc_matrix, FloatArray, float]:
+        """Normal matrix, right-hand side and robust cost, linearized at the estimates."""
+        blocks = _Blocks()
+        cost = self._add_priors(blocks) + (0.0 if self._is_rigid else self._add_odometry(blocks))
+        residual, jacobian, columns = self._sightings()
+        square = np.sum(residual**2, axis=1)
+        self._weight = 1.0 / np.square(1.0 + square / scale**2)
+        root = np.sqrt(self._weight)
+        blocks.add(jacobian * root[:, None, None], columns, residual * root[:, None])
+        cost += float(np.sum(square / (1.0 + square / scale**2)))
+        return *blocks.normal(self._size), cost
+
+    def _add_odometry(self, blocks: _Blocks) -> float:
+        """Steps between consecutive knots: r = log(T_b T_a^-1) - Ad(T_a) D p."""
+        a, b, root, response = self._pairs
+        adjoint = se2.adjoint(self._knot[a])
+        drift = se2.log(se2.compose(self._knot[b], se2.inverse(self._knot[a])))
+        robot = self._problem.knots.robot[a]
+        moved = np.einsum("kij,kj->ki", response, self._parameter[robot, :3])
+        back = np.linalg.inv(adjoint)  # residuals in the frame of the track, where the noise is given
+        residual = np.einsum("kij,kj->ki", root, np.einsum("kij,kj->ki", back, drift) - moved)
+        by_pose = np.einsum("kij,kjl->kil", root, back)
+        by_parameter = -np.einsum("kij,kjl->kil", root, response)
+        jacobian = np.concatenate([-by_pose, by_pose, by_parameter], axis=2)
+        columns = np.concatenate(
+            [
+                self._knot_column[a][:, None] + np.arange(3),
+                self._knot_column[b][:, None] + np.arange(3),
+                self._parameter_column[robot][:, :3],
+            ],
+            axis=1,
+        )
+        blocks.add(jacobian, columns, residual)
+        return float(np.sum(residual**2))
+
+    def _add_priors(self, blocks: _Blocks) -> float:
+        """Priors of parameters, described landmarks, starts and the origin."""
+        scaled = self._parameter / PRIORS
+        diagonal = np.tile(np.diag(1.0 / PRIORS), (self._robots, 1, 1))
+        blocks.add(diagonal, self._parameter_column, scaled)
+        cost = float(np.sum(scaled**2))
+        for column, pose, prior, sigma in self._anchors():
+            # the error of the pose in map, linearized: xi = log(X X_prior^-1)
+            residual = se2.log(se2.compose(pose, se2.inverse(prior)))
+            root = np.linalg.inv(np.linalg.cholesky(se2.error_covariance(prior, np.diag(sigma**2))))
+            blocks.add(root[None], (column + np.arange(3))[None], (root @ residual)[None])
+            cost += float(np.sum((root @ residual) ** 2))
+        return cost
+
+    def _anchors(self) -> list[tuple[int, FloatArray, FloatArray, FloatArray]]:
+        """Columns, poses, described poses and standard deviations of what is described."""
+        problem, found = self._problem, []
+        for index, mark in enumerate(problem.swarm.landmarks):
+            column = int(self._landmark_column[index])
+            if column < 0:
+                continue
+            described = np.array([mark.x, mark.y, mark.yaw or 0.0])
+            if problem.is_known[index]:
+                sigma = np.array([mark.position_sigma, mark.position_sigma, mark.yaw_sigma])
+                if mark.yaw is None:
+                    sigma[2] = _YAW_SIGMA
+                found.append((column, self._landmark[index], described, np.maximum(sigma, _ORIGIN_SIGMA)))
+            elif mark.yaw is None:
+                pose = self._landmark[index]
+                found.append((column, pose, pose * [1.0, 1.0, 0.0], np.array([1e3, 1e3, _YAW_SIGMA])))
+        has_frame = bool(problem.is_known.any())
+        for index, robot in enumerate(problem.swarm.robots):
+            own = np.flatnonzero((problem.knots.robot == index) & (self._knot_column >= 0))
+            if not own.size or robot.start is None:
+                continue
+            has_frame = True
+            spread = robot.start_sigma
+            sigma = np.array([spread.x, spread.y, spread.theta])
+            found.append(self._first_pose(int(own[0]), np.array(robot.start), sigma))
+        if not has_frame:
+            first = int(np.flatnonzero(self._knot_column >= 0)[0])
+            track = problem.knots.sample.pose[first]
+            origin = se2.compose(self._knot[first], track) if self._origin is None else self._origin
+            self._origin = origin
+            found.append(self._first_pose(first, origin, np.full(3, _ORIGIN_SIGMA)))
+        return found
+
+    _origin: FloatArray | None = None
+
+    def _first_pose(
+        self, knot: int, pose: FloatArray, sigma: FloatArray
+    ) -> tuple[int, FloatArray, FloatArray, FloatArray]:
+        # the error of X = T O is that of T
+        track = self._problem.knots.sample.pose[knot]
+        return int(self._knot_column[knot]), se2.compose(self._knot[knot], track), pose, sigma
+
+    def _sightings(self) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Whitened residuals (u, 3), Jacobians (u, 3, 8) and columns (u, 8) of the used sightings."""
+        problem, rows = self._problem, self._rows
+        some, (observer, target) = problem.sightings[rows], problem.sides[rows].T
+        mark, robot = self._mark[rows], problem.sightings["observer"][rows]
+        poses = [se2.compose(self._knot[observer], problem.tracks[0, rows])]
+        moved = se2.compose(self._knot[target], problem.tracks[1, rows])
+        poses.append(np.where((target >= 0)[:, None], moved, self._landmark[mark]))
+        camera = self._parameter[robot, 3:]
+        value, jacobian = predict(some, poses[0], poses[1], camera)
+        by_pose = jacobian[:, :, :3]
+        noise = some["covariance"].copy()
+        for side, knot in enumerate((observer, target)):
+            carried = np.where((knot >= 0)[:, None, None], by_pose @ se2.adjoint(self._knot[knot]), 0.0)
+            noise += carried @ problem.slip[side, rows] @ carried.transpose(0, 2, 1)
+        innovation = _innovation(some["value"], value, problem.is_polar[rows], some["has_heading"] > 0)
+        root = np.linalg.inv(np.linalg.cholesky(noise))
+        residual = -np.einsum("kij,kj->ki", root, innovation)
+        other = _innovation(some["alternative"], value, problem.is_polar[rows], some["has_heading"] > 0)
+        mirrored = -np.einsum("kij,kj->ki", root, other)
+        better = (some["has_alternative"] > 0) & (np.sum(mirrored**2, axis=1) < np.sum(residual**2, axis=1))
+        residual[better] = mirrored[better]
+        whole = np.concatenate([-by_pose, by_pose, jacobian[:, :, 3:]], axis=2)
+        columns = np.full((rows.size, 8), -1)
+        columns[:, :3] = self._knot_column[observer][:, None] + np.arange(3)
+        first = np.where(target >= 0, self._knot_column[target], self._landmark_column[mark])
+        columns[:, 3:6] = np.where(first[:, None] >= 0, first[:, None] + np.arange(3), -1)
+        columns[:, 6:] = self._parameter_column[robot][:, 3:]
+        return residual, np.einsum("kij,kjl->kil", root, whole), columns
+
+    def _solution(self, matrix: csc_matrix) -> Solution:
+        residual, _, _ = self._sightings()
+        good = self._weight > 0.5
+        degrees = 2.0 + (self._problem.sightings["has_heading"][self._rows] > 0)
+        ratio = float(np.sum(residual[good] ** 2) / max(1.0, np.sum(degrees[good])))
+        factor = _factor(matrix, 0.0)
+        covariance = np.zeros((self._landmarks, 3, 3))
+        for index in np.flatnonzero(self._landmark_column >= 0).tolist():
+            block = _block(factor, self._size, self._landmark_column[index] + np.arange(3))
+            covariance[index] = se2.pose_covariance(self._landmark[index], block)
+        sigma = np.array([np.sqrt(np.diag(_block(factor, self._size, c))) for c in self._parameter_column])
+        weight = np.zeros(self.used.size)
+        weight[self._rows] = self._weight
+        return Solution(
+            self._knot, self._landmark, self._parameter, sigma, covariance, weight, self.used, ratio
+        )
+
+
+class _Blocks:
+    """Rows of a sparse Jacobian and residuals, collected."""
+
+    def __init__(self) -> None:
+        self._rows = 0
+        self._entries: list[tuple[FloatArray, IntArray, IntArray]] = []
+        self._residual: list[FloatArray] = []
+
+    def add(self, jacobian: FloatArray, columns: IntArray, residual: FloatArray) -> None:
+        """Add residuals (k, r) with Jacobians (k, r, c) by columns (k, c); -1: fixed."""
+        count, size, width = jacobian.shape
+        rows = self._rows + np.arange(count * size).reshape(count, size)
+        row = np.broadcast_to(rows[:, :, None], jacobian.shape)
+        column = np.broadcast_to(columns[:, None, :], jacobian.shape)
+        kept = column >= 0
+        self._entries.append((jacobian[kept], row[kept], column[kept]))
+        self._residual.append(residual.reshape(-1))
+        self._rows += count * size
+        assert width == columns.shape[1]  # noqa: S101
+
+    def normal(self, size: int) -> tuple[csc_matrix, FloatArray]:
+        """J^T J (n, n) and -J^T r (n,)."""
+        value, row, column = (np.concatenate(part) for part in zip(*self._entries, strict=True))
+        jacobian = coo_matrix((value, (row, column)), (self._rows, size)).tocsr()
+        return csc_matrix(jacobian.T @ jacobian), -(jacobian.T @ np.concatenate(self._residual))
+
+
+def _numbered(wanted: BoolArray, first: int) -> tuple[IntArray, int]:
+    """First columns (k,) of bodies of three columns, -1 where not wanted; and the next free column."""
+    columns = np.where(wanted, first + 3 * (np.cumsum(wanted) - 1), -1)
+    return columns, first + 3 * int(wanted.sum())
+
+
+def _is_exact(swarm: Swarm) -> BoolArray:
+    return np.array([not mark.is_estimated for mark in swarm.landmarks], dtype=bool)
+
+
+def _steps(problem: Problem, is_placed: BoolArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Pairs of consecutive knots (p,), whitening of their steps, and Jacobians by parameters."""
+    knots = problem.knots
+    same = (knots.robot[1:] == knots.robot[:-1]) & is_placed[1:]
+    a = np.flatnonzero(same)
+    covariance = knots.sample.covariance[a + 1] - knots.sample.covariance[a]
+    covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1)) + np.eye(3) * _LEAST_VARIANCE
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    return a, a + 1, root, knots.sample.jacobian[a + 1] - knots.sample.jacobian[a]
+
+
+_LEAST_VARIANCE = 1e-10
+"""Of a step, so that that of a standing robot is invertible [m^2, rad^2]."""
+
+
+def _innovation(
+    measured: FloatArray, predicted: FloatArray, is_polar: BoolArray, has_heading: BoolArray
+) -> FloatArray:
+    """Measured minus predicted (k, 3), angles wrapped, zero for a heading that was not measured."""
+    found = measured - predicted
+    found[:, 2] = np.where(has_heading, se2.wrap_angle(found[:, 2]), 0.0)
+    found[is_polar, 1] = se2.wrap_angle(found[is_polar, 1])
+    return found
+
+
+def _factor(matrix: csc_matrix, damping: float) -> SuperLU:
+    diagonal = matrix.diagonal()
+    damped = matrix.copy()
+    # without any information, as of knots that are tied to others, columns stay as they are
+    damped.setdiag(np.where(diagonal > 0.0, diagonal * (1.0 + damping), 1.0))
+    return splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
+
+
+def _block(factor: SuperLU, size: int, columns: IntArray) -> FloatArray:
+    """Block (k, k) of the inverse of the factored matrix."""
+    right = np.zeros((size, columns.size))
+    right[columns, np.arange(columns.size)] = 1.0
+    block = factor.solve(right)[columns]
+    return np.asarray(0.5 * (block + block.T))

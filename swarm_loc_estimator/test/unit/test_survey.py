@@ -1,0 +1,194 @@
+"""Surveying landmarks: places, covariances and frames against the truth; wrong ids, lone parts, sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from core_messages import joined as joined_detections
+from core_world import Plan, World, simulate
+
+from swarm_loc_estimator.cli import survey as command
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
+from swarm_loc_estimator.offline.survey.problem import problem_of
+from swarm_loc_estimator.offline.survey.solve import Solver
+from swarm_loc_estimator.offline.survey.start import start_of
+from swarm_loc_estimator.offline.survey.survey import survey
+from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
+from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
+from swarm_loc_estimator.sensors.sensor import chosen
+from swarm_loc_estimator.swarm.swarm import StartSigma, Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+
+PLAN = Plan(robots=3, duration_s=25.0, arena=0.8, landmarks=8, start_known=(False,))
+BAGS = Path(__file__).parents[3] / "bags"
+
+
+def recording_of(world: World) -> Recording:
+    moved = [event for event in world.events if event.pose is not None]
+    seen = [event for event in world.events if event.detections.size]
+    stamps = np.array([event.stamp_ns for event in moved])
+    poses = np.array([event.pose for event in moved], dtype=float)
+    odometry = OdometryRows.without_twist(np.array([event.robot for event in moved]), stamps, poses, stamps)
+    count = [event.detections.size for event in seen]
+    at_ns = np.repeat([event.stamp_ns for event in seen], count)
+    robots = np.repeat([event.robot for event in seen], count)
+    detections = DetectionRows(robots, at_ns, joined_detections([e.detections for e in seen]), at_ns)
+    return Recording("world", odometry, detections, {})
+
+
+def unplaced(swarm: Swarm) -> Swarm:
+    return replace(swarm, landmarks=())
+
+
+def places_of(swarm: Swarm) -> Mapping[int, FloatArray]:
+    return {mark.id: np.array([mark.x, mark.y, mark.yaw or 0.0]) for mark in swarm.landmarks}
+
+
+def errors(found: Swarm, true: Swarm) -> FloatArray:
+    """Errors (L, 3) of landmarks after a rigid fit to their true places."""
+    poses, truth = places_of(found), places_of(true)
+    a, b = (np.array([one[marker_id] for marker_id in sorted(truth)]) for one in (poses, truth))
+    here, there = a[:, :2] - a[:, :2].mean(axis=0), b[:, :2] - b[:, :2].mean(axis=0)
+    turn = np.arctan2(np.sum(here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0]), np.sum(here * there))
+    moved = se2.transform_points([0.0, 0.0, turn], here) - there
+    return np.column_stack([moved, se2.wrap_angle(a[:, 2] + turn - b[:, 2])])
+
+
+def rms(error: FloatArray) -> float:
+    return float(np.sqrt(np.mean(np.sum(error[:, :2] ** 2, axis=1))))
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("content", [1, 2])
+def test_landmarks_are_found_from_nothing(seed: int, content: int) -> None:
+    """By ranges and bearings, and by poses; the robots do not know where they start."""
+    world = simulate(replace(PLAN, content=content), seed)
+    done = survey(recording_of(world), unplaced(world.swarm))
+    assert rms(errors(done.swarm, world.swarm)) < 0.02
+    assert "The origin is the first pose of one robot" in done.text
+    first = done.path[np.flatnonzero(np.abs(done.path).max(axis=1) < 1e-3)]
+    assert len(first)  # the pose that is the origin
+
+
+def test_without_noise_they_are_exact() -> None:
+    world = simulate(replace(PLAN, noise=0.0), 0)
+    done = survey(recording_of(world), unplaced(world.swarm))
+    assert rms(errors(done.swarm, world.swarm)) < 1e-4
+
+
+def test_errors_are_within_the_covariances() -> None:
+    """With one robot's start known exactly, errors are those in its frame."""
+    squares = []
+    for seed in range(6):
+        world = simulate(PLAN, seed)
+        x, y, theta = world.truth[0, 0].tolist()
+        robots = (replace(world.swarm.robots[0], start=(x, y, theta)), *world.swarm.robots[1:])
+        robots = (replace(robots[0], start_sigma=StartSigma(1e-3, 1e-3, 1e-3)), *robots[1:])
+        done = survey(recording_of(world), replace(world.swarm, robots=robots, landmarks=()))
+        ids = [mark.id for mark in done.problem.swarm.landmarks]
+        truth = places_of(world.swarm)
+        for index, marker_id in enumerate(ids):
+            error = done.solution.landmark[index] - truth[marker_id]
+            error[2] = se2.wrap_angle(error[2])
+            squares.append(error @ np.linalg.solve(done.solution.landmark_covariance[index], error))
+    # 3 is ideal; less, since cameras and odometry are exact here, which the survey does not know
+    assert 0.3 < np.mean(squares) < 4.5
+
+
+def test_cameras_and_odometry_are_corrected() -> None:
+    world = simulate(replace(PLAN, lasting=1.0, duration_s=40.0), 2)
+    exact = tuple(
+        replace(
+            robot,
+            odometry=replace(
+                robot.odometry, distance_scale_sigma=0.0, turn_scale_sigma=0.0, turn_bias_sigma=0.0
+            ),
+        )
+        for robot in world.swarm.robots
+    )
+    known = world.swarm.landmarks[::4]  # two opposite ones give the scale
+    done = survey(recording_of(world), replace(world.swarm, robots=exact, landmarks=known))
+    assert "Corrected for robot_" in done.text
+    assert rms(errors(done.swarm, world.swarm)) < 0.03
+
+
+def test_wrong_ids_change_little() -> None:
+    world = simulate(replace(PLAN, duration_s=40.0), 1)
+    recording = recording_of(world)
+    clean = rms(errors(survey(recording, unplaced(world.swarm)).swarm, world.swarm))
+    rng, rows = np.random.default_rng(0), recording.detections.detection.copy()
+    wrong = rng.uniform(size=rows.size) < 0.1
+    rows["id"][wrong] = rng.choice(np.unique(rows["id"]), int(wrong.sum()))
+    spoilt = replace(recording, detections=recording.detections._replace(detection=rows))
+    done = survey(spoilt, unplaced(world.swarm))
+    assert rms(errors(done.swarm, world.swarm)) < 1.5 * clean + 0.002
+    of_landmarks = done.problem.sightings["landmark"] > 0
+    assert 0.04 < np.mean(done.solution.weight[of_landmarks] < 0.1) < 0.16
+
+
+def test_described_landmarks_give_the_frame_and_stay() -> None:
+    world = simulate(PLAN, 3)
+    known = world.swarm.landmarks[:2]
+    done = survey(recording_of(world), replace(world.swarm, landmarks=known))
+    assert done.swarm.landmarks[:2] == known
+    found, truth = places_of(done.swarm), places_of(world.swarm)
+    assert max(np.hypot(*(found[i] - truth[i])[:2]) for i in truth) < 0.06
+    assert "The frame is that of the 2 described landmarks" in done.text
+
+
+def test_what_is_rare_or_lone_is_named_with_a_remedy() -> None:
+    world = simulate(replace(PLAN, robots=2), 0)
+    recording = recording_of(world)
+    rows = recording.detections
+    ids, robot = rows.detection["id"], rows.robot
+    mine, yours = (1000, 1001, 1002, 1003), (1004, 1005, 1006, 1007)
+    apart = np.where(robot == 0, np.isin(ids, mine), np.isin(ids, yours))
+    apart[np.flatnonzero((ids == 1007) & apart)[3:]] = False
+    seen = chosen(rows, apart)
+    done = survey(replace(recording, detections=seen), unplaced(world.swarm))
+    assert "Marker 1007 was seen 3 x only and is left out; drive past it." in done.text
+    assert "cannot be placed: nothing connects them with the others" in done.text
+    assert len(done.swarm.landmarks) in {3, 4}
+
+
+def test_what_cannot_be_surveyed_is_said_in_a_sentence() -> None:
+    world = simulate(PLAN, 0)
+    recording = recording_of(world)
+    with pytest.raises(CalibrationError, match="no odometry"):
+        survey(replace(recording, odometry=NO_ODOMETRY), world.swarm)
+    with pytest.raises(CalibrationError, match="no marker that belongs to nobody"):
+        survey(replace(recording, detections=NO_DETECTIONS), unplaced(world.swarm))
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    world = simulate(PLAN, 1)
+    problem = problem_of(recording_of(world), unplaced(world.swarm))
+    solver = Solver(problem, start_of(problem))
+    solver.solve(lambda _share, _what: None)
+    rng = np.random.default_rng(0)
+    matrix, gradient, _ = solver._normal(1e6)  # without weights
+    solver._apply(rng.standard_normal(gradient.size) / np.sqrt(matrix.diagonal()))  # away from the minimum
+    matrix, gradient, _ = solver._normal(1e6)
+    step = 1e-3 * gradient / matrix.diagonal()
+    before, cost = (solver._knot, solver._landmark, solver._parameter), []
+    for sign in (1.0, -1.0):
+        solver._apply(sign * step)
+        cost.append(solver._normal(1e6)[2])
+        solver._knot, solver._landmark, solver._parameter = before
+    assert cost[0] - cost[1] == pytest.approx(-4.0 * gradient @ step, rel=1e-2)
+
+
+def test_the_command_surveys_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag, out = BAGS / "eight_five_robots", tmp_path / "surveyed.yaml"
+    assert command.main([str(bag), "--all", "--out", str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "20" in said
+    assert out.with_suffix(".png").stat().st_size > 10_000
+    true = load_swarm(bag / "swarm.yaml")
+    assert rms(errors(load_swarm(out), true)) < 0.005
