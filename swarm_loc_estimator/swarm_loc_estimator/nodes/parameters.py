@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, field
 
-from swarm_loc_estimator.common.parameters import ParameterError, flag, number, text, texts
+from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text, texts
 from swarm_loc_estimator.mapping.settings import MapperSettings
+from swarm_loc_estimator.nodes.localizer_sources import SOURCES
 from swarm_loc_estimator.timeline.settings import Settings
 
 
@@ -117,3 +118,42 @@ class MarkersParameters:
 
     swarm_file: str = text("", "path of the swarm description", required=True)
     rate: float = number(10.0, "Hz", 0.1, 100.0, "how often markers are published, at most")
+
+
+@dataclass(frozen=True)
+class BridgeParameters:
+    """Parameters of `localizer_bridge`."""
+
+    swarm_file: str = text("", "path of the swarm description", required=True)
+    source: str = choice("pose", tuple(SOURCES), "kind of messages, see the table of sources")
+    topic: str = text(
+        "", "their topic, with <body> in place of the body's name; empty: that of the table of sources"
+    )
+    output: str = choice(
+        "fix",
+        ("fix", "ground_truth"),
+        "<robot>/fix for the estimator, or <robot>/ground_truth to evaluate it",
+    )
+    bodies: tuple[str, ...] = texts(
+        "tracked bodies, such as cf1=epuck1, or epuck2 for a body with the robot's name; empty: all robots so"
+    )
+    offsets: tuple[str, ...] = texts(
+        "poses of bodies in base_link, such as epuck1=0.01,0,1.5708 [m, m, rad]; else bodies are base_link"
+    )
+    source_frame: str = text("", "frame that the poses must be in; empty: map_frame or world")
+    map_frame: str = text("map", "what this frame is called in the output", required=True)
+    latency_s: float = number(
+        0.0, "s", 0.0, 2.0, "time from the exposure to the stamp of a message, subtracted from the stamp"
+    )
+    stamp_on_arrival: bool = flag(
+        False, "take the time of arrival in place of stamps, for a source with another clock or none"
+    )
+    position_sigma: float = number(
+        0.001, "m", 0.0, 10.0, "noise of x and of y, for poses without covariance", above=True
+    )
+    heading_sigma: float = number(
+        0.005, "rad", 0.0, 3.0, "noise of the heading, for poses without covariance", above=True
+    )
+    max_tilt: float = number(
+        0.35, "rad", 0.0, 3.1416, "largest angle between the z axes of a body and of the frame"
+    )

@@ -17,6 +17,7 @@ from swarm_loc_estimator.common.parameters import (
     parameter_specs,
 )
 from swarm_loc_estimator.nodes.parameters import (
+    BridgeParameters,
     EstimatorParameters,
     MapperParameters,
     MarkersParameters,
@@ -32,6 +33,7 @@ DOC = Path(__file__).parents[2] / "doc"
     ("page", "cls"),
     [
         ("estimator_node.md", EstimatorParameters),
+        ("motion_capture.md", BridgeParameters),
         ("play.md", PlayerParameters),
         ("mapper_node.md", MapperParameters),
         ("watch.md", WatchParameters),

@@ -34,7 +34,7 @@ def run(*arguments):
         return end.code
 """
 COMMANDS = {"calibrate", "calibrate_ir", "import_droplets", "import_mrclam", "replay", "replay_map", "survey"}
-NODES = {"estimator_node", "mapper_node", "markers_node", "play", "watch_node"}
+NODES = {"estimator_node", "localizer_bridge", "mapper_node", "markers_node", "play", "watch_node"}
 STARTERS = {"demo", "graph", "watch"}
 """Commands that start nodes."""
 

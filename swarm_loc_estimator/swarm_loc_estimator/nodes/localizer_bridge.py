@@ -1,0 +1,119 @@
+"""Passes poses of motion capture, AMCL and other localisers on as fixes or ground truth of robots.
+
+    ./run swarm_loc_estimator localizer_bridge --ros-args -p swarm_file:=swarm.yaml -p source:=pose
+
+It subscribes to topics of the localiser, and publishes `<robot>/fix` or `<robot>/ground_truth`, and
+`/diagnostics`. Parameters: see `doc/motion_capture.md`.
+"""
+
+from __future__ import annotations
+
+import re
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of, listed
+from swarm_loc_estimator.common.messages.poses import encode_pose_stamped, encode_poses
+from swarm_loc_estimator.common.node import ConfiguredNode, MessageTypeError, message_class, run_node
+from swarm_loc_estimator.common.parameters import ParameterError
+from swarm_loc_estimator.nodes.localizer_robots import LocalizedRobots, RobotPose
+from swarm_loc_estimator.nodes.localizer_sources import BODY, SOURCES
+from swarm_loc_estimator.nodes.parameters import BridgeParameters
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+
+_INPUT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Matches publishers of both kinds; deeper than that of sensor data, since many nodes share /tf."""
+_OUTPUT_QOS = QoSProfile(depth=10)
+
+
+class LocalizerBridge(ConfiguredNode[BridgeParameters]):
+    """Converts the messages of a localiser and publishes poses of robots."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("localizer_bridge", BridgeParameters, **node_arguments)
+        parameters = self.params
+        swarm = load_swarm(Path(parameters.swarm_file))
+        self._source = SOURCES[parameters.source]
+        self._robots = LocalizedRobots(parameters, list(swarm.index_of), self.health)
+        kind: Any = PoseWithCovarianceStamped if parameters.output == "fix" else PoseStamped
+        self._outputs = {
+            robot: self.create_publisher(kind, f"{robot}/{parameters.output}", _OUTPUT_QOS)
+            for robot in self._robots.robot_of.values()
+        }
+        received = self._message_class()
+        for topic, body in self._robots.topics.items():
+            take = partial(self._on_message, topic, body)
+            self.create_subscription(received, topic, take, _INPUT_QOS)
+        self.start_diagnostics(self._on_diagnostics)
+        self.get_logger().info(f"ready: {len(self._outputs)} robots of '{parameters.swarm_file}'")
+
+    def _message_class(self) -> Any:
+        try:
+            return message_class(self._source.message_type)
+        except MessageTypeError as error:
+            package = self._source.message_type.partition("/")[0]
+            raise ParameterError(
+                f"parameter source = '{self.params.source}' needs the package {package}:"
+                f" install ros-jazzy-{package.replace('_', '-')}, or build it in a sourced workspace."
+            ) from error
+
+    def _on_message(self, topic: str, body: str, message: Any) -> None:
+        self.health.received(topic)
+        arrival_ns = self.get_clock().now().nanoseconds
+        for pose in self._robots.convert(self._source.bodies(message), body, arrival_ns):
+            self._outputs[pose.robot].publish(self._encoded(pose))
+
+    def _encoded(self, pose: RobotPose) -> bytes:
+        frame, stamps, poses = self.params.map_frame, np.array([pose.stamp_ns]), pose.pose[None]
+        if self.params.output == "fix":
+            return encode_poses(frame, stamps, poses, pose.covariance[None])[0]
+        return encode_pose_stamped(frame, stamps, poses)[0]
+
+    def _on_diagnostics(self) -> None:
+        robots, missing = self._robots, self._missing()
+        if missing:
+            self._note_topics_of_strangers()
+        said = {name: f"body '{name}' is of no robot: name it in bodies" for name in robots.strangers}
+        self.health.warn_of("missing", {one: f"no messages received on {one}" for one in missing}, PATIENCE_S)
+        self.health.warn_of("strangers", said)
+        self.health.warn_of_drops()
+        message = f"no messages received on {listed(missing)}" if missing else ""
+        message = "; ".join(filter(None, (message, *list(said.values())[:1])))
+        values: dict[str, object] = {
+            "poses": robots.used,
+            "bodies of no robot": listed(sorted(robots.strangers)),
+            **drop_values(self.health.drops),
+        }
+        trouble = message or self._trouble()
+        self.publish_reports(Report(self.status_name, trouble or "bridging", level_of(trouble), values))
+
+    def _trouble(self) -> str:
+        """That every pose is dropped; "": some are used."""
+        drops = self.health.drops
+        return f"no pose can be used: {listed(sorted(drops))}" if drops and not self._robots.used else ""
+
+    def _missing(self) -> list[str]:
+        """Topics, and bodies on them, of which nothing was received yet or recently."""
+        silent = [topic for topic in self._robots.topics if self.health.silence(topic)]
+        if not silent:
+            return [label for label in self._robots.label_of.values() if self.health.silence(label)]
+        return [f"{one}{self.why_missing(one, self._source.message_type)}" for one in silent]
+
+    def _note_topics_of_strangers(self) -> None:
+        """Note bodies with topics of their own that nobody describes."""
+        before, own, after = self.resolve_topic_name(self._robots.topic.replace(BODY, "BODY")).partition(
+            "BODY"
+        )
+        pattern = re.compile(f"{re.escape(before)}([^/]+){re.escape(after)}")
+        for name, types in self.get_topic_names_and_types() if own else ():
+            match = pattern.fullmatch(name)
+            if match and match[1] not in self._robots.robot_of and self._source.message_type in types:
+                self._robots.note_stranger(match[1])
+
+
+main = partial(run_node, "localizer_bridge", LocalizerBridge)

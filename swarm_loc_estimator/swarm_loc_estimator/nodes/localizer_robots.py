@@ -1,0 +1,214 @@
+"""Poses of tracked bodies as poses of the robots that carry them. No ROS here."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.health import Health
+from swarm_loc_estimator.common.parameters import ParameterError
+from swarm_loc_estimator.nodes.localizer_sources import BODY, SOURCES, BodyPose
+from swarm_loc_estimator.nodes.parameters import BridgeParameters
+from swarm_loc_estimator.sensors.fix import HEADING_UNKNOWN, has_heading, is_unknown
+
+_IN_TOPICS = re.compile(r"[A-Za-z0-9_/]+")
+_MAX_OFFSET_M = 10.0
+_MAX_STRANGERS = 100
+"""Maximum number of names of bodies that are kept only to name them."""
+_NO_HEADING = 1e3 * HEADING_UNKNOWN
+"""Variance of a heading that was not measured [rad^2]."""
+
+
+class RobotPose(NamedTuple):
+    """Pose of a robot in `map`.
+
+    Attributes:
+        robot: Its name.
+        stamp_ns: Time of measurement.
+        pose: (3,) x [m], y [m], heading [rad]; 0 if it was not measured.
+        covariance: (3, 3) of the pose; the variance of a heading that was not measured is huge.
+    """
+
+    robot: str
+    stamp_ns: int
+    pose: FloatArray
+    covariance: FloatArray
+
+
+class _UnusableError(Exception):
+    """A pose that is dropped, with the reason and a sentence."""
+
+    def __init__(self, reason: str, sentence: str) -> None:
+        super().__init__(sentence)
+        self.reason = reason
+
+
+class LocalizedRobots:
+    """Converts poses of bodies to poses of robots.
+
+    Args:
+        parameters: Of `localizer_bridge`.
+        robots: Names of the robots of the swarm.
+        health: Counts what is dropped, and records when bodies were seen.
+
+    Raises:
+        ParameterError: A parameter cannot be used.
+
+    Attributes:
+        robot_of: Body -> robot.
+        topic: The topic, with `BODY` if each body has its own.
+        topics: Topic -> the body that it is about, "" for a topic that names bodies itself.
+        label_of: Body -> what its poses come from, for messages to users.
+        strangers: Names of bodies of no robot.
+        used: Number of poses that were converted.
+    """
+
+    def __init__(self, parameters: BridgeParameters, robots: Collection[str], health: Health) -> None:
+        self._parameters, self._health = parameters, health
+        self.robot_of = _robots_of_bodies(parameters.bodies, robots)
+        self._to_robot = {
+            robot: se2.inverse(offset)
+            for robot, offset in _offsets(parameters.offsets, self.robot_of.values()).items()
+        }
+        self.topic = topic = parameters.topic or SOURCES[parameters.source].topic
+        has_own = BODY in SOURCES[parameters.source].topic
+        if has_own != (BODY in topic):
+            raise ParameterError(
+                f"parameter topic = '{topic}' must {'' if has_own else 'not '}contain {BODY}:"
+                f" messages of the source '{parameters.source}' {'do not ' if has_own else ''}name bodies."
+            )
+        self.topics = {topic.replace(BODY, body): body for body in self.robot_of} if has_own else {topic: ""}
+        self.label_of = {
+            body: topic.replace(BODY, body) if has_own else f"{topic} about body '{body}'"
+            for body in self.robot_of
+        }
+        for body in self.robot_of if has_own else ():
+            if not _IN_TOPICS.fullmatch(body):
+                raise ParameterError(
+                    f"parameter bodies: '{body}' cannot be part of a topic; name the body as its topic does."
+                )
+        self.strangers: set[str] = set()
+        self.used = 0
+        self._variances = np.diag(
+            [parameters.position_sigma**2, parameters.position_sigma**2, parameters.heading_sigma**2]
+        )
+
+    def convert(self, bodies: Iterable[BodyPose], of_topic: str, arrival_ns: int) -> Iterator[RobotPose]:
+        """The poses of robots by those of bodies; what cannot be used is counted.
+
+        Args:
+            bodies: Of one message.
+            of_topic: The body that its topic is about, "" if it names bodies itself.
+            arrival_ns: Time of arrival.
+        """
+        for body in bodies:
+            name = body.name or of_topic
+            if name not in self.robot_of:
+                if self._parameters.source != "tf":  # which carries frames of all kinds
+                    self._health.drop("unknown_body")
+                    self.note_stranger(name)
+                continue
+            self._health.received(self.label_of[name])
+            try:
+                yield self._robot_pose(name, body, arrival_ns)
+            except _UnusableError as error:
+                self._health.drop(error.reason, str(error))
+            else:
+                self.used += 1
+
+    def note_stranger(self, name: str) -> None:
+        """Note a body of no robot."""
+        if len(self.strangers) < _MAX_STRANGERS:
+            self.strangers.add(name)
+
+    def _robot_pose(self, name: str, body: BodyPose, arrival_ns: int) -> RobotPose:
+        parameters, robot = self._parameters, self.robot_of[name]
+        frames = [parameters.source_frame] if parameters.source_frame else [parameters.map_frame, "world"]
+        if body.frame_id not in frames:
+            raise _UnusableError(
+                "foreign_frame",
+                f"the poses of body '{name}' are in frame '{body.frame_id}', not {' or '.join(frames)}:"
+                " is source_frame right?",
+            )
+        stamp_ns = arrival_ns if parameters.stamp_on_arrival else body.stamp_ns
+        if stamp_ns == 0:
+            raise _UnusableError(
+                "no_stamp", f"the poses of body '{name}' have no stamps: set stamp_on_arrival"
+            )
+        if body.tilt > parameters.max_tilt:
+            lean = f"the z axis of body '{name}' leans by {math.degrees(body.tilt):.0f} deg"
+            raise _UnusableError("tilted", f"{lean}: does the localiser's z axis point up?")
+        covariance = self._variances if is_unknown(body.covariance[None])[0] else body.covariance
+        if not (np.isfinite(body.pose[:2]).all() and np.isfinite(covariance).all()):
+            raise _UnusableError("not_finite", f"a number in the poses of body '{name}' is NaN or infinite")
+        pose, to_robot = np.array(body.pose), self._to_robot.get(robot, np.zeros(3))
+        if math.isnan(pose[2]) or not has_heading(covariance[None])[0]:
+            if to_robot.any() or parameters.output == "ground_truth":
+                raise _UnusableError(
+                    "no_heading", f"the poses of body '{name}' have no heading, which is needed"
+                )
+            pose, covariance = np.array([*pose[:2], 0.0]), covariance.copy()
+            covariance[2, :], covariance[:, 2] = 0.0, 0.0
+            covariance[2, 2] = _NO_HEADING
+        placed = se2.compose(pose, to_robot)
+        by_heading = np.eye(3)  # the lever between robot and body turns with the heading
+        by_heading[:2, 2] = pose[1] - placed[1], placed[0] - pose[0]
+        return RobotPose(
+            robot,
+            stamp_ns - round(parameters.latency_s * 1e9),
+            placed,
+            by_heading @ covariance @ by_heading.T,
+        )
+
+
+def _robots_of_bodies(selected: Collection[str], robots: Collection[str]) -> dict[str, str]:
+    """Body -> robot.
+
+    Raises:
+        ParameterError: There is no such robot, or a body or a robot is named twice.
+    """
+    robot_of: dict[str, str] = {}
+    for one in selected or robots:
+        body, _, robot = one.rpartition("=")
+        body = body or robot
+        _check_robot("bodies", robot, robots)
+        if body in robot_of or robot in robot_of.values():
+            raise ParameterError(f"parameter bodies: '{one}' names a body or a robot a second time.")
+        robot_of[body] = robot
+    return robot_of
+
+
+def _offsets(selected: Collection[str], robots: Collection[str]) -> Mapping[str, FloatArray]:
+    """Robot -> pose (3,) of its body in base_link.
+
+    Raises:
+        ParameterError: There is no such robot, or a text is no pose.
+    """
+    offset_of: dict[str, FloatArray] = {}
+    for one in selected:
+        robot, _, numbers = one.partition("=")
+        _check_robot("offsets", robot, robots)
+        try:
+            offset = np.array([float(number) for number in numbers.split(",")])
+        except ValueError:
+            offset = np.zeros(0)
+        if offset.shape != (3,) or not (np.abs(offset) <= _MAX_OFFSET_M).all():
+            raise ParameterError(
+                f"parameter offsets: '{one}' must be a robot and x, y, yaw of its body,"
+                f" such as epuck1=0.01,0,1.5708, each at most {_MAX_OFFSET_M:g} [m, rad]."
+            )
+        offset_of[robot] = offset
+    return offset_of
+
+
+def _check_robot(parameter: str, robot: str, robots: Collection[str]) -> None:
+    if robot not in robots:
+        raise ParameterError(
+            f"parameter {parameter}: there is no robot '{robot}', but {', '.join(robots) or 'none'}."
+        )
