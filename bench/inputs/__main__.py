@@ -11,10 +11,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 
-from bench.inputs import imu, no_map
+from bench.inputs import imu, mocap, no_map
 from bench.shared.common import ProgressLine, table, write_figures
 
 PARTS: Mapping[str, Callable[[Sequence[int], ProgressLine], Mapping[str, float]]] = {
+    "mocap": mocap.measure,
     "imu": imu.measure,
     "no_map": no_map.measure,
 }
