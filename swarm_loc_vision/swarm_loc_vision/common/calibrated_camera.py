@@ -15,11 +15,8 @@ from swarm_loc_vision.common.images import Gray, ImageError
 GrayOf = Callable[[Any], Gray]
 
 
-class CalibratedCamera:
-    """The calibration of one camera, and its images.
-
-    Args:
-        gray_of: Reads an image message, see `TRANSPORTS`.
+class Calibration:
+    """The calibration of one camera; subclasses use its images, or what was found in them.
 
     Attributes:
         images: Number of images received.
@@ -28,12 +25,11 @@ class CalibratedCamera:
         trouble: What is wrong with the calibration, a sentence; empty: nothing.
     """
 
-    def __init__(self, gray_of: GrayOf) -> None:
+    def __init__(self) -> None:
         self.images = 0
         self.drops: Counter[str] = Counter()
         self.camera: Camera | None = None
         self.trouble = ""
-        self._gray_of = gray_of
 
     def calibrate(self, message: Any) -> None:
         """Use a sensor_msgs/CameraInfo from now on.
@@ -42,11 +38,15 @@ class CalibratedCamera:
             CameraError: The camera is not calibrated; its images are dropped from now on.
         """
         try:
-            camera = camera_of(message)
+            camera = self.read(message)
         except CameraError as error:
             self.camera, self.trouble = None, str(error)
             raise
         self.take_over(camera)
+
+    def read(self, message: Any) -> Camera:
+        """The camera of a sensor_msgs/CameraInfo, see `camera_of`."""
+        return camera_of(message)
 
     def take_over(self, camera: Camera) -> None:
         """Use a calibration from now on."""
@@ -58,6 +58,28 @@ class CalibratedCamera:
     def use(self, camera: Camera) -> None:
         """Adapt to a calibration that differs from the previous one."""
         raise NotImplementedError
+
+    def known_camera(self) -> Camera:
+        """The calibration.
+
+        Raises:
+            ImageError: There is none.
+        """
+        if self.camera is None:
+            raise ImageError("no_calibration", self.trouble or "no camera_info was received yet.")
+        return self.camera
+
+
+class CalibratedCamera(Calibration):
+    """The calibration of one camera, and its images.
+
+    Args:
+        gray_of: Reads an image message, see `TRANSPORTS`.
+    """
+
+    def __init__(self, gray_of: GrayOf) -> None:
+        super().__init__()
+        self._gray_of = gray_of
 
     def gray(self, message: Any) -> Gray:
         """The brightness (height, width) of an image of this camera.
@@ -73,10 +95,9 @@ class CalibratedCamera:
             raise
 
     def _of_this_camera(self, message: Any) -> Gray:
-        if self.camera is None:
-            raise ImageError("no_calibration", self.trouble or "no camera_info was received yet.")
+        camera = self.known_camera()
         gray = self._gray_of(message)
-        size, calibrated = gray.shape[::-1], (self.camera.width, self.camera.height)
+        size, calibrated = gray.shape[::-1], (camera.width, camera.height)
         if size != calibrated:
             shown, wanted = (f"{width} x {height}" for width, height in (size, calibrated))
             raise ImageError(
@@ -85,8 +106,8 @@ class CalibratedCamera:
         return gray
 
 
-def camera_of(message: Any) -> Camera:
-    """The camera of the images that a sensor_msgs/CameraInfo comes with.
+def camera_of(message: Any, *, rectified: bool = False) -> Camera:
+    """The camera of the images that a sensor_msgs/CameraInfo comes with, or of their rectified images.
 
     The calibration is that of the whole sensor. The images show its region of interest, and each of their
     pixels is the mean of `binning_x` x `binning_y` pixels of the sensor; what is left over at the right and
@@ -95,9 +116,9 @@ def camera_of(message: Any) -> Camera:
     Raises:
         CameraError: It is not calibrated, or its region or binning do not fit its size.
     """
-    whole = Camera.from_matrix(
-        (message.width, message.height), np.reshape(message.k, (3, 3)), message.d, message.distortion_model
-    )
+    matrix = np.reshape(message.p, (3, 4))[:, :3] if rectified else np.reshape(message.k, (3, 3))
+    lens = ((), "") if rectified else (message.d, message.distortion_model)
+    whole = Camera.from_matrix((message.width, message.height), matrix, *lens)
     roi = message.roi
     left, top, width, height = roi.x_offset, roi.y_offset, roi.width, roi.height
     if not any((left, top, width, height)):

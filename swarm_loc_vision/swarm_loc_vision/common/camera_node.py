@@ -12,7 +12,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
 from swarm_loc_estimator.common.node import ConfiguredNode, Parameters
-from swarm_loc_vision.common.calibrated_camera import CalibratedCamera
+from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, Calibration
 from swarm_loc_vision.common.camera import CameraError
 from swarm_loc_vision.common.images import TRANSPORTS, ImageError
 
@@ -31,7 +31,7 @@ class CameraNode(ConfiguredNode[Parameters]):
         self._cost_s = 0.0
 
     def watch(self, camera: CalibratedCamera, transport_name: str, detections: Publisher) -> None:
-        """Subscribe to the camera's topics.
+        """Subscribe to the camera's images and calibration.
 
         Args:
             camera: The camera.
@@ -39,7 +39,24 @@ class CameraNode(ConfiguredNode[Parameters]):
             detections: Publisher of what is found.
         """
         transport = TRANSPORTS[transport_name]
+        # as image_transport does: a remapping of image_raw applies to all of its transports
+        topic = self.resolve_topic_name("image_raw") + transport.suffix
+        self.take(camera, _MESSAGES[transport.message_type], topic, detections, IMAGE_QOS)
+
+    def take(
+        self, camera: Calibration, message_class: type, topic: str, detections: Publisher, qos: QoSProfile
+    ) -> None:
+        """Subscribe to a topic about the camera's images and to its calibration.
+
+        Args:
+            camera: The calibration.
+            message_class: Class of the messages that `detect` gets.
+            topic: Their topic, with its namespace.
+            detections: Publisher of what is found.
+            qos: Of the subscription.
+        """
         self._source, self._detections = camera, detections
+        self._topic = topic
         overriding = QoSOverridingOptions([QoSPolicyKind.RELIABILITY])
         self.create_subscription(
             CameraInfo,
@@ -48,14 +65,8 @@ class CameraNode(ConfiguredNode[Parameters]):
             qos_profile_sensor_data,
             qos_overriding_options=overriding,
         )
-        # as image_transport does: a remapping of image_raw applies to all of its transports
-        self._image_topic = self.resolve_topic_name("image_raw") + transport.suffix
         self.create_subscription(
-            _MESSAGES[transport.message_type],
-            self._image_topic,
-            self._on_image,
-            IMAGE_QOS,
-            qos_overriding_options=overriding,
+            message_class, self._topic, self._on_message, qos, qos_overriding_options=overriding
         )
         self.start_diagnostics(self._on_diagnostics)
 
@@ -81,7 +92,7 @@ class CameraNode(ConfiguredNode[Parameters]):
         except CameraError as error:
             self.get_logger().error(str(error), throttle_duration_sec=_THROTTLE_S)
 
-    def _on_image(self, message: Image | CompressedImage) -> None:
+    def _on_message(self, message: Any) -> None:
         begin_s = time.process_time()
         try:
             self._detections.publish(self.detect(message))
@@ -89,7 +100,7 @@ class CameraNode(ConfiguredNode[Parameters]):
             self.health.drop(error.reason, str(error))
         finally:
             self._cost_s += time.process_time() - begin_s
-            self.health.received(self._image_topic)
+            self.health.received(self._topic)
 
     def _on_diagnostics(self) -> None:
         source, missing = self._source, self._missing()
@@ -108,4 +119,4 @@ class CameraNode(ConfiguredNode[Parameters]):
         """What is not received, a sentence; "": nothing."""
         if self._source.camera is None and not self._source.trouble:
             return f"no messages received on {self.resolve_topic_name('camera_info')}"
-        return self.health.silence(self._image_topic)
+        return self.health.silence(self._topic)

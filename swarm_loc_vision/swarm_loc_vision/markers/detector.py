@@ -16,29 +16,21 @@ from swarm_loc_estimator.common.parameters import number
 from swarm_loc_vision.common.camera import LENS_SIZE, Camera
 from swarm_loc_vision.common.images import Gray
 from swarm_loc_vision.common.sampling import GRID, homographies, read_cells
-from swarm_loc_vision.markers.bodies import Body, Placement, Seen, solve_bodies
+from swarm_loc_vision.markers.bodies import Body, Placement
 from swarm_loc_vision.markers.decoder import Dictionary
 from swarm_loc_vision.markers.edges import refine, refine_read
 from swarm_loc_vision.markers.families import Family, draw_marker, family_named
-from swarm_loc_vision.markers.pose import Poses, Upright, marker_poses
+from swarm_loc_vision.markers.pose import Poses
+from swarm_loc_vision.markers.pose_solver import PoseSettings, PoseSolver
 from swarm_loc_vision.markers.quads import find_quads
 
 
 @dataclass(frozen=True)
-class DetectorSettings:
+class DetectorSettings(PoseSettings):
     """Settings of the detector."""
 
-    marker_length: float = number(
-        0.05, "m", 0.001, 10.0, "side of markers without a length of their own, black border included"
-    )
     min_side_px: float = number(8.0, "px", 6.0, 1000.0, "smallest side of markers in the image")
     min_contrast: float = number(4.0, "1", 1.0, 100.0, "least brightness of paper minus that of ink [counts]")
-    tilt_sigma: float = number(
-        0.0, "rad", 0.0, 1.0, "standard deviation of markers from upright; 0: any orientation"
-    )
-    ambiguity: float = number(
-        16.0, "1", 0.0, 1e4, "the mirrored pose is published if its chi square is higher by at most this"
-    )
 
 
 _ROUGH_PX = 3.0
@@ -124,9 +116,7 @@ class MarkerDetector:
         self._settings = settings
         self._camera = camera
         self._lens = camera.lens if camera else np.zeros(LENS_SIZE)
-        self._lengths = lengths or {}
-        self._bodies = bodies
-        self._upright = None if up is None or not settings.tilt_sigma else Upright(up, settings.tilt_sigma)
+        self._solver = PoseSolver(settings, camera, lengths or {}, up, bodies) if camera else None
         by_side: dict[int, dict[Family, IntArray]] = {}
         for family, ids in families.items():
             used = np.arange(len(family.words)) if ids is None else ids
@@ -182,18 +172,9 @@ class MarkerDetector:
 
     def _poses(self, markers: _Markers) -> tuple[Poses | None, int]:
         """Poses of all markers, jointly for bodies, and the number of misfits."""
-        if self._camera is None:
+        if self._solver is None:
             return None, 0
-        default = self._settings.marker_length
-        lengths = np.array([self._lengths.get(int(i), default) for i in markers.id], dtype=float)
-        intrinsics = self._camera.intrinsics
-        poses, is_misfit = marker_poses(
-            markers.corners, markers.covariance, lengths, intrinsics, self._upright
-        )
-        if self._bodies:
-            seen = Seen(markers.id, markers.corners, markers.covariance, lengths, poses)
-            solve_bodies(seen, self._bodies, intrinsics, self._upright)
-        return poses, int(is_misfit.sum())
+        return self._solver.solve(markers.id, markers.corners, markers.covariance)
 
 
 def _best(markers: _Markers) -> _Markers:

@@ -16,17 +16,14 @@ from rclpy.qos import QoSProfile
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import MarkerDetectionArray
-from swarm_loc_vision.common.camera_node import CameraNode
 from swarm_loc_vision.common.images import TRANSPORTS
 from swarm_loc_vision.markers.camera_detector import CameraDetector
 from swarm_loc_vision.markers.detector import precompile
+from swarm_loc_vision.markers.marker_node import MarkerNode
 from swarm_loc_vision.markers.parameters import DetectorParameters, detector_maker
 
-_MAX_MISFIT_SHARE = 0.1
-"""Largest share of misfits since the last diagnostics; above it the calibration may be wrong."""
 
-
-class MarkerDetectorNode(CameraNode[DetectorParameters]):
+class MarkerDetectorNode(MarkerNode[DetectorParameters]):
     """Receives images and publishes detections."""
 
     def __init__(self, **node_arguments: Any) -> None:
@@ -37,29 +34,10 @@ class MarkerDetectorNode(CameraNode[DetectorParameters]):
             self.get_logger().info("compiling the detector for this machine: about half a minute")
         precompile()
         gray_of = TRANSPORTS[parameters.image_transport].gray_of
-        self._camera = CameraDetector(create_detector, gray_of, parameters.settings.ambiguity)
-        self._told = (0, 0)  # markers and misfits
+        self.camera = CameraDetector(create_detector, gray_of, parameters.settings.ambiguity)
         publisher = self.create_publisher(MarkerDetectionArray, "detections", QoSProfile(depth=10))
-        self.watch(self._camera, parameters.image_transport, publisher)
+        self.watch(self.camera, parameters.image_transport, publisher)
         self.get_logger().info(f"ready: markers of family {parameters.family}")
-
-    def detect(self, message: Any) -> bytes:
-        """The serialized detections of an image; see `CameraDetector.detect`."""
-        return self._camera.detect(message)
-
-    def figures(self) -> dict[str, str]:
-        """Numbers of markers."""
-        camera = self._camera
-        return {"markers": str(camera.markers), "markers that fit no square": str(camera.misfits)}
-
-    def trouble(self) -> str:
-        """A warning if many markers since the last call do not fit a square."""
-        camera = self._camera
-        markers, misfits = camera.markers - self._told[0], camera.misfits - self._told[1]
-        self._told = camera.markers, camera.misfits
-        if misfits <= _MAX_MISFIT_SHARE * markers:
-            return ""
-        return f"{misfits} of {markers} markers fit no square: is camera_info that of this camera?"
 
 
 main = partial(run_node, "marker_detector_node", MarkerDetectorNode)

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, text, texts
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.common.images import TRANSPORTS
-from swarm_loc_vision.markers.bodies import robot_body, up_of
+from swarm_loc_vision.markers.bodies import Body, robot_body, up_of
 from swarm_loc_vision.markers.camera_detector import CreateDetector
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import Family, families, family_named
@@ -27,10 +28,9 @@ _LONGEST_M = 10.0
 
 
 @dataclass(frozen=True)
-class DetectorParameters:
-    """Parameters of `marker_detector_node`."""
+class MarkersInUse:
+    """Parameters about the markers in use and the camera's mount."""
 
-    image_transport: str = choice("raw", tuple(TRANSPORTS), "transport: uncompressed images, or JPEG or PNG")
     family: str = choice("artoolkit_bch_thin", tuple(families()), "kind of marker")
     ids: tuple[str, ...] = texts("ids in use, such as 5 or 0-31; empty: those of swarm_file, or all")
     lengths: tuple[str, ...] = texts(
@@ -40,8 +40,52 @@ class DetectorParameters:
         "", "path of the swarm description: ids in use, sizes, faces of robots; empty: none"
     )
     robot: str = text("", "robot of the camera in swarm_file, for its mount; empty: a level camera")
+
+
+@dataclass(frozen=True)
+class DetectorParameters(MarkersInUse):
+    """Parameters of `marker_detector_node`."""
+
+    image_transport: str = choice("raw", tuple(TRANSPORTS), "transport: uncompressed images, or JPEG or PNG")
     settings: DetectorSettings = field(
         default_factory=DetectorSettings, metadata={"numbers_of": DetectorSettings}
+    )
+
+
+class KnownMarkers(NamedTuple):
+    """What a description says of markers: `MarkersInUse` with the contents of its files.
+
+    Attributes:
+        family: The family.
+        ids: (N,) ids in use, ascending; None: all.
+        lengths: Sides by id [m].
+        up: (3,) up in the camera frame.
+        bodies: Faces of the other robots.
+    """
+
+    family: Family
+    ids: IntArray | None
+    lengths: Mapping[int, float]
+    up: FloatArray
+    bodies: Sequence[Body]
+
+
+def known_markers(parameters: MarkersInUse) -> KnownMarkers:
+    """The markers that parameters describe.
+
+    Raises:
+        ParameterError: A parameter cannot be used.
+        SwarmFileError: The swarm description cannot be used.
+    """
+    family = family_named(parameters.family)
+    swarm = load_swarm(Path(parameters.swarm_file)) if parameters.swarm_file else Swarm()
+    robot = _robot(parameters, swarm)
+    return KnownMarkers(
+        family,
+        _ids(parameters, swarm, family),
+        _lengths(parameters, swarm, family),
+        up_of((robot.camera if robot else None) or CameraMount()),
+        [robot_body(other) for other in swarm.robots if other is not robot],
     )
 
 
@@ -52,13 +96,7 @@ def detector_maker(parameters: DetectorParameters) -> CreateDetector:
         ParameterError: A parameter cannot be used.
         SwarmFileError: The swarm description cannot be used.
     """
-    family = family_named(parameters.family)
-    swarm = load_swarm(Path(parameters.swarm_file)) if parameters.swarm_file else Swarm()
-    robot = _robot(parameters, swarm)
-    ids = _ids(parameters, swarm, family)
-    lengths = _lengths(parameters, swarm, family)
-    up = up_of((robot.camera if robot else None) or CameraMount())
-    bodies = [robot_body(other) for other in swarm.robots if other is not robot]
+    family, ids, lengths, up, bodies = known_markers(parameters)
 
     def create(camera: Camera) -> MarkerDetector:
         return MarkerDetector(
@@ -68,7 +106,7 @@ def detector_maker(parameters: DetectorParameters) -> CreateDetector:
     return create
 
 
-def _robot(parameters: DetectorParameters, swarm: Swarm) -> Robot | None:
+def _robot(parameters: MarkersInUse, swarm: Swarm) -> Robot | None:
     """The robot that carries the camera."""
     if not parameters.robot:
         return None
@@ -80,7 +118,7 @@ def _robot(parameters: DetectorParameters, swarm: Swarm) -> Robot | None:
     return swarm.robots[swarm.index_of[parameters.robot]]
 
 
-def _ids(parameters: DetectorParameters, swarm: Swarm, family: Family) -> IntArray | None:
+def _ids(parameters: MarkersInUse, swarm: Swarm, family: Family) -> IntArray | None:
     """The ids in use; None: all."""
     count = len(family.words)
     if parameters.ids:
@@ -96,7 +134,7 @@ def _ids(parameters: DetectorParameters, swarm: Swarm, family: Family) -> IntArr
     return np.array(sorted(swarm.owner_of), np.int64)
 
 
-def _lengths(parameters: DetectorParameters, swarm: Swarm, family: Family) -> dict[int, float]:
+def _lengths(parameters: MarkersInUse, swarm: Swarm, family: Family) -> dict[int, float]:
     """Sides by id, from the swarm or from the parameter."""
     if parameters.lengths and parameters.swarm_file:
         raise ParameterError(

@@ -1,0 +1,219 @@
+"""Markers that other detectors have found, with poses and covariances of our own.
+
+`apriltag_msgs/AprilTagDetectionArray` has corners, `aruco_opencv_msgs/ArucoDetection` has poses by
+`solvePnPGeneric` without covariance; from these the corners follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
+from swarm_loc_estimator.common.messages.detections import encode_detections
+from swarm_loc_estimator.common.parameters import choice, flag, number
+from swarm_loc_vision.common.calibrated_camera import Calibration, camera_of
+from swarm_loc_vision.common.camera import Camera
+from swarm_loc_vision.common.images import ImageError
+from swarm_loc_vision.markers.camera_detector import detection_rows
+from swarm_loc_vision.markers.detector import Detections
+from swarm_loc_vision.markers.parameters import MarkersInUse, known_markers
+from swarm_loc_vision.markers.pose import square
+from swarm_loc_vision.markers.pose_solver import PoseSettings, PoseSolver
+
+_APRILTAG_CENTRE_PX = 0.5
+"""Where AprilTag's detector sees the centre of the first pixel; everywhere else it is at 0."""
+_APRILTAG_NAMES = {"apriltag_36h11": "tag36h11"}
+"""Names that AprilTag's detector has for our families."""
+_HALF_TURN = ("apriltag_36h11",)
+"""Families that OpenCV has upside down."""
+
+
+class ForeignMarker(NamedTuple):
+    """A marker that another detector has found.
+
+    Attributes:
+        id: Its id.
+        family: Name of its family in the message; "": the message does not say.
+        corners: (4, 2) clockwise from its own upper left [px]; of an image without distortion if
+            `ForeignKind.has_ideal_corners`.
+    """
+
+    id: int
+    family: str
+    corners: FloatArray
+
+
+@dataclass(frozen=True)
+class ForeignParameters(MarkersInUse):
+    """Parameters of `marker_bridge_node`."""
+
+    source: str = choice("apriltag", ("apriltag", "aruco_opencv"), "the other detector")
+    rectified: bool = flag(
+        True, "whether it sees rectified images, so that P of camera_info counts, not K and distortion"
+    )
+    corner_sigma_px: float = number(
+        0.3, "px", 0.001, 100.0, "standard deviation of each corner along u and v"
+    )
+    source_marker_length: float = number(
+        0.15, "m", 0.001, 10.0, "marker_size of aruco_opencv, in whose poses the true size is not known"
+    )
+    settings: PoseSettings = field(default_factory=PoseSettings, metadata={"numbers_of": PoseSettings})
+
+
+@dataclass(frozen=True)
+class ForeignKind:
+    """Kind of messages of another detector.
+
+    Attributes:
+        message_type: Such as apriltag_msgs/msg/AprilTagDetectionArray.
+        topic: Its topic.
+        markers: Reads a message.
+        has_ideal_corners: Whether corners are those of an image without distortion.
+    """
+
+    message_type: str
+    topic: str
+    markers: Callable[[Any, Camera, ForeignParameters], Iterator[ForeignMarker]]
+    has_ideal_corners: bool
+
+
+def _of_apriltag(message: Any, _camera: Camera, _parameters: ForeignParameters) -> Iterator[ForeignMarker]:
+    """AprilTag's corners go counter-clockwise from the lower left."""
+    for tag in message.detections:
+        corners = np.array([(corner.x, corner.y) for corner in tag.corners])
+        yield ForeignMarker(tag.id, tag.family, corners[::-1] - _APRILTAG_CENTRE_PX)
+
+
+def _of_aruco(message: Any, camera: Camera, parameters: ForeignParameters) -> Iterator[ForeignMarker]:
+    """Project the square of a marker at its pose; a marker behind the camera has corners that are NaN."""
+    fx, fy, cx, cy = camera.intrinsics
+    turned = 2 if parameters.family in _HALF_TURN else 0
+    for marker in message.markers:
+        place, turn = marker.pose.position, marker.pose.orientation
+        quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
+        points = np.full((4, 3), np.nan)
+        if np.isfinite(quaternion).all() and quaternion.any():
+            rotation = Rotation.from_quat(quaternion).as_matrix()
+            points = square(parameters.source_marker_length) @ rotation.T + [place.x, place.y, place.z]
+        if not (points[:, 2] > 0.0).all():
+            points[:] = np.nan
+        corners = points[:, :2] / points[:, 2:] * [fx, fy] + [cx, cy]
+        yield ForeignMarker(marker.marker_id, "", np.roll(corners, turned, axis=0))
+
+
+KINDS: dict[str, ForeignKind] = {
+    "apriltag": ForeignKind(
+        "apriltag_msgs/msg/AprilTagDetectionArray", "apriltag_detections", _of_apriltag, False
+    ),
+    "aruco_opencv": ForeignKind("aruco_opencv_msgs/msg/ArucoDetection", "aruco_detections", _of_aruco, True),
+}
+"""Kinds of messages by the parameter `source`."""
+
+
+class ForeignMarkers(Calibration):
+    """The markers that another detector finds in the images of one camera.
+
+    Args:
+        parameters: Which markers there are, and what the other detector does.
+
+    Raises:
+        ParameterError: A parameter cannot be used.
+        SwarmFileError: The swarm description cannot be used.
+
+    Attributes:
+        markers: Number of markers with a pose.
+        misfits: Number of them whose corners do not fit a square.
+    """
+
+    def __init__(self, parameters: ForeignParameters) -> None:
+        super().__init__()
+        self.markers = self.misfits = 0
+        self._parameters = parameters
+        self._known = known_markers(parameters)
+        self._kind = KINDS[parameters.source]
+        self._frame = ""
+        self._solver: PoseSolver  # set with the calibration, without which messages are dropped
+
+    def calibrate(self, message: Any) -> None:
+        """Use a sensor_msgs/CameraInfo from now on.
+
+        Raises:
+            CameraError: The camera is not calibrated; its images are dropped from now on.
+        """
+        self._frame = message.header.frame_id
+        super().calibrate(message)
+
+    def read(self, message: Any) -> Camera:
+        """The camera of the images that the other detector sees."""
+        return camera_of(message, rectified=self._parameters.rectified)
+
+    def use(self, camera: Camera) -> None:
+        """Solve with another calibration from now on."""
+        _, _, lengths, up, bodies = self._known
+        self._solver = PoseSolver(self._parameters.settings, camera, lengths, up, bodies)
+
+    def detect(self, message: Any) -> bytes:
+        """The serialized swarm_loc_msgs/MarkerDetectionArray of the markers in an image.
+
+        Raises:
+            ImageError: The message was dropped and counted.
+        """
+        self.images += 1
+        try:
+            camera = self._camera_of(message)
+        except ImageError as error:
+            self.drops[error.reason] += 1
+            raise
+        detections = self._solved(camera, list(self._used(message, camera)))
+        rows = detection_rows(detections, self._parameters.settings.ambiguity)
+        self.drops["no_pose"] += len(detections) - len(rows)
+        self.markers += len(rows)
+        self.misfits += detections.misfits
+        return encode_detections(message.header.frame_id, nanoseconds(message.header.stamp), rows)
+
+    def _camera_of(self, message: Any) -> Camera:
+        camera, frame = self.known_camera(), message.header.frame_id
+        if frame != self._frame:
+            said = f"markers are in frame '{frame}', but camera_info in '{self._frame}': is output_frame set?"
+            raise ImageError("foreign_frame", said)
+        return camera
+
+    def _used(self, message: Any, camera: Camera) -> Iterator[ForeignMarker]:
+        """The markers that can be used; corners become those of an image without distortion."""
+        family, ids = self._known.family, self._known.ids
+        for marker in self._kind.markers(message, camera, self._parameters):
+            corners = (
+                marker.corners if self._kind.has_ideal_corners else camera.to_ideal(marker.corners[None])[0]
+            )
+            if marker.family not in ("", _APRILTAG_NAMES.get(family.name)):
+                self.drops["other_family"] += 1
+            elif not 0 <= marker.id < len(family.words) or (ids is not None and marker.id not in ids):
+                self.drops["unknown_id"] += 1
+            elif not np.isfinite(corners).all():
+                self.drops["not_finite"] += 1
+            elif _signed_area(corners) <= 0.0:
+                self.drops["corner_order"] += 1
+            else:
+                yield marker._replace(corners=corners)
+
+    def _solved(self, camera: Camera, markers: list[ForeignMarker]) -> Detections:
+        """The markers with poses."""
+        count = len(markers)
+        ids = np.array([marker.id for marker in markers], np.int64)
+        corners = np.array([marker.corners for marker in markers]).reshape(-1, 4, 2)
+        covariance = np.tile(self._parameters.corner_sigma_px**2 * np.eye(8), (count, 1, 1))
+        poses, misfits = self._solver.solve(ids, corners, covariance)
+        codes, unknown = np.full(count, self._known.family.code), np.full(count, np.nan)
+        return Detections(codes, ids, unknown, unknown, unknown, camera.to_raw(corners), poses, misfits, {})
+
+
+def _signed_area(corners: FloatArray) -> float:
+    """Area of a quadrangle (4, 2) [px^2], positive if its corners go clockwise in the image."""
+    x, y = corners.T
+    return 0.5 * float(x @ np.roll(y, -1) - y @ np.roll(x, -1))

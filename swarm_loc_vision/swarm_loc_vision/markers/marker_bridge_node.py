@@ -1,0 +1,35 @@
+"""Passes markers that apriltag_ros or aruco_opencv have found on as detections with covariances.
+
+    ./run swarm_loc_vision marker_bridge_node --ros-args -r __ns:=/epuck1 -p source:=apriltag
+
+The node subscribes to `camera_info` and to `apriltag_detections` or `aruco_detections`, and publishes
+`detections` and `/diagnostics`. Parameters: see `doc/marker_bridge_node.md`.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from rclpy.qos import QoSProfile, qos_profile_sensor_data
+
+from swarm_loc_estimator.common.node import message_class, run_node
+from swarm_loc_msgs.msg import MarkerDetectionArray
+from swarm_loc_vision.markers.foreign_markers import KINDS, ForeignMarkers, ForeignParameters
+from swarm_loc_vision.markers.marker_node import MarkerNode
+
+
+class MarkerBridgeNode(MarkerNode[ForeignParameters]):
+    """Receives markers of another detector and publishes detections."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("marker_bridge", ForeignParameters, **node_arguments)
+        self.camera = ForeignMarkers(self.params)
+        kind = KINDS[self.params.source]
+        publisher = self.create_publisher(MarkerDetectionArray, "detections", QoSProfile(depth=10))
+        topic = self.resolve_topic_name(kind.topic)
+        self.take(self.camera, message_class(kind.message_type), topic, publisher, qos_profile_sensor_data)
+        self.get_logger().info(f"ready: markers of family {self.params.family}")
+
+
+main = partial(run_node, "marker_bridge_node", MarkerBridgeNode)

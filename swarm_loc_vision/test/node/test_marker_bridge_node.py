@@ -1,0 +1,103 @@
+"""The marker bridge over DDS: markers of another detector in, detections with covariances out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray
+from node_world import Ros, newest_status, overrides, values_of
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import CameraInfo
+
+from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
+from swarm_loc_estimator.common import node
+from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
+from swarm_loc_vision.markers.families import family_named
+from swarm_loc_vision.markers.foreign_markers import KINDS, ForeignMarker
+from swarm_loc_vision.markers.marker_bridge_node import MarkerBridgeNode
+
+FAMILY = "apriltag_36h11"
+FRAME = "epuck1/camera_optical_frame"
+_, (TRUTH, *_) = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())
+
+
+def _markers(message: Any, *_: object) -> Iterator[ForeignMarker]:
+    for one in message.detections:
+        yield ForeignMarker(one.id, "tag36h11", np.reshape(one.corners_px, (4, 2)))
+
+
+@pytest.fixture(autouse=True)
+def _frequent_diagnostics(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the node say at once what the test waits for."""
+    monkeypatch.setattr(node, "_DIAGNOSTICS_PERIOD_S", 0.05)
+
+
+def publish_until(ros: Ros, publisher: Any, message: Any, condition: Any) -> None:
+    """Publish until something is so: what is sent by best effort may get lost."""
+
+    def happened() -> bool:
+        if not condition():
+            publisher.publish(message)
+            return False
+        return True
+
+    ros.until(happened)
+
+
+def test_markers_become_detections(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    # a type that is installed everywhere; test_foreign_markers.py reads those of the other detectors
+    stand_in = replace(
+        KINDS["apriltag"], message_type="swarm_loc_msgs/msg/MarkerDetectionArray", markers=_markers
+    )
+    monkeypatch.setitem(KINDS, "apriltag", stand_in)
+    parameters = overrides(family=FAMILY, rectified=False, marker_length=TRUTH.length)
+    ros.add(MarkerBridgeNode(parameter_overrides=parameters))
+    reports: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
+    detections: list[MarkerDetectionArray] = ros.listen(MarkerDetectionArray, "detections")
+
+    def said() -> str:
+        return str(newest_status(reports, "marker_bridge").message)
+
+    ros.until(lambda: said() == "no messages received on /camera_info")
+    info = CameraInfo(height=HEIGHT, width=WIDTH, distortion_model="plumb_bob", d=[0.0] * 5, k=CAMERA.ravel())
+    info.header.frame_id = FRAME
+    publisher = ros.tester.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
+    publish_until(ros, publisher, info, lambda: said() == "no messages received on /apriltag_detections")
+
+    found = MarkerDetectionArray(
+        detections=[MarkerDetection(id=TRUTH.marker_id, corners_px=TRUTH.corners.ravel())]
+    )
+    found.header.stamp.sec, found.header.frame_id = 7, "elsewhere"
+    publisher = ros.tester.create_publisher(
+        MarkerDetectionArray, "apriltag_detections", qos_profile_sensor_data
+    )
+    publish_until(
+        ros,
+        publisher,
+        found,
+        lambda: "dropped: foreign_frame" in values_of(newest_status(reports, "marker_bridge")),
+    )
+    assert not detections
+    found.header.frame_id = FRAME
+    publish_until(ros, publisher, found, lambda: detections)
+    assert (detections[0].header.frame_id, detections[0].header.stamp.sec) == (FRAME, 7)
+    (row,) = detections[0].detections
+    place = row.pose.pose.position
+    assert (place.x, place.y, place.z) == pytest.approx(tuple(TRUTH.position), abs=1e-3)
+    assert np.linalg.eigvalsh(np.reshape(row.pose.covariance, (6, 6)))[0] > 0.0
+    ros.until(lambda: said() == "detecting")
+
+
+@pytest.mark.parametrize(
+    ("source", "package"), [("apriltag", "apriltag-msgs"), ("aruco_opencv", "aruco-opencv-msgs")]
+)
+@pytest.mark.skipif(any(map(find_spec, ("apriltag_msgs", "aruco_opencv_msgs"))), reason="they are installed")
+def test_a_detector_whose_messages_are_missing_ends_the_start(ros: Ros, source: str, package: str) -> None:
+    with pytest.raises(UserError, match=f"install ros-jazzy-{package}, or build"):
+        ros.add(MarkerBridgeNode(parameter_overrides=overrides(source=source)))
