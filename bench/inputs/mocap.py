@@ -22,12 +22,13 @@ from swarm_loc_estimator.nodes.localizer_robots import LocalizedRobots
 from swarm_loc_estimator.nodes.localizer_sources import SOURCES
 from swarm_loc_estimator.nodes.parameters import BridgeParameters
 from swarm_loc_estimator.offline.metrics import nees
+from swarm_loc_estimator.sensors.sensor import chosen, in_order_of_arrival
 from swarm_loc_estimator.swarm.swarm import OdometryModel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+    from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 
 ROBOTS = 5
 DURATION_S = 60.0
@@ -69,6 +70,9 @@ class _Shown(NamedTuple):
     bound: FloatArray
 
 
+_NO_FIXES = _Fixes(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)))
+
+
 @dataclass(frozen=True)
 class _Drive:
     """A robot's run: true poses (s, 3) at the stamps (s,) of odometry, its odometry (s, 3), and its fixes."""
@@ -106,7 +110,7 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
             smoothed.append(smoother_bound)
             ages.append(age)
             sigma = np.sqrt(np.trace(covariances[:, robot, :2, :2], axis1=1, axis2=2))
-            shown = _Shown(1e-9 * (ticks - _T0_NS), errors[-1], sigma, np.sqrt(filter_bound))
+            shown = _Shown(1e-9 * (ticks - _T0_NS).astype(float), errors[-1], sigma, np.sqrt(filter_bound))
     _plot(shown, np.concatenate(ages), np.concatenate(errors), np.concatenate(online))
     rms, by_filter, by_smoother = (
         float(np.sqrt(np.mean(one))) for one in (np.square(errors), online, smoothed)
@@ -134,7 +138,7 @@ def _drive(rng: np.random.Generator) -> _Drive:
     noisy = wheels + np.sqrt(MODEL.wheel_noise * np.abs(wheels)) * rng.normal(size=wheels.shape)
     start = np.array([*rng.uniform(-1.0, 1.0, 2), rng.uniform(-np.pi, np.pi)])
     stamp_ns = _T0_NS + STEP_NS * np.arange(steps + 1)
-    drive = _Drive(stamp_ns, _track(start, wheels), _track(np.zeros(3), noisy), _Fixes(*3 * (stamp_ns[:0],)))
+    drive = _Drive(stamp_ns, _track(start, wheels), _track(np.zeros(3), noisy), _NO_FIXES)
     at_ns = np.arange(_T0_NS + int(rng.integers(FIX_NS)), stamp_ns[-1], FIX_NS)
     at_ns = at_ns[~_is_lost(at_ns, rng)]
     noise = np.array([POSITION_SIGMA, POSITION_SIGMA, HEADING_SIGMA]) * rng.normal(size=(at_ns.size, 3))
@@ -152,7 +156,7 @@ def _track(start: FloatArray, wheels: FloatArray) -> FloatArray:
     return np.stack(poses)
 
 
-def _is_lost(at_ns: IntArray, rng: np.random.Generator) -> FloatArray:
+def _is_lost(at_ns: IntArray, rng: np.random.Generator) -> BoolArray:
     """Which fixes (f,) are lost: single ones, and all of drop-outs."""
     lost = rng.random(at_ns.size) < LOST
     begin_s = rng.exponential(BETWEEN_BLACKOUTS_S)
@@ -168,20 +172,18 @@ def _estimate(drives: Sequence[_Drive], ticks: IntArray) -> tuple[FloatArray, Fl
     swarm = Swarm(tuple(Robot(f"robot{k}", odometry=MODEL) for k in range(len(drives))))
     estimator = Estimator(swarm, Settings())
     fixes = _bridged(drives, list(swarm.index_of))
-    odometry = OdometryRows.without_twist(
+    driven = OdometryRows.without_twist(
         np.repeat(np.arange(len(drives)), [len(one.stamp_ns) for one in drives]),
         np.concatenate([one.stamp_ns for one in drives]),
         np.concatenate([one.odometry for one in drives]),
         np.concatenate([one.stamp_ns for one in drives]),
     )
-    order = np.argsort(odometry.arrival_ns, kind="stable")
-    odometry = OdometryRows(*(column[order] for column in odometry))
+    odometry = in_order_of_arrival([driven])
     poses, covariances, done = [], [], [0, 0]
     for now_ns in range(_T0_NS, int(ticks[-1]) + 1, TICK_NS):
         ends = [int(np.searchsorted(one.arrival_ns, now_ns, side="right")) for one in (odometry, fixes)]
-        driven = OdometryRows(*(column[done[0] : ends[0]] for column in odometry))
-        fixed = FixRows(*(column[done[1] : ends[1]] for column in fixes))
-        estimator.receive(Batch.of(now_ns - TICK_NS, now_ns, odometry=driven, fixes=fixed))
+        new = chosen(odometry, slice(done[0], ends[0])), chosen(fixes, slice(done[1], ends[1]))
+        estimator.receive(Batch.of(now_ns - TICK_NS, now_ns, odometry=new[0], fixes=new[1]))
         estimate, done = estimator.tick(now_ns), ends
         if now_ns >= ticks[0]:
             poses.append(estimate.poses)
@@ -206,8 +208,8 @@ def _bridged(drives: Sequence[_Drive], names: list[str]) -> FixRows:
             bodies = SOURCES["pose"].bodies(_message(int(at_ns) + LATENCY_NS, body))
             (found,) = robots.convert(bodies, name, int(arrival_ns))
             rows.append((number, found.stamp_ns, found.pose, found.covariance, int(arrival_ns)))
-    rows.sort(key=lambda row: row[-1])
-    return FixRows(*(np.array(column) for column in zip(*rows, strict=True)))
+    robot, stamp_ns, poses, covariances, arrival_ns = (np.array(column) for column in zip(*rows, strict=True))
+    return in_order_of_arrival([FixRows(robot, stamp_ns, poses, covariances, arrival_ns)])
 
 
 def _message(stamp_ns: int, body: FloatArray) -> SimpleNamespace:

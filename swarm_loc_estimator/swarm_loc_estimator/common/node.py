@@ -72,7 +72,11 @@ def message_class(message_type: str) -> Any:
         package, _, name = candidate.replace("/msg/", "/").partition("/")
         with suppress(ImportError, AttributeError):
             return getattr(import_module(f"{package}.msg"), name)
-    raise MessageTypeError(f"There is no message type {message_type} here.")
+    package = message_type.partition("/")[0]
+    raise MessageTypeError(
+        f"There is no message type {message_type} here: install ros-jazzy-{package.replace('_', '-')},"
+        f" or build the package {package} and source its workspace."
+    )
 
 
 class MessageTypeError(UserError):

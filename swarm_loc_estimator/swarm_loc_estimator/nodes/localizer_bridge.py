@@ -19,8 +19,7 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of, listed
 from swarm_loc_estimator.common.messages.poses import encode_pose_stamped, encode_poses
-from swarm_loc_estimator.common.node import ConfiguredNode, MessageTypeError, message_class, run_node
-from swarm_loc_estimator.common.parameters import ParameterError
+from swarm_loc_estimator.common.node import ConfiguredNode, message_class, run_node
 from swarm_loc_estimator.nodes.localizer_robots import LocalizedRobots, RobotPose
 from swarm_loc_estimator.nodes.localizer_sources import BODY, SOURCES
 from swarm_loc_estimator.nodes.parameters import BridgeParameters
@@ -45,22 +44,12 @@ class LocalizerBridge(ConfiguredNode[BridgeParameters]):
             robot: self.create_publisher(kind, f"{robot}/{parameters.output}", _OUTPUT_QOS)
             for robot in self._robots.robot_of.values()
         }
-        received = self._message_class()
+        received = message_class(self._source.message_type)
         for topic, body in self._robots.topics.items():
             take = partial(self._on_message, topic, body)
             self.create_subscription(received, topic, take, _INPUT_QOS)
         self.start_diagnostics(self._on_diagnostics)
         self.get_logger().info(f"ready: {len(self._outputs)} robots of '{parameters.swarm_file}'")
-
-    def _message_class(self) -> Any:
-        try:
-            return message_class(self._source.message_type)
-        except MessageTypeError as error:
-            package = self._source.message_type.partition("/")[0]
-            raise ParameterError(
-                f"parameter source = '{self.params.source}' needs the package {package}:"
-                f" install ros-jazzy-{package.replace('_', '-')}, or build it in a sourced workspace."
-            ) from error
 
     def _on_message(self, topic: str, body: str, message: Any) -> None:
         self.health.received(topic)

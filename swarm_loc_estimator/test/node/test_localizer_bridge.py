@@ -147,5 +147,5 @@ def test_a_body_of_which_a_shared_topic_says_nothing_is_named(ros: Ros, swarm_fi
 def test_a_source_whose_package_is_missing_ends_the_start(
     ros: Ros, swarm_file: Path, source: str, package: str
 ) -> None:
-    with pytest.raises(UserError, match=f"install ros-jazzy-{package}, or build it"):
+    with pytest.raises(UserError, match=f"install ros-jazzy-{package}, or build"):
         Bridged(ros, swarm_file, source=source)
