@@ -37,6 +37,8 @@ from swarm_loc_estimator.filter.measurement_model import (
     MeasurementArray,
     MeasurementColumns,
 )
+from swarm_loc_estimator.sensors.bearing import BEARING
+from swarm_loc_estimator.sensors.optical_frame import face_heading, is_rotation, scale, to_level_frame
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Converter,
@@ -56,6 +58,8 @@ CONTENT_POSE = 2
 """Detection content: position and orientation."""
 CONTENT_POSE_TWO = 3
 """Detection content: position and orientation, with a mirrored second solution."""
+CONTENT_BEARING = 4
+"""Detection content: only the direction of the position."""
 
 _OUTCOMES = ("measured", "unknown_id", "own_marker", "no_camera", "bad_content", "non_finite", "absurd")
 _MEASURED, _UNKNOWN_ID, _OWN_MARKER, _NO_CAMERA, _BAD_CONTENT, _NON_FINITE, _ABSURD = range(len(_OUTCOMES))
@@ -100,13 +104,14 @@ class Conversion:
 
 
 class _Cameras(NamedTuple):
-    """Cameras by robot: has one (N,), S (N, 3), optical to level rotation (N, 3, 3), errors, gate."""
+    """Cameras by robot: has one (N,), S (N, 3), optical to level rotation (N, 3, 3), errors, gates."""
 
     present: NDArray[np.bool_]
     mount: FloatArray
     level: FloatArray
     sensor: NDArray[np.void]
     gate: FloatArray
+    bearing_gate: FloatArray
 
 
 class _Markers(NamedTuple):
@@ -153,6 +158,7 @@ class SightingConverter:
             level=np.array(tilts).reshape(-1, 3, 3),
             sensor=np.array(sensors, dtype=_SENSOR_DTYPE),
             gate=MODELS[Kind.POLAR].gate([robot.sensor.gate_probability for robot in swarm.robots]),
+            bearing_gate=MODELS[BEARING].gate([robot.sensor.gate_probability for robot in swarm.robots]),
         )
         owners = sorted(swarm.owner_of.items())
         markers = [owner.marker for _, owner in owners]
@@ -230,8 +236,14 @@ def _convert_all(
         assign(out.sensor[k], cameras.mount[robot])
         out.gate[k] = cameras.gate[robot]
         out.marker[k, 0], out.marker[k, 1] = marker[0], marker[1]
-        _to_level_frame(level, detections.position[k], position)
-        _scale(position, 1.0 / sensor.distance_scale)
+        to_level_frame(level, detections.position[k], position)
+        if detections.content[k] == CONTENT_BEARING:
+            out.kind[k], out.gate[k] = BEARING, cameras.bearing_gate[robot]
+            out.value[k, 0] = _calibrated_bearing(sensor, position)
+            out.covariance[k, 0, 0] = sensor.bearing_sigma**2
+            out.covariance[k, 1, 1] = out.covariance[k, 2, 2] = 1.0
+            continue
+        scale(position, 1.0 / sensor.distance_scale)
         if detections.content[k] == CONTENT_POSITION or math.isnan(marker[2]):
             out.kind[k] = POLAR
             _calibrate(sensor, position, out.target[k], out.value[k], out.covariance[k])
@@ -240,13 +252,13 @@ def _convert_all(
             continue
         out.has_heading[k], out.marker[k, 2] = 1, marker[2]
         out.value[k, 0], out.value[k, 1] = position[0], position[1]
-        out.value[k, 2] = _face_heading(level, detections.orientation[k])
+        out.value[k, 2] = face_heading(level, detections.orientation[k])
         if detections.content[k] == CONTENT_POSE_TWO:
             out.has_alternative[k] = 1
-            _to_level_frame(level, detections.alternative_position[k], other_position)
-            _scale(other_position, 1.0 / sensor.distance_scale)
+            to_level_frame(level, detections.alternative_position[k], other_position)
+            scale(other_position, 1.0 / sensor.distance_scale)
             out.alternative[k, 0], out.alternative[k, 1] = other_position[0], other_position[1]
-            out.alternative[k, 2] = _face_heading(level, detections.alternative_orientation[k])
+            out.alternative[k, 2] = face_heading(level, detections.alternative_orientation[k])
         _pose_noise(sensor, level, detections.covariance[k], out.covariance[k])
         out.covariance[k, 0, 0] += markers.variance[place]
         out.covariance[k, 1, 1] += markers.variance[place]
@@ -263,59 +275,36 @@ def _outcome(
         return _OWN_MARKER
     if not cameras.present[robot]:
         return _NO_CAMERA
-    if not CONTENT_POSITION <= detections.content[k] <= CONTENT_POSE_TWO:
+    content = detections.content[k]
+    if not CONTENT_POSITION <= content <= CONTENT_BEARING:
         return _BAD_CONTENT
     position, valid = detections.position[k], True
     for i in range(3):
         valid = valid and math.isfinite(position[i])
-    if detections.content[k] != CONTENT_POSITION:
-        valid = valid and _is_rotation(detections.orientation[k])
+    if content == CONTENT_BEARING:
+        valid = valid and (position[0] != 0.0 or position[1] != 0.0 or position[2] != 0.0)
+    if content in (CONTENT_POSE, CONTENT_POSE_TWO):
+        valid = valid and is_rotation(detections.orientation[k])
         for i in range(6):
             for j in range(6):
                 valid = valid and math.isfinite(detections.covariance[k, i, j])
-    if detections.content[k] == CONTENT_POSE_TWO:
-        valid = valid and _is_rotation(detections.alternative_orientation[k])
+    if content == CONTENT_POSE_TWO:
+        valid = valid and is_rotation(detections.alternative_orientation[k])
         for i in range(3):
             valid = valid and math.isfinite(detections.alternative_position[k, i])
     if not valid:
         return _NON_FINITE
-    if max(abs(position[0]), abs(position[1]), abs(position[2])) > _MAX_DISTANCE_M:
+    farthest = max(abs(position[0]), abs(position[1]), abs(position[2]))
+    if farthest > _MAX_DISTANCE_M and content != CONTENT_BEARING:
         return _ABSURD
     return _MEASURED
 
 
 @cached_njit
-def _is_rotation(quaternion: FloatArray) -> bool:
-    """Whether a quaternion (4,) is finite and not zero."""
-    norm = 0.0
-    for i in range(4):
-        norm += quaternion[i] * quaternion[i]
-    return math.isfinite(norm) and norm > 1e-12
-
-
-@cached_njit
-def _to_level_frame(level: FloatArray, optical: FloatArray, out: FloatArray) -> None:
-    """Rotate a vector (3,) from the optical frame to the camera's level axes forward, left, up."""
-    for i in range(3):
-        out[i] = level[i, 0] * optical[0] + level[i, 1] * optical[1] + level[i, 2] * optical[2]
-
-
-@cached_njit
-def _scale(vector: FloatArray, factor: float) -> None:
-    """Multiply a vector (3,), in place."""
-    for i in range(3):
-        vector[i] *= factor
-
-
-@cached_njit
-def _face_heading(level: FloatArray, quaternion: FloatArray) -> float:
-    """Heading in the sensor plane of the z axis of an orientation xyzw (4,), the normal of a face."""
-    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    out_of_face, axes = np.empty(3), np.empty(3)
-    out_of_face[0], out_of_face[1] = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x)
-    out_of_face[2] = w * w - x * x - y * y + z * z
-    _to_level_frame(level, out_of_face, axes)
-    return math.atan2(axes[1], axes[0])
+def _calibrated_bearing(sensor: SensorModel, position: FloatArray) -> float:
+    """Calibrated bearing of a position (3,); see `SensorModel`."""
+    logged = math.atan2(position[1], position[0])
+    return (sensor.bearing_scale + sensor.bearing_curve * logged) * logged + sensor.bearing_offset
 
 
 @cached_njit
@@ -329,7 +318,7 @@ def _calibrate(
     if target != NOBODY:
         distance += sensor.robot_range_offset
     value[0] = distance
-    value[1] = (sensor.bearing_scale + sensor.bearing_curve * logged) * logged + sensor.bearing_offset
+    value[1] = _calibrated_bearing(sensor, position)
     noise[0, 0] = (sensor.range_sigma + sensor.range_sigma_per_m * abs(distance)) ** 2
     noise[1, 1] = sensor.bearing_sigma**2
     noise[2, 2] = 1.0

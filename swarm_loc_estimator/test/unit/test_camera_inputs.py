@@ -13,7 +13,8 @@ from scipy.spatial.transform import Rotation
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.filter.measurement_model import NOBODY, Kind, MeasurementArray
-from swarm_loc_estimator.sensors.camera import SightingConverter
+from swarm_loc_estimator.sensors.bearing import BEARING
+from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, SightingConverter
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, SensorModel, Swarm
 
 LEVEL = CameraMount(x=0.04, z=0.05)
@@ -67,6 +68,19 @@ def test_a_rendered_landmark_comes_back_as_the_measurement_in_the_plane(
     distance, bearing = math.hypot(expected[0], expected[1]), math.atan2(expected[1], expected[0])
     np.testing.assert_allclose(position["value"][0, :2], [distance, bearing], atol=1e-12)
     assert (position["kind"][0], position["has_heading"][0]) == (Kind.POLAR, 0)
+    direction = detection(7, seen(base, mount, mark), CONTENT_BEARING)
+    direction["position"] *= 1e4  # its length means nothing
+    direction["orientation"] = np.nan
+    towards, dropped = converted(direction, swarm(mount))
+    assert not dropped
+    np.testing.assert_allclose(towards["value"][0, 0], bearing, atol=1e-12)
+    assert (towards["kind"][0], towards["has_heading"][0]) == (BEARING, 0)
+    assert towards["gate"] < position["gate"]
+    np.testing.assert_allclose(
+        towards["covariance"][0], np.diag([SensorModel().bearing_sigma ** 2, 1.0, 1.0])
+    )
+    direction["position"] = 0.0
+    assert converted(direction, swarm(mount))[1] == {"non_finite": 1}
 
 
 def test_a_face_is_seen_on_the_robot_that_carries_it() -> None:
@@ -161,7 +175,7 @@ def broken(name: str, value: float, content: int = POSE_TWO) -> NDArray[np.void]
         (broken("alternative_orientation", math.nan), "non_finite"),
         (broken("alternative_position", math.nan), "non_finite"),
         (broken("position", 1e6), "absurd"),
-        *((broken("content", content), "bad_content") for content in (0, 4, 7, 255)),
+        *((broken("content", content), "bad_content") for content in (0, 5, 7, 255)),
     ],
 )
 def test_what_cannot_be_used_is_dropped_with_a_reason(one: NDArray[np.void], reason: str) -> None:
