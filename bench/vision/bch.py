@@ -9,7 +9,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_vision.common.sampling import GRID
 from swarm_loc_vision.markers.decoder import Dictionary
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import Family, draw_marker, family_named
@@ -78,9 +77,9 @@ def _sheet(family: Family, ids: NDArray[np.int64], quarters: int, rng: np.random
 def _us_per_candidate(candidates: int = 200, rounds: int = 7) -> float:
     """Median CPU time of decoding, per candidate."""
     family = family_named("artoolkit_bch_thin")
-    dictionary = Dictionary({family: np.arange(len(family.words))})
+    dictionary = Dictionary(family.layout, {family: np.arange(len(family.words))})
     rng = np.random.default_rng(0)
-    cells = np.full((candidates, GRID, GRID), 200.0)
+    cells = np.full((candidates, family.layout.grid, family.layout.grid), 200.0)
     for square in cells:
         square[1:-1, 1:-1] = np.where(family.pattern(int(rng.integers(4096))), 200.0, 40.0)
     cells += rng.normal(0.0, 5.0, cells.shape)

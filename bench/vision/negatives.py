@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from bench.vision.peers import FAMILY, own_detector
 from bench.vision.scenes import Look, random_scene
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
-from swarm_loc_vision.markers.families import Family, families, family_named
+from swarm_loc_vision.markers.families import CODE_OTHER, Family, families, family_named
+from swarm_loc_vision.markers.layouts import Layout
 
 Gray = NDArray[np.uint8]
 
@@ -28,7 +29,7 @@ def random_squares(seeds: Sequence[int], frames: int, markers: int) -> tuple[int
     for seed in seeds:
         rng = np.random.default_rng([99, seed])
         words = rng.integers(0, 1 << 36, 4096, dtype=np.uint64)
-        anything = Family("random", 255, 1, words)
+        anything = Family("random", CODE_OTHER, Layout(6, 1), words)
         for _ in range(frames):
             image, truths = random_scene(rng, anything, markers, Look())
             squares += len(truths)

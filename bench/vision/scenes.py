@@ -105,13 +105,18 @@ def random_truth(rng: np.random.Generator, family: Family, ids: int, max_blur: f
     incidence = rng.uniform(0.0, math.radians(70.0))
     azimuth, roll = rng.uniform(-math.pi, math.pi, 2)
     rotation = facing(azimuth, incidence, roll, position)
-    corners = project(rotation, position, square(length * (family.side + 2 * _CELL_MARGIN) / family.side))
+    corners = project(rotation, position, square(length * _whole_side(family) / family.side))
     blur = rng.uniform(min(1.0, max_blur), max_blur) if max_blur else 0.0
     room = _BORDER_PX + 0.5 * blur
     if corners.min() < room or (corners > np.array([WIDTH, HEIGHT]) - 1 - room).any():
         return None
     inner = project(rotation, position, square(length))
     return Truth(int(rng.integers(ids)), inner, rotation, position, length, incidence, blur)
+
+
+def _whole_side(family: Family) -> int:
+    """Cells along a side with the margin."""
+    return family.side + 2 * (family.layout.outside + _CELL_MARGIN)
 
 
 def random_scene(
@@ -124,7 +129,9 @@ def random_scene(
         truth = random_truth(rng, family, ids or len(family.words), look.max_blur)
         if truth is None:
             continue
-        grown = project(truth.rotation, truth.position, square(truth.length * 1.5))
+        grown = project(
+            truth.rotation, truth.position, square(truth.length * max(1.5, _whole_side(family) / family.side))
+        )
         box = np.concatenate([grown.min(axis=0) - _GAP_PX, grown.max(axis=0) + _GAP_PX])
         if any((box[:2] < other[2:]).all() and (other[:2] < box[2:]).all() for other in boxes):
             continue
@@ -175,7 +182,7 @@ def _paint(
     shades = np.where(cells, look.white, look.black).astype(np.float32)
     instants = 1 if truth.blur == 0.0 else 24
     grid = 8 if instants == 1 else 4
-    side = family.side + 2 * _CELL_MARGIN
+    side = _whole_side(family)
     outer = project(truth.rotation, truth.position, square(truth.length * side / family.side))
     to_cells = np.linalg.inv(homographies(outer[None])[0] @ np.diag([1.0 / side, 1.0 / side, 1.0]))
     direction = rng.uniform(-math.pi, math.pi)

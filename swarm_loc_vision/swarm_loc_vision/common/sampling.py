@@ -15,8 +15,6 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.common.camera import raw_pixel
 from swarm_loc_vision.common.images import Gray
 
-GRID = 10
-"""Cells read along a side: the 6 of the marker, a ring of its border, and a ring around that."""
 MAX_PROFILES = 40
 _MIN_REACH_PX, _MAX_REACH_PX = 1.5, 6.0
 _STEP_PX = 0.5
@@ -169,14 +167,15 @@ def read_cells(image: Gray, lens: FloatArray, homographies: FloatArray, side: in
         lens: See `camera.Camera`.
         homographies: (N, 3, 3) from the marker, 0 to 1 along each side, to ideal pixels.
         side: Cells along a marker's side, border included.
-        cells: (N, GRID, GRID) filled, upper left first.
+        cells: (N, grid, grid) filled, upper left first; the marker is in the middle.
     """
-    first = 0.5 * (side - GRID)
+    grid = cells.shape[1]
+    first = 0.5 * (side - grid)
     for n in range(len(homographies)):
         h = homographies[n]
         points, spread = _points_per_cell(h, side)
-        for row in range(GRID):
-            for column in range(GRID):
+        for row in range(grid):
+            for column in range(grid):
                 total = 0.0
                 for i in range(points):
                     y = (first + row + 0.5 + spread * (i - 0.5 * (points - 1))) / side

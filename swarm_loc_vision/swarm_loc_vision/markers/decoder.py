@@ -2,6 +2,9 @@
 
 Blur mixes neighbouring cells, so cells are sharpened first. Bits are weighted by the distance of a cell from
 the threshold: a difference in a clear cell costs a whole bit.
+
+With few bits, as in AprilTag 16h5, random squares match some word too often. Then no bit may differ, and all
+that is known of a marker must be seen: clear data, a dark border, and a light margin all around it.
 """
 
 from __future__ import annotations
@@ -13,12 +16,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_vision.common.sampling import GRID
-from swarm_loc_vision.markers.families import BITS, CELLS, Family, rotated, unpacked
-
-Words = NDArray[np.uint64]
+from swarm_loc_vision.markers.families import Family
+from swarm_loc_vision.markers.layouts import Layout, Words
 
 FALSE_READINGS = 1e-5
 """Maximum false positive rate for random squares, with whole bits and one threshold. Weighted bits and the
@@ -26,7 +27,7 @@ second threshold increase it: with all 4096 ids to one or two of 100 000 random 
 _SHARPENING = 0.2
 """Share of the difference to each of its four neighbours that is added to a cell."""
 _MAX_DARK_ERRORS = 3.0
-"""Maximum number of light cells among the 28 cells of the border's inner ring."""
+"""Maximum number of light cells among those of the border's inner ring, which are 20 or more."""
 _MAX_SLOPE = 0.5
 """Maximum difference of the border's brightness between its sides, relative to the contrast."""
 _MIDDLE, _LOW = 0.5, 0.28
@@ -34,6 +35,9 @@ _MIDDLE, _LOW = 0.5, 0.28
 _MIN_CORRELATION = 0.4
 """Minimum correlation of a candidate and its word. A black square with a speck of light has cells near the
 threshold that fit any word at little cost; it reaches 0.37, moving markers 0.5 and more."""
+_CLEAR = 0.3
+"""Minimum clearness of each cell where words are scarce, and maximum number of light cells in the border.
+Sharpening makes light cells among dark ones so light that those among light ones have no more than 0.4."""
 _FAR = 1e9
 _WEIGHED = 4
 """Maximum excess of different bits over the nearest word for words compared by weighted bits."""
@@ -57,81 +61,118 @@ class Readings(NamedTuple):
     contrast: FloatArray
 
 
+class _Places(NamedTuple):
+    """Rows and columns (k, 2) of data, of the border's inner ring and of the margin, see `Layout`."""
+
+    data: IntArray
+    ring: IntArray
+    margin: IntArray
+
+
+class _Rules(NamedTuple):
+    """When a candidate is accepted, see `Dictionary`."""
+
+    min_contrast: float
+    correctable: float
+    scarce: bool
+    framed: bool
+
+
 class Dictionary:
-    """Words in use of families with the same border.
+    """Words in use of families with the same layout.
 
     Args:
+        layout: The layout.
         ids_of: Ids in use of each family.
 
     Attributes:
+        layout: The layout.
         codes: (N,) the family's code of each word.
         ids: (N,) its id in it.
-        strips: (N, 4, cells) the row of cells behind the border along each side, clockwise; 1 is white.
+        strips: (N, 4, cells) the row of cells behind the border along each side, clockwise, as the detector
+            sees them; 1 is white.
         correctable: Bits that may differ; see `FALSE_READINGS`.
+        scarce: Whether even words without a difference are too common, see the module.
+        framed: Whether the margin must be seen: words are scarce, or the margin is a part of the marker.
     """
 
-    def __init__(self, ids_of: Mapping[Family, NDArray[np.int64]]) -> None:
+    def __init__(self, layout: Layout, ids_of: Mapping[Family, NDArray[np.int64]]) -> None:
+        self.layout = layout
         self.codes = np.concatenate([np.full(len(ids), family.code) for family, ids in ids_of.items()])
         self.ids = np.concatenate(list(ids_of.values()))
         words = np.concatenate([family.words[ids] for family, ids in ids_of.items()])
-        border = next(iter(ids_of)).border
-        self._words = np.concatenate([rotated(words, quarters) for quarters in range(4)])
-        self.correctable = correctable_bits(len(words))
-        cells = unpacked(words)
+        if layout.surrounded:
+            words = words ^ np.uint64((1 << layout.bits) - 1)  # as seen with light and dark swapped
+        self._words = np.concatenate([layout.rotated(words, quarters) for quarters in range(4)])
+        self._places = _Places(layout.data, layout.ring, layout.margin)
+        self.correctable = correctable_bits(len(words), layout.bits)
+        self.scarce = 4.0 * len(words) / 2.0**layout.bits > FALSE_READINGS
+        self.framed = self.scarce or layout.surrounded
+        cells = layout.inner(words)
         rows = np.stack([np.rot90(cells, k, axes=(1, 2))[:, 0] for k in range(4)], axis=1)
-        self.strips = np.pad(rows, ((0, 0), (0, 0), (border, border)))
+        self.strips = np.pad(rows, ((0, 0), (0, 0), (layout.border, layout.border)))
 
     def read(self, cells: FloatArray, min_contrast: float) -> Readings:
         """Decode candidates.
 
         Args:
-            cells: (N, GRID, GRID) of `sampling.read_cells`.
+            cells: (N, grid, grid) of `sampling.read_cells`, see `Layout.grid`.
             min_contrast: Minimum difference of light and dark cells [counts].
         """
         count = len(cells)
         readings = Readings(
             np.full(count, -1), np.zeros(count, np.int64), np.zeros(count), np.zeros(count), np.zeros(count)
         )
-        _read(cells, self._words, min_contrast, float(self.correctable), readings)
+        rules = _Rules(min_contrast, float(self.correctable), self.scarce, self.framed)
+        _read(cells, self._words, self._places, rules, readings)
         return readings
 
 
-def correctable_bits(words: int) -> int:
+def correctable_bits(words: int, bits: int) -> int:
     """Maximum number of different bits with a false positive rate of at most FALSE_READINGS."""
-    near, bits = 1, 0
-    while bits < BITS // 4:
-        near += math.comb(BITS, bits + 1)
-        if 4.0 * words * near / 2.0**BITS > FALSE_READINGS:
+    near, different = 1, 0
+    while different < bits // 4:
+        near += math.comb(bits, different + 1)
+        if 4.0 * words * near / 2.0**bits > FALSE_READINGS:
             break
-        bits += 1
-    return bits
+        different += 1
+    return different
 
 
 @cached_njit
 def _read(
-    cells: FloatArray, words: Words, min_contrast: float, correctable: float, readings: Readings
+    cells: FloatArray,
+    words: Words,
+    places: _Places,
+    rules: _Rules,
+    readings: Readings,
 ) -> None:
     """Decode each candidate into the readings."""
     word, quarters, errors, margin, contrast = readings
-    clear, flat = np.empty(BITS), np.empty((GRID - 2, GRID - 2))
+    area, count = cells.shape[1] - 2, len(places.data)
+    clear, flat, plane = np.empty(count), np.empty((area, area)), np.empty(3)
     bits = np.empty(len(words), np.uint8)
     for n in range(len(cells)):
         before = np.uint64(0)
-        light = _flatten(cells[n], flat)
+        light = _flatten(cells[n], places, flat, plane)
         for level in (_MIDDLE, _LOW):
-            contrast[n] = light if light > 0.0 and _clear_cells(flat, light, level, clear) else 0.0
-            if contrast[n] < min_contrast:
+            contrast[n] = light if light > 0.0 and _clear_cells(flat, light, level, places, clear) else 0.0
+            if contrast[n] < rules.min_contrast:
                 continue
             seen = np.uint64(0)
-            for bit in range(BITS):
+            for bit in range(count):
                 seen = (seen << np.uint64(1)) | np.uint64(clear[bit] > 0.0)
             if level == _LOW and seen == before:
                 continue
             before = seen
             best, distance, runner_up = nearest(words, seen, clear, bits)
-            if distance > correctable or runner_up <= distance:
+            if distance > rules.correctable or runner_up <= distance:
                 continue
-            if np.abs(clear).mean() - 2.0 * distance / BITS < _MIN_CORRELATION:
+            if np.abs(clear).mean() - 2.0 * distance / count < _MIN_CORRELATION:
+                continue
+            if rules.scarce and not _is_clear(flat, light, level, places, clear):
+                continue
+            if rules.framed and not _has_margin(cells[n], light, level, places, plane):
                 continue
             quarters[n], word[n] = divmod(best, len(words) // 4)
             errors[n], margin[n] = distance, 0.5 * (runner_up - distance)
@@ -139,14 +180,15 @@ def _read(
 
 
 @cached_njit
-def _flatten(cells: FloatArray, sharp: FloatArray) -> float:
-    """Write sharpened brightness minus dark (GRID - 2, GRID - 2); returns that of light, 0 if there is none.
+def _flatten(cells: FloatArray, places: _Places, sharp: FloatArray, plane: FloatArray) -> float:
+    """Write sharpened brightness minus dark (area, area); returns that of light, 0 if there is none.
 
-    Dark is a plane through the border's inner ring, to allow for uneven light; light is the mean of the
-    lighter cells.
+    Dark is a plane through the border's inner ring, to allow for uneven light, written to `plane` (3,): in
+    the middle, by column, by row. Light is the mean of the lighter data cells.
     """
-    for row in range(GRID - 2):
-        for column in range(GRID - 2):
+    area = len(sharp)
+    for row in range(area):
+        for column in range(area):
             here = cells[row + 1, column + 1]
             around = (
                 cells[row, column + 1]
@@ -155,52 +197,78 @@ def _flatten(cells: FloatArray, sharp: FloatArray) -> float:
                 + cells[row + 1, column + 2]
             )
             sharp[row, column] = here + _SHARPENING * (4.0 * here - around)
-    middle = 0.5 * (GRID - 3)
-    mean, by_x, by_y, square, n = 0.0, 0.0, 0.0, 0.0, 0
-    for row in range(GRID - 2):
-        for column in range(GRID - 2):
-            if 0 < row < GRID - 3 and 0 < column < GRID - 3:
-                continue
-            mean += sharp[row, column]
-            by_x += (column - middle) * sharp[row, column]
-            by_y += (row - middle) * sharp[row, column]
-            square += (column - middle) ** 2
-            n += 1
-    mean, by_x, by_y = mean / n, by_x / square, by_y / square
-    lightest = 0.0
-    for row in range(GRID - 2):
-        for column in range(GRID - 2):
+    middle = 0.5 * (area - 1)
+    mean, by_x, by_y, square = 0.0, 0.0, 0.0, 0.0
+    for i in range(len(places.ring)):
+        row, column = places.ring[i, 0], places.ring[i, 1]
+        mean += sharp[row, column]
+        by_x += (column - middle) * sharp[row, column]
+        by_y += (row - middle) * sharp[row, column]
+        square += (column - middle) ** 2
+    mean, by_x, by_y = mean / len(places.ring), by_x / square, by_y / square
+    plane[0], plane[1], plane[2] = mean, by_x, by_y
+    for row in range(area):
+        for column in range(area):
             sharp[row, column] -= mean + by_x * (column - middle) + by_y * (row - middle)
-            if 0 < row < GRID - 3 and 0 < column < GRID - 3:
-                lightest = max(lightest, sharp[row, column])
+    lightest = 0.0
+    for i in range(len(places.data)):
+        lightest = max(lightest, sharp[places.data[i, 0], places.data[i, 1]])
     total, light = 0.0, 0
-    for row in range(1, GRID - 3):
-        for column in range(1, GRID - 3):
-            if sharp[row, column] > 0.5 * lightest:
-                total += sharp[row, column]
-                light += 1
+    for i in range(len(places.data)):
+        value = sharp[places.data[i, 0], places.data[i, 1]]
+        if value > 0.5 * lightest:
+            total += value
+            light += 1
     if light == 0:
         return 0.0
     high = total / light
-    return high if (abs(by_x) + abs(by_y)) * (GRID - 3) <= _MAX_SLOPE * high else 0.0
+    return high if (abs(by_x) + abs(by_y)) * (area - 1) <= _MAX_SLOPE * high else 0.0
 
 
 @cached_njit
-def _clear_cells(flat: FloatArray, light: float, level: float, clear: FloatArray) -> bool:
-    """Map brightness to -1 (dark) ... 1 (light) in `clear`; returns whether the border is dark.
+def _clear_cells(flat: FloatArray, light: float, level: float, places: _Places, clear: FloatArray) -> bool:
+    """Map data to -1 (dark) ... 1 (light) in `clear`; returns whether the border is dark.
 
     The share `level` of `light` maps to 0.
     """
-    wrong = 0.0
-    for row in range(GRID - 2):
-        for column in range(GRID - 2):
-            above = flat[row, column] / light - level
-            value = min(max(above / (level if above < 0.0 else min(1.0 - level, 2.0 * level)), -1.0), 1.0)
-            if 0 < row < GRID - 3 and 0 < column < GRID - 3:
-                clear[(row - 1) * CELLS + column - 1] = value
-            elif value > 0.0:
-                wrong += value
+    wrong = _light_in_border(flat, light, level, places)
+    for bit in range(len(places.data)):
+        clear[bit] = _clearness(flat[places.data[bit, 0], places.data[bit, 1]], light, level)
     return wrong <= _MAX_DARK_ERRORS
+
+
+@cached_njit
+def _clearness(value: float, light: float, level: float) -> float:
+    """A brightness above dark on a scale from -1 (dark) to 1 (light)."""
+    above = value / light - level
+    return float(min(max(above / (level if above < 0.0 else min(1.0 - level, 2.0 * level)), -1.0), 1.0))
+
+
+@cached_njit
+def _is_clear(flat: FloatArray, light: float, level: float, places: _Places, clear: FloatArray) -> bool:
+    """Whether data are clearly dark or light, and the border is dark."""
+    return bool(np.abs(clear).min() >= _CLEAR and _light_in_border(flat, light, level, places) <= _CLEAR)
+
+
+@cached_njit
+def _has_margin(cells: FloatArray, light: float, level: float, places: _Places, plane: FloatArray) -> bool:
+    """Whether the margin around the border is light, which is not sharpened and so less light than data."""
+    middle = 0.5 * (len(cells) - 1)
+    for i in range(len(places.margin)):
+        row, column = places.margin[i, 0], places.margin[i, 1]
+        dark = plane[0] + plane[1] * (column - middle) + plane[2] * (row - middle)
+        if _clearness(cells[row, column] - dark, light, level) < 0.0:
+            return False
+    return True
+
+
+@cached_njit
+def _light_in_border(flat: FloatArray, light: float, level: float, places: _Places) -> float:
+    """Number of light cells in the border's inner ring, weighted."""
+    wrong = 0.0
+    for i in range(len(places.ring)):
+        wrong += max(_clearness(flat[places.ring[i, 0], places.ring[i, 1]], light, level), 0.0)
+    return wrong
 
 
 @cached_njit
@@ -212,19 +280,20 @@ def nearest(
     Args:
         words: (N,) all words.
         seen: The candidate's bits.
-        clear: (BITS,) soft bits, -1 (dark) to 1 (light).
+        clear: (bits,) soft bits, -1 (dark) to 1 (light).
         bits: (N,) filled with the number of different bits.
 
     Returns:
         Index of the nearest word, its weighted distance, and that of the second nearest. A distant second is
         that with the fewest different bits, although another may be nearer by a tenth of a weighted bit.
     """
-    fewest, second = np.uint8(BITS), np.uint8(BITS)
+    count = clear.size
+    fewest, second = np.uint8(count), np.uint8(count)
     for i in range(len(words)):
         bits[i] = _bits_set(words[i] ^ seen)
         fewest = min(fewest, bits[i])
     for i in range(len(words)):  # a separate loop: the compiler does not vectorize a joint one
-        second = min(second, bits[i] if bits[i] > fewest else np.uint8(BITS))
+        second = min(second, bits[i] if bits[i] > fewest else np.uint8(count))
     reach = max(fewest + _WEIGHED, second)  # so that there is always a second nearest
     best, distance, runner_up = -1, _FAR, _FAR
     for i in range(len(words)):
@@ -232,8 +301,8 @@ def nearest(
             continue
         different = words[i] ^ seen
         cost = 0.0
-        for bit in range(BITS):
-            if (different >> np.uint64(BITS - 1 - bit)) & np.uint64(1):
+        for bit in range(count):
+            if (different >> np.uint64(count - 1 - bit)) & np.uint64(1):
                 cost += abs(clear[bit])
         if cost < distance:
             best, distance, runner_up = i, cost, distance

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -15,11 +16,12 @@ from swarm_loc_estimator.common.jit import note_precompiled
 from swarm_loc_estimator.common.parameters import number
 from swarm_loc_vision.common.camera import LENS_SIZE, Camera
 from swarm_loc_vision.common.images import Gray
-from swarm_loc_vision.common.sampling import GRID, homographies, read_cells
+from swarm_loc_vision.common.sampling import homographies, read_cells
 from swarm_loc_vision.markers.bodies import Body, Placement
 from swarm_loc_vision.markers.decoder import Dictionary
 from swarm_loc_vision.markers.edges import refine, refine_read
 from swarm_loc_vision.markers.families import Family, draw_marker, family_named
+from swarm_loc_vision.markers.layouts import Layout
 from swarm_loc_vision.markers.pose import Poses
 from swarm_loc_vision.markers.pose_solver import PoseSettings, PoseSolver
 from swarm_loc_vision.markers.quads import find_quads
@@ -117,15 +119,33 @@ class MarkerDetector:
         self._camera = camera
         self._lens = camera.lens if camera else np.zeros(LENS_SIZE)
         self._solver = PoseSolver(settings, camera, lengths or {}, up, bodies) if camera else None
-        by_side: dict[int, dict[Family, IntArray]] = {}
+        by_layout: dict[Layout, dict[Family, IntArray]] = {}
         for family, ids in families.items():
             used = np.arange(len(family.words)) if ids is None else ids
-            by_side.setdefault(family.side, {})[family] = used
+            by_layout.setdefault(family.layout, {})[family] = used
         self._touching = any(family.touching for family in families)
-        self._dictionaries = {side: Dictionary(used) for side, used in by_side.items()}
+        self._dictionaries = [Dictionary(layout, used) for layout, used in by_layout.items()]
 
     def detect(self, gray: Gray) -> Detections:
         """The markers in an image (height, width)."""
+        dropped: Counter[str] = Counter(too_many_candidates=0, too_far_off_axis=0)
+        found: list[_Markers] = []
+        for swapped in sorted({dictionary.layout.surrounded for dictionary in self._dictionaries}):
+            seen = np.invert(gray) if swapped else gray
+            quads = self._candidates(seen, dropped)
+            blocks = np.split(quads, range(_BLOCK, len(quads), _BLOCK))
+            found += [
+                self._read(seen, block, dictionary)
+                for dictionary in self._dictionaries
+                if dictionary.layout.surrounded == swapped
+                for block in blocks
+            ]
+        markers = _best(_Markers(*map(np.concatenate, zip(*found, strict=True))))
+        corners = self._camera.to_raw(markers.corners) if self._camera else markers.corners
+        return Detections(*markers[:5], corners, *self._poses(markers), dropped)
+
+    def _candidates(self, gray: Gray, dropped: Counter[str]) -> FloatArray:
+        """(N, 4, 2) dark quadrangles [ideal px]."""
         settings = self._settings
         quads = find_quads(gray, settings.min_side_px, settings.min_contrast, touching=self._touching)
         surplus = max(len(quads) - _MAX_CANDIDATES, 0)
@@ -135,20 +155,17 @@ class MarkerDetector:
         if self._camera:
             quads = self._camera.to_ideal(quads)
             quads = quads[np.isfinite(quads).all(axis=(1, 2))]
-        dropped = {"too_many_candidates": surplus, "too_far_off_axis": count - len(quads)}
-        blocks = np.split(quads, range(_BLOCK, len(quads), _BLOCK))
-        found = [self._read(gray, block, side) for side in self._dictionaries for block in blocks]
-        markers = _best(_Markers(*map(np.concatenate, zip(*found, strict=True))))
-        corners = self._camera.to_raw(markers.corners) if self._camera else markers.corners
-        return Detections(*markers[:5], corners, *self._poses(markers), dropped)
+        dropped["too_many_candidates"] += surplus
+        dropped["too_far_off_axis"] += count - len(quads)
+        return quads
 
-    def _read(self, gray: Gray, quads: FloatArray, side: int) -> _Markers:
-        """The candidates that are markers of `side` cells along a side."""
-        min_contrast, dictionary = self._settings.min_contrast, self._dictionaries[side]
-        rough = refine(gray, self._lens, quads, side, _ROUGH_PX)
+    def _read(self, gray: Gray, quads: FloatArray, dictionary: Dictionary) -> _Markers:
+        """The candidates that are markers of a dictionary."""
+        min_contrast, layout = self._settings.min_contrast, dictionary.layout
+        rough = refine(gray, self._lens, quads, layout.side, _ROUGH_PX)
         corners = rough.corners[rough.contrast >= _MIN_EDGE * min_contrast]
-        cells = np.empty((len(corners), GRID, GRID))
-        read_cells(gray, self._lens, homographies(corners), side, cells)
+        cells = np.empty((len(corners), layout.grid, layout.grid))
+        read_cells(gray, self._lens, homographies(corners), layout.side, cells)
         readings = dictionary.read(cells, _MIN_EDGE * min_contrast)
         good = readings.word >= 0
         word, quarters = readings.word[good], readings.quarters[good]
@@ -158,6 +175,7 @@ class MarkerDetector:
             self._lens,
             np.take_along_axis(corners[good], own[..., None], axis=1),
             dictionary.strips[word],
+            layout.border,
         )
         markers = _Markers(
             dictionary.codes[word],

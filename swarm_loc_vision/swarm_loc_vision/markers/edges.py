@@ -15,7 +15,6 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.common.images import Gray
 from swarm_loc_vision.common.sampling import MAX_PROFILES, profile_crossings
-from swarm_loc_vision.markers.families import CELLS
 from swarm_loc_vision.markers.side_pixels import side_pixels
 from swarm_loc_vision.markers.sides import fit_sides
 
@@ -67,7 +66,9 @@ def refine(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, spacing
     return Corners(corners, covariance, contrast)
 
 
-def refine_read(image: Gray, lens: FloatArray, quads: FloatArray, strips: NDArray[np.uint8]) -> Corners:
+def refine_read(
+    image: Gray, lens: FloatArray, quads: FloatArray, strips: NDArray[np.uint8], border: int
+) -> Corners:
     """Move the corners of decoded markers to their edges by a fit to pixels, see `sides`.
 
     Args:
@@ -75,11 +76,11 @@ def refine_read(image: Gray, lens: FloatArray, quads: FloatArray, strips: NDArra
         lens: See `camera.Camera`.
         quads: (N, 4, 2) clockwise from each marker's own upper left, within a pixel [ideal px].
         strips: (N, 4, cells) the row of cells behind the border along each side; 1 is white.
+        border: Width of the border [cells].
     """
     cells = strips.shape[2]
     corners, covariance = quads.copy(), np.zeros((len(quads), 8, 8))
     ends, of_ends, contrast = np.zeros((len(quads), 8)), np.zeros((len(quads), 8, 8)), np.empty(len(quads))
-    border = (cells - CELLS) // 2
     pixels = side_pixels(image, lens, quads, cells, border)
     fit_sides(pixels, strips, border, ends, of_ends, contrast)
     _intersect(corners, ends, of_ends, covariance, contrast)

@@ -1,7 +1,4 @@
-"""Families of square markers: 6 x 6 cells inside a black border, each id a word of 36 bits.
-
-A word holds the cells row by row from the upper left, the first one in bit 35; 1 is white.
-"""
+"""Families of square markers: a layout of cells, and a word of bits for each id."""
 
 from __future__ import annotations
 
@@ -12,6 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_vision.markers.layouts import Cells, Layout, Words
+
 _BCH_IDS = 4096
 
 _BCH_GENERATOR = 0x1DB2777
@@ -20,7 +19,7 @@ _BCH_PARITY_BITS = 24
 _BCH_MASK = 0x8F80B8750
 
 
-def bch_words() -> NDArray[np.uint64]:
+def bch_words() -> Words:
     """(4096,) words of the BCH code of ARToolKitPlus.
 
     BCH(63, 39), t = 4, over GF(64) with x^6 + x + 1, shortened to (36, 12). A codeword has the remainder in
@@ -32,17 +31,14 @@ def bch_words() -> NDArray[np.uint64]:
     for bit in range(35, _BCH_PARITY_BITS - 1, -1):
         set_here = (remainder >> np.uint64(bit)) & np.uint64(1)
         remainder ^= set_here * np.uint64(_BCH_GENERATOR << (bit - _BCH_PARITY_BITS))
-    cells: NDArray[np.uint64] = (words | remainder) ^ np.uint64(_BCH_MASK)
+    cells: Words = (words | remainder) ^ np.uint64(_BCH_MASK)
     return cells
 
-
-CELLS = 6
-"""Cells along a side, without the border."""
-BITS = CELLS * CELLS
 
 CODE_ARTOOLKIT_BCH = 0
 CODE_ARUCO_MIP_36H12 = 1
 CODE_APRILTAG_36H11 = 2
+CODE_OTHER = 255
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,54 +48,38 @@ class Family:
     Attributes:
         name: Name in parameters.
         code: FAMILY_* of swarm_loc_msgs/MarkerDetection.
-        border: Width of the black border [cells].
+        layout: Places of the cells.
         words: (N,) words of the ids.
         touching: Whether the corners touch those of other dark squares, as in Kalibr's grids.
     """
 
     name: str
     code: int
-    border: int
-    words: NDArray[np.uint64]
+    layout: Layout
+    words: Words
     touching: bool = False
 
     @property
     def side(self) -> int:
         """Cells along a side, border included."""
-        return CELLS + 2 * self.border
+        return self.layout.side
 
-    def pattern(self, marker_id: int) -> NDArray[np.uint8]:
-        """(side, side) 1 where a cell is white, upper left first.
+    def whole_size(self, size: float) -> float:
+        """Side of a marker with the data around its border, by the side of its border [m]."""
+        return size * (self.side + 2 * self.layout.outside) / self.side
+
+    def pattern(self, marker_id: int) -> Cells:
+        """Cells of a marker, see `Layout.pattern`; 1 where a cell is white, upper left first.
 
         Raises:
             ValueError: The family has no such id.
         """
         if not 0 <= marker_id < len(self.words):
             raise ValueError(f"{self.name} has ids 0 to {len(self.words) - 1}, not {marker_id}.")
-        return np.pad(unpacked(self.words[marker_id : marker_id + 1])[0], self.border)
+        return self.layout.pattern(self.words[marker_id])
 
 
-def packed(cells: NDArray[np.uint8]) -> NDArray[np.uint64]:
-    """Words (N,) of cells (N, 6, 6), 1 white."""
-    shifts = np.arange(BITS - 1, -1, -1, dtype=np.uint64)
-    bits: NDArray[np.uint64] = cells.reshape(-1, BITS).astype(np.uint64) << shifts
-    words: NDArray[np.uint64] = np.bitwise_or.reduce(bits, axis=1)
-    return words
-
-
-def unpacked(words: NDArray[np.uint64]) -> NDArray[np.uint8]:
-    """Cells (N, 6, 6), 1 white, of words (N,)."""
-    shifts = np.arange(BITS - 1, -1, -1, dtype=np.uint64)
-    cells: NDArray[np.uint8] = ((words[:, None] >> shifts) & np.uint64(1)).astype(np.uint8)
-    return cells.reshape(-1, CELLS, CELLS)
-
-
-def rotated(words: NDArray[np.uint64], quarters: int) -> NDArray[np.uint64]:
-    """The words (N,) of markers after counter-clockwise quarter turns."""
-    return packed(np.rot90(unpacked(words), quarters, axes=(1, 2)))
-
-
-def _published_words(name: str) -> NDArray[np.uint64]:
+def _published_words(name: str) -> Words:
     """(N,) words of a family from its file in `words/`, where it says who published them."""
     lines = (Path(__file__).parent / "words" / f"{name}.txt").read_text(encoding="ascii").splitlines()
     words = [int(word, 16) for line in lines if not line.startswith("#") for word in line.split()]
@@ -109,15 +89,28 @@ def _published_words(name: str) -> NDArray[np.uint64]:
 @lru_cache(maxsize=1)
 def families() -> dict[str, Family]:
     """All families by name; AprilTags are upright as published, not as in OpenCV."""
-    words = bch_words()
-    tags = _published_words("apriltag_36h11")
-    known = (
-        Family("artoolkit_bch_thin", CODE_ARTOOLKIT_BCH, 1, words),
-        Family("artoolkit_bch_thick", CODE_ARTOOLKIT_BCH, 3, words),
-        Family("aruco_mip_36h12", CODE_ARUCO_MIP_36H12, 1, _published_words("aruco_mip_36h12")),
-        Family("apriltag_36h11", CODE_APRILTAG_36H11, 1, tags),
-        Family("apriltag_36h11_thick", CODE_APRILTAG_36H11, 2, tags, touching=True),
-    )
+    bch, tags = bch_words(), _published_words("apriltag_36h11")
+    known = [
+        Family("artoolkit_bch_thin", CODE_ARTOOLKIT_BCH, Layout(6, 1), bch),
+        Family("artoolkit_bch_thick", CODE_ARTOOLKIT_BCH, Layout(6, 3), bch),
+        Family("aruco_mip_36h12", CODE_ARUCO_MIP_36H12, Layout(6, 1), _published_words("aruco_mip_36h12")),
+        Family("apriltag_36h11", CODE_APRILTAG_36H11, Layout(6, 1), tags),
+        Family("apriltag_36h11_thick", CODE_APRILTAG_36H11, Layout(6, 2), tags, touching=True),
+        Family("apriltag_16h5", CODE_OTHER, Layout(4, 1), _published_words("apriltag_16h5")),
+        Family("apriltag_25h9", CODE_OTHER, Layout(5, 1), _published_words("apriltag_25h9")),
+        Family(
+            "apriltag_standard_41h12",
+            CODE_OTHER,
+            Layout(3, 1, surrounded=True),
+            _published_words("apriltag_standard_41h12"),
+        ),
+    ]
+    for cells in (4, 5, 6, 7):
+        words = _published_words(f"aruco_{cells}x{cells}")
+        known += [
+            Family(f"aruco_{cells}x{cells}_{count}", CODE_OTHER, Layout(cells, 1), words[:count])
+            for count in (50, 100, 250, 1000)
+        ]
     return {family.name: family for family in known}
 
 
@@ -139,7 +132,7 @@ WHITE = 255
 def draw_marker(
     family: Family, marker_id: int, pixels_per_cell: int = 8, margin: int = 1
 ) -> NDArray[np.uint8]:
-    """An image (n, n) of 0 and 255 of an upright marker, n = (family.side + 2 margin) pixels_per_cell.
+    """An image (n, n) of 0 and 255 of an upright marker, n = (cells of pattern + 2 margin) pixels_per_cell.
 
     Args:
         family: Family of the marker.

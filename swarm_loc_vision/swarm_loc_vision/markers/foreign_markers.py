@@ -28,10 +28,13 @@ from swarm_loc_vision.markers.pose_solver import PoseSettings, PoseSolver
 
 _APRILTAG_CENTRE_PX = 0.5
 """Where AprilTag's detector sees the centre of the first pixel; everywhere else it is at 0."""
-_APRILTAG_NAMES = {"apriltag_36h11": "tag36h11"}
-"""Names that AprilTag's detector has for our families."""
-_HALF_TURN = ("apriltag_36h11",)
-"""Families that OpenCV has upside down."""
+_APRILTAG_NAMES = {
+    "apriltag_16h5": "tag16h5",
+    "apriltag_25h9": "tag25h9",
+    "apriltag_36h11": "tag36h11",
+    "apriltag_standard_41h12": "tagStandard41h12",
+}
+"""Names that AprilTag's detector has for our families; OpenCV has those that it reads upside down."""
 
 
 class ForeignMarker(NamedTuple):
@@ -93,7 +96,7 @@ def _of_apriltag(message: Any, _camera: Camera, _parameters: ForeignParameters) 
 def _of_aruco(message: Any, camera: Camera, parameters: ForeignParameters) -> Iterator[ForeignMarker]:
     """Project the square of a marker at its pose; a marker behind the camera has corners that are NaN."""
     fx, fy, cx, cy = camera.intrinsics
-    turned = 2 if parameters.family in _HALF_TURN else 0
+    turned = 2 if parameters.family in _APRILTAG_NAMES else 0
     for marker in message.markers:
         place, turn = marker.pose.position, marker.pose.orientation
         quaternion = np.array([turn.x, turn.y, turn.z, turn.w])

@@ -24,7 +24,7 @@ from swarm_loc_vision.markers.marker_bridge_node import MarkerBridgeNode
 
 FAMILY = "apriltag_36h11"
 FRAME = "epuck1/camera_optical_frame"
-_, (TRUTH, *_) = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())
+TRUTH = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())[1][0]
 
 
 def _markers(message: Any, *_: object) -> Iterator[ForeignMarker]:

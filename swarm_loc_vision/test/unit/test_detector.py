@@ -22,7 +22,7 @@ from swarm_loc_estimator.sensors.camera import CONTENT_POSE, CONTENT_POSE_TWO
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.camera_detector import detection_rows
 from swarm_loc_vision.markers.detector import Detections, DetectorSettings, MarkerDetector
-from swarm_loc_vision.markers.families import Family, draw_marker, family_named, packed
+from swarm_loc_vision.markers.families import draw_marker, family_named
 
 PHOTOS = Path(__file__).resolve().parents[4] / "shared" / "data" / "photos"
 Gray = NDArray[np.uint8]
@@ -110,13 +110,13 @@ def test_corners_and_poses_are_as_sure_as_they_say() -> None:
     family, nees = family_named("aruco_mip_36h12"), []
     for seed in range(6):
         image, truths = random_scene(np.random.default_rng(seed), family, 15, Look())
-        detector = own_detector(family)
-        detector._lengths = {truth.marker_id: truth.length for truth in truths}
-        detections = detector.detect(image)
+        lengths = {truth.marker_id: truth.length for truth in truths}
+        camera = Camera.from_matrix((WIDTH, HEIGHT), CAMERA, ())
+        detections = MarkerDetector(DetectorSettings(), {family: None}, camera, lengths=lengths).detect(image)
         poses = detections.poses
         assert poses is not None
         for row, truth in match(detections, truths):
-            if truth.side_px < 24.0 or detector._lengths[truth.marker_id] != truth.length:
+            if truth.side_px < 24.0 or lengths[truth.marker_id] != truth.length:
                 continue
             turn = Rotation.from_matrix(poses.rotation[row, 0] @ truth.rotation.T).as_rotvec()
             error = np.concatenate([poses.position[row, 0] - truth.position, turn])
@@ -259,15 +259,7 @@ def test_rows_hold_what_was_found() -> None:
         assert np.isnan(rows["alternative_ratio"][~two]).all()
 
 
-def photo_family(dictionary: str) -> Family:
-    """The family of a photograph; those of OpenCV's tutorials are not among ours."""
-    if dictionary == "DICT_APRILTAG_36h11":
-        return family_named("apriltag_36h11")
-    if not hasattr(cv2, "aruco"):
-        pytest.skip(f"OpenCV {cv2.__version__} does not have {dictionary}")
-    source = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_6X6_250)
-    cells = np.stack([source.generateImageMarker(i, 8)[1:-1, 1:-1] for i in range(250)]) // 255
-    return Family(dictionary, 255, 1, packed(cells.astype(np.uint8)))
+PHOTO_FAMILIES = {"DICT_APRILTAG_36h11": "apriltag_36h11", "DICT_6X6_250": "aruco_6x6_250"}
 
 
 @pytest.mark.skipif(not PHOTOS.exists(), reason="the photographs are not at hand")
@@ -286,7 +278,9 @@ def test_photographs(file: str) -> None:
     manifest = json.loads((PHOTOS / "manifest.json").read_text(encoding="utf-8"))
     (entry,) = [entry for entry in manifest if entry["file"] == file]
     image = np.asarray(cv2.imread(str(PHOTOS / file), cv2.IMREAD_GRAYSCALE), np.uint8)
-    detections = MarkerDetector(DetectorSettings(), {photo_family(entry["dict"]): None}).detect(image)
+    detections = MarkerDetector(
+        DetectorSettings(), {family_named(PHOTO_FAMILIES[entry["dict"]]): None}
+    ).detect(image)
     assert not Counter(entry["ids"]) - Counter(detections.id.tolist())
     assert set(detections.id.tolist()) <= set(entry["ids"])
     for marker_id, corners in entry.get("corners", {}).items():

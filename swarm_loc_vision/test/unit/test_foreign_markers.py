@@ -9,11 +9,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bench.shared.parameter_table import markdown_table
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
-from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import decode
 from swarm_loc_estimator.common.messages.definitions import DETECTIONS
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
@@ -50,7 +50,7 @@ def camera_info(distortion: tuple[float, ...] = (0.0,) * 5) -> SimpleNamespace:
     )
 
 
-def tag(marker_id: int, corners: FloatArray, family: str = "tag36h11") -> SimpleNamespace:
+def tag(marker_id: int, corners: NDArray[Any], family: str = "tag36h11") -> SimpleNamespace:
     """An apriltag_msgs/AprilTagDetection with corners (4, 2) as AprilTag gives them."""
     points = [SimpleNamespace(x=float(u), y=float(v)) for u, v in corners]
     return SimpleNamespace(id=marker_id, family=family, hamming=0, corners=points)

@@ -25,7 +25,7 @@ STRAIGHT = np.zeros(LENS_SIZE)
 
 
 def strips(marker_id: int) -> NDArray[np.uint8]:
-    return Dictionary({FAMILY: np.array([marker_id])}).strips
+    return Dictionary(FAMILY.layout, {FAMILY: np.array([marker_id])}).strips
 
 
 def shares(begin: float, cell: float, blur: float, motion: float, cover: float = 0.0) -> FloatArray:
@@ -68,7 +68,7 @@ def corners_of(at: tuple[float, float], cell: float) -> FloatArray:
 
 
 def fitted(image: NDArray[np.uint8], near: FloatArray, marker_id: int) -> Corners:
-    return refine_read(image, STRAIGHT, near[None], strips(marker_id))
+    return refine_read(image, STRAIGHT, near[None], strips(marker_id), FAMILY.layout.border)
 
 
 @settings(max_examples=60)

@@ -115,7 +115,7 @@ def _scene(
 
 def _board(pose: list[float], mark: Face | Landmark, family: Family) -> Patches:
     """A marker on its sheet."""
-    return scenery.marker(pose, mark.z, family.pattern(mark.id) != 0, mark.size)
+    return scenery.marker(pose, mark.z, family.pattern(mark.id) != 0, family.whole_size(mark.size))
 
 
 @dataclass(frozen=True)
@@ -188,7 +188,9 @@ class OverheadRig:
         model = overhead_model(settings)
         count = len(scene.robots)
         lying = [
-            scenery.floor_marker((one.x, one.y, one.yaw), family.pattern(one.id) != 0, one.size)
+            scenery.floor_marker(
+                (one.x, one.y, one.yaw), family.pattern(one.id) != 0, family.whole_size(one.size)
+            )
             for one in markers
         ]
         shadow = scenery.shadow(
