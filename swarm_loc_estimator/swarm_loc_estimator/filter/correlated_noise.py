@@ -33,7 +33,8 @@ error s is in the prediction already, and the fix improves only the rest p - s, 
 
 The noise is inflated so that the update has this result, in the directions that diagonalise both covariances.
 With b = 0 it stays as it is; with b = 1 the variance becomes c, however many fixes there are, and a fix that
-is less sure than the prediction is ignored.
+is less sure than the prediction is ignored. Where position and heading have different shares, as under a
+fixed camera, b is their mean, weighted by the squares of a direction's components in units of c.
 """
 
 from __future__ import annotations
@@ -122,11 +123,11 @@ def use_mean(
 
 
 @cached_njit
-def inflate_fix(share: float, predicted_covariance: FloatArray, noise: FloatArray) -> None:
+def inflate_fix(shares: FloatArray, predicted_covariance: FloatArray, noise: FloatArray) -> None:
     """Inflate the noise of a fix so that it adds no more than what earlier ones with its errors lack.
 
     Args:
-        share: Systematic share of its variance.
+        shares: (3,) systematic share of each of its variances.
         predicted_covariance: (3, 3) of the pose.
         noise: (3, 3) covariance of the fix, changed.
     """
@@ -136,6 +137,9 @@ def inflate_fix(share: float, predicted_covariance: FloatArray, noise: FloatArra
     basis = np.dot(root, np.ascontiguousarray(axes))
     scaled = np.empty((3, 3))
     for i in range(3):
+        share = 0.0
+        for j in range(3):
+            share += shares[j] * axes[j, i] * axes[j, i]
         rest, new = ratio[i] - share, 0.0
         if rest > 0.0:
             after = share + rest * (1.0 - share) / (rest + 1.0 - share)

@@ -181,14 +181,13 @@ def evaluate(
     for i in range(2):
         batch.whitened[row, i] = innovation[i] / math.sqrt(s[i, i] + small[i])
     batch.cause[row] = cause_of(measurements.kind[k], innovation, predicted)
-    share = measurements.systematic_share[k, 0] if measurements.observer[k] < 0 else 0.0
-    if share > 0.0:
+    if measurements.observer[k] < 0 and measurements.systematic_share[k, 0] > 0.0:
         batch.nis[row] = squared_distance(innovation, s)
         batch.accepted[row] = batch.nis[row] <= POSE_GATE
         for i in range(3):
             for j in range(3):
                 s[i, j] -= noise[i, j]
-        inflate_fix(share, s, noise)
+        inflate_fix(measurements.systematic_share[k], s, noise)
         return
     if measurements.has_heading[k]:
         before = (noise[0, 2], noise[1, 2], noise[2, 2])

@@ -8,7 +8,7 @@ switch on their numbers. Each of their measurements observes the pose of a marke
 the transform chains (3) and (5) of the e-puck paper in the plane (its printed eq. (6) has three wrong signs,
 which the chain avoids). S is the sensor on the observer, M the marker on the target. A landmark has no target
 robot: M is its pose in `map`, corrected by X_target if the landmark is estimated. An absolute fix has no
-observer: S is the identity.
+observer: S is the identity, or the pose of a fixed camera in `map`.
 
 With right-invariant errors X = exp(xi) X_hat the chain depends on xi_target - xi_observer only, so one
 Jacobian (3 x 3) serves both robots, with opposite signs. Two more columns are for the camera's yaw offset
@@ -59,7 +59,7 @@ NO_MODEL = -1
 MEASUREMENT_DTYPE = np.dtype(
     [
         ("stamp_ns", np.int64),  # time of measurement
-        ("received_from", np.int64),  # robot whose message it came in; -1 for a message about the whole swarm
+        ("received_from", np.int64),  # robot or fixed camera of the message; -1: about the whole swarm
         ("observer", np.int64),  # robot index or NOBODY
         ("target", np.int64),  # robot index or NOBODY
         ("landmark", np.int64),  # 1 + index of the landmark; 0: none
@@ -142,6 +142,7 @@ def locates_alone(measurements: MeasurementColumns, k: int) -> bool:
     More of them would not confirm it, so a single one initializes a robot.
     """
     is_fix: bool = measurements.observer[k] < 0 and measurements.has_heading[k] > 0
+    is_fix = is_fix and not measurements.has_alternative[k]
     return is_fix and measurements.systematic_share[k, 0] > 0.0
 
 

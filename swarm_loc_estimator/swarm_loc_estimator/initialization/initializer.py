@@ -109,9 +109,7 @@ class Initializer:
         track = self._tracks.at(np.array([robot]), one["stamp_ns"])
         at = Preintegrated(now_ns, track.covariance[0], track.jacobian[0])
         if locates_alone(MeasurementColumns.of(one), 0) and self._is_sure(one["covariance"][0]):
-            pose, covariance = one["value"][0], one["covariance"][0]
-            transform = se2.compose(pose, se2.inverse(track.pose[0]))
-            located(state, robot, InitialPose(transform, se2.error_covariance(pose, covariance)), at)
+            located(state, robot, _fixed(one, track.pose[0]), at)
             return True
         old = state.constraints.get(robot, NO_CONSTRAINTS)
         same = old[(old["marker_id"] == one["marker_id"][0]) & (old["other"] == other)]
@@ -151,3 +149,12 @@ class Initializer:
         predict(state.arrays(), other, at, new_scratch())
         transform = state.transform[other].copy()
         return OtherSide(other, -1, se2.compose(transform, sample.pose[0]), transform, at.covariance)
+
+
+def _fixed(one: MeasurementArray, on_track: FloatArray) -> InitialPose:
+    """The initial pose of a robot at a pose (3,) on its track by an absolute measurement (1,) of its pose."""
+    sensor, value = one["sensor"][0], one["value"][0]
+    pose = se2.compose(se2.compose(sensor, value), se2.inverse(one["marker"][0]))
+    carry = se2.adjoint(sensor)  # from errors seen by the sensor to errors in map
+    covariance = carry @ se2.error_covariance(value, one["covariance"][0]) @ carry.T
+    return InitialPose(se2.compose(pose, se2.inverse(on_track)), covariance)

@@ -17,7 +17,7 @@ from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
 from swarm_loc_estimator.sensors.registry import InputTopic
-from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import FixedCamera, Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradiction
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
 from swarm_loc_estimator.timeline.fusion import Verdict
@@ -33,6 +33,8 @@ _CAUSES = {
     "non_finite": "are not finite",
     "odometry_non_finite": "are odometry that is not finite",
     "absurd": "are absurdly large",
+    "face_down": "are of lying markers that show the floor: is the pose of the camera right?",
+    "not_flat": "are of markers that do not lie level at z of their face: are size and camera pose right?",
     "odometry_absurd": "are odometry that is absurdly large",
 }
 """Why messages of a robot are dropped."""
@@ -130,14 +132,15 @@ class Diagnostics:
         self._parameters = parameters
         self._graph = graph
         self._sole = sole
-        self._inputs_of: list[list[tuple[int, InputTopic]]] = [[] for _ in swarm.robots]
+        self._sources = swarm.sources
+        self._inputs_of: list[list[tuple[int, InputTopic]]] = [[] for _ in self._sources]
         self._of_swarm: list[tuple[int, InputTopic]] = []
         for handle, topic in enumerate(ingest.topics):
             inputs = self._inputs_of[topic.robot] if topic.kind.of_each else self._of_swarm
             inputs.append((handle, topic))
         self._was_located = np.zeros(len(swarm.robots), dtype=bool)
         self._received = [0] * len(ingest.topics)
-        self._dropped: list[Mapping[str, int]] = [{} for _ in swarm.robots]
+        self._dropped: list[Mapping[str, int]] = [{} for _ in self._sources]
         self._reported_ns: int | None = None
 
     def missing(self) -> list[InputTopic]:
@@ -161,25 +164,25 @@ class Diagnostics:
         drops: Mapping[str, int],
         drops_of: Sequence[Mapping[str, int]] = (),
     ) -> list[Report]:
-        """Reports of the robots, then of the swarm's inputs and drops; begins a new interval.
+        """Reports of robots, of fixed cameras, of the swarm's inputs and drops; begins a new interval.
 
         Args:
             now_ns: The node's time.
             estimate: The newest estimate.
             recent: The estimator's measurements with verdicts and normalized innovations squared.
             drops: Data not used, by reason.
-            drops_of: The same of each robot.
+            drops_of: The same of each robot and fixed camera.
         """
         elapsed_s = (now_ns - self._reported_ns) * 1e-9 if self._reported_ns is not None else 0.0
         self._reported_ns = now_ns
-        used, nis = _used_per_robot(recent, len(self._swarm.robots))
+        used, nis = _used_per_source(recent, len(self._sources))
         of_one = [topic.name for _, topic in self._of_swarm if not topic.kind.stands_for]
         common = self._duplicates_on([*self._sole, *of_one])
         self.duplicate_publishers = common.copy()
         reports = []
-        for index, robot in enumerate(self._swarm.robots):
+        for index, source in enumerate(self._sources):
             lost = self._drop_troubles(index, drops_of[index]) if drops_of else []
-            report = self._robot_report(index, robot, estimate, now_ns, elapsed_s, lost)
+            report = self._source_report(index, source, estimate, now_ns, elapsed_s, lost)
             report.values |= drop_values(drops_of[index]) if drops_of else {}
             report.values["measurements used"] = str(used[index])
             report.values["NIS mean"] = _figure(nis[index])
@@ -212,16 +215,17 @@ class Diagnostics:
         some = [(reason, count) for reason, count in grown.items() if count]
         return [f"dropped {count} of its data: they {_CAUSES[reason]}" for reason, count in some]
 
-    def _robot_report(
+    def _source_report(
         self,
         index: int,
-        robot: Robot,
+        source: Robot | FixedCamera,
         estimate: Estimate,
         now_ns: int,
         elapsed_s: float,
         dropped: Sequence[str],
     ) -> Report:
-        """State and inputs of one robot, with sentences about its dropped data."""
+        """State and inputs of one robot, or inputs of a fixed camera, with sentences about dropped data."""
+        robot = source if isinstance(source, Robot) else None
         duplicates = self._duplicates_on([topic.name for _, topic in self._inputs_of[index]])
         self.duplicate_publishers += duplicates
         troubles = [*duplicates, *dropped]
@@ -230,6 +234,8 @@ class Diagnostics:
             troubles += self._input_troubles(handle, topic, robot, now_ns)
             if topic.expected or self._ingest.statistics[handle].received:
                 values.update(self._input_values(handle, topic, now_ns, elapsed_s))
+        if robot is None:
+            return Report(source.name, "; ".join(troubles) or "seeing", level_of(troubles), values)
         status = Status(int(estimate.status[index]))
         if status is Status.WAITING and not troubles:
             lost = "lost, " if self._was_located[index] else ""
@@ -357,14 +363,14 @@ def _patience_s(topic: InputTopic, robot: Robot | None, statistics: InputStatist
     return max(_PATIENCE_S, _PATIENCE_PERIODS * 1e-9 * (statistics.mean_period_ns or 0.0))
 
 
-def _used_per_robot(recent: Recent, robots: int) -> tuple[list[int], list[float]]:
-    """How many measurements from each robot's camera were used lately, and their mean NIS (NaN for none)."""
+def _used_per_source(recent: Recent, sources: int) -> tuple[list[int], list[float]]:
+    """How many measurements of each robot or fixed camera were used, and their mean NIS (NaN for none)."""
     measurements, verdicts, nis = recent
     mine = (verdicts == Verdict.USED) & (measurements["received_from"] >= 0) & np.isfinite(nis)
     observers = measurements["received_from"][mine]
-    count = np.bincount(observers, minlength=robots)
-    total = np.bincount(observers, nis[mine], minlength=robots)
-    mean = np.divide(total, count, out=np.full(robots, np.nan), where=count > 0)
+    count = np.bincount(observers, minlength=sources)
+    total = np.bincount(observers, nis[mine], minlength=sources)
+    mean = np.divide(total, count, out=np.full(sources, np.nan), where=count > 0)
     return count.tolist(), mean.tolist()
 
 

@@ -242,7 +242,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         if self._estimate is None:
             return [merged(causes, "estimator")]
         now_ns = self._time_ns()
-        own = [self._estimator.drops_of(robot) for robot in range(len(self._swarm.robots))]
+        own = [self._estimator.drops_of(source) for source in range(len(self._swarm.sources))]
         reports = self._diagnostics.reports(now_ns, self._estimate, self._estimator.recent(), drops, own)
         contradictions = self._estimator.contradictions(now_ns)
         add_contradictions(reports, contradictions)

@@ -43,7 +43,7 @@ class InputConverter:
     """
 
     def __init__(self, swarm: Swarm, settings: SensorSettings) -> None:
-        self.drops = DropCounts(len(swarm.robots))
+        self.drops = DropCounts(len(swarm.sources))
         self.accumulators: dict[str, Accumulator] = {
             name: sensor.create_accumulator(swarm)
             for name, sensor in SENSORS.items()

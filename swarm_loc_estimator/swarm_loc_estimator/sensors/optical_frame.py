@@ -34,11 +34,23 @@ def scale(vector: FloatArray, factor: float) -> None:
 
 
 @cached_njit
+def write_rotation(quaternion: FloatArray, out: FloatArray) -> None:
+    """Write the rotation matrix (3, 3) of a quaternion xyzw (4,) of any length."""
+    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    out[0, 0], out[1, 1], out[2, 2] = (
+        w * w + x * x - y * y - z * z,
+        w * w - x * x + y * y - z * z,
+        w * w - x * x - y * y + z * z,
+    )
+    out[0, 1], out[0, 2], out[1, 2] = 2.0 * (x * y - w * z), 2.0 * (x * z + w * y), 2.0 * (y * z - w * x)
+    out[1, 0], out[2, 0], out[2, 1] = 2.0 * (x * y + w * z), 2.0 * (x * z - w * y), 2.0 * (y * z + w * x)
+    out /= x * x + y * y + z * z + w * w
+
+
+@cached_njit
 def face_heading(level: FloatArray, quaternion: FloatArray) -> float:
     """Heading in the sensor plane of the z axis of an orientation xyzw (4,), the normal of a face."""
-    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    out_of_face, axes = np.empty(3), np.empty(3)
-    out_of_face[0], out_of_face[1] = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x)
-    out_of_face[2] = w * w - x * x - y * y + z * z
-    to_level_frame(level, out_of_face, axes)
+    rotation, axes = np.empty((3, 3)), np.empty(3)
+    write_rotation(quaternion, rotation)
+    to_level_frame(level, rotation[:, 2], axes)
     return math.atan2(axes[1], axes[0])

@@ -41,7 +41,7 @@ class InputTopic:
     Attributes:
         name: Relative topic name, such as `<robot>/odom`.
         kind: Kind of the topic.
-        robot: Index into `Swarm.robots`, or THE_SWARM.
+        robot: Index into `Swarm.sources`, or THE_SWARM.
         expected: True if missing messages are an error; False for detections of a robot without camera.
     """
 
@@ -52,19 +52,25 @@ class InputTopic:
 
 
 def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
-    """All possible input topics of a swarm: those of each robot, then those of the swarm."""
+    """All possible input topics of a swarm: of each robot, of each fixed camera, then of the swarm."""
     of_robots = (
         InputTopic(f"{robot.name}/{kind.topic}", kind, index, kind.expected_of(robot))
         for index, robot in enumerate(swarm.robots)
         for kind in kinds().values()
         if kind.of_each and (kind.expected_of(robot) or not kind.only_expected)
     )
+    of_cameras = (
+        InputTopic(f"{camera.name}/{kind.topic}", kind, index)
+        for index, camera in enumerate(swarm.cameras, len(swarm.robots))
+        for kind in kinds().values()
+        if kind.of_cameras
+    )
     of_swarm = (
         InputTopic(kind.topic, kind, THE_SWARM, not kind.stands_for and kind.is_expected_of(swarm))
         for kind in kinds().values()
         if not kind.of_each
     )
-    return (*of_robots, *of_swarm)
+    return (*of_robots, *of_cameras, *of_swarm)
 
 
 def live_topics(swarm: Swarm, *, shared: bool) -> tuple[InputTopic, ...]:
@@ -80,7 +86,9 @@ def live_topics(swarm: Swarm, *, shared: bool) -> tuple[InputTopic, ...]:
 
 
 def _is_sent(topic: InputTopic, swarm: Swarm, stood_for: Collection[str]) -> bool:
-    """Whether the robot publishes this topic and no shared topic replaces it."""
+    """Whether the robot or fixed camera publishes this topic and no shared topic replaces it."""
+    if topic.robot >= len(swarm.robots):
+        return True
     return topic.kind.rows not in stood_for and topic.kind.expected_of(swarm.robots[topic.robot])
 
 

@@ -91,19 +91,19 @@ class DropCounts:
     """Numbers of dropped readings by reason.
 
     Args:
-        robots: Number of robots.
+        sources: Number of robots and fixed cameras.
 
     Attributes:
         total: Of all readings.
-        of_robot: Of each robot's own readings.
+        of_robot: Of the own readings of each robot and, after them, of each fixed camera.
     """
 
-    def __init__(self, robots: int) -> None:
+    def __init__(self, sources: int) -> None:
         self.total: Counter[str] = Counter()
-        self.of_robot: list[Counter[str]] = [Counter() for _ in range(robots)]
+        self.of_robot: list[Counter[str]] = [Counter() for _ in range(sources)]
 
     def add(self, reason: str, robots: IntArray) -> None:
-        """Count dropped readings of robots (k,); -1: of none of them."""
+        """Count dropped readings of robots and fixed cameras (k,); -1: of none of them."""
         if not robots.size:
             return
         self.total[reason] += robots.size
@@ -151,6 +151,7 @@ class InputKind:
         expected_of: True if a missing topic of the robot is an error.
         of_each: True if each robot has its own topic.
         only_expected: True if robots of which it is not expected have no such topic.
+        of_cameras: True if each fixed camera has such a topic, too.
         in_map: True if readings must be in the frame `map`.
         stands_for: Name of the sensor whose topics of single robots it replaces; "" if none.
     """
@@ -163,6 +164,7 @@ class InputKind:
     expected_of: Callable[[Robot], bool] = of_every
     of_each: bool = True
     only_expected: bool = False
+    of_cameras: bool = False
     in_map: bool = False
     stands_for: str = ""
 

@@ -150,5 +150,6 @@ def shared_kind(
         ),
         columns_of=_shared_columns,
         of_each=False,
+        of_cameras=False,
         stands_for=own.name,
     )

@@ -14,6 +14,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from swarm_loc_estimator.common.parameters import number
+from swarm_loc_estimator.swarm.fix_model import FixModel
 from swarm_loc_estimator.swarm.imu_model import ImuModel
 
 if TYPE_CHECKING:
@@ -24,7 +25,6 @@ if TYPE_CHECKING:
 
 Pose2 = tuple[float, float, float]
 """x [m], y [m], heading [rad]."""
-
 
 TURN = 6.2832
 """Maximum absolute angle in descriptions: a full turn [rad]."""
@@ -186,6 +186,7 @@ class Face:
         yaw: Direction of the outward normal [rad]; None if the marker shows no heading.
         size: Side of the marker, black border included [m].
         position_sigma: Standard deviation of x and y, each [m].
+        lies: Whether it lies flat and looks up; its yaw is then the direction of its x axis, to the right.
     """
 
     name: str
@@ -198,6 +199,7 @@ class Face:
     position_sigma: float = number(
         0.0, "m", 0.0, 10.0, "standard deviation of x and y; added to the noise of its sightings"
     )
+    lies: bool = False
 
 
 @dataclass(frozen=True)
@@ -255,17 +257,6 @@ class RandomWalk:
 
 
 @dataclass(frozen=True)
-class FixModel:
-    """Error model of a robot's absolute fixes, beside or in place of the covariance of each."""
-
-    systematic_share: float = number(
-        0.0, "1", 0.0, 1.0, "share of a fix's variance that earlier fixes have, too; 1: fixes of a mapper"
-    )
-    position_sigma: float = number(0.0, "m", 0.0, 1e3, "of x and y, for fixes without covariance; 0: dropped")
-    heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "of the heading, for such fixes; 0: it is not used")
-
-
-@dataclass(frozen=True)
 class Robot:
     """One robot.
 
@@ -314,6 +305,24 @@ class Robot:
 
 
 @dataclass(frozen=True)
+class FixedCamera:
+    """A camera with a fixed pose in `map`, such as at the ceiling; its angles are those of `CameraMount`."""
+
+    name: str
+    x: float = number(0.0, "m", -1e6, 1e6, "in map")
+    y: float = number(0.0, "m", -1e6, 1e6, "in map")
+    z: float = number(0.0, "m", -1e4, 1e4, "above the floor")
+    yaw: float = number(0.0, "rad", -TURN, TURN, "turned to the left")
+    pitch: float = number(math.pi / 2, "rad", -TURN, TURN, "turned down; by default straight down")
+    roll: float = number(0.0, "rad", -TURN, TURN, "turned about the optical axis")
+    position_sigma: float = number(
+        0.001, "m", 0.0, 10.0, "error of positions on the floor, the same in all of its images", above=True
+    )
+    yaw_sigma: float = number(0.002, "rad", 0.0, 1.0, "error of headings, the same in all images", above=True)
+    sensor: SensorModel = SensorModel()
+
+
+@dataclass(frozen=True)
 class MarkerOwner:
     """Owner of a marker id.
 
@@ -334,20 +343,21 @@ class SwarmError(ValueError):
 
 @dataclass(frozen=True)
 class Swarm:
-    """All robots and landmarks.
+    """All robots, landmarks and fixed cameras.
 
     Raises:
-        SwarmError: A robot name, a marker id or the id of an infrared board appears twice, or a robot with
-            odometry has a random walk or one without has an IMU.
+        SwarmError: A name, a marker id or the id of an infrared board appears twice, or a robot with odometry
+            has a random walk or one without has an IMU.
     """
 
     robots: tuple[Robot, ...] = ()
     landmarks: tuple[Landmark, ...] = ()
+    cameras: tuple[FixedCamera, ...] = ()
 
     def __post_init__(self) -> None:
-        names = Counter(robot.name for robot in self.robots)
+        names = Counter(one.name for one in self.sources)
         if twice := [name for name, count in names.items() if count > 1]:
-            raise SwarmError(f"robot name '{twice[0]}' is given to two robots; names must be unique.")
+            raise SwarmError(f"name '{twice[0]}' is given to two robots or cameras; names must be unique.")
         faces = [
             (f"face '{face.name}' of robot '{r.name}'", face.id) for r in self.robots for face in r.faces
         ]
@@ -367,6 +377,11 @@ class Swarm:
             )
         if turned := [r.name for r in self.robots if r.imu.is_used and r.stands]:
             raise SwarmError(f"robot '{turned[0]}' has no odometry, so its imu.turn_noise_density must be 0.")
+
+    @property
+    def sources(self) -> tuple[Robot | FixedCamera, ...]:
+        """All that have input topics, as these count them: robots, then fixed cameras."""
+        return (*self.robots, *self.cameras)
 
     @cached_property
     def index_of(self) -> Mapping[str, int]:

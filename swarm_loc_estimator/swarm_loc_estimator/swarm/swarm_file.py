@@ -16,6 +16,7 @@ types:
     camera: {x: 0.035, z: 0.028}            # null: it has none
     faces:                                  # markers on the body; null takes one away
       front: {x: 0.035, yaw: 0.0, size: 0.036, position_sigma: 0.001}
+      top: {z: 0.1, yaw: 0.0, size: 0.05, lies: true}   # lies flat, its own right is forward
   droplet:
     odometry: null                          # null: it has none, and stands where it is
     random_walk: {position: 1e-4, heading: 0.05}   # or moves, nobody knows where to
@@ -26,7 +27,7 @@ types:
 robots:
   epuck1:                 # the same keys; what is not said comes from its type
     type: epuck
-    ids: {front: 12}      # which marker is on which face
+    ids: {front: 12, top: 13}   # which marker is on which face
     start: {x: 0.0, y: 0.0, theta: 0.0}     # null or left out: unknown
   droplet1:
     type: droplet
@@ -35,6 +36,8 @@ robots:
       gains: {sensor: [1, 1, 1, 1, 1, 1], emitter: [1, 1, 1, 1, 1, 1]}   # null or left out: never calibrated
 landmarks:
   100: {x: 1.2, y: -0.4, yaw: 3.14159, size: 0.05}      # yaw null or left out: shows no heading
+cameras:                  # fixed ones, which see markers on robots
+  ceiling1: {x: -1.0, y: 0.5, z: 2.5, position_sigma: 0.001, sensor: {residual_position_sigma: 0.001}}
 ```
 Numbers, units, ranges and defaults are those of the classes in `swarm/swarm.py`.
 """
@@ -48,13 +51,14 @@ from typing import TYPE_CHECKING, Any
 
 from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
+from swarm_loc_estimator.swarm.fix_model import FixModel
 from swarm_loc_estimator.swarm.imu_model import ImuModel
 from swarm_loc_estimator.swarm.ir_section import IrSection, Values
 from swarm_loc_estimator.swarm.motion_response import MotionResponse, MotionResponseError
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
-    FixModel,
+    FixedCamera,
     Landmark,
     OdometryModel,
     Pose2,
@@ -72,7 +76,7 @@ if TYPE_CHECKING:
 
 FILE_VERSION = 1
 
-_SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks")
+_SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks", "cameras")
 _LAYER = (
     "odometry",
     "imu",
@@ -198,20 +202,19 @@ class _Loader(TreeChecks):
         named = self._named(sections.get("robots", {}), "robots")
         if not named:
             raise self.said("robots is empty but must name at least one robot")
-        if taken := [name for name, _ in named if name in RESERVED_NAMES]:
-            rule = f"must be none of {', '.join(sorted(RESERVED_NAMES))}, which topics, nodes and frames have"
-            raise self.error("a name in robots", taken[0], rule)
         if len(named) > MAX_ROBOTS:
             raise self.said(f"robots names {len(named)} robots but must name at most {MAX_ROBOTS}")
         robots = tuple(self._robot(name, tree, defaults, types) for name, tree in named)
         landmarks = self._landmarks(sections.get("landmarks", {}), sections.get("defaults", {}))
+        fixed = self._named(sections.get("cameras", {}), "cameras")
+        cameras = tuple(self._fixed_camera(name, tree) for name, tree in fixed)
         states = _state_count(robots, landmarks)
         if states > MAX_STATES:
             raise self.said(
                 f"what has a sigma makes a filter of {states} states but must make at most {MAX_STATES}"
             )
         try:
-            return Swarm(robots, landmarks)
+            return Swarm(robots, landmarks, cameras)
         except SwarmError as error:
             raise self.said(str(error).removesuffix(".")) from error
 
@@ -253,16 +256,31 @@ class _Loader(TreeChecks):
         if "ir" in mapping:
             sections["ir"] = self._ir.layer(mapping["ir"], f"{key}.ir", of_robot=of_robot)
         faces = self._named(mapping.get("faces", {}), f"{key}.faces")
-        specs = number_specs(Face)
         return _Layer(
             sections,
             self._response(mapping.get("response"), f"{key}.response"),
             "response" in mapping,
-            {
-                name: None if face is None else self.numbers(face, f"{key}.faces.{name}", specs)
-                for name, face in faces
-            },
+            {name: None if face is None else self._face(face, f"{key}.faces.{name}") for name, face in faces},
         )
+
+    def _face(self, tree: Tree, key: str) -> Numbers:
+        """Parse the place of a marker on a robot."""
+        specs = number_specs(Face)
+        mapping = self.mapping(tree, key, (*specs, "lies"))
+        place = self.numbers({name: mapping[name] for name in specs if name in mapping}, key, specs)
+        if "lies" in mapping:
+            if not isinstance(mapping["lies"], bool):
+                raise self.error(f"{key}.lies", mapping["lies"], "must be true or false")
+            place["lies"] = mapping["lies"]
+        return place
+
+    def _fixed_camera(self, name: str, tree: Tree) -> FixedCamera:
+        """Parse one fixed camera."""
+        key, specs = f"cameras.{name}", number_specs(FixedCamera)
+        mapping = self.mapping(tree, key, (*specs, "sensor"), required=("x", "y", "z"))
+        pose: Any = self.numbers({spec: mapping[spec] for spec in specs if spec in mapping}, key, specs)
+        sensor: Any = self.numbers(mapping.get("sensor"), f"{key}.sensor", number_specs(SensorModel))
+        return FixedCamera(name, **pose, sensor=SensorModel(**sensor))
 
     def _response(self, tree: Tree, key: str) -> MotionResponse | None:
         """Parse a motion response or null; layers are not merged."""
@@ -345,6 +363,10 @@ class _Loader(TreeChecks):
                 )
             if len(name) > _MAX_NAME:
                 raise self.error(f"a name in {key}", name, f"must have at most {_MAX_NAME} characters")
+            if key in ("robots", "cameras") and name in RESERVED_NAMES:
+                rule = ", ".join(sorted(RESERVED_NAMES))
+                rule = f"must be none of {rule}, which topics, nodes and frames have"
+                raise self.error(f"a name in {key}", name, rule)
         return list(mapping.items())
 
 

@@ -13,6 +13,7 @@ from swarm_loc_estimator.swarm.ir_section import ir_tree
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import (
     Face,
+    FixedCamera,
     Landmark,
     Robot,
     Swarm,
@@ -50,7 +51,7 @@ def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
 
 def _units() -> list[str]:
     """One comment per group of numbers, with the unit of each."""
-    groups = {**MODELS, "faces": Face, "landmarks": Landmark}
+    groups = {**MODELS, "faces": Face, "landmarks": Landmark, "cameras": FixedCamera}
     lines = ["Units:"]
     for name, cls in groups.items():
         units = ", ".join(f"{key} [{spec.unit}]" for key, spec in number_specs(cls).items())
@@ -74,8 +75,15 @@ def _tree(swarm: Swarm, folder: Path) -> Mapping:
         "types": types,
         "robots": robots,
         "landmarks": landmarks,
+        "cameras": {one.name: _fixed_camera(one) for one in swarm.cameras},
     }
     return {key: value for key, value in tree.items() if value}
+
+
+def _fixed_camera(camera: FixedCamera) -> Mapping:
+    """A fixed camera."""
+    sensor = _numbers(camera.sensor)
+    return _numbers(camera, keep=("x", "y", "z")) | ({"sensor": sensor} if sensor else {})
 
 
 def _taken_out(names: Iterable[str], entries: list[Mapping]) -> Mapping:
@@ -103,7 +111,9 @@ def _layer(robot: Robot, folder: Path) -> Mapping:
     if robot.stands:
         layer["odometry"] = None
     layer["ir"] = {} if robot.ir is None else ir_tree(robot.ir, folder)
-    layer["faces"] = {face.name: _numbers(face) for face in robot.faces}
+    layer["faces"] = {
+        face.name: _numbers(face) | ({"lies": True} if face.lies else {}) for face in robot.faces
+    }
     return layer
 
 

@@ -158,7 +158,7 @@ class Estimator:
         return {reason: count for reason, count in sorted(total.items()) if count}
 
     def drops_of(self, robot: int) -> Mapping[str, int]:
-        """Numbers of a robot's dropped data by reason, where they are known to be its own."""
+        """Numbers of a robot's or fixed camera's dropped data by reason, where they are known as its own."""
         return self._converter.drops.of_robot[robot]
 
     @property

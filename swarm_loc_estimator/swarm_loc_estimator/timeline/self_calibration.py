@@ -33,12 +33,13 @@ def learned(swarm: Swarm, state: SwarmState) -> Swarm:
     The bias of the turn rate is omitted, because it changes. Standard deviations of landmarks are marginal:
     they include errors common to all landmarks.
     """
-    return Swarm(
-        tuple(
+    return replace(
+        swarm,
+        robots=tuple(
             _robot(robot, index, state) if state.tracked[index] else robot
             for index, robot in enumerate(swarm.robots)
         ),
-        tuple(
+        landmarks=tuple(
             _landmark(mark, index, state) if state.landmark_column(index) >= 0 else mark
             for index, mark in enumerate(swarm.landmarks)
         ),

@@ -69,6 +69,7 @@ class MarkersEncoder:
         self._size = _BODY_PER_WHEELS * float(np.median(widths)) if widths else 0.07
         self._landmarks = np.array([[one.x, one.y, one.z] for one in swarm.landmarks]).reshape(-1, 3)
         self._faces = _faces(swarm.landmarks, self._size)
+        self._cameras = np.array([[one.x, one.y, one.z] for one in swarm.cameras]).reshape(-1, 3)
 
     def encode(self, estimate: EstimateMessage, sightings: Sightings | None = None) -> bytes:
         """The message for poses and sightings; it deletes all markers before it."""
@@ -79,6 +80,7 @@ class MarkersEncoder:
         markers = [
             _Marker("landmarks", CUBE_LIST, (0.4 * size,) * 3, self._landmarks, _inked(self._landmarks)),
             _Marker("landmarks_facing", LINE_LIST, line, self._faces, _inked(self._faces)),
+            _Marker("cameras", CUBE_LIST, (0.6 * size,) * 3, self._cameras, _inked(self._cameras)),
             _Marker("robots", SPHERE_LIST, (size, size, 0.5 * size), _lifted(pose), colours),
             _lines("headings", line, _headings(pose, size)),
             _lines("ellipses_95", (0.06 * size, 0.0, 0.0), ellipses(pose, estimate.covariance[located])),

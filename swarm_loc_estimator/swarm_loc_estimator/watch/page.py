@@ -84,7 +84,8 @@ def about(swarm: Swarm, title: str, *, teleop: bool = False, commands: bool = Tr
         teleop: Whether robots may be driven.
         commands: Whether poses may be set and the estimator reset.
     """
-    landmarks = [[mark.id, mark.x, mark.y, mark.yaw] for mark in swarm.landmarks]
+    landmarks: list[list[Any]] = [[mark.id, mark.x, mark.y, mark.yaw] for mark in swarm.landmarks]
+    landmarks += [[camera.name, camera.x, camera.y, None] for camera in swarm.cameras]
     return {
         "kind": "about",
         "title": title,

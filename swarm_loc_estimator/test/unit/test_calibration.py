@@ -41,7 +41,7 @@ from swarm_loc_estimator.offline.calibration.recording import (
     started_at_truth,
 )
 from swarm_loc_estimator.offline.calibration.robust import population, ridge, softened
-from swarm_loc_estimator.sensors.camera import CONTENT_POSE
+from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSE
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import CameraMount, OdometryModel, Robot, SensorModel
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

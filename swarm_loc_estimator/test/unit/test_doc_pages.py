@@ -11,17 +11,19 @@ import pytest
 
 from swarm_loc_estimator.cli import calibrate, calibrate_ir, import_mrclam, replay, replay_map, survey, watch
 from swarm_loc_estimator.common.parameters import number_specs
+from swarm_loc_estimator.swarm.fix_model import FixModel
 from swarm_loc_estimator.swarm.imu_model import ImuModel
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
-    FixModel,
+    FixedCamera,
     Landmark,
     OdometryModel,
     RandomWalk,
     SensorModel,
     StartSigma,
 )
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 DOC = Path(__file__).parents[2] / "doc"
 SWARM_DESCRIPTION = (DOC / "swarm_description.md").read_text(encoding="utf-8")
@@ -47,6 +49,19 @@ def test_every_number_of_a_robot_has_its_place(cls: type) -> None:
 
 def test_every_number_of_a_landmark_has_its_place() -> None:
     assert table_of(Landmark, "x", "y") in SWARM_DESCRIPTION
+
+
+def test_every_number_of_a_fixed_camera_has_its_place() -> None:
+    assert table_of(FixedCamera, "x", "y", "z") in SWARM_DESCRIPTION
+
+
+def test_the_example_of_overhead_cameras_is_a_swarm(tmp_path: Path) -> None:
+    page = (DOC / "overhead_cameras.md").read_text(encoding="utf-8")
+    (example,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "swarm.yaml").write_text(example, encoding="utf-8")
+    swarm = load_swarm(tmp_path / "swarm.yaml")
+    assert [camera.name for camera in swarm.cameras] == ["ceiling1", "ceiling2"]
+    assert all(face.lies for robot in swarm.robots for face in robot.faces)
 
 
 @pytest.mark.parametrize(

@@ -17,7 +17,8 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.correlated_noise import inflate_fix
 from swarm_loc_estimator.mapping.mapper_feed import fix_covariance
 from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.swarm.swarm import FixModel, RandomWalk, Robot, StartSigma, Swarm
+from swarm_loc_estimator.swarm.fix_model import FixModel
+from swarm_loc_estimator.swarm.swarm import RandomWalk, Robot, StartSigma, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimate import Estimate
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
@@ -33,7 +34,7 @@ def updated(
 ) -> tuple[FloatArray, FloatArray]:
     """Pose and covariance after a fix with an innovation `value` (3,), from a pose of zeros."""
     own = noise.copy()
-    inflate_fix(share, before, own)
+    inflate_fix(np.full(3, share), before, own)
     gain = before @ np.linalg.inv(before + own)
     return gain @ value, before - gain @ before
 

@@ -293,7 +293,7 @@ def test_numbers_are_read_as_people_write_them(tmp_path: Path) -> None:
 
 
 def test_two_robots_of_one_name_are_refused() -> None:
-    with pytest.raises(SwarmError, match="robot name 'a' is given to two robots"):
+    with pytest.raises(SwarmError, match="name 'a' is given to two robots or cameras"):
         Swarm((Robot("a"), Robot("a")))
 
 

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Robot
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Robot
 from swarm_loc_vision.markers.pose import Poses, Upright, body_pose, square
 
 _MIN_SIGMA = 0.0005
@@ -52,14 +52,16 @@ def robot_body(robot: Robot) -> Body:
 
 
 def _placement(face: Face, yaw: float) -> Placement:
-    """The pose of an upright face whose normal points along its yaw."""
+    """The pose of an upright face whose normal points along its yaw, or of a lying one whose x axis does."""
     cos, sin = math.cos(yaw), math.sin(yaw)
     rotation = np.array([[-sin, 0.0, cos], [cos, 0.0, sin], [0.0, 1.0, 0.0]])
+    if face.lies:
+        rotation = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     return Placement(rotation, np.array([face.x, face.y, face.z]), max(face.position_sigma, _MIN_SIGMA))
 
 
-def up_of(mount: CameraMount) -> FloatArray:
-    """(3,) up in the optical frame of a camera on a level robot."""
+def up_of(mount: CameraMount | FixedCamera) -> FloatArray:
+    """(3,) up in the optical frame of a camera on a level robot, or of a fixed one."""
     cos = math.cos(mount.pitch)
     return np.array([-math.sin(mount.roll) * cos, -math.cos(mount.roll) * cos, -math.sin(mount.pitch)])
 

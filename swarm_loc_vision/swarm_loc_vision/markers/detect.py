@@ -173,11 +173,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def camera_maker(parameters: DetectorParameters) -> CreateCamera:
-    """Creates the detectors of a bag's cameras; a camera in the namespace of a robot belongs to it."""
-    robots = load_swarm(Path(parameters.swarm_file)).index_of if parameters.swarm_file else {}
+    """Creates the detectors of a bag's cameras, which are those of robots or fixed by their namespaces."""
+    known = load_swarm(Path(parameters.swarm_file)).sources if parameters.swarm_file else ()
+    names = {source.name for source in known}
 
     def create(space: str, transport: Transport) -> CameraDetector:
-        own = replace(parameters, robot=space if space in robots else "")
+        own = replace(parameters, robot=space if space in names else "")
         return CameraDetector(detector_maker(own), transport.gray_of, parameters.settings.ambiguity)
 
     return create

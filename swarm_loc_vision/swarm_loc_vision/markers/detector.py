@@ -102,6 +102,7 @@ class MarkerDetector:
         camera: The camera; None: no poses, no distortion.
         lengths: Sides of markers that differ from `settings.marker_length`, by id [m].
         up: (3,) direction up in the camera frame, for `settings.tilt_sigma`.
+        lying: Ids of markers that lie flat, to which `settings.tilt_sigma` does not apply.
         bodies: Bodies that carry several markers.
     """
 
@@ -113,12 +114,13 @@ class MarkerDetector:
         *,
         lengths: Mapping[int, float] | None = None,
         up: FloatArray | None = None,
+        lying: Sequence[int] = (),
         bodies: Sequence[Body] = (),
     ) -> None:
         self._settings = settings
         self._camera = camera
         self._lens = camera.lens if camera else np.zeros(LENS_SIZE)
-        self._solver = PoseSolver(settings, camera, lengths or {}, up, bodies) if camera else None
+        self._solver = PoseSolver(settings, camera, lengths or {}, up, lying, bodies) if camera else None
         by_layout: dict[Layout, dict[Family, IntArray]] = {}
         for family, ids in families.items():
             used = np.arange(len(family.words)) if ids is None else ids

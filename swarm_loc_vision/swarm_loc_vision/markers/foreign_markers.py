@@ -158,8 +158,8 @@ class ForeignMarkers(Calibration):
 
     def use(self, camera: Camera) -> None:
         """Solve with another calibration from now on."""
-        _, _, lengths, up, bodies = self._known
-        self._solver = PoseSolver(self._parameters.settings, camera, lengths, up, bodies)
+        _, _, lengths, up, lying, bodies = self._known
+        self._solver = PoseSolver(self._parameters.settings, camera, lengths, up, lying, bodies)
 
     def detect(self, message: Any) -> bytes:
         """The serialized swarm_loc_msgs/MarkerDetectionArray of the markers in an image.

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, text, texts
-from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import CameraMount, FixedCamera, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.common.images import TRANSPORTS
@@ -39,7 +39,9 @@ class MarkersInUse:
     swarm_file: str = text(
         "", "path of the swarm description: ids in use, sizes, faces of robots; empty: none"
     )
-    robot: str = text("", "robot of the camera in swarm_file, for its mount; empty: a level camera")
+    robot: str = text(
+        "", "robot of the camera in swarm_file, or fixed camera there, for its mount; empty: a level camera"
+    )
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,7 @@ class KnownMarkers(NamedTuple):
         ids: (N,) ids in use, ascending; None: all.
         lengths: Sides by id [m].
         up: (3,) up in the camera frame.
+        lying: Ids of markers that lie flat.
         bodies: Faces of the other robots.
     """
 
@@ -67,6 +70,7 @@ class KnownMarkers(NamedTuple):
     ids: IntArray | None
     lengths: Mapping[int, float]
     up: FloatArray
+    lying: Sequence[int]
     bodies: Sequence[Body]
 
 
@@ -79,13 +83,15 @@ def known_markers(parameters: MarkersInUse) -> KnownMarkers:
     """
     family = family_named(parameters.family)
     swarm = load_swarm(Path(parameters.swarm_file)) if parameters.swarm_file else Swarm()
-    robot = _robot(parameters, swarm)
+    carrier = _carrier(parameters, swarm)
+    mount = carrier.camera if isinstance(carrier, Robot) else carrier
     return KnownMarkers(
         family,
         _ids(parameters, swarm, family),
         _lengths(parameters, swarm, family),
-        up_of((robot.camera if robot else None) or CameraMount()),
-        [robot_body(other) for other in swarm.robots if other is not robot],
+        up_of(mount or CameraMount()),
+        [face.id for other in swarm.robots for face in other.faces if face.lies],
+        [robot_body(other) for other in swarm.robots if other is not carrier],
     )
 
 
@@ -96,26 +102,29 @@ def detector_maker(parameters: DetectorParameters) -> CreateDetector:
         ParameterError: A parameter cannot be used.
         SwarmFileError: The swarm description cannot be used.
     """
-    family, ids, lengths, up, bodies = known_markers(parameters)
+    family, ids, lengths, up, lying, bodies = known_markers(parameters)
 
     def create(camera: Camera) -> MarkerDetector:
         return MarkerDetector(
-            parameters.settings, {family: ids}, camera, lengths=lengths, up=up, bodies=bodies
+            parameters.settings, {family: ids}, camera, lengths=lengths, up=up, lying=lying, bodies=bodies
         )
 
     return create
 
 
-def _robot(parameters: MarkersInUse, swarm: Swarm) -> Robot | None:
-    """The robot that carries the camera."""
+def _carrier(parameters: MarkersInUse, swarm: Swarm) -> Robot | FixedCamera | None:
+    """The robot that carries the camera, or the fixed camera itself."""
     if not parameters.robot:
         return None
     if not parameters.swarm_file:
         raise ParameterError(f"parameter robot = '{parameters.robot}' needs the parameter swarm_file, too.")
-    if parameters.robot not in swarm.index_of:
-        known = ", ".join(swarm.index_of)
-        raise ParameterError(f"parameter robot = '{parameters.robot}' must be a robot of the swarm: {known}.")
-    return swarm.robots[swarm.index_of[parameters.robot]]
+    carriers = {one.name: one for one in swarm.sources}
+    if parameters.robot not in carriers:
+        raise ParameterError(
+            f"parameter robot = '{parameters.robot}' must be a robot or fixed camera of the swarm:"
+            f" {', '.join(carriers)}."
+        )
+    return carriers[parameters.robot]
 
 
 def _ids(parameters: MarkersInUse, swarm: Swarm, family: Family) -> IntArray | None:

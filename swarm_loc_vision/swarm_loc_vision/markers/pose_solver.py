@@ -37,6 +37,7 @@ class PoseSolver:
         camera: The camera.
         lengths: Sides of markers that differ from `settings.marker_length`, by id [m].
         up: (3,) direction up in the camera frame, for `settings.tilt_sigma`.
+        lying: Ids of markers that lie flat, to which `settings.tilt_sigma` does not apply.
         bodies: Bodies that carry several markers.
     """
 
@@ -46,10 +47,12 @@ class PoseSolver:
         camera: Camera,
         lengths: Mapping[int, float],
         up: FloatArray | None,
+        lying: Sequence[int],
         bodies: Sequence[Body],
     ) -> None:
         self._intrinsics = camera.intrinsics
         self._length, self._lengths = settings.marker_length, lengths
+        self._lying: IntArray = np.array(lying, dtype=np.int64)
         self._bodies = bodies
         self._upright = None if up is None or not settings.tilt_sigma else Upright(up, settings.tilt_sigma)
 
@@ -63,6 +66,13 @@ class PoseSolver:
         """
         lengths = np.array([self._lengths.get(int(i), self._length) for i in ids], dtype=float)
         poses, is_misfit = marker_poses(corners, covariance, lengths, self._intrinsics, self._upright)
+        lies = np.isin(ids, self._lying)
+        if self._upright is not None and lies.any():
+            again, is_misfit[lies] = marker_poses(
+                corners[lies], covariance[lies], lengths[lies], self._intrinsics
+            )
+            for column, new in zip(poses, again, strict=True):
+                column[lies] = new
         if self._bodies:
             seen = Seen(ids, corners, covariance, lengths, poses)
             solve_bodies(seen, self._bodies, self._intrinsics, self._upright)

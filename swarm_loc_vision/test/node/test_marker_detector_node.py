@@ -263,8 +263,36 @@ def test_a_swarm_that_does_not_fit_stops_at_start(ros: Ros, tmp_path: Path) -> N
     for parameters, words in (
         ({}, "marker id 300, but"),
         ({"ids": ["1"], "lengths": ["1:0.08"]}, "lengths cannot be given along with swarm_file"),
-        ({"robot": "b"}, "must be a robot of the swarm: a"),
+        ({"robot": "b"}, "must be a robot or fixed camera of the swarm: a"),
     ):
         overridden = overrides(family=FAMILY, swarm_file=str(path), **parameters)
         with pytest.raises(ParameterError, match=words):
             ros.add(MarkerDetectorNode(parameter_overrides=overridden))
+
+
+def test_a_fixed_camera_has_the_detector_in_its_namespace(ros: Ros, tmp_path: Path) -> None:
+    ids = [truth.marker_id for truth in TRUTHS]
+    faces = ", ".join(f"top{k}: {{z: 0.1, yaw: 0.0, lies: true}}" for k in ids)
+    own = ", ".join(f"top{k}: {k}" for k in ids)
+    path = tmp_path / "swarm.yaml"
+    path.write_text(
+        f"fileversion: 1\nrobots: {{a: {{faces: {{{faces}}}, ids: {{{own}}}}}}}\n"
+        "cameras: {ceiling1: {x: 0.0, y: 0.0, z: 2.5}}\n",
+        encoding="utf-8",
+    )
+    given = overrides(family=FAMILY, swarm_file=str(path), robot="ceiling1", tilt_sigma=0.02)
+    arguments = ["--ros-args", "-r", "__ns:=/ceiling1"]
+    ros.add(MarkerDetectorNode(parameter_overrides=given, cli_args=arguments))
+    pictures = ros.tester.create_publisher(Image, "/ceiling1/image_raw", qos_profile_sensor_data)
+    info = ros.tester.create_publisher(CameraInfo, "/ceiling1/camera_info", qos_profile_sensor_data)
+    heard: list[MarkerDetectionArray] = ros.listen(MarkerDetectionArray, "/ceiling1/detections")
+    ros.until(lambda: pictures.get_subscription_count() and info.get_subscription_count())
+    ros.until(lambda: ros.tester.count_publishers("/ceiling1/detections"))
+
+    def seen() -> bool:
+        info.publish(camera_info())
+        pictures.publish(image(1))
+        return bool(heard)
+
+    ros.until(seen)
+    assert sorted(detection.id for detection in heard[-1].detections) == sorted(ids)

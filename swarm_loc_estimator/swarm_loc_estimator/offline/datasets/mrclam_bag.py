@@ -16,7 +16,7 @@ from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, enco
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry, encode_pose_stamped
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.offline.datasets.mrclam import MAX_TRUTH_GAP_NS, Dataset, RobotLog, integrate
-from swarm_loc_estimator.sensors.camera import CONTENT_POSITION
+from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSITION
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,

@@ -16,14 +16,16 @@ from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementArray
 from swarm_loc_estimator.odometry.look_up import OdometrySample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.offline.calibration.recording import Recording
-from swarm_loc_estimator.sensors.camera import CONTENT_POSITION, SightingConverter
+from swarm_loc_estimator.sensors.camera import SightingConverter
 from swarm_loc_estimator.sensors.sensor import chosen
+from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSE, CONTENT_POSE_TWO
 from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
 
 STEP_NS = 100_000_000
 """Shortest time between two instants at which the transform of a track is estimated."""
 MAX_KNOTS = 12_000
 """Maximum number of these instants, of all robots; those of long recordings are farther apart."""
+_WITH_POSE = (CONTENT_POSE, CONTENT_POSE_TWO)
 MIN_SIGHTINGS = 5
 """Minimum number of sightings of a marker that is to be a landmark."""
 
@@ -102,6 +104,7 @@ def problem_of(recording: Recording, swarm: Swarm) -> Problem:
     ]
     converter = SightingConverter(replace(described, landmarks=tuple(at_origin)))
     sightings = converter.convert(seen.robot, seen.stamp_ns, seen.detection).measurements
+    sightings = sightings[sightings["kind"] <= POLAR]  # not those of a direction alone
     knots = _knots(tracks, recording)
     robots = np.stack([sightings["observer"], sightings["target"]])
     started = np.array([tracks.has_started(np.maximum(one, 0), sightings["stamp_ns"]) for one in robots])
@@ -125,7 +128,7 @@ def _with_landmarks(recording: Recording, swarm: Swarm) -> tuple[Swarm, dict[int
     ids, counts = np.unique(detections["id"], return_counts=True)
     unknown = {int(i): int(n) for i, n in zip(ids, counts, strict=True) if int(i) not in swarm.owner_of}
     rare = {marker_id: count for marker_id, count in unknown.items() if count < MIN_SIGHTINGS}
-    with_heading = set(np.unique(detections["id"][detections["content"] != CONTENT_POSITION]).tolist())
+    with_heading = set(np.unique(detections["id"][np.isin(detections["content"], _WITH_POSE)]).tolist())
     new = [
         Landmark(marker_id, yaw=0.0 if marker_id in with_heading else None)
         for marker_id in unknown

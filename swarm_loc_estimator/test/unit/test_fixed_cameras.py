@@ -1,0 +1,324 @@
+"""Fixed cameras and lying markers: conversion against an independent composition in three dimensions."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from core_geometry import homogeneous, optical_frame, planar, pose_of, seen, wrapped
+from core_messages import POSE, POSE_TWO, POSITION, SECOND, T0, detection, joined
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.filter.measurement_model import (
+    MEASUREMENT_DTYPE,
+    NOBODY,
+    Kind,
+    MeasurementArray,
+    predict,
+)
+from swarm_loc_estimator.nodes.estimator_diagnostics import _CAUSES, Diagnostics
+from swarm_loc_estimator.nodes.parameters import EstimatorParameters
+from swarm_loc_estimator.sensors.camera import DetectionRows, SightingConverter
+from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.registry import Batch, live_topics
+from swarm_loc_estimator.swarm.swarm import (
+    CameraMount,
+    Face,
+    FixedCamera,
+    Landmark,
+    RandomWalk,
+    Robot,
+    SensorModel,
+    Swarm,
+)
+from swarm_loc_estimator.timeline.estimate import Estimate
+from swarm_loc_estimator.timeline.estimator import Estimator, Status
+
+EXACT = SensorModel(residual_position_sigma=0.002, residual_heading_sigma=0.01)
+CAMERAS = (
+    FixedCamera("straight", 0.3, -0.2, 2.5, sensor=EXACT),
+    FixedCamera("aslant", -1.0, 0.5, 2.2, yaw=0.7, pitch=1.1, roll=0.2, sensor=EXACT),
+    FixedCamera("low", 2.0, 1.0, 0.8, yaw=-2.4, pitch=0.5, roll=-0.4, sensor=EXACT),
+)
+TOP = Face("top", 3, 0.01, -0.02, 0.1, 0.4, size=0.05, position_sigma=0.001, lies=True)
+MUTE = Face("mute", 4, -0.02, 0.01, 0.1, None, size=0.05, lies=True)
+SIDE = Face("side", 5, 0.03, 0.0, 0.04, 0.2)
+MARK = Landmark(9, 0.0, 0.0, 0.0, 0.3)
+BASE = np.array([0.4, 0.3, 2.1])
+SWARM = Swarm((Robot("a", faces=(TOP, MUTE, SIDE)), Robot("b")), (MARK,), CAMERAS)
+SPREAD = np.diag(np.square([1e-4, 1e-4, 5e-3, 0.02, 0.02, 0.003]))
+SPREAD[2, 3] = SPREAD[3, 2] = 0.5 * math.sqrt(SPREAD[2, 2] * SPREAD[3, 3])
+
+
+def in_view(face: Face, camera: FixedCamera, base: FloatArray = BASE, *, up: bool = False) -> FloatArray:
+    """The pose (4, 4) of a face in the optical frame of a fixed camera, which may be turned to the sky."""
+    mount = CameraMount(
+        0.0, 0.0, camera.z, 0.0, pitch=-camera.pitch if up else camera.pitch, roll=camera.roll
+    )
+    x, y, theta = base
+    on_robot = homogeneous(face.x, face.y, face.z, face.yaw or 0.0)
+    if not face.lies:  # z out of the face, y up
+        on_robot[:3, :3] = on_robot[:3, :3] @ np.array([[0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    return seen([camera.x, camera.y, camera.yaw], mount, homogeneous(x, y, 0.0, theta) @ on_robot)
+
+
+def looked(marker_id: int, pose: FloatArray, content: int = POSE) -> NDArray[np.void]:
+    one = detection(marker_id, pose, content)
+    one["covariance"] = SPREAD
+    return one
+
+
+def converted(
+    detections: NDArray[np.void], camera: int = 0, swarm: Swarm = SWARM
+) -> tuple[MeasurementArray, dict[str, list[int]]]:
+    count = detections.size
+    received = np.frombuffer(detections.tobytes(), dtype=DETECTION_DTYPE)
+    sources = np.full(count, len(swarm.robots) + camera)
+    result = SightingConverter(swarm).convert(sources, np.full(count, T0), received)
+    return result.measurements, {reason: robots.tolist() for reason, robots in result.dropped.items()}
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("camera", range(3))
+@pytest.mark.parametrize("face", [TOP, MUTE, SIDE])
+def test_a_face_in_view_comes_back_as_the_robots_pose(face: Face, camera: int, seed: int) -> None:
+    base = BASE + np.random.default_rng(seed).uniform(-0.2, 0.2, 3)
+    one, dropped = converted(looked(face.id, in_view(face, CAMERAS[camera], base)), camera)
+    assert dropped == {}
+    assert (one["observer"][0], one["target"][0], one["received_from"][0]) == (NOBODY, 0, 2 + camera)
+    assert one["kind"][0] == Kind.CARTESIAN
+    assert one["has_heading"][0] == (face is not MUTE)
+    predicted, _ = predict(one, np.zeros((1, 3)), base[None])
+    np.testing.assert_allclose(wrapped(one["value"] - predicted)[0, : 3 - (face is MUTE)], 0.0, atol=2e-9)
+
+
+@pytest.mark.parametrize("camera", range(3))
+def test_a_position_alone_gives_the_place_on_the_plane(camera: int) -> None:
+    near = in_view(TOP, CAMERAS[camera])
+    near[:3, 3] *= 1.01  # the distance is not used
+    one, _ = converted(looked(TOP.id, near, POSITION), camera)
+    predicted, _ = predict(one, np.zeros((1, 3)), BASE[None])
+    np.testing.assert_allclose(one["value"][0, :2], predicted[0, :2], atol=1e-9)
+    assert one["has_heading"][0] == 0
+    assert one["covariance"][0, 2].tolist() == [0.0, 0.0, 1.0]
+
+
+def test_a_robots_camera_sees_lying_markers_of_others() -> None:
+    mount = CameraMount(0.02, 0.0, 0.4, 0.3, pitch=0.8)
+    swarm = Swarm((Robot("a", faces=(TOP,)), Robot("b", camera=mount)))
+    observer = np.array([0.0, 0.1, 0.5])
+    x, y, theta = BASE
+    tag = homogeneous(x, y, 0.0, theta) @ homogeneous(TOP.x, TOP.y, TOP.z, TOP.yaw or 0.0)
+    found = SightingConverter(swarm).convert(
+        np.array([1]), np.array([T0]), joined([looked(TOP.id, seen(observer, mount, tag))])
+    )
+    assert found.measurements["observer"][0] == 1
+    assert found.measurements["systematic_share"].tolist() == [[0.0, 0.0, 0.0]]
+    predicted, _ = predict(found.measurements, observer[None], BASE[None])
+    np.testing.assert_allclose(found.measurements["value"], predicted, atol=1e-9)
+
+
+def perturbed(pose: FloatArray, step: FloatArray) -> FloatArray:
+    """A pose moved and turned about the axes of the camera by a step (6,)."""
+    moved: FloatArray = pose.copy()
+    moved[:3, 3] += step[:3]
+    moved[:3, :3] = Rotation.from_rotvec(step[3:]).as_matrix() @ moved[:3, :3]
+    return moved
+
+
+@pytest.mark.parametrize("camera", range(3))
+def test_the_covariance_is_that_of_the_pose_propagated(camera: int) -> None:
+    pose, step = in_view(TOP, CAMERAS[camera]), 1e-6
+    ends = [
+        [converted(looked(TOP.id, perturbed(pose, sign * axis)), camera)[0]["value"][0] for sign in (1, -1)]
+        for axis in step * np.eye(6)
+    ]
+    slopes = np.array([wrapped(ahead - behind) / (2.0 * step) for ahead, behind in ends]).T
+    one, _ = converted(looked(TOP.id, pose), camera)
+    fixed = CAMERAS[camera]
+    position = TOP.position_sigma**2 + EXACT.residual_position_sigma**2 + fixed.position_sigma**2
+    heading = EXACT.residual_heading_sigma**2 + fixed.yaw_sigma**2
+    expected = slopes @ SPREAD @ slopes.T + np.diag([position, position, heading])
+    np.testing.assert_allclose(one["covariance"][0], expected, rtol=1e-5, atol=1e-10)
+    shares = np.square([fixed.position_sigma, fixed.position_sigma, fixed.yaw_sigma]) / np.diag(expected)
+    np.testing.assert_allclose(one["systematic_share"][0], shares, rtol=1e-5)
+
+
+def test_tilt_and_distance_of_a_marker_move_its_place_by_no_more_than_its_pixels() -> None:
+    """Under the camera, a face that seems tilted has the same corners in the image but for perspective."""
+    pose = in_view(TOP, CAMERAS[0], np.array([CAMERAS[0].x, CAMERAS[0].y, 2.1]))
+    straight, _ = converted(looked(TOP.id, pose))
+    tilted, dropped = converted(looked(TOP.id, perturbed(pose, np.array([0, 0, 0, 0.05, -0.03, 0.0]))))
+    assert dropped == {}
+    off = wrapped(tilted["value"] - straight["value"])[0]
+    assert np.abs(off[:2]).max() < 1e-4
+    assert abs(off[2]) < math.radians(0.1)
+
+
+def test_of_two_mirrored_poses_the_one_that_lies_is_used() -> None:
+    pose = in_view(TOP, CAMERAS[1])
+    one = looked(TOP.id, perturbed(pose, np.array([0, 0, 0, 0.9, 0.0, 0.0])), POSE_TWO)
+    one["alternative_position"], one["alternative_orientation"] = looked(TOP.id, pose)[
+        ["position", "orientation"]
+    ][0]
+    found, dropped = converted(one, 1)
+    assert dropped == {}
+    assert not found["has_alternative"][0]
+    expected, _ = converted(looked(TOP.id, pose), 1)
+    np.testing.assert_allclose(found["value"], expected["value"], atol=1e-12)
+
+
+def turned_over(pose: FloatArray) -> FloatArray:
+    pose = pose.copy()
+    pose[:3, :3] = pose[:3, :3] @ np.diag([1.0, -1.0, -1.0])
+    return pose
+
+
+@pytest.mark.parametrize(
+    ("marker_id", "pose", "reason"),
+    [
+        (TOP.id, turned_over(in_view(TOP, CAMERAS[0])), "face_down"),
+        (TOP.id, perturbed(in_view(TOP, CAMERAS[0]), np.array([0, 0, 0, 0.6, 0, 0])), "not_flat"),
+        (TOP.id, perturbed(in_view(TOP, CAMERAS[0]), np.array([0, 0, -0.6, 0, 0, 0])), "not_flat"),
+        (TOP.id, in_view(TOP, CAMERAS[0], up=True), "face_down"),
+        (TOP.id, np.full((4, 4), np.nan), "non_finite"),
+        (MARK.id, in_view(TOP, CAMERAS[0]), "fixed_on_fixed"),
+        (77, in_view(TOP, CAMERAS[0]), "unknown_id"),
+    ],
+)
+def test_what_cannot_be_used_has_a_reason(marker_id: int, pose: FloatArray, reason: str) -> None:
+    with np.errstate(invalid="ignore"):
+        one = looked(TOP.id, np.eye(4)) if np.isnan(pose).any() else looked(marker_id, pose)
+    if np.isnan(pose).any():
+        one["position"] = np.nan
+    found, dropped = converted(one)
+    assert (found.size, dropped) == (0, {reason: [2]})
+
+
+def test_a_camera_that_looks_to_the_sky_drops_what_lies_below_it() -> None:
+    """Its description says so, but its detections are those of a camera that looks down."""
+    sky = replace(CAMERAS[0], pitch=-math.pi / 2)
+    found, dropped = converted(looked(TOP.id, in_view(TOP, CAMERAS[0])), 0, replace(SWARM, cameras=(sky,)))
+    assert (found.size, dropped) == (0, {"face_down": [2]})
+
+
+def test_a_covariance_that_is_not_known_is_that_of_the_description() -> None:
+    one = detection(TOP.id, in_view(TOP, CAMERAS[0]))
+    found, _ = converted(one)
+    sensor, fixed = CAMERAS[0].sensor, CAMERAS[0]
+    heading = found["covariance"][0, 2, 2] - sensor.residual_heading_sigma**2 - fixed.yaw_sigma**2
+    assert math.sqrt(heading) == pytest.approx(sensor.heading_sigma, rel=0.05)
+    assert math.sqrt(found["covariance"][0, 0, 0]) == pytest.approx(sensor.left_sigma, rel=0.1)
+
+
+STANDING = Robot("a", camera=None, faces=(TOP, SIDE), stands=True, random_walk=RandomWalk(1e-10, 1e-10))
+
+
+def watched(looks: list[tuple[int, int, NDArray[np.void]]], swarm: Swarm) -> list[Estimate]:
+    """Estimates after each look: second, number of the camera, detection."""
+    estimator, found = Estimator(swarm), []
+    for second, camera, one in looks:
+        stamp_ns = T0 + second * SECOND
+        source, stamp = np.array([len(swarm.robots) + camera]), np.array([stamp_ns])
+        rows = DetectionRows(source, stamp, joined([one]), stamp)
+        estimator.receive(Batch.of(stamp_ns, stamp_ns, detections=rows))
+        found.append(estimator.tick(stamp_ns))
+    return found
+
+
+def test_a_single_sighting_locates_a_robot() -> None:
+    swarm = Swarm((STANDING,), (), CAMERAS)
+    (only,) = watched([(0, 1, looked(TOP.id, in_view(TOP, CAMERAS[1])))], swarm)
+    assert only.status[0] == Status.TRACKED
+    np.testing.assert_allclose(wrapped(only.poses[0] - BASE), 0.0, atol=1e-9)
+    one, _ = converted(looked(TOP.id, in_view(TOP, CAMERAS[1])), 1, swarm)
+    # the same covariance by composition: of the marker in the sensor's frame to that of base_link in map
+    step, value, sensor = 1e-6, one["value"][0], one["sensor"][0]
+
+    def placed(at: FloatArray) -> FloatArray:
+        return pose_of(planar(sensor) @ planar(at) @ np.linalg.inv(planar(one["marker"][0])))
+
+    slopes = np.array(
+        [wrapped(placed(value + axis) - placed(value - axis)) / (2.0 * step) for axis in step * np.eye(3)]
+    ).T
+    suspect = np.diag(np.square([0.03, 0.03, 0.06]))  # until others agree
+    expected = slopes @ one["covariance"][0] @ slopes.T
+    np.testing.assert_allclose(only.covariances[0] - suspect, expected, rtol=1e-3)
+
+
+def test_many_sightings_are_no_surer_than_the_pose_of_their_camera() -> None:
+    swarm = Swarm((STANDING,), (), CAMERAS)
+    look = looked(TOP.id, in_view(TOP, CAMERAS[0]))
+    *_, last = watched([(second, 0, look) for second in range(60)], swarm)
+    x, y, heading = np.sqrt(np.diag(last.covariances[0]))
+    assert 0.98 * CAMERAS[0].position_sigma < min(x, y) < max(x, y) < 1.3 * CAMERAS[0].position_sigma
+    assert 0.98 * CAMERAS[0].yaw_sigma < heading < 1.3 * CAMERAS[0].yaw_sigma
+
+
+def test_between_cameras_that_disagree_a_standing_robot_does_not_jump() -> None:
+    """The second camera errs by 3 mm, one of its standard deviations."""
+    cameras = tuple(replace(one, position_sigma=0.003) for one in CAMERAS)
+    off = BASE + np.array([0.003, 0.0, 0.0])
+    looks = [(second, 0, looked(TOP.id, in_view(TOP, cameras[0]))) for second in range(20)]
+    looks += [(second, 1, looked(TOP.id, in_view(TOP, cameras[1], off))) for second in range(20, 40)]
+    poses = np.array([one.poses[0] for one in watched(looks, Swarm((STANDING,), (), cameras))])
+    assert np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).max() < 0.0005
+
+
+def test_an_upright_face_with_two_poses_does_not_locate_alone() -> None:
+    one = looked(SIDE.id, in_view(SIDE, CAMERAS[2]), POSE_TWO)
+    (only,) = watched([(0, 2, one)], Swarm((STANDING,), (), CAMERAS))
+    assert only.status[0] == Status.WAITING
+
+
+def test_the_optical_frame_of_a_fixed_camera_looks_down() -> None:
+    """Of a camera over the origin, the image's right is map's -y, and its top is map's x."""
+    frame = optical_frame(CameraMount(z=2.0, pitch=math.pi / 2))
+    np.testing.assert_allclose(frame[:3, :3], [[0, -1, 0], [-1, 0, 0], [0, 0, -1]], atol=1e-12)
+
+
+class Silence:
+    """A graph in which nobody publishes."""
+
+    def duplicate_publishers(self, topic: str) -> list[str]:
+        """None."""
+        return [] if topic else [""]
+
+    def why_missing(self, topic: str, message_type: str) -> str:
+        """That nobody does."""
+        assert topic
+        assert message_type
+        return " (no publisher)"
+
+
+def test_a_described_camera_has_a_topic_that_is_missed_and_its_drops_are_named() -> None:
+    swarm = Swarm((STANDING,), (), CAMERAS[:2])
+    ingest = Ingest(swarm, topics=live_topics(swarm, shared=False))
+    diagnostics = Diagnostics(swarm, ingest, EstimatorParameters(), Silence(), [])
+    data = encode_detections("straight", T0, np.zeros(0, DETECTION_DTYPE))
+    message = SerializedMessage(ingest.handle_of["straight/detections"], data, T0)
+    list(ingest.read(MessageBatch.of([message])))
+    (estimate,) = watched([(0, 1, looked(TOP.id, in_view(TOP, CAMERAS[1])))], swarm)
+    nothing = (np.zeros(0, dtype=MEASUREMENT_DTYPE), np.zeros(0, dtype=np.uint8), np.zeros(0))
+    drops: list[dict[str, int]] = [{}, {"not_flat": 3, "unknown_id": 2}, {}]
+    _, straight, aslant, whole = diagnostics.reports(T0, estimate, nothing, {}, drops)
+    assert straight.name == "straight"
+    assert straight.message == f"dropped 3 of its data: they {_CAUSES['not_flat']}"
+    assert straight.values["dropped: unknown_id"] == 2
+    assert straight.values["detections received"] == "1"
+    assert aslant.message == "no messages received on aslant/detections (no publisher)"
+    assert whole.message == aslant.message
+
+
+def test_with_shared_topics_fixed_cameras_keep_their_own() -> None:
+    names = [topic.name for topic in live_topics(SWARM, shared=True)]
+    assert [name for name in names if "detections" in name] == [
+        *("straight/detections", "aslant/detections", "low/detections"),
+        *("aerial/detections", "swarm/detections"),
+    ]
