@@ -11,10 +11,11 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 
-from bench.inputs import apriltag_msgs, families, imu, mocap, no_map
+from bench.inputs import apriltag_msgs, families, imu, mocap, no_map, overhead
 from bench.shared.common import ProgressLine, table, write_figures
 
 PARTS: Mapping[str, Callable[[Sequence[int], ProgressLine], Mapping[str, float]]] = {
+    "overhead": overhead.measure,
     "mocap": mocap.measure,
     "apriltag_msgs": apriltag_msgs.measure,
     "families": families.measure,

@@ -172,6 +172,16 @@ def overhead_model(settings: OverheadSettings) -> OverheadModel:
     )
 
 
+def floor(markers: Sequence[FloorMarker], family: Family) -> list[Patches]:
+    """Fiducials on the floor."""
+    return [
+        scenery.lying_marker(
+            (one.x, one.y, one.yaw), one.z, family.pattern(one.id) != 0, family.whole_size(one.size)
+        )
+        for one in markers
+    ]
+
+
 class OverheadRig:
     """The overhead camera of one world; for use by one thread.
 
@@ -187,12 +197,7 @@ class OverheadRig:
     ) -> None:
         model = overhead_model(settings)
         count = len(scene.robots)
-        lying = [
-            scenery.floor_marker(
-                (one.x, one.y, one.yaw), family.pattern(one.id) != 0, family.whole_size(one.size)
-            )
-            for one in markers
-        ]
+        lying = floor(markers, family)
         shadow = scenery.shadow(
             settings.aerial_shadow, settings.aerial_shadow_yaw, settings.aerial_shadow_slope
         )

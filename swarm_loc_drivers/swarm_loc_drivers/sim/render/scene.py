@@ -132,13 +132,15 @@ def _printed(sheet: Surface, cells: NDArray[np.bool_], size: float) -> Patches:
     return patches([sheet])
 
 
-def floor_marker(pose: Sequence[float], cells: NDArray[np.bool_], size: float) -> Patches:
-    """A marker on its sheet that lies on the floor and looks up; arguments as for `marker`.
+def lying_marker(pose: Sequence[float], height: float, cells: NDArray[np.bool_], size: float) -> Patches:
+    """A marker on its sheet that lies level and looks up; arguments as for `marker`.
 
-    The last number of the pose is the direction to the marker's own right, from map's x.
+    The last number of the pose is the direction to the marker's own right, from the x axis of the frame.
     """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
-    sheet = Surface(np.array([pose[0], pose[1], 0.0]), np.array([cos, sin, 0.0]), np.array([sin, -cos, 0.0]))
+    sheet = Surface(
+        np.array([pose[0], pose[1], height]), np.array([cos, sin, 0.0]), np.array([sin, -cos, 0.0])
+    )
     return _printed(sheet, cells, size)
 
 

@@ -49,8 +49,8 @@ class AerialRun(LivedRun):
 def simulate_wandering(settings: EightSettings) -> AerialRun:
     """Drive robots about at random and look at them from above; each robot has a speed of its own."""
     rng = np.random.default_rng(settings.seed)
-    start = _places(rng, settings.robots)
-    swarm, truth, odometry = drive_robots(rng, settings, start, _wander(rng, settings.robots))
+    start = places(rng, settings.robots, ARENA)
+    swarm, truth, odometry = drive_robots(rng, settings, start, wander(rng, settings.robots, ARENA))
     blind = Swarm(tuple(replace(robot, camera=None, faces=()) for robot in swarm.robots))
     stamp_ns = np.arange(START_NS + PERIOD_NS, int(truth.stamp_ns[-1]), PERIOD_NS)
     poses = truth.all_at(stamp_ns)
@@ -67,21 +67,21 @@ def simulate_wandering(settings: EightSettings) -> AerialRun:
     )
 
 
-def _places(rng: np.random.Generator, robots: int) -> FloatArray:
-    """Start poses (N, 3) that are not too near to each other."""
-    half = 0.5 * np.array(ARENA) - _EDGE
-    places: list[FloatArray] = []
-    while len(places) < robots:
+def places(rng: np.random.Generator, robots: int, arena: tuple[float, float]) -> FloatArray:
+    """Start poses (N, 3) in an arena [m] that are not too near to each other."""
+    half = 0.5 * np.array(arena) - _EDGE
+    chosen: list[FloatArray] = []
+    while len(chosen) < robots:
         place = rng.uniform(-half, half)
-        if all(np.hypot(*(place - other)) > 2.0 * _NEAR for other in places):
-            places.append(place)
-    return np.column_stack([np.array(places), rng.uniform(-np.pi, np.pi, robots)])
+        if all(np.hypot(*(place - other)) > 2.0 * _NEAR for other in chosen):
+            chosen.append(place)
+    return np.column_stack([np.array(chosen), rng.uniform(-np.pi, np.pi, robots)])
 
 
-def _wander(rng: np.random.Generator, robots: int) -> Controller:
-    """Commands that change at random, each robot's at times of its own."""
+def wander(rng: np.random.Generator, robots: int, arena: tuple[float, float]) -> Controller:
+    """Commands in an arena [m] that change at random, each robot's at times of its own."""
     speed, rate, left_s = np.zeros(robots), np.zeros(robots), np.zeros(robots)
-    half = 0.5 * np.array(ARENA) - _EDGE
+    half = 0.5 * np.array(arena) - _EDGE
 
     def control(_step: int, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
         new = left_s <= 0.0
