@@ -44,7 +44,7 @@ class IntegrityArrays(NamedTuple):
             `integrity/motion_noise.py`.
         drift_transform: (N, W, 3) T at that time.
         drift_noise: (N, W, 3, 3) preintegrated covariance of the track at that time.
-        drift_variance: (N, W, 2) variances of position and heading at that time.
+        drift_covariance: (N, W, 3, 3) of the error of T at that time.
         motion_likelihood: (N, scales) log-likelihood of each scale of the process noise.
         motion_scale: (N,) scale of the process noise of each robot.
         motion_explained: (N,) True if it stays 1, as scales of the robot's motion are described as estimated.
@@ -72,7 +72,7 @@ class IntegrityArrays(NamedTuple):
     drift_ns: IntArray
     drift_transform: FloatArray
     drift_noise: FloatArray
-    drift_variance: FloatArray
+    drift_covariance: FloatArray
     motion_likelihood: FloatArray
     motion_scale: FloatArray
     motion_explained: BoolArray

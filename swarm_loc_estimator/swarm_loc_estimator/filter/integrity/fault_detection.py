@@ -85,7 +85,7 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         drift_ns=np.full((robots, WINDOWS), NEVER_NS // 2),
         drift_transform=np.zeros((robots, WINDOWS, 3)),
         drift_noise=np.zeros((robots, WINDOWS, 3, 3)),
-        drift_variance=np.zeros((robots, WINDOWS, 2)),
+        drift_covariance=np.zeros((robots, WINDOWS, 3, 3)),
         motion_likelihood=np.zeros((robots, LOG_SCALES.size)),
         motion_scale=np.ones(robots),
         motion_explained=np.zeros(robots, dtype=bool),

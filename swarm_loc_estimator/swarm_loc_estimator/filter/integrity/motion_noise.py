@@ -77,13 +77,14 @@ def learn(belief: BeliefArrays, robot: int, pose: FloatArray, stamp_ns: int) -> 
         since_ns = stamp_ns - state.drift_ns[robot, window]
         if 0 <= since_ns < _WINDOW_NS[window]:
             continue
-        position, heading = _variances(belief, robot, pose)
         if 0 <= since_ns < _LONGEST * _WINDOW_NS[window]:
-            _add_evidence(belief, robot, window, pose, position, heading, since_ns * 1e-9)
+            _add_evidence(belief, robot, window, pose, since_ns * 1e-9)
         state.drift_ns[robot, window] = stamp_ns
         assign(state.drift_transform[robot, window], belief.transform[robot])
         assign_matrix(state.drift_noise[robot, window], belief.preintegrated_covariance[robot])
-        state.drift_variance[robot, window, 0], state.drift_variance[robot, window, 1] = position, heading
+        for i in range(3):
+            for j in range(3):
+                state.drift_covariance[robot, window, i, j] = covariance_within(belief, 3 * robot, i, j)
 
 
 @cached_njit
@@ -92,11 +93,9 @@ def _add_evidence(
     robot: int,
     window: int,
     pose: FloatArray,
-    position: float,
-    heading: float,
     since_s: float,
 ) -> None:
-    """Add the likelihood of a window that ends at a pose (3,) with these variances to those before."""
+    """Add the likelihood of a window that ends at a pose (3,) to those before."""
     state = belief.integrity
     now, begin = belief.transform[robot], state.drift_transform[robot, window]
     difference, noise = np.empty((3, 3)), np.empty((3, 3))
@@ -112,7 +111,9 @@ def _add_evidence(
     moved = composed(now[0], now[1], now[2], back[0], back[1], back[2])
     x, y, theta = between(moved[0], moved[1], moved[2], pose[0], pose[1], pose[2])
     squared = ((pose[0] - x) ** 2 + (pose[1] - y) ** 2, wrap(pose[2] - theta) ** 2)
-    was_position, was_heading = state.drift_variance[robot, window]
+    # where the window ends, an uncertain heading at its begin moves the robot sideways
+    was_position, was_heading = _at(state.drift_covariance[robot, window], pose)
+    position, heading = _variances(belief, robot, pose)
     rest = (
         max(was_position - position, 0.0) + _POSE_SHARE * position,
         max(was_heading - heading, 0.0) + _POSE_SHARE * heading,
