@@ -42,7 +42,10 @@ class CeilingRig:
         tops = [
             [
                 scenery.lying_marker(
-                    (face.x, face.y, face.yaw or 0.0), face.z, arena.family.pattern(face.id) != 0, face.size
+                    (face.x, face.y, face.yaw or 0.0),
+                    face.z,
+                    arena.family.pattern(face.id) != 0,
+                    arena.family.whole_size(face.size),
                 )
                 for face in robot.faces
             ]
