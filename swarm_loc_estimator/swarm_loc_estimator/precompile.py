@@ -54,10 +54,11 @@ _SETTINGS: dict[Size, tuple[Settings, ...]] = {
 
 
 def size_of(swarm: Swarm, settings: Settings) -> Size:
-    """The size of a swarm, by which its measurements are fused."""
+    """The size of a swarm, by which its measurements are fused; ranges are, as in large ones."""
     if settings.resolved_for(swarm).is_sparse(swarm):
         return "sparse"
-    return "large" if len(swarm.robots) >= settings.policy.large_from else "small"
+    has_radios = any(robot.uwb is not None for robot in swarm.robots)
+    return "large" if has_radios or len(swarm.robots) >= settings.policy.large_from else "small"
 
 
 def precompile(size: Size, infrared: bool) -> None:
@@ -145,7 +146,7 @@ def _run(settings: Settings, *, infrared: bool, fused: bool = True) -> None:
 
 def _call_rare(swarm: Swarm) -> None:
     """What is called once something contradicts, or once many infrared exchanges are fused together."""
-    state = SwarmState(ParameterTable.of(swarm.robots, swarm.landmarks), pairs=2)
+    state = SwarmState(ParameterTable.of(swarm.robots, swarm.surveyed), pairs=2)
     is_kidnapped(state.integrity, 0)
     columns = MeasurementColumns.of(np.zeros(2, MEASUREMENT_DTYPE))
     record_pair(columns, 0, state.arrays(), np.zeros((PAIR_ROWS, 3)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.small_matrix import assign
 from swarm_loc_estimator.filter import prediction
@@ -23,6 +23,7 @@ from swarm_loc_estimator.filter.integrity.divergence import (
     is_uncertain,
 )
 from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_excluded
+from swarm_loc_estimator.filter.integrity.pairs import assess_link
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel
 from swarm_loc_estimator.odometry.look_up import look_up, look_up_pose, new_sample
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
@@ -127,24 +128,22 @@ def assess_all(
     measurements: MeasurementColumns,
     belief: BeliefArrays,
     limits: LossLimits,
-    distance: FloatArray,
-    whitened: FloatArray,
-    cause: IntArray,
-    accepted: BoolArray,
+    batch: InnovationBatch,
 ) -> BoolArray:
     """Run fault detection on measurements (m,); return contradicted robots and landmarks (N + L,).
 
-    Measurements of excluded pairs are rejected. Measurements of models without a kernel are ignored: they
-    are no evidence and are never excluded.
+    Measurements of excluded pairs are rejected.
     """
+    accepted = batch.accepted
     contradicted = np.zeros(belief.integrity.fault_score.size, dtype=np.bool_)
     for k in range(accepted.size):
-        if not has_kernel(measurements, k):
-            continue
-        pair = (whitened[k, 0], whitened[k, 1])
-        source = assess(measurements, k, belief, limits.max_fault_score, distance[k], pair, cause[k])
-        if source >= 0:
-            contradicted[source] = True
+        pair, distance = (batch.whitened[k, 0], batch.whitened[k, 1]), batch.distance[k]
+        if has_kernel(measurements, k):
+            source = assess(measurements, k, belief, limits.max_fault_score, distance, pair, batch.cause[k])
+            if source >= 0:
+                contradicted[source] = True
+        else:
+            batch.noise[k] *= assess_link(measurements, k, belief, distance, pair[0])
         accepted[k] &= not is_excluded(measurements, k, belief)
     return contradicted
 

@@ -17,7 +17,8 @@ NEVER_NS = np.iinfo(np.int64).min
 class IntegrityArrays(NamedTuple):
     """Statistics of recent innovations for fault detection; see `integrity/`.
 
-    A source is a measured object: robot i has index i, landmark l has index N + l.
+    A source is a measured object: robot i has index i, landmark l has index N + l. Measurements of models
+    without a kernel have sources of their own, with indices that are larger by N + L.
 
     Attributes:
         source: (N, S) sources measured most recently by each robot; -1: none.

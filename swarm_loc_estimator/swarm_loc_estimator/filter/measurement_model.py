@@ -175,8 +175,9 @@ class MeasurementModel:
             undefined.
         innovation: Returns measured minus predicted (n,), angles wrapped, for a measurement (1,) and a
             predicted value (n,).
-        constraint: Converts a measurement (1,) to `Kind.CARTESIAN` or `Kind.POLAR`, to initialize a robot;
-            None if not supported.
+        constraint: Converts a measurement (1,) to `Kind.CARTESIAN` or `Kind.POLAR`, to initialize a robot.
+            None: those of one degree of freedom initialize one together, see `initialization/window.py`, and
+            others do not.
     """
 
     name: str

@@ -2,8 +2,9 @@
 
 Such a measurement is gated with the degrees of freedom of its model. When accepted it confirms the poses of
 its robots; when gated it counts towards their loss (`integrity/divergence.py`), but does not refute a
-configured start. It takes no part in the attribution of faults (`integrity/fault_detection.py`), in noise
-inflation or in the mean of repeated measurements (`correlated_noise.py`): these need positions and headings.
+configured start. A contradiction is evidence against its pair of observer and source, never against one of
+them (`integrity/pairs.py`). It takes no part in the noise inflation of robots or in the mean of
+repeated measurements (`correlated_noise.py`): these need positions and headings.
 """
 
 from __future__ import annotations
@@ -74,6 +75,7 @@ def _evaluate(
         batch.distance[k] = innovation[gated] @ np.linalg.solve(s[gated, gated], innovation[gated])
         batch.accepted[k] = batch.distance[k] <= one["gate"][0]
         batch.nis[k] = innovation @ np.linalg.solve(s, innovation)
+        batch.whitened[k, 0] = innovation[0] / np.sqrt(s[0, 0])
     else:  # the model has failed at these poses
         batch.jacobian[k], batch.innovation[k], batch.noise[k] = 0.0, 0.0, np.eye(3)
         batch.distance[k], batch.nis[k], batch.accepted[k] = np.inf, np.nan, False

@@ -108,6 +108,8 @@ class SwarmState:
         pair_history: (N, pairs, PAIR_ROWS, 3) mean of the measurements, see `correlated_noise.py`.
         constraints: Stored sightings per robot that is not tracked (see `initializer.py`).
         next_attempt_ns: (N,) earliest instant of the next attempt to initialize the robot.
+        windows: Stored measurements of one degree of freedom per such robot (see `window.py`).
+        next_window_ns: (N,) earliest instant of the next attempt with them.
         images: Memory of aerial images.
         origin: Robot whose pose was the origin when a local frame began, see `local_frame.py`; IN_MAP: none.
         frame_moves: How often all poses have moved from a local frame to `map`.
@@ -138,6 +140,8 @@ class SwarmState:
         self.pair_history: FloatArray = np.zeros((robots, pairs, PAIR_ROWS, 3))
         self.constraints: dict[int, NDArray[np.void]] = {}
         self.next_attempt_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
+        self.windows: dict[int, NDArray[np.void]] = {}
+        self.next_window_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.images = IdentityMemory()
         self.origin, self.frame_moves, self.meetings = IN_MAP, 0, Meetings()
 
@@ -145,7 +149,7 @@ class SwarmState:
         """Return an independent copy."""
         other = SwarmState.__new__(SwarmState)
         for name, value in vars(self).items():
-            # tuples and numbers are immutable; the arrays inside `constraints` are replaced, never written to
+            # tuples and numbers are immutable; arrays in dictionaries are replaced, never written to
             setattr(other, name, value if isinstance(value, tuple | int) else value.copy())
         other.integrity = IntegrityArrays(*(column.copy() for column in self.integrity))
         return other
@@ -205,6 +209,7 @@ class SwarmState:
         self._trust(robots, confirmations)
         for robot in robots.tolist():
             self.constraints.pop(robot, None)
+            self.windows.pop(robot, None)
 
     def move(self, robot: int, initial: InitialPose) -> None:
         """Move all poses rigidly such that one robot, predicted to the same instant, is at an initial pose.
@@ -232,6 +237,7 @@ class SwarmState:
             covariance[:, rows] += cross.T
         self.filter.covariance[:] = 0.5 * (covariance + covariance.T)
         self.constraints.clear()
+        self.windows.clear()
         self._restart_drift(tracked)
 
     def deinitialize(self, robot: int) -> None:
@@ -325,7 +331,8 @@ class SwarmState:
         self.integrity.fault_score[robots] = 0.0
         self.integrity.confirmations[robots] = confirmations
         self.integrity.source[robots] = -1
-        self.integrity.evidence[np.isin(self.integrity.source, robots)] = 0.0
+        named = self.integrity.source % self.integrity.fault_score.size
+        self.integrity.evidence[np.isin(named, robots)] = 0.0
 
     def _forget_pairs(self, robot: int) -> None:
         """Clear the stored means of all pairs of the robot: its new errors are independent of them."""

@@ -6,6 +6,7 @@ the transform in closed form (a rigid alignment); a sighting with heading determ
 it has a mirrored solution. The transform on which most constraints agree is refined by least squares. It is
 accepted when its covariance is small enough and no other transform explains the constraints about as well.
 A whole pose by a mapper locates a robot alone: it is an estimate, which its next poses would not confirm.
+Measurements of one degree of freedom are collected apart, see `window.py`.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED
 from swarm_loc_estimator.filter.measurement_model import (
     NOBODY,
+    POLAR,
     MeasurementArray,
     MeasurementColumns,
     locates_alone,
@@ -39,6 +41,13 @@ from swarm_loc_estimator.initialization.constraints import (
     refreshed,
     with_constraint,
 )
+from swarm_loc_estimator.initialization.window import (
+    NO_WINDOW,
+    WINDOW_DTYPE,
+    is_redundant,
+    locate,
+    with_row,
+)
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW
@@ -51,16 +60,14 @@ _PAUSE_SHARE = 8
 
 Counted in stamps, so that attempts do not depend on the order of arrival.
 """
+_SHORTEST_WINDOW_PAUSE_NS, _WINDOW_PAUSE_SHARE = 500_000_000, 4
+"""The same for windows of measurements of one degree of freedom, whose attempts take longer."""
 
 
 Keep = Callable[[SwarmState, MeasurementArray], bool]
 """Keeps a measurement (1,); returns whether it helps to locate a robot."""
-Located = Callable[[SwarmState, int, InitialPose, Preintegrated], None]
-"""Called with a robot, the pose of its track, and the instant."""
-
-
-def _initialize(state: SwarmState, robot: int, initial: InitialPose, at: Preintegrated) -> None:
-    state.initialize(robot, initial, at, CONFIRMED)
+Located = Callable[[SwarmState, int, InitialPose, Preintegrated, int], None]
+"""Called with a robot, the pose of its track, the instant, and how many measurements confirm the pose."""
 
 
 class Initializer:
@@ -88,7 +95,7 @@ class Initializer:
         robot, other = (target, observer) if knows_observer else (observer, target)
         if knows_observer == knows_target or not self._tracks.has_started(robot, now_ns):
             return False
-        return self.constrain(state, robot, other, one, _initialize)
+        return self.constrain(state, robot, other, one, SwarmState.initialize)
 
     def constrain(
         self, state: SwarmState, robot: int, other: int, one: MeasurementArray, located: Located
@@ -109,8 +116,10 @@ class Initializer:
         track = self._tracks.at(np.array([robot]), one["stamp_ns"])
         at = Preintegrated(now_ns, track.covariance[0], track.jacobian[0])
         if locates_alone(MeasurementColumns.of(one), 0) and self._is_sure(one["covariance"][0]):
-            located(state, robot, _fixed(one, track.pose[0]), at)
+            located(state, robot, _fixed(one, track.pose[0]), at, CONFIRMED)
             return True
+        if one["kind"][0] > POLAR:
+            return self._note_partial(state, one, robot, other, at, located)
         old = state.constraints.get(robot, NO_CONSTRAINTS)
         same = old[(old["marker_id"] == one["marker_id"][0]) & (old["other"] == other)]
         if same.size and abs(now_ns - int(same["stamp_ns"][-1])) < _INDEPENDENT_NS:
@@ -124,10 +133,41 @@ class Initializer:
             return True
         initial = align(refreshed(constraints, state.arrays()), at.covariance, self._heading_sigma)
         if initial is not None:
-            located(state, robot, initial, at)
+            located(state, robot, initial, at, CONFIRMED)
         else:
             waited_ns = now_ns - int(constraints["stamp_ns"][0])
             state.next_attempt_ns[robot] = now_ns + min(_LONGEST_PAUSE_NS, waited_ns // _PAUSE_SHARE)
+        return True
+
+    def _note_partial(
+        self,
+        state: SwarmState,
+        one: MeasurementArray,
+        robot: int,
+        other: int,
+        at: Preintegrated,
+        located: Located,
+    ) -> bool:
+        """Keep a measurement (1,) of one degree of freedom, see `window.py`."""
+        row = np.zeros(1, dtype=WINDOW_DTYPE)
+        row["measurement"], row["noise"] = one, at.covariance
+        row["track"] = self._tracks.at(np.array([robot]), one["stamp_ns"]).pose
+        if other != NOBODY:
+            sample = self._tracks.at(np.array([other]), one["stamp_ns"])
+            row["other_track"], row["other_noise"] = sample.pose, sample.covariance
+        old = state.windows.get(robot, NO_WINDOW)
+        if is_redundant(old, row):
+            return True
+        window = state.windows[robot] = with_row(old, row, self._window_ns)
+        if at.stamp_ns < state.next_window_ns[robot]:
+            return True
+        first_ns = int(window["measurement"]["stamp_ns"][0])
+        state.next_window_ns[robot] = at.stamp_ns + max(
+            _SHORTEST_WINDOW_PAUSE_NS, (at.stamp_ns - first_ns) // _WINDOW_PAUSE_SHARE
+        )
+        initial = locate(state, robot, window, at.covariance, self._heading_sigma)
+        if initial is not None:
+            located(state, robot, initial, at, 0)
         return True
 
     def _is_sure(self, covariance: FloatArray) -> bool:

@@ -128,7 +128,14 @@ class LocalFrame:
             return False
         return self._initializer.constrain(state, robot, NOBODY, one, self.move_to_map)
 
-    def move_to_map(self, state: SwarmState, robot: int, initial: InitialPose, at: Preintegrated) -> None:
+    def move_to_map(
+        self,
+        state: SwarmState,
+        robot: int,
+        initial: InitialPose,
+        at: Preintegrated,
+        confirmations: int = CONFIRMED,
+    ) -> None:
         """Move all robots to `map` with a robot whose pose there is known.
 
         Where it is not among the located ones, or the filter is sparse, the others are deinitialized.
@@ -139,7 +146,7 @@ class LocalFrame:
             state.move(robot, initial)
         else:
             self.leave(state)
-            state.initialize(robot, initial, at, CONFIRMED)
+            state.initialize(robot, initial, at, confirmations)
 
     @staticmethod
     def leave(state: SwarmState) -> None:
@@ -148,3 +155,4 @@ class LocalFrame:
         for other in np.flatnonzero(state.tracked).tolist():
             state.deinitialize(other)
         state.constraints.clear()
+        state.windows.clear()

@@ -55,7 +55,7 @@ class InputConverter:
             if sensor.create_converter is not None
         }
         self._future_ns = round(settings.future_tolerance_s * 1e9)
-        self._robots, self._landmarks = len(swarm.robots), len(swarm.landmarks)
+        self._robots, self._landmarks = len(swarm.robots), len(swarm.surveyed)
 
     def convert(self, batch: Batch) -> Measurements:
         """Convert valid readings; count the others in `drops`."""

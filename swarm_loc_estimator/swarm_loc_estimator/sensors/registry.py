@@ -16,11 +16,12 @@ from swarm_loc_estimator.sensors.fix import FIXES
 from swarm_loc_estimator.sensors.imu import TURN_RATES
 from swarm_loc_estimator.sensors.infrared import BRIGHTNESS
 from swarm_loc_estimator.sensors.odometry import ODOMETRY
+from swarm_loc_estimator.sensors.ranges import RANGES
 from swarm_loc_estimator.sensors.sensor import InputKind, Sensor, chosen
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 SENSORS: dict[str, Sensor] = {
-    sensor.name: sensor for sensor in (ODOMETRY, TURN_RATES, DETECTIONS, BRIGHTNESS, FIXES, AERIAL)
+    sensor.name: sensor for sensor in (ODOMETRY, TURN_RATES, DETECTIONS, BRIGHTNESS, FIXES, RANGES, AERIAL)
 }
 """All sensors by name. Simultaneous measurements are fused in this order."""
 

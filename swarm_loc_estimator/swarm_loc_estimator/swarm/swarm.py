@@ -15,13 +15,14 @@ from typing import TYPE_CHECKING
 
 from swarm_loc_estimator.common.parameters import number
 from swarm_loc_estimator.swarm.fix_model import FixModel
-from swarm_loc_estimator.swarm.imu_model import ImuModel
+from swarm_loc_estimator.swarm.motion_models import ImuModel, RandomWalk
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from swarm_loc_estimator.swarm.ir_board import RobotIr
     from swarm_loc_estimator.swarm.motion_response import MotionResponse
+    from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 
 Pose2 = tuple[float, float, float]
 """x [m], y [m], heading [rad]."""
@@ -244,19 +245,6 @@ class StartSigma:
 
 
 @dataclass(frozen=True)
-class RandomWalk:
-    """Random walk of a robot without odometry, given by the growth of its pose variance."""
-
-    position: float = number(0.0, "m^2/s", 0.0, 1e3, "variance of x and of y per second; 0: stationary")
-    heading: float = number(0.0, "rad^2/s", 0.0, 1e3, "variance of the heading per second")
-
-    @property
-    def moves(self) -> bool:
-        """Whether the pose changes at all."""
-        return self.position > 0.0 or self.heading > 0.0
-
-
-@dataclass(frozen=True)
 class Robot:
     """One robot.
 
@@ -275,6 +263,7 @@ class Robot:
         random_walk: Random walk without odometry.
         fix: Error model of its absolute fixes.
         ir: Infrared board; None if it has none.
+        uwb: UWB radio; None if it has none.
     """
 
     name: str
@@ -291,6 +280,7 @@ class Robot:
     random_walk: RandomWalk = RandomWalk()
     fix: FixModel = FixModel()
     ir: RobotIr | None = None
+    uwb: UwbDevice | None = None
 
     @property
     def turn_sensor(self) -> OdometryModel | ImuModel:
@@ -343,16 +333,17 @@ class SwarmError(ValueError):
 
 @dataclass(frozen=True)
 class Swarm:
-    """All robots, landmarks and fixed cameras.
+    """All robots, landmarks, fixed cameras and UWB anchors.
 
     Raises:
-        SwarmError: A name, a marker id or the id of an infrared board appears twice, or a robot with odometry
-            has a random walk or one without has an IMU.
+        SwarmError: A name, a marker id, the id of an infrared board or the address of a radio appears twice,
+            or a robot with odometry has a random walk or one without has an IMU.
     """
 
     robots: tuple[Robot, ...] = ()
     landmarks: tuple[Landmark, ...] = ()
     cameras: tuple[FixedCamera, ...] = ()
+    anchors: tuple[Anchor, ...] = ()
 
     def __post_init__(self) -> None:
         names = Counter(one.name for one in self.sources)
@@ -363,7 +354,10 @@ class Swarm:
         ]
         marks = [(f"landmark {mark.id}", mark.id) for mark in self.landmarks]
         boards = [(f"robot '{r.name}'", r.ir.id) for r in self.robots if r.ir is not None]
-        for what, named in (("marker id", faces + marks), ("ir.id", boards)):
+        radios = [(f"robot '{r.name}'", r.uwb.address) for r in self.robots if r.uwb is not None]
+        radios += [(f"anchors[{k}]", anchor.address) for k, anchor in enumerate(self.anchors)]
+        unique = (("marker id", faces + marks), ("ir.id", boards), ("uwb.address", radios))
+        for what, named in unique:
             owners: dict[int, str] = {}
             for owner, one_id in named:
                 first = owners.setdefault(one_id, owner)
@@ -387,6 +381,12 @@ class Swarm:
     def index_of(self) -> Mapping[str, int]:
         """Robot index by name."""
         return {robot.name: index for index, robot in enumerate(self.robots)}
+
+    @cached_property
+    def surveyed(self) -> tuple[Landmark, ...]:
+        """Static bodies whose places may be estimated: the landmarks, then the anchors as such."""
+        anchors = (Landmark(a.address, a.x, a.y, a.z, position_sigma=a.position_sigma) for a in self.anchors)
+        return (*self.landmarks, *anchors)
 
     @cached_property
     def owner_of(self) -> Mapping[int, MarkerOwner]:

@@ -2,7 +2,7 @@
 
 ```yaml
 fileversion: 1
-defaults:              # odometry, imu, random_walk, response, camera, sensor, fix, ir, faces, start_sigma
+defaults:      # odometry, imu, random_walk, response, camera, sensor, fix, ir, uwb, faces, start_sigma
   sensor: {range_sigma: 0.1}
   landmark: {size: 0.06, position_sigma: 0.01, yaw_sigma: 0.02}  # without sigmas: surveyed exactly
 types:
@@ -38,6 +38,8 @@ landmarks:
   100: {x: 1.2, y: -0.4, yaw: 3.14159, size: 0.05}      # yaw null or left out: shows no heading
 cameras:                  # fixed ones, which see markers on robots
   ceiling1: {x: -1.0, y: 0.5, z: 2.5, position_sigma: 0.001, sensor: {residual_position_sigma: 0.001}}
+anchors:                  # UWB radios, see doc/uwb.md
+  - {address: 0x10, x: 0.0, y: 5.0, z: 2.1}
 ```
 Numbers, units, ranges and defaults are those of the classes in `swarm/swarm.py`.
 """
@@ -52,8 +54,8 @@ from typing import TYPE_CHECKING, Any
 from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
 from swarm_loc_estimator.swarm.fix_model import FixModel
-from swarm_loc_estimator.swarm.imu_model import ImuModel
 from swarm_loc_estimator.swarm.ir_section import IrSection, Values
+from swarm_loc_estimator.swarm.motion_models import ImuModel, RandomWalk
 from swarm_loc_estimator.swarm.motion_response import MotionResponse, MotionResponseError
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
@@ -62,7 +64,6 @@ from swarm_loc_estimator.swarm.swarm import (
     Landmark,
     OdometryModel,
     Pose2,
-    RandomWalk,
     Robot,
     SensorModel,
     StartSigma,
@@ -70,23 +71,16 @@ from swarm_loc_estimator.swarm.swarm import (
     SwarmError,
 )
 from swarm_loc_estimator.swarm.tree_checks import Numbers, TreeChecks, nearest
+from swarm_loc_estimator.swarm.uwb import read_anchors, uwb_device, uwb_layer
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping
 
 FILE_VERSION = 1
 
-_SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks", "cameras")
+_SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors")
 _LAYER = (
-    "odometry",
-    "imu",
-    "random_walk",
-    "response",
-    "camera",
-    "sensor",
-    "fix",
-    "ir",
-    "faces",
+    *("odometry", "imu", "random_walk", "response", "camera", "sensor", "fix", "ir", "uwb", "faces"),
     "start_sigma",
 )
 _DEFAULTS = (*_LAYER, "landmark")
@@ -208,13 +202,17 @@ class _Loader(TreeChecks):
         landmarks = self._landmarks(sections.get("landmarks", {}), sections.get("defaults", {}))
         fixed = self._named(sections.get("cameras", {}), "cameras")
         cameras = tuple(self._fixed_camera(name, tree) for name, tree in fixed)
-        states = _state_count(robots, landmarks)
+        anchors = read_anchors(self, sections.get("anchors"))
+        estimated = sum(mark.is_estimated for mark in landmarks) + sum(
+            a.position_sigma > 0.0 for a in anchors
+        )
+        states = _state_count(robots, estimated)
         if states > MAX_STATES:
             raise self.said(
                 f"what has a sigma makes a filter of {states} states but must make at most {MAX_STATES}"
             )
         try:
-            return Swarm(robots, landmarks, cameras)
+            return Swarm(robots, landmarks, cameras, anchors)
         except SwarmError as error:
             raise self.said(str(error).removesuffix(".")) from error
 
@@ -227,7 +225,7 @@ class _Loader(TreeChecks):
             raise self.error(f"{key}.type", type_name, f"must be one of the types{nearest(type_name, types)}")
         own = self._layer(mapping, key, _ROBOT, of_robot=True)
         layers = [defaults, *([types[type_name]] if type_name else []), own]
-        sections = {section: _said(layers, section) for section in (*MODELS, "ir")}
+        sections = {section: _said(layers, section) for section in (*MODELS, "ir", "uwb")}
         models: dict[str, Any] = {
             section: None if (values := sections[section]) is None else cls(**values)
             for section, cls in MODELS.items()
@@ -240,6 +238,7 @@ class _Loader(TreeChecks):
             start=self._start(mapping.get("start"), f"{key}.start"),
             stands=models["odometry"] is None,
             ir=self._ir.board(sections["ir"], f"{key}.ir"),
+            uwb=uwb_device(self, sections["uwb"], f"{key}.uwb"),
             **{**models, "odometry": models["odometry"] or OdometryModel()},
         )
 
@@ -255,6 +254,8 @@ class _Loader(TreeChecks):
         }
         if "ir" in mapping:
             sections["ir"] = self._ir.layer(mapping["ir"], f"{key}.ir", of_robot=of_robot)
+        if "uwb" in mapping:
+            sections["uwb"] = uwb_layer(self, mapping["uwb"], f"{key}.uwb", of_robot=of_robot)
         faces = self._named(mapping.get("faces", {}), f"{key}.faces")
         return _Layer(
             sections,
@@ -380,8 +381,8 @@ def _said(layers: Iterable[_Layer], section: str) -> Values | None:
     return values
 
 
-def _state_count(robots: tuple[Robot, ...], landmarks: tuple[Landmark, ...]) -> int:
-    """Number of filter states: three per pose and estimated landmark, one per estimated parameter."""
+def _state_count(robots: tuple[Robot, ...], estimated: int) -> int:
+    """Number of filter states: three per pose and estimated landmark or anchor, one per parameter."""
     sigmas = [
         sigma
         for robot in robots
@@ -392,5 +393,4 @@ def _state_count(robots: tuple[Robot, ...], landmarks: tuple[Landmark, ...]) -> 
             *((robot.camera.yaw_sigma, robot.sensor.distance_scale_sigma) if robot.camera else ()),
         )
     ]
-    estimated: int = sum(mark.is_estimated for mark in landmarks)
     return 3 * (len(robots) + estimated) + sum(1 for sigma in sigmas if sigma > 0.0)

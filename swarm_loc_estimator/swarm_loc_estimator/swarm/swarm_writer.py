@@ -19,6 +19,7 @@ from swarm_loc_estimator.swarm.swarm import (
     Swarm,
 )
 from swarm_loc_estimator.swarm.swarm_file import FILE_VERSION, LANDMARK_DEFAULTS, MODELS, parse_swarm
+from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -51,7 +52,8 @@ def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
 
 def _units() -> list[str]:
     """One comment per group of numbers, with the unit of each."""
-    groups = {**MODELS, "faces": Face, "landmarks": Landmark, "cameras": FixedCamera}
+    groups = {**MODELS, "uwb": UwbDevice, "faces": Face, "landmarks": Landmark}
+    groups |= {"cameras": FixedCamera, "anchors": Anchor}
     lines = ["Units:"]
     for name, cls in groups.items():
         units = ", ".join(f"{key} [{spec.unit}]" for key, spec in number_specs(cls).items())
@@ -69,6 +71,7 @@ def _tree(swarm: Swarm, folder: Path) -> Mapping:
     robots = {robot.name: _robot(robot, types.get(robot.type, {}), folder) for robot in swarm.robots}
     landmarks = {mark.id: _numbers(mark, keep=("x", "y")) for mark in swarm.landmarks}
     defaults = _taken_out(LANDMARK_DEFAULTS, list(landmarks.values()))
+    anchors = [{"address": one.address, **_numbers(one, keep=("x", "y"))} for one in swarm.anchors]
     tree = {
         "fileversion": FILE_VERSION,
         "defaults": {"landmark": defaults} if defaults else {},
@@ -76,6 +79,7 @@ def _tree(swarm: Swarm, folder: Path) -> Mapping:
         "robots": robots,
         "landmarks": landmarks,
         "cameras": {one.name: _fixed_camera(one) for one in swarm.cameras},
+        "anchors": anchors,
     }
     return {key: value for key, value in tree.items() if value}
 
@@ -111,6 +115,7 @@ def _layer(robot: Robot, folder: Path) -> Mapping:
     if robot.stands:
         layer["odometry"] = None
     layer["ir"] = {} if robot.ir is None else ir_tree(robot.ir, folder)
+    layer["uwb"] = {} if robot.uwb is None else _numbers(robot.uwb)
     layer["faces"] = {
         face.name: _numbers(face) | ({"lies": True} if face.lies else {}) for face in robot.faces
     }
@@ -156,6 +161,8 @@ def _robot(robot: Robot, shared: Mapping, folder: Path) -> Mapping:
             entry[section] = rest
     if robot.ir is not None:
         entry["ir"] = {"id": robot.ir.id, **entry.get("ir", {})}
+    if robot.uwb is not None:
+        entry["uwb"] = {"address": robot.uwb.address, **entry.get("uwb", {})}
     if robot.faces:
         entry["ids"] = {face.name: face.id for face in robot.faces}
     if robot.start is not None:

@@ -52,6 +52,7 @@ def contradictions(
         now_ns: The instant.
     """
     names = [robot.name for robot in swarm.robots] + [f"landmark {mark.id}" for mark in swarm.landmarks]
+    names += [f"anchor {anchor.address}" for anchor in swarm.anchors]
     conflicting = tracks.has_conflicting_sources(now_ns)
     reset = tracks.had_fault(now_ns) & ~conflicting
     robots = np.flatnonzero(state.tracked).tolist()
@@ -63,7 +64,7 @@ def contradictions(
         *(_reset(names[robot]) for robot in np.flatnonzero(reset).tolist()),
         *(_constant(names[robot]) for robot in np.flatnonzero(tracks.integrates_twist()).tolist()),
         *(_pose(names[robot]) for robot in denied),
-        *(_sightings(names[observer], names[source]) for observer, source in aside),
+        *(_sightings(names[observer], names[source % len(names)]) for observer, source in aside),
         *(_description(names[source], source, state) for source in contradicted),
         *(_noise(names[robot]) for robot in np.flatnonzero(state.integrity.noise_inflation).tolist()),
     ]

@@ -106,7 +106,7 @@ class Fusion:
         self._initializer = Initializer(tracks, settings.fix_window_s, surer)
         self._local = LocalFrame(swarm, tracks, self._initializer, settings.origin_after_s)
         self._pictures = PictureFusion(swarm, settings, tracks)
-        self._table = ParameterTable.of(swarm.robots, swarm.landmarks, in_blocks=self.is_sparse)
+        self._table = ParameterTable.of(swarm.robots, swarm.surveyed, in_blocks=self.is_sparse)
         self._pairs = _PAIRS_PER_ROBOT if any(robot.ir is not None for robot in swarm.robots) else 0
 
     def new_state(self) -> SwarmState:
@@ -242,6 +242,7 @@ class Fusion:
             return Verdict.OPEN
         belief, accepted = state.arrays(), batch.accepted
         evaluate_by_records(one, self._tracks.arrays, belief, state.filter, batch)
+        assess_all(fields, belief, self._limits, batch)
         nis[:] = batch.nis
         gone = confirm_all(fields, belief, accepted)
         if accepted[0]:
@@ -313,13 +314,13 @@ class Fusion:
         """
         belief, accepted, newest_ns = state.arrays(), batch.accepted, int(fields.stamp_ns[-1])
         state.filter.prepare_update(
-            related_columns(fields, belief), self._robots(state, newest_ns), batch.cross_covariance
+            related_columns(fields, belief),
+            Robots(self._poses(state, newest_ns)[:, :2], state.tracked.copy()),
+            batch.cross_covariance,
         )
         evaluate_all(fields, belief, batch)
         evaluate_by_records(rows, self._tracks.arrays, belief, state.filter, batch)
-        contradicted = assess_all(
-            fields, belief, self._limits, batch.distance, batch.whitened, batch.cause, accepted
-        )
+        contradicted = assess_all(fields, belief, self._limits, batch)
         lost = confirm_all(fields, belief, accepted)
         systematic = (fields.systematic_share > 0.0).any(axis=1) & (fields.kind <= POLAR)
         for k in np.flatnonzero(accepted & systematic).tolist():
@@ -342,10 +343,6 @@ class Fusion:
                 verdicts[k] = self._note(state, rows[k : k + 1])
         return verdicts, batch.nis
 
-    def _robots(self, state: SwarmState, stamp_ns: int) -> Robots:
-        """Positions in `map` and tracked flags of all robots at an instant."""
-        return Robots(self._poses(state, stamp_ns)[:, :2], state.tracked.copy())
-
     def _poses(self, state: SwarmState, stamp_ns: int) -> FloatArray:
         """Poses (N, 3) of all robots in `map` at an instant."""
         robots = np.arange(state.tracked.size)
@@ -353,8 +350,11 @@ class Fusion:
 
     def _note(self, state: SwarmState, one: MeasurementArray, keep: Keep | None = None) -> Verdict:
         """Store a measurement (1,) as a constraint if it can initialize a robot, or what `keep` does."""
-        constraint, keep = MODELS[int(one["kind"][0])].constraint, keep or self._initializer.note
-        if constraint is None or not keep(state, at_initialization(constraint(one))):
+        model, keep = MODELS[int(one["kind"][0])], keep or self._initializer.note
+        if model.constraint is None and model.degrees_of_freedom > 1:
+            return Verdict.NOT_LOCALIZED
+        noted = one if model.constraint is None else at_initialization(model.constraint(one))
+        if not keep(state, noted):
             return Verdict.NOT_LOCALIZED
         sides = np.array([one["observer"][0], one["target"][0]])
         if self._pairs and (sides >= 0).all() and one["kind"][0] <= POLAR:

@@ -24,7 +24,7 @@ from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 def learns(swarm: Swarm) -> bool:
     """Whether parameters of any camera, odometry or landmark are described with a standard deviation."""
     lasting = np.delete(ParameterTable.of(swarm.robots).column, TURN_BIAS, axis=1)
-    return bool((lasting >= 0).any()) or any(mark.is_estimated for mark in swarm.landmarks)
+    return bool((lasting >= 0).any()) or any(mark.is_estimated for mark in swarm.surveyed)
 
 
 def learned(swarm: Swarm, state: SwarmState) -> Swarm:
@@ -33,15 +33,21 @@ def learned(swarm: Swarm, state: SwarmState) -> Swarm:
     The bias of the turn rate is omitted, because it changes. Standard deviations of landmarks are marginal:
     they include errors common to all landmarks.
     """
+    surveyed = [
+        _landmark(mark, index, state) if state.landmark_column(index) >= 0 else mark
+        for index, mark in enumerate(swarm.surveyed)
+    ]
+    marks, places = surveyed[: len(swarm.landmarks)], surveyed[len(swarm.landmarks) :]
     return replace(
         swarm,
         robots=tuple(
             _robot(robot, index, state) if state.tracked[index] else robot
             for index, robot in enumerate(swarm.robots)
         ),
-        landmarks=tuple(
-            _landmark(mark, index, state) if state.landmark_column(index) >= 0 else mark
-            for index, mark in enumerate(swarm.landmarks)
+        landmarks=tuple(marks),
+        anchors=tuple(
+            replace(anchor, x=place.x, y=place.y, position_sigma=place.position_sigma)
+            for anchor, place in zip(swarm.anchors, places, strict=True)
         ),
     )
 

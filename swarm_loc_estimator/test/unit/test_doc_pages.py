@@ -12,18 +12,18 @@ import pytest
 from swarm_loc_estimator.cli import calibrate, calibrate_ir, import_mrclam, replay, replay_map, survey, watch
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.swarm.fix_model import FixModel
-from swarm_loc_estimator.swarm.imu_model import ImuModel
+from swarm_loc_estimator.swarm.motion_models import ImuModel, RandomWalk
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
     FixedCamera,
     Landmark,
     OdometryModel,
-    RandomWalk,
     SensorModel,
     StartSigma,
 )
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 
 DOC = Path(__file__).parents[2] / "doc"
 SWARM_DESCRIPTION = (DOC / "swarm_description.md").read_text(encoding="utf-8")
@@ -62,6 +62,12 @@ def test_the_example_of_overhead_cameras_is_a_swarm(tmp_path: Path) -> None:
     swarm = load_swarm(tmp_path / "swarm.yaml")
     assert [camera.name for camera in swarm.cameras] == ["ceiling1", "ceiling2"]
     assert all(face.lies for robot in swarm.robots for face in robot.faces)
+
+
+def test_every_number_of_radios_has_its_place() -> None:
+    page = (DOC / "uwb.md").read_text(encoding="utf-8")
+    assert table_of(UwbDevice) in page
+    assert table_of(Anchor, "x", "y") in page
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,8 @@ from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, NOBO
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.ir_board import RobotIr
-from swarm_loc_estimator.swarm.swarm import RandomWalk, Robot, Swarm
+from swarm_loc_estimator.swarm.motion_models import RandomWalk
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradicted
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 from swarm_loc_estimator.timeline.settings import Settings

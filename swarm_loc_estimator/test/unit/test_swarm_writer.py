@@ -13,13 +13,13 @@ from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.fix_model import FixModel
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrMethod, RobotIr
+from swarm_loc_estimator.swarm.motion_models import RandomWalk
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
     Landmark,
     OdometryModel,
-    RandomWalk,
     Robot,
     SensorModel,
     StartSigma,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.belief import BeliefArrays, IntegrityArrays, covariance_within
-from swarm_loc_estimator.filter.integrity.fault_detection import source_of
+from swarm_loc_estimator.filter.integrity.pairs import source_of
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns
 
 CONFIRMED = 2

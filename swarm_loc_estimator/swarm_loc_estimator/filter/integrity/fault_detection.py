@@ -19,11 +19,21 @@ from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.filter.integrity.motion_noise import LOG_SCALES, WINDOWS
 from swarm_loc_estimator.filter.integrity.noise_inflation import inflate_noise
+from swarm_loc_estimator.filter.integrity.pairs import (
+    AGAIN_NS,
+    EXCLUDED,
+    MAX_EVIDENCE,
+    RECENT_NS,
+    TREND,
+    find_pair,
+    links_disagree,
+    new_pair,
+    source_of,
+    weight_of_trend,
+)
 from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementColumns
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW
 
-_EXCLUDED, _MAX_EVIDENCE = 10.0, 15.0
-"""Evidence from which a pair is excluded, and its maximum."""
 _SUSPECT = 7.5
 """Fault score from which a robot is not reported as tracked."""
 
@@ -45,19 +55,10 @@ _MAX_SINGLE_DOUBT = 5.0
 _SHARED_WEIGHT = 0.2
 """Weight for the source where observer and source are equally likely to be wrong."""
 _INLIER_WEIGHT = 0.25
-RECENT_NS = 400_000_000
 _ONE_IMAGE_NS = 20_000_000
 _REPORTED_NS = 3_000_000_000
-_AGAIN_NS = 90_000_000
-"""A measurement sooner after the last one of its pair is no new evidence."""
 _INDEPENDENT_NS = 100_000_000
 """Measurements of a pair that follow each other faster share their errors."""
-_TREND_LOOKS = 8
-_TREND = 3.0
-"""Limit of the squared sum of whitened innovations over their sum of squares; 1 without a trend."""
-_MIN_TREND = 0.6
-"""Smallest mean of whitened innovations that counts: trends of calibrated sensors lie below their noise."""
-_TREND_WEIGHT = 4.0
 
 
 def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
@@ -120,24 +121,24 @@ def assess(
     if observer < 0 or source < 0:
         return -1
     state, now_ns = belief.integrity, measurements.stamp_ns[k]
-    place = _find(measurements, k, belief)
+    place = find_pair(measurements, k, belief)
     if place < 0:
-        place = _new_place(state, observer, source)
+        place = new_pair(state, observer, source)
     state.source_ns[observer, place] = max(now_ns, state.source_ns[observer, place])
     state.outlier[observer, place] = distance > _OUTLIER
     state.unexplained[observer, place] = cause == KIDNAPPED
-    if now_ns - state.counted_ns[observer, place] < _AGAIN_NS:
+    if now_ns - state.counted_ns[observer, place] < AGAIN_NS:
         return -1
     state.counted_ns[observer, place] = now_ns
     weight = min(distance / _OUTLIER, _MAX_WEIGHT) if distance > _OUTLIER else 0.0
     if weight == 0.0:
-        weight = _weight_of_trend(state, observer, place, whitened)
+        weight = weight_of_trend(state, observer, place, whitened, TREND)
     if weight == 0.0:
         if not state.trending[observer, place]:
             _count_inlier(state, observer, source, place)
         return -1
     if not _attribute(state, (observer, source), weight, cause == KIDNAPPED, now_ns):
-        state.evidence[observer, place] = min(state.evidence[observer, place] + weight, _MAX_EVIDENCE)
+        state.evidence[observer, place] = min(state.evidence[observer, place] + weight, MAX_EVIDENCE)
     for node in (observer, source):
         if state.fault_score[node] >= max_fault_score:
             if cause != NOISE or not _is_estimated(belief, node) or not inflate_noise(belief, observer):
@@ -168,15 +169,15 @@ def _reset_evidence(state: IntegrityArrays, node: int) -> None:
 
 def excluded_pairs(state: IntegrityArrays, now_ns: int) -> list[tuple[int, int]]:
     """The excluded pairs of observer and source among those measured recently."""
-    aside = (state.evidence >= _EXCLUDED) & (now_ns - state.source_ns < _REPORTED_NS)
+    aside = (state.evidence >= EXCLUDED) & (now_ns - state.source_ns < _REPORTED_NS)
     return [(int(observer), int(state.source[observer, place])) for observer, place in np.argwhere(aside)]
 
 
 @inlined_njit
 def is_excluded(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> bool:
     """Whether the pair of measurement k is excluded."""
-    observer, place = measurements.observer[k], _find(measurements, k, belief)
-    aside: bool = place >= 0 and belief.integrity.evidence[observer, place] >= _EXCLUDED
+    observer, place = measurements.observer[k], find_pair(measurements, k, belief)
+    aside: bool = place >= 0 and belief.integrity.evidence[observer, place] >= EXCLUDED
     return aside
 
 
@@ -210,7 +211,9 @@ def is_kidnapped(state: IntegrityArrays, robot: int, within_ns: int = RECENT_NS)
         newest_ns = max(newest_ns, state.source_ns[robot, place])
     for place in range(state.source.shape[1]):
         recent = newest_ns - state.source_ns[robot, place] < within_ns
-        if recent and state.source[robot, place] >= 0 and state.evidence[robot, place] < _EXCLUDED:
+        is_link = state.source[robot, place] >= state.fault_score.size
+        recent = recent and not is_link and state.source[robot, place] >= 0
+        if recent and state.evidence[robot, place] < EXCLUDED:
             count += 1
             elsewhere += 1 if state.unexplained[robot, place] else 0
     return 2 * elsewhere > count
@@ -223,6 +226,7 @@ def is_contradicted(state: IntegrityArrays, robot: int) -> bool:
         state.fault_score[robot] >= _SUSPECT
         or state.gated_fixes[robot] > 0
         or is_kidnapped(state, robot, _ONE_IMAGE_NS)
+        or links_disagree(state, robot)
     )
     return contradicted
 
@@ -268,7 +272,7 @@ def _outliers(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, floa
             named += state.source[robot, place] == node
         for place in range(places if named or robot == node else 0):
             source = state.source[robot, place]
-            about = source >= 0 and node in (robot, source)
+            about = 0 <= source < state.fault_score.size and node in (robot, source)
             if about and now_ns - state.source_ns[robot, place] < RECENT_NS:
                 count += 1
                 bad += 1 if state.outlier[robot, place] or state.trending[robot, place] else 0
@@ -276,69 +280,9 @@ def _outliers(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, floa
 
 
 @inlined_njit
-def _weight_of_trend(
-    state: IntegrityArrays, observer: int, place: int, whitened: tuple[float, float]
-) -> float:
-    """Add a whitened innovation (2,) to the sum of its pair; return the weight of a trend, 0 without one."""
-    total = state.whitened[observer, place]
-    for i in range(2):
-        total[i] += whitened[i]
-        state.squares[observer, place] += whitened[i] * whitened[i]
-    state.looks[observer, place] += 1
-    if state.looks[observer, place] < _TREND_LOOKS:
-        return 0.0
-    squared = total[0] * total[0] + total[1] * total[1]
-    trending = squared > max(_TREND * state.squares[observer, place], (_MIN_TREND * _TREND_LOOKS) ** 2)
-    _forget_trend(state, observer, place)
-    state.trending[observer, place] = trending
-    return _TREND_WEIGHT if trending else 0.0
-
-
-@inlined_njit
-def _forget_trend(state: IntegrityArrays, observer: int, place: int) -> None:
-    state.whitened[observer, place, 0] = state.whitened[observer, place, 1] = 0.0
-    state.squares[observer, place], state.looks[observer, place] = 0.0, 0
-
-
-@inlined_njit
-def _find(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
-    """The slot of the pair of measurement k; -1: it has none, or it is no pair."""
-    observer, source = measurements.observer[k], source_of(measurements, k, belief)
-    if observer >= 0 and source >= 0:
-        sources = belief.integrity.source[observer]
-        for place in range(sources.size):
-            if sources[place] == source:
-                return place
-    return -1
-
-
-@inlined_njit
-def _new_place(state: IntegrityArrays, observer: int, source: int) -> int:
-    """Give a new pair the slot of the one measured longest ago."""
-    oldest = 0
-    for place in range(state.source.shape[1]):
-        if state.source_ns[observer, place] < state.source_ns[observer, oldest]:
-            oldest = place
-    state.source[observer, oldest], state.source_ns[observer, oldest] = source, NEVER_NS // 2
-    state.counted_ns[observer, oldest] = NEVER_NS // 2
-    state.evidence[observer, oldest] = 0.0
-    state.outlier[observer, oldest] = state.trending[observer, oldest] = False
-    _forget_trend(state, observer, oldest)
-    return oldest
-
-
-@inlined_njit
-def source_of(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
-    """The source of measurement k: a robot, N + l for landmark l, or -1."""
-    landmark: int = measurements.landmark[k] - 1
-    target: int = measurements.target[k]
-    return belief.tracked.size + landmark if landmark >= 0 else target
-
-
-@inlined_njit
 def noise_of_frequent_looks(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> float:
     """Factor on the noise of measurement k that follows closely on another one of its pair."""
-    observer, place = measurements.observer[k], _find(measurements, k, belief)
+    observer, place = measurements.observer[k], find_pair(measurements, k, belief)
     if place < 0:
         return 1.0
     since_ns = measurements.stamp_ns[k] - belief.integrity.source_ns[observer, place]

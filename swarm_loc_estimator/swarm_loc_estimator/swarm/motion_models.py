@@ -1,4 +1,4 @@
-"""Error model of the IMU of a robot."""
+"""Error models of motion besides odometry: IMUs, and robots without odometry."""
 
 from __future__ import annotations
 
@@ -43,3 +43,16 @@ class ImuModel:
     def is_used(self) -> bool:
         """Whether the robot has an IMU."""
         return self.turn_noise_density > 0.0
+
+
+@dataclass(frozen=True)
+class RandomWalk:
+    """Random walk of a robot without odometry, given by the growth of its pose variance."""
+
+    position: float = number(0.0, "m^2/s", 0.0, 1e3, "variance of x and of y per second; 0: stationary")
+    heading: float = number(0.0, "rad^2/s", 0.0, 1e3, "variance of the heading per second")
+
+    @property
+    def moves(self) -> bool:
+        """Whether the pose changes at all."""
+        return self.position > 0.0 or self.heading > 0.0

@@ -1,0 +1,258 @@
+"""UWB: ranges between radios on robots and at anchors, and differences of two ranges.
+
+A range is the distance between two antennas in space. Heights are known, so it has one degree of freedom in
+the plane. A difference has a second antenna, the reference, which must be an anchor; where it is on a robot
+and the other one is not, both change places and the sign. See doc/uwb.md.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.messages.cdr import Rows, decode, nanoseconds
+from swarm_loc_estimator.common.messages.definitions import RANGES as MESSAGE_TYPE
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageColumns
+from swarm_loc_estimator.filter.measurement_model import (
+    MEASUREMENT_DTYPE,
+    MeasurementArray,
+    MeasurementModel,
+    Prediction,
+    register,
+)
+from swarm_loc_estimator.sensors.sensor import (
+    NO_ROWS,
+    Converter,
+    DropCounts,
+    InputKind,
+    Known,
+    Measured,
+    Sensor,
+    SensorSettings,
+    chosen,
+)
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.swarm.uwb import UwbDevice
+
+
+def _predict_range(one: MeasurementArray, observer: FloatArray, target: FloatArray) -> Prediction:
+    """Slant range; `sensor` and `marker` are the antennas, with the height in place of the yaw."""
+    sensor, marker = one["sensor"][0].tolist(), one["marker"][0].tolist()
+    sx, sy = _moved(sensor, observer)
+    is_fixed = one["target"][0] < 0 and one["landmark"][0] == 0
+    mx, my = (marker[0], marker[1]) if is_fixed else _moved(marker, target)
+    distance, ux, uy = _direction(mx - sx, my - sy, marker[2] - sensor[2])
+    return Prediction(
+        np.array([distance]),
+        np.array([[-ux, -uy, ux * sy - uy * sx]]),
+        np.array([[ux, uy, uy * mx - ux * my]]),
+    )
+
+
+def _predict_difference(one: MeasurementArray, observer: FloatArray, target: FloatArray) -> Prediction:
+    """Slant range minus that to the reference, whose place in `map` is `alternative`."""
+    value, own, other = _predict_range(one, observer, target)
+    sensor, reference = one["sensor"][0].tolist(), one["alternative"][0].tolist()
+    sx, sy = _moved(sensor, observer)
+    distance, ux, uy = _direction(reference[0] - sx, reference[1] - sy, reference[2] - sensor[2])
+    return Prediction(value - distance, own + np.array([[ux, uy, uy * sx - ux * sy]]), other)
+
+
+def _moved(place: list[float], pose: FloatArray) -> tuple[float, float]:
+    """Position in `map` of a place on a body at a pose (3,)."""
+    x, y, theta = pose.tolist()
+    cos, sin = math.cos(theta), math.sin(theta)
+    return x + cos * place[0] - sin * place[1], y + sin * place[0] + cos * place[1]
+
+
+def _direction(x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Length of a vector, and the horizontal components of its direction; zero at length zero."""
+    length = math.sqrt(x * x + y * y + z * z)
+    scale = 1.0 / length if length > 1e-6 else 0.0
+    return length, scale * x, scale * y
+
+
+def _innovation(one: MeasurementArray, predicted: FloatArray) -> FloatArray:
+    innovation: FloatArray = one["value"][0, :1] - predicted
+    return innovation
+
+
+RANGE = MeasurementModel("range", 10, 1, _predict_range, _innovation)
+"""Distance of two antennas [m]."""
+RANGE_DIFFERENCE = MeasurementModel("range difference", 11, 1, _predict_difference, _innovation)
+"""Distance to one antenna minus that to the reference [m]."""
+register(RANGE)
+register(RANGE_DIFFERENCE)
+
+
+class RangeRows(NamedTuple):
+    """Ranges and range differences (k,).
+
+    Attributes:
+        robot: (k,) index of the robot that measured.
+        stamp_ns: (k,) time of measurement.
+        device: (k,) uint64, address of the other device.
+        reference: (k,) uint64, address of the reference; 0: a range.
+        range: (k,) range, or difference [m].
+        variance: (k,) of `range` [m^2]; 0: that of the swarm description is used.
+        arrival_ns: (k,) arrival times.
+    """
+
+    robot: IntArray
+    stamp_ns: IntArray
+    device: NDArray[np.uint64]
+    reference: NDArray[np.uint64]
+    range: FloatArray
+    variance: FloatArray
+    arrival_ns: IntArray
+
+
+_NO_ADDRESSES = np.zeros(0, dtype=np.uint64)
+NO_RANGES = RangeRows(NO_ROWS, NO_ROWS, _NO_ADDRESSES, _NO_ADDRESSES, np.zeros(0), np.zeros(0), NO_ROWS)
+
+
+class RangeArrayMessage(NamedTuple):
+    """swarm_loc_msgs/RangeArray: `ranges` has the fields of swarm_loc_msgs/Range."""
+
+    stamp_ns: int
+    frame_id: str
+    ranges: Rows
+
+
+def decode_ranges(data: bytes) -> RangeArrayMessage:
+    """Read a swarm_loc_msgs/RangeArray.
+
+    Raises:
+        CdrError: The bytes are not one whole message.
+    """
+    message = decode(data, MESSAGE_TYPE)
+    return RangeArrayMessage(nanoseconds(message.header.stamp), message.header.frame_id, message.ranges)
+
+
+def _columns(
+    found: MessageColumns[RangeArrayMessage], batch: MessageBatch, robot: IntArray, _known: Known
+) -> tuple[RangeRows, Mapping[str, int]]:
+    if not found.messages:
+        return NO_RANGES, {}
+    counts = [message.ranges.size for message in found.messages]
+    ranges = np.concatenate([message.ranges for message in found.messages])
+    columns = (robot[found.valid], found.stamp_ns[found.valid], batch.log_ns[found.valid])
+    robots, stamps_ns, arrivals_ns = (np.repeat(column, counts) for column in columns)
+    device, reference, value, variance = (ranges[name].copy() for name in ranges.dtype.names or ())
+    return RangeRows(robots, stamps_ns, device, reference, value, variance, arrivals_ns), {}
+
+
+class _Devices(NamedTuple):
+    """All radios by ascending address (d,), the first one is none.
+
+    Attributes:
+        address: (d,) uint64.
+        robot: (d,) index of its robot; -1: an anchor.
+        landmark: (d,) field `landmark` of measurements; 0: a robot.
+        place: (d, 3) antenna x, y, z in base_link or in `map`.
+        bias: (d,) of its ranges [m].
+        variance: (d,) of x and of y of an anchor [m^2].
+    """
+
+    address: NDArray[np.uint64]
+    robot: IntArray
+    landmark: IntArray
+    place: FloatArray
+    bias: FloatArray
+    variance: FloatArray
+
+    @classmethod
+    def of(cls, swarm: Swarm) -> _Devices:
+        """The radios of a swarm."""
+        first = len(swarm.landmarks) + 1
+        rows = [(0, -1, 0, (0.0, 0.0, 0.0), 0.0, 0.0)]
+        rows += [
+            (u.address, k, 0, (u.x, u.y, u.z), u.range_bias, 0.0)
+            for k, robot in enumerate(swarm.robots)
+            if (u := robot.uwb) is not None
+        ]
+        rows += [
+            (a.address, -1, first + k, (a.x, a.y, a.z), a.range_bias, a.position_sigma**2)
+            for k, a in enumerate(swarm.anchors)
+        ]
+        address, *columns = zip(*sorted(rows), strict=True)
+        return cls(np.array(address, dtype=np.uint64), *(np.array(column) for column in columns))
+
+    def find(self, address: NDArray[np.uint64]) -> IntArray:
+        """Indices (k,) of addresses (k,); 0: unknown."""
+        place = np.minimum(np.searchsorted(self.address, address), self.address.size - 1)
+        return np.where(self.address[place] == address, place, 0)
+
+
+def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts) -> Converter:
+    devices = _Devices.of(swarm)
+    radios = [robot.uwb or UwbDevice(0) for robot in swarm.robots]
+    own_address = np.array([radio.address for radio in radios], dtype=np.uint64)
+    antenna = np.array([(radio.x, radio.y, radio.z) for radio in radios]).reshape(-1, 3)
+    sigma = np.array([(radio.range_sigma, radio.difference_sigma) for radio in radios]).reshape(-1, 2)
+    scale, bias = (np.array([getattr(r, name) for r in radios]) for name in ("range_scale", "range_bias"))
+    gate = RANGE.gate([radio.gate_probability for radio in radios])
+
+    def convert(rows: RangeRows) -> Measured:
+        device, reference = devices.find(rows.device), devices.find(rows.reference)
+        rows, device, reference = _usable(rows, device, reference)
+        is_difference = rows.reference > 0
+        value = rows.range - devices.bias[device]
+        value += np.where(is_difference, devices.bias[reference], -bias[rows.robot])
+        # the reference must be fixed: change places where only the other device is
+        swapped = is_difference & (devices.robot[reference] >= 0)
+        value[swapped] *= -1.0
+        device, reference = np.where(swapped, reference, device), np.where(swapped, device, reference)
+        out = np.zeros(rows.robot.size, dtype=MEASUREMENT_DTYPE)
+        out["stamp_ns"], out["gate"] = rows.stamp_ns, gate[rows.robot]
+        out["received_from"] = out["observer"] = rows.robot
+        out["kind"] = np.where(is_difference, RANGE_DIFFERENCE.number, RANGE.number)
+        out["target"], out["landmark"] = devices.robot[device], devices.landmark[device]
+        out["marker_id"] = device + devices.address.size * reference
+        out["sensor"], out["marker"] = antenna[rows.robot], devices.place[device]
+        out["alternative"] = devices.place[reference]
+        out["value"][:, 0] = value / scale[rows.robot]
+        described = np.square(sigma[rows.robot, is_difference.astype(np.int64)])
+        noise = np.where(rows.variance == 0.0, described, rows.variance) / np.square(scale[rows.robot])
+        out["covariance"] = np.eye(3)
+        out["covariance"][:, 0, 0] = noise + devices.variance[reference]
+        return Measured(out, rows.arrival_ns)
+
+    def _usable(
+        rows: RangeRows, device: IntArray, reference: IntArray
+    ) -> tuple[RangeRows, IntArray, IntArray]:
+        own, is_difference = own_address[rows.robot], rows.reference > 0
+        on_robots = (devices.robot[device] >= 0) & (devices.robot[reference] >= 0)
+        reasons: dict[str, BoolArray] = {
+            "no_uwb": own == 0,
+            "uwb_own_address": (rows.device == own) | (is_difference & (rows.reference == own)),
+            "uwb_unknown_address": (device == 0) | (is_difference & (reference == 0)),
+            "uwb_equal_addresses": rows.device == rows.reference,
+            "uwb_two_robots": is_difference & on_robots,
+            "uwb_negative_range": ~is_difference & (rows.range < 0.0),
+            "bad_covariance": rows.variance < 0.0,
+        }
+        usable = np.ones(rows.robot.size, dtype=bool)
+        for reason, wrong in reasons.items():
+            drops.add(reason, rows.robot[usable & wrong])
+            usable &= ~wrong
+        return chosen(rows, usable), device[usable], reference[usable]
+
+    return convert
+
+
+def _has_radio(robot: Robot) -> bool:
+    return robot.uwb is not None
+
+
+_OWN = InputKind(
+    "ranges", "ranges", MESSAGE_TYPE, lambda n, _: EachReader(n, decode_ranges), _columns, _has_radio
+)
+RANGES = Sensor("ranges", NO_RANGES, (_OWN,), _create_converter)
+"""The sensor, see `registry.SENSORS`."""

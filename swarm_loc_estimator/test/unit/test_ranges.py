@@ -1,0 +1,381 @@
+"""UWB ranges: bytes to measurements, laws of the models, unknown starts, links that contradict."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from core_geometry import nees, wrapped
+from core_messages import SECOND, T0
+from core_run import on_time, play, ticks
+from core_world import Plan, World, simulate
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.cdr import encode
+from swarm_loc_estimator.common.messages.definitions import RANGES as MESSAGE_TYPE
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MODELS, MeasurementArray
+from swarm_loc_estimator.precompile import size_of
+from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.ranges import RANGE, RANGE_DIFFERENCE
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
+from swarm_loc_estimator.timeline.scheduling import Policy
+from swarm_loc_estimator.timeline.settings import Settings
+
+DOC = Path(__file__).parents[2] / "doc" / "uwb.md"
+SIGMA = 0.02
+SQUARE = ((-1.5, -1.5, 0.8), (1.5, -1.5, 1.0), (1.5, 1.5, 0.8), (-1.5, 1.5, 1.0))
+LINE = ((-1.5, -1.5, 0.8), (0.0, -1.5, 0.8), (1.5, -1.5, 0.8))
+HUGE = 2**64 - 1
+
+
+def device(index: int) -> UwbDevice:
+    """The radio of a robot: off the centre of its base."""
+    return UwbDevice(index + 1, x=0.02, y=-0.03, z=0.1, range_sigma=SIGMA, difference_sigma=1.5 * SIGMA)
+
+
+def world_of(seed: int, places: Sequence[tuple[float, float, float]] = SQUARE, **plan: Any) -> World:
+    """Robots with radios that see nothing, and anchors."""
+    world = simulate(Plan(reach=0.0, **plan), seed)
+    robots = (replace(one, camera=None, uwb=device(k)) for k, one in enumerate(world.swarm.robots))
+    anchors = tuple(Anchor(100 + k, *place) for k, place in enumerate(places))
+    return replace(world, swarm=Swarm(tuple(robots), (), anchors))
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A range or a difference, as the radio of a robot gives it."""
+
+    robot: int
+    stamp_ns: int
+    device: int
+    range: float
+    reference: int = 0
+    variance: float = 0.0
+
+    def data(self) -> bytes:
+        """The message."""
+        one = {name: getattr(self, name) for name in ("device", "reference", "range", "variance")}
+        return encode({"header": {"stamp": self.stamp_ns}, "ranges": [one]}, MESSAGE_TYPE)
+
+
+def antenna(world: World, step: int, address: int) -> FloatArray:
+    """True place (3,) of an antenna."""
+    for anchor in world.swarm.anchors:
+        if anchor.address == address:
+            return np.array([anchor.x, anchor.y, anchor.z])
+    radio = device(address - 1)
+    x, y, _ = se2.compose(world.truth[step, address - 1], [radio.x, radio.y, 0.0])
+    return np.array([x, y, radio.z])
+
+
+def ranges_of(world: World, seed: int, *, between: bool = False, differences: bool = False) -> list[Measured]:
+    """Each link five times a second, one after the other."""
+    rng, found = np.random.default_rng([seed, 7]), []
+    anchors = [one.address for one in world.swarm.anchors]
+    links = [(robot, to) for robot in range(len(world.swarm.robots)) for to in anchors]
+    if between:
+        links += [(k, other + 1) for k in range(len(world.swarm.robots)) for other in range(k)]
+    for number, (robot, to) in enumerate(links):
+        for step in range(1 + number % 4, world.stamp_ns.size, 4):
+            own, reference = antenna(world, step, robot + 1), anchors[0] if differences else 0
+            value = float(np.linalg.norm(antenna(world, step, to) - own))
+            if reference == to:
+                continue
+            if reference:
+                value -= float(np.linalg.norm(antenna(world, step, reference) - own))
+            noise = (1.5 if reference else 1.0) * SIGMA * rng.standard_normal()
+            found.append(Measured(robot, int(world.stamp_ns[step]), to, value + noise, reference))
+    return sorted(found, key=lambda one: one.stamp_ns)
+
+
+IN_ORDER = Settings(fusion_period_s=0.0)
+TOGETHER = Settings(fusion_period_s=0.2, policy=Policy(large_from=1, batch_from=2))
+SPARSE = Settings(fusion_period_s=0.2, sparse_from=2)
+ALL = pytest.mark.parametrize("settings", [IN_ORDER, TOGETHER, SPARSE], ids=["order", "batch", "sparse"])
+
+
+def run(
+    world: World, measured: Sequence[Measured], settings: Settings = IN_ORDER, late_s: float = 0.0
+) -> tuple[Estimator, list[Estimate]]:
+    """A world whose ranges come as bytes, late by up to so much."""
+    rng, estimator, ingest = np.random.default_rng(0), Estimator(world.swarm, settings), Ingest(world.swarm)
+    arrivals = [(one.stamp_ns + int(rng.uniform(0.0, late_s) * SECOND), one) for one in measured]
+    arrivals.sort(key=lambda pair: pair[0])
+    handle = [ingest.handle_of[f"{robot.name}/ranges"] for robot in world.swarm.robots]
+    estimates, begin_ns, events = [], T0 - 1, on_time(world)
+    for now_ns in ticks(T0, int(world.stamp_ns[-1]) + int(late_s * SECOND), 0.25):
+        new = [(t, one) for t, one in arrivals if begin_ns < t <= now_ns]
+        messages = [SerializedMessage(handle[one.robot], one.data(), t) for t, one in new]
+        if messages:
+            for part in ingest.read(MessageBatch.of(messages)):
+                estimator.receive(part)
+        estimates += play(estimator, [(t, e) for t, e in events if begin_ns < t <= now_ns], [now_ns])
+        begin_ns = now_ns
+    return estimator, estimates
+
+
+def errors(world: World, estimates: Sequence[Estimate]) -> FloatArray:
+    """Errors (T, N, 3) at the ticks of the world; NaN where not located."""
+    return wrapped(np.array([e.poses - world.at(e.stamp_ns) for e in estimates]))
+
+
+# --- bytes to measurements
+
+
+def converted(swarm: Swarm, *measured: Measured) -> tuple[MeasurementArray, dict[str, int]]:
+    """Measurements of messages, and what was dropped."""
+    ingest, estimator = Ingest(swarm), Estimator(swarm)
+    handle = [ingest.handle_of[f"{robot.name}/ranges"] for robot in swarm.robots]
+    batch = MessageBatch.of([SerializedMessage(handle[one.robot], one.data(), T0) for one in measured])
+    (part,) = ingest.read(batch)
+    return estimator.convert(part).measurements, estimator.drops
+
+
+TWO = Swarm(
+    (Robot("a", uwb=device(0)), Robot("b", uwb=device(1)), Robot("c")),
+    anchors=(Anchor(100, 1.0, 2.0, 0.5), Anchor(HUGE, -1.0, 2.0, 0.5, range_bias=0.3)),
+)
+
+
+@pytest.mark.parametrize(
+    ("one", "reason"),
+    [
+        (Measured(0, T0, 7, 1.0), "uwb_unknown_address"),
+        (Measured(0, T0, 0, 1.0), "uwb_unknown_address"),
+        (Measured(0, T0, 100, 1.0, reference=7), "uwb_unknown_address"),
+        (Measured(0, T0, 1, 1.0), "uwb_own_address"),
+        (Measured(0, T0, 100, 1.0, reference=1), "uwb_own_address"),
+        (Measured(0, T0, 100, 1.0, reference=100), "uwb_equal_addresses"),
+        (Measured(2, T0, 100, 1.0), "no_uwb"),
+        (Measured(0, T0, 100, -0.1), "uwb_negative_range"),
+        (Measured(0, T0, 100, np.nan), "non_finite"),
+        (Measured(0, T0, 100, np.inf), "non_finite"),
+        (Measured(0, T0, 100, 1e7), "absurd"),
+        (Measured(0, T0, 100, 1.0, variance=-1.0), "bad_covariance"),
+        (Measured(0, T0, 100, 1.0, variance=np.nan), "bad_covariance"),
+        (Measured(0, T0, 100, 1.0, variance=np.inf), "bad_covariance"),
+    ],
+)
+def test_a_useless_range_is_dropped_and_counted_by_its_reason(one: Measured, reason: str) -> None:
+    found, drops = converted(TWO, one, Measured(1, T0, 100, 2.0))
+    assert drops == {reason: 1}
+    assert found["value"][:, 0].tolist() == [2.0]
+
+
+def test_a_difference_of_two_robots_is_dropped_as_three_poses_would_be_in_it() -> None:
+    swarm = replace(TWO, robots=(*TWO.robots[:2], Robot("c", uwb=device(2))))
+    assert converted(swarm, Measured(0, T0, 2, 0.1, reference=3))[1] == {"uwb_two_robots": 1}
+
+
+def test_biases_and_scale_are_taken_out_and_the_variance_is_of_the_true_range() -> None:
+    radio = replace(device(0), range_bias=0.1, range_scale=1.25)
+    swarm = replace(TWO, robots=(Robot("a", uwb=radio), *TWO.robots[1:]))
+    measured = Measured(0, T0, HUGE, 2.9), Measured(0, T0, HUGE, 0.8, reference=100, variance=0.01)
+    found, _ = converted(swarm, *measured)
+    np.testing.assert_allclose(found["value"][:, 0], [(2.9 - 0.3 - 0.1) / 1.25, (0.8 - 0.3) / 1.25])
+    np.testing.assert_allclose(found["covariance"][:, 0, 0], [(SIGMA / 1.25) ** 2, 0.01 / 1.25**2])
+
+
+def test_a_reference_on_a_robot_changes_places_with_the_anchor() -> None:
+    found, _ = converted(TWO, Measured(0, T0, 100, 0.5, reference=2), Measured(0, T0, 2, -0.5, reference=100))
+    assert found[0] == found[1]
+    assert found["target"].tolist() == [1, 1]
+
+
+def test_malformed_messages_are_counted() -> None:
+    ingest = Ingest(TWO)
+    good, handle = Measured(0, T0, 100, 1.0).data(), ingest.handle_of["a/ranges"]
+    batch = MessageBatch.of([SerializedMessage(handle, data, T0) for data in (good[:-9], good)])
+    (part,) = ingest.read(batch)
+    assert part.dropped == {"bad_message": 1}
+    assert part.rows["ranges"].device.tolist() == [100]
+
+
+def test_a_node_of_robots_with_radios_compiles_what_fuses_their_ranges() -> None:
+    assert [size_of(swarm, Settings()) for swarm in (TWO, Swarm((Robot("a"),)))] == ["large", "small"]
+
+
+# --- laws of the models
+
+POSES = st.tuples(*[st.floats(-5.0, 5.0)] * 2, st.floats(-3.0, 3.0)).map(np.array)
+
+
+def between_robots(kind: int, observer: int = 0, target: int = 1) -> MeasurementArray:
+    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+    one["kind"], one["observer"], one["target"] = kind, observer, target
+    one["sensor"], one["marker"] = (0.1, -0.2, 0.3), (-0.3, 0.1, 0.5)
+    return one
+
+
+@given(POSES, POSES)
+def test_a_range_is_the_same_from_both_ends(a: FloatArray, b: FloatArray) -> None:
+    one, back = between_robots(RANGE.number), between_robots(RANGE.number)
+    back["sensor"], back["marker"] = one["marker"], one["sensor"]
+    there, here = RANGE.predict(one, a, b), RANGE.predict(back, b, a)
+    np.testing.assert_allclose(there.value, here.value, atol=1e-12)
+    np.testing.assert_allclose(there.observer_jacobian, here.target_jacobian, atol=1e-9)
+
+
+@pytest.mark.parametrize("number", [RANGE.number, RANGE_DIFFERENCE.number])
+@given(POSES, POSES, POSES)
+def test_moving_the_map_changes_no_value(number: int, move: FloatArray, a: FloatArray, b: FloatArray) -> None:
+    one, moved = between_robots(number), between_robots(number)
+    one["alternative"] = (1.0, 2.0, 0.7)
+    moved["alternative"][0, :2], moved["alternative"][0, 2] = se2.transform_points(move, [1.0, 2.0]), 0.7
+    value = MODELS[number].predict(one, a, b).value
+    again = MODELS[number].predict(moved, se2.compose(move, a), se2.compose(move, b)).value
+    np.testing.assert_allclose(again, value, atol=1e-9)
+
+
+def test_a_common_move_of_both_robots_changes_no_range() -> None:
+    one = between_robots(RANGE.number)
+    found = RANGE.predict(one, np.array([1.0, 2.0, 0.3]), np.array([-2.0, 0.5, 1.0]))
+    np.testing.assert_allclose(found.observer_jacobian + found.target_jacobian, 0.0, atol=1e-12)
+
+
+def test_antennas_at_one_place_have_a_finite_model() -> None:
+    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
+    one["kind"], one["target"] = RANGE.number, 1
+    for model in (RANGE, RANGE_DIFFERENCE):
+        for part in model.predict(one, np.zeros(3), np.zeros(3)):
+            assert np.isfinite(part).all()
+            np.testing.assert_array_equal(part, 0.0)
+
+
+# --- estimates
+
+
+@ALL
+@pytest.mark.parametrize("differences", [False, True], ids=["ranges", "differences"])
+def test_errors_are_as_large_as_the_covariances_say(settings: Settings, differences: bool) -> None:
+    squared, distance = [], []
+    for seed in range(3):
+        world = world_of(seed, robots=3, duration_s=10.0)
+        measured = ranges_of(world, seed, between=not differences, differences=differences)
+        _, estimates = run(world, measured, settings)
+        error = errors(world, estimates)[12:]
+        covariance = np.array([one.covariances for one in estimates])[12:]
+        squared.append(nees(error, covariance).mean(axis=0))
+        distance.append(np.square(error[..., :2]).sum(axis=-1).mean())
+    assert 1.0 < np.mean(squared) < 6.0
+    assert np.sqrt(np.mean(distance)) < 0.03
+
+
+def test_robots_without_a_start_are_located_in_any_order_of_arrival() -> None:
+    world = world_of(11, robots=2, duration_s=8.0, start_known=(False,))
+    measured = ranges_of(world, 11, between=True)
+    estimator, estimates = run(world, measured)
+    assert estimates[0].status.tolist() == [Status.WAITING] * 2
+    assert estimates[-1].status.tolist() == [Status.TRACKED] * 2
+    error = errors(world, estimates)
+    assert np.nanmax(np.hypot(error[..., 0], error[..., 1])) < 0.3
+    assert np.hypot(*error[-1, :, :2].T).max() < 0.05
+    assert estimator.counters["constraints kept"] > 20
+    late = run(world, measured, late_s=1.5)[1][-1]
+    np.testing.assert_allclose(late.poses, run(world, measured, late_s=1e-9)[1][-1].poses, atol=0.05)
+    again = run(world, list(reversed(measured)), late_s=1.5)[1][-1]
+    np.testing.assert_allclose(again.poses, late.poses, atol=1e-9)
+
+
+def straight(world: World, until_s: float) -> World:
+    """The world until its robot turns: a part of its run is a line along x."""
+    steps = round(until_s / 0.05)
+    truth, events = world.truth.copy(), []
+    for k in range(steps + 1):
+        truth[k, :, 0], truth[k, :, 1:] = -0.6 + 0.2 * 0.05 * k, (0.1, 0.0)
+    for event in world.events:
+        k = round((event.stamp_ns - T0) / (0.05 * SECOND))
+        pose = event.pose
+        if k <= steps:
+            pose = (0.2 * 0.05 * k, 0.0, 0.0)
+        elif pose is not None:
+            turn = 0.5 * 0.05 * (k - steps)
+            at = 0.2 * 0.05 * steps + 0.4 * np.sin(turn), 0.4 * (1.0 - np.cos(turn)), turn
+            pose, truth[k, 0] = at, (-0.6 + at[0], 0.1 + at[1], at[2])
+        events.append(replace(event, pose=pose))
+    return replace(world, truth=truth, events=tuple(events))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_mirror_image_beside_a_line_of_anchors_stays_open_until_the_robot_turns(seed: int) -> None:
+    world = straight(world_of(seed, LINE, robots=1, duration_s=12.0, start_known=(False,), noise=0.0), 5.0)
+    _, estimates = run(world, ranges_of(world, seed))
+    time_s = np.array([(one.stamp_ns - T0) / SECOND for one in estimates])
+    located = np.array([one.status[0] != Status.WAITING for one in estimates])
+    assert not located[time_s < 5.0].any()
+    assert located[-1]
+    error = errors(world, estimates)[located, 0]
+    assert np.hypot(error[:, 0], error[:, 1]).max() < 0.3
+
+
+def test_one_anchor_locates_nobody() -> None:
+    world = world_of(5, SQUARE[:1], robots=1, duration_s=10.0, start_known=(False,))
+    _, estimates = run(world, ranges_of(world, 5))
+    assert all(one.status[0] == Status.WAITING for one in estimates)
+
+
+@ALL
+def test_a_link_that_is_too_long_for_seconds_is_named_and_the_pose_stays_right(settings: Settings) -> None:
+    world = world_of(20, robots=2, duration_s=10.0)
+    begin_ns, end_ns = T0 + 3 * SECOND, T0 + 7 * SECOND
+    measured = [
+        replace(one, range=one.range + 0.5)
+        if one.robot == 0 and one.device == 101 and begin_ns < one.stamp_ns < end_ns
+        else one
+        for one in ranges_of(world, 20)
+    ]
+    until = [one for one in measured if one.stamp_ns < end_ns]
+    estimator, _ = run(world, until, settings)
+    (named,) = estimator.contradictions(end_ns)
+    assert named.text == "excluding robot_0's measurements of anchor 101: inconsistent with all others"
+    estimator, estimates = run(world, measured, settings)
+    assert estimator.contradictions(int(world.stamp_ns[-1])) == []
+    assert (np.array([one.status for one in estimates[4:]]) == Status.TRACKED).all()
+    error = errors(world, estimates)[4:]
+    assert np.hypot(error[..., 0], error[..., 1]).max() < 0.1
+
+
+@ALL
+def test_scattered_outliers_exclude_no_link(settings: Settings) -> None:
+    world, rng = world_of(21, robots=2, duration_s=10.0), np.random.default_rng(3)
+    measured = [
+        replace(one, range=one.range + (1.0 if rng.uniform() < 0.1 else 0.0)) for one in ranges_of(world, 21)
+    ]
+    estimator, _ = run(world, measured, replace(settings, horizon_s=60.0))
+    _, verdicts, _ = estimator.recent()
+    assert np.mean(verdicts == 2) == pytest.approx(0.1, rel=0.3)
+
+
+def test_a_bias_that_the_description_lacks_loses_no_robot() -> None:
+    world = world_of(22, robots=2, duration_s=10.0)
+    biased = [replace(one, range=one.range + 1.2 * SIGMA) for one in ranges_of(world, 22)]
+    estimator, estimates = run(world, biased)
+    links = len(world.swarm.robots) * len(world.swarm.anchors)
+    assert len(estimator.contradictions(int(world.stamp_ns[-1]))) < links / 2
+    assert (np.array([one.status for one in estimates[4:]]) != Status.WAITING).all()
+    error = errors(world, estimates)[4:]
+    assert np.hypot(error[..., 0], error[..., 1]).max() < 5.0 * SIGMA
+
+
+@ALL
+def test_an_anchor_with_an_inexact_survey_is_estimated(settings: Settings) -> None:
+    world = world_of(30, robots=3, duration_s=15.0)
+    measured = ranges_of(world, 30)
+    first = world.swarm.anchors[0]
+    moved = replace(first, x=first.x + 0.12, y=first.y - 0.08, position_sigma=0.1)
+    surveyed = replace(world, swarm=replace(world.swarm, anchors=(moved, *world.swarm.anchors[1:])))
+    estimator, _ = run(surveyed, measured, settings)
+    learned = estimator.learned().anchors
+    assert np.hypot(learned[0].x - first.x, learned[0].y - first.y) < 0.04
+    assert learned[0].position_sigma < 0.05
+    assert learned[1:] == world.swarm.anchors[1:]
