@@ -11,12 +11,13 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 
-from bench.inputs import apriltag_msgs, families, imu, mocap, no_map, overhead
+from bench.inputs import apriltag_msgs, families, imu, mocap, no_map, overhead, uwb
 from bench.shared.common import ProgressLine, table, write_figures
 
 PARTS: Mapping[str, Callable[[Sequence[int], ProgressLine], Mapping[str, float]]] = {
     "overhead": overhead.measure,
     "mocap": mocap.measure,
+    "uwb": uwb.measure,
     "apriltag_msgs": apriltag_msgs.measure,
     "families": families.measure,
     "imu": imu.measure,

@@ -1,0 +1,358 @@
+"""Simulated robots with UWB radios, their messages, and the posterior Cramer-Rao bound of their positions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.messages.cdr import encode
+from swarm_loc_estimator.common.messages.definitions import RANGES
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.poses import encode_odometry
+from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, StartSigma, Swarm
+from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
+from swarm_loc_estimator.timeline.contradictions import Contradiction
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
+
+STEP_NS = 50_000_000
+START_NS = 1_000_000_000_000
+_STEPS_PER_RANGE = 4  # of one link: five a second
+TICK_STEPS = 2
+LATE_NS = (150_000_000, 300_000_000)
+_SPEED, _TURN_RATE, _ARENA_M = 0.3, 1.0, 3.0
+_ANCHORS = ((-4.0, -4.0, 2.0), (4.0, -4.0, 2.4), (4.0, 4.0, 2.0), (-4.0, 4.0, 2.4))
+_ANTENNA_Z = 0.3
+_ODOMETRY = OdometryModel(wheel_separation=0.15, wheel_noise=2e-5)
+_START_SIGMA = StartSigma(0.05, 0.05, 0.05)
+_NLOS_M, _NLOS_S = (0.3, 2.0), (1.0, 4.0)
+_FIRST_ANCHOR = 100
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to simulate.
+
+    Attributes:
+        robots: N.
+        anchors: Number of anchors.
+        duration_s: [s].
+        between_robots: Whether robots measure each other, too.
+        known_starts: Number of robots with a start, the first ones.
+        nlos: Share of ranges that are too long, for seconds per link.
+        sigma: Noise of a range [m].
+    """
+
+    robots: int = 3
+    anchors: int = 4
+    duration_s: float = 60.0
+    between_robots: bool = False
+    known_starts: int = 99
+    nlos: float = 0.0
+    sigma: float = 0.05
+
+
+class Ranges(NamedTuple):
+    """Ranges (k,) in order of their stamps.
+
+    Attributes:
+        step: (k,) number of the step of the truth at which it was measured.
+        robot: (k,) who measured.
+        device: (k,) the other robot, or N plus the index of the anchor.
+        range: (k,) [m].
+        arrival_ns: (k,).
+    """
+
+    step: IntArray
+    robot: IntArray
+    device: IntArray
+    range: FloatArray
+    arrival_ns: IntArray
+
+
+@dataclass(frozen=True)
+class UwbWorld:
+    """A simulated run.
+
+    Attributes:
+        plan: What was simulated.
+        swarm: Its description.
+        truth: (T, N, 3) at every step.
+        odometry: (T, N, 3) as reported.
+        ranges: All ranges.
+    """
+
+    plan: Plan
+    swarm: Swarm
+    truth: FloatArray
+    odometry: FloatArray
+    ranges: Ranges
+
+    @property
+    def tick_steps(self) -> IntArray:
+        """Steps (K,) at which the estimator ticks."""
+        return np.arange(TICK_STEPS, len(self.truth), TICK_STEPS)
+
+    @property
+    def antenna_z(self) -> float:
+        """Height of the robots' antennas [m]."""
+        return _ANTENNA_Z
+
+    def anchor_places(self) -> FloatArray:
+        """Antennas (A, 3) of the anchors."""
+        return np.array([(one.x, one.y, one.z) for one in self.swarm.anchors]).reshape(-1, 3)
+
+
+def simulate(plan: Plan, seed: int) -> UwbWorld:
+    """Robots that drive arcs within a square, the anchors in its corners."""
+    rng = np.random.default_rng(seed)
+    steps, n = round(plan.duration_s * 1e9 / STEP_NS), plan.robots
+    truth, odometry = np.zeros((2, steps + 1, n, 3))
+    truth[0, :, :2] = rng.uniform(-0.6, 0.6, (n, 2)) * _ARENA_M
+    truth[0, :, 2] = rng.uniform(-math.pi, math.pi, n)
+    odometry[0] = rng.uniform(-1.0, 1.0, (n, 3))
+    rate = np.zeros(n)
+    for k in range(steps):
+        if k % 30 == 0:
+            rate = rng.uniform(-_TURN_RATE, _TURN_RATE, n)
+        path, turn = _commanded(truth[k], rate)
+        wheels = np.abs([path + 0.5 * turn * _ODOMETRY.wheel_separation, path - 0.5 * turn * 0.15])
+        slip = np.sqrt(_ODOMETRY.wheel_noise * wheels) * rng.standard_normal((2, n))
+        odometry[k + 1] = _arc(odometry[k], path, turn)
+        slipped = turn + (slip[0] - slip[1]) / _ODOMETRY.wheel_separation
+        truth[k + 1] = _arc(truth[k], path + slip.mean(axis=0), slipped)
+    sigma = np.array([_START_SIGMA.x, _START_SIGMA.y, _START_SIGMA.theta])
+    start = truth[0] + sigma * rng.standard_normal((n, 3))
+    swarm = Swarm(
+        tuple(
+            Robot(
+                f"robot_{k}",
+                odometry=_ODOMETRY,
+                camera=None,
+                start=(float(x), float(y), float(theta)) if k < plan.known_starts else None,
+                start_sigma=_START_SIGMA,
+                uwb=UwbDevice(k + 1, z=_ANTENNA_Z, range_sigma=plan.sigma),
+            )
+            for k, (x, y, theta) in enumerate(start)
+        ),
+        anchors=tuple(Anchor(_FIRST_ANCHOR + k, *_ANCHORS[k]) for k in range(plan.anchors)),
+    )
+    world = UwbWorld(plan, swarm, truth, odometry, Ranges(*np.zeros((5, 0))))
+    return UwbWorld(plan, swarm, truth, odometry, _measured(world, rng))
+
+
+def _commanded(pose: FloatArray, rate: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Path and turn (N,) of a step: arcs at random rates, and back to the middle from outside."""
+    away = np.arctan2(-pose[:, 1], -pose[:, 0]) - pose[:, 2]
+    away = np.arctan2(np.sin(away), np.cos(away))
+    out = np.abs(pose[:, :2]).max(axis=1) > 0.8 * _ARENA_M
+    rate = np.where(out, np.clip(2.0 * away, -1.5, 1.5), rate)
+    return np.full(len(pose), _SPEED * STEP_NS * 1e-9), rate * STEP_NS * 1e-9
+
+
+def _arc(pose: FloatArray, path: FloatArray, turn: FloatArray) -> FloatArray:
+    """Poses (N, 3) after arcs."""
+    half = 0.5 * turn
+    chord, heading = path * np.sinc(half / np.pi), pose[:, 2] + half
+    moved = [pose[:, 0] + chord * np.cos(heading), pose[:, 1] + chord * np.sin(heading), pose[:, 2] + turn]
+    return np.stack(moved, axis=1)
+
+
+def antenna(world: UwbWorld, step: int, device: int) -> FloatArray:
+    """True place (3,) of the antenna of a robot, or of an anchor as N plus its index."""
+    if device >= world.plan.robots:
+        place: FloatArray = world.anchor_places()[device - world.plan.robots]
+        return place
+    return np.array([*world.truth[step, device, :2], _ANTENNA_Z])
+
+
+def _measured(world: UwbWorld, rng: np.random.Generator) -> Ranges:
+    """Each link five times a second, one after the other."""
+    plan, n = world.plan, world.plan.robots
+    links = [(robot, n + k) for robot in range(n) for k in range(plan.anchors)]
+    if plan.between_robots:
+        links += [(robot, other) for robot in range(n) for other in range(robot)]
+    rows: list[tuple[int, int, int, float, int]] = []
+    for number, (robot, device) in enumerate(links):
+        steps = np.arange(1 + number % _STEPS_PER_RANGE, len(world.truth), _STEPS_PER_RANGE)
+        bias = _nlos(plan, steps, rng)
+        for step, more in zip(steps.tolist(), bias.tolist(), strict=True):
+            away = antenna(world, step, device) - antenna(world, step, robot)
+            distance = float(np.linalg.norm(away)) + plan.sigma * rng.standard_normal() + more
+            late_ns = int(rng.uniform(*LATE_NS))
+            rows.append((step, robot, device, distance, START_NS + step * STEP_NS + late_ns))
+    columns = zip(*sorted(rows), strict=True)
+    return Ranges(*(np.array(column) for column in columns))
+
+
+def _nlos(plan: Plan, steps: IntArray, rng: np.random.Generator) -> FloatArray:
+    """How much too long the ranges (k,) of a link are: in bursts, one error each."""
+    bias, step_s = np.zeros(steps.size), _STEPS_PER_RANGE * STEP_NS * 1e-9
+    while np.mean(bias > 0.0) < plan.nlos:
+        begin = int(rng.integers(steps.size))
+        bias[begin : begin + round(rng.uniform(*_NLOS_S) / step_s)] = rng.uniform(*_NLOS_M)
+    return bias
+
+
+def messages(world: UwbWorld, ingest: Ingest) -> list[SerializedMessage]:
+    """All messages in order of arrival; odometry arrives at its stamp."""
+    out, unknown = [], np.zeros((6, 6))
+    stamps = START_NS + STEP_NS * np.arange(len(world.truth))
+    for k, robot in enumerate(world.swarm.robots):
+        twist = np.full((len(stamps), 3), np.nan)
+        data = encode_odometry("odom", "base", stamps, world.odometry[:, k], twist, unknown, unknown)
+        handle = ingest.handle_of[f"{robot.name}/odom"]
+        out += [SerializedMessage(handle, *one) for one in zip(data, stamps.tolist(), strict=True)]
+    addresses = [r.uwb.address for r in world.swarm.robots if r.uwb] + [
+        a.address for a in world.swarm.anchors
+    ]
+    for step, robot, device, distance, arrival_ns in zip(*world.ranges, strict=True):
+        header = {"stamp": int(START_NS + step * STEP_NS)}
+        one = {"device": addresses[int(device)], "range": float(distance)}
+        handle = ingest.handle_of[f"{world.swarm.robots[int(robot)].name}/ranges"]
+        data_of = encode({"header": header, "ranges": [one]}, RANGES)
+        out.append(SerializedMessage(handle, data_of, int(arrival_ns)))
+    return sorted(out, key=lambda message: message[2])
+
+
+class UwbResult(NamedTuple):
+    """Estimates at the ticks.
+
+    Attributes:
+        error: (K, N, 3) NaN where not located.
+        covariance: (K, N, 3, 3).
+        status: (K, N) of `Status`.
+        named: Contradictions that were reported, by their text.
+    """
+
+    error: FloatArray
+    covariance: FloatArray
+    status: IntArray
+    named: frozenset[str]
+
+
+def run(world: UwbWorld) -> UwbResult:
+    """Give the bytes of all messages to the estimator, as a node does."""
+    ingest, estimator = Ingest(world.swarm), Estimator(world.swarm)
+    waiting, begin = messages(world, ingest), 0
+    estimates: list[Estimate] = []
+    named: set[Contradiction] = set()
+    for step in world.tick_steps.tolist():
+        now_ns, end = START_NS + step * STEP_NS, begin
+        while end < len(waiting) and waiting[end][2] <= now_ns:
+            end += 1
+        for batch in ingest.read(MessageBatch.of(waiting[begin:end])):
+            estimator.receive(batch)
+        begin = end
+        estimates.append(estimator.tick(now_ns))
+        named.update(estimator.contradictions(now_ns))
+    error = np.array([one.poses for one in estimates]) - world.truth[world.tick_steps]
+    error[..., 2] = np.arctan2(np.sin(error[..., 2]), np.cos(error[..., 2]))
+    covariance = np.array([one.covariances for one in estimates])
+    status = np.array([one.status for one in estimates])
+    return UwbResult(error, covariance, status, frozenset(one.text for one in named))
+
+
+def _step_noise(world: UwbWorld, robot: int, step: int, course: float) -> FloatArray:
+    """Covariance (3, 3) of x, y, heading of a step in a direction [rad]."""
+    move = world.odometry[step + 1, robot] - world.odometry[step, robot]
+    path, half = math.hypot(move[0], move[1]), 0.5 * _ODOMETRY.wheel_separation * move[2]
+    wheels = np.diag(_ODOMETRY.wheel_noise * np.abs([path + half, path - half]))
+    cos, sin = math.cos(course), math.sin(course)
+    moved = np.array([[cos, -0.5 * path * sin], [sin, 0.5 * path * cos], [0.0, 1.0]])
+    moved = moved @ [[0.5, 0.5], [1.0 / _ODOMETRY.wheel_separation, -1.0 / _ODOMETRY.wheel_separation]]
+    covariance: FloatArray = moved @ wheels @ moved.T
+    return covariance
+
+
+def motion_noise(world: UwbWorld, robot: int, first: int, last: int) -> FloatArray:
+    """Covariance (3, 3) of the reported motion between two steps, in the frame of its end, as in gtsam."""
+    out, report = 1e-11 * np.eye(3), world.odometry[:, robot]
+    for step in range(first, last):
+        move = report[step + 1] - report[step]
+        noise = _step_noise(world, robot, step, math.atan2(move[1], move[0]) - report[step, 2])
+        noise = _rotated(noise, report[step, 2] - report[step + 1, 2])
+        later = se2.adjoint(se2.inverse(se2.between(report[step], report[step + 1])))
+        out = later @ out @ later.T + noise
+    return out
+
+
+def _rotated(covariance: FloatArray, angle: float) -> FloatArray:
+    cos, sin = math.cos(angle), math.sin(angle)
+    turn = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+    rotated: FloatArray = turn @ covariance @ turn.T
+    return rotated
+
+
+class _Bound:
+    """Covariance (3N, 3N) of x, y, heading of all robots along their true trajectories."""
+
+    def __init__(self, world: UwbWorld) -> None:
+        self._world = world
+        sigma = [_START_SIGMA.x, _START_SIGMA.y, _START_SIGMA.theta]
+        self.covariance = np.diag(np.tile(np.square(sigma), world.plan.robots))
+
+    def copy(self) -> _Bound:
+        """An independent copy."""
+        other = _Bound(self._world)
+        other.covariance = self.covariance.copy()
+        return other
+
+    def move(self, step: int) -> None:
+        """Predict from a step to the next one."""
+        count = self._world.plan.robots
+        transition, noise = np.eye(3 * count), np.zeros((3 * count, 3 * count))
+        for robot in range(count):
+            (dx, dy) = self._world.truth[step + 1, robot, :2] - self._world.truth[step, robot, :2]
+            own = slice(3 * robot, 3 * robot + 3)
+            transition[own, own][:2, 2] = -dy, dx
+            noise[own, own] = _step_noise(self._world, robot, step, math.atan2(dy, dx))
+        self.covariance = transition @ self.covariance @ transition.T + noise
+
+    def measure(self, step: int, robot: int, device: int) -> None:
+        """Update with a range."""
+        away = antenna(self._world, step, device) - antenna(self._world, step, robot)
+        direction = away[:2] / np.linalg.norm(away)
+        row = np.zeros(len(self.covariance))
+        row[3 * robot : 3 * robot + 2] = -direction
+        if device < self._world.plan.robots:
+            row[3 * device : 3 * device + 2] = direction
+        gain = self.covariance @ row
+        self.covariance -= np.outer(gain, gain) / (row @ gain + self._world.plan.sigma**2)
+
+
+def bounds(world: UwbWorld) -> FloatArray:
+    """Variances (K, N) of x plus y at the ticks, of what has arrived by then: no estimator can do better."""
+    ranges, out = world.ranges, []
+    first = np.searchsorted(ranges.step, np.arange(len(world.truth) + 1))
+    certain, at = _Bound(world), 0
+    everything: BoolArray = np.ones(ranges.step.size, dtype=bool)
+    for step in world.tick_steps.tolist():
+        until = max(0, step - LATE_NS[1] // STEP_NS)
+        _advance(certain, ranges, first, at, until, everything)
+        at = until
+        now = certain.copy()
+        _advance(now, ranges, first, at, step, ranges.arrival_ns <= START_NS + step * STEP_NS)
+        variance = np.diag(now.covariance).reshape(-1, 3)
+        out.append(variance[:, 0] + variance[:, 1])
+    return np.array(out)
+
+
+def _advance(bound: _Bound, ranges: Ranges, first: IntArray, begin: int, end: int, used: BoolArray) -> None:
+    """Predict from a step to another, with the ranges that are used."""
+    for step in range(begin, end):
+        bound.move(step)
+        for k in range(int(first[step + 1]), int(first[step + 2])):
+            if used[k]:
+                bound.measure(step + 1, int(ranges.robot[k]), int(ranges.device[k]))
+
+
+def rms(squared: Sequence[FloatArray]) -> float:
+    """Root of the mean over all arrays."""
+    return math.sqrt(float(np.mean(np.concatenate([one.reshape(-1) for one in squared]))))
