@@ -20,11 +20,12 @@ markers_node = Program("swarm_loc_estimator.watch.markers_node")
 play = Program("swarm_loc_estimator.nodes.play_node")
 replay = Program("swarm_loc_estimator.cli.replay")
 replay_map = Program("swarm_loc_estimator.cli.replay_map")
+schema = Program("swarm_loc_estimator.cli.schema")
 survey = Program("swarm_loc_estimator.cli.survey")
 watch = Program("swarm_loc_estimator.cli.watch")
 watch_node = Program("swarm_loc_estimator.watch.watch_node")
 
-WITHOUT_ROS = (calibrate, calibrate_ir, import_droplets, import_mrclam, replay, replay_map, survey)
+WITHOUT_ROS = (calibrate, calibrate_ir, import_droplets, import_mrclam, replay, replay_map, schema, survey)
 
 
 def swarm_loc() -> int:

@@ -79,12 +79,12 @@ if TYPE_CHECKING:
 FILE_VERSION = 1
 
 _SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors")
-_LAYER = (
+LAYER = (
     *("odometry", "imu", "random_walk", "response", "camera", "sensor", "fix", "ir", "uwb", "faces"),
     "start_sigma",
 )
-_DEFAULTS = (*_LAYER, "landmark")
-_ROBOT = ("type", *_LAYER, "ids", "start")
+_DEFAULTS = (*LAYER, "landmark")
+_ROBOT = ("type", *LAYER, "ids", "start")
 MODELS: dict[str, type] = {
     "odometry": OdometryModel,
     "imu": ImuModel,
@@ -94,17 +94,17 @@ MODELS: dict[str, type] = {
     "fix": FixModel,
     "start_sigma": StartSigma,
 }
-_MAY_BE_NONE = ("odometry", "camera")
-_START = {
+MAY_BE_NONE = ("odometry", "camera")
+START = {
     "x": number_specs(Landmark)["x"],
     "y": number_specs(Landmark)["y"],
     "theta": number_specs(CameraMount)["yaw"],
 }
 LANDMARK_DEFAULTS = {name: number_specs(Landmark)[name] for name in ("size", "position_sigma", "yaw_sigma")}
-_RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
-_MAX_ID = 2**32 - 1
-_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-_MAX_NAME = 64
+RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
+MAX_ID = 2**32 - 1
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+MAX_NAME = 64
 """Maximum length of a robot name; DDS limits the length of topic names."""
 RESERVED_NAMES = frozenset(
     [
@@ -190,7 +190,7 @@ class _Loader(TreeChecks):
             raise self.error("fileversion", version, f"must be {FILE_VERSION}")
         defaults = self._layer(sections.get("defaults", {}), "defaults", _DEFAULTS)
         types = {
-            name: self._layer(tree, f"types.{name}", _LAYER)
+            name: self._layer(tree, f"types.{name}", LAYER)
             for name, tree in self._named(sections.get("types", {}), "types")
         }
         named = self._named(sections.get("robots", {}), "robots")
@@ -247,7 +247,7 @@ class _Loader(TreeChecks):
         mapping = self.mapping(tree, key, known)
         sections: dict[str, Values | None] = {
             section: None
-            if mapping[section] is None and section in _MAY_BE_NONE
+            if mapping[section] is None and section in MAY_BE_NONE
             else self.numbers(mapping[section], f"{key}.{section}", number_specs(cls))
             for section, cls in MODELS.items()
             if section in mapping
@@ -287,8 +287,8 @@ class _Loader(TreeChecks):
         """Parse a motion response or null; layers are not merged."""
         if tree is None:
             return None
-        mapping = self.mapping(tree, key, _RESPONSE)
-        for name in _RESPONSE:
+        mapping = self.mapping(tree, key, RESPONSE)
+        for name in RESPONSE:
             if name not in mapping:
                 raise self.said(f"{key} lacks {name}, a list of numbers")
         axes = {
@@ -343,27 +343,27 @@ class _Loader(TreeChecks):
         """Parse a start pose; None if it is unknown."""
         if tree is None:
             return None
-        numbers = self.numbers(tree, key, _START, required=tuple(_START))
+        numbers = self.numbers(tree, key, START, required=tuple(START))
         return (float(numbers["x"] or 0.0), float(numbers["y"] or 0.0), float(numbers["theta"] or 0.0))
 
     def _marker_id(self, value: Tree, key: str) -> int:
         """Parse a marker id."""
-        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= _MAX_ID:
-            raise self.error(key, value, f"must be a marker id, a whole number in [0, {_MAX_ID}]")
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
+            raise self.error(key, value, f"must be a marker id, a whole number in [0, {MAX_ID}]")
         return value
 
     def _named(self, tree: Tree, key: str) -> list[tuple[str, Tree]]:
         """Parse a mapping whose keys are valid names for topics and frames."""
         mapping = self.mapping(tree, key)
         for name in mapping:
-            if not isinstance(name, str) or not _NAME.fullmatch(name):
+            if not isinstance(name, str) or not NAME.fullmatch(name):
                 raise self.error(
                     f"a name in {key}",
                     name,
                     "must be letters, digits and underscores and start with a letter",
                 )
-            if len(name) > _MAX_NAME:
-                raise self.error(f"a name in {key}", name, f"must have at most {_MAX_NAME} characters")
+            if len(name) > MAX_NAME:
+                raise self.error(f"a name in {key}", name, f"must have at most {MAX_NAME} characters")
             if key in ("robots", "cameras") and name in RESERVED_NAMES:
                 rule = ", ".join(sorted(RESERVED_NAMES))
                 rule = f"must be none of {rule}, which topics, nodes and frames have"

@@ -11,6 +11,7 @@ from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.common.yaml_tree import tree_text
 from swarm_loc_estimator.swarm.ir_section import ir_tree
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
+from swarm_loc_estimator.swarm.schema import SCHEMA_COMMENT, SCHEMA_FILE
 from swarm_loc_estimator.swarm.swarm import (
     Face,
     FixedCamera,
@@ -31,6 +32,8 @@ Mapping = dict[Any, Any]
 def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
     """Write a swarm description that `load_swarm` reads back equal.
 
+    Its first line names the JSON Schema if that lies beside it, so that editors complete its keys.
+
     Args:
         swarm: What to write.
         path: The file; replaced when it exists, its folder created when missing.
@@ -42,7 +45,8 @@ def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
     path = Path(path)
     tree = _tree(swarm, path.parent)
     parse_swarm(tree, path)
-    text = "".join(f"# {line}\n" for line in [*comment.splitlines(), *_units()])
+    schema = [SCHEMA_COMMENT] if (path.parent / SCHEMA_FILE).is_file() else []
+    text = "".join(f"# {line}\n" for line in [*schema, *comment.splitlines(), *_units()])
     text += tree_text(tree)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(path.name + ".part")

@@ -55,7 +55,7 @@ class Anchor:
     range_bias: float = number(0.0, "m", -10.0, 10.0, "added to each range to this anchor")
 
 
-_MAX_ADDRESS = 2**64 - 1
+MAX_ADDRESS = 2**64 - 1
 _HEXADECIMAL = re.compile(r"0[xX][0-9A-Fa-f]{1,16}")
 _DEVICE, _ANCHOR = number_specs(UwbDevice), number_specs(Anchor)
 
@@ -92,7 +92,7 @@ def read_anchors(checks: TreeChecks, tree: Tree) -> tuple[Anchor, ...]:
 def _require(checks: TreeChecks, values: Values, key: str, names: Iterable[str]) -> None:
     for name in names:
         if name not in values:
-            rule = f"a whole number in [1, {_MAX_ADDRESS}]" if name == "address" else "a number"
+            rule = f"a whole number in [1, {MAX_ADDRESS}]" if name == "address" else "a number"
             raise checks.said(f"{key} lacks {name}, {rule}")
 
 
@@ -110,6 +110,6 @@ def _read(checks: TreeChecks, mapping: Values, key: str, specs: Mapping[str, Num
 def _address(checks: TreeChecks, value: Tree, key: str) -> int:
     """An address, decimal or hexadecimal with 0x."""
     address = int(value, 16) if isinstance(value, str) and _HEXADECIMAL.fullmatch(value) else value
-    if isinstance(address, bool) or not isinstance(address, int) or not 1 <= address <= _MAX_ADDRESS:
-        raise checks.error(key, value, f"must be a whole number in [1, {_MAX_ADDRESS}]")
+    if isinstance(address, bool) or not isinstance(address, int) or not 1 <= address <= MAX_ADDRESS:
+        raise checks.error(key, value, f"must be a whole number in [1, {MAX_ADDRESS}]")
     return address

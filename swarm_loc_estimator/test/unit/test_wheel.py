@@ -33,7 +33,9 @@ def run(*arguments):
     except SystemExit as end:
         return end.code
 """
-COMMANDS = {"calibrate", "calibrate_ir", "import_droplets", "import_mrclam", "replay", "replay_map", "survey"}
+COMMANDS = {
+    *("calibrate", "calibrate_ir", "import_droplets", "import_mrclam", "replay", "replay_map", "schema", "survey"),
+}
 NODES = {"estimator_node", "localizer_bridge", "mapper_node", "markers_node", "play", "watch_node"}
 STARTERS = {"demo", "graph", "watch"}
 """Commands that start nodes."""
