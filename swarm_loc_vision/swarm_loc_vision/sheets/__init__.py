@@ -1,0 +1,1 @@
+"""Sheets of markers to print in true size."""

@@ -1,0 +1,121 @@
+"""Draw the markers of a swarm description in true size on sheets to print: a PDF.
+
+    print_markers swarm.yaml --family apriltag_36h11 --out markers.pdf
+    print_markers --board 3x4 --family apriltag_36h11 --out board.pdf
+
+Each marker has its id, its robot and face, and lines to cut along. --board adds a sheet to lay on the floor
+below a camera, and writes its markers to a file of control points of aerial_camera_node: markers_board.yaml.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from swarm_loc_estimator.common.command_line import (
+    command_parser,
+    exit_with_message,
+    folder_to_write,
+    number_in,
+)
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_vision.aerial.ground_control import Ground
+from swarm_loc_vision.aerial.ground_file import save_ground
+from swarm_loc_vision.markers.families import families, family_named
+from swarm_loc_vision.sheets.drawing import save_pdf
+from swarm_loc_vision.sheets.pages import (
+    PAPERS,
+    SheetError,
+    board_page,
+    floor_markers,
+    pages_of,
+    stickers_of,
+)
+
+_SIZE = re.compile(r"([1-9]\d?)x([1-9]\d?)")
+
+
+@exit_with_message
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    options = _parser().parse_args(arguments)
+    family = family_named(options.family)
+    swarm = load_swarm(options.swarm_file) if options.swarm_file else Swarm()
+    pages = pages_of(stickers_of(swarm), family, options.paper)
+    if options.board:
+        first = max(swarm.owner_of, default=-1) + 1 if options.first_id is None else options.first_id
+        columns, rows = options.board
+        board = board_page(first, columns, rows, 1e3 * options.size, family, options.paper)
+        if taken := [piece.sticker.id for piece in board.pieces if piece.sticker.id in swarm.owner_of]:
+            raise SheetError(
+                f"marker {taken[0]} of the board is in {options.swarm_file}, too: see --first-id."
+            )
+        pages.append(board)
+    if not pages:
+        why = (
+            f"{options.swarm_file} has no markers" if options.swarm_file else "name a description, or --board"
+        )
+        raise SheetError(f"There is nothing to print: {why}.")
+    save_pdf(pages, family, options.paper, options.out)
+    print(f"{sum(len(page.pieces) for page in pages)} markers on {len(pages)} sheets in {options.out}")
+    if options.board:
+        file = options.out.with_name(f"{options.out.stem}_board.yaml")
+        origin = (
+            f"{pages[-1].title}. The middle of the board is the origin of map, x to the right of its text."
+        )
+        save_ground(Ground(markers=floor_markers(pages[-1]), family=family), file, origin)
+        print(f"places of the markers of the board in {file}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = command_parser(__doc__)
+    parser.add_argument("swarm_file", metavar="SWARM_FILE", type=Path, nargs="?", help="swarm description")
+    parser.add_argument(
+        "--out", type=_pdf, default=Path("markers.pdf"), help="the PDF (default: markers.pdf)"
+    )
+    parser.add_argument(
+        "--family", choices=list(families()), default="artoolkit_bch_thin", help="as of marker_detector_node"
+    )
+    parser.add_argument(
+        "--paper", choices=list(PAPERS), default="a4", help="size of the sheets (default: a4)"
+    )
+    parser.add_argument("--board", type=_size, metavar="COLUMNSxROWS", help="add a grid of markers")
+    parser.add_argument(
+        "--size",
+        type=number_in(0.005, 1.0, "m"),
+        default=0.05,
+        help="side of those markers (default: 0.05 m)",
+    )
+    parser.add_argument(
+        "--first-id",
+        type=number_in(0, 2**32 - 1),
+        help="id of the first one (default: the next after the swarm's)",
+    )
+    return parser
+
+
+def _pdf(text: str) -> Path:
+    """A PDF file that can be written."""
+    path = Path(text)
+    if path.suffix != ".pdf":
+        raise argparse.ArgumentTypeError(f"'{text}' must end in .pdf")
+    folder_to_write(str(path.parent))
+    return path
+
+
+def _size(text: str) -> list[int]:
+    """Columns and rows."""
+    match = _SIZE.fullmatch(text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"'{text}' must be columns and rows, such as 3x4")
+    return [int(number) for number in match.groups()]
+
+
+if __name__ == "__main__":
+    sys.exit(main())
