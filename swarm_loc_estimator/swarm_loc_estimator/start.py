@@ -17,6 +17,7 @@ import_mrclam = Program("swarm_loc_estimator.cli.import_mrclam")
 localizer_bridge = Program("swarm_loc_estimator.nodes.localizer_bridge")
 mapper_node = Program("swarm_loc_estimator.nodes.mapper_node")
 markers_node = Program("swarm_loc_estimator.watch.markers_node")
+new = Program("swarm_loc_estimator.cli.new")
 play = Program("swarm_loc_estimator.nodes.play_node")
 replay = Program("swarm_loc_estimator.cli.replay")
 replay_map = Program("swarm_loc_estimator.cli.replay_map")
@@ -25,7 +26,9 @@ survey = Program("swarm_loc_estimator.cli.survey")
 watch = Program("swarm_loc_estimator.cli.watch")
 watch_node = Program("swarm_loc_estimator.watch.watch_node")
 
-WITHOUT_ROS = (calibrate, calibrate_ir, import_droplets, import_mrclam, replay, replay_map, schema, survey)
+WITHOUT_ROS = (
+    *(calibrate, calibrate_ir, import_droplets, import_mrclam, new, replay, replay_map, schema, survey),
+)
 
 
 def swarm_loc() -> int:

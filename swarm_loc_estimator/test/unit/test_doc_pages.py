@@ -9,10 +9,20 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.cli import calibrate, calibrate_ir, import_mrclam, replay, replay_map, survey, watch
+from swarm_loc_estimator.cli import (
+    calibrate,
+    calibrate_ir,
+    import_mrclam,
+    new,
+    replay,
+    replay_map,
+    survey,
+    watch,
+)
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.swarm.fix_model import FixModel
 from swarm_loc_estimator.swarm.motion_models import ImuModel, RandomWalk
+from swarm_loc_estimator.swarm.robot_types import ROBOT_TYPES, SENSORS
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
@@ -27,6 +37,7 @@ from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 
 DOC = Path(__file__).parents[2] / "doc"
 SWARM_DESCRIPTION = (DOC / "swarm_description.md").read_text(encoding="utf-8")
+NEW_SWARM = (DOC / "new_swarm.md").read_text(encoding="utf-8")
 COMMANDS = (DOC / "commands.md").read_text(encoding="utf-8")
 
 
@@ -71,7 +82,7 @@ def test_every_number_of_radios_has_its_place() -> None:
 
 
 @pytest.mark.parametrize(
-    "command", [replay, replay_map, calibrate, calibrate_ir, import_mrclam, survey, watch]
+    "command", [new, replay, replay_map, calibrate, calibrate_ir, import_mrclam, survey, watch]
 )
 def test_every_option_of_a_command_has_its_place(command: object, capsys: pytest.CaptureFixture[str]) -> None:
     main: Callable[[list[str]], int] = command.main  # type: ignore[attr-defined]
@@ -79,3 +90,10 @@ def test_every_option_of_a_command_has_its_place(command: object, capsys: pytest
         main(["--help"])
     options = set(re.findall(r"(?<!\S)\[?--([a-z-]+)", capsys.readouterr().out)) - {"help"}
     assert {option for option in options if f"`--{option}" not in COMMANDS} == set()
+
+
+def test_types_and_sensors_of_new_descriptions_have_their_place() -> None:
+    assert [word for word in (*ROBOT_TYPES, *SENSORS) if f"`{word}`" not in NEW_SWARM] == []
+    for word, said in SENSORS.items():
+        row = next(line for line in NEW_SWARM.splitlines() if line.startswith(f"| `{word}` | "))
+        assert re.sub(r"\[(.*?)\]\(.*?\)", r"\1", row).replace("`", "") == f"| {word} | {said} |"

@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[3]
 WRITTEN = ROOT / "swarm_loc_estimator" / "doc" / SCHEMA_FILE
 EXAMPLES = sorted(path for path in (ROOT / "bags").glob("*/*.yaml") if "fileversion" in path.read_text())
 EXAMPLES = [path for path in EXAMPLES if "robots:" in path.read_text(encoding="utf-8")]
-TYPES = {"object": dict, "array": list, "string": str, "null": type(None)}
+TYPES: dict[str, type] = {"object": dict, "array": list, "string": str, "null": type(None)}
 WHOLE = {
     "fileversion": 1,
     "defaults": {"sensor": {"range_sigma": 0.1}, "landmark": {"size": 0.06}},

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from swarm_loc_estimator.swarm.new_swarm import FAMILY_IDS
 from swarm_loc_vision.markers.families import draw_marker, families, family_named
 
 BCH = family_named("artoolkit_bch_thin")
@@ -157,3 +158,7 @@ def test_unknown_names_and_ids_are_one_sentence() -> None:
         family_named("qr")
     with pytest.raises(ValueError, match="aruco_mip_36h12 has ids 0 to 249, not 250"):
         families()["aruco_mip_36h12"].pattern(250)
+
+
+def test_new_descriptions_know_the_families_and_their_ids() -> None:
+    assert {name: len(family.words) for name, family in families().items()} == FAMILY_IDS

@@ -34,7 +34,7 @@ DPI = 300
 NUMBER = r"(-?[\d.]+)"
 
 
-def squares_in(pdf: bytes) -> list[list[float]]:
+def squares_in(pdf: bytes) -> NDArray[np.float64]:
     """Left, bottom, right and top [mm] of all closed outlines on the pages of a PDF, in its own units."""
     found = []
     for stream in re.findall(rb"stream\r?\n(.*?)\r?\nendstream", pdf, re.DOTALL):
@@ -42,7 +42,7 @@ def squares_in(pdf: bytes) -> list[list[float]]:
         for loop in re.findall(rf"{NUMBER} {NUMBER} m\n((?:{NUMBER} {NUMBER} l\n)+)h", content):
             points = np.array([loop[:2], *re.findall(f"{NUMBER} {NUMBER} l", loop[2])], float)
             found.append([*points.min(axis=0), *points.max(axis=0)])
-    return (np.array(found) * MM_PER_INCH / 72.0).tolist()
+    return np.array(found, float) * MM_PER_INCH / 72.0
 
 
 def photograph(page: Page, family: str) -> NDArray[np.uint8]:
@@ -73,7 +73,7 @@ def test_squares_have_their_true_size_and_place_in_the_pdf(tmp_path: Path, paper
     data = (tmp_path / "sheets.pdf").read_bytes()
     boxes = [float(number) for number in re.findall(rb"/MediaBox \[ 0 0 ([\d.]+) ([\d.]+) \]", data)[0]]
     assert boxes == pytest.approx([length * 72.0 / MM_PER_INCH for length in PAPERS[paper]], abs=0.01)
-    squares = np.array(squares_in(data))
+    squares = squares_in(data)
     for page in pages:
         for piece in page.pieces:
             side = piece.sticker.side
@@ -127,8 +127,9 @@ def test_an_outline_surrounds_the_black_cells_without_seams() -> None:
     for _ in range(20):
         black = rng.random((6, 6)) < 0.6
         path = outline(black, 0.0, 0.0, 1.0)
-        ends = [*np.flatnonzero(path.codes == path.MOVETO), len(path.vertices)]
-        loops = [path.vertices[begin:end] for begin, end in pairwise(ends)]
+        vertices = np.asarray(path.vertices, float)
+        ends = [*np.flatnonzero(path.codes == path.MOVETO), len(vertices)]
+        loops = [vertices[begin:end] for begin, end in pairwise(ends)]
         area = sum(np.sum(a[:-1, 1] * a[1:, 0] - a[:-1, 0] * a[1:, 1]) / 2.0 for a in loops)
         assert area == black.sum()
         border = sum(np.abs(np.diff(loop, axis=0)).sum() for loop in loops)

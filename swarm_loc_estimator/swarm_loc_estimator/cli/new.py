@@ -1,0 +1,256 @@
+"""Write a first description of a swarm from a few answers, and show how to start its graph.
+
+    new                                                                       # asks on the terminal
+    new epucks.yaml --yes --type epuck2 --robots 5 --arena 2.4x1.6            # asks nothing
+
+Options answer questions in advance; --yes takes the default for all others. Marker ids are given so that none
+appears twice. A JSON Schema is written beside the description, with which editors complete it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TypeVar
+
+from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
+from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.swarm.new_swarm import FAMILY_IDS, SwarmPlan, planned_swarm
+from swarm_loc_estimator.swarm.robot_types import ROBOT_TYPES, SENSORS
+from swarm_loc_estimator.swarm.schema import SCHEMA_FILE, schema_text
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import MAX_NAME, MAX_ROBOTS, NAME
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+
+Answer = TypeVar("Answer")
+QUESTIONS = {
+    "type": f"type of the robots: {', '.join(ROBOT_TYPES)}",
+    "robots": "number of robots",
+    "prefix": "names of the robots begin with",
+    "sensors": "what locates them, with commas between",
+    "wheel-separation": "distance between the wheels [m]",
+    "family": f"kind of markers: {', '.join(FAMILY_IDS)}",
+    "size": "side of the markers on robots, black border included [m]",
+    "arena": "length along x and along y [m], such as 2.4x1.6",
+    "pitch": "distance of landmarks along the walls [m]",
+    "landmark-size": "side of the landmarks [m]",
+}
+_LENGTH = number_in(0.001, 10.0, "m")
+
+
+class Dialog:
+    """Takes each answer from an option, from the defaults, or from the terminal, until it can be used.
+
+    Args:
+        given: Answers of options, by name; None: not given.
+        asks: Whether to ask for what was not given.
+    """
+
+    def __init__(self, given: Mapping[str, str | None], *, asks: bool) -> None:
+        self._given, self._asks = given, asks
+
+    def answer(self, name: str, default: str, read: Callable[[str], Answer], choice: str = "") -> Answer:
+        """The answer to a question.
+
+        Args:
+            name: Of `QUESTIONS`.
+            default: Answer of those who only press Enter.
+            read: Converts an answer; raises ArgumentTypeError with what is allowed.
+            choice: Explains the answers.
+
+        Raises:
+            UserError: An option cannot be used, or standard input has ended.
+        """
+        text = self._given[name.replace("-", "_")]
+        if text is not None or not self._asks:
+            try:
+                return read(default if text is None else text)
+            except argparse.ArgumentTypeError as error:
+                raise UserError(f"--{name}: {error}.") from error
+        while True:
+            try:
+                text = input(f"{QUESTIONS[name]}{choice} [{default}]: ").strip()
+            except EOFError:
+                raise UserError(
+                    "There are no more answers on standard input; --yes takes the defaults."
+                ) from None
+            try:
+                return read(text or default)
+            except argparse.ArgumentTypeError as error:
+                print(f"{error}.")
+
+
+def asked_plan(dialog: Dialog) -> SwarmPlan:
+    """The plan of a swarm by the answers of a user."""
+    name = dialog.answer("type", "epuck", _one_of(ROBOT_TYPES))
+    known = ROBOT_TYPES[name]
+    usual = SwarmPlan(name, 5, name, known.usual_sensors)
+    robots = dialog.answer("robots", str(usual.robots), number_in(1, MAX_ROBOTS))
+    first = {"own": "robot"}.get(name, name)
+    prefix = dialog.answer("prefix", f"{first}_" if first[-1].isdigit() else first, _prefix)
+    choice = "".join(f"\n  {sensor}: {SENSORS[sensor]}" for sensor in known.sensors)
+    sensors = dialog.answer("sensors", ",".join(known.usual_sensors), _some_of(known.sensors), choice)
+    wheels = known.odometry.wheel_separation if known.odometry else usual.wheel_separation
+    if name == "own":
+        wheels = dialog.answer("wheel-separation", f"{wheels:g}", _LENGTH)
+    family, size, arena = usual.family, known.marker_size, usual.arena
+    pitch, landmark_size = usual.pitch, usual.landmark_size
+    if {"robots", "landmarks", "aerial"} & set(sensors):
+        family = dialog.answer("family", family, _one_of(FAMILY_IDS))
+    if "robots" in sensors:
+        size = dialog.answer("size", f"{size:g}", _LENGTH)
+    if "landmarks" in sensors:
+        arena = dialog.answer("arena", "x".join(f"{length:g}" for length in arena), _arena)
+        pitch = dialog.answer("pitch", f"{pitch:g}", number_in(0.01, 100.0, "m"))
+        landmark_size = dialog.answer("landmark-size", f"{landmark_size:g}", _LENGTH)
+    return SwarmPlan(name, robots, prefix, sensors, wheels, family, size, arena, pitch, landmark_size)
+
+
+def start_lines(plan: SwarmPlan, file: str) -> list[str]:
+    """How to start the graph of a swarm: commands, and comments about what others must publish."""
+    robot, sensors, known = f"{plan.prefix}1", set(plan.sensors), plan.known
+    sheets = f"{plan.prefix}_markers"
+    sees = bool(sensors & {"robots", "landmarks"})
+    lines = []
+    if sees or "aerial" in sensors:
+        board = " --board 3x4" if "aerial" in sensors else ""
+        lines.append(
+            f"./run swarm_loc_vision print_markers {file} --family {plan.family}{board} --out {sheets}.pdf"
+        )
+    if known.driver:
+        lines.append(f"./run swarm_loc_drivers {known.driver.format(robot=robot, file=file)}")
+    needs = [] if known.driver or known.odometry is None else [("odom", "nav_msgs/Odometry")]
+    needs += [("fix", "geometry_msgs/PoseWithCovarianceStamped")] if "fix" in sensors else []
+    needs += [("imu", "sensor_msgs/Imu")] if "imu" in sensors else []
+    needs += [(f"{known.image}image_raw, camera_info", "calibrated images")] if sees else []
+    lines += [f"# another node must publish {robot}/{topic}: {kind}" for topic, kind in needs]
+    if sees:
+        names = ("image_raw", "camera_info") if known.image else ()
+        remapped = "".join(f" -r {name}:={known.image}{name}" for name in names)
+        described = f"-p family:={plan.family} -p swarm_file:={file} -p robot:={robot}"
+        lines.append(
+            f"./run swarm_loc_vision marker_detector_node --ros-args -r __ns:=/{robot}{remapped} {described}"
+        )
+    if "mapper" in sensors:
+        tracker = f"-r __ns:=/{robot} -p calibration:={robot}.yaml"
+        lines += [
+            f"./run swarm_loc_vision event_tracker_node --ros-args {tracker}",
+            f"./run swarm_loc_estimator mapper_node --ros-args -p swarm_file:={file}",
+            f"./run swarm_loc_drivers exploration_node --ros-args -p swarm_file:={file}",
+        ]
+    if len(lines) > 1 and plan.robots > 1:
+        lines.append(
+            f"# the lines with {robot} are needed for {plan.prefix}2 to {plan.prefix}{plan.robots}, too"
+        )
+    if "aerial" in sensors:
+        lines.append(
+            "./run swarm_loc_vision aerial_camera_node --ros-args -r __ns:=/aerial"
+            f" -p control_points_file:={sheets}_board.yaml  # its page says more, such as robot_height"
+        )
+    return [*lines, f"./run swarm_loc_estimator graph {file} --watch"]
+
+
+def remarks(plan: SwarmPlan, swarm: Swarm) -> str:
+    """The comment at the top of a description."""
+    lines = [
+        f"{plan.robots} x {plan.known.title}, located by: {'; '.join(SENSORS[one] for one in plan.sensors)}.",
+        plan.known.sources,
+    ]
+    if swarm.owner_of:
+        lines.append(
+            f"Markers are of the family {plan.family}. Measure where they and the cameras are, and write it"
+            " below; a landmark whose place is not exact gets position_sigma and yaw_sigma."
+        )
+    if not {"landmarks", "aerial", "fix", "mapper"} & set(plan.sensors):
+        lines.append("Nothing here says where the robots are in map, unless one of them gets a start.")
+    if "fix" in plan.sensors:
+        lines.append("fix: the sigmas are used for fixes without covariance.")
+    lines.append(
+        "The noise is a first guess: a bag with ground truth and the command calibrate give a better one."
+    )
+    return "\n".join(part for line in lines for part in textwrap.wrap(line, 100))
+
+
+@exit_with_message
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    options = _parser().parse_args(arguments)
+    path: Path = options.swarm_file
+    if path.exists():
+        raise UserError(f"{path} exists and is not overwritten.")
+    plan = asked_plan(Dialog(vars(options), asks=not options.yes))
+    swarm = planned_swarm(plan)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    (path.parent / SCHEMA_FILE).write_text(schema_text(), encoding="utf-8")
+    save_swarm(swarm, path, remarks(plan, swarm))
+    print(f"{path} describes {len(swarm.robots)} robots and {len(swarm.landmarks)} landmarks. To start it:\n")
+    print("\n".join(start_lines(plan, shlex.quote(str(path)))))
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = command_parser(__doc__)
+    parser.add_argument(
+        "swarm_file", type=Path, nargs="?", default=Path("swarm.yaml"), help="file to write (swarm.yaml)"
+    )
+    parser.add_argument(
+        "--yes", action="store_true", help="ask nothing; take defaults where no option is given"
+    )
+    for name, question in QUESTIONS.items():
+        parser.add_argument(f"--{name}", help=question)
+    return parser
+
+
+def _one_of(words: Sequence[str] | Mapping[str, object]) -> Callable[[str], str]:
+    """Reads one word out of a list."""
+
+    def read(text: str) -> str:
+        if text not in words:
+            raise argparse.ArgumentTypeError(f"'{text}' must be one of {', '.join(words)}")
+        return text
+
+    return read
+
+
+def _some_of(words: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
+    """Reads words with commas between."""
+
+    def read(text: str) -> tuple[str, ...]:
+        chosen = tuple(dict.fromkeys(word.strip() for word in text.split(",")))
+        if not set(chosen) <= set(words):
+            raise argparse.ArgumentTypeError(f"'{text}' must be of {', '.join(words)}")
+        if {"mapper", "fix"} <= set(chosen):
+            raise argparse.ArgumentTypeError("mapper and fix publish on the same topic: choose one of them")
+        return chosen
+
+    return read
+
+
+def _prefix(text: str) -> str:
+    """Reads the beginning of names."""
+    longest = MAX_NAME - len(str(MAX_ROBOTS))
+    if not NAME.fullmatch(text) or len(text) > longest:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' must be at most {longest} letters, digits and underscores and start with a letter"
+        )
+    return text
+
+
+def _arena(text: str) -> tuple[float, float]:
+    """Reads two lengths."""
+    length, _, width = text.partition("x")
+    try:
+        return number_in(0.1, 1000.0, "m")(length), number_in(0.1, 1000.0, "m")(width)
+    except argparse.ArgumentTypeError:
+        raise argparse.ArgumentTypeError(
+            f"'{text}' must be two lengths in [0.1, 1000] m, such as 2.4x1.6"
+        ) from None
+
+
+if __name__ == "__main__":
+    sys.exit(main())
