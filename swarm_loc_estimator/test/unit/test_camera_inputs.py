@@ -14,7 +14,8 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.filter.measurement_model import NOBODY, Kind, MeasurementArray
 from swarm_loc_estimator.sensors.bearing import BEARING
-from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, SightingConverter
+from swarm_loc_estimator.sensors.camera import SightingConverter
+from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_BEARING
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, SensorModel, Swarm
 
 LEVEL = CameraMount(x=0.04, z=0.05)

@@ -48,7 +48,7 @@ def world_of(seed: int, places: Sequence[tuple[float, float, float]] = SQUARE, *
     world = simulate(Plan(reach=0.0, **plan), seed)
     robots = (replace(one, camera=None, uwb=device(k)) for k, one in enumerate(world.swarm.robots))
     anchors = tuple(Anchor(100 + k, *place) for k, place in enumerate(places))
-    return replace(world, swarm=Swarm(tuple(robots), (), anchors))
+    return replace(world, swarm=Swarm(tuple(robots), anchors=anchors))
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ class Knots:
 
 
 @dataclass(frozen=True)
-class Problem:
+class SurveyProblem:
     """What is to be solved.
 
     Attributes:
@@ -87,7 +87,7 @@ class Problem:
         return np.asarray(self.sightings["kind"] == POLAR)
 
 
-def problem_of(recording: Recording, swarm: Swarm) -> Problem:
+def problem_of(recording: Recording, swarm: Swarm) -> SurveyProblem:
     """Set up the problem of a recording.
 
     Args:
@@ -104,7 +104,8 @@ def problem_of(recording: Recording, swarm: Swarm) -> Problem:
     ]
     converter = SightingConverter(replace(described, landmarks=tuple(at_origin)))
     sightings = converter.convert(seen.robot, seen.stamp_ns, seen.detection).measurements
-    sightings = sightings[sightings["kind"] <= POLAR]  # not those of a direction alone
+    # not directions alone, and not what fixed cameras see
+    sightings = sightings[(sightings["kind"] <= POLAR) & (sightings["observer"] >= 0)]
     knots = _knots(tracks, recording)
     robots = np.stack([sightings["observer"], sightings["target"]])
     started = np.array([tracks.has_started(np.maximum(one, 0), sightings["stamp_ns"]) for one in robots])
@@ -119,7 +120,7 @@ def problem_of(recording: Recording, swarm: Swarm) -> Problem:
         since = at.covariance - knots.sample.covariance[sides[side][moves]]
         slip[side, moves] = since * np.sign(np.trace(since, axis1=1, axis2=2))[:, None, None]
     is_known = np.array([mark.id in known for mark in described.landmarks], dtype=bool)
-    return Problem(described, is_known, knots, sightings, sides.T, poses, slip, rare)
+    return SurveyProblem(described, is_known, knots, sightings, sides.T, poses, slip, rare)
 
 
 def _with_landmarks(recording: Recording, swarm: Swarm) -> tuple[Swarm, dict[int, int]]:

@@ -18,7 +18,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.filter.measurement_model import predict
-from swarm_loc_estimator.offline.survey.problem import Problem
+from swarm_loc_estimator.offline.survey.problem import SurveyProblem
 from swarm_loc_estimator.offline.survey.start import Start
 from swarm_loc_estimator.swarm.swarm import Swarm
 
@@ -69,7 +69,7 @@ class Solver:
         start: Where to begin; what is not connected there is left out.
     """
 
-    def __init__(self, problem: Problem, start: Start) -> None:
+    def __init__(self, problem: SurveyProblem, start: Start) -> None:
         self._problem, knots = problem, problem.knots
         robots, landmarks = len(problem.swarm.robots), len(problem.swarm.landmarks)
         self._knot, self._landmark = start.transform[knots.robot], start.landmark.copy()
@@ -312,7 +312,7 @@ def _is_exact(swarm: Swarm) -> BoolArray:
     return np.array([not mark.is_estimated for mark in swarm.landmarks], dtype=bool)
 
 
-def _steps(problem: Problem, is_placed: BoolArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+def _steps(problem: SurveyProblem, is_placed: BoolArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
     """Pairs of consecutive knots (p,), whitening of their steps, and Jacobians by parameters."""
     knots = problem.knots
     same = (knots.robot[1:] == knots.robot[:-1]) & is_placed[1:]

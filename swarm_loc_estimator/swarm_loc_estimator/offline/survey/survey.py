@@ -12,7 +12,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
-from swarm_loc_estimator.offline.survey.problem import MIN_SIGHTINGS, Problem, problem_of
+from swarm_loc_estimator.offline.survey.problem import MIN_SIGHTINGS, SurveyProblem, problem_of
 from swarm_loc_estimator.offline.survey.solve import Solution, Solver
 from swarm_loc_estimator.offline.survey.start import start_of
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
@@ -42,7 +42,7 @@ class Surveyed:
     """
 
     swarm: Swarm
-    problem: Problem
+    problem: SurveyProblem
     solution: Solution
     path: FloatArray
     text: str
@@ -78,7 +78,7 @@ def survey(recording: Recording, swarm: Swarm, progress: Progress = unwatched) -
     return Surveyed(found, problem, solution, path, _text(problem, solution, swarm, found))
 
 
-def _landmarks(problem: Problem, solution: Solution) -> list[Landmark]:
+def _landmarks(problem: SurveyProblem, solution: Solution) -> list[Landmark]:
     """All landmarks that are connected, with standard deviations for those that were estimated."""
     factor = max(1.0, solution.variance_ratio)
     found = []
@@ -117,7 +117,7 @@ def _calibrated(robot: Robot, index: int, solution: Solution) -> Robot:
     )
 
 
-def _text(problem: Problem, solution: Solution, before: Swarm, found: Swarm) -> str:
+def _text(problem: SurveyProblem, solution: Solution, before: Swarm, found: Swarm) -> str:
     places = {mark.id: mark for mark in found.landmarks}
     lines = ["landmark        x [m]     y [m]  yaw [deg]  sigma [mm]  sightings  contradicting"]
     for index, mark in enumerate(problem.swarm.landmarks):
@@ -156,7 +156,7 @@ def _corrections(before: Swarm, found: Swarm) -> list[str]:
     return lines
 
 
-def _frame(problem: Problem) -> list[str]:
+def _frame(problem: SurveyProblem) -> list[str]:
     """What gives the frame."""
     if problem.is_known.any():
         return [f"The frame is that of the {int(problem.is_known.sum())} described landmarks."]
@@ -165,7 +165,7 @@ def _frame(problem: Problem) -> list[str]:
     return ["The origin is the first pose of one robot, since no landmark and no start is described."]
 
 
-def _remarks(problem: Problem, solution: Solution) -> list[str]:
+def _remarks(problem: SurveyProblem, solution: Solution) -> list[str]:
     """What is badly determined, a sentence each with a remedy."""
     sightings, remarks = problem.sightings, []
     for marker_id, count in sorted(problem.rare.items()):
