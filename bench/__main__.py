@@ -8,6 +8,7 @@ import sys
 BENCHMARKS = {
     "aerial": "bench.aerial",
     "calibrated": "bench.peers.calibrated",
+    "commissioning": "bench.commissioning",
     "droplet": "bench.droplet",
     "droplet_real": "bench.droplet.real",
     "epuck": "bench.epuck",

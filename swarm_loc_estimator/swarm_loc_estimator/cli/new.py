@@ -124,7 +124,6 @@ def start_lines(plan: SwarmPlan, file: str) -> list[str]:
     if known.driver:
         lines.append(f"./run swarm_loc_drivers {known.driver.format(robot=robot, file=file)}")
     needs = [] if known.driver or known.odometry is None else [("odom", "nav_msgs/Odometry")]
-    needs += [("fix", "geometry_msgs/PoseWithCovarianceStamped")] if "fix" in sensors else []
     needs += [("imu", "sensor_msgs/Imu")] if "imu" in sensors else []
     needs += [(f"{known.image}image_raw, camera_info", "calibrated images")] if sees else []
     lines += [f"# another node must publish {robot}/{topic}: {kind}" for topic, kind in needs]
@@ -134,6 +133,11 @@ def start_lines(plan: SwarmPlan, file: str) -> list[str]:
         described = f"-p family:={plan.family} -p swarm_file:={file} -p robot:={robot}"
         lines.append(
             f"./run swarm_loc_vision marker_detector_node --ros-args -r __ns:=/{robot}{remapped} {described}"
+        )
+    if "fix" in sensors:
+        lines.append(
+            f"./run swarm_loc_estimator localizer_bridge --ros-args -p swarm_file:={file} -p source:=pose"
+            "  # of vrpn_mocap; its page has others"
         )
     if "mapper" in sensors:
         tracker = f"-r __ns:=/{robot} -p calibration:={robot}.yaml"
