@@ -114,8 +114,7 @@ def _misleading(results: Sequence[UwbResult]) -> float:
 def _batch(world: UwbWorld) -> FloatArray:
     """Squared distances (K, N) of gtsam's Levenberg-Marquardt over all that has arrived by some ticks.
 
-    Ranges are made horizontal, since its poses are: heights are known. Anchors are poses, since points and
-    vectors of gtsam 4.2 crash with NumPy 2.
+    Ranges are made horizontal, since its poses are: heights are known.
     """
     places, plan, ranges = world.anchor_places(), world.plan, world.ranges
     found = []
