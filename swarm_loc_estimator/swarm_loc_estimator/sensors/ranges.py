@@ -252,7 +252,13 @@ def _has_radio(robot: Robot) -> bool:
 
 
 _OWN = InputKind(
-    "ranges", "ranges", MESSAGE_TYPE, lambda n, _: EachReader(n, decode_ranges), _columns, _has_radio
+    "ranges",
+    "ranges",
+    MESSAGE_TYPE,
+    lambda n, _: EachReader(n, decode_ranges),
+    _columns,
+    _has_radio,
+    only_expected=True,
 )
 RANGES = Sensor("ranges", NO_RANGES, (_OWN,), _create_converter)
 """The sensor, see `registry.SENSORS`."""

@@ -23,6 +23,10 @@ FAMILY_IDS = MappingProxyType(
         "aruco_mip_36h12": 250,
         "apriltag_36h11": 587,
         "apriltag_36h11_thick": 587,
+        "apriltag_16h5": 30,
+        "apriltag_25h9": 35,
+        "apriltag_standard_41h12": 2115,
+        **{f"aruco_{n}x{n}_{count}": count for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
     }
 )
 """Families of markers that the detector has -> number of their ids."""

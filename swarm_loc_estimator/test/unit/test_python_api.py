@@ -81,7 +81,7 @@ def test_all_names_load_and_no_others() -> None:
         (lambda: replay(BAG, "swarm.yaml"), "swarm must be a Swarm, not 'swarm.yaml'"),  # type: ignore[arg-type]
         (lambda: replay(BAG, SWARM, {"x": 1}), "settings must be a Settings, not {'x': 1}"),  # type: ignore[arg-type]
         (lambda: Estimator(SWARM, 2.0), "settings must be a Settings, not 2.0"),  # type: ignore[arg-type]
-        (lambda: Batch.of(0, 1, odometri=ROWS), "no sensor 'odometri', only odometry, detections, "),
+        (lambda: Batch.of(0, 1, odometri=ROWS), "no sensor 'odometri', only odometry, imu, detections, "),
         (lambda: Batch.of(0, 1, fixes=ROWS), "fixes must be FixRows with columns of equal length"),
         (
             lambda: Batch.of(0, 1, odometry=ROWS._replace(pose=np.zeros((1, 3)))),

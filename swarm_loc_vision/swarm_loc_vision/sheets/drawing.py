@@ -89,7 +89,9 @@ def _draw(axes: Axes, piece: Piece, family: Family, *, is_cut: bool) -> None:
     """One marker, its label and its cutting line."""
     sticker = piece.sticker
     black = family.pattern(sticker.id) == 0
-    path = outline(black, piece.x, piece.y, sticker.side / family.side)
+    cell = sticker.side / family.side
+    outside = family.layout.outside * cell  # some families have data around their square
+    path = outline(black, piece.x - outside, piece.y - outside, cell)
     axes.add_patch(PathPatch(path, facecolor="black", linewidth=0.0, snap=False))
     left, bottom, width, height = piece.frame
     if is_cut:

@@ -180,5 +180,6 @@ def _piece(sticker: Sticker, family: Family, left: float, bottom: float) -> Piec
     """A piece whose frame has a given lower left corner [mm]."""
     if sticker.id >= len(family.words):
         raise SheetError(f"marker {sticker.id} is none of {family.name}, which has {len(family.words)} ids.")
-    margin = max(sticker.side / family.side, _LEAST_MARGIN_MM)
+    cell = sticker.side / family.side
+    margin = max(cell, _LEAST_MARGIN_MM) + family.layout.outside * cell  # of data around the square
     return Piece(sticker, left + margin, bottom + margin + STRIP_MM, margin)
