@@ -350,7 +350,8 @@ class StandIn:
 
     def __init__(self, *_: object) -> None:
         self.odometry: list[tuple[int, int]] = []
-        self.time_jumps = 0
+        self.time_jumps = self.frame_moves = 0
+        self.origin = ""
         self.drops: dict[str, int] = {}
         self.counters: dict[str, int] = {}
         self.identities = None

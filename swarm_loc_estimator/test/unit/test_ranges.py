@@ -135,7 +135,7 @@ def errors(world: World, estimates: Sequence[Estimate]) -> FloatArray:
 def converted(swarm: Swarm, *measured: Measured) -> tuple[MeasurementArray, dict[str, int]]:
     """Measurements of messages, and what was dropped."""
     ingest, estimator = Ingest(swarm), Estimator(swarm)
-    handle = [ingest.handle_of[f"{robot.name}/ranges"] for robot in swarm.robots]
+    handle = {k: ingest.handle_of[f"{r.name}/ranges"] for k, r in enumerate(swarm.robots) if r.uwb}
     batch = MessageBatch.of([SerializedMessage(handle[one.robot], one.data(), T0) for one in measured])
     (part,) = ingest.read(batch)
     return estimator.convert(part).measurements, estimator.drops
@@ -156,7 +156,6 @@ TWO = Swarm(
         (Measured(0, T0, 1, 1.0), "uwb_own_address"),
         (Measured(0, T0, 100, 1.0, reference=1), "uwb_own_address"),
         (Measured(0, T0, 100, 1.0, reference=100), "uwb_equal_addresses"),
-        (Measured(2, T0, 100, 1.0), "no_uwb"),
         (Measured(0, T0, 100, -0.1), "uwb_negative_range"),
         (Measured(0, T0, 100, np.nan), "non_finite"),
         (Measured(0, T0, 100, np.inf), "non_finite"),
@@ -170,6 +169,16 @@ def test_a_useless_range_is_dropped_and_counted_by_its_reason(one: Measured, rea
     found, drops = converted(TWO, one, Measured(1, T0, 100, 2.0))
     assert drops == {reason: 1}
     assert found["value"][:, 0].tolist() == [2.0]
+
+
+def test_ranges_of_a_robot_without_a_radio_are_dropped() -> None:
+    ingest, estimator = Ingest(TWO), Estimator(TWO)
+    assert "c/ranges" not in ingest.handle_of
+    message = SerializedMessage(ingest.handle_of["a/ranges"], Measured(0, T0, 100, 1.0).data(), T0)
+    (part,) = ingest.read(MessageBatch.of([message]))
+    rows = part["ranges"]._replace(robot=np.array([2]))
+    estimator.convert(replace(part, rows={"ranges": rows}))
+    assert estimator.drops == {"no_uwb": 1}
 
 
 def test_a_difference_of_two_robots_is_dropped_as_three_poses_would_be_in_it() -> None:
