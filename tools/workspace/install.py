@@ -100,6 +100,7 @@ def _install(groups: tuple[str, ...], ros: Path | None) -> None:
     options = ["--disable-pip-version-check", "--no-input", "--retries", "2", "--progress-bar", "off"]
     _run_installer([*pip, "install", *options, UV], "pip.log")
     command: list[str | Path] = [VENV / "bin" / "uv", "pip", "install", "--python", VENV_PYTHON]
+    command += ["--override", REQUIREMENTS / "overrides.txt"]
     for group in groups:
         command += ["--requirement", REQUIREMENTS / f"{group}.txt"]
     if ros:
