@@ -113,7 +113,7 @@ def asked_plan(dialog: Dialog) -> SwarmPlan:
 def start_lines(plan: SwarmPlan, file: str) -> list[str]:
     """How to start the graph of a swarm: commands, and comments about what others must publish."""
     robot, sensors, known = f"{plan.prefix}1", set(plan.sensors), plan.known
-    sheets = f"{plan.prefix}_markers"
+    sheets = f"{plan.prefix.rstrip('_')}_markers"
     sees = bool(sensors & {"robots", "landmarks"})
     lines = []
     if sees or "aerial" in sensors:
