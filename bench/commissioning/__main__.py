@@ -155,7 +155,7 @@ def _fitted(places: FloatArray, truth: FloatArray) -> FloatArray:
     """Errors (k, 2) of places after the rigid motion that fits the truth best."""
     a, b = places - places.mean(axis=0), truth - truth.mean(axis=0)
     turn = np.arctan2(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), np.sum(a * b))
-    return se2.transform_points([0.0, 0.0, turn], a) - b
+    return np.asarray(se2.transform_points([0.0, 0.0, turn], a) - b)
 
 
 def _rms(errors: FloatArray) -> float:
