@@ -138,7 +138,8 @@ def _batch(world: UwbWorld) -> FloatArray:
                 model = gtsam.noiseModel.Gaussian.Covariance(covariance)
                 graph.add(gtsam.BetweenFactorPose2(key, key + 1, gtsam.Pose2(*moves[key]), model))
             for k, place in enumerate(places):
-                fixed, at = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6), gtsam.Pose2(*place[:2], 0.0)
+                x, y, _ = place.tolist()
+                fixed, at = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6), gtsam.Pose2(x, y, 0.0)
                 values.insert(10**6 + k, at)
                 graph.add(gtsam.PriorFactorPose2(10**6 + k, at, fixed))
             for row in mine.tolist():
