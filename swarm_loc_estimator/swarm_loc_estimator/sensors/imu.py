@@ -102,10 +102,7 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
             "imu_non_finite": ~np.isfinite(rows.velocity).all(axis=1),
             "imu_absurd": np.abs(rows.rate) > _MAX_RATE,
         }
-        good = np.ones(rows.robot.size, dtype=bool)
-        for reason, bad in reasons.items():
-            drops.add(reason, rows.robot[good & bad])
-            good &= ~bad
+        good = drops.screen(rows.robot, reasons)
         return rows if good.all() else chosen(rows, good)
 
     return valid

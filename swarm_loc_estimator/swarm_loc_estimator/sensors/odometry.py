@@ -80,11 +80,7 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
             "odometry_non_finite": ~np.isfinite(rows.pose).all(axis=1),
             "odometry_absurd": ~(np.abs(rows.pose).max(axis=1) <= _MAX_DISTANCE_M),
         }
-        good = np.ones(rows.robot.size, dtype=bool)
-        for reason, bad in reasons.items():
-            if bad.any():
-                drops.add(reason, rows.robot[good & bad])
-                good &= ~bad
+        good = drops.screen(rows.robot, reasons)
         return rows if good.all() else chosen(rows, good)
 
     return valid

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import Rows, decode, nanoseconds
 from swarm_loc_estimator.common.messages.definitions import RANGES as MESSAGE_TYPE
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
@@ -229,7 +229,7 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
     ) -> tuple[RangeRows, IntArray, IntArray]:
         own, is_difference = own_address[rows.robot], rows.reference > 0
         on_robots = (devices.robot[device] >= 0) & (devices.robot[reference] >= 0)
-        reasons: dict[str, BoolArray] = {
+        reasons = {
             "no_uwb": own == 0,
             "uwb_own_address": (rows.device == own) | (is_difference & (rows.reference == own)),
             "uwb_unknown_address": (device == 0) | (is_difference & (reference == 0)),
@@ -238,10 +238,7 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
             "uwb_negative_range": ~is_difference & (rows.range < 0.0),
             "bad_covariance": rows.variance < 0.0,
         }
-        usable = np.ones(rows.robot.size, dtype=bool)
-        for reason, wrong in reasons.items():
-            drops.add(reason, rows.robot[usable & wrong])
-            usable &= ~wrong
+        usable = drops.screen(rows.robot, reasons)
         return chosen(rows, usable), device[usable], reference[usable]
 
     return convert

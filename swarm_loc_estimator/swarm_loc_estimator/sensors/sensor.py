@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, IntArray
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementArray
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
@@ -109,6 +109,15 @@ class DropCounts:
         self.total[reason] += robots.size
         for robot, count in zip(*np.unique(robots[robots >= 0], return_counts=True), strict=True):
             self.of_robot[robot][reason] += int(count)
+
+    def screen(self, robots: IntArray, reasons: Mapping[str, BoolArray]) -> BoolArray:
+        """Which readings (k,) of robots (k,) are good; the others count under their first reason (k,)."""
+        good = np.ones(robots.size, dtype=bool)
+        for reason, bad in reasons.items():
+            if bad.any():
+                self.add(reason, robots[good & bad])
+                good &= ~bad
+        return good
 
 
 class Guard:
