@@ -11,7 +11,7 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.sensors.imu import TurnRateRows
 from swarm_loc_estimator.sensors.sensor import chosen
-from swarm_loc_estimator.swarm.motion_models import ImuModel
+from swarm_loc_estimator.swarm.error_models import ImuModel
 
 RATE_HZ = 50.0
 """Rate of the messages of an IMU."""

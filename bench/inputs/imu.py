@@ -24,7 +24,7 @@ from swarm_loc_estimator.offline.metrics import is_misleading
 from swarm_loc_estimator.sensors.imu import TurnRateRows
 from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.sensors.sensor import chosen
-from swarm_loc_estimator.swarm.motion_models import ImuModel
+from swarm_loc_estimator.swarm.error_models import ImuModel
 from swarm_loc_estimator.timeline.estimator import Estimator
 
 IMU = ImuModel(turn_noise_density=3e-4, turn_scale_sigma=0.005, turn_bias_sigma=0.01)

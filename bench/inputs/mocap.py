@@ -23,7 +23,7 @@ from swarm_loc_estimator.nodes.localizer_sources import SOURCES
 from swarm_loc_estimator.nodes.parameters import BridgeParameters
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.sensors.sensor import chosen, in_order_of_arrival
-from swarm_loc_estimator.swarm.swarm import OdometryModel
+from swarm_loc_estimator.swarm.error_models import OdometryModel
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

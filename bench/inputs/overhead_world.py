@@ -23,7 +23,8 @@ from swarm_loc_drivers.sim.scenarios.eight import EightSettings, drive_robots
 from swarm_loc_drivers.sim.scenarios.wandering import places, wander
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.sensors.camera import DetectionRows
-from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, SensorModel, Swarm
+from swarm_loc_estimator.swarm.error_models import SensorModel
+from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Swarm
 from swarm_loc_vision.aerial.fixed_camera import fixed_camera
 from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, GroundControl
 from swarm_loc_vision.aerial.parameters import AerialSettings

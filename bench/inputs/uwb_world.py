@@ -16,7 +16,8 @@ from swarm_loc_estimator.common.messages.definitions import RANGES
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, StartSigma, Swarm
+from swarm_loc_estimator.swarm.error_models import OdometryModel
+from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
 from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 from swarm_loc_estimator.timeline.contradictions import Contradiction
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator

@@ -14,7 +14,7 @@ from swarm_loc_drivers.sim.scenarios.eight import EightSettings
 from swarm_loc_drivers.sim.worlds import W0, W2, ErrorModel
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.swarm.swarm import SensorModel
+from swarm_loc_estimator.swarm.error_models import SensorModel
 
 DURATION_S = 60.0
 FAULT_S = (15.0, 45.0)

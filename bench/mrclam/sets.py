@@ -18,7 +18,8 @@ from swarm_loc_estimator.offline.datasets.mrclam import read_dataset
 from swarm_loc_estimator.offline.datasets.mrclam_bag import Delay, convert
 from swarm_loc_estimator.sensors.camera import NO_DETECTIONS
 from swarm_loc_estimator.sensors.sensor import chosen
-from swarm_loc_estimator.swarm.swarm import CameraMount, OdometryModel, Robot, SensorModel, Swarm
+from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 

@@ -29,7 +29,8 @@ from swarm_loc_estimator.offline.metrics import Errors, compare
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.conversion import InputConverter
 from swarm_loc_estimator.swarm.calibration_states import TURN_BIAS
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.swarm.error_models import OdometryModel
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 
 _FLOOR = np.diag([1e-10, 1e-10, 1e-10])

@@ -26,7 +26,8 @@ from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.offline.calibration.recording import Recording
 from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY
-from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, SensorModel, Swarm
+from swarm_loc_estimator.swarm.error_models import SensorModel
+from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
 
 SWARM = Swarm(
     tuple(Robot(f"robot{k}", "create", faces=(Face("body", k),), start=(0.0, 0.0, 0.0)) for k in (1, 2, 3)),

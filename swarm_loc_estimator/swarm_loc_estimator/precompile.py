@@ -30,8 +30,9 @@ from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
+from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.ir_board import IrMethod, RobotIr
-from swarm_loc_estimator.swarm.swarm import Face, Landmark, OdometryModel, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.fusion import Fusion
 from swarm_loc_estimator.timeline.scheduling import Policy

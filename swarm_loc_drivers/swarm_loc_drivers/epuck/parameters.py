@@ -16,7 +16,7 @@ from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
 from swarm_loc_drivers.epuck.hardware import EPUCK2, EPUCK_MODELS, EpuckModel, wheel_geometry
 from swarm_loc_drivers.epuck.session import CameraSettings
 from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text
-from swarm_loc_estimator.swarm.swarm import OdometryModel
+from swarm_loc_estimator.swarm.error_models import OdometryModel
 
 _ODOMETRY = OdometryModel()
 

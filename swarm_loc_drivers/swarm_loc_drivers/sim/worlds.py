@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.swarm.swarm import Pose2, Robot, SensorModel, Swarm
+from swarm_loc_estimator.swarm.error_models import SensorModel
+from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
 
 PRINTED_SENSOR = SensorModel(forward_sigma=0.026, left_sigma=0.029, heading_sigma=0.508)
 """The sigmas that the e-puck paper prints below its figure 5."""

@@ -18,7 +18,8 @@ from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2, as_counter
 from swarm_loc_drivers.epuck.odometry import WheelOdometry
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot
+from swarm_loc_estimator.swarm.error_models import OdometryModel
+from swarm_loc_estimator.swarm.swarm import Robot
 
 SECOND = 1_000_000_000
 NOISE = 2e-4

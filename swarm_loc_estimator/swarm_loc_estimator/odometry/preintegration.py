@@ -22,7 +22,7 @@ from swarm_loc_estimator.odometry.process_noise import (
     add_step_noise,
 )
 from swarm_loc_estimator.odometry.track_arrays import BEFORE_ALL_NS, LATEST_NS, TrackArrays
-from swarm_loc_estimator.swarm.swarm import OdometryModel
+from swarm_loc_estimator.swarm.error_models import OdometryModel
 
 UNCHANGED_NS = LATEST_NS
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.swarm.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
-from swarm_loc_estimator.swarm.swarm import OdometryModel
+from swarm_loc_estimator.swarm.error_models import OdometryModel
 
 _MAX_DISTANCE_M = 1e3
 _MAX_TURNING_S = 100.0

@@ -22,7 +22,7 @@ from swarm_loc_estimator.sensors.optical_frame import (
     to_level_frame,
     write_rotation,
 )
-from swarm_loc_estimator.swarm.swarm import SensorModel
+from swarm_loc_estimator.swarm.error_models import SensorModel
 
 CONTENT_POSITION = 1
 """Detection content: position only (MarkerDetection.CONTENT_POSITION)."""

@@ -10,11 +10,10 @@ from types import MappingProxyType
 
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.fix_model import FixModel
+from swarm_loc_estimator.swarm.error_models import FixModel, ImuModel, OdometryModel
 from swarm_loc_estimator.swarm.ir_board import RobotIr
-from swarm_loc_estimator.swarm.motion_models import ImuModel
 from swarm_loc_estimator.swarm.robot_types import ROBOT_TYPES, KnownRobot
-from swarm_loc_estimator.swarm.swarm import Face, Landmark, OdometryModel, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
 
 FAMILY_IDS = MappingProxyType(
     {

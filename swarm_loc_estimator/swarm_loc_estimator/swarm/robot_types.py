@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from swarm_loc_estimator.swarm.motion_models import ImuModel, RandomWalk
-from swarm_loc_estimator.swarm.swarm import CameraMount, Face, OdometryModel
+from swarm_loc_estimator.swarm.error_models import ImuModel, OdometryModel, RandomWalk
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face
 
 SENSORS = MappingProxyType(
     {

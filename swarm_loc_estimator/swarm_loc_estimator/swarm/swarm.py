@@ -14,8 +14,14 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 from swarm_loc_estimator.common.parameters import number
-from swarm_loc_estimator.swarm.fix_model import FixModel
-from swarm_loc_estimator.swarm.motion_models import ImuModel, RandomWalk
+from swarm_loc_estimator.swarm.error_models import (
+    TURN,
+    FixModel,
+    ImuModel,
+    OdometryModel,
+    RandomWalk,
+    SensorModel,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -26,131 +32,6 @@ if TYPE_CHECKING:
 
 Pose2 = tuple[float, float, float]
 """x [m], y [m], heading [rad]."""
-
-TURN = 6.2832
-"""Maximum absolute angle in descriptions: a full turn [rad]."""
-
-
-@dataclass(frozen=True)
-class OdometryModel:
-    """Error model of a robot's odometry: process noise, and calibration of the reported motion.
-
-    The reported speed v and turn rate w of a step become distance_scale * v and turn_scale * w, further
-    scaled by the robot's `MotionResponse` if it has one; turn_bias is added while the robot moves. They take
-    effect `delay_s` after their stamp, through a first-order lag `lag_s`. base_link moves along
-    `course_offset` and lies `axle_offset` ahead of the wheels' axle. Errors that last - a varying bias of the
-    turn rate, scales that are not quite known - are estimated along with the pose where their sigma is not
-    zero.
-    """
-
-    wheel_separation: float = number(0.053, "m", 0.001, 10.0, "distance between the two wheels")
-    wheel_noise: float = number(
-        2e-4, "m", 0.0, 1.0, "variance of each wheel's path per metre it rolls [m^2/m]"
-    )
-    distance_noise: float = number(
-        0.0, "m", 0.0, 1.0, "additional variance of the path per metre driven [m^2/m]"
-    )
-    distance_turn_noise: float = number(
-        0.0, "m^2/rad", 0.0, 1.0, "additional variance of the path per radian turned"
-    )
-    lateral_noise: float = number(0.0, "m", 0.0, 1.0, "variance across the path per metre driven [m^2/m]")
-    turn_noise: float = number(
-        0.0, "rad", 0.0, 10.0, "additional variance of the turn per radian turned [rad^2/rad]"
-    )
-    turn_change_noise: float = number(
-        0.0, "rad s", 0.0, 10.0, "additional variance of the turn per change of turn rate [rad^2/(rad/s)]"
-    )
-    distance_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance of the path per second while moving")
-    lateral_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance across the path per second while moving")
-    turn_drift: float = number(0.0, "rad^2/s", 0.0, 10.0, "variance of the turn per second while moving")
-    distance_scale: float = number(1.0, "1", 0.1, 10.0, "true path per reported path")
-    distance_scale_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "relative standard deviation of distance_scale; 0: exact, else estimated"
-    )
-    turn_scale: float = number(1.0, "1", 0.1, 10.0, "true turn per reported turn")
-    turn_scale_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "relative standard deviation of turn_scale; 0: exact, else estimated"
-    )
-    turn_bias: float = number(0.0, "rad/s", -1.0, 1.0, "true minus scaled turn rate while moving")
-    turn_bias_sigma: float = number(
-        0.0, "rad/s", 0.0, 10.0, "standard deviation of the variable part of turn_bias, estimated; 0: none"
-    )
-    turn_bias_time_s: float = number(
-        60.0, "s", 0.1, 1e6, "time constant of this variable part (Gauss-Markov)"
-    )
-    course_offset: float = number(
-        0.0, "rad", -math.pi, math.pi, "direction of motion against base_link's x axis"
-    )
-    axle_offset: float = number(0.0, "m", -1.0, 1.0, "base_link ahead of the wheels' axle")
-    delay_s: float = number(0.0, "s", -2.0, 2.0, "the motion happens this much after its stamp")
-    lag_s: float = number(0.0, "s", 0.0, 10.0, "time constant with which the motion follows the report")
-    timeout_s: float = number(1.0, "s", 0.01, 60.0, "time without messages after which the motion is unknown")
-    max_speed: float = number(1.0, "m/s", 0.001, 100.0, "steps that imply more are dropped")
-    max_turn_rate: float = number(10.0, "rad/s", 0.01, 1000.0, "steps that imply more are dropped")
-    speed_change: float = number(
-        0.1, "m/s/s^0.5", 0.0, 100.0, "random walk of the speed past the newest message"
-    )
-    turn_rate_change: float = number(
-        2.0, "rad/s/s^0.5", 0.0, 1000.0, "random walk of the turn rate past the newest message"
-    )
-
-
-@dataclass(frozen=True)
-class SensorModel:
-    """Error model of a robot's sightings: noise, calibration and gate.
-
-    Measured distances are multiplied by distance_scale. A sighting without heading has a range r [m] and a
-    bearing b [rad], positive to the left, which become
-    distance = r * exp(range_log_scale + range_skew * b + range_curve * b^2) + range_offset, to a robot's
-    marker with robot_range_offset more, and
-    bearing = bearing_scale * b + bearing_curve * b^2 + bearing_offset, taken `time_offset_s` after the stamp.
-    """
-
-    forward_sigma: float = number(
-        0.02, "m", 0.0, 10.0, "noise along the optical axis, sightings with heading", above=True
-    )
-    left_sigma: float = number(
-        0.01, "m", 0.0, 10.0, "noise across the optical axis, sightings with heading", above=True
-    )
-    heading_sigma: float = number(0.1, "rad", 0.0, 10.0, "noise of the marker's heading", above=True)
-    residual_position_sigma: float = number(
-        0.0,
-        "m",
-        0.0,
-        10.0,
-        "additional error forward and left, such as of calibration",
-    )
-    residual_heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "additional error of the marker's heading")
-    range_sigma: float = number(
-        0.15, "m", 0.0, 10.0, "noise of the range, sightings without heading", above=True
-    )
-    range_sigma_per_m: float = number(
-        0.0, "1", 0.0, 10.0, "growth of the range noise with distance [m per m]"
-    )
-    bearing_sigma: float = number(
-        0.05, "rad", 0.0, 10.0, "noise of the bearing, sightings without heading", above=True
-    )
-    distance_scale: float = number(1.0, "1", 0.1, 10.0, "measured per true distance")
-    distance_scale_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "relative standard deviation of distance_scale; 0: exact, else estimated"
-    )
-    range_log_scale: float = number(0.0, "1", -2.0, 2.0, "a of the range curve")
-    range_skew: float = number(0.0, "1/rad", -10.0, 10.0, "c of the range curve")
-    range_curve: float = number(
-        0.0, "1/rad^2", -10.0, 10.0, "q of the range curve; 0.5 when depth is logged as range"
-    )
-    range_offset: float = number(0.0, "m", -5.0, 5.0, "added to the scaled range")
-    robot_range_offset: float = number(0.0, "m", -5.0, 5.0, "also added to the range of a robot's marker")
-    bearing_curve: float = number(0.0, "1/rad", -10.0, 10.0, "quadratic term of the bearing")
-    bearing_offset: float = number(0.0, "rad", -TURN, TURN, "added to the scaled bearing")
-    bearing_scale: float = number(1.0, "1", 0.1, 10.0, "true bearing per logged bearing")
-    time_offset_s: float = number(0.0, "s", -2.0, 2.0, "exposure time minus stamp of the image")
-    time_sigma_s: float = number(
-        0.0, "s", 0.0, 2.0, "noise of the stamp of an image, common to its detections"
-    )
-    gate_probability: float = number(
-        0.9999, "1", 0.5, 1.0, "share of good sightings that must pass the gate; 1 passes all"
-    )
 
 
 @dataclass(frozen=True)

@@ -53,19 +53,16 @@ from typing import TYPE_CHECKING, Any
 
 from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
-from swarm_loc_estimator.swarm.fix_model import FixModel
+from swarm_loc_estimator.swarm.error_models import FixModel, ImuModel, OdometryModel, RandomWalk, SensorModel
 from swarm_loc_estimator.swarm.ir_section import IrSection, Values
-from swarm_loc_estimator.swarm.motion_models import ImuModel, RandomWalk
 from swarm_loc_estimator.swarm.motion_response import MotionResponse, MotionResponseError
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
     FixedCamera,
     Landmark,
-    OdometryModel,
     Pose2,
     Robot,
-    SensorModel,
     StartSigma,
     Swarm,
     SwarmError,

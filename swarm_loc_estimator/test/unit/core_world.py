@@ -12,16 +12,8 @@ from core_messages import POSE, POSITION, SECOND, T0, Event, detection, joined, 
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.swarm.swarm import (
-    CameraMount,
-    Face,
-    Landmark,
-    OdometryModel,
-    Robot,
-    SensorModel,
-    StartSigma,
-    Swarm,
-)
+from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, StartSigma, Swarm
 
 
 @dataclass(frozen=True)

@@ -42,8 +42,9 @@ from swarm_loc_estimator.offline.calibration.recording import (
 )
 from swarm_loc_estimator.offline.calibration.robust import population, ridge, softened
 from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSE
+from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
-from swarm_loc_estimator.swarm.swarm import CameraMount, OdometryModel, Robot, SensorModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Robot
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.settings import Settings
 

@@ -16,7 +16,8 @@ from swarm_loc_estimator.filter.measurement_model import NOBODY, Kind, Measureme
 from swarm_loc_estimator.sensors.bearing import BEARING
 from swarm_loc_estimator.sensors.camera import SightingConverter
 from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_BEARING
-from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, SensorModel, Swarm
+from swarm_loc_estimator.swarm.error_models import SensorModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, Swarm
 
 LEVEL = CameraMount(x=0.04, z=0.05)
 MOUNTS = [

@@ -20,8 +20,8 @@ from swarm_loc_estimator.common.messages.poses import decode_fix, encode_fix, en
 from swarm_loc_estimator.sensors.conversion import InputConverter
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import Batch
-from swarm_loc_estimator.swarm.fix_model import FixModel
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.swarm.error_models import FixModel, OdometryModel
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 from swarm_loc_estimator.timeline.settings import Settings
 

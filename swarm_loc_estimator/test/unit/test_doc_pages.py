@@ -20,18 +20,9 @@ from swarm_loc_estimator.cli import (
     watch,
 )
 from swarm_loc_estimator.common.parameters import number_specs
-from swarm_loc_estimator.swarm.fix_model import FixModel
-from swarm_loc_estimator.swarm.motion_models import ImuModel, RandomWalk
+from swarm_loc_estimator.swarm.error_models import FixModel, ImuModel, OdometryModel, RandomWalk, SensorModel
 from swarm_loc_estimator.swarm.robot_types import ROBOT_TYPES, SENSORS
-from swarm_loc_estimator.swarm.swarm import (
-    CameraMount,
-    Face,
-    FixedCamera,
-    Landmark,
-    OdometryModel,
-    SensorModel,
-    StartSigma,
-)
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Landmark, StartSigma
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 

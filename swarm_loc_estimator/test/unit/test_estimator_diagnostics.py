@@ -12,7 +12,8 @@ from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE
 from swarm_loc_estimator.nodes.estimator_diagnostics import Diagnostics, Recent, TickCost, load_report
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.swarm.error_models import OdometryModel
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
 from swarm_loc_estimator.timeline.fusion import Verdict
 

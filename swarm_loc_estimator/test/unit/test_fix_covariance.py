@@ -17,8 +17,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.correlated_noise import inflate_fix
 from swarm_loc_estimator.mapping.mapper_feed import fix_covariance
 from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.swarm.fix_model import FixModel
-from swarm_loc_estimator.swarm.motion_models import RandomWalk
+from swarm_loc_estimator.swarm.error_models import FixModel, RandomWalk
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimate import Estimate

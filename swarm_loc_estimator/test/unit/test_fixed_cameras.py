@@ -27,16 +27,8 @@ from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.camera import DetectionRows, SightingConverter
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import Batch, live_topics
-from swarm_loc_estimator.swarm.motion_models import RandomWalk
-from swarm_loc_estimator.swarm.swarm import (
-    CameraMount,
-    Face,
-    FixedCamera,
-    Landmark,
-    Robot,
-    SensorModel,
-    Swarm,
-)
+from swarm_loc_estimator.swarm.error_models import RandomWalk, SensorModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Estimate
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 

@@ -17,7 +17,8 @@ from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.swarm.error_models import OdometryModel
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.scheduling import Policy, end_of_period, middle_of_period
 from swarm_loc_estimator.timeline.settings import Settings

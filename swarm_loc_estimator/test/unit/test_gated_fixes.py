@@ -13,8 +13,8 @@ from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, NOBODY, MeasurementColumns
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
+from swarm_loc_estimator.swarm.error_models import RandomWalk
 from swarm_loc_estimator.swarm.ir_board import RobotIr
-from swarm_loc_estimator.swarm.motion_models import RandomWalk
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradicted
 from swarm_loc_estimator.timeline.estimator import Estimator, Status

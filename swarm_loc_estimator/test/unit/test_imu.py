@@ -24,8 +24,8 @@ from swarm_loc_estimator.sensors.imu import TURN_RATES, TurnRateRows, decode_imu
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
-from swarm_loc_estimator.swarm.motion_models import ImuModel
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.swarm.error_models import ImuModel, OdometryModel
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 
 NOISE = 0.002

@@ -21,7 +21,8 @@ from swarm_loc_estimator.common.messages.definitions import ODOMETRY
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.report.table import SELF_CALIBRATED
 from swarm_loc_estimator.sensors.camera import SightingConverter
-from swarm_loc_estimator.swarm.swarm import Landmark, OdometryModel, Robot, Swarm
+from swarm_loc_estimator.swarm.error_models import OdometryModel
+from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Estimator

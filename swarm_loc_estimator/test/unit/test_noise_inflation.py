@@ -21,7 +21,8 @@ from swarm_loc_estimator.filter.measurement_model import (
 )
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
-from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, SensorModel
+from swarm_loc_estimator.swarm.error_models import SensorModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Robot
 
 ROBOTS = (Robot("one", camera=CameraMount()), Robot("two", camera=CameraMount()))
 

@@ -15,8 +15,8 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.odometry.look_up import OdometrySample, look_up_pose
 from swarm_loc_estimator.odometry.tracks import OdometryTracks, TrackChange
 from swarm_loc_estimator.swarm.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
-from swarm_loc_estimator.swarm.motion_models import RandomWalk
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot
+from swarm_loc_estimator.swarm.error_models import OdometryModel, RandomWalk
+from swarm_loc_estimator.swarm.swarm import Robot
 
 PLAIN = OdometryModel(wheel_separation=0.1, wheel_noise=1e-4)
 WALK = RandomWalk(position=2e-4, heading=0.05)

@@ -23,7 +23,8 @@ from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.odometry import ODOMETRY
 from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.sensors.sensor import chosen
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.swarm.error_models import OdometryModel
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.timeline import HasBudget

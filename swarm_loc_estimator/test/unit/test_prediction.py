@@ -16,7 +16,8 @@ from swarm_loc_estimator.swarm.calibration_states import (
     TURN_SCALE,
     ParameterTable,
 )
-from swarm_loc_estimator.swarm.swarm import CameraMount, OdometryModel, Robot, SensorModel
+from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Robot
 
 BIAS_SIGMA, DISTANCE_SIGMA, TURN_SIGMA, BIAS_TIME_S = 0.005, 0.01, 0.005, 20.0
 STEP_NS = SECOND // 20

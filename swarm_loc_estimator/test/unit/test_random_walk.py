@@ -8,7 +8,7 @@ from core_geometry import wrapped
 from core_messages import SECOND, T0, give_fix
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.swarm.motion_models import RandomWalk
+from swarm_loc_estimator.swarm.error_models import RandomWalk
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm, SwarmError
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.settings import Settings

@@ -8,7 +8,8 @@ import pytest
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.offline.calibration.noise import with_noise
 from swarm_loc_estimator.offline.calibration.scatter import sway_of
-from swarm_loc_estimator.swarm.swarm import Robot, SensorModel, Swarm
+from swarm_loc_estimator.swarm.error_models import SensorModel
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 
 def sightings(seed: int, sway: float, time_s: float, noise: float) -> tuple[FloatArray, IntArray, FloatArray]:

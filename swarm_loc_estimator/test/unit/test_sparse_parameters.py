@@ -23,13 +23,8 @@ from swarm_loc_estimator.swarm.calibration_states import (
     DRIVES,
     ParameterTable,
 )
-from swarm_loc_estimator.swarm.swarm import (
-    CameraMount,
-    Landmark,
-    OdometryModel,
-    Robot,
-    SensorModel,
-)
+from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Landmark, Robot
 
 START = np.diag([1e-4, 1e-4, 4e-4])
 NOISE = np.diag([4e-4, 4e-4, 1e-3])

@@ -19,14 +19,8 @@ from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.camera import SightingConverter
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
-from swarm_loc_estimator.swarm.swarm import (
-    CameraMount,
-    Face,
-    Landmark,
-    OdometryModel,
-    Robot,
-    Swarm,
-)
+from swarm_loc_estimator.swarm.error_models import OdometryModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.scheduling import Policy
 from swarm_loc_estimator.timeline.settings import Settings

@@ -11,20 +11,10 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.fix_model import FixModel
+from swarm_loc_estimator.swarm.error_models import FixModel, OdometryModel, RandomWalk, SensorModel
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrMethod, RobotIr
-from swarm_loc_estimator.swarm.motion_models import RandomWalk
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
-from swarm_loc_estimator.swarm.swarm import (
-    CameraMount,
-    Face,
-    Landmark,
-    OdometryModel,
-    Robot,
-    SensorModel,
-    StartSigma,
-    Swarm,
-)
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, StartSigma, Swarm
 from swarm_loc_estimator.swarm.swarm_file import RESERVED_NAMES, load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 

@@ -25,7 +25,8 @@ from swarm_loc_drivers.sim.scenarios.eight_images import FAMILY
 from swarm_loc_drivers.sim.worlds import WORLDS, ErrorModel, WorldError, hidden_geometry, start_of
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Swarm
+from swarm_loc_estimator.swarm.error_models import OdometryModel
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.aerial.ground_control import FloorMarker
 from swarm_loc_vision.aerial.ground_file import load_ground

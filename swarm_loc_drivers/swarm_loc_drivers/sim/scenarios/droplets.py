@@ -41,8 +41,9 @@ from swarm_loc_drivers.sim.scenarios.eight import rounded
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 PITCH = 0.13
 _JITTER = 0.02

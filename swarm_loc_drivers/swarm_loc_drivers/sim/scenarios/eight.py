@@ -21,15 +21,8 @@ from swarm_loc_drivers.sim.sightings import Exposures, View, observe_markers, sc
 from swarm_loc_drivers.sim.worlds import W0, ErrorModel
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.swarm.swarm import (
-    CameraMount,
-    Face,
-    Landmark,
-    OdometryModel,
-    Robot,
-    StartSigma,
-    Swarm,
-)
+from swarm_loc_estimator.swarm.error_models import OdometryModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, StartSigma, Swarm
 
 _TABLE_SIZE = 20001
 

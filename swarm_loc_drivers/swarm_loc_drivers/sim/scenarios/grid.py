@@ -25,16 +25,8 @@ from swarm_loc_drivers.sim.run import (
 from swarm_loc_drivers.sim.sightings import Exposures, View, deliver, schedule_exposures
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.swarm.swarm import (
-    CameraMount,
-    Face,
-    Landmark,
-    OdometryModel,
-    Robot,
-    SensorModel,
-    StartSigma,
-    Swarm,
-)
+from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, StartSigma, Swarm
 
 PITCH = 0.5
 HOME_RADIUS = 0.08

@@ -57,8 +57,8 @@ from swarm_loc_estimator.common.messages.poses import (
     encode_odometry,
     encode_pose_stamped,
 )
-from swarm_loc_estimator.swarm.fix_model import FixModel
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, StartSigma, Swarm
+from swarm_loc_estimator.swarm.error_models import FixModel, OdometryModel
+from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
 
 EVENT_STEP_US = 5_000
 """Time of an event packet, as the driver makes them."""

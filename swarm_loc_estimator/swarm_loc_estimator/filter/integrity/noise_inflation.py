@@ -16,7 +16,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.belief import BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementColumns
-from swarm_loc_estimator.swarm.swarm import SensorModel
+from swarm_loc_estimator.swarm.error_models import SensorModel
 
 _POSITION_SIGMA, _BEARING_SIGMA, _HEADING_SIGMA, _STAMP_SIGMA = 0.004, 0.01, 0.03, 0.03
 """One unit of inflation [m], [rad], [rad], [s]."""

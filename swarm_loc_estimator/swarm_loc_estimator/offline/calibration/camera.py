@@ -25,7 +25,8 @@ from swarm_loc_estimator.offline.calibration.robust import (
 )
 from swarm_loc_estimator.sensors.camera import SightingConverter
 from swarm_loc_estimator.sensors.sensor import chosen
-from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, SensorModel, Swarm
+from swarm_loc_estimator.swarm.error_models import SensorModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm
 
 DENSE_GAP_NS = 200_000_000
 """Longest gap of ground truth that is interpolated."""

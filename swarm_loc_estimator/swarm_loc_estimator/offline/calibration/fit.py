@@ -42,8 +42,9 @@ from swarm_loc_estimator.offline.calibration.robust import spread
 from swarm_loc_estimator.offline.calibration.scatter import with_scatter
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.sensors.ingest import MAX_PAUSE_NS
+from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
-from swarm_loc_estimator.swarm.swarm import OdometryModel, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 EVALUATIONS = 80
 """Runs of the estimator to fit the noise."""

@@ -22,8 +22,8 @@ from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.offline.calibration.camera import DENSE_GAP_NS
 from swarm_loc_estimator.offline.calibration.robust import ridge
 from swarm_loc_estimator.sensors.sensor import chosen
+from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
-from swarm_loc_estimator.swarm.swarm import OdometryModel
 
 LONGEST_DELAY_S = 0.5
 LONGEST_LAG_S = 1.0

@@ -23,7 +23,8 @@ from swarm_loc_estimator.offline.calibration.recording import Recording, rerun
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.sensor import chosen
-from swarm_loc_estimator.swarm.swarm import OdometryModel, SensorModel, Swarm
+from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
+from swarm_loc_estimator.swarm.swarm import Swarm
 
 TICK_S = 1.0
 """Interval at which errors are computed."""

@@ -17,15 +17,8 @@ from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.offline.datasets.mrclam import MAX_TRUTH_GAP_NS, Dataset, RobotLog, integrate
 from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSITION
-from swarm_loc_estimator.swarm.swarm import (
-    CameraMount,
-    Face,
-    Landmark,
-    OdometryModel,
-    Pose2,
-    Robot,
-    Swarm,
-)
+from swarm_loc_estimator.swarm.error_models import OdometryModel
+from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Pose2, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 ROBOT_TYPE = "create"

@@ -1,0 +1,194 @@
+"""Error models of odometry, of IMUs, of robots without odometry, of sightings and of absolute fixes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from swarm_loc_estimator.common.parameters import number
+
+TURN = 6.2832
+"""Maximum absolute angle in descriptions: a full turn [rad]."""
+
+
+@dataclass(frozen=True)
+class OdometryModel:
+    """Error model of a robot's odometry: process noise, and calibration of the reported motion.
+
+    The reported speed v and turn rate w of a step become distance_scale * v and turn_scale * w, further
+    scaled by the robot's `MotionResponse` if it has one; turn_bias is added while the robot moves. They take
+    effect `delay_s` after their stamp, through a first-order lag `lag_s`. base_link moves along
+    `course_offset` and lies `axle_offset` ahead of the wheels' axle. Errors that last - a varying bias of the
+    turn rate, scales that are not quite known - are estimated along with the pose where their sigma is not
+    zero.
+    """
+
+    wheel_separation: float = number(0.053, "m", 0.001, 10.0, "distance between the two wheels")
+    wheel_noise: float = number(
+        2e-4, "m", 0.0, 1.0, "variance of each wheel's path per metre it rolls [m^2/m]"
+    )
+    distance_noise: float = number(
+        0.0, "m", 0.0, 1.0, "additional variance of the path per metre driven [m^2/m]"
+    )
+    distance_turn_noise: float = number(
+        0.0, "m^2/rad", 0.0, 1.0, "additional variance of the path per radian turned"
+    )
+    lateral_noise: float = number(0.0, "m", 0.0, 1.0, "variance across the path per metre driven [m^2/m]")
+    turn_noise: float = number(
+        0.0, "rad", 0.0, 10.0, "additional variance of the turn per radian turned [rad^2/rad]"
+    )
+    turn_change_noise: float = number(
+        0.0, "rad s", 0.0, 10.0, "additional variance of the turn per change of turn rate [rad^2/(rad/s)]"
+    )
+    distance_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance of the path per second while moving")
+    lateral_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance across the path per second while moving")
+    turn_drift: float = number(0.0, "rad^2/s", 0.0, 10.0, "variance of the turn per second while moving")
+    distance_scale: float = number(1.0, "1", 0.1, 10.0, "true path per reported path")
+    distance_scale_sigma: float = number(
+        0.0, "1", 0.0, 1.0, "relative standard deviation of distance_scale; 0: exact, else estimated"
+    )
+    turn_scale: float = number(1.0, "1", 0.1, 10.0, "true turn per reported turn")
+    turn_scale_sigma: float = number(
+        0.0, "1", 0.0, 1.0, "relative standard deviation of turn_scale; 0: exact, else estimated"
+    )
+    turn_bias: float = number(0.0, "rad/s", -1.0, 1.0, "true minus scaled turn rate while moving")
+    turn_bias_sigma: float = number(
+        0.0, "rad/s", 0.0, 10.0, "standard deviation of the variable part of turn_bias, estimated; 0: none"
+    )
+    turn_bias_time_s: float = number(
+        60.0, "s", 0.1, 1e6, "time constant of this variable part (Gauss-Markov)"
+    )
+    course_offset: float = number(
+        0.0, "rad", -math.pi, math.pi, "direction of motion against base_link's x axis"
+    )
+    axle_offset: float = number(0.0, "m", -1.0, 1.0, "base_link ahead of the wheels' axle")
+    delay_s: float = number(0.0, "s", -2.0, 2.0, "the motion happens this much after its stamp")
+    lag_s: float = number(0.0, "s", 0.0, 10.0, "time constant with which the motion follows the report")
+    timeout_s: float = number(1.0, "s", 0.01, 60.0, "time without messages after which the motion is unknown")
+    max_speed: float = number(1.0, "m/s", 0.001, 100.0, "steps that imply more are dropped")
+    max_turn_rate: float = number(10.0, "rad/s", 0.01, 1000.0, "steps that imply more are dropped")
+    speed_change: float = number(
+        0.1, "m/s/s^0.5", 0.0, 100.0, "random walk of the speed past the newest message"
+    )
+    turn_rate_change: float = number(
+        2.0, "rad/s/s^0.5", 0.0, 1000.0, "random walk of the turn rate past the newest message"
+    )
+
+
+@dataclass(frozen=True)
+class ImuModel:
+    """Error model of the gyroscope of a robot's IMU, which measures the turns in place of the wheels.
+
+    The turn rate w about the vertical becomes turn_scale * w + turn_bias. Errors that last are estimated
+    along with the pose where their sigma is not zero; those of the wheels' turns are then not estimated.
+    """
+
+    turn_noise_density: float = number(
+        0.0, "rad/s/Hz^0.5", 0.0, 1.0, "white noise of the turn rate; 0: the robot has no IMU"
+    )
+    turn_scale: float = number(1.0, "1", -10.0, 10.0, "true turn per measured turn; -1: mounted upside down")
+    turn_scale_sigma: float = number(
+        0.0, "1", 0.0, 1.0, "relative standard deviation of turn_scale; 0: exact, else estimated"
+    )
+    turn_bias: float = number(0.0, "rad/s", -1.0, 1.0, "true minus scaled turn rate")
+    turn_bias_sigma: float = number(
+        0.0, "rad/s", 0.0, 10.0, "standard deviation of the variable part of turn_bias, estimated; 0: none"
+    )
+    turn_bias_time_s: float = number(
+        600.0, "s", 0.1, 1e6, "time constant of this variable part (Gauss-Markov)"
+    )
+    roll: float = number(
+        0.0, "rad", -math.pi, math.pi, "mount: the IMU turned about base_link's x axis, before pitch"
+    )
+    pitch: float = number(0.0, "rad", -math.pi, math.pi, "mount: turned about base_link's y axis")
+    delay_s: float = number(0.0, "s", -2.0, 2.0, "the turn happens this much after its stamp")
+    timeout_s: float = number(
+        0.25, "s", 0.001, 10.0, "time between two messages from which the turn of the wheels is used"
+    )
+
+    @property
+    def is_used(self) -> bool:
+        """Whether the robot has an IMU."""
+        return self.turn_noise_density > 0.0
+
+
+@dataclass(frozen=True)
+class RandomWalk:
+    """Random walk of a robot without odometry, given by the growth of its pose variance."""
+
+    position: float = number(0.0, "m^2/s", 0.0, 1e3, "variance of x and of y per second; 0: stationary")
+    heading: float = number(0.0, "rad^2/s", 0.0, 1e3, "variance of the heading per second")
+
+    @property
+    def moves(self) -> bool:
+        """Whether the pose changes at all."""
+        return self.position > 0.0 or self.heading > 0.0
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """Error model of a robot's sightings: noise, calibration and gate.
+
+    Measured distances are multiplied by distance_scale. A sighting without heading has a range r [m] and a
+    bearing b [rad], positive to the left, which become
+    distance = r * exp(range_log_scale + range_skew * b + range_curve * b^2) + range_offset, to a robot's
+    marker with robot_range_offset more, and
+    bearing = bearing_scale * b + bearing_curve * b^2 + bearing_offset, taken `time_offset_s` after the stamp.
+    """
+
+    forward_sigma: float = number(
+        0.02, "m", 0.0, 10.0, "noise along the optical axis, sightings with heading", above=True
+    )
+    left_sigma: float = number(
+        0.01, "m", 0.0, 10.0, "noise across the optical axis, sightings with heading", above=True
+    )
+    heading_sigma: float = number(0.1, "rad", 0.0, 10.0, "noise of the marker's heading", above=True)
+    residual_position_sigma: float = number(
+        0.0,
+        "m",
+        0.0,
+        10.0,
+        "additional error forward and left, such as of calibration",
+    )
+    residual_heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "additional error of the marker's heading")
+    range_sigma: float = number(
+        0.15, "m", 0.0, 10.0, "noise of the range, sightings without heading", above=True
+    )
+    range_sigma_per_m: float = number(
+        0.0, "1", 0.0, 10.0, "growth of the range noise with distance [m per m]"
+    )
+    bearing_sigma: float = number(
+        0.05, "rad", 0.0, 10.0, "noise of the bearing, sightings without heading", above=True
+    )
+    distance_scale: float = number(1.0, "1", 0.1, 10.0, "measured per true distance")
+    distance_scale_sigma: float = number(
+        0.0, "1", 0.0, 1.0, "relative standard deviation of distance_scale; 0: exact, else estimated"
+    )
+    range_log_scale: float = number(0.0, "1", -2.0, 2.0, "a of the range curve")
+    range_skew: float = number(0.0, "1/rad", -10.0, 10.0, "c of the range curve")
+    range_curve: float = number(
+        0.0, "1/rad^2", -10.0, 10.0, "q of the range curve; 0.5 when depth is logged as range"
+    )
+    range_offset: float = number(0.0, "m", -5.0, 5.0, "added to the scaled range")
+    robot_range_offset: float = number(0.0, "m", -5.0, 5.0, "also added to the range of a robot's marker")
+    bearing_curve: float = number(0.0, "1/rad", -10.0, 10.0, "quadratic term of the bearing")
+    bearing_offset: float = number(0.0, "rad", -TURN, TURN, "added to the scaled bearing")
+    bearing_scale: float = number(1.0, "1", 0.1, 10.0, "true bearing per logged bearing")
+    time_offset_s: float = number(0.0, "s", -2.0, 2.0, "exposure time minus stamp of the image")
+    time_sigma_s: float = number(
+        0.0, "s", 0.0, 2.0, "noise of the stamp of an image, common to its detections"
+    )
+    gate_probability: float = number(
+        0.9999, "1", 0.5, 1.0, "share of good sightings that must pass the gate; 1 passes all"
+    )
+
+
+@dataclass(frozen=True)
+class FixModel:
+    """Error model of a robot's absolute fixes, beside or in place of the covariance of each."""
+
+    systematic_share: float = number(
+        0.0, "1", 0.0, 1.0, "share of a fix's variance that earlier fixes have, too; 1: fixes of a mapper"
+    )
+    position_sigma: float = number(0.0, "m", 0.0, 1e3, "of x and y, for fixes without covariance; 0: dropped")
+    heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "of the heading, for such fixes; 0: it is not used")
