@@ -100,7 +100,7 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
         rows = rows._replace(rate=np.sum(vertical[rows.robot] * rows.velocity, axis=1))
         reasons = {
             "imu_non_finite": ~np.isfinite(rows.velocity).all(axis=1),
-            "imu_absurd": np.abs(rows.rate) > _MAX_RATE,
+            "imu_absurd": ~(np.abs(rows.rate) <= _MAX_RATE),
         }
         good = drops.screen(rows.robot, reasons)
         return rows if good.all() else chosen(rows, good)
