@@ -63,7 +63,8 @@ def pytest_collection_finish() -> None:
 def _own_ros_domain(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Give a test under `test/node` a domain that no other test on this machine has at the same time.
 
-    Tests kill processes. Where Fast DDS 2.14 shares memory with one that was killed, it may crash at its end.
+    Only UDP is used, since tests kill processes: Fast DDS 2.14 may crash at exit after a process that shared
+    memory with it was killed.
     """
     if "node" not in request.path.parts:
         yield

@@ -102,12 +102,8 @@ def _relative_errors(run: SimulatedRun) -> FloatArray:
 def _fitted(places: FloatArray, truth: FloatArray) -> FloatArray:
     """Distances (N,) after the rigid motion of places (N, 2) that fits the truth best."""
     known = np.isfinite(places).all(axis=1)
-    a, b = places - places[known].mean(axis=0), truth - truth[known].mean(axis=0)
-    turn = np.arctan2(
-        np.sum(a[known, 0] * b[known, 1] - a[known, 1] * b[known, 0]), np.sum(a[known] * b[known])
-    )
-    moved = se2.transform_points([0.0, 0.0, turn], a)
-    return np.asarray(np.hypot(*(moved - b).T))
+    moved = se2.transform_points(se2.rigid_fit(places[known], truth[known]), places)
+    return np.asarray(np.hypot(*(moved - truth).T))
 
 
 def _in_map(run: SimulatedRun) -> tuple[FloatArray, BoolArray, BoolArray, int]:

@@ -26,7 +26,7 @@ from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Swarm
 from swarm_loc_vision.aerial.fixed_camera import fixed_camera
-from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, GroundControl
+from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, located
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.markers.bodies import robot_body, up_of
 from swarm_loc_vision.markers.camera_detector import detection_rows
@@ -127,12 +127,10 @@ def _located(
     ground = Ground(markers=tuple(_measured(one, rng) for one in floor), family=FAMILY)
     empty, cameras = Trajectories(truth.stamp_ns, truth.poses[:, :0]), []
     for k, camera in enumerate(hidden):
-        control = GroundControl(ground, MODEL.camera, _CONTROL)
-        for image in range(1, _CALIBRATION_IMAGES + 1):
-            control.look(rig.take(k, START_NS + image * PERIOD_NS, empty, rng))
-        if control.fit is None:
-            raise ValueError(control.trouble)
-        cameras.append(replace(fixed_camera(camera.name, control.fit.ground, TOP.z), sensor=_RESIDUAL))
+        stamps_ns = [START_NS + image * PERIOD_NS for image in range(1, _CALIBRATION_IMAGES + 1)]
+        pictures = [rig.take(k, stamp_ns, empty, rng) for stamp_ns in stamps_ns]
+        fit = located(ground, MODEL.camera, pictures, _CONTROL)
+        cameras.append(replace(fixed_camera(camera.name, fit.ground, TOP.z), sensor=_RESIDUAL))
     return tuple(cameras)
 
 

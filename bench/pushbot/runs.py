@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 from bench.pushbot.particle_mapper import ParticleMapper
 from swarm_loc_drivers.sim.pushbot.exploration import Arrival, Exploration, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan
+from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import fix_covariance
 from swarm_loc_estimator.offline.metrics import is_misleading, nees
@@ -187,15 +187,6 @@ def wall_distance_cm(cells: FloatArray, plan: FloorPlan) -> float:
     return 100.0 * float(cKDTree(wall_points(plan, 0.01)).query(cells)[0].mean()) if len(cells) else math.inf
 
 
-def rigid_fit(points: FloatArray, to: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Rotation (2, 2) and shift (2,) that bring points (n, 2) closest to others (n, 2)."""
-    middle, goal = points.mean(axis=0), to.mean(axis=0)
-    spread = (points - middle).T @ (to - goal)
-    angle = math.atan2(spread[0, 1] - spread[1, 0], spread[0, 0] + spread[1, 1])
-    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    return rotation, goal - rotation @ middle
-
-
 def _place(mapper: CooperativeMapper | ParticleMapper, arrival: Arrival) -> tuple[int, float]:
     """Stop of an arrival in the graph, and the turn by odometry there until now."""
     if isinstance(mapper, ParticleMapper):
@@ -231,9 +222,9 @@ def _score(
     robots = np.array([one.robot for one in arrivals])
     errors, told = (100.0 * np.hypot(*(poses - truth)[:, :2].T) for poses in (final, online))
     last = [int(np.flatnonzero(robots == robot)[-1]) for robot in exploration.robots]
-    heading = np.degrees(np.abs(wrap_angle(final[last, 2] - truth[last, 2])))
-    rotation, shift = rigid_fit(final[:, :2], truth[:, :2])
-    aligned = final[:, :2] @ rotation.T + shift - truth[:, :2]
+    heading = np.degrees(np.abs(se2.wrap_angle(final[last, 2] - truth[last, 2])))
+    fit = se2.rigid_fit(final[:, :2], truth[:, :2])
+    aligned = se2.transform_points(fit, final[:, :2]) - truth[:, :2]
     occupancy = mapper.occupancy()
     cells = occupancy.centres(occupancy.occupied)
     return RunResult(
@@ -245,7 +236,7 @@ def _score(
         online_worst_cm=float(told.max()),
         aligned_cm=100.0 * float(np.sqrt(np.square(aligned).sum(axis=1).mean())),
         wall_cm=wall_distance_cm(cells, plan),
-        wall_aligned_cm=wall_distance_cm(cells @ rotation.T + shift, plan),
+        wall_aligned_cm=wall_distance_cm(se2.transform_points(fit, cells), plan),
         coverage=coverage(cells, wall_points(plan, 0.04)),
         coverage_90_s=coverage_90_s,
         cpu_s_per_s=exploration.cpu_s / (60.0 * settings.minutes),

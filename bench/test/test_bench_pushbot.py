@@ -11,19 +11,10 @@ from bench.pushbot.calibration import calibrate
 from bench.pushbot.driver import robots_on_two_cores
 from bench.pushbot.event_flow import RATE, Measured
 from bench.pushbot.mapping import MappingEffort, figures_of, planned
-from bench.pushbot.runs import RunResult, RunSettings, coverage, rigid_fit, run, wall_distance_cm, wall_points
+from bench.pushbot.runs import RunResult, RunSettings, coverage, run, wall_distance_cm, wall_points
 from bench.pushbot.tracker import BAR_NOISE, TRACKERS, packet, scene, score
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_estimator.common.messages.event_encoding import Events
-
-
-def test_a_rigid_fit_undoes_a_motion() -> None:
-    points = np.random.default_rng(1).normal(size=(20, 2))
-    angle = 0.3
-    rotation = np.array([[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]])
-    found, shift = rigid_fit(points, points @ rotation.T + [1.0, -2.0])
-    assert np.allclose(found, rotation)
-    assert np.allclose(shift, [1.0, -2.0])
 
 
 def test_walls_are_covered_by_cells_on_them() -> None:

@@ -18,7 +18,7 @@ from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 from swarm_loc_vision.aerial.fixed_camera import fixed_camera
-from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, GroundControl
+from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, located
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.markers.bodies import robot_body
 from swarm_loc_vision.markers.camera_detector import detection_rows
@@ -44,11 +44,9 @@ def described() -> FixedCamera:
     track = still(np.zeros((0, 3)))
     rig = CeilingRig((), (HUNG,), ARENA, MODEL, FLOOR, 1)
     settings = AerialSettings(control_sigma_px=0.1, control_sigma=0.0)
-    control = GroundControl(Ground(markers=tuple(FLOOR), family=FAMILY), MODEL.camera, settings)
-    for k in range(5):
-        control.look(rig.take(0, START_NS + 10**9, track, np.random.default_rng(k)))
-    assert control.fit is not None, control.trouble
-    return fixed_camera("up", control.fit.ground, TOP.z)
+    pictures = [rig.take(0, START_NS + 10**9, track, np.random.default_rng(k)) for k in range(5)]
+    fit = located(Ground(markers=tuple(FLOOR), family=FAMILY), MODEL.camera, pictures, settings)
+    return fixed_camera("up", fit.ground, TOP.z)
 
 
 def still(poses: np.ndarray) -> Trajectories:

@@ -52,6 +52,15 @@ def transform_points(pose: ArrayLike, points: ArrayLike) -> FloatArray:
     return np.stack([x, y], axis=-1)
 
 
+def rigid_fit(points: ArrayLike, to: ArrayLike) -> FloatArray:
+    """The pose (3,) of the frame of points (k, 2) [m] that brings them closest to others (k, 2) [m]."""
+    points, to = np.asarray(points, dtype=float), np.asarray(to, dtype=float)
+    middle, goal = points.mean(axis=0), to.mean(axis=0)
+    spread = (points - middle).T @ (to - goal)
+    turn = np.arctan2(spread[0, 1] - spread[1, 0], spread[0, 0] + spread[1, 1])
+    return np.array([*(goal - transform_points([0.0, 0.0, turn], middle)), turn])
+
+
 def exp(twist: ArrayLike) -> FloatArray:
     """The pose (..., 3) reached by following ``twist`` (..., 3) for unit time."""
     twist = np.asarray(twist, dtype=float)

@@ -127,7 +127,8 @@ class BridgeParameters:
     swarm_file: str = text("", "path of the swarm description", required=True)
     source: str = choice("pose", tuple(SOURCES), "kind of messages, see the table of sources")
     topic: str = text(
-        "", "their topic, with <body> in place of the body's name; empty: that of the table of sources"
+        "",
+        "topic of the messages, with <body> in place of the body's name; empty: that of the table of sources",
     )
     output: str = choice(
         "fix",
@@ -135,13 +136,15 @@ class BridgeParameters:
         "<robot>/fix for the estimator, or <robot>/ground_truth to evaluate it",
     )
     bodies: tuple[str, ...] = texts(
-        "tracked bodies, such as cf1=epuck1, or epuck2 for a body with the robot's name; empty: all robots so"
+        "tracked bodies, such as cf1=epuck1, or epuck2 for a body with the robot's name;"
+        " empty: each robot has a body of its own name"
     )
     offsets: tuple[str, ...] = texts(
-        "poses of bodies in base_link, such as epuck1=0.01,0,1.5708 [m, m, rad]; else bodies are base_link"
+        "poses of bodies in base_link, such as epuck1=0.01,0,1.5708 [m, m, rad];"
+        " the body of a robot not named here is at base_link"
     )
     source_frame: str = text("", "frame that the poses must be in; empty: map_frame or world")
-    map_frame: str = text("map", "what this frame is called in the output", required=True)
+    map_frame: str = text("map", "frame of the published poses", required=True)
     latency_s: float = number(
         0.0, "s", 0.0, 2.0, "time from the exposure to the stamp of a message, subtracted from the stamp"
     )

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import decode, nanoseconds
 from swarm_loc_estimator.common.messages.definitions import IMU
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
@@ -49,6 +49,9 @@ class TurnRateRows(NamedTuple):
     velocity: FloatArray
     rate: FloatArray
     arrival_ns: IntArray
+
+
+NO_TURN_RATES = TurnRateRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros(0), NO_ROWS)
 
 
 class ImuMessage(NamedTuple):
@@ -98,7 +101,7 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
 
     def valid(rows: TurnRateRows) -> TurnRateRows:
         rows = rows._replace(rate=np.sum(vertical[rows.robot] * rows.velocity, axis=1))
-        reasons = {
+        reasons: dict[str, BoolArray] = {
             "imu_non_finite": ~np.isfinite(rows.velocity).all(axis=1),
             "imu_absurd": ~(np.abs(rows.rate) <= _MAX_RATE),
         }
@@ -115,11 +118,5 @@ def _has_imu(robot: Robot) -> bool:
 _OWN = InputKind(
     "imu", "imu", IMU, lambda n, _: EachReader(n, decode_imu), _columns, _has_imu, only_expected=True
 )
-TURN_RATES = Sensor(
-    "imu",
-    TurnRateRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros(0), NO_ROWS),
-    (_OWN,),
-    _create_converter,
-    unit=None,
-)
+TURN_RATES = Sensor("imu", NO_TURN_RATES, (_OWN,), _create_converter, unit=None)
 """The sensor, see `registry.SENSORS`."""

@@ -31,7 +31,9 @@ class UwbDevice:
         0.15, "m", 0.0, 10.0, "noise of a range difference without variance", above=True
     )
     range_bias: float = number(0.0, "m", -10.0, 10.0, "added to each range from or to this device")
-    range_scale: float = number(1.0, "1", 0.5, 2.0, "measured per true distance, of what it measures")
+    range_scale: float = number(
+        1.0, "1", 0.5, 2.0, "measured over true distance, of ranges that this device measures"
+    )
     gate_probability: float = number(
         0.999, "1", 0.5, 1.0, "share of good ranges that must pass the gate; 1 passes all"
     )

@@ -49,7 +49,7 @@ def run(estimator: Estimator, world: World, until_s: float | None = None) -> Est
     return play(estimator, events, ticks(T0 + SECOND // 10, end_ns))[-1]
 
 
-def after_rigid_fit(poses: FloatArray, truth: FloatArray) -> FloatArray:
+def relative_to_first(poses: FloatArray, truth: FloatArray) -> FloatArray:
     """Errors (N, 3) of poses (N, 3) moved such that the first robot has its true pose."""
     motion = se2.compose(truth[0], se2.inverse(poses[0]))
     return wrapped(se2.compose(motion, poses) - truth)
@@ -67,7 +67,7 @@ def test_robots_are_located_relative_to_one_of_them(seed: int) -> None:
     last = run(estimator, world)
     assert estimator.origin in {robot.name for robot in world.swarm.robots}
     assert (last.status == Status.TRACKED).all()
-    error = after_rigid_fit(last.poses, world.at(end_of(world)))
+    error = relative_to_first(last.poses, world.at(end_of(world)))
     assert np.abs(error[:, :2]).max() < 0.1
 
 

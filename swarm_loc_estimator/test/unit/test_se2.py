@@ -44,6 +44,15 @@ def test_compose_and_inverse_are_those_of_homogeneous_matrices(seed: int) -> Non
     np.testing.assert_allclose(se2.transform_points(a, point), (planar(a) @ [*point, 1.0])[:2], atol=1e-12)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_rigid_fit_undoes_a_motion_and_errors_that_balance(seed: int) -> None:
+    (pose,) = poses(seed, 1)
+    points = np.random.default_rng(seed).normal(size=(20, 2))
+    assert_same_pose(se2.rigid_fit(points, se2.transform_points(pose, points)), pose)
+    square = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 0.0], [0.0, -1.0]])
+    assert_same_pose(se2.rigid_fit(square, se2.transform_points(pose, 1.1 * square)), pose)
+
+
 @pytest.mark.parametrize("turn", [0.0, 1e-12, 1e-5, 0.99e-4, 1.01e-4, 0.3, -2.0, 3.1])
 def test_exp_is_the_matrix_exponential_and_log_undoes_it(turn: float) -> None:
     twist = np.array([0.8, -1.7, turn])

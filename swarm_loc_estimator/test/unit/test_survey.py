@@ -20,9 +20,11 @@ from swarm_loc_estimator.offline.survey.solve import Solver
 from swarm_loc_estimator.offline.survey.start import start_of
 from swarm_loc_estimator.offline.survey.survey import survey
 from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
+from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.sensor import chosen
-from swarm_loc_estimator.swarm.swarm import StartSigma, Swarm
+from swarm_loc_estimator.swarm.error_models import ImuModel
+from swarm_loc_estimator.swarm.swarm import Landmark, StartSigma, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 PLAN = Plan(robots=3, duration_s=25.0, arena=0.8, landmarks=8, start_known=(False,))
@@ -54,10 +56,9 @@ def errors(found: Swarm, true: Swarm) -> FloatArray:
     """Errors (L, 3) of landmarks after a rigid fit to their true places."""
     poses, truth = places_of(found), places_of(true)
     a, b = (np.array([one[marker_id] for marker_id in sorted(truth)]) for one in (poses, truth))
-    here, there = a[:, :2] - a[:, :2].mean(axis=0), b[:, :2] - b[:, :2].mean(axis=0)
-    turn = np.arctan2(np.sum(here[:, 0] * there[:, 1] - here[:, 1] * there[:, 0]), np.sum(here * there))
-    moved = se2.transform_points([0.0, 0.0, turn], here) - there
-    return np.column_stack([moved, se2.wrap_angle(a[:, 2] + turn - b[:, 2])])
+    error = se2.compose(se2.rigid_fit(a[:, :2], b[:, :2]), a) - b
+    error[:, 2] = se2.wrap_angle(error[:, 2])
+    return error
 
 
 def rms(error: FloatArray) -> float:
@@ -157,6 +158,66 @@ def test_what_is_rare_or_lone_is_named_with_a_remedy() -> None:
     assert len(done.swarm.landmarks) in {3, 4}
 
 
+def test_a_robot_that_takes_no_part_or_stands_costs_nothing() -> None:
+    """Without the odometry of the first robot, and with one that has none, those of others are used."""
+    world = simulate(PLAN, 0)
+    recording = recording_of(world)
+    rows, seen = recording.odometry, recording.detections
+    absent = replace(
+        recording, odometry=chosen(rows, rows.robot > 0), detections=chosen(seen, seen.robot > 0)
+    )
+    first, *others = world.swarm.robots
+    for robot in (first, replace(first, stands=True)):
+        swarm = replace(world.swarm, robots=(robot, *others), landmarks=())
+        done = survey(absent, swarm)
+        assert not (done.problem.sides[done.problem.sightings["landmark"] == 0] < 0).any()
+        assert rms(errors(done.swarm, world.swarm)) < 0.02
+    standing = replace(world.swarm, robots=(replace(first, stands=True), *others), landmarks=())
+    done = survey(replace(absent, detections=seen), standing)  # what it sees has no pose to start from
+    assert rms(errors(done.swarm, world.swarm)) < 0.02
+
+
+def test_an_inexact_landmark_that_nobody_saw_stays_as_it_is() -> None:
+    world = simulate(PLAN, 3)
+    unseen = Landmark(9999, 5.0, 5.0, position_sigma=0.02, yaw_sigma=0.1)
+    done = survey(recording_of(world), replace(world.swarm, landmarks=(*world.swarm.landmarks[:2], unseen)))
+    assert "Landmark 9999 was not seen and stays as it is described." in done.text
+    kept = places_of(done.swarm)[9999]
+    np.testing.assert_allclose(kept, [5.0, 5.0, 0.0], atol=1e-6)
+
+
+def test_turns_of_gyroscopes_replace_those_of_wheels() -> None:
+    """The wheels report no turn at all, and the gyroscopes 4 % too little."""
+    world = simulate(replace(PLAN, duration_s=40.0), 2)
+    recording = recording_of(world)
+    rows, at_ns, robots = recording.odometry, world.stamp_ns, range(len(world.swarm.robots))
+    straight = np.zeros_like(rows.pose)
+    for robot in robots:
+        own = rows.robot == robot
+        straight[own, 0] = np.append(0.0, np.cumsum(np.hypot(*np.diff(rows.pose[own, :2], axis=0).T)))
+    # constant rates between two instants of the truth, so that their integral is exact
+    stamp_ns = np.tile(np.append(at_ns[:-1] + 1, at_ns[1:]), len(robots))
+    true_rate = np.diff(np.unwrap(world.truth[..., 2], axis=0), axis=0) / np.diff(at_ns)[:, None] * 1e9
+    rate = np.tile(true_rate, (2, 1)).T.ravel() / 1.04
+    robot = np.repeat(robots, 2 * len(true_rate))
+    turned = replace(
+        recording,
+        odometry=rows._replace(pose=straight),
+        turn_rates=TurnRateRows(robot, stamp_ns, np.zeros((rate.size, 3)), rate, stamp_ns),
+    )
+    imu = ImuModel(turn_noise_density=1e-3, timeout_s=1.0)
+    with_imu = tuple(replace(one, imu=imu) for one in world.swarm.robots)
+    done = survey(turned, replace(world.swarm, robots=with_imu, landmarks=()))
+    assert rms(errors(done.swarm, world.swarm)) < 0.02
+    assert "imu.turn_scale 1.0000 -> 1.0" in done.text
+    error = done.solution.parameter[:, 2] - 0.04
+    assert (np.abs(error) < 3.0 * done.solution.parameter_sigma[:, 2]).all()
+    assert [one.imu.turn_scale for one in done.swarm.robots] == pytest.approx([1.04] * 3, abs=0.03)
+    assert [one.odometry for one in done.swarm.robots] == [one.odometry for one in world.swarm.robots]
+    by_wheels = survey(replace(turned, turn_rates=NO_TURN_RATES), replace(world.swarm, landmarks=()))
+    assert rms(errors(by_wheels.swarm, world.swarm)) > 0.1
+
+
 def test_what_cannot_be_surveyed_is_said_in_a_sentence() -> None:
     world = simulate(PLAN, 0)
     recording = recording_of(world)
@@ -187,8 +248,8 @@ def test_the_gradient_is_that_of_the_cost() -> None:
 def test_the_command_surveys_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     bag, out = BAGS / "eight_five_robots", tmp_path / "surveyed.yaml"
     assert command.main([str(bag), "--all", "--out", str(out)]) == 0
-    said = capsys.readouterr().out
-    assert "20" in said
+    assert f"{out} written" in capsys.readouterr().out
+    assert len(load_swarm(out).landmarks) == 20
     assert out.with_suffix(".png").stat().st_size > 10_000
     true = load_swarm(bag / "swarm.yaml")
     assert rms(errors(load_swarm(out), true)) < 0.005

@@ -176,8 +176,29 @@ class GroundControl:
     def _solve(self, points: ControlPoints) -> None:
         """Solve for the pose with points."""
         try:
-            fit = solve_pose(self._camera, points, self._settings)
-            self.trouble = misfit(fit, points, self._settings)
+            self.fit, self.trouble = _solved(self._camera, points, self._settings), ""
         except ControlPointError as error:
-            fit, self.trouble = None, str(error)
-        self.fit = None if self.trouble else fit
+            self.fit, self.trouble = None, str(error)
+
+
+def located(ground: Ground, camera: Camera, pictures: Sequence[Gray], settings: AerialSettings) -> PoseFit:
+    """The pose by all points and by the corners of the markers, averaged over all pictures (height, width).
+
+    Raises:
+        ControlPointError: The points do not determine a pose, or contradict each other.
+    """
+    points = ground.points
+    if ground.markers:
+        markers = FloorMarkers(ground.markers, ground.family, camera)
+        for gray in pictures:
+            markers.look(gray)
+        points = points.joined(markers.mean())
+    return _solved(camera, points, settings)
+
+
+def _solved(camera: Camera, points: ControlPoints, settings: AerialSettings) -> PoseFit:
+    """The pose with points; raises ControlPointError if they do not fit."""
+    fit = solve_pose(camera, points, settings)
+    if why := misfit(fit, points, settings):
+        raise ControlPointError(why)
+    return fit

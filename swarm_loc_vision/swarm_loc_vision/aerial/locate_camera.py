@@ -27,8 +27,9 @@ from swarm_loc_estimator.common.command_line import (
 from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.yaml_tree import tree_text
 from swarm_loc_estimator.swarm.swarm import FixedCamera
+from swarm_loc_vision.aerial.control_points import ControlPointError
 from swarm_loc_vision.aerial.fixed_camera import fixed_camera
-from swarm_loc_vision.aerial.ground_control import GroundControl
+from swarm_loc_vision.aerial.ground_control import located
 from swarm_loc_vision.aerial.ground_file import load_ground
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.common.images import Gray
@@ -48,15 +49,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if ground.markers and not options.pictures:
         raise LocateError(f"{options.control_points} has floor markers, so pictures of them must be given.")
     settings = parameters_of(AerialSettings, options.set)
-    control = GroundControl(ground, ground.camera, settings)
     size = (ground.camera.height, ground.camera.width)
-    for path in options.pictures:
-        control.look(_picture(path, size))
-    if control.fit is None:
-        raise LocateError(f"{options.control_points}: {control.trouble}")
-    camera = fixed_camera(options.name, control.fit.ground, options.height)
+    pictures = [_picture(path, size) for path in options.pictures]
+    try:
+        fit = located(ground, ground.camera, pictures, settings)
+    except ControlPointError as error:
+        raise LocateError(f"{options.control_points}: {error}") from error
+    camera = fixed_camera(options.name, fit.ground, options.height)
     section = {name: getattr(camera, name) for name in number_specs(FixedCamera)}
-    print(f"# {len(control.fit.names)} control points, {control.fit.rms_px:.2g} px rms")
+    print(f"# {len(fit.names)} control points, {fit.rms_px:.2g} px rms")
     print(tree_text({"cameras": {camera.name: section}}), end="")
     return 0
 

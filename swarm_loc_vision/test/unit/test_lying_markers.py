@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from aerial_scenes import LENSES, floor_points, over_floor
@@ -15,17 +13,12 @@ from scipy.spatial.transform import Rotation
 from bench.vision.scenes import CAMERA, project
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.yaml_tree import read_tree
 from swarm_loc_estimator.filter.measurement_model import predict
 from swarm_loc_estimator.sensors.camera import SightingConverter
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.aerial.control_points import solve_pose
 from swarm_loc_vision.aerial.fixed_camera import fixed_camera
 from swarm_loc_vision.aerial.ground_camera import GroundCamera
-from swarm_loc_vision.aerial.ground_control import Ground
-from swarm_loc_vision.aerial.ground_file import save_ground
-from swarm_loc_vision.aerial.locate_camera import main
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.bodies import Seen, robot_body, solve_bodies
@@ -159,51 +152,3 @@ def test_sigmas_of_a_camera_are_those_of_what_it_sees() -> None:
     largest = math.sqrt(max(np.linalg.eigvalsh(one)[-1] for one in spreads))
     assert 0.85 < largest / told.position_sigma < 1.15
     assert 0.8 < np.std(np.unwrap(turns, axis=0), axis=0).max() / told.yaw_sigma < 1.2
-
-
-def written(folder: Path) -> tuple[Path, FloatArray]:
-    """Control points of a camera, and its place."""
-    rng = np.random.default_rng(2)
-    truth = over_floor(LENSES["barrel"], rng)
-    save_ground(Ground(floor_points(truth, rng, 8)), folder / "points.yaml")
-    camera = truth.camera
-    numbers = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    text = ", ".join(f"{name}: {value}" for name, value in numbers.items())
-    lens = f"distortion_model: {camera.model}, distortion: {[float(k) for k in camera.distortion]}"
-    with (folder / "points.yaml").open("a", encoding="utf-8") as file:
-        file.write(f"camera: {{{text}, {lens}}}\n")
-    return folder / "points.yaml", truth.centre
-
-
-def test_the_command_prints_a_section_of_the_description(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, centre = written(tmp_path)
-    assert main(["ceiling1", str(path), "--height", "0.1"]) == 0
-    section = capsys.readouterr().out
-    (tmp_path / "swarm.yaml").write_text(f"fileversion: 1\nrobots: {{a: {{}}}}\n{section}", encoding="utf-8")
-    (camera,) = load_swarm(tmp_path / "swarm.yaml").cameras
-    np.testing.assert_allclose([camera.x, camera.y, camera.z], centre, atol=2e-3)
-    assert 0.0 < camera.position_sigma < 0.1
-    assert read_tree(tmp_path / "swarm.yaml")["cameras"].keys() == {"ceiling1"}
-
-
-@pytest.mark.parametrize(
-    ("added", "arguments", "said"),
-    [
-        ("", ["picture.txt"], "picture.txt is no picture."),
-        ("", ["small.png"], "small.png has 8 x 6 pixels but the camera"),
-        ("markers: {7: {x: 0.0, y: 0.0, size: 0.1}}\n", [], "pictures of them must be given."),
-        ("", ["--set", "control=1"], "'control' is no parameter"),
-    ],
-)
-def test_what_the_command_cannot_use_is_one_sentence(
-    added: str, arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path, _ = written(tmp_path)
-    path.write_text(path.read_text(encoding="utf-8").replace("markers: {}\n", "") + added, encoding="utf-8")
-    (tmp_path / "picture.txt").write_text("no picture", encoding="utf-8")
-    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((6, 8), np.uint8))
-    paths = [one if one.startswith("-") or "=" in one else str(tmp_path / one) for one in arguments]
-    assert main(["ceiling1", str(path), *paths]) != 0
-    assert said in capsys.readouterr().err

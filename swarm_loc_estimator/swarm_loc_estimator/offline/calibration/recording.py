@@ -21,6 +21,7 @@ from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.conversion import InputConverter
 from swarm_loc_estimator.sensors.fix import NO_FIXES, FixRows
+from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.infrared import NO_BRIGHTNESS, BrightnessRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.registry import Batch
@@ -45,6 +46,7 @@ class Recording:
         truth: Robot name -> ground truth; robots without are missing.
         brightness: Of all infrared boards.
         fixes: Of all robots.
+        turn_rates: Of all IMUs.
         remarks: Unreadable contents, one sentence each.
     """
 
@@ -54,6 +56,7 @@ class Recording:
     truth: Mapping[str, Trajectory]
     brightness: BrightnessRows = NO_BRIGHTNESS
     fixes: FixRows = NO_FIXES
+    turn_rates: TurnRateRows = NO_TURN_RATES
     remarks: tuple[str, ...] = ()
 
     @property
@@ -111,16 +114,17 @@ def read_recording(
     parts: list[Batch] = []
     summary = read_bag(bag, swarm, parts.append, progress, remap)
     converter = InputConverter(swarm, Settings())
-    odometry = [converter.convert(part).rows.get("odometry", NO_ODOMETRY) for part in parts]
+    moved = [converter.convert(part).rows for part in parts]
     detections = [part["detections"] for part in parts if part["detections"].robot.size]
     unused = (f"{count} inputs are not used: {reason}." for reason, count in converter.drops.total.items())
     return Recording(
         bag.name,
-        joined([NO_ODOMETRY, *odometry]),
+        joined([NO_ODOMETRY, *(rows.get("odometry", NO_ODOMETRY) for rows in moved)]),
         joined(detections or [NO_DETECTIONS]),
         {name: _each_stamp_once(track.stamp_ns, track.pose) for name, track in summary.truth.items()},
         joined([NO_BRIGHTNESS, *(part["brightness"] for part in parts)]),
         joined([NO_FIXES, *(part["fixes"] for part in parts)]),
+        joined([NO_TURN_RATES, *(rows.get("imu", NO_TURN_RATES) for rows in moved)]),
         (*summary.remarks, *unused),
     )
 

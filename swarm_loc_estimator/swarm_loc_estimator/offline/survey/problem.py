@@ -96,7 +96,8 @@ def problem_of(recording: Recording, swarm: Swarm) -> SurveyProblem:
     """
     described, rare = _with_landmarks(recording, swarm)
     tracks = OdometryTracks(swarm.robots)
-    rows = recording.odometry
+    rows, turns = recording.odometry, recording.turn_rates
+    tracks.extend_turns(turns.robot, turns.stamp_ns, turns.rate)
     tracks.extend(rows.robot, rows.stamp_ns, rows.pose, rows.twist)
     seen = chosen(recording.detections, ~np.isin(recording.detections.detection["id"], list(rare)))
     at_origin = [
@@ -108,9 +109,10 @@ def problem_of(recording: Recording, swarm: Swarm) -> SurveyProblem:
     sightings = sightings[(sightings["kind"] <= POLAR) & (sightings["observer"] >= 0)]
     knots = _knots(tracks, recording)
     robots = np.stack([sightings["observer"], sightings["target"]])
-    started = np.array([tracks.has_started(np.maximum(one, 0), sightings["stamp_ns"]) for one in robots])
-    sightings, robots = sightings[started.all(axis=0)], robots[:, started.all(axis=0)]
     sides = np.stack([knots.nearest(one, sightings["stamp_ns"]) for one in robots])
+    started = np.array([tracks.has_started(np.maximum(one, 0), sightings["stamp_ns"]) for one in robots])
+    kept = ((robots < 0) | (started & (sides >= 0))).all(axis=0)
+    sightings, robots, sides = sightings[kept], robots[:, kept], sides[:, kept]
     known = {mark.id for mark in swarm.landmarks}
     poses, slip = np.zeros((2, sightings.size, 3)), np.zeros((2, sightings.size, 3, 3))
     for side in range(2):

@@ -18,6 +18,7 @@ from scipy.sparse.linalg import SuperLU, splu
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.filter.measurement_model import predict
+from swarm_loc_estimator.mapping.constraints import NormalFactor
 from swarm_loc_estimator.offline.survey.problem import SurveyProblem
 from swarm_loc_estimator.offline.survey.start import Start
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -27,11 +28,14 @@ PRIORS: FloatArray = np.array([0.01, 0.03, 0.05, 0.05, 0.02])
 _SCALES = (50.0, 20.0, 10.0, 5.0)
 """Residuals at which the weight of a sighting is a quarter [sigma], one after the other."""
 _ITERATIONS, _CONVERGED, _NEARLY = 15, 1e-2, 1e-3
-"""Of each scale: most steps, and the decrease of the cost that ends them; at first a share of the cost."""
+"""Most steps of each scale, and the decrease of the cost that ends them: of the last scale and, as a share of
+the cost, of the others."""
 _ORIGIN_SIGMA = 1e-5
 _YAW_SIGMA = 1.0
 """Of the heading of a landmark without one, which nothing determines [rad]."""
 _DAMPING = (1e-14, 1e-2)
+_LEAST_VARIANCE = 1e-10
+"""Added to the variances of a step, so that the covariance of a standing robot is regular [m^2, rad^2]."""
 
 Progress = Callable[[float, str], None]
 
@@ -90,6 +94,7 @@ class Solver:
         self._pairs = _steps(problem, is_placed)
         self._weight, self._is_rigid = np.ones(self._rows.size), True
         self._robots, self._landmarks = robots, landmarks
+        self._origin: FloatArray | None = None
 
     def solve(self, progress: Progress) -> Solution:
         """Solve, and compute covariances."""
@@ -99,7 +104,8 @@ class Solver:
         for k, scale in enumerate(_SCALES):
             progress(k / len(_SCALES), "solving")
             self._descend(scale)
-        return self._solution(*self._normal(_SCALES[-1])[:1])
+        matrix, _, _ = self._normal(_SCALES[-1])
+        return self._solution(matrix)
 
     def _rigid(self) -> IntArray:
         """Columns of the knots where odometry is exact: those of a robot's first knot for all."""
@@ -151,11 +157,10 @@ class Solver:
     def _add_odometry(self, blocks: _Blocks) -> float:
         """Steps between consecutive knots: r = log(T_b T_a^-1) - Ad(T_a) D p."""
         a, b, root, response = self._pairs
-        adjoint = se2.adjoint(self._knot[a])
         drift = se2.log(se2.compose(self._knot[b], se2.inverse(self._knot[a])))
         robot = self._problem.knots.robot[a]
         moved = np.einsum("kij,kj->ki", response, self._parameter[robot, :3])
-        back = np.linalg.inv(adjoint)  # residuals in the frame of the track, where the noise is given
+        back = se2.adjoint(se2.inverse(self._knot[a]))  # to the frame of the track, where the noise is given
         residual = np.einsum("kij,kj->ki", root, np.einsum("kij,kj->ki", back, drift) - moved)
         by_pose = np.einsum("kij,kjl->kil", root, back)
         by_parameter = -np.einsum("kij,kjl->kil", root, response)
@@ -218,8 +223,6 @@ class Solver:
             found.append(self._first_pose(first, origin, np.full(3, _ORIGIN_SIGMA)))
         return found
 
-    _origin: FloatArray | None = None
-
     def _first_pose(
         self, knot: int, pose: FloatArray, sigma: FloatArray
     ) -> tuple[int, FloatArray, FloatArray, FloatArray]:
@@ -262,12 +265,12 @@ class Solver:
         good = self._weight > 0.5
         degrees = 2.0 + (self._problem.sightings["has_heading"][self._rows] > 0)
         ratio = float(np.sum(residual[good] ** 2) / max(1.0, np.sum(degrees[good])))
-        factor = _factor(matrix, 0.0)
+        factor = NormalFactor(_factor(matrix, 0.0), np.arange(self._size))
         covariance = np.zeros((self._landmarks, 3, 3))
         for index in np.flatnonzero(self._landmark_column >= 0).tolist():
-            block = _block(factor, self._size, self._landmark_column[index] + np.arange(3))
-            covariance[index] = se2.pose_covariance(self._landmark[index], block)
-        sigma = np.array([np.sqrt(np.diag(_block(factor, self._size, c))) for c in self._parameter_column])
+            error = factor.covariance(self._landmark_column[index] + np.arange(3))
+            covariance[index] = se2.pose_covariance(self._landmark[index], error)
+        sigma = np.array([np.sqrt(np.diag(factor.covariance(one))) for one in self._parameter_column])
         weight = np.zeros(self.used.size)
         weight[self._rows] = self._weight
         return Solution(
@@ -285,7 +288,7 @@ class _Blocks:
 
     def add(self, jacobian: FloatArray, columns: IntArray, residual: FloatArray) -> None:
         """Add residuals (k, r) with Jacobians (k, r, c) by columns (k, c); -1: fixed."""
-        count, size, width = jacobian.shape
+        count, size, _ = jacobian.shape
         rows = self._rows + np.arange(count * size).reshape(count, size)
         row = np.broadcast_to(rows[:, :, None], jacobian.shape)
         column = np.broadcast_to(columns[:, None, :], jacobian.shape)
@@ -293,7 +296,6 @@ class _Blocks:
         self._entries.append((jacobian[kept], row[kept], column[kept]))
         self._residual.append(residual.reshape(-1))
         self._rows += count * size
-        assert width == columns.shape[1]  # noqa: S101
 
     def normal(self, size: int) -> tuple[csc_matrix, FloatArray]:
         """J^T J (n, n) and -J^T r (n,)."""
@@ -323,10 +325,6 @@ def _steps(problem: SurveyProblem, is_placed: BoolArray) -> tuple[IntArray, IntA
     return a, a + 1, root, knots.sample.jacobian[a + 1] - knots.sample.jacobian[a]
 
 
-_LEAST_VARIANCE = 1e-10
-"""Of a step, so that that of a standing robot is invertible [m^2, rad^2]."""
-
-
 def _innovation(
     measured: FloatArray, predicted: FloatArray, is_polar: BoolArray, has_heading: BoolArray
 ) -> FloatArray:
@@ -343,11 +341,3 @@ def _factor(matrix: csc_matrix, damping: float) -> SuperLU:
     # without any information, as of knots that are tied to others, columns stay as they are
     damped.setdiag(np.where(diagonal > 0.0, diagonal * (1.0 + damping), 1.0))
     return splu(damped, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
-
-
-def _block(factor: SuperLU, size: int, columns: IntArray) -> FloatArray:
-    """Block (k, k) of the inverse of the factored matrix."""
-    right = np.zeros((size, columns.size))
-    right[columns, np.arange(columns.size)] = 1.0
-    block = factor.solve(right)[columns]
-    return np.asarray(0.5 * (block + block.T))

@@ -108,7 +108,7 @@ def _alignment(
     own = maps[robot]
     both = np.flatnonzero(np.isfinite(own[:, 0]) & np.isfinite(start.landmark[:, 0]))
     candidates = [
-        _through(own[[i, j], :2], start.landmark[[i, j], :2])
+        se2.rigid_fit(own[[i, j], :2], start.landmark[[i, j], :2])
         for i in both.tolist()
         for j in both.tolist()
         if i < j
@@ -129,15 +129,6 @@ def _alignment(
         if votes > most:
             best, most = candidate, votes
     return best, most
-
-
-def _through(here: FloatArray, there: FloatArray) -> FloatArray:
-    """The transform that takes two points (2, 2) to the line through two others, middle to middle."""
-    a, b = here[1] - here[0], there[1] - there[0]
-    turn = float(np.arctan2(b[1], b[0]) - np.arctan2(a[1], a[0]))
-    middle = se2.transform_points([0.0, 0.0, turn], here.mean(axis=0)[None])[0]
-    x, y = there.mean(axis=0) - middle
-    return np.array([x, y, turn])
 
 
 def _by_robots(problem: SurveyProblem, start: Start, robot: int) -> list[FloatArray]:

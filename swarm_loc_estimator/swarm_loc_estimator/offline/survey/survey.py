@@ -22,9 +22,9 @@ _ONE_SIDE = math.radians(45.0)
 _WRONG = 0.3
 """Share of sightings that contradict a landmark from which it is named."""
 _VAGUE_M, _VAGUE = 0.01, 3.0
-"""Landmarks known worse than this [m], and than this many medians, are named."""
+"""A landmark is named if its sigma exceeds this [m] and this multiple of the median sigma."""
 _WORSE = 1.5
-"""Those seen from one side are named if they are known worse than this many medians."""
+"""One that was seen from one side is named if its sigma exceeds this multiple of the median sigma."""
 _SIGNIFICANT = 3.0
 """Parameters are written if they exceed this many of their standard deviations."""
 
@@ -104,14 +104,13 @@ def _calibrated(robot: Robot, index: int, solution: Solution) -> Robot:
     """A robot with those parameters corrected that differ significantly from the description."""
     value, sigma = solution.parameter[index], solution.parameter_sigma[index]
     _, path, turn, yaw, scale = np.where(np.abs(value) > _SIGNIFICANT * sigma, value, 0.0).tolist()
-    odometry, camera, sensor = robot.odometry, robot.camera, robot.sensor
+    camera, sensor = robot.camera, robot.sensor
+    turn_scale = (1.0 + turn) * robot.turn_sensor.turn_scale
+    odometry = replace(robot.odometry, distance_scale=(1.0 + path) * robot.odometry.distance_scale)
     return replace(
         robot,
-        odometry=replace(
-            odometry,
-            distance_scale=(1.0 + path) * odometry.distance_scale,
-            turn_scale=(1.0 + turn) * odometry.turn_scale,
-        ),
+        odometry=odometry if robot.imu.is_used else replace(odometry, turn_scale=turn_scale),
+        imu=replace(robot.imu, turn_scale=turn_scale) if robot.imu.is_used else robot.imu,
         camera=camera and replace(camera, yaw=float(se2.wrap_angle(camera.yaw + yaw))),
         sensor=replace(sensor, distance_scale=(1.0 + scale) * sensor.distance_scale),
     )
@@ -146,6 +145,7 @@ def _corrections(before: Swarm, found: Swarm) -> list[str]:
         pairs = {
             "odometry.distance_scale": (old.odometry.distance_scale, new.odometry.distance_scale),
             "odometry.turn_scale": (old.odometry.turn_scale, new.odometry.turn_scale),
+            "imu.turn_scale": (old.imu.turn_scale, new.imu.turn_scale),
             "sensor.distance_scale": (old.sensor.distance_scale, new.sensor.distance_scale),
         }
         if old.camera is not None and new.camera is not None:
@@ -190,6 +190,9 @@ def _remarks(problem: SurveyProblem, solution: Solution) -> list[str]:
     for index in np.flatnonzero(free).tolist():
         rows = (sightings["landmark"] == index + 1) & solution.used
         name = f"Landmark {problem.swarm.landmarks[index].id}"
+        if not rows.any():
+            remarks.append(f"{name} was not seen and stays as it is described.")
+            continue
         away = observers[rows, :2] - solution.landmark[index, :2]
         span = _span(np.arctan2(away[:, 1], away[:, 0]))
         wrong = float(np.mean(_is_wrong(solution)[rows]))
