@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import decode, nanoseconds
 from swarm_loc_estimator.common.messages.definitions import IMU
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
@@ -101,8 +101,8 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
 
     def valid(rows: TurnRateRows) -> TurnRateRows:
         rows = rows._replace(rate=np.sum(vertical[rows.robot] * rows.velocity, axis=1))
-        reasons: dict[str, BoolArray] = {
-            "imu_non_finite": ~np.isfinite(rows.velocity).all(axis=1),
+        reasons = {
+            "imu_non_finite": ~np.isfinite(rows.rate),
             "imu_absurd": ~(np.abs(rows.rate) <= _MAX_RATE),
         }
         good = drops.screen(rows.robot, reasons)

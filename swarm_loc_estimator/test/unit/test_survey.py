@@ -56,7 +56,7 @@ def errors(found: Swarm, true: Swarm) -> FloatArray:
     """Errors (L, 3) of landmarks after a rigid fit to their true places."""
     poses, truth = places_of(found), places_of(true)
     a, b = (np.array([one[marker_id] for marker_id in sorted(truth)]) for one in (poses, truth))
-    error = se2.compose(se2.rigid_fit(a[:, :2], b[:, :2]), a) - b
+    error: FloatArray = se2.compose(se2.rigid_fit(a[:, :2], b[:, :2]), a) - b
     error[:, 2] = se2.wrap_angle(error[:, 2])
     return error
 
@@ -199,11 +199,11 @@ def test_turns_of_gyroscopes_replace_those_of_wheels() -> None:
     stamp_ns = np.tile(np.append(at_ns[:-1] + 1, at_ns[1:]), len(robots))
     true_rate = np.diff(np.unwrap(world.truth[..., 2], axis=0), axis=0) / np.diff(at_ns)[:, None] * 1e9
     rate = np.tile(true_rate, (2, 1)).T.ravel() / 1.04
-    robot = np.repeat(robots, 2 * len(true_rate))
+    own = np.repeat(np.array(robots), 2 * len(true_rate))
     turned = replace(
         recording,
         odometry=rows._replace(pose=straight),
-        turn_rates=TurnRateRows(robot, stamp_ns, np.zeros((rate.size, 3)), rate, stamp_ns),
+        turn_rates=TurnRateRows(own, stamp_ns, np.zeros((rate.size, 3)), rate, stamp_ns),
     )
     imu = ImuModel(turn_noise_density=1e-3, timeout_s=1.0)
     with_imu = tuple(replace(one, imu=imu) for one in world.swarm.robots)
