@@ -14,6 +14,7 @@ import shlex
 import sys
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -46,12 +47,17 @@ class Dialog:
     """Takes each answer from an option, from the defaults, or from the terminal, until it can be used.
 
     Args:
-        given: Answers of options, by name; None: not given.
+        given: Answers of options, by name.
         asks: Whether to ask for what was not given.
     """
 
-    def __init__(self, given: Mapping[str, str | None], *, asks: bool) -> None:
-        self._given, self._asks = given, asks
+    def __init__(self, given: Mapping[str, str], *, asks: bool) -> None:
+        self._given, self._asks = dict(given), asks
+
+    @property
+    def unused(self) -> list[str]:
+        """Names of options that no question has used."""
+        return list(self._given)
 
     def answer(self, name: str, default: str, read: Callable[[str], Answer], choice: str = "") -> Answer:
         """The answer to a question.
@@ -65,7 +71,7 @@ class Dialog:
         Raises:
             UserError: An option cannot be used, or standard input has ended.
         """
-        text = self._given[name.replace("-", "_")]
+        text = self._given.pop(name, None)
         if text is not None or not self._asks:
             try:
                 return read(default if text is None else text)
@@ -88,26 +94,31 @@ def asked_plan(dialog: Dialog) -> SwarmPlan:
     """The plan of a swarm by the answers of a user."""
     name = dialog.answer("type", "epuck", _one_of(ROBOT_TYPES))
     known = ROBOT_TYPES[name]
-    usual = SwarmPlan(name, 5, name, known.usual_sensors)
+    usual = SwarmPlan(name, 5, "robot" if name == "own" else name, known.usual_sensors)
     robots = dialog.answer("robots", str(usual.robots), number_in(1, MAX_ROBOTS))
-    first = {"own": "robot"}.get(name, name)
-    prefix = dialog.answer("prefix", f"{first}_" if first[-1].isdigit() else first, _prefix)
+    first = f"{usual.prefix}_" if usual.prefix[-1].isdigit() else usual.prefix
+    prefix = dialog.answer("prefix", first, _prefix)
     choice = "".join(f"\n  {sensor}: {SENSORS[sensor]}" for sensor in known.sensors)
     sensors = dialog.answer("sensors", ",".join(known.usual_sensors), _some_of(known.sensors), choice)
-    wheels = known.odometry.wheel_separation if known.odometry else usual.wheel_separation
-    if name == "own":
-        wheels = dialog.answer("wheel-separation", f"{wheels:g}", _LENGTH)
-    family, size, arena = usual.family, known.marker_size, usual.arena
-    pitch, landmark_size = usual.pitch, usual.landmark_size
+    plan = replace(usual, robots=robots, prefix=prefix, sensors=sensors)
+    if name == "own" and known.odometry:
+        wheels = dialog.answer("wheel-separation", f"{known.odometry.wheel_separation:g}", _LENGTH)
+        plan = replace(plan, wheel_separation=wheels)
     if {"robots", "landmarks", "aerial"} & set(sensors):
-        family = dialog.answer("family", family, _one_of(FAMILY_IDS))
+        plan = replace(plan, family=dialog.answer("family", plan.family, _one_of(FAMILY_IDS)))
     if "robots" in sensors:
-        size = dialog.answer("size", f"{size:g}", _LENGTH)
+        plan = replace(plan, size=dialog.answer("size", f"{known.marker_size:g}", _LENGTH))
     if "landmarks" in sensors:
-        arena = dialog.answer("arena", "x".join(f"{length:g}" for length in arena), _arena)
-        pitch = dialog.answer("pitch", f"{pitch:g}", number_in(0.01, 100.0, "m"))
-        landmark_size = dialog.answer("landmark-size", f"{landmark_size:g}", _LENGTH)
-    return SwarmPlan(name, robots, prefix, sensors, wheels, family, size, arena, pitch, landmark_size)
+        plan = replace(
+            plan,
+            arena=dialog.answer("arena", "x".join(f"{length:g}" for length in plan.arena), _arena),
+            pitch=dialog.answer("pitch", f"{plan.pitch:g}", number_in(0.01, 100.0, "m")),
+            landmark_size=dialog.answer("landmark-size", f"{plan.landmark_size:g}", _LENGTH),
+        )
+    if dialog.unused:
+        located = f"{name} located by {', '.join(sensors)}"
+        raise UserError(f"--{dialog.unused[0]} has no meaning for robots of the type {located}.")
+    return plan
 
 
 def start_lines(plan: SwarmPlan, file: str) -> list[str]:
@@ -146,7 +157,7 @@ def start_lines(plan: SwarmPlan, file: str) -> list[str]:
             f"./run swarm_loc_estimator mapper_node --ros-args -p swarm_file:={file}",
             f"./run swarm_loc_drivers exploration_node --ros-args -p swarm_file:={file}",
         ]
-    if len(lines) > 1 and plan.robots > 1:
+    if plan.robots > 1 and any(robot in line for line in lines):
         lines.append(
             f"# the lines with {robot} are needed for {plan.prefix}2 to {plan.prefix}{plan.robots}, too"
         )
@@ -186,7 +197,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     path: Path = options.swarm_file
     if path.exists():
         raise UserError(f"{path} exists and is not overwritten.")
-    plan = asked_plan(Dialog(vars(options), asks=not options.yes))
+    answers = {name: getattr(options, name.replace("-", "_")) for name in QUESTIONS}
+    given = {name: answer for name, answer in answers.items() if answer is not None}
+    plan = asked_plan(Dialog(given, asks=not options.yes))
     swarm = planned_swarm(plan)
     path.parent.mkdir(parents=True, exist_ok=True)
     (path.parent / SCHEMA_FILE).write_text(schema_text(), encoding="utf-8")

@@ -204,7 +204,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             text = f"no start, landmark or fix: poses are relative to {self._origin}, in '{self._frame}'"
             self.get_logger().warning(text)
         else:
-            self.get_logger().info(f"all poses have moved from '{before}' to '{self._frame}'")
+            self.get_logger().info(f"poses are in '{self._frame}' now, no longer in '{before}'")
 
     @property
     def _frame(self) -> str:

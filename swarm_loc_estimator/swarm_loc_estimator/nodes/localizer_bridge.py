@@ -39,6 +39,7 @@ class LocalizerBridge(ConfiguredNode[BridgeParameters]):
         swarm = load_swarm(Path(parameters.swarm_file))
         self._source = SOURCES[parameters.source]
         self._robots = LocalizedRobots(parameters, list(swarm.index_of), self.health)
+        self._counts, self._trouble = (0, 0), ""
         kind: Any = PoseWithCovarianceStamped if parameters.output == "fix" else PoseStamped
         self._outputs = {
             robot: self.create_publisher(kind, f"{robot}/{parameters.output}", _OUTPUT_QOS)
@@ -65,6 +66,7 @@ class LocalizerBridge(ConfiguredNode[BridgeParameters]):
 
     def _on_diagnostics(self) -> None:
         robots, missing = self._robots, self._missing()
+        self._follow_poses()
         if missing:
             self._note_topics_of_strangers()
         said = {name: f"body '{name}' is of no robot: name it in bodies" for name in robots.strangers}
@@ -78,13 +80,17 @@ class LocalizerBridge(ConfiguredNode[BridgeParameters]):
             "bodies of no robot": listed(sorted(robots.strangers)),
             **drop_values(self.health.drops),
         }
-        trouble = message or self._trouble()
-        self.publish_reports(Report(self.status_name, trouble or "bridging", level_of(trouble), values))
+        message = message or self._trouble
+        self.publish_reports(Report(self.status_name, message or "bridging", level_of(message), values))
 
-    def _trouble(self) -> str:
-        """That every pose is dropped; "": some are used."""
-        drops = self.health.drops
-        return f"no pose can be used: {listed(sorted(drops))}" if drops and not self._robots.used else ""
+    def _follow_poses(self) -> None:
+        """Note whether every pose since the last report was dropped; without any pose, nothing changes."""
+        drops, (was_used, was_dropped) = self.health.drops, self._counts
+        used, dropped = self._counts = self._robots.used, drops.total()
+        if used > was_used:
+            self._trouble = ""
+        elif dropped > was_dropped:
+            self._trouble = f"no pose can be used: {listed(sorted(drops))}"
 
     def _missing(self) -> list[str]:
         """Topics, and bodies on them, of which nothing was received yet or recently."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Callable, Iterable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +22,7 @@ _LAYER = ("platform", "estimator", "gains", *_DEAD, *_NUMBERS)
 _GAIN_LISTS = ("sensor", "emitter")
 _GAIN_NUMBERS = number_specs(IrGains)
 _METHODS = {method.value: method for method in IrMethod}
-_MAX_ID = 2**16 - 1
-_HEXADECIMAL = re.compile(r"0[xX][0-9A-Fa-f]{1,4}")
+MAX_BOARD_ID = 2**16 - 1
 
 Values = dict[str, Any]
 
@@ -47,7 +46,7 @@ class IrSection:
             return None
         mapping = self._checks.mapping(tree, key, ("id", *_LAYER) if of_robot else _LAYER)
         readers: dict[str, Callable[[Tree, str], Any]] = {
-            "id": self._id,
+            "id": partial(self._checks.address, high=MAX_BOARD_ID),
             "platform": self._platform,
             "estimator": self._method,
             "gains": self._gains,
@@ -67,7 +66,7 @@ class IrSection:
         if "platform" not in values:
             raise self._checks.said(f"{key} lacks platform, the name of a packaged one or the path of a file")
         if "id" not in values:
-            raise self._checks.said(f"{key} lacks id, a whole number in [1, {_MAX_ID}]")
+            raise self._checks.said(f"{key} lacks id, a whole number in [1, {MAX_BOARD_ID}]")
         source = values["platform"]
         platform, gains = self._platforms[source], values.get("gains")
         if gains is not None and len(gains.sensor) != platform.n:
@@ -82,13 +81,6 @@ class IrSection:
                 )
         rest = {name: value for name, value in values.items() if name not in ("platform", "gains")}
         return RobotIr(platform=platform, source=source, gains=gains, **rest)
-
-    def _id(self, value: Tree, key: str) -> int:
-        """A board's id, decimal or hexadecimal with 0x as the robots print it."""
-        number = int(value, 16) if isinstance(value, str) and _HEXADECIMAL.fullmatch(value) else value
-        if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= _MAX_ID:
-            raise self._checks.error(key, value, f"must be a whole number in [1, {_MAX_ID}]")
-        return number
 
     def _platform(self, value: Tree, key: str) -> str:
         """The source of a platform; also loads the platform."""
@@ -119,13 +111,10 @@ class IrSection:
         """Factors of all elements; null: never calibrated."""
         if tree is None:
             return None
-        mapping = self._checks.mapping(tree, key, (*_GAIN_LISTS, *_GAIN_NUMBERS), _GAIN_LISTS)
-        values: Values = {
-            name: self._checks.number(value, f"{key}.{name}", _GAIN_NUMBERS[name])
-            if name in _GAIN_NUMBERS
-            else self._checks.list_of_numbers(value, f"{key}.{name}")
-            for name, value in mapping.items()
-        }
+        mapping = self._checks.mapping(tree, key, required=_GAIN_LISTS)
+        values: Values = {**self._checks.numbers(tree, key, _GAIN_NUMBERS, others=_GAIN_LISTS)}
+        for name in _GAIN_LISTS:
+            values[name] = self._checks.list_of_numbers(mapping[name], f"{key}.{name}")
         try:
             return IrGains(**values)
         except IrPlatformError as error:

@@ -47,9 +47,9 @@ class SwarmPlan:
         robots: How many.
         prefix: Names are this and a number from 1 on.
         sensors: Of the sensors of the type.
-        wheel_separation: Distance of the wheels, where the robots have any.
+        wheel_separation: Distance of the wheels; None: that of the type.
         family: Kind of the markers.
-        size: Side of the markers on robots.
+        size: Side of the markers on robots; None: that of the type.
         arena: Length along x and along y; the middle is the origin of map.
         pitch: Distance of the landmarks along the walls.
         landmark_size: Side of the landmarks.
@@ -59,9 +59,9 @@ class SwarmPlan:
     robots: int
     prefix: str
     sensors: tuple[str, ...]
-    wheel_separation: float = OdometryModel().wheel_separation
+    wheel_separation: float | None = None
     family: str = "artoolkit_bch_thin"
-    size: float = 0.036
+    size: float | None = None
     arena: tuple[float, float] = (2.4, 1.6)
     pitch: float = 0.4
     landmark_size: float = 0.05
@@ -83,7 +83,9 @@ def planned_swarm(plan: SwarmPlan) -> Swarm:
     faces = known.faces if "robots" in sensors else ()
     face_ids, landmark_ids = _ids(plan, len(faces), len(places))
     board = load_ir_platform("droplet") if "infrared" in known.sensors else None
-    odometry = known.odometry and replace(known.odometry, wheel_separation=plan.wheel_separation)
+    odometry, size = known.odometry, plan.size or known.marker_size
+    if odometry is not None and plan.wheel_separation is not None:
+        odometry = replace(odometry, wheel_separation=plan.wheel_separation)
     common = Robot(
         "",
         plan.type,
@@ -98,7 +100,7 @@ def planned_swarm(plan: SwarmPlan) -> Swarm:
         replace(
             common,
             name=f"{plan.prefix}{k + 1}",
-            faces=_numbered(faces, face_ids[k * len(faces) :], plan.size),
+            faces=_numbered(faces, face_ids[k * len(faces) :], size),
             ir=None if board is None else RobotIr(_FIRST_BOARD + k, board, "droplet"),
         )
         for k in range(plan.robots)

@@ -9,6 +9,7 @@ from typing import Any
 from swarm_loc_estimator.common.parameters import NumberSpec, number_specs
 from swarm_loc_estimator.swarm.board_file import packaged_platforms
 from swarm_loc_estimator.swarm.ir_board import GAIN_RANGE, IrGains, IrMethod, RobotIr
+from swarm_loc_estimator.swarm.ir_section import MAX_BOARD_ID
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Landmark
 from swarm_loc_estimator.swarm.swarm_file import (
     FILE_VERSION,
@@ -24,6 +25,7 @@ from swarm_loc_estimator.swarm.swarm_file import (
     RESPONSE,
     START,
 )
+from swarm_loc_estimator.swarm.tree_checks import hexadecimal
 from swarm_loc_estimator.swarm.uwb import MAX_ADDRESS, Anchor, UwbDevice
 
 SCHEMA_FILE = "swarm.schema.json"
@@ -44,12 +46,15 @@ def swarm_schema() -> Schema:
 
     Those are that marker ids are unique, that types and faces exist, and the sizes of tables.
     """
+    radio = _address(MAX_ADDRESS, "address in messages")
     of_robot = {name: {"$ref": f"#/definitions/{name}"} for name in LAYER}
     robot = {
         "type": {"type": ["string", "null"], "description": "one of types"},
         **of_robot,
-        "ir": _section("infrared board; null: none", {"id": _board_id(), **_board()}),
-        "uwb": _section("radio; null: none", {"address": _address(), **_of_class(UwbDevice)}),
+        "ir": _section(
+            "infrared board; null: none", {"id": _address(MAX_BOARD_ID, "id in exchanges"), **_board()}
+        ),
+        "uwb": _section("radio; null: none", {"address": radio, **_of_class(UwbDevice)}),
         "ids": _section("marker id of each face", named={_pattern(): _whole(0, MAX_ID, "marker id")}),
         "start": _section("start pose in map; null: unknown", _numbers(START), required=list(START)),
     }
@@ -58,7 +63,7 @@ def swarm_schema() -> Schema:
     shared = _section("what landmarks have where they say nothing else", _numbers(LANDMARK_DEFAULTS))
     camera = {**_of_class(FixedCamera), "sensor": {"$ref": "#/definitions/sensor"}}
     camera = _section("camera with a fixed pose", camera, required=["x", "y", "z"])
-    anchor = {"address": _address(), **_of_class(Anchor)}
+    anchor = {"address": radio, **_of_class(Anchor)}
     anchor = _section("radio at a fixed place", anchor, required=["address", "x", "y"])
     camera["type"] = anchor["type"] = "object"
     names = {"maxLength": MAX_NAME}
@@ -118,10 +123,9 @@ def _face() -> Schema:
     return {**_of_class(Face), "lies": lies}
 
 
-def _address() -> Schema:
-    """The address of a radio, decimal or in hexadecimal."""
-    text = {"type": "string", "pattern": "^0[xX][0-9A-Fa-f]{1,16}$"}
-    return {"anyOf": [_whole(1, MAX_ADDRESS, "address in messages"), text]}
+def _address(high: int, said: str) -> Schema:
+    """The address of a radio or id of a board, decimal or in hexadecimal."""
+    return {"anyOf": [_whole(1, high, said), {"type": "string", "pattern": f"^{hexadecimal(high)}$"}]}
 
 
 def _model(name: str) -> Schema:
@@ -146,12 +150,6 @@ def _board() -> Schema:
         "dead_emitters": {**elements, "description": "emitters to ignore"},
         **_of_class(RobotIr),
     }
-
-
-def _board_id() -> Schema:
-    """The id of a board, decimal or in hexadecimal."""
-    text = {"type": "string", "pattern": "^0[xX][0-9A-Fa-f]{1,4}$"}
-    return {"anyOf": [_whole(1, 2**16 - 1, "id in exchanges"), text]}
 
 
 def _pattern() -> str:

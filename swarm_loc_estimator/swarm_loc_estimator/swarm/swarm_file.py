@@ -53,6 +53,7 @@ from typing import TYPE_CHECKING, Any
 
 from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import FixModel, ImuModel, OdometryModel, RandomWalk, SensorModel
 from swarm_loc_estimator.swarm.ir_section import IrSection, Values
 from swarm_loc_estimator.swarm.motion_response import MotionResponse, MotionResponseError
@@ -200,18 +201,16 @@ class _Loader(TreeChecks):
         fixed = self._named(sections.get("cameras", {}), "cameras")
         cameras = tuple(self._fixed_camera(name, tree) for name, tree in fixed)
         anchors = read_anchors(self, sections.get("anchors"))
-        estimated = sum(mark.is_estimated for mark in landmarks) + sum(
-            a.position_sigma > 0.0 for a in anchors
-        )
-        states = _state_count(robots, estimated)
+        try:
+            swarm = Swarm(robots, landmarks, cameras, anchors)
+        except SwarmError as error:
+            raise self.said(str(error).removesuffix(".")) from error
+        states = ParameterTable.of(swarm.robots, swarm.surveyed).filter_size
         if states > MAX_STATES:
             raise self.said(
                 f"what has a sigma makes a filter of {states} states but must make at most {MAX_STATES}"
             )
-        try:
-            return Swarm(robots, landmarks, cameras, anchors)
-        except SwarmError as error:
-            raise self.said(str(error).removesuffix(".")) from error
+        return swarm
 
     def _robot(self, name: str, tree: Tree, defaults: _Layer, types: Mapping[str, _Layer]) -> Robot:
         """Parse one robot from its three layers."""
@@ -264,20 +263,18 @@ class _Loader(TreeChecks):
     def _face(self, tree: Tree, key: str) -> Numbers:
         """Parse the place of a marker on a robot."""
         specs = number_specs(Face)
-        mapping = self.mapping(tree, key, (*specs, "lies"))
-        place = self.numbers({name: mapping[name] for name in specs if name in mapping}, key, specs)
-        if "lies" in mapping:
-            if not isinstance(mapping["lies"], bool):
-                raise self.error(f"{key}.lies", mapping["lies"], "must be true or false")
-            place["lies"] = mapping["lies"]
+        place = self.numbers(tree, key, specs, others=("lies",))
+        if "lies" in self.mapping(tree, key):
+            if not isinstance(tree["lies"], bool):
+                raise self.error(f"{key}.lies", tree["lies"], "must be true or false")
+            place["lies"] = tree["lies"]
         return place
 
     def _fixed_camera(self, name: str, tree: Tree) -> FixedCamera:
         """Parse one fixed camera."""
         key, specs = f"cameras.{name}", number_specs(FixedCamera)
-        mapping = self.mapping(tree, key, (*specs, "sensor"), required=("x", "y", "z"))
-        pose: Any = self.numbers({spec: mapping[spec] for spec in specs if spec in mapping}, key, specs)
-        sensor: Any = self.numbers(mapping.get("sensor"), f"{key}.sensor", number_specs(SensorModel))
+        pose: Any = self.numbers(tree, key, specs, ("x", "y", "z"), ("sensor",))
+        sensor: Any = self.numbers(tree.get("sensor"), f"{key}.sensor", number_specs(SensorModel))
         return FixedCamera(name, **pose, sensor=SensorModel(**sensor))
 
     def _response(self, tree: Tree, key: str) -> MotionResponse | None:
@@ -376,18 +373,3 @@ def _said(layers: Iterable[_Layer], section: str) -> Values | None:
             said = layer.sections[section]
             values = None if said is None else {**(values or {}), **said}
     return values
-
-
-def _state_count(robots: tuple[Robot, ...], estimated: int) -> int:
-    """Number of filter states: three per pose and estimated landmark or anchor, one per parameter."""
-    sigmas = [
-        sigma
-        for robot in robots
-        for sigma in (
-            robot.turn_sensor.turn_bias_sigma,
-            robot.odometry.distance_scale_sigma,
-            robot.turn_sensor.turn_scale_sigma,
-            *((robot.camera.yaw_sigma, robot.sensor.distance_scale_sigma) if robot.camera else ()),
-        )
-    ]
-    return 3 * (len(robots) + estimated) + sum(1 for sigma in sigmas if sigma > 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -49,14 +50,23 @@ class TreeChecks:
         return tree
 
     def numbers(
-        self, tree: Tree, key: str, specs: Mapping[str, NumberSpec], required: tuple[str, ...] = ()
+        self,
+        tree: Tree,
+        key: str,
+        specs: Mapping[str, NumberSpec],
+        required: Iterable[str] = (),
+        others: Iterable[str] = (),
     ) -> Numbers:
-        """A mapping of numbers, each in its range."""
-        mapping = self.mapping(tree, key, specs)
+        """The numbers of a mapping, each in its range; other keys are allowed but left out."""
+        mapping = self.mapping(tree, key, (*specs, *others))
         for name in required:
             if name not in mapping:
                 raise self.said(f"{key} lacks {name}, a number in {specs[name].range_text}")
-        return {name: self.number(value, f"{key}.{name}", specs[name]) for name, value in mapping.items()}
+        return {
+            name: self.number(value, f"{key}.{name}", specs[name])
+            for name, value in mapping.items()
+            if name in specs
+        }
 
     def number(self, value: Tree, key: str, spec: NumberSpec) -> float | None:
         """One number in its range."""
@@ -70,6 +80,14 @@ class TreeChecks:
             number = math.inf
         if not spec.allows(number):
             raise self.error(key, value, f"must lie in {spec.range_text}")
+        return number
+
+    def address(self, value: Tree, key: str, high: int) -> int:
+        """A whole number in [1, high], decimal or in hexadecimal, see `hexadecimal`."""
+        is_text = isinstance(value, str) and re.fullmatch(hexadecimal(high), value)
+        number = int(value, 16) if is_text else value
+        if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= high:
+            raise self.error(key, value, f"must be a whole number in [1, {high}]")
         return number
 
     def items(self, tree: Tree, key: str) -> list[Tree]:
@@ -94,6 +112,11 @@ class TreeChecks:
     def said(self, sentence: str) -> ValueError:
         """A sentence, given without its full stop, about this file."""
         return self._error_type(f"{self._path}: {sentence}.")
+
+
+def hexadecimal(high: int) -> str:
+    """The pattern of texts such as 0x1F for whole numbers in [1, high]; `high` has only the digit f."""
+    return rf"0[xX](?=.*[1-9A-Fa-f])[0-9A-Fa-f]{{1,{len(f'{high:x}')}}}"
 
 
 def nearest(name: object, known: Iterable[str]) -> str:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from swarm_loc_estimator.common.parameters import NumberSpec, number, number_specs
+from swarm_loc_estimator.common.parameters import number, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree
-from swarm_loc_estimator.swarm.tree_checks import Numbers, TreeChecks
+from swarm_loc_estimator.swarm.tree_checks import TreeChecks
 
 
 @dataclass(frozen=True)
@@ -58,7 +56,7 @@ class Anchor:
 
 
 MAX_ADDRESS = 2**64 - 1
-_HEXADECIMAL = re.compile(r"0[xX][0-9A-Fa-f]{1,16}")
+_ADDRESS = ("address",)
 _DEVICE, _ANCHOR = number_specs(UwbDevice), number_specs(Anchor)
 
 Values = dict[str, Any]
@@ -68,16 +66,13 @@ def uwb_layer(checks: TreeChecks, tree: Tree, key: str, *, of_robot: bool) -> Va
     """The section `uwb` of one layer; only a robot has an address. None: no radio."""
     if tree is None:
         return None
-    mapping = checks.mapping(tree, key, ("address", *_DEVICE) if of_robot else _DEVICE)
-    return _read(checks, mapping, key, _DEVICE)
+    values: Values = {**checks.numbers(tree, key, _DEVICE, others=_ADDRESS if of_robot else ())}
+    return values if "address" not in tree else {**values, **_address(checks, tree, key)}
 
 
 def uwb_device(checks: TreeChecks, values: Values | None, key: str) -> UwbDevice | None:
     """The radio of a robot from the merged values of its layers."""
-    if not values:
-        return None
-    _require(checks, values, key, ("address",))
-    return UwbDevice(**values)
+    return UwbDevice(**{**values, **_address(checks, values, key)}) if values else None
 
 
 def read_anchors(checks: TreeChecks, tree: Tree) -> tuple[Anchor, ...]:
@@ -85,33 +80,13 @@ def read_anchors(checks: TreeChecks, tree: Tree) -> tuple[Anchor, ...]:
     anchors = []
     for index, entry in enumerate(checks.items([] if tree is None else tree, "anchors")):
         key = f"anchors[{index}]"
-        mapping = checks.mapping(entry, key, ("address", *_ANCHOR))
-        _require(checks, mapping, key, ("address", "x", "y"))
-        anchors.append(Anchor(**_read(checks, mapping, key, _ANCHOR)))
+        numbers: Values = {**checks.numbers(entry, key, _ANCHOR, ("x", "y"), _ADDRESS)}
+        anchors.append(Anchor(**numbers, **_address(checks, entry, key)))
     return tuple(anchors)
 
 
-def _require(checks: TreeChecks, values: Values, key: str, names: Iterable[str]) -> None:
-    for name in names:
-        if name not in values:
-            rule = f"a whole number in [1, {MAX_ADDRESS}]" if name == "address" else "a number"
-            raise checks.said(f"{key} lacks {name}, {rule}")
-
-
-def _read(checks: TreeChecks, mapping: Values, key: str, specs: Mapping[str, NumberSpec]) -> Values:
-    numbers: Numbers = {
-        name: checks.number(value, f"{key}.{name}", specs[name])
-        for name, value in mapping.items()
-        if name != "address"
-    }
-    if "address" not in mapping:
-        return numbers
-    return {"address": _address(checks, mapping["address"], f"{key}.address"), **numbers}
-
-
-def _address(checks: TreeChecks, value: Tree, key: str) -> int:
-    """An address, decimal or hexadecimal with 0x."""
-    address = int(value, 16) if isinstance(value, str) and _HEXADECIMAL.fullmatch(value) else value
-    if isinstance(address, bool) or not isinstance(address, int) or not 1 <= address <= MAX_ADDRESS:
-        raise checks.error(key, value, f"must be a whole number in [1, {MAX_ADDRESS}]")
-    return address
+def _address(checks: TreeChecks, tree: Values, key: str) -> Values:
+    """The address of a section, which must be there."""
+    if "address" not in tree:
+        raise checks.said(f"{key} lacks address, a whole number in [1, {MAX_ADDRESS}]")
+    return {"address": checks.address(tree["address"], f"{key}.address", MAX_ADDRESS)}

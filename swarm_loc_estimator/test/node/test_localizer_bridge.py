@@ -118,6 +118,9 @@ def test_odometry_keeps_its_covariance_and_its_frame_is_checked(ros: Ros, swarm_
     message.header.frame_id = "map"
     publish_until(ros, publisher, message, lambda: fixes)
     assert fixes[0].pose.covariance[[0, 7, 35]] == pytest.approx([0.01, 0.02, 0.03])
+    bridged.says("bridging")
+    message.header.frame_id = "odom"  # the source changes its frame, after good poses
+    publish_until(ros, publisher, message, lambda: bridged.status().message.startswith("no pose can be used"))
 
 
 def test_bodies_that_nobody_describes_are_named(ros: Ros, swarm_file: Path) -> None:

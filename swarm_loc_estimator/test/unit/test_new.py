@@ -8,7 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.cli.new import main, start_lines
+from swarm_loc_estimator.cli.new import main
+from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.new_swarm import FAMILY_IDS, PlanError, SwarmPlan, planned_swarm
 from swarm_loc_estimator.swarm.robot_types import ROBOT_TYPES, SENSORS
 from swarm_loc_estimator.swarm.schema import SCHEMA_FILE, schema_text
@@ -31,16 +32,12 @@ def answer(monkeypatch: pytest.MonkeyPatch, *answers: str) -> None:
 def test_every_type_with_all_its_sensors_loads(tmp_path: Path, name: str) -> None:
     for sensors in sensor_sets(name):
         path = tmp_path / f"{'_'.join(sensors)}.yaml"
-        options = ["--type", name, "--robots", "2", "--sensors", ",".join(sensors), "--pitch", "2"]
+        options = ["--type", name, "--robots", "2", "--sensors", ",".join(sensors)]
+        options += ["--pitch", "2"] if "landmarks" in sensors else []
         assert main([str(path), "--yes", *options]) == 0
         swarm = load_swarm(path)
-        plan = SwarmPlan(
-            name, 2, swarm.robots[0].name[:-1], sensors, size=ROBOT_TYPES[name].marker_size, pitch=2.0
-        )
-        if name not in ("own", "kilobot"):
-            odometry = ROBOT_TYPES[name].odometry
-            assert odometry is not None
-            assert [robot.odometry for robot in swarm.robots] == [odometry] * 2
+        odometry = ROBOT_TYPES[name].odometry or OdometryModel()
+        assert [robot.odometry for robot in swarm.robots] == [odometry] * 2
         assert len(swarm.landmarks) == (4 if "landmarks" in sensors else 0)
         for robot in swarm.robots:
             assert bool(robot.faces) == ("robots" in sensors)
@@ -50,7 +47,7 @@ def test_every_type_with_all_its_sensors_loads(tmp_path: Path, name: str) -> Non
             assert robot.fix.systematic_share == ("mapper" in sensors)
             assert (robot.ir is not None) == (name == "droplet")
             assert robot.stands == robot.random_walk.moves == (name == "kilobot")
-        assert len(start_lines(plan, "swarm.yaml")) >= 2
+            assert {face.size for face in robot.faces} <= {ROBOT_TYPES[name].marker_size}
 
 
 def test_every_sensor_belongs_to_a_type() -> None:
@@ -127,6 +124,14 @@ def test_wrong_answers_are_asked_again_with_those_that_are_allowed(
         (["--type", "pushbot", "--sensors", "mapper,fix"], "mapper and fix publish on the same topic"),
         (["--robots", "100", "--family", "aruco_mip_36h12"], "The swarm needs 520 markers, but"),
         (["--arena", "1x"], "--arena: '1x' must be two lengths"),
+        (
+            ["--wheel-separation", "0.2"],
+            "--wheel-separation has no meaning for robots of the type epuck located by robots, landmarks.",
+        ),
+        (["--sensors", "fix", "--size", "0.1"], "--size has no meaning for robots of the type epuck"),
+        (["--sensors", "robots", "--arena", "1x2"], "--arena has no meaning"),
+        (["--sensors", "robots", "--pitch", "1"], "--pitch has no meaning"),
+        (["--sensors", "aerial", "--landmark-size", "1"], "--landmark-size has no meaning"),
     ],
 )
 def test_wrong_options_end_with_one_sentence(

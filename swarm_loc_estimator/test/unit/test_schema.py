@@ -24,7 +24,7 @@ ROOT = Path(__file__).parents[3]
 WRITTEN = ROOT / "swarm_loc_estimator" / "doc" / SCHEMA_FILE
 EXAMPLES = sorted(path for path in (ROOT / "bags").glob("*/*.yaml") if "fileversion" in path.read_text())
 EXAMPLES = [path for path in EXAMPLES if "robots:" in path.read_text(encoding="utf-8")]
-TYPES: dict[str, type] = {"object": dict, "array": list, "string": str, "null": type(None)}
+TYPES: dict[str, type] = {"object": dict, "array": list, "string": str, "boolean": bool, "null": type(None)}
 WHOLE = {
     "fileversion": 1,
     "defaults": {"sensor": {"range_sigma": 0.1}, "landmark": {"size": 0.06}},
@@ -33,12 +33,19 @@ WHOLE = {
             "odometry": {"wheel_separation": 0.053},
             "response": {"speeds": [0], "turn_rates": [0], "speed_share": [[1]], "turn_share": [[1]]},
             "camera": {"x": 0.035},
-            "faces": {"front": {"x": 0.035, "yaw": None}, "back": None},
+            "faces": {"front": {"x": 0.035, "yaw": None}, "back": None, "top": {"z": 0.1, "lies": True}},
+            "imu": {"turn_noise_density": 1e-3},
+            "uwb": {"x": 0.1},
         },
         "droplet": {"odometry": None, "camera": None, "ir": {"platform": "droplet", "dead_sensors": [1]}},
     },
     "robots": {
-        "epuck1": {"type": "epuck", "ids": {"front": 12}, "start": {"x": 0.0, "y": 0.0, "theta": 0.0}},
+        "epuck1": {
+            "type": "epuck",
+            "ids": {"front": 12, "top": 13},
+            "start": {"x": 0.0, "y": 0.0, "theta": 0.0},
+            "uwb": {"address": "0x1F"},
+        },
         "droplet1": {
             "type": "droplet",
             "random_walk": {"position": 1e-4},
@@ -46,6 +53,8 @@ WHOLE = {
         },
     },
     "landmarks": {100: {"x": 1.2, "y": -0.4, "yaw": None}},
+    "cameras": {"up": {"x": 0.0, "y": 0.0, "z": 2.5, "sensor": {"residual_position_sigma": 0.001}}},
+    "anchors": [{"address": 7, "x": 0.0, "y": 5.0}],
 }
 
 
@@ -70,7 +79,7 @@ def faults(tree: Any, rule: dict[str, Any], place: str = "") -> Iterator[str]:
     if kinds and not any(kind_is(tree, kind) for kind in ([kinds] if isinstance(kinds, str) else kinds)):
         yield f"{place}: no {kinds}"
         return
-    if isinstance(tree, bool) or ("const" in rule and tree != rule["const"]):
+    if (isinstance(tree, bool) and kinds != "boolean") or ("const" in rule and tree != rule["const"]):
         yield f"{place}: {tree}"
     if tree not in rule.get("enum", [tree]) or ("not" in rule and not list(faults(tree, rule["not"]))):
         yield f"{place}: {tree}"
@@ -108,11 +117,11 @@ def faults_of_mapping(tree: dict[Any, Any], rule: dict[str, Any], place: str) ->
 
 def changed(path: str, value: Any) -> dict[Any, Any]:
     """The whole example with another value at a dotted path."""
-    tree = deepcopy(WHOLE)
-    *way, last = [int(name) if name.isdigit() else name for name in path.split(".")]
+    tree: dict[Any, Any] = deepcopy(WHOLE)
     inner: Any = tree
+    *way, last = [int(name) if name.isdigit() else name for name in path.split(".")]
     for name in way:
-        inner = inner.setdefault(name, {})
+        inner = inner.setdefault(name, {}) if isinstance(inner, dict) else inner[name]
     inner[last] = value
     return tree
 
@@ -146,6 +155,7 @@ def test_there_are_examples_and_one_with_all_sections() -> None:
         *("defaults", "types", "landmarks", "types.epuck", "types.epuck.camera", "types.epuck.faces.front"),
         *("types.droplet.odometry", "types.epuck.response", "types.droplet.ir", "types.epuck.sensor"),
         *("robots.droplet1.ir.gains", "robots.epuck1.start", "types.epuck.faces", "landmarks.100.yaw"),
+        *("robots.epuck1.uwb", "types.epuck.imu", "cameras", "cameras.up.sensor", "anchors"),
     ],
 )
 def test_null_is_valid_where_it_means_something(path: str) -> None:
@@ -197,6 +207,23 @@ def test_null_is_valid_where_it_means_something(path: str) -> None:
         ("landmarks.100", None),
         ("landmarks.100.size", 11.0),
         ("landmarks.a", {"x": 0.0, "y": 0.0}),
+        ("types.epuck.faces.top.lies", 1),
+        ("types.epuck.faces.top.lies", None),
+        ("types.epuck.imu.turn_noise_density", -1.0),
+        ("types.epuck.uwb.address", 7),
+        ("robots.droplet1.ir.id", "0x0"),
+        ("robots.droplet1.ir.id", "0x10000"),
+        ("robots.epuck1.uwb.address", "0x0"),
+        ("robots.epuck1.uwb.range_sigma", 0.0),
+        ("cameras.up", None),
+        ("cameras.up", {"x": 0.0, "y": 0.0}),
+        ("cameras.map", {"x": 0.0, "y": 0.0, "z": 2.5}),
+        ("cameras.up.sensor.noise", 0.1),
+        ("anchors", {}),
+        ("anchors.0", None),
+        ("anchors.0.address", 0),
+        ("anchors.0.address", 2**64),
+        ("anchors.0", {"address": 7, "x": 0.0}),
     ],
 )
 def test_both_refuse(path: str, value: Any) -> None:
