@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         recording = read_recording(options.bag, swarm, progress, options.remap)
         done = calibrate(recording, swarm, chosen, progress)
     save_swarm(done.swarm, options.out, f"Calibrated with {options.bag.name}. {done.warning}".rstrip())
-    print("\n".join([text_of(done), *recording.remarks, *_unused(recording)]))
+    print("\n".join([text_of(done), *recording.sentences(), *_unused(recording)]))
     print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
     return 0
 

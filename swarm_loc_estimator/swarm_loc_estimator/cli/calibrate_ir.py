@@ -46,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         recording = read_recording(options.bag, swarm, progress, options.remap)
         done = calibrate_infrared(recording, swarm, progress, with_truth=not options.without_truth)
     save_swarm(done.swarm, options.out, f"Infrared gains calibrated with {options.bag.name}.")
-    print("\n".join([text_of(done), *recording.remarks]))
+    print("\n".join([text_of(done), *recording.sentences()]))
     print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
     return 0
 

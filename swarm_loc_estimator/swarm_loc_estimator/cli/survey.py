@@ -43,8 +43,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         recording = read_recording(options.bag, swarm, progress, options.remap)
         done = survey(recording, swarm, progress)
     save_swarm(done.swarm, options.out, f"Surveyed with {options.bag.name}.")
-    others = [remark for remark in recording.remarks if "unknown_id" not in remark]  # these are the landmarks
-    print("\n".join([done.text, *others]))
+    print("\n".join([done.text, *recording.sentences(expected="unknown_id")]))  # those are the landmarks
     print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
     return 0
 

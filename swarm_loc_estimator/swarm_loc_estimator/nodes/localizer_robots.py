@@ -72,10 +72,13 @@ class LocalizedRobots:
     def __init__(self, parameters: BridgeParameters, robots: Collection[str], health: Health) -> None:
         self._parameters, self._health = parameters, health
         self.robot_of = _robots_of_bodies(parameters.bodies, robots)
+        offsets = _offsets(parameters.offsets, self.robot_of.values())
         self._to_robot = {
-            robot: se2.inverse(offset)
-            for robot, offset in _offsets(parameters.offsets, self.robot_of.values()).items()
+            robot: se2.inverse(offsets.get(robot, np.zeros(3))) for robot in self.robot_of.values()
         }
+        self._frames = (
+            [parameters.source_frame] if parameters.source_frame else [parameters.map_frame, "world"]
+        )
         self.topic = topic = parameters.topic or SOURCES[parameters.source].topic
         has_own = BODY in SOURCES[parameters.source].topic
         if has_own != (BODY in topic):
@@ -128,8 +131,7 @@ class LocalizedRobots:
             self.strangers.add(name)
 
     def _robot_pose(self, name: str, body: BodyPose, arrival_ns: int) -> RobotPose:
-        parameters, robot = self._parameters, self.robot_of[name]
-        frames = [parameters.source_frame] if parameters.source_frame else [parameters.map_frame, "world"]
+        parameters, robot, frames = self._parameters, self.robot_of[name], self._frames
         if body.frame_id not in frames:
             raise _UnusableError(
                 "foreign_frame",
@@ -147,7 +149,7 @@ class LocalizedRobots:
         covariance = self._variances if is_unknown(body.covariance[None])[0] else body.covariance
         if not (np.isfinite(body.pose[:2]).all() and np.isfinite(covariance).all()):
             raise _UnusableError("not_finite", f"a number in the poses of body '{name}' is NaN or infinite")
-        pose, to_robot = np.array(body.pose), self._to_robot.get(robot, np.zeros(3))
+        pose, to_robot = np.array(body.pose), self._to_robot[robot]
         if math.isnan(pose[2]) or not has_heading(covariance[None])[0]:
             if to_robot.any() or parameters.output == "ground_truth":
                 raise _UnusableError(

@@ -86,7 +86,7 @@ class ImuModel:
     turn_noise_density: float = number(
         0.0, "rad/s/Hz^0.5", 0.0, 1.0, "white noise of the turn rate; 0: the robot has no IMU"
     )
-    turn_scale: float = number(1.0, "1", -10.0, 10.0, "true turn per measured turn; -1: mounted upside down")
+    turn_scale: float = number(1.0, "1", 0.1, 10.0, "true turn per measured turn")
     turn_scale_sigma: float = number(
         0.0, "1", 0.0, 1.0, "relative standard deviation of turn_scale; 0: exact, else estimated"
     )
@@ -98,7 +98,11 @@ class ImuModel:
         600.0, "s", 0.1, 1e6, "time constant of this variable part (Gauss-Markov)"
     )
     roll: float = number(
-        0.0, "rad", -math.pi, math.pi, "mount: the IMU turned about base_link's x axis, before pitch"
+        0.0,
+        "rad",
+        -math.pi,
+        math.pi,
+        "mount: the IMU turned about base_link's x axis, before pitch; 3.1416: upside down",
     )
     pitch: float = number(0.0, "rad", -math.pi, math.pi, "mount: turned about base_link's y axis")
     delay_s: float = number(0.0, "s", -2.0, 2.0, "the turn happens this much after its stamp")

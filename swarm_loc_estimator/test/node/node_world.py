@@ -116,6 +116,11 @@ def detection_bytes(robot: str, stamp_ns: int, detections: NDArray[np.void]) -> 
     return encode_detections(f"{robot}/camera_optical_frame", stamp_ns, detections)
 
 
+def xytheta(pose: SwarmPose) -> NDArray[np.float64]:
+    """x, y, theta of a pose."""
+    return np.array([pose.x, pose.y, pose.theta])
+
+
 class Ros:
     """A ROS context with a node of the test's own, and an executor for all nodes of the test."""
 

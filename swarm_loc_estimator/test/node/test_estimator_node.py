@@ -11,11 +11,8 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseWithCovarianceStamped, TransformStamped
 from node_world import (
-    LANDMARKS,
-    SECOND,
     SETTINGS,
     STEP_NS,
-    SWARM_YAML,
     T0_NS,
     TRUE_POSES,
     UNKNOWN_ID,
@@ -28,6 +25,7 @@ from node_world import (
     sight,
     stamp_ns,
     values_of,
+    xytheta,
 )
 from rcl_interfaces.msg import Log
 from rclpy.node import Node
@@ -52,10 +50,6 @@ def planar(pose: Any) -> np.ndarray[Any, Any]:
     place = getattr(pose, "position", None) or pose.translation
     turn = getattr(pose, "orientation", None) or pose.rotation
     return np.array([place.x, place.y, 2.0 * np.arctan2(turn.z, turn.w)])
-
-
-def xytheta(pose: SwarmPose) -> np.ndarray[Any, Any]:
-    return np.array([pose.x, pose.y, pose.theta])
 
 
 def report(heard: list[DiagnosticArray], name: str) -> tuple[DiagnosticStatus, dict[str, str]]:
@@ -120,44 +114,6 @@ def test_transforms_per_robot_are_post_dated_and_have_no_prefix(ros: Ros, swarm_
     sentence = "beta/tf_static has a transform from 'world' to 'odom', which only the estimator may publish"
     ros.until(lambda: any(entry.msg == sentence for entry in log))
     assert not common
-
-
-def test_poses_without_a_map_are_in_a_frame_of_a_robot_until_landmarks_come(
-    ros: Ros, swarm_file: Path
-) -> None:
-    swarm_file.write_text(SWARM_YAML.replace(", start: {x: 0.0, y: 0.0, theta: 0.0}", ""), encoding="utf-8")
-    parameters = overrides(swarm_file=str(swarm_file), use_sim_time=True, origin_after_s=0.5, **SETTINGS)
-    ros.add(EstimatorNode(parameter_overrides=parameters))
-    robots, alpha, beta = Robots(ros), (1.0, 1.0, np.pi), (0.0, 1.0, 0.0)
-    robots.wait_for_estimator()
-    transforms, log = ros.listen(TFMessage, "/tf"), ros.listen(Log, "/rosout")
-    ros.until(lambda: ros.tester.count_publishers("/tf"))
-    now_ns = T0_NS
-
-    def step(ids: tuple[int, ...]) -> int:
-        nonlocal now_ns
-        now_ns, heard = now_ns + STEP_NS, len(robots.poses)
-        robots.tell_time(now_ns)
-        robots.odometry("alpha", odometry_bytes("alpha", now_ns))
-        robots.odometry("beta", odometry_bytes("beta", now_ns))
-        seen = sight(alpha, ids, {2: beta, **LANDMARKS})
-        robots.detections("alpha", detection_bytes("alpha", now_ns, seen))
-        ros.until(lambda: any(stamp_ns(pose) == now_ns for pose in robots.poses[heard:]))
-        return now_ns
-
-    while robots.poses[-1:] == [] or robots.poses[-1].header.frame_id == "map":
-        assert step((2,)) < T0_NS + 20 * SECOND
-    frame = robots.poses[-1].header.frame_id
-    assert frame in {"alpha/start", "beta/start"}
-    while not robots.located("beta"):
-        assert step((2,)) < T0_NS + 20 * SECOND
-    ros.until(lambda: transforms and stamp_ns(transforms[-1].transforms[0]) == now_ns)
-    assert {one.header.frame_id for one in transforms[-1].transforms} == {frame}
-    ros.until(lambda: any(f"poses are relative to {frame[:-6]}, in '{frame}'" in one.msg for one in log))
-    while robots.poses[-1].header.frame_id != "map":
-        assert step((2, *LANDMARKS)) < T0_NS + 40 * SECOND
-    assert xytheta(robots.newest("beta")) == pytest.approx(beta, abs=0.1)
-    ros.until(lambda: any(f"poses are in 'map' now, no longer in '{frame}'" in one.msg for one in log))
 
 
 def test_a_waiting_robot_has_a_status_but_no_pose(ros: Ros, robots: Robots) -> None:

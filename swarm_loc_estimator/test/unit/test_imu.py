@@ -83,12 +83,12 @@ def test_turns_are_those_of_the_gyroscope_and_paths_those_of_the_wheels() -> Non
 
 
 def test_scale_bias_and_a_varying_rate_are_integrated_exactly() -> None:
-    imu = replace(GYRO, turn_scale=-1.02, turn_bias=0.03)
+    imu = replace(GYRO, turn_scale=1.02, turn_bias=0.03)
     track, odometry, gyro = tracks(imu), stamps(7, 0.0, 3.0), stamps(50, -0.1, 3.1)
     turn(track, gyro, 0.4 * seconds(gyro))  # linear, which the trapezoidal rule integrates exactly
     feed(track, odometry, straight(odometry))
     end_s = float(seconds(odometry)[-1])
-    expected = -1.02 * 0.2 * end_s**2 + 0.03 * end_s
+    expected = 1.02 * 0.2 * end_s**2 + 0.03 * end_s
     assert look(track, end_s).pose[0, 2] == pytest.approx(expected, abs=1e-9)
 
 

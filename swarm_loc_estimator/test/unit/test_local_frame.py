@@ -62,7 +62,6 @@ def test_robots_are_located_relative_to_one_of_them(seed: int) -> None:
     early = run(estimator, world, AFTER_S)
     assert np.isnan(early.poses).all()
     assert estimator.origin == ""
-    last = run(Estimator(world.swarm, SETTINGS), world)
     estimator = Estimator(world.swarm, SETTINGS)
     last = run(estimator, world)
     assert estimator.origin in {robot.name for robot in world.swarm.robots}
@@ -77,7 +76,6 @@ def test_the_swarm_moves_to_the_map_as_a_whole_when_landmarks_come(seed: int) ->
     estimator = Estimator(world.swarm, SETTINGS)
     run(estimator, world, 7.9)
     assert estimator.origin != ""
-    last = run(Estimator(world.swarm, SETTINGS), world)
     estimator = Estimator(world.swarm, SETTINGS)
     estimates = play(estimator, on_time(world), ticks(T0 + SECOND // 10, end_of(world)))
     assert (estimator.origin, estimator.frame_moves) == ("", 1)

@@ -6,7 +6,7 @@ A fit runs the estimator over the same data a hundred times; the bag is read onl
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -47,6 +47,7 @@ class Recording:
         brightness: Of all infrared boards.
         fixes: Of all robots.
         turn_rates: Of all IMUs.
+        dropped: Number of dropped inputs by reason.
         remarks: Unreadable contents, one sentence each.
     """
 
@@ -57,7 +58,15 @@ class Recording:
     brightness: BrightnessRows = NO_BRIGHTNESS
     fixes: FixRows = NO_FIXES
     turn_rates: TurnRateRows = NO_TURN_RATES
+    dropped: Mapping[str, int] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
+
+    def sentences(self, expected: str = "") -> list[str]:
+        """The remarks, and what was dropped for another reason than the expected one."""
+        unused = (
+            f"{count} inputs are not used: {why}." for why, count in self.dropped.items() if why != expected
+        )
+        return [*self.remarks, *unused]
 
     @property
     def range_ns(self) -> tuple[int, int]:
@@ -116,7 +125,6 @@ def read_recording(
     converter = InputConverter(swarm, Settings())
     moved = [converter.convert(part).rows for part in parts]
     detections = [part["detections"] for part in parts if part["detections"].robot.size]
-    unused = (f"{count} inputs are not used: {reason}." for reason, count in converter.drops.total.items())
     return Recording(
         bag.name,
         joined([NO_ODOMETRY, *(rows.get("odometry", NO_ODOMETRY) for rows in moved)]),
@@ -125,7 +133,8 @@ def read_recording(
         joined([NO_BRIGHTNESS, *(part["brightness"] for part in parts)]),
         joined([NO_FIXES, *(part["fixes"] for part in parts)]),
         joined([NO_TURN_RATES, *(rows.get("imu", NO_TURN_RATES) for rows in moved)]),
-        (*summary.remarks, *unused),
+        converter.drops.total,
+        summary.remarks,
     )
 
 
