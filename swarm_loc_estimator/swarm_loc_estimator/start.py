@@ -10,6 +10,7 @@ from swarm_loc_estimator.common.command_line import Program
 calibrate = Program("swarm_loc_estimator.cli.calibrate")
 calibrate_ir = Program("swarm_loc_estimator.cli.calibrate_ir")
 demo = Program("swarm_loc_estimator.cli.demo")
+doctor = Program("swarm_loc_estimator.cli.doctor")
 estimator_node = Program("swarm_loc_estimator.nodes.estimator_node")
 graph = Program("swarm_loc_estimator.cli.graph")
 import_droplets = Program("swarm_loc_estimator.cli.import_droplets")
@@ -27,7 +28,18 @@ watch = Program("swarm_loc_estimator.cli.watch")
 watch_node = Program("swarm_loc_estimator.watch.watch_node")
 
 WITHOUT_ROS = (
-    *(calibrate, calibrate_ir, import_droplets, import_mrclam, new, replay, replay_map, schema, survey),
+    *(
+        calibrate,
+        calibrate_ir,
+        doctor,
+        import_droplets,
+        import_mrclam,
+        new,
+        replay,
+        replay_map,
+        schema,
+        survey,
+    ),
 )
 
 

@@ -57,7 +57,8 @@ from swarm_loc_estimator.sensors.sighting_kernels import (
 )
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Robot, Swarm
 
-_FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+"""Rotation from the optical frame to x forward, y left, z up."""
 
 
 class DetectionRows(NamedTuple):
@@ -106,7 +107,7 @@ class SightingConverter:
         mounts: list[CameraMount | FixedCamera] = [robot.camera or CameraMount() for robot in robots]
         mounts += fixed
         models = [source.sensor for source in swarm.sources]
-        tilts = [Rotation.from_euler("YX", [m.pitch, m.roll]).as_matrix() @ _FROM_OPTICAL for m in mounts]
+        tilts = [Rotation.from_euler("YX", [m.pitch, m.roll]).as_matrix() @ FROM_OPTICAL for m in mounts]
         sensors = [tuple(getattr(model, name) for name in SENSOR_DTYPE.names or ()) for model in models]
         sigmas = [(0.0, 0.0)] * len(robots) + [(one.position_sigma, one.yaw_sigma) for one in fixed]
         self._cameras = Cameras(

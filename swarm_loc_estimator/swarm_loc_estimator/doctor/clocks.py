@@ -1,0 +1,72 @@
+"""Stamps and clocks: stamps beside the time of arrival."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.doctor.evidence import Evidence, Finding
+
+_HOUR_S = 3600.0
+_AHEAD_S = 0.05
+_APART_S = 0.3
+"""Difference of a clock from the others that is named [s]; delays of networks stay below."""
+_BACK = 0.02
+"""Share of stamps before the one that arrived before, from which they are named."""
+_SENSORS = ("odometry", "detections", "imu", "ranges", "brightness")
+_SET_CLOCK = "Synchronize it with the others (chrony)"
+
+
+def check_clocks(evidence: Evidence) -> Iterator[Finding]:
+    """Stamps are acquisition times, by clocks that agree."""
+    delays: dict[str, float] = {}
+    for sensor in _SENSORS:
+        rows = evidence.rows(sensor)
+        for robot in np.unique(rows.robot).tolist():
+            own = rows.robot == robot
+            topic = f"{evidence.source_name(robot)}'s {sensor}"
+            found = _of_topic(topic, rows.stamp_ns[own], rows.arrival_ns[own], evidence.settings.horizon_s)
+            yield from found
+            if not found and sensor == "odometry":
+                delays[evidence.source_name(robot)] = _delay_s(rows.stamp_ns[own], rows.arrival_ns[own])
+    usual = float(np.median([*delays.values()])) if delays else 0.0
+    for robot_name, delay in delays.items():
+        if abs(delay - usual) > _APART_S and len(delays) > 2:
+            which = "behind" if delay > usual else "ahead of"
+            problem = f"has a clock {abs(delay - usual):.2g} s {which} those of the other robots"
+            yield Finding(robot_name, problem, _SET_CLOCK)
+
+
+def _delay_s(stamp_ns: IntArray, arrival_ns: IntArray) -> float:
+    return float(np.median(_seconds(stamp_ns, arrival_ns)))
+
+
+def _seconds(stamp_ns: IntArray, arrival_ns: IntArray) -> FloatArray:
+    """From stamps to arrivals [s]."""
+    return np.asarray(1e-9 * (arrival_ns - stamp_ns))
+
+
+def _of_topic(topic: str, stamp_ns: IntArray, arrival_ns: IntArray, horizon_s: float) -> list[Finding]:
+    """Stamps of one topic."""
+    delay_s = _delay_s(stamp_ns, arrival_ns)
+    if (stamp_ns == 0).mean() > 0.5:
+        return [Finding(topic, "has stamps of zero", "Let its node set header.stamp to the acquisition time")]
+    if stamp_ns.size > 10 and np.ptp(stamp_ns) == 0:
+        return [Finding(topic, "has always the same stamp", "Let its node set header.stamp at each message")]
+    if abs(delay_s) > _HOUR_S:
+        remedy = "Set use_sim_time alike in all nodes, and synchronize clocks"
+        return [Finding(topic, "has stamps of another time than the clock here", remedy)]
+    if delay_s < -_AHEAD_S:
+        return [
+            Finding(topic, f"has stamps {-delay_s:.2g} s in the future", f"Its clock is ahead. {_SET_CLOCK}")
+        ]
+    if delay_s > horizon_s:
+        problem = f"has stamps {delay_s:.2g} s old, which is beyond horizon_s ({horizon_s:g} s)"
+        return [Finding(topic, problem, f"Its clock is behind, or its data are queued. {_SET_CLOCK}")]
+    back = np.diff(stamp_ns) < 0
+    if topic.endswith("odometry") and back.mean() > _BACK and stamp_ns.size > 20:
+        problem = f"has stamps that go back, {int(back.sum())} times"
+        return [Finding(topic, problem, "Stop the second publisher, or the node that sets wrong stamps")]
+    return []

@@ -1,0 +1,166 @@
+"""Contents of messages: what the estimator drops or contradicts, and markers that nobody describes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from itertools import combinations
+from types import MappingProxyType
+
+import numpy as np
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.health import listed
+from swarm_loc_estimator.doctor.evidence import Evidence, Finding
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.sensors.registry import SENSORS
+from swarm_loc_estimator.timeline.contradictions import Contradicted
+from swarm_loc_estimator.timeline.estimate import Status
+
+_MIN_SIGHTINGS = 5
+"""Fewer sightings of an unknown marker are misread ones."""
+_MIN_SHARE = 0.05
+"""Smaller shares of dropped readings are not named."""
+_MIN_ROWS = 20
+_AWAY_M, _AWAY_SIGMAS = 0.1, 5.0
+"""Least distance from a start that is named [m], and least multiple of its standard deviation."""
+_REASONS = MappingProxyType(
+    {
+        "no_camera": ("sees markers but has no camera in the description", "Describe its camera"),
+        "no_odometry": ("publishes odometry but has none in the description", "Remove odometry: null"),
+        "odometry_non_finite": ("publishes odometry that is not finite", "Look for NaN in its driver"),
+        "odometry_absurd": ("publishes odometry beyond 1000 km", "Look at its driver and its units"),
+        "odometry_jump": (
+            "moves faster than max_speed or max_turn_rate by its odometry",
+            "Check units (metres, radians), or raise these values of the description",
+        ),
+        "imu_non_finite": (
+            "publishes turn rates that are not finite",
+            "Look for NaN in the driver of the IMU",
+        ),
+        "imu_absurd": ("publishes absurd turn rates", "Publish them in radians per second"),
+        "non_finite": ("publishes measurements that are not finite", "Look for NaN in its detector"),
+        "absurd": ("publishes measurements of absurd size", "Publish them in metres"),
+        "bad_covariance": ("publishes invalid covariances", "Publish symmetric, positive ones, or zeros"),
+        "bad_content": ("publishes detections with an unknown content", "Set content to one of CONTENT_*"),
+        "own_marker": ("sees markers of its own", "Check the ids of the description"),
+        "fix_frame": ("gets fixes in another frame than map", "Publish them in map, or set map_frame"),
+        "fix_without_covariance": (
+            "gets fixes without covariance",
+            "Publish one, or describe fix.position_sigma",
+        ),
+        "face_down": ("sees lying markers from below", "Check the pose of this camera in the description"),
+        "not_flat": ("sees lying markers askew", "Check size and z of the markers, and the camera's pose"),
+        "uwb_unknown_address": ("measures ranges to unknown addresses", "Describe these radios"),
+        "ir_unknown_id": ("hears boards with unknown ids", "Describe their ir.id"),
+    }
+)
+"""Reasons of drops -> what a robot or camera does, and what to do about it."""
+
+
+def check_contents(evidence: Evidence) -> Iterator[Finding]:
+    """Readings can be used."""
+    yield from _unknown_markers(evidence)
+    yield from _same_odometry(evidence)
+    readings = _readings(evidence)
+    for index, source in enumerate(evidence.swarm.sources):
+        for reason, count in evidence.estimated.drops_of(index).items():
+            if reason in _REASONS and count > _MIN_SHARE * readings[:, index].sum():
+                problem, remedy = _REASONS[reason]
+                yield Finding(source.name, f"{problem} ({count} times)", remedy)
+
+
+def check_estimate(evidence: Evidence) -> Iterator[Finding]:
+    """The estimator locates all robots, where they should be, and contradicts nothing."""
+    estimated = evidence.estimated
+    for one in estimated.contradictions:
+        problem, remedy = _CONTRADICTED[one.kind]
+        yield Finding(one.about, f"{problem}: {one.text}", remedy)
+    yield from _other_starts(evidence)
+    motion = [one in ("odometry", "imu") for one in SENSORS]
+    measured = _readings(evidence)[~np.array(motion)].sum(axis=0)
+    seen = evidence.rows("detections").detection["id"]
+    for index, robot in enumerate(evidence.swarm.robots):
+        is_seen = (
+            np.isin([face.id for face in robot.faces], seen).any() or evidence.rows("aerial").stamp_ns.size
+        )
+        if estimated.status[index] == Status.WAITING and not measured[index] and not is_seen:
+            problem = "cannot be located: it has no start, measures nothing, and nobody sees it"
+            yield Finding(robot.name, problem, "Give it a start, or a sensor and something to see")
+
+
+def _other_starts(evidence: Evidence) -> Iterator[Finding]:
+    """Robots that were not where their start is, by the first pose that was tracked."""
+    tracks, estimated = OdometryTracks(evidence.swarm.robots), evidence.estimated
+    rows = evidence.odometry
+    tracks.extend(rows.robot, rows.stamp_ns, rows.pose, rows.twist)
+    for index, robot in enumerate(evidence.swarm.robots):
+        own = rows.robot == index
+        if robot.start is None or estimated.begin_ns[index] < 0 or not own.any():
+            continue
+        stamps_ns = np.array(
+            [rows.stamp_ns[own].min(), min(estimated.begin_ns[index], rows.stamp_ns[own].max())]
+        )
+        first, then = tracks.at(np.array([index, index]), stamps_ns).pose
+        began = se2.compose(estimated.begin_pose[index], se2.between(then, first))
+        away = math.hypot(*(began[:2] - np.array(robot.start[:2])))
+        if away > max(_AWAY_M, _AWAY_SIGMAS * max(robot.start_sigma.x, robot.start_sigma.y)):
+            problem = f"began at {began[0]:.2f}, {began[1]:.2f}, which is {away:.2f} m from its start"
+            yield Finding(robot.name, problem, "Put it there, correct start, or leave start out")
+
+
+def _readings(evidence: Evidence) -> IntArray:
+    """Number of readings (S, N) by sensor, of robots and cameras."""
+    count = len(evidence.swarm.sources)
+    robots = [evidence.rows(sensor).robot for sensor in SENSORS]
+    return np.stack([np.bincount(one[one >= 0], minlength=count) for one in robots])
+
+
+_CONTRADICTED = MappingProxyType(
+    {
+        Contradicted.ODOMETRY: ("has odometry that contradicts all else", "Check its driver and wheels"),
+        Contradicted.RESET: ("has odometry that was reset", "Keep its driver running"),
+        Contradicted.CONSTANT: (
+            "publishes a constant pose",
+            "Nothing, if its twist is right; it is integrated",
+        ),
+        Contradicted.POSE: ("is not where it should be", "Check its start, and the places of the landmarks"),
+        Contradicted.SIGHTINGS: (
+            "is contradicted by sightings",
+            "Check the mount of its camera, the size and ids of markers, and places of landmarks",
+        ),
+        Contradicted.DESCRIPTION: ("differs from its description", "Measure it again, or use survey"),
+        Contradicted.NOISE: ("has more noise than described", "Use calibrate, or describe more noise"),
+    }
+)
+
+
+def _unknown_markers(evidence: Evidence) -> Iterator[Finding]:
+    """Markers that nobody describes, and described landmarks that nobody sees."""
+    detected = evidence.rows("detections").detection["id"]
+    ids, counts = np.unique(detected, return_counts=True)
+    unknown = {
+        int(i): int(n)
+        for i, n in zip(ids, counts, strict=True)
+        if int(i) not in evidence.swarm.owner_of and n >= _MIN_SIGHTINGS
+    }
+    if unknown:
+        most = sorted(unknown, key=lambda marker: -unknown[marker])
+        which = listed([f"{marker} ({unknown[marker]} times)" for marker in most])
+        remedy = "Describe them under landmarks, or ids of a robot; survey finds the places of landmarks"
+        yield Finding(f"marker {which}", "was seen, but is in no description", remedy)
+
+
+def _same_odometry(evidence: Evidence) -> Iterator[Finding]:
+    """Two robots with the same odometry: one driver for two names."""
+    rows = evidence.rows("odometry")
+    poses = {robot: rows.pose[rows.robot == robot] for robot in np.unique(rows.robot).tolist()}
+    moving = {
+        robot: pose for robot, pose in poses.items() if len(pose) > _MIN_ROWS and np.ptp(pose[:, :2]) > 0.01
+    }
+    for one, other in combinations(moving, 2):
+        count = min(len(moving[one]), len(moving[other]))
+        if np.array_equal(moving[one][:count], moving[other][:count]):
+            names = f"{evidence.source_name(one)} and {evidence.source_name(other)}"
+            yield Finding(names, "have the same odometry", "Start a driver of its own for each robot")

@@ -1,0 +1,65 @@
+"""The doctor: all checks, on a bag or on what was heard live."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.doctor.clocks import check_clocks
+from swarm_loc_estimator.doctor.contents import check_contents, check_estimate
+from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, same_type
+from swarm_loc_estimator.doctor.frames import check_frames
+from swarm_loc_estimator.doctor.motion import check_motion
+from swarm_loc_estimator.doctor.pictures import COMPRESSED_IMAGE, IMAGE, check_pictures
+from swarm_loc_estimator.doctor.topics import check_topics
+from swarm_loc_estimator.offline.recorded_bag import Progress, renamed_topics
+from swarm_loc_estimator.sensors.registry import input_topics
+from swarm_loc_estimator.swarm.swarm import Swarm
+
+CHECKS = (check_topics, check_clocks, check_frames, check_pictures, check_motion, check_contents)
+MAX_IMAGES = 20
+"""Maximum number of images of a topic that are kept; what is wrong with one is wrong with all."""
+
+
+def examine(evidence: Evidence) -> list[Finding]:
+    """All that is wrong, the most basic things first.
+
+    What the estimator contradicts often follows from the rest, so it is told only where nothing else is.
+    """
+    return [one for check in CHECKS for one in check(evidence)] or [*check_estimate(evidence)]
+
+
+def evidence_of_bag(
+    bag: Path, swarm: Swarm, seconds: float, progress: Progress, remap: Mapping[str, str]
+) -> Evidence:
+    """The first seconds of a bag.
+
+    Args:
+        bag: rosbag2 folder, .mcap or .db3 file.
+        swarm: The description.
+        seconds: How much of it is read [s].
+        progress: Called now and then.
+        remap: Expected topic -> topic of the bag, see `renamed_topics`.
+
+    Raises:
+        BagError: Nothing in the bag can be read, or a topic cannot be mapped.
+    """
+    known = [topic.name for topic in input_topics(swarm)]
+    messages: dict[str, list[tuple[int, bytes]]] = {}
+    with BagReader(bag, renamed_topics(remap, swarm, known)) as reader:
+        types = {topic.name: topic.type for topic in reader.topics}
+        end_ns = reader.time_range_ns[0] + round(seconds * 1e9)
+        for name, _, log_ns, data in reader.messages():
+            if log_ns > end_ns:
+                break
+            keep(messages.setdefault(name, []), types[name], log_ns, data)
+            progress(min(1.0, reader.progress), "reading")
+    return Evidence(swarm, {name: Heard(kind, messages.get(name, [])) for name, kind in types.items()})
+
+
+def keep(kept: list[tuple[int, bytes]], message_type: str, arrival_ns: int, data: bytes) -> None:
+    """Keep a message, unless it is one of many images."""
+    is_image = same_type(message_type, IMAGE) or same_type(message_type, COMPRESSED_IMAGE)
+    if not is_image or len(kept) < MAX_IMAGES:
+        kept.append((arrival_ns, data))

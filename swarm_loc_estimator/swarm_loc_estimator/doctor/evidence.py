@@ -1,0 +1,194 @@
+"""What was heard of a swarm for some seconds, from the live graph or from a bag."""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from rosbags.serde import SerdeError
+
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.bags.writer import typestore
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.sensors.conversion import InputConverter
+from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
+from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
+from swarm_loc_estimator.sensors.registry import SENSORS, Batch, InputTopic, live_topics
+from swarm_loc_estimator.sensors.sensor import joined
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.contradictions import Contradicted, Contradiction
+from swarm_loc_estimator.timeline.estimate import Status
+from swarm_loc_estimator.timeline.estimator import Estimator
+from swarm_loc_estimator.timeline.settings import Settings
+
+_TICK_NS = 500_000_000
+_LASTING_TICKS = 4
+"""Contradictions of fewer ticks are not named."""
+
+
+class Finding(NamedTuple):
+    """Something that is wrong.
+
+    Attributes:
+        about: A topic, robot, marker or node.
+        problem: What is wrong with it, the rest of a sentence.
+        remedy: What to do, a sentence without its full stop.
+    """
+
+    about: str
+    problem: str
+    remedy: str
+
+    def __str__(self) -> str:
+        return f"{self.about} {self.problem}. {self.remedy}."
+
+
+class Publisher(NamedTuple):
+    """A publisher in the live graph.
+
+    Attributes:
+        node: Full name of its node.
+        is_reliable: Whether it sends lost messages again.
+        is_latched: Whether late subscribers get its last messages.
+    """
+
+    node: str
+    is_reliable: bool = True
+    is_latched: bool = False
+
+
+@dataclass(frozen=True)
+class Heard:
+    """A topic that was found.
+
+    Attributes:
+        type: Of its messages.
+        messages: Arrival [ns] and serialized content, in order of arrival; of images only some.
+        publishers: In the live graph; of a bag they are not known.
+    """
+
+    type: str
+    messages: Sequence[tuple[int, bytes]] = ()
+    publishers: tuple[Publisher, ...] = ()
+
+
+class Estimated(NamedTuple):
+    """What the estimator made of all readings.
+
+    Attributes:
+        drops_of: Numbers of dropped readings by reason, of a robot or camera.
+        status: (N,) of the robots at the end.
+        contradictions: Those that lasted, each as it was last.
+        begin_ns: (N,) when a robot was tracked first; -1: never.
+        begin_pose: (N, 3) its pose then.
+    """
+
+    drops_of: Callable[[int], Mapping[str, int]]
+    status: IntArray
+    contradictions: list[Contradiction]
+    begin_ns: IntArray
+    begin_pose: FloatArray
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All that the checks look at.
+
+    Attributes:
+        swarm: The description.
+        topics: By name, without a leading slash.
+        is_live: Whether it comes from the live graph.
+    """
+
+    swarm: Swarm
+    topics: Mapping[str, Heard]
+    is_live: bool = False
+    settings: Settings = field(default_factory=Settings)
+
+    @cached_property
+    def inputs(self) -> tuple[InputTopic, ...]:
+        """Topics that the estimator reads: shared ones where there are messages on them."""
+        shared = any(
+            topic.kind.stands_for and topic.name in self.topics
+            for topic in live_topics(self.swarm, shared=True)
+        )
+        return live_topics(self.swarm, shared=shared)
+
+    def usable(self, topic: InputTopic) -> Heard | None:
+        """The topic where it was found with the right type."""
+        heard = self.topics.get(topic.name)
+        return heard if heard is not None and same_type(heard.type, topic.kind.message_type) else None
+
+    @cached_property
+    def read(self) -> tuple[list[Batch], list[InputStatistics], Ingest]:
+        """The estimator's inputs, and statistics by topic of `inputs`."""
+        ingest = Ingest(self.swarm, topics=self.inputs)
+        found = [self.usable(topic) or Heard("") for topic in self.inputs]
+        messages = [
+            SerializedMessage(number, data, arrival_ns)
+            for number, heard in enumerate(found)
+            for arrival_ns, data in heard.messages
+        ]
+        messages.sort(key=lambda one: one.log_ns)
+        parts = [*ingest.read(MessageBatch.of(messages))] if messages else []
+        return parts, ingest.statistics, ingest
+
+    def rows(self, sensor: str) -> Any:
+        """All readings of a sensor, see `sensors/registry.py`."""
+        return joined([SENSORS[sensor].nothing, *(part[sensor] for part in self.read[0])])
+
+    @cached_property
+    def odometry(self) -> OdometryRows:
+        """All valid odometry."""
+        converter = InputConverter(self.swarm, self.settings)
+        parts = [converter.convert(part).rows.get("odometry", NO_ODOMETRY) for part in self.read[0]]
+        rows: OdometryRows = joined([NO_ODOMETRY, *parts])
+        return rows
+
+    @cached_property
+    def estimated(self) -> Estimated:
+        """What the estimator makes of all readings."""
+        estimator, robots = Estimator(self.swarm, self.settings), len(self.swarm.robots)
+        ticks, lasting = Counter[tuple[str, Contradicted]](), dict[tuple[str, Contradicted], Contradiction]()
+        begin_ns, begin_pose = np.full(robots, -1), np.full((robots, 3), np.nan)
+        status = np.full(robots, int(Status.WAITING))
+        for part in self.read[0]:
+            stamps_ns = np.arange(part.begin_ns + _TICK_NS, part.end_ns, _TICK_NS)
+            for now_ns, arrived in zip(
+                [*stamps_ns.tolist(), part.end_ns], estimator.convert(part).until_each(stamps_ns), strict=True
+            ):
+                estimator.receive(arrived)
+                estimate = estimator.tick(now_ns)
+                status = estimate.status.astype(np.int64)
+                new = (begin_ns < 0) & (status == Status.TRACKED)
+                begin_ns[new], begin_pose[new] = now_ns, estimate.poses[new]
+                for one in estimator.contradictions(now_ns):
+                    ticks[one.about, one.kind] += 1
+                    lasting[one.about, one.kind] = one
+        found = [one for key, one in lasting.items() if ticks[key] >= _LASTING_TICKS]
+        return Estimated(estimator.drops_of, status, found, begin_ns, begin_pose)
+
+    def source_name(self, index: int) -> str:
+        """Name of a robot or a fixed camera."""
+        return self.swarm.sources[index].name
+
+
+def same_type(one: str, other: str) -> bool:
+    """Whether two names of types are the same; some writers of bags leave /msg/ out."""
+    return one.replace("/msg/", "/") == other.replace("/msg/", "/")
+
+
+def decoded(heard: Heard) -> tuple[list[Any], int]:
+    """Messages of a topic as objects of `rosbags`, and how many are malformed."""
+    messages, malformed = [], 0
+    for _, data in heard.messages:
+        try:
+            messages.append(typestore().deserialize_cdr(data, heard.type))
+        except (SerdeError, ValueError, IndexError, struct.error):
+            malformed += 1
+    return messages, malformed

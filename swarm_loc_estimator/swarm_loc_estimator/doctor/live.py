@@ -1,0 +1,109 @@
+"""Listens to the live graph of a swarm for some seconds."""
+
+from __future__ import annotations
+
+import time
+from functools import partial
+
+import rclpy
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+
+from swarm_loc_estimator.common.node import MessageTypeError, message_class
+from swarm_loc_estimator.doctor.doctor import keep
+from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Publisher
+from swarm_loc_estimator.offline.recorded_bag import Progress
+from swarm_loc_estimator.swarm.swarm import Swarm
+
+_DEPTH = 1000
+_LOOK_S = 0.5
+"""Time between two looks at the topics of the graph [s]."""
+_OWN = ("parameter_events", "rosout")
+
+
+class Listener(Node):
+    """Subscribes to all topics in the namespaces of a swarm.
+
+    Args:
+        swarm: The description.
+        use_sim_time: Whether arrivals are by /clock.
+    """
+
+    def __init__(self, swarm: Swarm, *, use_sim_time: bool) -> None:
+        super().__init__(
+            "doctor", parameter_overrides=[Parameter("use_sim_time", Parameter.Type.BOOL, use_sim_time)]
+        )
+        self._swarm = swarm
+        self._messages: dict[str, list[tuple[int, bytes]]] = {}
+        self._types: dict[str, str] = {}
+
+    def listen(self, seconds: float, progress: Progress) -> Evidence:
+        """What is heard in some seconds."""
+        executor = SingleThreadedExecutor()
+        executor.add_node(self)
+        begin_s = time.monotonic()
+        looked_s = begin_s - _LOOK_S
+        while (now_s := time.monotonic()) < begin_s + seconds:
+            if now_s - looked_s >= _LOOK_S:
+                self._follow_topics()
+                looked_s = now_s
+            progress((now_s - begin_s) / seconds, "listening")
+            executor.spin_once(timeout_sec=0.1)
+        executor.remove_node(self)
+        return Evidence(
+            self._swarm,
+            {
+                name: Heard(kind, self._messages.get(name, []), self._publishers(name))
+                for name, kind in self._types.items()
+            },
+            is_live=True,
+        )
+
+    def _follow_topics(self) -> None:
+        """Subscribe to topics that are new."""
+        own = self.get_namespace().strip("/")
+        for full, types in self.get_topic_names_and_types():
+            name = full.strip("/").removeprefix(f"{own}/" if own else "")
+            if name in self._types or name in _OWN or not self.count_publishers(full):
+                continue
+            self._types[name] = types[0]
+            try:
+                kind = message_class(types[0])
+            except MessageTypeError:
+                continue  # the topic is known by its name and type
+            self.create_subscription(kind, full, partial(self._on_message, name), _qos(name), raw=True)
+
+    def _on_message(self, name: str, data: bytes) -> None:
+        arrival_ns = int(self.get_clock().now().nanoseconds)
+        keep(self._messages.setdefault(name, []), self._types[name], arrival_ns, data)
+
+    def _publishers(self, name: str) -> tuple[Publisher, ...]:
+        """The publishers of a topic."""
+        return tuple(
+            Publisher(
+                f"{one.node_namespace.rstrip('/')}/{one.node_name}",
+                one.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT,
+                one.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+            )
+            for one in self.get_publishers_info_by_topic(name)
+        )
+
+
+def _qos(name: str) -> QoSProfile:
+    """Best effort, which hears every publisher; latched messages where they are usual."""
+    if name.endswith("tf_static"):
+        return QoSProfile(depth=_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    return QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def listen(swarm: Swarm, seconds: float, progress: Progress, *, use_sim_time: bool) -> Evidence:
+    """What is heard of a swarm in some seconds."""
+    rclpy.init()
+    node = Listener(swarm, use_sim_time=use_sim_time)
+    try:
+        return node.listen(seconds, progress)
+    finally:
+        node.destroy_node()
+        rclpy.try_shutdown()

@@ -1,0 +1,145 @@
+"""Topics: missing ones, other types and names, publishers, rates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import MappingProxyType
+
+import numpy as np
+
+from swarm_loc_estimator.common.health import listed
+from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, decoded, same_type
+from swarm_loc_estimator.sensors.registry import InputTopic
+
+_STARTS = MappingProxyType(
+    {
+        "odometry": "Start the robot's driver, in the robot's namespace",
+        "detections": "Start a detector such as marker_detector_node, in the namespace of the camera",
+        "imu": "Start the driver of the IMU, or remove imu from the description",
+        "brightness": "Start the robot's driver, or remove ir from the description",
+        "ranges": "Start the driver of the radio, or remove uwb from the description",
+    }
+)
+"""What to do without the messages of a sensor."""
+_SLOW_S = 0.35
+"""Longest usual time between two odometry messages [s]."""
+_PAUSE_S = 2.0
+"""Shortest pause of odometry that is named [s]."""
+_SOLE = ("swarm/poses",)
+
+
+def check_topics(evidence: Evidence) -> Iterator[Finding]:
+    """Every expected topic has messages of its type, from one publisher, often enough."""
+    statistics = evidence.read[1]
+    lone = _lone(evidence)
+    for topic, counted in zip(evidence.inputs, statistics, strict=True):
+        heard = evidence.topics.get(topic.name)
+        if heard is not None and evidence.usable(topic) is None:
+            yield Finding(
+                topic.name, f"has the type {heard.type}, not {topic.kind.message_type}", _convert(topic)
+            )
+        elif topic.expected and not counted.received:
+            yield _missing(evidence, topic, heard, lone)
+        elif counted.received and counted.malformed == counted.received:
+            yield Finding(
+                topic.name,
+                f"has {counted.malformed} messages, none of which is a {topic.kind.message_type} of ROS 2",
+                "Rebuild its publisher with the messages of this workspace",
+            )
+        elif heard is not None and counted.received and topic.kind.rows == "odometry":
+            yield from _rate(topic, heard)
+    expected = {
+        topic.name for topic in evidence.inputs if topic.expected and topic.name not in evidence.topics
+    }
+    kinds = {topic.kind.message_type for topic in evidence.inputs if topic.name in expected}
+    for name, heard in lone.items():
+        if not any(same_type(heard.type, kind) for kind in kinds):
+            yield Finding(
+                name, "belongs to no robot of the description", "Describe that robot, or stop its nodes"
+            )
+    yield from _publishers(evidence)
+    for name, heard in evidence.topics.items():
+        if same_type(heard.type, "diagnostic_msgs/msg/DiagnosticArray"):
+            yield from _of_diagnostics(name, heard)
+
+
+def _lone(evidence: Evidence) -> dict[str, Heard]:
+    """Topics that look like an input of a robot, but of none that is described."""
+    kinds = {topic.kind.topic: topic.kind.message_type for topic in evidence.inputs if topic.kind.of_each}
+    known = {topic.name for topic in evidence.inputs}
+    return {
+        name: heard
+        for name, heard in evidence.topics.items()
+        if name not in known and same_type(kinds.get(name.rpartition("/")[2], "?"), heard.type)
+    }
+
+
+def _missing(evidence: Evidence, topic: InputTopic, heard: Heard | None, lone: dict[str, Heard]) -> Finding:
+    """An expected topic without messages."""
+    if heard is not None and heard.publishers:
+        nodes = listed(sorted(one.node for one in heard.publishers))
+        return Finding(topic.name, f"has no messages, though {nodes} publishes it", "Look at that node's log")
+    known = {one.name for one in evidence.inputs}
+    of_type = [
+        name
+        for name, other in evidence.topics.items()
+        if name not in known
+        and same_type(other.type, topic.kind.message_type)
+        and not name.endswith("/ground_truth")
+    ]
+    # first those with the same last word, then those of the same robot
+    last, robot = topic.name.rpartition("/")[2], topic.name.partition("/")[0]
+    of_type.sort(key=lambda name: (name not in lone, not name.endswith(last), robot not in name, name))
+    if of_type:
+        how = "-r" if evidence.is_live else "--remap"
+        remedy = f"Remap it ({how} {of_type[0]}:={topic.name}), or correct the name in the description"
+        return Finding(topic.name, f"has no messages; {listed(of_type)} has this type", remedy)
+    return Finding(topic.name, "has no messages", _STARTS.get(topic.kind.rows, "Start its publisher"))
+
+
+def _convert(topic: InputTopic) -> str:
+    """How to get another type."""
+    if topic.kind.rows == "fix":
+        return "Use localizer_bridge, which converts poses of other types"
+    if topic.kind.rows == "detections":
+        return "Use marker_bridge_node, which converts detections of apriltag_ros and aruco_opencv"
+    return "Publish the expected type, or give the topic another name"
+
+
+def _rate(topic: InputTopic, heard: Heard) -> Iterator[Finding]:
+    """Odometry that is rare or pauses."""
+    between_s = 1e-9 * np.diff([arrival_ns for arrival_ns, _ in heard.messages])
+    if between_s.size < 2:
+        return
+    usual_s, longest_s = float(np.median(between_s)), float(between_s.max())
+    if usual_s > _SLOW_S:
+        problem = f"has a message every {usual_s:.2g} s; poses are predicted with a constant speed meanwhile"
+        yield Finding(topic.name, problem, "Publish odometry 5 times per second or more often")
+    elif longest_s > max(_PAUSE_S, 10.0 * usual_s):
+        problem = f"pauses for up to {longest_s:.2g} s"
+        yield Finding(topic.name, problem, "Check the radio link and the load of the robot")
+
+
+def _publishers(evidence: Evidence) -> Iterator[Finding]:
+    """Topics with several publishers, or with a publisher that nobody can hear well."""
+    inputs = {topic.name for topic in evidence.inputs}
+    for name, heard in evidence.topics.items():
+        nodes = sorted(one.node for one in heard.publishers)
+        if name in (*inputs, *_SOLE) and len(nodes) > 1:
+            remedy = "Stop one of them: two robots in one namespace, or a node that was started twice"
+            yield Finding(name, f"has {len(nodes)} publishers: {listed(nodes)}", remedy)
+        if name in inputs and any(not one.is_reliable for one in heard.publishers):
+            remedy = "Publish it reliable: lost messages are then sent again"
+            yield Finding(name, "is published best effort, so lost messages are missing", remedy)
+        if name.endswith("tf_static") and any(not one.is_latched for one in heard.publishers):
+            remedy = "Use the QoS of tf2's StaticTransformBroadcaster"
+            yield Finding(name, "is published volatile, so nodes that start later never hear it", remedy)
+
+
+def _of_diagnostics(topic: str, heard: Heard) -> Iterator[Finding]:
+    """What other nodes report, each by its newest status; the checks here look at the estimator's inputs."""
+    newest = {status.name: status for message in decoded(heard)[0] for status in message.status}
+    for status in newest.values():
+        is_estimator = status.name.startswith("estimator") and not status.name.endswith("load")
+        if status.level and not is_estimator:
+            yield Finding(status.name, f"reports '{status.message}' on {topic}", "See the page of that node")
