@@ -123,7 +123,8 @@ def simulate(plan: Plan, seed: int) -> UwbWorld:
         if k % 30 == 0:
             rate = rng.uniform(-_TURN_RATE, _TURN_RATE, n)
         path, turn = _commanded(truth[k], rate)
-        wheels = np.abs([path + 0.5 * turn * _ODOMETRY.wheel_separation, path - 0.5 * turn * 0.15])
+        half = 0.5 * turn * _ODOMETRY.wheel_separation
+        wheels = np.abs([path + half, path - half])
         slip = np.sqrt(_ODOMETRY.wheel_noise * wheels) * rng.standard_normal((2, n))
         odometry[k + 1] = _arc(odometry[k], path, turn)
         slipped = turn + (slip[0] - slip[1]) / _ODOMETRY.wheel_separation
