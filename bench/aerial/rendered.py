@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from sensor_msgs.msg import Image
 
 from bench.graph.listener import ROBOTS, Listener, starting_swarm
-from bench.shared.common import OUT, Cell, ProgressLine, table
+from bench.shared.common import OUT, Cell, ProgressLine, rms, table
+from bench.shared.simulated_run import position_rmse
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, seen_from_above
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common import se2
@@ -67,12 +68,12 @@ class AerialRun:
     @property
     def position_cm(self) -> float:
         """Root mean square of the distance [cm]."""
-        return 100.0 * float(np.sqrt(np.mean(np.sum(self.errors[:, :2] ** 2, axis=1))))
+        return 100.0 * position_rmse(self.errors)
 
     @property
     def heading_deg(self) -> float:
         """Root mean square [deg]."""
-        return math.degrees(float(np.sqrt(np.mean(self.errors[:, 2] ** 2))))
+        return math.degrees(rms(self.errors[:, 2]))
 
 
 def measure(seed: int, worlds: int = WORLDS_RUN, duration_s: float = DURATION_S) -> dict[str, float]:

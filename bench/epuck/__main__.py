@@ -31,7 +31,7 @@ from bench.epuck.dense import DenseSettings, blind_robots, simulate_dense
 from bench.epuck.rendered_report import rendered_worlds
 from bench.epuck.rendered_report import report as report_rendered
 from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
-from bench.shared.simulated_run import errors_of, mean_nees, run_core
+from bench.shared.simulated_run import errors_of, mean_nees, run_core, ticks
 from bench.vision import report as vision_report
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_drivers.sim.worlds import W0, W2, W2_FAST, ErrorModel
@@ -46,7 +46,6 @@ SLOW, FAST = 0.06, 0.08
 W0_SEEDS, DENSE_SEEDS, WORLDS, FAST_WORLDS = 6, 3, 24, 8
 VISION_SEEDS, VISION_FRAMES = 3, 10
 RENDERED_SEEDS, RENDERED_S = 3, 60.0
-TICK_NS = 100_000_000
 SETTLING_S = 10.0
 LAPS_S = 108.0
 PAPER_STATE_PERIOD_S = 1.0 / 7.5
@@ -190,7 +189,7 @@ def outcome(task: tuple[Case, int]) -> tuple[str, Outcome]:
     """Run a case in one world."""
     case, seed = task
     run = simulate(case, seed)
-    stamp_ns = np.arange(run.start_ns + TICK_NS, run.end_ns + 1, TICK_NS)
+    stamp_ns = ticks(run)
     result = run_core(run, stamp_ns, FILTERS[case.filter][1])
     settled = stamp_ns >= run.start_ns + SETTLING_S * 1e9
     robots = np.arange(len(run.swarm.robots)) if case.robots else blind_robots()

@@ -6,36 +6,31 @@ import math
 
 import numpy as np
 
-from swarm_loc_drivers.sim.run import LivedRun, Trajectories
+from swarm_loc_drivers.sim.run import CAMERA_LATENESS, LivedRun, Trajectories, arrival_ns
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.sensors.imu import TurnRateRows
-from swarm_loc_estimator.sensors.sensor import chosen
+from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import ImuModel
 
 RATE_HZ = 50.0
 """Rate of the messages of an IMU."""
 
 
-def simulate_gyroscopes(
-    rng: np.random.Generator, run: LivedRun, imu: ImuModel, late_s: tuple[float, float]
-) -> TurnRateRows:
-    """Readings of an IMU on each robot that the description draws: bias and scale from their sigmas.
+def simulate_gyroscopes(rng: np.random.Generator, run: LivedRun, imu: ImuModel) -> TurnRateRows:
+    """Readings of an IMU on each robot, with bias and scale drawn from their sigmas, in order of arrival.
 
     Args:
         rng: Draws errors and delays.
         run: Gives the true motion.
         imu: Error model of all robots.
-        late_s: Bounds of the delay of a message [s].
     """
     stamp_ns = np.arange(run.start_ns, run.end_ns, round(1e9 / RATE_HZ))
     parts = [_readings(rng, run.truth, robot, stamp_ns, imu) for robot in range(len(run.swarm.robots))]
     robots = np.repeat(np.arange(len(parts)), stamp_ns.size)
     stamps, rate = np.tile(stamp_ns, len(parts)), np.concatenate(parts)
-    arrival_ns = stamps + np.rint(1e9 * rng.uniform(*late_s, stamps.size)).astype(np.int64)
-    order = np.argsort(arrival_ns, kind="stable")
+    arrivals = arrival_ns(rng, stamps, CAMERA_LATENESS)
     velocity = np.column_stack([np.zeros((rate.size, 2)), rate])
-    return chosen(TurnRateRows(robots, stamps, velocity, np.full(rate.size, np.nan), arrival_ns), order)
+    return in_order_of_arrival([TurnRateRows(robots, stamps, velocity, np.full(rate.size, np.nan), arrivals)])
 
 
 def _readings(
@@ -44,7 +39,7 @@ def _readings(
     """Turn rates (k,) that the IMU of one robot measures, each the mean over its period."""
     period_s = 1.0 / RATE_HZ
     heading = truth.at(robot, stamp_ns)[:, 2]
-    turn = np.gradient(np.unwrap(wrap_angle(heading)), period_s)
+    turn = np.gradient(np.unwrap(heading), period_s)
     # a Gauss-Markov bias, in its stationary distribution
     kept = math.exp(-period_s / imu.turn_bias_time_s)
     bias, step = np.empty(stamp_ns.size), imu.turn_bias_sigma * math.sqrt(1.0 - kept**2)

@@ -12,17 +12,17 @@ from dataclasses import replace
 
 import numpy as np
 
+from bench.integrity.faults import seconds
 from bench.integrity.scenarios import CLEAN
-from bench.shared.common import ProgressLine, new_plot, save_plot
-from bench.shared.simulated_run import errors_of, inputs_between
+from bench.shared.common import ProgressLine, new_plot, rms, save_plot
+from bench.shared.simulated_run import errors_of, estimates_of, fitted_errors, inputs_of, ticks
 from swarm_loc_drivers.sim.run import SimulatedRun
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
-from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.offline.metrics import is_misleading
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 
-TICK_NS, SETTLED_S, TOGETHER_S, LANDMARKS_S = 100_000_000, 25.0, 30.0, 40.0
+SETTLED_S, TOGETHER_S, LANDMARKS_S = 25.0, 30.0, 40.0
 _GROUP = (0, 1)
 
 
@@ -45,15 +45,16 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
         wrong.append(misleading.mean())
         tracked.append(is_tracked[-10:].mean())
         moves.append(count)
-    rms = {name: 100.0 * _rms(np.concatenate(errors)) for name, errors in relative.items()}
+    fitted = {name: np.concatenate(errors) for name, errors in relative.items()}
+    relative_cm = {name: 100.0 * rms(one[np.isfinite(one)]) for name, one in fitted.items()}
     _plot(relative, moved)
     return {
-        "no_map.relative_cm": rms["no map"],
-        "no_map.known_frame_relative_cm": rms["one start known"],
-        "no_map.ratio_to_known_frame": rms["no map"] / rms["one start known"],
-        "merge.misleading_share": float(np.mean(wrong)),
-        "merge.tracked_share_at_end": float(np.mean(tracked)),
-        "merge.frame_moves": float(np.mean(moves)),
+        "no_map.relative_cm": relative_cm["no map"],
+        "no_map.known_frame_relative_cm": relative_cm["one start known"],
+        "no_map.ratio_to_known_frame": relative_cm["no map"] / relative_cm["one start known"],
+        "no_map.merge.misleading_share": float(np.mean(wrong)),
+        "no_map.merge.tracked_share_at_end": float(np.mean(tracked)),
+        "no_map.merge.frame_moves": float(np.mean(moves)),
     }
 
 
@@ -76,7 +77,7 @@ def _observers(run: SimulatedRun) -> IntArray:
 
 
 def _time_s(run: SimulatedRun) -> FloatArray:
-    return np.asarray((np.repeat(run.frames["stamp_ns"], run.frames["count"]) - run.start_ns) * 1e-9)
+    return seconds(run, np.repeat(run.frames["stamp_ns"], run.frames["count"]))
 
 
 def _of_landmarks(run: SimulatedRun) -> BoolArray:
@@ -95,15 +96,8 @@ def _relative_errors(run: SimulatedRun) -> FloatArray:
     for estimate, _ in _estimates(run):
         if (estimate.stamp_ns - run.start_ns) * 1e-9 >= SETTLED_S:
             truth = run.truth.all_at(np.array([estimate.stamp_ns]))[0]
-            errors.append(_fitted(estimate.poses[:, :2], truth[:, :2]))
+            errors.append(np.linalg.norm(fitted_errors(estimate.poses[:, :2], truth[:, :2]), axis=1))
     return np.array(errors)
-
-
-def _fitted(places: FloatArray, truth: FloatArray) -> FloatArray:
-    """Distances (N,) after the rigid motion of places (N, 2) that fits the truth best."""
-    known = np.isfinite(places).all(axis=1)
-    moved = se2.transform_points(se2.rigid_fit(places[known], truth[known]), places)
-    return np.asarray(np.hypot(*(moved - truth).T))
 
 
 def _in_map(run: SimulatedRun) -> tuple[FloatArray, BoolArray, BoolArray, int]:
@@ -120,16 +114,9 @@ def _in_map(run: SimulatedRun) -> tuple[FloatArray, BoolArray, BoolArray, int]:
 
 
 def _estimates(run: SimulatedRun) -> Iterator[tuple[Estimate, Estimator]]:
-    """Estimates at all ticks, and the estimator at that moment."""
-    tick_ns = np.arange(run.start_ns + 10 * TICK_NS, run.end_ns + 1, TICK_NS)
-    estimator = Estimator(run.swarm)
-    for now_ns, inputs in zip(tick_ns.tolist(), inputs_between(run, tick_ns), strict=True):
-        estimator.receive(inputs)
-        yield estimator.tick(now_ns), estimator
-
-
-def _rms(errors: FloatArray) -> float:
-    return float(np.sqrt(np.nanmean(np.square(errors))))
+    """Estimates at all ticks from the first second on, and the estimator at that moment."""
+    tick_ns = ticks(run)[9:]
+    return estimates_of(run.swarm, inputs_of(run, tick_ns), tick_ns)
 
 
 def _plot(

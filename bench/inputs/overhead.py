@@ -3,7 +3,7 @@
 Bounds: position 0.3 cm and heading 0.5 degrees (root mean square), no jump by more than 0.3 cm when one
 camera takes over from another, and all detectors and the estimator on one core. Images arrive 150 to 300 ms
 late, and what the wheels slip meanwhile nobody can know. `bound` is the error of a pose that was exact in the
-newest image that has arrived; `at_once` is a swarm whose images are not late.
+newest image that has arrived; `at_once` is a swarm whose images and odometry are not late.
 """
 
 from __future__ import annotations
@@ -19,17 +19,22 @@ from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
 from bench.inputs.overhead_world import ARENA, MODEL, PERIOD_NS, ROBOTS, OverheadRun, simulate_overhead
-from bench.shared.common import ProgressLine, new_plot, save_plot
+from bench.shared.common import ProgressLine, new_plot, rms, save_plot
+from bench.shared.simulated_run import (
+    errors_of,
+    estimates_of,
+    inputs_between,
+    odometry_rows,
+    position_rmse,
+    ticks,
+)
 from swarm_loc_drivers.sim.run import START_NS
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.offline.metrics import nees
-from swarm_loc_estimator.sensors.camera import DetectionRows
-from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.sensors.registry import Batch
-from swarm_loc_estimator.sensors.sensor import chosen
-from swarm_loc_estimator.timeline.estimator import Estimator, Status
+from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
+from swarm_loc_estimator.timeline.estimator import Status
 
 DURATION_S = 20.0
 _SETTLED_NS = 3 * 10**9
@@ -89,12 +94,12 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> dict[str, float]:
     detectors, estimator = np.mean(shares, axis=0)
     begun = [one.stamp_ns > START_NS + 10**9 for one in runs]
     of = {"": map(_rms, runs), "at_once.": map(_rms, prompt), "bound.": bounds}
-    rms = {name: np.sqrt(np.mean(np.square(list(values)), axis=0)) for name, values in of.items()}
+    wrong = {name: np.sqrt(np.mean(np.square(list(values)), axis=0)) for name, values in of.items()}
     return {
-        **{f"overhead.{name}position_cm": float(values[0]) for name, values in rms.items()},
-        **{f"overhead.{name}heading_deg": float(values[1]) for name, values in rms.items()},
+        **{f"overhead.{name}position_cm": float(values[0]) for name, values in wrong.items()},
+        **{f"overhead.{name}heading_deg": float(values[1]) for name, values in wrong.items()},
         "overhead.handover_jump_cm": 100.0 * float(jumps.max()),
-        "overhead.handover_jump_rms_cm": 100.0 * math.sqrt(np.mean(jumps**2)),
+        "overhead.handover_jump_rms_cm": 100.0 * rms(jumps),
         "overhead.other_jump_cm": 100.0 * float(steady.max()),
         "overhead.nees": float(np.mean(np.concatenate([one.nees[one.counts] for one in runs]))),
         "overhead.tracked_share": float(
@@ -107,12 +112,11 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> dict[str, float]:
 
 def _at_once(run: OverheadRun) -> OverheadRun:
     """The run with arrivals at the stamps."""
-    seen, odometry = run.detections, run.odometry.copy()
+    odometry, seen = run.odometry.copy(), run.detections
     odometry["arrival_ns"] = odometry["stamp_ns"]
-    order = np.argsort(seen.stamp_ns, kind="stable")
-    seen = DetectionRows(seen.robot[order], seen.stamp_ns[order], seen.detection[order], seen.stamp_ns[order])
-    odometry = odometry[np.argsort(odometry["stamp_ns"], kind="stable")]
-    return replace(run, odometry=odometry, detections=seen)
+    seen = in_order_of_arrival([seen._replace(arrival_ns=seen.stamp_ns)])
+    order = np.argsort(odometry["arrival_ns"], kind="stable")
+    return replace(run, odometry=odometry[order], detections=seen)
 
 
 def _bound(run: OverheadRun, found: Tracked) -> FloatArray:
@@ -135,27 +139,16 @@ def _bound(run: OverheadRun, found: Tracked) -> FloatArray:
 
 def track(run: OverheadRun) -> Tracked:
     """Run the estimator over a run in order of arrival, with a tick every 0.1 s."""
-    estimator = Estimator(run.swarm)
-    names = ("robot", "stamp_ns", "arrival_ns")
-    robot, stamp_ns, arrival_ns = (run.odometry[name].astype(np.int64) for name in names)
-    pose = run.odometry["pose"].copy()
-    odometry = OdometryRows(robot, stamp_ns, pose, np.full(pose.shape, np.nan), arrival_ns)
-    ticks_ns = np.arange(START_NS + PERIOD_NS, run.end_ns + 1, PERIOD_NS)
-    estimates, begin, cpu_s = [], [0, 0], 0.0
-    for now_ns in ticks_ns.tolist():
-        both = (odometry, run.detections)
-        ends = [int(np.searchsorted(one.arrival_ns, now_ns, side="right")) for one in both]
-        parts = [chosen(one, slice(a, b)) for one, a, b in zip(both, begin, ends, strict=True)]
-        begin, begun_s = ends, time.process_time()
-        estimator.receive(Batch.of(now_ns, now_ns, odometry=parts[0], detections=parts[1]))
-        estimates.append(estimator.tick(now_ns))
-        cpu_s += time.process_time() - begun_s
+    ticks_ns = ticks(run)
+    inputs = inputs_between(ticks_ns, odometry=odometry_rows(run), detections=run.detections)
+    begun_s = time.process_time()
+    estimates, (*_, estimator) = zip(*estimates_of(run.swarm, inputs, ticks_ns), strict=True)
+    cpu_s = time.process_time() - begun_s
     poses, covariances, transforms = (
         np.array([one[k] for one in estimates])
         for k in (1, 2, 3)  # poses, covariances, map_to_odom
     )
-    errors = poses - run.truth.all_at(ticks_ns)
-    errors[..., 2] = se2.wrap_angle(errors[..., 2])
+    errors = errors_of(poses, run, ticks_ns)
     squared = np.full(errors.shape[:2], np.nan)
     known = np.isfinite(errors).all(axis=2)
     squared[known] = nees(errors[known], covariances[known])
@@ -170,7 +163,7 @@ def track(run: OverheadRun) -> Tracked:
 
 
 def _hand_overs(run: OverheadRun, ticks_ns: IntArray) -> NDArray[np.bool_]:
-    """(K, N) ticks just after the images of a camera that sees a robot anew, or for the last time, arrive.
+    """(K, N) ticks just after the stamps of images of a camera that sees a robot anew or for the last time.
 
     Only where another camera saw it within a second, too.
     """
@@ -198,9 +191,7 @@ def _rms(found: Tracked) -> FloatArray:
 
 def _rms_of(errors: FloatArray) -> FloatArray:
     """Position [cm] and heading [deg], rms, of errors (k, 3)."""
-    position = np.sqrt(np.mean(np.sum(errors[:, :2] ** 2, axis=1)))
-    heading = np.sqrt(np.mean(se2.wrap_angle(errors[:, 2]) ** 2))
-    return np.array([100.0 * position, math.degrees(heading)])
+    return np.array([100.0 * position_rmse(errors), math.degrees(rms(se2.wrap_angle(errors[:, 2])))])
 
 
 def _draw(run: OverheadRun, found: Tracked) -> None:

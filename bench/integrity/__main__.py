@@ -21,7 +21,7 @@ from bench.integrity.late_start import LATE_START, run_late_start
 from bench.integrity.live import LIVE_SCENARIOS, run_live
 from bench.integrity.scenarios import SCENARIOS
 from bench.integrity.scoring import Score, score
-from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, table, write_figures
+from bench.shared.common import OUT, Cell, ProgressLine, new_plot, rms, save_plot, table, write_figures
 
 _NAMES = (*SCENARIOS, LATE_START, *LIVE_SCENARIOS)
 _PLOTS_PER_FILE = 5
@@ -68,7 +68,7 @@ def _figures(name: str, runs: Sequence[Score]) -> dict[str, float]:
     figures = {
         f"{name}.misleading_share": float(np.mean([one.misleading_share for one in runs])),
         f"{name}.tracked_share": float(np.mean([one.tracked_share for one in runs])),
-        f"{name}.position_cm": 100.0 * float(np.sqrt(np.mean([one.position_m**2 for one in runs]))),
+        f"{name}.position_cm": 100.0 * rms([one.position_m for one in runs]),
         f"{name}.nees": float(np.mean([one.nees for one in runs])),
     }
     recovery_s = max(one.recovery_s for one in runs)

@@ -9,13 +9,13 @@ import numpy as np
 
 from bench.integrity.faults import seconds
 from bench.integrity.scenarios import Fault
-from bench.shared.simulated_run import errors_of, inputs_between
+from bench.shared.common import rms
+from bench.shared.simulated_run import errors_of, estimates_of, inputs_of, ticks
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.offline.metrics import is_misleading, nees
 from swarm_loc_estimator.timeline.contradictions import Contradicted
-from swarm_loc_estimator.timeline.estimator import Estimator, Status
+from swarm_loc_estimator.timeline.estimator import Status
 
-TICK_NS = 100_000_000
 _RIGHT_M = 0.05
 _SETTLED_S = 1.0
 _STEADY_S = 3.0
@@ -67,13 +67,11 @@ class Score:
 def score(fault: Fault) -> Score:
     """Run the estimator over a scenario, ticking ten times a second."""
     run = fault.run
-    tick_ns = np.arange(run.start_ns + TICK_NS, run.end_ns + 1, TICK_NS)
-    estimator, estimates = Estimator(run.swarm), []
+    tick_ns, estimates = ticks(run), []
     reported: set[tuple[str, Contradicted]] = set()
-    for now_ns, inputs in zip(tick_ns.tolist(), inputs_between(run, tick_ns), strict=True):
-        estimator.receive(inputs)
-        estimates.append(estimator.tick(now_ns))
-        reported |= {(one.about, one.kind) for one in estimator.contradictions(now_ns)}
+    for estimate, estimator in estimates_of(run.swarm, inputs_of(run, tick_ns), tick_ns):
+        estimates.append(estimate)
+        reported |= {(one.about, one.kind) for one in estimator.contradictions(estimate.stamp_ns)}
     error = errors_of(np.array([one.poses for one in estimates]), run, tick_ns)
     covariance = np.array([one.covariances for one in estimates])
     tracked = np.array([one.status for one in estimates]) == Status.TRACKED
@@ -100,7 +98,7 @@ def scored(
     return Score(
         misleading_share=float(misleading[knowable].mean()),
         tracked_share=float(tracked[time_s > _SETTLED_S].mean()),
-        position_m=float(np.sqrt(np.mean(distance[used] ** 2))),
+        position_m=rms(distance[used]),
         nees=float(np.mean(nees(error[used], covariance[used]))),
         recovery_s=_recovery_s(time_s, tracked & (distance < right_m), ends_s),
         time_s=time_s,

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.shared.common import Cell, new_plot, save_plot, table
+from bench.shared.common import Cell, new_plot, rms, save_plot, table
 from swarm_loc_drivers.sim.pushbot.optics import assembled
 from swarm_loc_drivers.sim.pushbot.wall_drive import WallDriveSettings, drive_at_wall
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -83,7 +83,7 @@ def measure_calibration(seeds: int) -> dict[str, float]:
     robots = [calibrate(seed) for seed in range(seeds)]
     rows: list[list[Cell]] = [
         [seed, one.truth[0], one.found.row_at_infinity, one.truth[1], one.found.focal_base,
-         _rms(one.hyperbola_cm), _rms(one.logarithm_cm), _rms(one.window_cm)]
+         rms(one.hyperbola_cm), rms(one.logarithm_cm), rms(one.window_cm)]
         for seed, one in enumerate(robots)
     ]  # fmt: skip
     head = [
@@ -99,15 +99,11 @@ def measure_calibration(seeds: int) -> dict[str, float]:
     print(table(head, rows))
     _draw(robots)
     return {
-        "calibration.distance_rms_cm": _rms(np.concatenate([one.hyperbola_cm for one in robots])),
-        "calibration.worst_distance_rms_cm": max(_rms(one.hyperbola_cm) for one in robots),
-        "calibration.logarithm_rms_cm": _rms(np.concatenate([one.logarithm_cm for one in robots])),
-        "calibration.window_rms_cm": _rms(np.concatenate([one.window_cm for one in robots])),
+        "calibration.distance_rms_cm": rms(np.concatenate([one.hyperbola_cm for one in robots])),
+        "calibration.worst_distance_rms_cm": max(rms(one.hyperbola_cm) for one in robots),
+        "calibration.logarithm_rms_cm": rms(np.concatenate([one.logarithm_cm for one in robots])),
+        "calibration.window_rms_cm": rms(np.concatenate([one.window_cm for one in robots])),
     }
-
-
-def _rms(errors: FloatArray) -> float:
-    return float(np.sqrt(np.mean(np.square(errors))))
 
 
 def _draw(robots: list[Calibrated]) -> None:
@@ -123,7 +119,3 @@ def _draw(robots: list[Calibrated]) -> None:
         right.plot(100.0 * DEPTHS_M[-len(robot.hyperbola_cm) :], robot.hyperbola_cm, lw=1)
     right.set(xlabel="distance [cm]", ylabel="error of the hyperbola [cm]", title=f"{len(robots)} robots")
     print(f"wrote {save_plot(figure, 'pushbot_calibration')}")
-
-
-if __name__ == "__main__":
-    print(measure_calibration(5))

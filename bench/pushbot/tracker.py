@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.pushbot.paper_tracker import PaperSettings, PaperTracker
-from bench.shared.common import Cell, new_plot, save_plot, table
+from bench.shared.common import Cell, new_plot, rms, save_plot, table
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraEvents, CameraNoise, EventCamera, Spot
 from swarm_loc_drivers.sim.pushbot.optics import spot_brightness
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -103,7 +103,7 @@ def score(tracker: LightTracker, seen: Scene) -> Score:
     share = len(errors) / max(1, windows - _SKIPPED)
     if not errors:
         return Score(float("nan"), float("nan"), 0.0)
-    return Score(float(np.sqrt(np.mean(np.square(errors)))), float(np.mean(nees)), share)
+    return Score(rms(errors), float(np.mean(nees)), share)
 
 
 def throughput(seed: int, sources: int) -> float:
@@ -176,7 +176,3 @@ def _draw(by_noise: dict[str, list[Score]], by_depth: list[Score]) -> None:
     right.axhline(0.15, color="k", ls=":")
     right.set(xlabel="distance of the wall [m]", ylabel="rms per axis [px]", title="15 noise events/s/pixel")
     print(f"wrote {save_plot(figure, 'pushbot_tracker')}")
-
-
-if __name__ == "__main__":
-    print(measure_tracker(3))

@@ -1,1 +1,1 @@
-"""What benchmarks share: figures, tables and plots, and simulated runs through the core."""
+"""What benchmarks share: figures, tables and plots, bags, and simulated runs through the core."""

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import matplotlib as mpl
+import numpy as np
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
@@ -17,6 +18,9 @@ if TYPE_CHECKING:
 
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from numpy.typing import ArrayLike
+
+    from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 
 OUT = Path(__file__).resolve().parents[2] / "out"
 """Folder of results."""
@@ -42,6 +46,16 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
     widths = [max(len(text) for text in column) for column in zip(*texts, strict=True)]
     lines = ["  ".join(text.rjust(width) for text, width in zip(row, widths, strict=True)) for row in texts]
     return "\n".join([lines[0], "-" * len(lines[0]), *lines[1:]])
+
+
+def rms(values: ArrayLike) -> float:
+    """Root mean square of numbers."""
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def equal_parts(values: FloatArray, count: int) -> list[IntArray]:
+    """Indices of values by size, in so many parts of about as many each."""
+    return np.array_split(np.argsort(values, kind="stable"), count)
 
 
 def write_figures(name: str, figures: Mapping[str, float], folder: Path = OUT / "bench") -> Path:

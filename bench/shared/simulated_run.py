@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -20,14 +20,17 @@ from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.timeline.estimator import Estimator
 
 if TYPE_CHECKING:
-    from numpy.typing import NDArray
+    from collections.abc import Iterator, Sequence
 
-    from swarm_loc_drivers.sim.run import SimulatedRun
-    from swarm_loc_estimator.common.arrays import FloatArray
+    from swarm_loc_drivers.sim.run import LivedRun, SimulatedRun
+    from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+    from swarm_loc_estimator.swarm.swarm import Swarm
+    from swarm_loc_estimator.timeline.estimator import Estimate
     from swarm_loc_estimator.timeline.settings import Settings
 
 
 _TICK_NS = 100_000_000
+_COLUMNS = ("robot", "stamp_ns", "arrival_ns")
 
 
 @dataclass(frozen=True)
@@ -45,10 +48,10 @@ class CoreResult:
     covariances: FloatArray
 
 
-def run_core(run: SimulatedRun, tick_ns: NDArray[np.int64], settings: Settings) -> CoreResult:
+def run_core(run: SimulatedRun, tick_ns: IntArray, settings: Settings) -> CoreResult:
     """Run the estimator over a run in order of arrival."""
     runner = Runner(Estimator(run.swarm, settings), ListedSchedule(tick_ns))
-    parts = inputs_between(run, tick_ns)
+    parts = inputs_of(run, tick_ns)
     begun = time.process_time()
     for inputs in parts:
         runner.take(inputs)
@@ -57,26 +60,50 @@ def run_core(run: SimulatedRun, tick_ns: NDArray[np.int64], settings: Settings) 
     return CoreResult(cpu_s, result.poses, result.covariances)
 
 
-def inputs_between(run: SimulatedRun, tick_ns: NDArray[np.int64]) -> list[Batch]:
-    """The inputs that arrived between the previous tick and each tick."""
-    rows, frames = run.odometry, run.frames
-    names = ("robot", "stamp_ns", "arrival_ns")
-    robot, stamp_ns, arrival_ns = (rows[name].astype(np.int64) for name in names)
-    pose = rows["pose"].copy()
-    twist = rows["twist"].copy() if "twist" in (rows.dtype.names or ()) else np.full(pose.shape, np.nan)
-    odometry = OdometryRows(robot, stamp_ns, pose, twist, arrival_ns)
-    robot, stamp_ns, arrival_ns = (
-        np.repeat(frames[name].astype(np.int64), frames["count"]) for name in names
-    )
-    seen = DetectionRows(robot, stamp_ns, as_detections(run), arrival_ns)
-    parts, begin = [], [0, 0]
-    for now_ns in tick_ns.tolist():
-        ends = [int(np.searchsorted(p.arrival_ns, now_ns, side="right")) for p in (odometry, seen)]
-        first, second = (slice(a, b) for a, b in zip(begin, ends, strict=True))
-        part = {"odometry": chosen(odometry, first), "detections": chosen(seen, second)}
-        parts.append(Batch(now_ns, now_ns, part))
-        begin = ends
+def estimates_of(
+    swarm: Swarm, inputs: Sequence[Batch], tick_ns: IntArray
+) -> Iterator[tuple[Estimate, Estimator]]:
+    """The estimate at each tick by the inputs before it, and the estimator at that moment."""
+    estimator = Estimator(swarm)
+    for now_ns, batch in zip(tick_ns.tolist(), inputs, strict=True):
+        estimator.receive(batch)
+        yield estimator.tick(now_ns), estimator
+
+
+def inputs_of(run: SimulatedRun, tick_ns: IntArray, **others: Any) -> list[Batch]:
+    """Odometry and detections of a run, and other readings by sensor, cut as by `inputs_between`."""
+    return inputs_between(tick_ns, odometry=odometry_rows(run), detections=detection_rows(run), **others)
+
+
+def inputs_between(tick_ns: IntArray, **rows: Any) -> list[Batch]:
+    """The readings by sensor that arrived between the previous tick and each tick."""
+    cuts = {
+        name: [0, *np.searchsorted(one.arrival_ns, tick_ns, side="right").tolist()]
+        for name, one in rows.items()
+    }
+    parts = []
+    for k, now_ns in enumerate(tick_ns.tolist()):
+        part = {name: chosen(one, slice(*cuts[name][k : k + 2])) for name, one in rows.items()}
+        parts.append(Batch.of(now_ns, now_ns, **part))
     return parts
+
+
+def odometry_rows(run: LivedRun) -> OdometryRows:
+    """The odometry of a run; without twists in the run, they are not known."""
+    rows = run.odometry
+    has_twist = "twist" in (rows.dtype.names or ())
+    twist = rows["twist"].copy() if has_twist else np.full(rows["pose"].shape, np.nan)
+    robot, stamp_ns, arrival_ns = (rows[name].astype(np.int64) for name in _COLUMNS)
+    return OdometryRows(robot, stamp_ns, rows["pose"].copy(), twist, arrival_ns)
+
+
+def detection_rows(run: SimulatedRun) -> DetectionRows:
+    """The sightings of a run as detections."""
+    frames = run.frames
+    robot, stamp_ns, arrival_ns = (
+        np.repeat(frames[name].astype(np.int64), frames["count"]) for name in _COLUMNS
+    )
+    return DetectionRows(robot, stamp_ns, as_detections(run), arrival_ns)
 
 
 def without_delay(run: SimulatedRun) -> SimulatedRun:
@@ -92,16 +119,22 @@ def without_delay(run: SimulatedRun) -> SimulatedRun:
     return replace(run, odometry=odometry, frames=frames, sightings=sightings)
 
 
-def ticks(run: SimulatedRun) -> NDArray[np.int64]:
+def ticks(run: LivedRun) -> IntArray:
     """Stamps of outputs (K,), ten times a second."""
     return np.arange(run.start_ns + _TICK_NS, run.end_ns + 1, _TICK_NS)
 
 
-def errors_of(poses: FloatArray, run: SimulatedRun, stamp_ns: NDArray[np.int64]) -> FloatArray:
+def errors_of(poses: FloatArray, run: LivedRun, stamp_ns: IntArray) -> FloatArray:
     """Errors x, y, theta (K, N, 3) of poses at stamps (K,)."""
     errors: FloatArray = poses - run.truth.all_at(stamp_ns)
     errors[..., 2] = se2.wrap_angle(errors[..., 2])
     return errors
+
+
+def fitted_errors(places: FloatArray, truth: FloatArray) -> FloatArray:
+    """Errors (k, 2) of places (k, 2) after the rigid motion that fits the finite ones to the truth best."""
+    known = np.isfinite(places).all(axis=1)
+    return se2.transform_points(se2.rigid_fit(places[known], truth[known]), places) - truth
 
 
 def position_rmse(errors: FloatArray) -> float:
