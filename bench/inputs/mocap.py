@@ -14,15 +14,17 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from bench.shared.common import ProgressLine, new_plot, save_plot
-from swarm_loc_estimator import Batch, Estimator, FixRows, OdometryRows, Robot, Settings, Swarm
+from bench.shared.common import ProgressLine, equal_parts, new_plot, save_plot
+from bench.shared.simulated_run import estimates_of, inputs_between
+from swarm_loc_drivers.sim.run import CAMERA_LATENESS, START_NS, arrival_ns
+from swarm_loc_estimator import FixRows, OdometryRows, Robot, Swarm
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.health import Health
 from swarm_loc_estimator.nodes.localizer_robots import LocalizedRobots
 from swarm_loc_estimator.nodes.localizer_sources import SOURCES
 from swarm_loc_estimator.nodes.parameters import BridgeParameters
 from swarm_loc_estimator.offline.metrics import nees
-from swarm_loc_estimator.sensors.sensor import chosen, in_order_of_arrival
+from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 
 if TYPE_CHECKING:
@@ -38,7 +40,6 @@ STEP_NS = SECOND_NS // 50
 FIX_NS = SECOND_NS // 30
 TICK_NS = SECOND_NS // 10
 SETTLING_NS = 3 * SECOND_NS
-DELAY_NS = (150_000_000, 300_000_000)
 LATENCY_NS = 10_000_000
 """From the exposure to the stamp of a message."""
 LOST = 0.1
@@ -49,7 +50,6 @@ POSITION_SIGMA, HEADING_SIGMA = 0.001, np.radians(0.3)
 OFFSET = np.array([0.02, -0.01, 0.5 * np.pi])
 """Pose of the tracked body in base_link."""
 MODEL = OdometryModel()
-_T0_NS = 1_000 * SECOND_NS
 _UNKNOWN = np.diag([1e2, 1e2, 1e2])
 
 
@@ -93,7 +93,7 @@ class _Drive:
 
 def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
     """Errors of the estimator and both bounds, over all seeds and robots."""
-    ticks = np.arange(_T0_NS + SETTLING_NS, _T0_NS + round(DURATION_S * 1e9), TICK_NS)
+    ticks = np.arange(START_NS + SETTLING_NS, START_NS + round(DURATION_S * 1e9), TICK_NS)
     errors, normalized, online, smoothed, ages = [], [], [], [], []
     for seed in seeds:
         say(f"seed {seed}")
@@ -110,7 +110,7 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
             smoothed.append(smoother_bound)
             ages.append(age)
             sigma = np.sqrt(np.trace(covariances[:, robot, :2, :2], axis1=1, axis2=2))
-            shown = _Shown(1e-9 * (ticks - _T0_NS).astype(float), errors[-1], sigma, np.sqrt(filter_bound))
+            shown = _Shown(1e-9 * (ticks - START_NS).astype(float), errors[-1], sigma, np.sqrt(filter_bound))
     _plot(shown, np.concatenate(ages), np.concatenate(errors), np.concatenate(online))
     rms, by_filter, by_smoother = (
         float(np.sqrt(np.mean(one))) for one in (np.square(errors), online, smoothed)
@@ -137,13 +137,13 @@ def _drive(rng: np.random.Generator) -> _Drive:
     wheels = path[:, None] + 0.5 * MODEL.wheel_separation * turn[:, None] * np.array([1.0, -1.0])
     noisy = wheels + np.sqrt(MODEL.wheel_noise * np.abs(wheels)) * rng.normal(size=wheels.shape)
     start = np.array([*rng.uniform(-1.0, 1.0, 2), rng.uniform(-np.pi, np.pi)])
-    stamp_ns = _T0_NS + STEP_NS * np.arange(steps + 1)
+    stamp_ns = START_NS + STEP_NS * np.arange(steps + 1)
     drive = _Drive(stamp_ns, _track(start, wheels), _track(np.zeros(3), noisy), _NO_FIXES)
-    at_ns = np.arange(_T0_NS + int(rng.integers(FIX_NS)), stamp_ns[-1], FIX_NS)
+    at_ns = np.arange(START_NS + int(rng.integers(FIX_NS)), stamp_ns[-1], FIX_NS)
     at_ns = at_ns[~_is_lost(at_ns, rng)]
     noise = np.array([POSITION_SIGMA, POSITION_SIGMA, HEADING_SIGMA]) * rng.normal(size=(at_ns.size, 3))
     body = se2.compose(drive.truth_at(at_ns), OFFSET) + noise
-    fixes = _Fixes(at_ns, at_ns + rng.integers(*DELAY_NS, at_ns.size), body)
+    fixes = _Fixes(at_ns, arrival_ns(rng, at_ns, CAMERA_LATENESS), body)
     return _Drive(drive.stamp_ns, drive.truth, drive.odometry, fixes)
 
 
@@ -162,7 +162,7 @@ def _is_lost(at_ns: IntArray, rng: np.random.Generator) -> BoolArray:
     begin_s = rng.exponential(BETWEEN_BLACKOUTS_S)
     while begin_s < DURATION_S:
         end_s = begin_s + rng.uniform(*BLACKOUT_S)
-        lost |= (at_ns >= _T0_NS + begin_s * 1e9) & (at_ns < _T0_NS + end_s * 1e9)
+        lost |= (at_ns >= START_NS + begin_s * 1e9) & (at_ns < START_NS + end_s * 1e9)
         begin_s = end_s + rng.exponential(BETWEEN_BLACKOUTS_S)
     return lost
 
@@ -170,25 +170,17 @@ def _is_lost(at_ns: IntArray, rng: np.random.Generator) -> BoolArray:
 def _estimate(drives: Sequence[_Drive], ticks: IntArray) -> tuple[FloatArray, FloatArray]:
     """Poses (k, N, 3) and covariances (k, N, 3, 3) at ticks (k,), by the bridge and the estimator."""
     swarm = Swarm(tuple(Robot(f"robot{k}", odometry=MODEL) for k in range(len(drives))))
-    estimator = Estimator(swarm, Settings())
-    fixes = _bridged(drives, list(swarm.index_of))
-    driven = OdometryRows.without_twist(
+    odometry = OdometryRows.without_twist(
         np.repeat(np.arange(len(drives)), [len(one.stamp_ns) for one in drives]),
         np.concatenate([one.stamp_ns for one in drives]),
         np.concatenate([one.odometry for one in drives]),
         np.concatenate([one.stamp_ns for one in drives]),
     )
-    odometry = in_order_of_arrival([driven])
-    poses, covariances, done = [], [], [0, 0]
-    for now_ns in range(_T0_NS, int(ticks[-1]) + 1, TICK_NS):
-        ends = [int(np.searchsorted(one.arrival_ns, now_ns, side="right")) for one in (odometry, fixes)]
-        new = chosen(odometry, slice(done[0], ends[0])), chosen(fixes, slice(done[1], ends[1]))
-        estimator.receive(Batch.of(now_ns - TICK_NS, now_ns, odometry=new[0], fixes=new[1]))
-        estimate, done = estimator.tick(now_ns), ends
-        if now_ns >= ticks[0]:
-            poses.append(estimate.poses)
-            covariances.append(estimate.covariances)
-    return np.stack(poses), np.stack(covariances)
+    fixes = _bridged(drives, list(swarm.index_of))
+    all_ns = np.arange(START_NS, ticks[-1] + 1, TICK_NS)
+    inputs = inputs_between(all_ns, odometry=in_order_of_arrival([odometry]), fixes=fixes)
+    estimates = [one for one, _ in estimates_of(swarm, inputs, all_ns) if one.stamp_ns >= ticks[0]]
+    return np.stack([one.poses for one in estimates]), np.stack([one.covariances for one in estimates])
 
 
 def _bridged(drives: Sequence[_Drive], names: list[str]) -> FixRows:
@@ -204,12 +196,11 @@ def _bridged(drives: Sequence[_Drive], names: list[str]) -> FixRows:
     robots = LocalizedRobots(parameters, names, Health(print))
     rows = []
     for number, (name, drive) in enumerate(zip(names, drives, strict=True)):
-        for at_ns, arrival_ns, body in zip(*drive.fixes, strict=True):
+        for at_ns, arrived_ns, body in zip(*drive.fixes, strict=True):
             bodies = SOURCES["pose"].bodies(_message(int(at_ns) + LATENCY_NS, body))
-            (found,) = robots.convert(bodies, name, int(arrival_ns))
-            rows.append((number, found.stamp_ns, found.pose, found.covariance, int(arrival_ns)))
-    robot, stamp_ns, poses, covariances, arrival_ns = (np.array(column) for column in zip(*rows, strict=True))
-    return in_order_of_arrival([FixRows(robot, stamp_ns, poses, covariances, arrival_ns)])
+            (found,) = robots.convert(bodies, name, int(arrived_ns))
+            rows.append((number, found.stamp_ns, found.pose, found.covariance, int(arrived_ns)))
+    return in_order_of_arrival([FixRows(*(np.array(column) for column in zip(*rows, strict=True)))])
 
 
 def _message(stamp_ns: int, body: FloatArray) -> SimpleNamespace:
@@ -241,7 +232,7 @@ def _bounds(drive: _Drive, ticks: IntArray) -> tuple[FloatArray, FloatArray, Flo
     online, age = np.zeros(len(ticks)), np.zeros(len(ticks))
     settled, begin = _UNKNOWN, 0  # the covariance before the fix at `begin`, behind which all have arrived
     for k, end in enumerate(tick_at):
-        while at[begin] + DELAY_NS[1] <= ticks[k]:
+        while at[begin] + round(1e9 * CAMERA_LATENESS.high_s) <= ticks[k]:
             settled = _moved(_fused(settled, of_fix[begin]), moves[begin], noises[begin])
             begin += 1
         covariance = settled
@@ -321,12 +312,10 @@ def _plot(shown: _Shown, ages: FloatArray, errors: FloatArray, online: FloatArra
     left.plot(shown.time_s, 1e3 * shown.bound, "k--", lw=1.0, label="bound of the filter")
     left.set(xlabel="time [s]", ylabel="position, one robot [mm]", ylim=(0.0, None))
     left.legend()
-    edges = np.quantile(ages, np.linspace(0.0, 1.0, 25))
-    number = np.clip(np.searchsorted(edges, ages, side="right") - 1, 0, len(edges) - 2)
-    filled = np.unique(number)
-    middle = [ages[number == k].mean() for k in filled]
+    parts = equal_parts(ages, 24)
+    middle = [ages[part].mean() for part in parts]
     for squares, style, label in ((errors**2, "o", "estimator"), (online, "k--", "bound of the filter")):
-        right.plot(middle, [1e3 * np.sqrt(squares[number == k].mean()) for k in filled], style, label=label)
+        right.plot(middle, [1e3 * np.sqrt(squares[part].mean()) for part in parts], style, label=label)
     right.set(xlabel="age of the newest fix [s]", ylabel="position, RMS [mm]")
     right.legend()
     save_plot(figure, "inputs-mocap")

@@ -9,7 +9,6 @@ import gtsam
 import numpy as np
 
 from bench.inputs.uwb_world import (
-    START_NS,
     STEP_NS,
     TICK_STEPS,
     Plan,
@@ -22,9 +21,11 @@ from bench.inputs.uwb_world import (
     simulate,
 )
 from bench.shared.common import ProgressLine, new_plot, save_plot
+from bench.shared.simulated_run import mean_nees
+from swarm_loc_drivers.sim.run import START_NS
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.offline.metrics import is_misleading, nees
+from swarm_loc_estimator.offline.metrics import is_misleading
 from swarm_loc_estimator.timeline.estimator import Status
 
 _ANCHORS, _AMONG_ROBOTS = Plan(), Plan(robots=4, anchors=0, between_robots=True, duration_s=30.0)
@@ -98,7 +99,7 @@ def _settled(arrays: Sequence[FloatArray]) -> list[FloatArray]:
 def _nees(results: Sequence[UwbResult]) -> float:
     """Mean normalised error squared after the first seconds; 3 is ideal."""
     pairs = [(r.error[_SETTLED_TICKS:], r.covariance[_SETTLED_TICKS:]) for r in results]
-    return float(np.mean([nees(e.reshape(-1, 3), c.reshape(-1, 3, 3)).mean() for e, c in pairs]))
+    return float(np.mean([mean_nees(*pair) for pair in pairs]))
 
 
 def _misleading(results: Sequence[UwbResult]) -> float:
@@ -156,7 +157,7 @@ def _batch(world: UwbWorld) -> FloatArray:
 
 
 def _draw(cases: dict[str, _Case], bound_of: dict[str, list[FloatArray]]) -> None:
-    """Errors over time, root mean square of all seeds and robots."""
+    """Errors over time, root mean square of all seeds and tracked robots."""
     figure, axes = new_plot(len(cases), width=3.6)
     for one, (name, case) in zip(axes, cases.items(), strict=True):
         count = len(case.squared[0])

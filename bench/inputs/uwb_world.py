@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from swarm_loc_drivers.sim.run import CAMERA_LATENESS, START_NS, arrival_ns
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import encode
@@ -16,17 +17,15 @@ from swarm_loc_estimator.common.messages.definitions import RANGES
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.sensor import chosen, joined
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
 from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
-from swarm_loc_estimator.timeline.contradictions import Contradiction
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 
 STEP_NS = 50_000_000
-START_NS = 1_000_000_000_000
 _STEPS_PER_RANGE = 4  # of one link: five a second
 TICK_STEPS = 2
-LATE_NS = (150_000_000, 300_000_000)
 _SPEED, _TURN_RATE, _ARENA_M = 0.3, 1.0, 3.0
 _ANCHORS = ((-4.0, -4.0, 2.0), (4.0, -4.0, 2.4), (4.0, 4.0, 2.0), (-4.0, 4.0, 2.4))
 _ANTENNA_Z = 0.3
@@ -151,8 +150,7 @@ def simulate(plan: Plan, seed: int) -> UwbWorld:
 
 def _commanded(pose: FloatArray, rate: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Path and turn (N,) of a step: arcs at random rates, and back to the middle from outside."""
-    away = np.arctan2(-pose[:, 1], -pose[:, 0]) - pose[:, 2]
-    away = np.arctan2(np.sin(away), np.cos(away))
+    away = se2.wrap_angle(np.arctan2(-pose[:, 1], -pose[:, 0]) - pose[:, 2])
     out = np.abs(pose[:, :2]).max(axis=1) > 0.8 * _ARENA_M
     rate = np.where(out, np.clip(2.0 * away, -1.5, 1.5), rate)
     return np.full(len(pose), _SPEED * STEP_NS * 1e-9), rate * STEP_NS * 1e-9
@@ -160,18 +158,15 @@ def _commanded(pose: FloatArray, rate: FloatArray) -> tuple[FloatArray, FloatArr
 
 def _arc(pose: FloatArray, path: FloatArray, turn: FloatArray) -> FloatArray:
     """Poses (N, 3) after arcs."""
-    half = 0.5 * turn
-    chord, heading = path * np.sinc(half / np.pi), pose[:, 2] + half
-    moved = [pose[:, 0] + chord * np.cos(heading), pose[:, 1] + chord * np.sin(heading), pose[:, 2] + turn]
-    return np.stack(moved, axis=1)
+    return se2.compose(pose, se2.exp(np.stack([path, np.zeros_like(path), turn], axis=1)))
 
 
-def antenna(world: UwbWorld, step: int, device: int) -> FloatArray:
-    """True place (3,) of the antenna of a robot, or of an anchor as N plus its index."""
+def antenna(world: UwbWorld, steps: IntArray | int, device: int) -> FloatArray:
+    """True places (..., 3) of a robot's antenna at steps (...), or of an anchor (3,) as N plus its index."""
     if device >= world.plan.robots:
         place: FloatArray = world.anchor_places()[device - world.plan.robots]
         return place
-    return np.array([*world.truth[step, device, :2], _ANTENNA_Z])
+    return np.insert(world.truth[steps, device, :2], 2, _ANTENNA_Z, axis=-1)
 
 
 def _measured(world: UwbWorld, rng: np.random.Generator) -> Ranges:
@@ -180,24 +175,24 @@ def _measured(world: UwbWorld, rng: np.random.Generator) -> Ranges:
     links = [(robot, n + k) for robot in range(n) for k in range(plan.anchors)]
     if plan.between_robots:
         links += [(robot, other) for robot in range(n) for other in range(robot)]
-    rows: list[tuple[int, int, int, float, int]] = []
+    parts = []
     for number, (robot, device) in enumerate(links):
         steps = np.arange(1 + number % _STEPS_PER_RANGE, len(world.truth), _STEPS_PER_RANGE)
-        bias = _nlos(plan, steps, rng)
-        for step, more in zip(steps.tolist(), bias.tolist(), strict=True):
-            away = antenna(world, step, device) - antenna(world, step, robot)
-            distance = float(np.linalg.norm(away)) + plan.sigma * rng.standard_normal() + more
-            late_ns = int(rng.uniform(*LATE_NS))
-            rows.append((step, robot, device, distance, START_NS + step * STEP_NS + late_ns))
-    columns = zip(*sorted(rows), strict=True)
-    return Ranges(*(np.array(column) for column in columns))
+        distance = np.linalg.norm(antenna(world, steps, device) - antenna(world, steps, robot), axis=1)
+        distance += _nlos(plan, steps.size, rng) + plan.sigma * rng.standard_normal(steps.size)
+        arrivals_ns = arrival_ns(rng, START_NS + steps * STEP_NS, CAMERA_LATENESS)
+        parts.append(
+            Ranges(steps, np.full_like(steps, robot), np.full_like(steps, device), distance, arrivals_ns)
+        )
+    ranges = joined(parts)
+    return chosen(ranges, np.lexsort((ranges.device, ranges.robot, ranges.step)))
 
 
-def _nlos(plan: Plan, steps: IntArray, rng: np.random.Generator) -> FloatArray:
-    """How much too long the ranges (k,) of a link are: in bursts, one error each."""
-    bias, step_s = np.zeros(steps.size), _STEPS_PER_RANGE * STEP_NS * 1e-9
+def _nlos(plan: Plan, count: int, rng: np.random.Generator) -> FloatArray:
+    """How much too long the ranges (count,) of a link are: in bursts, one error each."""
+    bias, step_s = np.zeros(count), _STEPS_PER_RANGE * STEP_NS * 1e-9
     while np.mean(bias > 0.0) < plan.nlos:
-        begin = int(rng.integers(steps.size))
+        begin = int(rng.integers(count))
         bias[begin : begin + round(rng.uniform(*_NLOS_S) / step_s)] = rng.uniform(*_NLOS_M)
     return bias
 
@@ -214,12 +209,12 @@ def messages(world: UwbWorld, ingest: Ingest) -> list[SerializedMessage]:
     addresses = [r.uwb.address for r in world.swarm.robots if r.uwb] + [
         a.address for a in world.swarm.anchors
     ]
-    for step, robot, device, distance, arrival_ns in zip(*world.ranges, strict=True):
+    for step, robot, device, distance, arrived_ns in zip(*world.ranges, strict=True):
         header = {"stamp": int(START_NS + step * STEP_NS)}
         one = {"device": addresses[int(device)], "range": float(distance)}
         handle = ingest.handle_of[f"{world.swarm.robots[int(robot)].name}/ranges"]
         data_of = encode({"header": header, "ranges": [one]}, RANGES)
-        out.append(SerializedMessage(handle, data_of, int(arrival_ns)))
+        out.append(SerializedMessage(handle, data_of, int(arrived_ns)))
     return sorted(out, key=lambda message: message[2])
 
 
@@ -230,13 +225,11 @@ class UwbResult(NamedTuple):
         error: (K, N, 3) NaN where not located.
         covariance: (K, N, 3, 3).
         status: (K, N) of `Status`.
-        named: Contradictions that were reported, by their text.
     """
 
     error: FloatArray
     covariance: FloatArray
     status: IntArray
-    named: frozenset[str]
 
 
 def run(world: UwbWorld) -> UwbResult:
@@ -244,7 +237,6 @@ def run(world: UwbWorld) -> UwbResult:
     ingest, estimator = Ingest(world.swarm), Estimator(world.swarm)
     waiting, begin = messages(world, ingest), 0
     estimates: list[Estimate] = []
-    named: set[Contradiction] = set()
     for step in world.tick_steps.tolist():
         now_ns, end = START_NS + step * STEP_NS, begin
         while end < len(waiting) and waiting[end][2] <= now_ns:
@@ -253,18 +245,18 @@ def run(world: UwbWorld) -> UwbResult:
             estimator.receive(batch)
         begin = end
         estimates.append(estimator.tick(now_ns))
-        named.update(estimator.contradictions(now_ns))
     error = np.array([one.poses for one in estimates]) - world.truth[world.tick_steps]
-    error[..., 2] = np.arctan2(np.sin(error[..., 2]), np.cos(error[..., 2]))
+    error[..., 2] = se2.wrap_angle(error[..., 2])
     covariance = np.array([one.covariances for one in estimates])
     status = np.array([one.status for one in estimates])
-    return UwbResult(error, covariance, status, frozenset(one.text for one in named))
+    return UwbResult(error, covariance, status)
 
 
 def _step_noise(world: UwbWorld, robot: int, step: int, course: float) -> FloatArray:
     """Covariance (3, 3) of x, y, heading of a step in a direction [rad]."""
     move = world.odometry[step + 1, robot] - world.odometry[step, robot]
-    path, half = math.hypot(move[0], move[1]), 0.5 * _ODOMETRY.wheel_separation * move[2]
+    path = math.hypot(move[0], move[1])
+    half = 0.5 * _ODOMETRY.wheel_separation * float(se2.wrap_angle(move[2]))
     wheels = np.diag(_ODOMETRY.wheel_noise * np.abs([path + half, path - half]))
     cos, sin = math.cos(course), math.sin(course)
     moved = np.array([[cos, -0.5 * path * sin], [sin, 0.5 * path * cos], [0.0, 1.0]])
@@ -336,7 +328,7 @@ def bounds(world: UwbWorld) -> FloatArray:
     certain, at = _Bound(world), 0
     everything: BoolArray = np.ones(ranges.step.size, dtype=bool)
     for step in world.tick_steps.tolist():
-        until = max(0, step - LATE_NS[1] // STEP_NS)
+        until = max(0, step - round(1e9 * CAMERA_LATENESS.high_s) // STEP_NS)
         _advance(certain, ranges, first, at, until, everything)
         at = until
         now = certain.copy()
