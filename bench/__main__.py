@@ -8,7 +8,6 @@ import sys
 BENCHMARKS = {
     "aerial": "bench.aerial",
     "calibrated": "bench.peers.calibrated",
-    "commissioning": "bench.commissioning",
     "droplet": "bench.droplet",
     "droplet_real": "bench.droplet.real",
     "epuck": "bench.epuck",
@@ -21,6 +20,7 @@ BENCHMARKS = {
     "reading": "bench.peers.reading",
     "scaling": "bench.peers.scaling",
     "soak": "bench.graph.soak",
+    "survey": "bench.survey",
     "vision": "bench.vision",
     "watch": "bench.watch",
 }
