@@ -13,9 +13,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.aerial.detector import Score, score_places
-from bench.shared.common import Cell, table
+from bench.shared.common import Cell, rms, table
 from swarm_loc_vision.aerial.control_points import solve_pose
 from swarm_loc_vision.aerial.detector import AerialDetector
 from swarm_loc_vision.aerial.ground_file import load_ground
@@ -54,7 +55,13 @@ def measure() -> dict[str, float]:
         return {}
     scores = [_scored(path) for path in pictures]
     rows: list[list[Cell]] = [
-        [path.stem, score.robots - score.missed, score.false, _rms_mm(score), 1e3 * score.seconds]
+        [
+            path.stem,
+            score.robots - score.missed,
+            score.false,
+            1e3 * rms(score.position_m),
+            1e3 * score.seconds,
+        ]
         for path, score in zip(pictures, scores, strict=True)
     ]
     print(table(["picture", f"found of {len(_PLACES)}", "false", "rms [mm]", "CPU [ms]"], rows))
@@ -62,8 +69,13 @@ def measure() -> dict[str, float]:
     return {
         "cases.recall": 1.0 - score.missed / score.robots,
         "cases.false_detections": float(score.false),
-        "cases.position_mm": _rms_mm(score),
+        "cases.position_mm": 1e3 * rms(score.position_m),
     }
+
+
+def gray_picture(path: Path) -> NDArray[np.uint8]:
+    """A picture as an array (height, width)."""
+    return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
 
 
 def _scored(path: Path) -> Score:
@@ -76,14 +88,9 @@ def _scored(path: Path) -> Score:
     if ground.camera is None:
         raise ValueError(f"{path.with_suffix('.yaml')} has no camera.")
     detector = AerialDetector(settings, solve_pose(ground.camera, ground.points, settings).ground)
-    gray = np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
+    gray = gray_picture(path)
     detector.detect(gray)
     begin_s = time.process_time()
     found = detector.detect(gray)
     poses = np.concatenate([_PLACES, np.zeros((len(_PLACES), 1))], axis=1)
     return score_places(poses, _DIAMETER, found, time.process_time() - begin_s)
-
-
-def _rms_mm(score: Score) -> float:
-    """Error of the places that were found [mm]."""
-    return 1e3 * float(np.sqrt(np.mean(score.position_m**2)))

@@ -11,19 +11,17 @@ from collections import Counter
 from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
-import cv2
 import numpy as np
 
-from bench.shared.common import ProgressLine, new_plot, save_plot
-from bench.vision.comparison import MARKERS
-from bench.vision.peers import FAMILY, Found, all_peers, own_detector
+from bench.shared.common import ProgressLine, equal_parts, new_plot, rms, save_plot
+from bench.vision.comparison import MARKERS, solved_by_opencv
+from bench.vision.peers import FAMILY, Found, all_peers, as_found, own_detector
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
 from swarm_loc_estimator.common.messages.cdr import decode
 from swarm_loc_estimator.common.messages.definitions import DETECTIONS
 from swarm_loc_vision.markers.camera_detector import detection_rows
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.foreign_markers import ForeignMarkers, ForeignParameters
-from swarm_loc_vision.markers.pose import square
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -37,13 +35,14 @@ _NOWHERE = np.full(3, np.nan)
 _HEADER = SimpleNamespace(frame_id="camera", stamp=SimpleNamespace(sec=0, nanosec=0))
 _SIGMA_PX = {"own": 0.05, "cv2.aruco": 0.4, "pupil 1": 0.15}
 """Detectors and the error of their corners."""
+_OTHERS = ("cv2.aruco", "pupil 1")
 
 
 def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
     """Position errors of all ways over all markers that all of them find, as ratios to our own."""
-    family, own, peers = family_named(FAMILY), own_detector(family_named(FAMILY)), all_peers()
-    ways = {name: peers[name] for name in _SIGMA_PX if name in peers}
-    errors: dict[str, list[FloatArray]] = {name: [] for name in ("whole", *ways, "solvePnP")}
+    family, peers = family_named(FAMILY), all_peers()
+    own, others = own_detector(family), {name: peers[name] for name in _OTHERS if name in peers}
+    errors: dict[str, list[FloatArray]] = {name: [] for name in ("whole", "own", *others, "solvePnP")}
     depths: list[float] = []
     for seed in seeds:
         rng = np.random.default_rng([7, seed])
@@ -52,8 +51,9 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
             image, shown = random_scene(rng, family, MARKERS, Look())
             ids = Counter(truth.marker_id for truth in shown)
             truths = [truth for truth in shown if ids[truth.marker_id] == 1]
-            found = {name: peer(image) for name, peer in ways.items()}
-            rows = detection_rows(own.detect(image), 0.0)
+            detections = own.detect(image)
+            found = {"own": as_found(detections)} | {name: peer(image) for name, peer in others.items()}
+            rows = detection_rows(detections, 0.0)
             poses = dict(zip(rows["id"].tolist(), rows["position"], strict=True))
             for truth in truths:
                 scale = truth.length / 0.05  # the detector's default length
@@ -65,17 +65,17 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
                 errors[name] += [by_bridge(truth) - truth.position for truth in truths]
     norms = {name: np.linalg.norm(np.array(values), axis=1) for name, values in errors.items()}
     seen = np.isfinite(list(norms.values())).all(axis=0)
-    rms = {name: float(np.sqrt(np.mean(np.square(values[seen])))) for name, values in norms.items()}
+    error = {name: rms(values[seen]) for name, values in norms.items()}
     _plot(np.array(depths)[seen], {name: values[seen] for name, values in norms.items()})
     figures = {
-        "apriltag_msgs.own_position_mm": 1e3 * rms["whole"],
-        "apriltag_msgs.position_ratio_to_own": rms["own"] / rms["whole"],
-        "apriltag_msgs.opencv_corners_ratio_to_own": rms["cv2.aruco"] / rms["whole"],
-        "apriltag_msgs.opencv_solvepnp_ratio_to_own": rms["solvePnP"] / rms["whole"],
+        "apriltag_msgs.own_position_mm": 1e3 * error["whole"],
+        "apriltag_msgs.position_ratio_to_own": error["own"] / error["whole"],
+        "apriltag_msgs.opencv_corners_ratio_to_own": error["cv2.aruco"] / error["whole"],
+        "apriltag_msgs.opencv_solvepnp_ratio_to_own": error["solvePnP"] / error["whole"],
         "apriltag_msgs.markers": float(seen.sum()),
     }
-    if "pupil 1" in rms:
-        figures["apriltag_msgs.apriltag_corners_ratio_to_own"] = rms["pupil 1"] / rms["whole"]
+    if "pupil 1" in error:
+        figures["apriltag_msgs.apriltag_corners_ratio_to_own"] = error["pupil 1"] / error["whole"]
     return figures
 
 
@@ -124,11 +124,8 @@ def _by_opencv(markers: Found, truth: Truth) -> NDArray[np.float64]:
     (rows,) = np.nonzero(markers.ids == truth.marker_id)
     if not len(rows):
         return _NOWHERE
-    corners = markers.corners[rows[0]] + 1e-6 * np.arange(8.0).reshape(4, 2)
-    found, _, shifts, _ = cv2.solvePnPGeneric(
-        square(truth.length), corners, CAMERA, None, flags=cv2.SOLVEPNP_IPPE_SQUARE
-    )
-    return np.ravel(shifts[0]) if found else _NOWHERE
+    found = solved_by_opencv(markers.corners[rows[0]], truth.length)
+    return found[1] if found else _NOWHERE
 
 
 def _plot(depths: FloatArray, errors: Mapping[str, FloatArray]) -> None:
@@ -141,11 +138,10 @@ def _plot(depths: FloatArray, errors: Mapping[str, FloatArray]) -> None:
         "solvePnP": "OpenCV alone",
     }
     figure, (axes,) = new_plot(1, width=6.0)
-    edges = np.quantile(depths, np.linspace(0.0, 1.0, 9))
-    number = np.clip(np.searchsorted(edges, depths, side="right") - 1, 0, len(edges) - 2)
-    middle = [np.median(depths[number == k]) for k in range(len(edges) - 1)]
+    parts = equal_parts(depths, 8)
+    middle = [np.median(depths[part]) for part in parts]
     for name, values in errors.items():
-        median = [1e3 * np.median(values[number == k]) for k in range(len(edges) - 1)]
+        median = [1e3 * np.median(values[part]) for part in parts]
         axes.plot(middle, median, "o--" if name == "own" else "o-", label=labels[name])
     axes.set(xlabel="distance [m]", ylabel="position, median error [mm]", yscale="log")
     axes.legend()

@@ -2,116 +2,73 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from bench.aerial.cases import FOLDER, gray_picture
 from bench.shared.common import ProgressLine, new_plot, save_plot
-from bench.vision.negatives import black_square
+from bench.vision.comparison import match
+from bench.vision.negatives import black_square, random_family
+from bench.vision.peers import Found, Peer, as_found, opencv_name, stock
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, facing, project, random_scene, render
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import CODE_OTHER, Family, families
-from swarm_loc_vision.markers.layouts import Layout
 from swarm_loc_vision.markers.pose import square
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    from numpy.typing import NDArray
+
     from bench.vision.scenes import Gray
 
-_Found = tuple[NDArray[np.int64], NDArray[np.float64]]
-"""Ids (N,) and corners (N, 4, 2)."""
 SIDE_PX = 30.0
-_SHARED = Path(__file__).resolve().parents[3] / "shared"
 _OWN_MARKERS = {"opencv": "aruco_6x6", "apriltag": "apriltag_36h11"}
 """Folder of photographs -> families of the markers in them."""
 _BLACK_SQUARES, _CLUTTERED, _RANDOM_IMAGES = 200, 20, 5
-_WORDS = np.random.default_rng(99).integers(0, 1 << 36, 4096, dtype=np.uint64)
-_RANDOM = Family("random", CODE_OTHER, Layout(6, 1), _WORDS)
+_RANDOM = random_family(np.random.default_rng(99))
 _LENGTH = 0.05
 
 
 def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
-    """Shares of ids read and numbers of false ids, of all families but the prefixes of larger ones."""
+    """Shares of ids read and numbers of false ids.
+
+    Of families without a code of their own; of ArUco's, those with the fewest and the most ids.
+    """
+    say("pictures")
+    without, foreign = [*_without_markers(seeds)], [*_of_makers(seeds)]
     figures: dict[str, float] = {}
     for name, family in families().items():
         if family.code != CODE_OTHER or name.endswith(("_100", "_250")):
             continue
-        own, other = _Reader(family), _opencv(family)
-        read, by_opencv, count = 0, 0, 0
-        for seed in seeds:
-            rng = np.random.default_rng([5, seed])
-            ids = rng.permutation(len(family.words))
-            for begin in range(0, len(ids), _per_image(family)):
-                say(f"{name}, seed {seed}")
-                image, truths = _sheet(rng, family, ids[begin : begin + _per_image(family)])
-                count += len(truths)
-                read += _right(own.read(image), truths)
-                by_opencv += _right(other.read(image), truths) if other else 0
-        figures[f"families.{name}.read_share"] = read / count
-        if other:
-            figures[f"families.{name}.opencv_read_share"] = by_opencv / count
-        for kind, pictures in (
-            ("false_ids", _without_markers(seeds)),
-            ("foreign_ids", _of_others(name, seeds)),
-        ):
-            numbers = np.zeros(2, np.int64)
-            for image in pictures:
-                numbers += len(own.read(image)[0]), len(other.read(image)[0]) if other else 0
-            figures[f"families.{name}.{kind}"] = int(numbers[0])
-            if other:
-                figures[f"families.{name}.opencv_{kind}"] = int(numbers[1])
+        say(name)
+        sheets = [sheet for seed in seeds for sheet in _sheets(family, seed)]
+        others = [image for maker, image in foreign if not name.startswith(maker)]
+        for who, read in _readers(family).items():
+            right = sum(_right(read(image), truths) for image, truths in sheets)
+            count = sum(len(truths) for _, truths in sheets)
+            figures[f"families.{name}.{who}read_share"] = right / count
+            for kind, pictures in (("false_ids", without), ("foreign_ids", others)):
+                number = sum(len(read(image).ids) for image in pictures)
+                figures[f"families.{name}.{who}{kind}"] = float(number)
     _plot(figures)
     return figures
 
 
-class _Reader:
-    """Reads ids (N,) and corners (N, 4, 2) by our own detector."""
-
-    def __init__(self, family: Family) -> None:
-        self._detector = MarkerDetector(DetectorSettings(), {family: None})
-
-    def read(self, image: Gray) -> _Found:
-        """The markers in an image."""
-        found = self._detector.detect(image)
-        return found.id, found.corners
+def _readers(family: Family) -> dict[str, Peer]:
+    """Our own detector and, where it has the family, OpenCV's, by the prefix of their figures."""
+    detector = MarkerDetector(DetectorSettings(), {family: None})
+    readers: dict[str, Peer] = {"": lambda image: as_found(detector.detect(image))}
+    if hasattr(cv2.aruco, opencv_name(family)):
+        readers["opencv_"] = stock(family)
+    return readers
 
 
-class _OpenCv:
-    """Reads them by OpenCV as it comes."""
-
-    def __init__(self, dictionary: int, quarters: int) -> None:
-        self._detector = cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(dictionary))
-        self._quarters = quarters
-
-    def read(self, image: Gray) -> _Found:
-        """The markers in an image."""
-        corners, ids, _ = self._detector.detectMarkers(image)
-        read: Any = ids  # (N, 1) in 4.x, (N,) in 5.0, None in both
-        found = np.array([] if read is None else read, np.int64).ravel()
-        return found, np.roll(np.array(corners, float).reshape(-1, 4, 2), self._quarters, axis=1)
-
-
-def _opencv(family: Family) -> _OpenCv | None:
-    """OpenCV's detector of a family; None: it does not have it."""
-    kind, _, rest = family.name.partition("_")
-    name = f"DICT_APRILTAG_{rest}" if kind == "apriltag" else f"DICT_{rest.upper()}"
-    dictionary = getattr(cv2.aruco, name, None)
-    return None if dictionary is None else _OpenCv(dictionary, 2 if kind == "apriltag" else 0)
-
-
-def _right(found: _Found, truths: Sequence[Truth]) -> int:
+def _right(found: Found, truths: Sequence[Truth]) -> int:
     """How many markers were read with the right id and corners."""
-    ids, corners = found
-    return sum(
-        any(
-            np.abs(corners[row] - truth.corners).max() < 3.0 for row in np.flatnonzero(ids == truth.marker_id)
-        )
-        for truth in truths
-    )
+    return sum(match(found, truth, set()) is not None for truth in truths)
 
 
 def _pitch(family: Family) -> float:
@@ -121,6 +78,14 @@ def _pitch(family: Family) -> float:
 
 def _per_image(family: Family) -> int:
     return int(WIDTH / _pitch(family)) * int(HEIGHT / _pitch(family))
+
+
+def _sheets(family: Family, seed: int) -> Iterator[tuple[Gray, list[Truth]]]:
+    """Images with all ids of a family."""
+    rng = np.random.default_rng([5, seed])
+    ids, size = rng.permutation(len(family.words)), _per_image(family)
+    for begin in range(0, len(ids), size):
+        yield _sheet(rng, family, ids[begin : begin + size])
 
 
 def _sheet(rng: np.random.Generator, family: Family, ids: NDArray[np.int64]) -> tuple[Gray, list[Truth]]:
@@ -142,27 +107,20 @@ def _sheet(rng: np.random.Generator, family: Family, ids: NDArray[np.int64]) -> 
 def _without_markers(seeds: Sequence[int]) -> Iterator[Gray]:
     """Pictures without any marker: overhead pictures, black squares with a speck of light, clutter."""
     rng = np.random.default_rng(6)
-    yield from map(_picture, sorted(_SHARED.glob("cases/*/*.png")))
+    yield from map(gray_picture, sorted(FOLDER.glob("*/*.png")))
     for _ in range(_BLACK_SQUARES):
         yield black_square(rng)
-    for _ in seeds:
-        for _ in range(_CLUTTERED):
-            yield render(rng, _RANDOM, [], Look(clutter=400))
+    for _ in range(_CLUTTERED * len(seeds)):
+        yield render(rng, _RANDOM, [], Look(clutter=400))
 
 
-def _of_others(name: str, seeds: Sequence[int]) -> Iterator[Gray]:
-    """Pictures with markers of other families: photographs, and squares with 6 x 6 random cells."""
-    for path in sorted(_SHARED.glob("data/photos/*/*.[jp][pn]g")):
-        if not name.startswith(_OWN_MARKERS[path.parent.name]):
-            yield _picture(path)
+def _of_makers(seeds: Sequence[int]) -> Iterator[tuple[str, Gray]]:
+    """Pictures of markers, and how names of their families begin: photographs, and 6 x 6 random cells."""
+    for path in sorted(FOLDER.parent.glob("data/photos/*/*.[jp][pn]g")):
+        yield _OWN_MARKERS[path.parent.name], gray_picture(path)
     rng = np.random.default_rng(7)
-    for _ in seeds:
-        for _ in range(_RANDOM_IMAGES):
-            yield random_scene(rng, _RANDOM, 20, Look())[0]
-
-
-def _picture(path: Path) -> Gray:
-    return np.asarray(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE), np.uint8)
+    for _ in range(_RANDOM_IMAGES * len(seeds)):
+        yield _RANDOM.name, random_scene(rng, _RANDOM, 20, Look())[0]
 
 
 def _plot(figures: Mapping[str, float]) -> None:

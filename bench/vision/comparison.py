@@ -107,15 +107,15 @@ def _add(score: Score, peer: Peer, image: NDArray[np.uint8], truths: Sequence[Tr
     score.ms.append(1e3 * (time.process_time() - begin_s))
     used: set[int] = set()
     for truth in truths:
-        match = _match(found, truth, used)
+        row = match(found, truth, used)
         score.truths.append(truth)
-        if match is None:
+        if row is None:
             score.corner_px.append(math.nan)
             score.position_m.append(np.full(3, math.nan))
             score.angle.append(math.nan)
             continue
-        used.add(match)
-        corners = found.corners[match]
+        used.add(row)
+        corners = found.corners[row]
         score.corner_px.append(float(np.sqrt(np.mean(np.sum((corners - truth.corners) ** 2, axis=1)))))
         position, angle = _pose_error(corners, truth)
         score.position_m.append(position)
@@ -123,7 +123,7 @@ def _add(score: Score, peer: Peer, image: NDArray[np.uint8], truths: Sequence[Tr
     score.false_ids += len(found.ids) - len(used)
 
 
-def _match(found: Found, truth: Truth, used: set[int]) -> int | None:
+def match(found: Found, truth: Truth, used: set[int]) -> int | None:
     """The unused detection with the marker's id and all corners near its own."""
     near = max(_NEAR_PX, 0.1 * truth.side_px) + 0.5 * truth.blur
     for row in np.flatnonzero(found.ids == truth.marker_id):
@@ -132,18 +132,24 @@ def _match(found: Found, truth: Truth, used: set[int]) -> int | None:
     return None
 
 
-def _pose_error(corners: FloatArray, truth: Truth) -> tuple[FloatArray, float]:
-    """Error of the position [m] and of the rotation [rad] by OpenCV's IPPE, the same for all detectors."""
+def solved_by_opencv(corners: FloatArray, length: float) -> tuple[FloatArray, FloatArray] | None:
+    """Rotation vector and position (3,) of a marker in the camera by OpenCV's IPPE; None: none is found."""
     # exactly axis-aligned rectangles make IPPE_SQUARE give up
     jittered = corners + 1e-6 * np.arange(8.0).reshape(4, 2)
     found, turns, shifts, _ = cv2.solvePnPGeneric(
-        square(truth.length), jittered, CAMERA, None, flags=cv2.SOLVEPNP_IPPE_SQUARE
+        square(length), jittered, CAMERA, None, flags=cv2.SOLVEPNP_IPPE_SQUARE
     )
-    if not found:
+    return (np.ravel(turns[0]), np.ravel(shifts[0])) if found else None
+
+
+def _pose_error(corners: FloatArray, truth: Truth) -> tuple[FloatArray, float]:
+    """Error of the position [m] and of the rotation [rad] by OpenCV's IPPE, the same for all detectors."""
+    found = solved_by_opencv(corners, truth.length)
+    if found is None:
         return np.full(3, math.nan), math.nan
-    rotation, _ = cv2.Rodrigues(turns[0])
+    rotation, _ = cv2.Rodrigues(found[0])
     cos = 0.5 * (np.trace(rotation.T @ truth.rotation) - 1.0)
-    return np.ravel(shifts[0]) - truth.position, math.acos(min(max(cos, -1.0), 1.0))
+    return found[1] - truth.position, math.acos(min(max(cos, -1.0), 1.0))
 
 
 def share_flipped(score: Score) -> float:

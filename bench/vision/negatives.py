@@ -6,15 +6,12 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from bench.vision.peers import FAMILY, own_detector
-from bench.vision.scenes import Look, random_scene
+from bench.vision.scenes import Gray, Look, random_scene
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import CODE_OTHER, Family, families, family_named
 from swarm_loc_vision.markers.layouts import Layout
-
-Gray = NDArray[np.uint8]
 
 _INK, _PAPER, _MARGIN_PX = 25.0, 225.0, 20
 _FEW_IDS = np.arange(16)
@@ -28,13 +25,17 @@ def random_squares(seeds: Sequence[int], frames: int, markers: int) -> tuple[int
     detector = own_detector(family_named(FAMILY))
     for seed in seeds:
         rng = np.random.default_rng([99, seed])
-        words = rng.integers(0, 1 << 36, 4096, dtype=np.uint64)
-        anything = Family("random", CODE_OTHER, Layout(6, 1), words)
+        family = random_family(rng)
         for _ in range(frames):
-            image, truths = random_scene(rng, anything, markers, Look())
+            image, truths = random_scene(rng, family, markers, Look())
             squares += len(truths)
             ids += len(detector.detect(image))
     return squares, ids
+
+
+def random_family(rng: np.random.Generator) -> Family:
+    """Squares with 6 x 6 random cells."""
+    return Family("random", CODE_OTHER, Layout(6, 1), rng.integers(0, 1 << 36, 4096, dtype=np.uint64))
 
 
 def black_squares(count: int) -> dict[str, int]:

@@ -12,13 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.vision.scenes import CAMERA, HEIGHT, WIDTH
+from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Gray
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.detector import Detections, DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import Family, family_named
-
-Gray = NDArray[np.uint8]
 
 FAMILY = "apriltag_36h11"
 """The one that all of them read."""
@@ -49,9 +47,17 @@ def as_found(detections: Detections) -> Found:
     return Found(detections.id, detections.corners)
 
 
-def stock() -> Peer:
+def opencv_name(family: Family) -> str:
+    """The name that a family's dictionary has in cv2.aruco, if it is there."""
+    kind, _, rest = family.name.partition("_")
+    return f"DICT_APRILTAG_{rest}" if kind == "apriltag" else f"DICT_{rest.upper()}"
+
+
+def stock(family: Family) -> Peer:
     """cv2.aruco as it comes, with its sub-pixel refinement."""
-    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    name = opencv_name(family)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    quarters = 2 if "APRILTAG" in name else 0  # OpenCV's tags are upside down
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     detector = cv2.aruco.ArucoDetector(dictionary, parameters)
@@ -61,7 +67,7 @@ def stock() -> Peer:
         stacked = np.array(corners, np.float64).reshape(-1, 4, 2)
         found: Any = ids  # (N, 1) in 4.x, (N,) in 5.0, None in both
         flat = np.array([] if found is None else found, np.int64).ravel()
-        return Found(flat, np.roll(stacked, 2, axis=1))  # OpenCV's tags are upside down
+        return Found(flat, np.roll(stacked, quarters, axis=1))
 
     return detect
 
@@ -84,10 +90,11 @@ def pupil(decimate: float) -> Peer:
 
 def all_peers() -> dict[str, Peer]:
     """By name; pupil-apriltags only where it is installed."""
-    detector = own_detector(family_named(FAMILY))
+    family = family_named(FAMILY)
+    detector = own_detector(family)
     peers: dict[str, Peer] = {
         "own": lambda gray: as_found(detector.detect(gray)),
-        "cv2.aruco": stock(),
+        "cv2.aruco": stock(family),
     }
     if importlib.util.find_spec("pupil_apriltags"):
         peers |= {"pupil 1": pupil(1.0), "pupil 2": pupil(2.0)}
