@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.peers.shapes import scored
+from bench.peers.shapes import second_half
 from bench.shared.common import new_plot, save_plot, table, write_figures
-from bench.shared.simulated_run import errors_of, run_core, ticks
+from bench.shared.simulated_run import run_core, ticks
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
@@ -99,11 +99,7 @@ def _turned(sightings: Records, yaw: FloatArray) -> Records:
 def measure(robots: int, seed: int) -> dict[str, float]:
     """CPU time of a run, and the figures of its second half."""
     run = simulate_calibrated(GridSettings(robots, seed, min(40.0, ROBOT_SECONDS / robots)))
-    at_ns = ticks(run)
-    core = run_core(run, at_ns, Settings())
-    counted = np.arange(at_ns.size) >= at_ns.size // 2
-    errors = errors_of(core.poses, run, at_ns)[counted]
-    return {"cpu_s_per_s": core.cpu_s / run.duration_s} | scored(errors, core.covariances[counted])
+    return second_half(run, Settings())
 
 
 def draw(results: dict[tuple[int, int], dict[str, float]]) -> None:

@@ -2,11 +2,11 @@
 
 The swarm is a grid with about three neighbours in view of each robot (`sim.scenarios.grid`):
 odometry at 20 Hz, cameras at 7.5 Hz, 150-300 ms late; for one figure (`prompt_cpu_s_per_s`) nothing is late.
-Everybody gives all poses ten times a second and uses
-new measurements five times a second, as the live node does with a large swarm. Measured is CPU time of this
-process per simulated second, without reading messages; the optimum is gtsam's batch solution of all data that
-have arrived by the same moment. Swarms of several shapes are compared with the exact filter (`shapes.py`). At
-the end some are played into the live graph in real time (`make bench-large_swarms`).
+Everybody gives all poses ten times a second; each uses measurements as often as suits it, the estimator as
+its default settings say. Measured is CPU time of this process per simulated second, without reading
+messages; the optimum is gtsam's batch solution of all data that have arrived by the same moment. Swarms of
+several shapes are compared with the exact filter (`shapes.py`). At the end some are played into the live
+graph in real time (`make bench-large_swarms`).
 """
 
 from __future__ import annotations

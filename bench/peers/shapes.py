@@ -12,6 +12,7 @@ import numpy as np
 
 from bench.shared.common import table
 from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_core, ticks
+from swarm_loc_drivers.sim.run import SimulatedRun
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, Shape, simulate_grid
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.timeline.settings import Settings
@@ -43,19 +44,19 @@ def measure_shape(shape: Shape, robots: int, runs: ShapeRuns) -> dict[str, float
 
 
 def _measure(grid: GridSettings, exact_s: float) -> dict[str, float]:
-    is_long = exact_s < grid.duration_s
-    own = _scored(grid, Settings())
-    compared = replace(grid, duration_s=exact_s) if is_long else grid
-    exact = _scored(compared, Settings(sparse_from=_NEVER))
-    beside = _scored(compared, Settings()) if is_long else own
+    run = simulate_grid(grid)
+    own = beside = second_half(run, Settings())
+    if exact_s < grid.duration_s:
+        run = simulate_grid(replace(grid, duration_s=exact_s))
+        beside = second_half(run, Settings())
+    exact = second_half(run, Settings(sparse_from=_NEVER))
     ratio = beside["position_rmse_mm"] / exact["position_rmse_mm"]
     reference = {f"exact_{name}": exact[name] for name in ("nees", "tracked_share", "cpu_s_per_s")}
     return own | {"position_rmse_ratio_to_exact": ratio} | reference
 
 
-def _scored(grid: GridSettings, settings: Settings) -> dict[str, float]:
+def second_half(run: SimulatedRun, settings: Settings) -> dict[str, float]:
     """CPU time of a run, and the figures of its second half."""
-    run = simulate_grid(grid)
     at_ns = ticks(run)
     core = run_core(run, at_ns, settings)
     counted = np.arange(at_ns.size) >= at_ns.size // 2
