@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from bench.aerial.worlds import PERIOD_NS, Conditions, picture_of, simulate
+from bench.aerial.driving import followed
+from bench.aerial.worlds import PERIOD_NS, Conditions, simulate
 from swarm_loc_estimator.identification.anchors import Scale
-from swarm_loc_estimator.identification.chain import ChainModel, Chains
+from swarm_loc_estimator.identification.chain import ChainModel
 
 if TYPE_CHECKING:
     from bench.aerial.rates import Results
@@ -49,10 +50,7 @@ def measure(results: Results, worlds: int, seed: int) -> Reliability:
         model = ChainModel(scale=Scale(1.0, 0.02), scale_drift=conditions.drift / np.sqrt(PERIOD_NS * 1e-9))
         world = simulate(conditions, rng)
         for robot in range(min(conditions.robots, _ROBOTS_PER_WORLD)):
-            chains = Chains(model)
-            for k, positions in enumerate(world.images):
-                picture = picture_of(positions, conditions.sigma)
-                chains = chains.advanced(picture, world.track(robot, k), k * PERIOD_NS)
+            for k, chains in enumerate(followed(world, robot, conditions, model)):
                 found = chains.probabilities
                 if k and found.size:
                     probability.append(float(found.max()))

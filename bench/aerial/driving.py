@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -76,20 +77,20 @@ def _rate(
         world = simulate(conditions, rng)
         for robot in range(min(conditions.robots, _ROBOTS_PER_WORLD)):
             begin_s = time.process_time()
-            chains = followed(world, robot, conditions, model)
+            *_, chains = followed(world, robot, conditions, model)
             spent_s += time.process_time() - begin_s
             right += int(np.argmax(chains.probabilities)) == world.place_of(robot, conditions.images - 1)
             trials += 1
     return right, trials, 1e6 * spent_s / trials / conditions.images
 
 
-def followed(world: World, robot: int, conditions: Conditions, model: ChainModel) -> Chains:
-    """The chains of a robot over all images of a world."""
+def followed(world: World, robot: int, conditions: Conditions, model: ChainModel) -> Iterator[Chains]:
+    """The chains of a robot after each image of a world."""
     chains = Chains(model)
     for k, positions in enumerate(world.images):
         picture = picture_of(positions, conditions.sigma)
         chains = chains.advanced(picture, world.track(robot, k), k * PERIOD_NS)
-    return chains
+        yield chains
 
 
 def heading_error(seed: int) -> float:

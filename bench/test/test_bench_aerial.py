@@ -89,6 +89,6 @@ def test_chains_find_most_robots_and_sure_answers_are_right() -> None:
         conditions = Conditions(10, 4)
         world = simulate(conditions, rng)
         for robot in range(5):
-            chains = driving.followed(world, robot, conditions, ChainModel())
+            *_, chains = driving.followed(world, robot, conditions, ChainModel())
             right += int(np.argmax(chains.probabilities)) == world.place_of(robot, 3)
     assert right >= 17
