@@ -112,7 +112,7 @@ def identify_by_turns(headings: FloatArray, own_turns: FloatArray) -> int:
 
 
 def chain_costs(
-    images: ComplexArray, way: FloatArray, sigma: float, scale: float = 1.0, scale_sigma: float = np.inf
+    images: ComplexArray, way: FloatArray, sigma: float, scale: float, scale_sigma: float
 ) -> FloatArray:
     """Costs (n, n, n) of all chains of three images, of n^3 that the paper tests, too.
 
@@ -132,33 +132,30 @@ def chain_costs(
 
 
 def identify_by_speeds(
-    images: ComplexArray, way: FloatArray, sigma: float, scale: float = 1.0, scale_sigma: float = np.inf
+    images: ComplexArray, way: FloatArray, sigma: float, scale: float, scale_sigma: float
 ) -> tuple[int, ...]:
     """Which position of each of three images is that of a robot that drove so; arguments as above."""
     cost = chain_costs(images, way, sigma, scale, scale_sigma)
     return tuple(int(place) for place in np.unravel_index(np.argmin(cost), cost.shape))
 
 
-def pair_misfits(first: ComplexArray, second: ComplexArray, own: complex, scale: float = 1.0) -> FloatArray:
-    """By how much the distances of all pairs (n, m) differ from the own way: | |D| - lambda |W| |.
+def pair_misfits(first: ComplexArray, second: ComplexArray, own: complex) -> FloatArray:
+    """By how much the distances of all pairs (n, m) differ from the own way: | |D| - |W| |.
 
     Args:
         first: (n,) positions in the first image.
         second: (m,) positions in the second one.
         own: W, the own motion in between, in the frame of the first heading.
-        scale: lambda.
     """
-    misfit: FloatArray = np.abs(np.abs(second[None, :] - first[:, None]) - scale * abs(own))
+    misfit: FloatArray = np.abs(np.abs(second[None, :] - first[:, None]) - abs(own))
     return misfit
 
 
-def identify_by_way(
-    first: ComplexArray, second: ComplexArray, own: complex, scale: float = 1.0
-) -> tuple[int, int, float]:
+def identify_by_way(first: ComplexArray, second: ComplexArray, own: complex) -> tuple[int, int, float]:
     """Which position in each image is that of a robot that moved by W, and its first heading [rad].
 
     Arguments as for `pair_misfits`; W must not be zero for the heading to mean anything.
     """
-    misfit = pair_misfits(first, second, own, scale)
+    misfit = pair_misfits(first, second, own)
     i, j = (int(place) for place in np.unravel_index(np.argmin(misfit), misfit.shape))
     return i, j, float(relation(second[j] - first[i], own).heading)

@@ -7,7 +7,7 @@ over it; a camera of any tilt and lens looks at it, pixel by pixel as means of s
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -155,11 +155,6 @@ def control_pixels(
     seen = np.isfinite(flat).all(axis=1)
     places = np.concatenate([flat[seen][:count], np.zeros((count, 1))], axis=1)
     return places, ground.pixels(places)
-
-
-def plainer(look: Look) -> Look:
-    """The same without anything on the floor but robots."""
-    return replace(look, clutter=0, texture=0.0)
 
 
 def _raw_places(ground: GroundCamera) -> FloatArray:

@@ -7,7 +7,7 @@ Bearings and headings are uniform, readings have one count of noise and saturate
 the Droplet paper's equations, corrected, on the power that suits; "likelihood" uses all readings of both
 powers. Beside it stands the Cramer-Rao bound, which no unbiased estimate betters. "mismatch" are robots whose
 elements differ by 10 %, before and after their gains were calibrated from 200 exchanges of the two, poses
-unknown and known. At the end a swarm of 20 is localized through infrared, see bench/droplet_swarm.py.
+unknown and known. At the end a swarm of 20 is localized through infrared, see bench/droplet/swarm.py.
 """
 
 from __future__ import annotations

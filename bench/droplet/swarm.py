@@ -1,7 +1,6 @@
 """A swarm of 20 Droplets on a table, 2 of them seen by a tracker, all others located by infrared alone.
 
-    make bench-droplet_swarm
-    make bench-droplet_swarm ARGS="--live 2 --replays 8"
+    make bench-droplet ARGS="--live 2 --replays 8"
 
 Nobody's start is known, every element has a gain of its own (10 %), steps are longer or shorter than the
 robots believe (8 %), every other robot wanders. "live" is the whole graph: emulated firmware on
@@ -13,8 +12,6 @@ time on when the swarm has found itself.
 
 from __future__ import annotations
 
-import argparse
-import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -28,7 +25,7 @@ from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
 from bench.shared.bags import read_truth
-from bench.shared.common import OUT, Cell, new_plot, save_plot, table, write_figures
+from bench.shared.common import OUT, Cell, new_plot, save_plot, table
 from swarm_loc_drivers.sim.scenarios.bags import write_droplet_bag
 from swarm_loc_drivers.sim.scenarios.droplets import (
     FIXED,
@@ -275,18 +272,3 @@ def _draw_pose(axes: Axes, pose: FloatArray, covariance: FloatArray) -> None:
     axes.add_patch(Ellipse((x, y), width, height, angle=angle, color="C1", alpha=0.5))
     dx, dy = 2.2 * np.cos(pose[2]), 2.2 * np.sin(pose[2])
     axes.plot([x, x + dx], [y, y + dy], color="C3", linewidth=1.2)
-
-
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--live", type=int, default=2, help="runs over the whole graph")
-    parser.add_argument("--replays", type=int, default=6, help="bags")
-    options = parser.parse_args(arguments)
-    figures = measure(range(1, options.live + 1), range(1, options.replays + 1))
-    print(f"figures: {write_figures('droplet_swarm', figures)}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Inputs: how well each kind of sensor locates a swarm, compared with its bound.
+"""Inputs: how well each kind of sensor locates a swarm, compared with bounds and other software.
 
 A part is a module with a function `measure(seeds, say)`, which returns figures by name and draws plots.
 

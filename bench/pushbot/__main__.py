@@ -16,7 +16,6 @@ runs in which one was off by more than 30 cm and 3 sigma.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Sequence
 
@@ -28,8 +27,6 @@ PARTS = ("tracker", "calibration", "driver", "mapping")
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
     options = _parser().parse_args(arguments)
-    os.environ.setdefault("OMP_NUM_THREADS", "1")  # before NumPy: two threads make small systems slower
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     figures: dict[str, float] = {}
     for part in options.parts:
         figures |= _measure(part, options)

@@ -91,7 +91,3 @@ def _draw(rates: dict[str, list[float]], flows: dict[int, Measured]) -> None:
     right.bar([str(one) for one in flows], [100.0 * flow.events_per_s / RATE for flow in flows.values()])
     right.set(xlabel="robots of 300 k events/s", ylabel="events that came [%]", title="through the graph")
     print(f"wrote {save_plot(figure, 'pushbot_driver')}")
-
-
-if __name__ == "__main__":
-    print(measure_driver(3))

@@ -89,7 +89,7 @@ _EVERY = 25
 _FLOOR = 0.05
 """Weight of a beam that ends where the map says nothing."""
 _DISTANCE_NOISE, _TURN_NOISE, _HEADING_NOISE = 0.02, math.radians(4.0), math.radians(0.4)
-_MIN_PATH, _SPREAD = 0.5, 0.5
+_MIN_PATH = 0.5
 _MARGIN_CELLS = 160
 _OCCUPIED = 0.3
 

@@ -97,7 +97,7 @@ def facing(azimuth: float, incidence: float, roll: float, position: FloatArray) 
     return np.asarray(upright @ tilt @ turn)
 
 
-def random_truth(rng: np.random.Generator, family: Family, ids: int, max_blur: float) -> Truth | None:
+def _random_truth(rng: np.random.Generator, family: Family, max_blur: float) -> Truth | None:
     """A marker of 3 to 10 cm at 0.2 to 2 m, tilted by up to 70 degrees; None when it leaves the image."""
     length, distance = rng.uniform(0.03, 0.10), rng.uniform(0.2, 2.0)
     pixel = rng.uniform([0.0, 0.0], [WIDTH, HEIGHT])
@@ -111,7 +111,7 @@ def random_truth(rng: np.random.Generator, family: Family, ids: int, max_blur: f
     if corners.min() < room or (corners > np.array([WIDTH, HEIGHT]) - 1 - room).any():
         return None
     inner = project(rotation, position, square(length))
-    return Truth(int(rng.integers(ids)), inner, rotation, position, length, incidence, blur)
+    return Truth(int(rng.integers(len(family.words))), inner, rotation, position, length, incidence, blur)
 
 
 def _whole_side(family: Family) -> int:
@@ -120,13 +120,13 @@ def _whole_side(family: Family) -> int:
 
 
 def random_scene(
-    rng: np.random.Generator, family: Family, count: int, look: Look, ids: int | None = None
+    rng: np.random.Generator, family: Family, count: int, look: Look
 ) -> tuple[Gray, list[Truth]]:
     """An image with up to `count` markers that do not touch, and the truth."""
     truths: list[Truth] = []
     boxes: list[FloatArray] = []
     for _ in range(40 * count):
-        truth = random_truth(rng, family, ids or len(family.words), look.max_blur)
+        truth = _random_truth(rng, family, look.max_blur)
         if truth is None:
             continue
         grown = project(
