@@ -20,7 +20,7 @@ BENCHMARKS = {
     "reading": "bench.peers.reading",
     "scaling": "bench.peers.scaling",
     "soak": "bench.graph.soak",
-    "survey": "bench.survey",
+    "commissioning": "bench.commissioning",
     "vision": "bench.vision",
     "watch": "bench.watch",
 }

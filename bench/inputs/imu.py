@@ -61,8 +61,8 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
         figures[f"{prefix}.misleading_share"] = float(np.mean(wrong))
     figures["imu.blind60s.heading_deg"] = figures["imu.blind60s.with_gyro.heading_deg"]
     pose, twist = (position_rmse(np.stack([error for error, _ in found[name]])) for name in ("pose", "twist"))
-    figures["imu.twist_only.position_ratio_to_pose"] = twist / pose
-    figures["imu.twist_only.nees"] = float(np.mean([mean_nees(*one) for one in found["twist"]]))
+    figures["twist_only.position_ratio_to_pose"] = twist / pose
+    figures["twist_only.nees"] = float(np.mean([mean_nees(*one) for one in found["twist"]]))
     _plot(found)
     return figures
 

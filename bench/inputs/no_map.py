@@ -52,9 +52,9 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
         "no_map.relative_cm": relative_cm["no map"],
         "no_map.known_frame_relative_cm": relative_cm["one start known"],
         "no_map.ratio_to_known_frame": relative_cm["no map"] / relative_cm["one start known"],
-        "no_map.merge.misleading_share": float(np.mean(wrong)),
-        "no_map.merge.tracked_share_at_end": float(np.mean(tracked)),
-        "no_map.merge.frame_moves": float(np.mean(moves)),
+        "merge.misleading_share": float(np.mean(wrong)),
+        "merge.tracked_share_at_end": float(np.mean(tracked)),
+        "merge.frame_moves": float(np.mean(moves)),
     }
 
 

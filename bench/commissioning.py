@@ -5,8 +5,8 @@ cameras, wheels and images that are systematically wrong. Nobody has a start and
 errors are those after a rigid fit. Then robots are localized with the surveyed landmarks and with the true
 ones; their errors are after a rigid fit of all poses, too.
 
-    make bench-survey
-    make bench-survey ARGS="--seeds 1"
+    make bench-commissioning
+    make bench-commissioning ARGS="--seeds 1"
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def main() -> None:
         print()
     columns = ("case", "landmarks [mm]", "worst seed", "CPU [s]", "poses by survey [mm]", "by truth [mm]")
     print(table(columns, [_row(name, runs) for name, runs in found.items()]))
-    print(write_figures("survey", _figures(found)))
+    print(write_figures("commissioning", _figures(found)))
     print(_plot(found))
 
 
@@ -169,7 +169,7 @@ def _plot(found: Mapping[str, Sequence[Outcome]]) -> str:
             axis.plot(*(1e3 * one.error).T, ".", markersize=4)
         axis.set(title=name, xlabel="x error [mm]", xlim=(-20, 20), ylim=(-20, 20), aspect="equal")
     axes[0].set_ylabel("y error [mm]")
-    return str(save_plot(figure, "survey"))
+    return str(save_plot(figure, "commissioning"))
 
 
 if __name__ == "__main__":
