@@ -8,6 +8,7 @@ import sys
 BENCHMARKS = {
     "aerial": "bench.aerial",
     "calibrated": "bench.peers.calibrated",
+    "commissioning": "bench.commissioning",
     "droplet": "bench.droplet",
     "droplet_real": "bench.droplet.real",
     "epuck": "bench.epuck",
@@ -20,7 +21,6 @@ BENCHMARKS = {
     "reading": "bench.peers.reading",
     "scaling": "bench.peers.scaling",
     "soak": "bench.graph.soak",
-    "commissioning": "bench.commissioning",
     "vision": "bench.vision",
     "watch": "bench.watch",
 }

@@ -23,7 +23,7 @@ PARTS: Mapping[str, Callable[[Sequence[int], ProgressLine], Mapping[str, float]]
     "imu": imu.measure,
     "no_map": no_map.measure,
 }
-"""Part -> its function. Most figures start with the name of the part; imu has `twist_only.*`, no_map `merge.*`."""
+"""Part -> its function. Figures start with the name of the part, or twist_only (imu) or merge (no_map)."""
 
 
 def main() -> None:

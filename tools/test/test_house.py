@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMITS = {
-    "product_lines": 67_351,
+    "product_lines": 68_500,
     "files_under_40": 60,
     "files_over_400": 0,
     "import_circles": 0,
@@ -21,7 +21,7 @@ LIMITS = {
 }
 ORDER = (
     *("common", "swarm", "odometry", "identification", "filter", "initialization", "infrared", "mapping"),
-    *("sensors", "timeline", "nodes", "watch", "offline", "cli"),
+    *("sensors", "timeline", "nodes", "watch", "offline", "doctor", "cli"),
 )
 """The folders of the estimator package: each imports only those before it."""
 MIN_DOCUMENTED = 0.96

@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     seconds = options.seconds or (_LIVE_S if is_live else _BAG_S)
     with ProgressLine() as progress:
         if is_live:
-            listen = import_module("swarm_loc_estimator.doctor.live").listen
+            listen = import_module("swarm_loc_estimator.doctor.listener_node").listen
             evidence = listen(swarm, seconds, progress, use_sim_time=options.use_sim_time)
         else:
             evidence = evidence_of_bag(options.source, swarm, seconds, progress, options.remap)

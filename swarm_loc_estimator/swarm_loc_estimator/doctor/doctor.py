@@ -8,7 +8,7 @@ from pathlib import Path
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.doctor.clocks import check_clocks
 from swarm_loc_estimator.doctor.contents import check_contents, check_estimate
-from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, same_type
+from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, Message, same_type
 from swarm_loc_estimator.doctor.frames import check_frames
 from swarm_loc_estimator.doctor.motion import check_motion
 from swarm_loc_estimator.doctor.pictures import COMPRESSED_IMAGE, IMAGE, check_pictures
@@ -25,7 +25,7 @@ MAX_IMAGES = 20
 def examine(evidence: Evidence) -> list[Finding]:
     """All that is wrong, the most basic things first.
 
-    What the estimator contradicts often follows from the rest, so it is told only where nothing else is.
+    What the estimator contradicts often follows from the rest, so it is added only where nothing else is.
     """
     return [one for check in CHECKS for one in check(evidence)] or [*check_estimate(evidence)]
 
@@ -46,20 +46,20 @@ def evidence_of_bag(
         BagError: Nothing in the bag can be read, or a topic cannot be mapped.
     """
     known = [topic.name for topic in input_topics(swarm)]
-    messages: dict[str, list[tuple[int, bytes]]] = {}
+    messages: dict[str, list[Message]] = {}
     with BagReader(bag, renamed_topics(remap, swarm, known)) as reader:
         types = {topic.name: topic.type for topic in reader.topics}
         end_ns = reader.time_range_ns[0] + round(seconds * 1e9)
         for name, _, log_ns, data in reader.messages():
             if log_ns > end_ns:
                 break
-            keep(messages.setdefault(name, []), types[name], log_ns, data)
+            keep(messages.setdefault(name, []), types[name], Message(log_ns, data))
             progress(min(1.0, reader.progress), "reading")
     return Evidence(swarm, {name: Heard(kind, messages.get(name, [])) for name, kind in types.items()})
 
 
-def keep(kept: list[tuple[int, bytes]], message_type: str, arrival_ns: int, data: bytes) -> None:
+def keep(kept: list[Message], message_type: str, message: Message) -> None:
     """Keep a message, unless it is one of many images."""
     is_image = same_type(message_type, IMAGE) or same_type(message_type, COMPRESSED_IMAGE)
     if not is_image or len(kept) < MAX_IMAGES:
-        kept.append((arrival_ns, data))
+        kept.append(message)

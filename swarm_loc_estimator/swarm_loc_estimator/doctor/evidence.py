@@ -62,18 +62,25 @@ class Publisher(NamedTuple):
     is_latched: bool = False
 
 
+class Message(NamedTuple):
+    """A serialized message, and when it arrived [ns]."""
+
+    arrival_ns: int
+    data: bytes
+
+
 @dataclass(frozen=True)
 class Heard:
     """A topic that was found.
 
     Attributes:
         type: Of its messages.
-        messages: Arrival [ns] and serialized content, in order of arrival; of images only some.
+        messages: In order of arrival; of images only some.
         publishers: In the live graph; of a bag they are not known.
     """
 
     type: str
-    messages: Sequence[tuple[int, bytes]] = ()
+    messages: Sequence[Message] = ()
     publishers: tuple[Publisher, ...] = ()
 
 

@@ -53,7 +53,7 @@ _WRONG: MappingProxyType[str, Change] = MappingProxyType(
 """What odometry may do wrong, and how it is undone for poses (k, 3)."""
 
 
-class _Fit(NamedTuple):
+class _Alignment(NamedTuple):
     """Scale and yaw [rad] between sightings and odometry, their sigma, and the residual [m]."""
 
     scale: float
@@ -158,7 +158,7 @@ def _spread(seen: FloatArray, landmark: IntArray, stamp_ns: IntArray) -> float:
 
 def _fitted(
     robot: Robot, own: OdometryRows, seen: FloatArray, landmark: IntArray, stamp_ns: IntArray, undo: Change
-) -> _Fit | None:
+) -> _Alignment | None:
     """The fit with odometry whose poses are changed; None: the robot moves too little."""
     tracks = OdometryTracks([robot])
     tracks.extend(np.zeros(own.robot.size, dtype=np.int64), own.stamp_ns, undo(own.pose), None)
@@ -195,4 +195,4 @@ def _fitted(
         # errors of a landmark's sightings last, so the landmarks of each window are the independent samples
         push = (weight[:, None] * along * (sighted + a * along + b * across)).sum(axis=1)
         sigma = math.sqrt(float(np.sum(np.bincount(group, push) ** 2))) / (size * information)
-    return _Fit(scale, yaw, sigma, residual)
+    return _Alignment(scale, yaw, sigma, residual)

@@ -15,7 +15,7 @@ from swarm_loc_estimator.cli import doctor as command
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.definitions import ODOMETRY, TRANSFORMS
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag, examine
-from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Publisher
+from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message, Publisher
 from swarm_loc_estimator.doctor.pictures import CAMERA_INFO, IMAGE
 from swarm_loc_estimator.offline.recorded_bag import unwatched
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -61,7 +61,7 @@ def edited(names: Collection[str], edit: Callable[[Any, int], object]) -> Change
             for arrival_ns, data in heard.messages:
                 message = typestore().deserialize_cdr(data, heard.type)
                 edit(message, arrival_ns)
-                messages.append((arrival_ns, bytes(typestore().serialize_cdr(message, heard.type))))
+                messages.append(Message(arrival_ns, bytes(typestore().serialize_cdr(message, heard.type))))
             topics[name] = Heard(heard.type, messages)
         return Evidence(evidence.swarm, topics)
 
@@ -165,7 +165,7 @@ def retyped(evidence: Evidence) -> Evidence:
 
 
 def malformed(evidence: Evidence) -> Evidence:
-    cut = [(arrival_ns, data[:40]) for arrival_ns, data in evidence.topics[ODOM].messages]
+    cut = [Message(arrival_ns, data[:40]) for arrival_ns, data in evidence.topics[ODOM].messages]
     return with_topics(evidence, epuck2__odom=Heard(ODOMETRY, cut))
 
 
@@ -179,7 +179,7 @@ def serialized(kind: str, **fields: Any) -> bytes:
 
 def picture(encoding: str = "mono8") -> Heard:
     fields = {"height": 2, "width": 3, "encoding": encoding, "is_bigendian": 0, "step": 3}
-    return Heard(IMAGE, [(1, serialized(IMAGE, **fields, data=np.zeros(6, np.uint8)))])
+    return Heard(IMAGE, [Message(1, serialized(IMAGE, **fields, data=np.zeros(6, np.uint8)))])
 
 
 def intrinsics(focal: float = 100.0, width: int = 3) -> Heard:
@@ -187,7 +187,7 @@ def intrinsics(focal: float = 100.0, width: int = 3) -> Heard:
     k = np.array([focal, 0.0, 1.0, 0.0, focal, 1.0, 0.0, 0.0, 1.0])
     fields = {"height": 2, "width": width, "distortion_model": "plumb_bob", "d": np.zeros(5), "k": k}
     fields |= {"r": np.eye(3).ravel(), "p": np.zeros(12), "binning_x": 0, "binning_y": 0, "roi": region}
-    return Heard(CAMERA_INFO, [(1, serialized(CAMERA_INFO, **fields))])
+    return Heard(CAMERA_INFO, [Message(1, serialized(CAMERA_INFO, **fields))])
 
 
 def transforms(*parents: str) -> Heard:
@@ -200,7 +200,7 @@ def transforms(*parents: str) -> Heard:
         transform: Any = types["geometry_msgs/msg/Transform"](zero, turn)
         stamped: Any = types["geometry_msgs/msg/TransformStamped"](header, f"{ROBOT}/odom", transform)
         message: Any = types[TRANSFORMS](np.array([stamped]))
-        messages.append((1, bytes(typestore().serialize_cdr(message, TRANSFORMS))))
+        messages.append(Message(1, bytes(typestore().serialize_cdr(message, TRANSFORMS))))
     return Heard(TRANSFORMS, messages)
 
 
@@ -217,7 +217,7 @@ def reporting(message: str) -> Change:
     kind = "diagnostic_msgs/msg/DiagnosticArray"
     status: Any = types["diagnostic_msgs/msg/DiagnosticStatus"](1, f"{ROBOT}/driver", message, "", [])
     data = serialized(kind, status=[status])
-    return lambda evidence: with_topics(evidence, diagnostics=Heard(kind, [(1, data)]))
+    return lambda evidence: with_topics(evidence, diagnostics=Heard(kind, [Message(1, data)]))
 
 
 def exchanged_ids(swarm: Swarm) -> Swarm:

@@ -34,7 +34,7 @@ def run(*arguments):
         return end.code
 """
 COMMANDS = {
-    *("calibrate", "calibrate_ir", "import_droplets", "import_mrclam", "new"),
+    *("calibrate", "calibrate_ir", "doctor", "import_droplets", "import_mrclam", "new"),
     *("replay", "replay_map", "schema", "survey"),
 }
 NODES = {"estimator_node", "localizer_bridge", "mapper_node", "markers_node", "play", "watch_node"}

@@ -13,7 +13,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from swarm_loc_estimator.common.node import MessageTypeError, message_class
 from swarm_loc_estimator.doctor.doctor import keep
-from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Publisher
+from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message, Publisher
 from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.swarm.swarm import Swarm
 
@@ -36,7 +36,7 @@ class Listener(Node):
             "doctor", parameter_overrides=[Parameter("use_sim_time", Parameter.Type.BOOL, use_sim_time)]
         )
         self._swarm = swarm
-        self._messages: dict[str, list[tuple[int, bytes]]] = {}
+        self._messages: dict[str, list[Message]] = {}
         self._types: dict[str, str] = {}
 
     def listen(self, seconds: float, progress: Progress) -> Evidence:
@@ -55,7 +55,7 @@ class Listener(Node):
         return Evidence(
             self._swarm,
             {
-                name: Heard(kind, self._messages.get(name, []), self._publishers(name))
+                name: Heard(kind, self._messages.get(name, []), self.publishers_of(name))
                 for name, kind in self._types.items()
             },
             is_live=True,
@@ -77,9 +77,9 @@ class Listener(Node):
 
     def _on_message(self, name: str, data: bytes) -> None:
         arrival_ns = int(self.get_clock().now().nanoseconds)
-        keep(self._messages.setdefault(name, []), self._types[name], arrival_ns, data)
+        keep(self._messages.setdefault(name, []), self._types[name], Message(arrival_ns, data))
 
-    def _publishers(self, name: str) -> tuple[Publisher, ...]:
+    def publishers_of(self, name: str) -> tuple[Publisher, ...]:
         """The publishers of a topic."""
         return tuple(
             Publisher(

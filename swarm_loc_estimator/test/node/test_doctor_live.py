@@ -1,0 +1,53 @@
+"""The doctor over DDS: it hears the topics of a live graph, and knows their publishers."""
+
+from __future__ import annotations
+
+import threading
+import time
+from pathlib import Path
+
+from geometry_msgs.msg import PoseStamped
+from nav_msgs.msg import Odometry
+from node_world import Ros, detection_bytes, odometry_bytes, sight
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+
+from swarm_loc_estimator.doctor.doctor import examine
+from swarm_loc_estimator.doctor.listener_node import Listener
+from swarm_loc_estimator.offline.recorded_bag import unwatched
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_msgs.msg import MarkerDetectionArray
+
+BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
+
+
+def test_a_live_graph_is_heard(ros: Ros, swarm_file: Path) -> None:
+    """Alpha is well but for its QoS; beta has another type, no detector, and its odometry elsewhere."""
+    odometry = ros.tester.create_publisher(Odometry, "alpha/odom", BEST_EFFORT)
+    detections = ros.tester.create_publisher(MarkerDetectionArray, "alpha/detections", 10)
+    ros.tester.create_publisher(PoseStamped, "beta/odom", 10)
+    ros.tester.create_publisher(Odometry, "beta/wheels", 10)
+    listener = Listener(load_swarm(swarm_file), use_sim_time=False)
+    stop = threading.Event()
+
+    def drive() -> None:
+        while not stop.wait(0.05):
+            now_ns = time.time_ns()
+            odometry.publish(odometry_bytes("alpha", now_ns))
+            detections.publish(detection_bytes("alpha", now_ns, sight((0.0, 0.0, 0.0))))
+
+    driver = threading.Thread(target=drive)
+    driver.start()
+    try:
+        evidence = listener.listen(4.0, unwatched)
+    finally:
+        stop.set()
+        driver.join()
+        listener.destroy_node()
+    assert len(evidence.topics["alpha/odom"].messages) > 20
+    assert {one.node for one in evidence.topics["alpha/odom"].publishers} == {"/tester"}
+    found = [(one.about, one.problem) for one in examine(evidence)]
+    assert found == [
+        ("beta/odom", "has the type geometry_msgs/msg/PoseStamped, not nav_msgs/msg/Odometry"),
+        ("beta/detections", "has no messages"),
+        ("alpha/odom", "is published best effort, so lost messages are missing"),
+    ]
