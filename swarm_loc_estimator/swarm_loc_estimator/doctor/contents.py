@@ -85,7 +85,8 @@ def check_estimate(evidence: Evidence) -> Iterator[Finding]:
         is_seen = (
             np.isin([face.id for face in robot.faces], seen).any() or evidence.rows("aerial").stamp_ns.size
         )
-        if estimated.status[index] == Status.WAITING and not measured[index] and not is_seen:
+        is_helpless = robot.start is None and not measured[index] and not is_seen
+        if estimated.status[index] == Status.WAITING and is_helpless:
             problem = "cannot be located: it has no start, measures nothing, and nobody sees it"
             yield Finding(robot.name, problem, "Give it a start, or a sensor and something to see")
 
@@ -98,6 +99,8 @@ def _other_starts(evidence: Evidence) -> Iterator[Finding]:
     for index, robot in enumerate(evidence.swarm.robots):
         own = rows.robot == index
         if robot.start is None or estimated.begin_ns[index] < 0 or not own.any():
+            continue
+        if not evidence.is_at_start(index):
             continue
         stamps_ns = np.array(
             [rows.stamp_ns[own].min(), min(estimated.begin_ns[index], rows.stamp_ns[own].max())]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -20,13 +20,15 @@ from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.registry import SENSORS, Batch, InputTopic, live_topics
 from swarm_loc_estimator.sensors.sensor import joined
-from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradicted, Contradiction
 from swarm_loc_estimator.timeline.estimate import Status
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 
 _TICK_NS = 500_000_000
+_AT_ZERO = 0.05
+"""Odometry begins at zero if x and y [m] and the heading [rad] are smaller."""
 _LASTING_TICKS = 4
 """Contradictions of fewer ticks are not named."""
 
@@ -160,7 +162,8 @@ class Evidence:
     @cached_property
     def estimated(self) -> Estimated:
         """What the estimator makes of all readings."""
-        estimator, robots = Estimator(self.swarm, self.settings), len(self.swarm.robots)
+        swarm = replace(self.swarm, robots=tuple(map(self._without_old_start, range(len(self.swarm.robots)))))
+        estimator, robots = Estimator(swarm, self.settings), len(swarm.robots)
         ticks, lasting = Counter[tuple[str, Contradicted]](), dict[tuple[str, Contradicted], Contradiction]()
         begin_ns, begin_pose = np.full(robots, -1), np.full((robots, 3), np.nan)
         status = np.full(robots, int(Status.WAITING))
@@ -179,6 +182,16 @@ class Evidence:
                     lasting[one.about, one.kind] = one
         found = [one for key, one in lasting.items() if ticks[key] >= _LASTING_TICKS]
         return Estimated(estimator.drops_of, status, found, begin_ns, begin_pose)
+
+    def is_at_start(self, index: int) -> bool:
+        """Whether a robot was heard from its start on: its odometry began at zero."""
+        first = self.odometry.pose[self.odometry.robot == index][:1]
+        return bool((np.abs(first) < _AT_ZERO).all())
+
+    def _without_old_start(self, index: int) -> Robot:
+        """The robot without its start, if it had left it before it was heard."""
+        robot = self.swarm.robots[index]
+        return robot if self.is_at_start(index) else replace(robot, start=None)
 
     def source_name(self, index: int) -> str:
         """Name of a robot or a fixed camera."""
