@@ -15,7 +15,7 @@ from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.doctor.evidence import Evidence, Finding
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.registry import SENSORS
-from swarm_loc_estimator.timeline.contradictions import Contradicted
+from swarm_loc_estimator.timeline.contradictions import Contradicted, Contradiction
 from swarm_loc_estimator.timeline.estimate import Status
 
 _MIN_SIGHTINGS = 5
@@ -74,9 +74,13 @@ def check_contents(evidence: Evidence) -> Iterator[Finding]:
 def check_estimate(evidence: Evidence) -> Iterator[Finding]:
     """The estimator locates all robots, where they should be, and contradicts nothing."""
     estimated = evidence.estimated
+    groups: dict[tuple[Contradicted, bool], list[Contradiction]] = {}
     for one in estimated.contradictions:
-        problem, remedy = _CONTRADICTED[one.kind]
-        yield Finding(one.about, f"{problem}: {one.text}", remedy)
+        groups.setdefault((one.kind, one.about.startswith("landmark")), []).append(one)
+    for (kind, _), some in groups.items():
+        problem, remedy = _CONTRADICTED[kind]
+        verb = "is" if len(some) == 1 else "are"
+        yield Finding(listed([one.about for one in some]), f"{verb} {problem}: {some[0].text}", remedy)
     yield from _other_starts(evidence)
     motion = [one in ("odometry", "imu") for one in SENSORS]
     measured = _readings(evidence)[~np.array(motion)].sum(axis=0)
@@ -122,21 +126,22 @@ def _readings(evidence: Evidence) -> IntArray:
 
 _CONTRADICTED = MappingProxyType(
     {
-        Contradicted.ODOMETRY: ("has odometry that contradicts all else", "Check its driver and wheels"),
-        Contradicted.RESET: ("has odometry that was reset", "Keep its driver running"),
+        Contradicted.ODOMETRY: ("contradicted by all else in odometry", "Check its driver and wheels"),
+        Contradicted.RESET: ("reset in odometry", "Keep its driver running"),
         Contradicted.CONSTANT: (
-            "publishes a constant pose",
-            "Nothing, if its twist is right; it is integrated",
+            "constant in the pose of odometry",
+            "Nothing, if twists are right: they are used",
         ),
-        Contradicted.POSE: ("is not where it should be", "Check its start, and the places of the landmarks"),
+        Contradicted.POSE: ("elsewhere than expected", "Check its start, and the places of the landmarks"),
         Contradicted.SIGHTINGS: (
-            "is contradicted by sightings",
+            "contradicted by sightings",
             "Check the mount of its camera, the size and ids of markers, and places of landmarks",
         ),
-        Contradicted.DESCRIPTION: ("differs from its description", "Measure it again, or use survey"),
-        Contradicted.NOISE: ("has more noise than described", "Use calibrate, or describe more noise"),
+        Contradicted.DESCRIPTION: ("other than described", "Measure it again, or use survey or calibrate"),
+        Contradicted.NOISE: ("noisier than described", "Use calibrate, or describe more noise"),
     }
 )
+"""What is contradicted, and what to do about it."""
 
 
 def _unknown_markers(evidence: Evidence) -> Iterator[Finding]:

@@ -29,8 +29,8 @@ from swarm_loc_estimator.timeline.settings import Settings
 _TICK_NS = 500_000_000
 _AT_ZERO = 0.05
 """Odometry begins at zero if x and y [m] and the heading [rad] are smaller."""
-_LASTING_TICKS = 4
-"""Contradictions of fewer ticks are not named."""
+_LASTING_TICKS, _LASTING_SHARE = 4, 0.2
+"""Contradictions of fewer ticks, or of a smaller share of all, are not named."""
 
 
 class Finding(NamedTuple):
@@ -166,12 +166,13 @@ class Evidence:
         estimator, robots = Estimator(swarm, self.settings), len(swarm.robots)
         ticks, lasting = Counter[tuple[str, Contradicted]](), dict[tuple[str, Contradicted], Contradiction]()
         begin_ns, begin_pose = np.full(robots, -1), np.full((robots, 3), np.nan)
-        status = np.full(robots, int(Status.WAITING))
+        status, count = np.full(robots, int(Status.WAITING)), 0
         for part in self.read[0]:
             stamps_ns = np.arange(part.begin_ns + _TICK_NS, part.end_ns, _TICK_NS)
             for now_ns, arrived in zip(
                 [*stamps_ns.tolist(), part.end_ns], estimator.convert(part).until_each(stamps_ns), strict=True
             ):
+                count += 1
                 estimator.receive(arrived)
                 estimate = estimator.tick(now_ns)
                 status = estimate.status.astype(np.int64)
@@ -180,7 +181,8 @@ class Evidence:
                 for one in estimator.contradictions(now_ns):
                     ticks[one.about, one.kind] += 1
                     lasting[one.about, one.kind] = one
-        found = [one for key, one in lasting.items() if ticks[key] >= _LASTING_TICKS]
+        least = max(_LASTING_TICKS, _LASTING_SHARE * count)
+        found = [one for key, one in lasting.items() if ticks[key] >= least]
         return Estimated(estimator.drops_of, status, found, begin_ns, begin_pose)
 
     def is_at_start(self, index: int) -> bool:

@@ -36,7 +36,7 @@ _ROUNDS = 8
 _CLEARER = 0.5
 """Residual of a mirrored track over that of the true one, below which the sign is wrong."""
 _STANDS_M = 1e-4
-_SCALE, _YAW, _SIGNIFICANT = 0.15, math.radians(15.0), 5.0
+_SCALE, _YAW, _SIGNIFICANT = 0.15, math.radians(20.0), 5.0
 """Least errors of scale and yaw that are named, and least multiple of their sigma."""
 _AHEAD = 0.4
 """Least usual share of the optical z axis in the directions of markers."""
