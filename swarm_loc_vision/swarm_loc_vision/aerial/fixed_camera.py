@@ -8,6 +8,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.swarm.swarm import FixedCamera
 from swarm_loc_vision.aerial.ground_camera import POSE_SIZE, GroundCamera
 
@@ -15,6 +16,10 @@ _FROM_OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Columns: forward, left and up of a camera in its optical frame."""
 _GRID = (9, 7)
 _BESIDE_PX, _STEP = 20.0, 1e-5
+
+
+class LocateError(UserError):
+    """A camera that cannot be located; the message is one sentence."""
 
 
 def fixed_camera(name: str, ground: GroundCamera, height: float = 0.0) -> FixedCamera:
@@ -26,6 +31,9 @@ def fixed_camera(name: str, ground: GroundCamera, height: float = 0.0) -> FixedC
         name: Namespace of its topics.
         ground: The camera with its pose.
         height: Of the markers on the robots above the floor [m].
+
+    Raises:
+        LocateError: The camera does not see markers that lie at this height.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # straight down, yaw and roll are one angle
@@ -37,7 +45,11 @@ def fixed_camera(name: str, ground: GroundCamera, height: float = 0.0) -> FixedC
 
 
 def floor_sigmas(ground: GroundCamera, height: float) -> tuple[float, float]:
-    """Largest standard deviations in the image, by the pose: of a coordinate [m] and of a direction [rad]."""
+    """Largest standard deviations in the image, by the pose: of a coordinate [m] and of a direction [rad].
+
+    Raises:
+        LocateError: The camera does not see the plane from above.
+    """
     camera = ground.camera
     u, v = np.meshgrid(
         np.linspace(0.0, camera.width - 1.0 - _BESIDE_PX, _GRID[0]),
@@ -58,6 +70,10 @@ def floor_sigmas(ground: GroundCamera, height: float) -> tuple[float, float]:
         2.0 * _STEP
     )
     slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]
+    if height >= ground.centre[2] or not len(slopes):
+        raise LocateError(
+            f"A camera {ground.centre[2]:.3g} m above the floor does not see markers lying at {height:g} m."
+        )
     spread = slopes @ ground.covariance @ np.swapaxes(slopes, -1, -2)
     position = np.sqrt(np.linalg.eigvalsh(spread[:, :2, :2]).max())
     return float(position), float(np.sqrt(spread[:, 2, 2].max()))

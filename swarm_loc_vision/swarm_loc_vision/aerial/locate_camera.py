@@ -24,19 +24,15 @@ from swarm_loc_estimator.common.command_line import (
     number_in,
     parameters_of,
 )
-from swarm_loc_estimator.common.parameters import UserError, number_specs
+from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.common.yaml_tree import tree_text
 from swarm_loc_estimator.swarm.swarm import FixedCamera
 from swarm_loc_vision.aerial.control_points import ControlPointError
-from swarm_loc_vision.aerial.fixed_camera import fixed_camera
+from swarm_loc_vision.aerial.fixed_camera import LocateError, fixed_camera
 from swarm_loc_vision.aerial.ground_control import located
 from swarm_loc_vision.aerial.ground_file import load_ground
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.common.images import Gray
-
-
-class LocateError(UserError):
-    """A camera that cannot be located; the message is one sentence."""
 
 
 @exit_with_message

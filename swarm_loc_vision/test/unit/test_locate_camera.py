@@ -115,6 +115,8 @@ def test_pictures_without_markers_are_one_sentence(
         ("", ["small.png"], "small.png has 8 x 6 pixels but the camera"),
         ("markers: {7: {x: 0.0, y: 0.0, size: 0.1}}\n", [], "pictures of them must be given."),
         ("", ["--set", "control=1"], "'control' is no parameter"),
+        ("", ["--height", "2"], "A camera 2 m above the floor does not see markers lying at 2 m."),
+        ("", ["--height", "3"], "A camera 2 m above the floor does not see markers lying at 3 m."),
     ],
 )
 def test_what_the_command_cannot_use_is_one_sentence(
@@ -124,6 +126,6 @@ def test_what_the_command_cannot_use_is_one_sentence(
     path.write_text(path.read_text(encoding="utf-8").replace("markers: {}\n", "") + added, encoding="utf-8")
     (tmp_path / "picture.txt").write_text("no picture", encoding="utf-8")
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((6, 8), np.uint8))
-    paths = [one if one.startswith("-") or "=" in one else str(tmp_path / one) for one in arguments]
+    paths = [str(tmp_path / one) if "." in one else one for one in arguments]
     assert main(["ceiling1", str(path), *paths]) != 0
     assert said in capsys.readouterr().err
