@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -16,12 +16,13 @@ from scipy.spatial.transform import Rotation
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.detections import encode_detections
-from swarm_loc_estimator.common.parameters import choice, flag, number
+from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number
 from swarm_loc_vision.common.calibrated_camera import Calibration, camera_of
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.common.images import ImageError
 from swarm_loc_vision.markers.camera_detector import detection_rows
 from swarm_loc_vision.markers.detector import Detections
+from swarm_loc_vision.markers.families import families
 from swarm_loc_vision.markers.parameters import MarkersInUse, known_markers
 from swarm_loc_vision.markers.pose import square
 from swarm_loc_vision.markers.pose_solver import PoseSettings, PoseSolver
@@ -34,7 +35,11 @@ _APRILTAG_NAMES = {
     "apriltag_36h11": "tag36h11",
     "apriltag_standard_41h12": "tagStandard41h12",
 }
-"""Names that AprilTag's detector has for our families; OpenCV has those that it reads upside down."""
+"""Families that AprilTag's detector finds, with the names that it gives them."""
+_UPSIDE_DOWN = ("apriltag_16h5", "apriltag_25h9", "apriltag_36h11")
+"""Families that OpenCV reads upside down."""
+_OPENCV = (*_UPSIDE_DOWN, *(name for name in families() if name.startswith("aruco_")))
+"""Families that OpenCV finds."""
 
 
 class ForeignMarker(NamedTuple):
@@ -43,30 +48,12 @@ class ForeignMarker(NamedTuple):
     Attributes:
         id: Its id.
         family: Name of its family in the message; "": the message does not say.
-        corners: (4, 2) clockwise from its own upper left [px]; of an image without distortion if
-            `ForeignKind.has_ideal_corners`.
+        corners: (4, 2) clockwise from its own upper left in an image without distortion [px].
     """
 
     id: int
     family: str
     corners: FloatArray
-
-
-@dataclass(frozen=True)
-class ForeignParameters(MarkersInUse):
-    """Parameters of `marker_bridge_node`."""
-
-    source: str = choice("apriltag", ("apriltag", "aruco_opencv"), "the other detector")
-    rectified: bool = flag(
-        True, "whether it sees rectified images, so that P of camera_info counts, not K and distortion"
-    )
-    corner_sigma_px: float = number(
-        0.3, "px", 0.001, 100.0, "standard deviation of each corner along u and v"
-    )
-    source_marker_length: float = number(
-        0.15, "m", 0.001, 10.0, "marker_size of aruco_opencv, in whose poses the true size is not known"
-    )
-    settings: PoseSettings = field(default_factory=PoseSettings, metadata={"numbers_of": PoseSettings})
 
 
 @dataclass(frozen=True)
@@ -76,27 +63,27 @@ class ForeignKind:
     Attributes:
         message_type: Such as apriltag_msgs/msg/AprilTagDetectionArray.
         topic: Its topic.
+        families: Families that the detector finds.
         markers: Reads a message.
-        has_ideal_corners: Whether corners are those of an image without distortion.
     """
 
     message_type: str
     topic: str
+    families: Sequence[str]
     markers: Callable[[Any, Camera, ForeignParameters], Iterator[ForeignMarker]]
-    has_ideal_corners: bool
 
 
-def _of_apriltag(message: Any, _camera: Camera, _parameters: ForeignParameters) -> Iterator[ForeignMarker]:
+def _of_apriltag(message: Any, camera: Camera, _parameters: ForeignParameters) -> Iterator[ForeignMarker]:
     """AprilTag's corners go counter-clockwise from the lower left."""
     for tag in message.detections:
-        corners = np.array([(corner.x, corner.y) for corner in tag.corners])
-        yield ForeignMarker(tag.id, tag.family, corners[::-1] - _APRILTAG_CENTRE_PX)
+        corners = np.array([(corner.x, corner.y) for corner in tag.corners])[::-1] - _APRILTAG_CENTRE_PX
+        yield ForeignMarker(tag.id, tag.family, camera.to_ideal(corners[None])[0])
 
 
 def _of_aruco(message: Any, camera: Camera, parameters: ForeignParameters) -> Iterator[ForeignMarker]:
     """Project the square of a marker at its pose; a marker behind the camera has corners that are NaN."""
     fx, fy, cx, cy = camera.intrinsics
-    turned = 2 if parameters.family in _APRILTAG_NAMES else 0
+    turned = 2 if parameters.family in _UPSIDE_DOWN else 0
     for marker in message.markers:
         place, turn = marker.pose.position, marker.pose.orientation
         quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
@@ -110,13 +97,40 @@ def _of_aruco(message: Any, camera: Camera, parameters: ForeignParameters) -> It
         yield ForeignMarker(marker.marker_id, "", np.roll(corners, turned, axis=0))
 
 
-KINDS: dict[str, ForeignKind] = {
+KINDS = {
     "apriltag": ForeignKind(
-        "apriltag_msgs/msg/AprilTagDetectionArray", "apriltag_detections", _of_apriltag, False
+        "apriltag_msgs/msg/AprilTagDetectionArray",
+        "apriltag_detections",
+        tuple(_APRILTAG_NAMES),
+        _of_apriltag,
     ),
-    "aruco_opencv": ForeignKind("aruco_opencv_msgs/msg/ArucoDetection", "aruco_detections", _of_aruco, True),
+    "aruco_opencv": ForeignKind(
+        "aruco_opencv_msgs/msg/ArucoDetection", "aruco_detections", _OPENCV, _of_aruco
+    ),
 }
 """Kinds of messages by the parameter `source`."""
+
+
+@dataclass(frozen=True)
+class ForeignParameters(MarkersInUse):
+    """Parameters of `marker_bridge_node`."""
+
+    family: str = choice(
+        "apriltag_36h11",
+        tuple(dict.fromkeys(name for kind in KINDS.values() for name in kind.families)),
+        "kind of marker; apriltag finds no aruco, aruco_opencv no apriltag_standard_41h12",
+    )
+    source: str = choice("apriltag", tuple(KINDS), "the other detector")
+    rectified: bool = flag(
+        True, "whether it sees rectified images, so that P of camera_info counts, not K and distortion"
+    )
+    corner_sigma_px: float = number(
+        0.3, "px", 0.001, 100.0, "standard deviation of each corner along u and v"
+    )
+    source_marker_length: float = number(
+        0.15, "m", 0.001, 10.0, "marker_size of aruco_opencv, in whose poses the true size is not known"
+    )
+    settings: PoseSettings = field(default_factory=PoseSettings, metadata={"numbers_of": PoseSettings})
 
 
 class ForeignMarkers(Calibration):
@@ -138,8 +152,13 @@ class ForeignMarkers(Calibration):
         super().__init__()
         self.markers = self.misfits = 0
         self._parameters = parameters
-        self._known = known_markers(parameters)
         self._kind = KINDS[parameters.source]
+        if parameters.family not in self._kind.families:
+            raise ParameterError(
+                f"parameter family = '{parameters.family}' must be one that {parameters.source} finds:"
+                f" {', '.join(self._kind.families)}."
+            )
+        self._known = known_markers(parameters)
         self._frame = ""
         self._solver: PoseSolver  # set with the calibration, without which messages are dropped
 
@@ -188,22 +207,19 @@ class ForeignMarkers(Calibration):
         return camera
 
     def _used(self, message: Any, camera: Camera) -> Iterator[ForeignMarker]:
-        """The markers that can be used; corners become those of an image without distortion."""
+        """The markers that can be used."""
         family, ids = self._known.family, self._known.ids
         for marker in self._kind.markers(message, camera, self._parameters):
-            corners = (
-                marker.corners if self._kind.has_ideal_corners else camera.to_ideal(marker.corners[None])[0]
-            )
             if marker.family not in ("", _APRILTAG_NAMES.get(family.name)):
                 self.drops["other_family"] += 1
             elif not 0 <= marker.id < len(family.words) or (ids is not None and marker.id not in ids):
                 self.drops["unknown_id"] += 1
-            elif not np.isfinite(corners).all():
+            elif not np.isfinite(marker.corners).all():
                 self.drops["not_finite"] += 1
-            elif _signed_area(corners) <= 0.0:
+            elif _signed_area(marker.corners) <= 0.0:
                 self.drops["corner_order"] += 1
             else:
-                yield marker._replace(corners=corners)
+                yield marker
 
     def _solved(self, camera: Camera, markers: list[ForeignMarker]) -> Detections:
         """The markers with poses."""

@@ -16,7 +16,7 @@ from sensor_msgs.msg import CameraInfo
 
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
 from swarm_loc_estimator.common import node
-from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.common.parameters import ParameterError, UserError
 from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.foreign_markers import KINDS, ForeignMarker
@@ -101,3 +101,8 @@ def test_markers_become_detections(ros: Ros, monkeypatch: pytest.MonkeyPatch) ->
 def test_a_detector_whose_messages_are_missing_ends_the_start(ros: Ros, source: str, package: str) -> None:
     with pytest.raises(UserError, match=f"install ros-jazzy-{package}, or build"):
         ros.add(MarkerBridgeNode(parameter_overrides=overrides(source=source)))
+
+
+def test_a_family_that_no_source_finds_ends_the_start(ros: Ros) -> None:
+    with pytest.raises(ParameterError, match="family = 'artoolkit_bch_thin' must be one of apriltag_16h5, "):
+        ros.add(MarkerBridgeNode(parameter_overrides=overrides(family="artoolkit_bch_thin")))

@@ -17,6 +17,7 @@ from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
 from swarm_loc_estimator.common.messages.cdr import decode
 from swarm_loc_estimator.common.messages.definitions import DETECTIONS
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
+from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_vision.common.images import ImageError
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.foreign_markers import ForeignMarkers, ForeignParameters
@@ -204,6 +205,21 @@ def test_what_cannot_be_used_is_counted() -> None:
     nothing.markers[0].marker_id = 3
     assert len(rows_of(aruco.detect(nothing))) == 0
     assert +aruco.drops == {"not_finite": 1}
+
+
+@pytest.mark.parametrize(
+    ("source", "family", "last"),
+    [
+        ("apriltag", "aruco_mip_36h12", "apriltag_standard_41h12"),
+        ("apriltag", "artoolkit_bch_thin", "apriltag_standard_41h12"),
+        ("aruco_opencv", "apriltag_standard_41h12", "aruco_7x7_1000"),
+        ("aruco_opencv", "apriltag_36h11_thick", "aruco_7x7_1000"),
+    ],
+)
+def test_a_family_that_the_source_does_not_find_is_one_sentence(source: str, family: str, last: str) -> None:
+    said = rf"parameter family = '{family}' must be one that {source} finds: apriltag_16h5, .*, {last}\."
+    with pytest.raises(ParameterError, match=said):
+        ForeignMarkers(ForeignParameters(source=source, family=family))
 
 
 def test_messages_need_a_calibration_of_their_frame() -> None:
