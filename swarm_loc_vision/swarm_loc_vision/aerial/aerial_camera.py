@@ -67,12 +67,8 @@ class AerialCamera(CalibratedCamera):
         self.control = GroundControl(self._ground, camera, self._settings)
         self._detector = None
 
-    def detect(self, message: Any) -> bytes:
-        """The serialized swarm_loc_msgs/AnonymousDetectionArray of an image, in map.
-
-        Raises:
-            ImageError: The image was dropped and counted.
-        """
+    def found(self, message: Any) -> bytes:
+        """The serialized swarm_loc_msgs/AnonymousDetectionArray of an image, in map."""
         detections = self._seen(self.gray(message))
         self.drops.update(detections.dropped)
         self.used += 1
@@ -84,13 +80,11 @@ class AerialCamera(CalibratedCamera):
         """The robots in an image."""
         ground = self.control.look(gray) if self.control else None
         if ground is None:
-            self.drops["no_control_points"] += 1
             raise ImageError("no_control_points", self.why_nothing)
         try:
             detections = self._detector_for(ground).detect(gray)
         except RectificationError as error:
             self._seeing_trouble = str(error)
-            self.drops["not_visible"] += 1
             raise ImageError("not_visible", str(error)) from error
         self._seeing_trouble = ""
         return detections

@@ -39,10 +39,6 @@ class AerialCameraNode(CameraNode[AerialParameters]):
         self.watch(self._camera, params.image_transport, publisher)
         self.trouble()
 
-    def detect(self, message: Any) -> bytes:
-        """The serialized detections of an image; see `AerialCamera.detect`."""
-        return self._camera.detect(message)
-
     def figures(self) -> dict[str, str]:
         """Robots per image, and the camera's pose."""
         camera = self._camera

@@ -59,6 +59,27 @@ class Calibration:
         """Adapt to a calibration that differs from the previous one."""
         raise NotImplementedError
 
+    def detect(self, message: Any) -> bytes:
+        """The serialized detections of an image, or of what was found in it; both are counted.
+
+        Raises:
+            ImageError: The message was dropped and counted.
+        """
+        self.images += 1
+        try:
+            return self.found(message)
+        except ImageError as error:
+            self.drops[error.reason] += 1
+            raise
+
+    def found(self, message: Any) -> bytes:
+        """The serialized detections of a message.
+
+        Raises:
+            ImageError: The message cannot be used.
+        """
+        raise NotImplementedError
+
     def known_camera(self) -> Camera:
         """The calibration.
 
@@ -85,16 +106,8 @@ class CalibratedCamera(Calibration):
         """The brightness (height, width) of an image of this camera.
 
         Raises:
-            ImageError: The image was dropped and counted.
+            ImageError: There is no calibration, or the image cannot be read or does not fit it.
         """
-        self.images += 1
-        try:
-            return self._of_this_camera(message)
-        except ImageError as error:
-            self.drops[error.reason] += 1
-            raise
-
-    def _of_this_camera(self, message: Any) -> Gray:
         camera = self.known_camera()
         gray = self._gray_of(message)
         size, calibrated = gray.shape[::-1], (camera.width, camera.height)

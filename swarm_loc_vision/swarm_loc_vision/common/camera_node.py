@@ -24,7 +24,7 @@ _THROTTLE_S = 30.0
 
 
 class CameraNode(ConfiguredNode[Parameters]):
-    """Receives the images of one camera and publishes detections; subclasses detect."""
+    """Receives the images of one camera and publishes what is found in them; subclasses report on it."""
 
     def __init__(self, name: str, parameters: type[Parameters], **node_arguments: Any) -> None:
         super().__init__(name, parameters, **node_arguments)
@@ -50,7 +50,7 @@ class CameraNode(ConfiguredNode[Parameters]):
 
         Args:
             camera: The calibration.
-            message_class: Class of the messages that `detect` gets.
+            message_class: Class of the messages that `Calibration.detect` gets.
             topic: Their topic, with its namespace.
             detections: Publisher of what is found.
             qos: Of the subscription.
@@ -70,14 +70,6 @@ class CameraNode(ConfiguredNode[Parameters]):
         )
         self.start_diagnostics(self._on_diagnostics)
 
-    def detect(self, message: Any) -> bytes:
-        """The serialized detections of an image.
-
-        Raises:
-            ImageError: The image was dropped and counted.
-        """
-        raise NotImplementedError
-
     def figures(self) -> dict[str, str]:
         """Values for the diagnostics beside images, cost and drops."""
         raise NotImplementedError
@@ -95,7 +87,7 @@ class CameraNode(ConfiguredNode[Parameters]):
     def _on_message(self, message: Any) -> None:
         begin_s = time.process_time()
         try:
-            self._detections.publish(self.detect(message))
+            self._detections.publish(self._source.detect(message))
         except ImageError as error:
             self.health.drop(error.reason, str(error))
         finally:

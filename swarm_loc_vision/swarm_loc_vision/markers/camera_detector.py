@@ -46,12 +46,8 @@ class CameraDetector(CalibratedCamera):
         """Create the detector for another calibration."""
         self._detector = self._create(camera)
 
-    def detect(self, message: Any) -> bytes:
-        """The serialized swarm_loc_msgs/MarkerDetectionArray of an image.
-
-        Raises:
-            ImageError: The image was dropped and counted.
-        """
+    def found(self, message: Any) -> bytes:
+        """The serialized swarm_loc_msgs/MarkerDetectionArray of an image."""
         gray = self.gray(message)
         detections = self._detector.detect(gray)
         rows = detection_rows(detections, self._ambiguity)

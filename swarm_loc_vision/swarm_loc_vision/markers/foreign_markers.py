@@ -180,18 +180,9 @@ class ForeignMarkers(Calibration):
         _, _, lengths, up, lying, bodies = self._known
         self._solver = PoseSolver(self._parameters.settings, camera, lengths, up, lying, bodies)
 
-    def detect(self, message: Any) -> bytes:
-        """The serialized swarm_loc_msgs/MarkerDetectionArray of the markers in an image.
-
-        Raises:
-            ImageError: The message was dropped and counted.
-        """
-        self.images += 1
-        try:
-            camera = self._camera_of(message)
-        except ImageError as error:
-            self.drops[error.reason] += 1
-            raise
+    def found(self, message: Any) -> bytes:
+        """The serialized swarm_loc_msgs/MarkerDetectionArray of the markers in an image."""
+        camera = self._camera_of(message)
         detections = self._solved(camera, list(self._used(message, camera)))
         rows = detection_rows(detections, self._parameters.settings.ambiguity)
         self.drops["no_pose"] += len(detections) - len(rows)

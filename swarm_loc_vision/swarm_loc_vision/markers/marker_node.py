@@ -17,9 +17,6 @@ class MarkerSource(Protocol):
     markers: int
     misfits: int
 
-    def detect(self, message: Any) -> bytes:
-        """The serialized swarm_loc_msgs/MarkerDetectionArray of a message."""
-
 
 class MarkerNode(CameraNode[Parameters]):
     """Publishes the markers of a camera; subclasses set `camera`."""
@@ -29,10 +26,6 @@ class MarkerNode(CameraNode[Parameters]):
     def __init__(self, name: str, parameters: type[Parameters], **node_arguments: Any) -> None:
         super().__init__(name, parameters, **node_arguments)
         self._told = (0, 0)  # markers and misfits
-
-    def detect(self, message: Any) -> bytes:
-        """The serialized detections of a message."""
-        return self.camera.detect(message)
 
     def figures(self) -> dict[str, str]:
         """Numbers of markers."""

@@ -42,11 +42,17 @@ class Seen(CalibratedCamera):
         """Create the detector."""
         self._detector = MarkerDetector(DetectorSettings(), {family_named(FAMILY): None}, camera)
 
-    def detect(self, pixels: Gray) -> Detections:
-        """The markers of an image message with these pixels."""
-        height, width = pixels.shape
-        fields = {"encoding": "mono8", "height": height, "width": width, "step": width, "is_bigendian": 0}
-        return self._detector.detect(self.gray(SimpleNamespace(**fields, data=pixels.tobytes())))
+    def found(self, message: Any) -> bytes:
+        """Keep the markers of an image message."""
+        self.detections = self._detector.detect(self.gray(message))
+        return b""
+
+
+def image_message(pixels: Gray) -> SimpleNamespace:
+    """A sensor_msgs/Image."""
+    height, width = pixels.shape
+    fields = {"encoding": "mono8", "height": height, "width": width, "step": width, "is_bigendian": 0}
+    return SimpleNamespace(**fields, data=pixels.tobytes())
 
 
 def shown(roi: tuple[int, int, int, int], binning: tuple[int, int]) -> Gray:
@@ -61,7 +67,8 @@ def shown(roi: tuple[int, int, int, int], binning: tuple[int, int]) -> Gray:
 def detections(roi: tuple[int, int, int, int], binning: tuple[int, int]) -> Detections:
     camera = Seen(gray_image)
     camera.calibrate(camera_info(roi, binning))
-    return camera.detect(shown(roi, binning))
+    camera.detect(image_message(shown(roi, binning)))
+    return camera.detections
 
 
 WHOLE = (0, 0, 0, 0)
@@ -125,6 +132,6 @@ def test_images_of_another_size_than_the_region_are_dropped() -> None:
     with pytest.raises(
         ImageError, match="the image has 1280 x 960 pixels, but must have 475 x 400"
     ) as caught:
-        camera.detect(IMAGE)
+        camera.detect(image_message(IMAGE))
     assert caught.value.reason == "size"
-    assert camera.drops["size"] == 1
+    assert (camera.images, camera.drops) == (1, {"size": 1})
