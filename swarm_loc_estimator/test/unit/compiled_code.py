@@ -14,8 +14,9 @@ from numba.core.dispatcher import Dispatcher
 
 def printed_by_process(script: str, *arguments: str) -> list[str]:
     """The names that a script prints, run by itself: in this process other tests have compiled already."""
-    root = str(Path(__file__).parents[3])  # for `bench`, as in this process
-    path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    own = Path(__file__)
+    places = [str(own.parents[3]), str(own.parent)]  # for `bench` and this file, as in this process
+    path = os.pathsep.join([*places, *filter(None, [os.environ.get("PYTHONPATH")])])
     env = {**os.environ, "PYTHONPATH": path}
     command = [sys.executable, script, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)

@@ -12,8 +12,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rclpy.qos import QoSProfile
-
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import AnonymousDetectionArray
 from swarm_loc_vision.aerial.aerial_camera import AerialCamera
@@ -35,8 +33,7 @@ class AerialCameraNode(CameraNode[AerialParameters]):
         gray_of = TRANSPORTS[params.image_transport].gray_of
         self._camera = AerialCamera(params.settings, params.polarity, ground, gray_of)
         self._said = ""
-        publisher = self.create_publisher(AnonymousDetectionArray, "detections", QoSProfile(depth=10))
-        self.watch(self._camera, params.image_transport, publisher)
+        self.start(self._camera, self.images(params.image_transport), AnonymousDetectionArray)
         self.trouble()
 
     def figures(self) -> dict[str, str]:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from typing import Any, NamedTuple
 
-from rclpy.publisher import Publisher
 from rclpy.qos import QoSPolicyKind, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
 from swarm_loc_estimator.common.node import ConfiguredNode, Parameters
-from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, Calibration
+from swarm_loc_vision.common.calibrated_camera import Calibration
 from swarm_loc_vision.common.camera import CameraError
 from swarm_loc_vision.common.images import TRANSPORTS, ImageError
 
@@ -23,6 +22,20 @@ _MESSAGES = {"sensor_msgs/msg/Image": Image, "sensor_msgs/msg/CompressedImage": 
 _THROTTLE_S = 30.0
 
 
+class Input(NamedTuple):
+    """A topic with a camera's images, or with what was found in them.
+
+    Attributes:
+        message_class: Class of its messages.
+        topic: Its name, with its namespace.
+        qos: Of the subscription.
+    """
+
+    message_class: type
+    topic: str
+    qos: QoSProfile
+
+
 class CameraNode(ConfiguredNode[Parameters]):
     """Receives the images of one camera and publishes what is found in them; subclasses report on it."""
 
@@ -30,33 +43,23 @@ class CameraNode(ConfiguredNode[Parameters]):
         super().__init__(name, parameters, **node_arguments)
         self._cost_s = 0.0
 
-    def watch(self, camera: CalibratedCamera, transport_name: str, detections: Publisher) -> None:
-        """Subscribe to the camera's images and calibration.
-
-        Args:
-            camera: The camera.
-            transport_name: One of `TRANSPORTS`.
-            detections: Publisher of what is found.
-        """
+    def images(self, transport_name: str) -> Input:
+        """The camera's images by one of `TRANSPORTS`."""
         transport = TRANSPORTS[transport_name]
         # as image_transport does: a remapping of image_raw applies to all of its transports
         topic = self.resolve_topic_name("image_raw") + transport.suffix
-        self.take(camera, _MESSAGES[transport.message_type], topic, detections, IMAGE_QOS)
+        return Input(_MESSAGES[transport.message_type], topic, IMAGE_QOS)
 
-    def take(
-        self, camera: Calibration, message_class: type, topic: str, detections: Publisher, qos: QoSProfile
-    ) -> None:
-        """Subscribe to a topic about the camera's images and to its calibration.
+    def start(self, camera: Calibration, source: Input, detections: type) -> None:
+        """Publish what is found in messages, and diagnostics.
 
         Args:
-            camera: The calibration.
-            message_class: Class of the messages that `Calibration.detect` gets.
-            topic: Their topic, with its namespace.
-            detections: Publisher of what is found.
-            qos: Of the subscription.
+            camera: Finds it.
+            source: Its messages.
+            detections: Class of the messages published.
         """
-        self._source, self._detections = camera, detections
-        self._topic = topic
+        self._source, self._topic = camera, source.topic
+        self._detections = self.create_publisher(detections, "detections", QoSProfile(depth=10))
         overriding = QoSOverridingOptions([QoSPolicyKind.RELIABILITY])
         self.create_subscription(
             CameraInfo,
@@ -66,7 +69,7 @@ class CameraNode(ConfiguredNode[Parameters]):
             qos_overriding_options=overriding,
         )
         self.create_subscription(
-            message_class, self._topic, self._on_message, qos, qos_overriding_options=overriding
+            source.message_class, self._topic, self._on_message, source.qos, qos_overriding_options=overriding
         )
         self.start_diagnostics(self._on_diagnostics)
 

@@ -11,10 +11,10 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from rclpy.qos import QoSProfile, qos_profile_sensor_data
+from rclpy.qos import qos_profile_sensor_data
 
 from swarm_loc_estimator.common.node import message_class, run_node
-from swarm_loc_msgs.msg import MarkerDetectionArray
+from swarm_loc_vision.common.camera_node import Input
 from swarm_loc_vision.markers.foreign_markers import KINDS, ForeignMarkers, ForeignParameters
 from swarm_loc_vision.markers.marker_node import MarkerNode
 
@@ -24,12 +24,9 @@ class MarkerBridgeNode(MarkerNode[ForeignParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("marker_bridge", ForeignParameters, **node_arguments)
-        self.camera = ForeignMarkers(self.params)
-        kind = KINDS[self.params.source]
-        publisher = self.create_publisher(MarkerDetectionArray, "detections", QoSProfile(depth=10))
+        camera, kind = ForeignMarkers(self.params), KINDS[self.params.source]
         topic = self.resolve_topic_name(kind.topic)
-        self.take(self.camera, message_class(kind.message_type), topic, publisher, qos_profile_sensor_data)
-        self.get_logger().info(f"ready: markers of family {self.params.family}")
+        self.publish_markers(camera, Input(message_class(kind.message_type), topic, qos_profile_sensor_data))
 
 
 main = partial(run_node, "marker_bridge_node", MarkerBridgeNode)

@@ -11,14 +11,9 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from rclpy.qos import QoSProfile
-
-from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.node import run_node
-from swarm_loc_msgs.msg import MarkerDetectionArray
 from swarm_loc_vision.common.images import TRANSPORTS
 from swarm_loc_vision.markers.camera_detector import CameraDetector
-from swarm_loc_vision.markers.detector import precompile
 from swarm_loc_vision.markers.marker_node import MarkerNode
 from swarm_loc_vision.markers.parameters import DetectorParameters, detector_maker
 
@@ -29,15 +24,9 @@ class MarkerDetectorNode(MarkerNode[DetectorParameters]):
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("marker_detector", DetectorParameters, **node_arguments)
         parameters = self.params
-        create_detector = detector_maker(parameters)
-        if not is_precompiled(precompile):
-            self.get_logger().info("compiling the detector for this machine: about half a minute")
-        precompile()
         gray_of = TRANSPORTS[parameters.image_transport].gray_of
-        self.camera = CameraDetector(create_detector, gray_of, parameters.settings.ambiguity)
-        publisher = self.create_publisher(MarkerDetectionArray, "detections", QoSProfile(depth=10))
-        self.watch(self.camera, parameters.image_transport, publisher)
-        self.get_logger().info(f"ready: markers of family {parameters.family}")
+        camera = CameraDetector(detector_maker(parameters), gray_of, parameters.settings.ambiguity)
+        self.publish_markers(camera, self.images(parameters.image_transport))
 
 
 main = partial(run_node, "marker_detector_node", MarkerDetectorNode)

@@ -2,42 +2,54 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any, TypeVar
 
-from swarm_loc_estimator.common.node import Parameters
-from swarm_loc_vision.common.camera_node import CameraNode
+from swarm_loc_estimator.common.jit import is_precompiled
+from swarm_loc_msgs.msg import MarkerDetectionArray
+from swarm_loc_vision.common.camera_node import CameraNode, Input
+from swarm_loc_vision.markers.camera_detector import CameraDetector
+from swarm_loc_vision.markers.detector import precompile
+from swarm_loc_vision.markers.foreign_markers import ForeignMarkers
+from swarm_loc_vision.markers.parameters import MarkersInUse
+
+Markers = TypeVar("Markers", bound=MarkersInUse)
 
 _MAX_MISFIT_SHARE = 0.1
 """Largest share of misfits since the last diagnostics; above it the calibration may be wrong."""
 
 
-class MarkerSource(Protocol):
-    """Finds markers; see `CameraDetector` and `ForeignMarkers`."""
+class MarkerNode(CameraNode[Markers]):
+    """Publishes the markers of a camera."""
 
-    markers: int
-    misfits: int
-
-
-class MarkerNode(CameraNode[Parameters]):
-    """Publishes the markers of a camera; subclasses set `camera`."""
-
-    camera: MarkerSource
-
-    def __init__(self, name: str, parameters: type[Parameters], **node_arguments: Any) -> None:
+    def __init__(self, name: str, parameters: type[Markers], **node_arguments: Any) -> None:
         super().__init__(name, parameters, **node_arguments)
         self._told = (0, 0)  # markers and misfits
+
+    def publish_markers(self, camera: CameraDetector | ForeignMarkers, source: Input) -> None:
+        """Publish the markers in messages, once all is compiled.
+
+        Args:
+            camera: Finds them.
+            source: Its messages.
+        """
+        self._camera = camera
+        if not is_precompiled(precompile):
+            self.get_logger().info("compiling for this machine: about half a minute")
+        precompile()
+        self.start(camera, source, MarkerDetectionArray)
+        self.get_logger().info(f"ready: markers of family {self.params.family}")
 
     def figures(self) -> dict[str, str]:
         """Numbers of markers."""
         return {
-            "markers": str(self.camera.markers),
-            "markers that fit no square": str(self.camera.misfits),
+            "markers": str(self._camera.markers),
+            "markers that fit no square": str(self._camera.misfits),
         }
 
     def trouble(self) -> str:
         """A warning if many markers since the last call do not fit a square."""
-        markers, misfits = self.camera.markers - self._told[0], self.camera.misfits - self._told[1]
-        self._told = self.camera.markers, self.camera.misfits
+        markers, misfits = self._camera.markers - self._told[0], self._camera.misfits - self._told[1]
+        self._told = self._camera.markers, self._camera.misfits
         if misfits <= _MAX_MISFIT_SHARE * markers:
             return ""
         return f"{misfits} of {markers} markers fit no square: is camera_info that of this camera?"

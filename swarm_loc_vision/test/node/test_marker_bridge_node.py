@@ -18,6 +18,7 @@ from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
 from swarm_loc_estimator.common import node
 from swarm_loc_estimator.common.parameters import ParameterError, UserError
 from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
+from swarm_loc_vision.markers import marker_node
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.foreign_markers import KINDS, ForeignMarker
 from swarm_loc_vision.markers.marker_bridge_node import MarkerBridgeNode
@@ -30,6 +31,12 @@ TRUTH = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())[
 def _markers(message: Any, *_: object) -> Iterator[ForeignMarker]:
     for one in message.detections:
         yield ForeignMarker(one.id, "tag36h11", np.reshape(one.corners_px, (4, 2)))
+
+
+STAND_IN = replace(
+    KINDS["apriltag"], message_type="swarm_loc_msgs/msg/MarkerDetectionArray", markers=_markers
+)
+"""Of a type that is installed everywhere; test_foreign_markers.py reads those of the other detectors."""
 
 
 @pytest.fixture(autouse=True)
@@ -51,11 +58,7 @@ def publish_until(ros: Ros, publisher: Any, message: Any, condition: Any) -> Non
 
 
 def test_markers_become_detections(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
-    # a type that is installed everywhere; test_foreign_markers.py reads those of the other detectors
-    stand_in = replace(
-        KINDS["apriltag"], message_type="swarm_loc_msgs/msg/MarkerDetectionArray", markers=_markers
-    )
-    monkeypatch.setitem(KINDS, "apriltag", stand_in)
+    monkeypatch.setitem(KINDS, "apriltag", STAND_IN)
     parameters = overrides(family=FAMILY, rectified=False, marker_length=TRUTH.length)
     ros.add(MarkerBridgeNode(parameter_overrides=parameters))
     reports: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
@@ -92,6 +95,14 @@ def test_markers_become_detections(ros: Ros, monkeypatch: pytest.MonkeyPatch) ->
     assert (place.x, place.y, place.z) == pytest.approx(tuple(TRUTH.position), abs=1e-3)
     assert np.linalg.eigvalsh(np.reshape(row.pose.covariance, (6, 6)))[0] > 0.0
     ros.until(lambda: said() == "detecting")
+
+
+def test_all_is_compiled_before_markers_come(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(KINDS, "apriltag", STAND_IN)
+    compiled: list[bool] = []
+    monkeypatch.setattr(marker_node, "precompile", lambda: compiled.append(True))
+    ros.add(MarkerBridgeNode())
+    assert compiled
 
 
 @pytest.mark.parametrize(

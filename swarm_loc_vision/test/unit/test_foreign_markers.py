@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -9,6 +11,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from compiled_code import compiled_since, printed_by_process, signatures
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -19,9 +22,11 @@ from swarm_loc_estimator.common.messages.definitions import DETECTIONS
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_vision.common.images import ImageError
+from swarm_loc_vision.markers.detector import precompile
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.foreign_markers import ForeignMarkers, ForeignParameters
 from swarm_loc_vision.markers.pose import square
+from swarm_loc_vision.markers.pose_solver import PoseSettings
 
 PAGE = Path(__file__).parents[2] / "doc" / "marker_bridge_node.md"
 TAG = "apriltag_36h11"
@@ -233,5 +238,26 @@ def test_messages_need_a_calibration_of_their_frame() -> None:
     assert len(rows_of(markers.detect(tags()))) == 0
 
 
+def test_nothing_is_compiled_once_markers_come() -> None:
+    assert printed_by_process(__file__) == []
+
+
+def compiled_late() -> list[str]:
+    """What is compiled for markers though all is warm; in a process of its own."""
+    precompile()
+    _, truths, lengths = scene()
+    before = signatures()
+    bridge(camera_info(DISTORTION), lengths=lengths).detect(tags(*map(by_apriltag, truths)))
+    bridge(lengths=lengths, settings=PoseSettings(tilt_sigma=0.1)).detect(tags(*map(by_apriltag, truths)))
+    aruco = bridge(camera_info(DISTORTION), source="aruco_opencv", lengths=lengths)
+    found = [by_aruco(truth, LENGTH, 2) for truth in truths]
+    aruco.detect(SimpleNamespace(header=header(), markers=found, boards=[]))
+    return compiled_since(before)
+
+
 def test_the_page_says_what_the_table_says() -> None:
     assert markdown_table(ForeignParameters) in PAGE.read_text(encoding="utf-8")
+
+
+if __name__ == "__main__":
+    json.dump(compiled_late(), sys.stdout)
