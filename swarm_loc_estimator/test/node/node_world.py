@@ -166,6 +166,17 @@ class Ros:
             assert time.monotonic() < end_s, "waited in vain"
             self.executor.spin_once(timeout_sec=0.02)
 
+    def publish_until(self, publisher: Publisher, message: Any, condition: Callable[[], object]) -> None:
+        """Publish until something is so: what is sent by best effort may get lost."""
+
+        def happened() -> bool:
+            if not condition():
+                publisher.publish(message)
+                return False
+            return True
+
+        self.until(happened)
+
     def close(self) -> None:
         """End all nodes, once the executor has let go of them: it crashes with the events of what is gone."""
         for node in self.nodes:

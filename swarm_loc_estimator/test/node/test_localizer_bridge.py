@@ -55,18 +55,6 @@ def header_of(message: Any, frame: str = "world") -> Any:
     return message
 
 
-def publish_until(ros: Ros, publisher: Any, message: Any, condition: Any) -> None:
-    """Publish until something is so: what is sent by best effort may get lost."""
-
-    def happened() -> bool:
-        if not condition():
-            publisher.publish(message)
-            return False
-        return True
-
-    ros.until(happened)
-
-
 @pytest.mark.parametrize("qos", [qos_profile_sensor_data, RELIABLE])
 def test_a_topic_of_each_body_becomes_a_fix_of_its_robot(ros: Ros, swarm_file: Path, qos: QoSProfile) -> None:
     bridged = Bridged(ros, swarm_file, bodies=["cf1=alpha", "beta"], latency_s=0.5)
@@ -78,7 +66,7 @@ def test_a_topic_of_each_body_becomes_a_fix_of_its_robot(ros: Ros, swarm_file: P
         message.pose.position.x, message.pose.position.y = POSES[robot]
         message.pose.orientation.w = 1.0
         publisher = ros.tester.create_publisher(PoseStamped, f"/vrpn_mocap/{body}/pose", qos)
-        publish_until(ros, publisher, message, lambda fixes=fixes: fixes)
+        ros.publish_until(publisher, message, fixes.__len__)
         assert fixes[0].header.frame_id == "map"
         assert stamp_ns(fixes[0]) == T0_NS - 500_000_000
         assert (fixes[0].pose.pose.position.x, fixes[0].pose.pose.position.y) == POSES[robot]
@@ -98,7 +86,7 @@ def test_transforms_become_ground_truth(ros: Ros, swarm_file: Path) -> None:
         transforms.append(one)
     transforms.append(header_of(TransformStamped(child_frame_id="alpha/base_link"), "alpha/odom"))
     publisher = ros.tester.create_publisher(TFMessage, "/tf", RELIABLE)
-    publish_until(ros, publisher, TFMessage(transforms=transforms), lambda: all(truths.values()))
+    ros.publish_until(publisher, TFMessage(transforms=transforms), lambda: all(truths.values()))
     assert truths["alpha"][0].pose.position.x == POSES["alpha"][0]
     assert truths["beta"][0].pose.position.x == POSES["beta"][0] - 0.5
     bridged.says("bridging")
@@ -112,15 +100,15 @@ def test_odometry_keeps_its_covariance_and_its_frame_is_checked(ros: Ros, swarm_
     message.pose.pose.orientation.w = 1.0
     message.pose.covariance = np.diag([0.01, 0.02, 0.0, 0.0, 0.0, 0.03]).ravel()
     publisher = ros.tester.create_publisher(Odometry, "alpha/odometry", RELIABLE)
-    publish_until(ros, publisher, message, lambda: bridged.status().message.startswith("no pose can be used"))
+    ros.publish_until(publisher, message, lambda: bridged.status().message.startswith("no pose can be used"))
     assert "dropped: foreign_frame" in values_of(bridged.status())
     assert not fixes
     message.header.frame_id = "map"
-    publish_until(ros, publisher, message, lambda: fixes)
+    ros.publish_until(publisher, message, lambda: fixes)
     assert fixes[0].pose.covariance[[0, 7, 35]] == pytest.approx([0.01, 0.02, 0.03])
     bridged.says("bridging")
     message.header.frame_id = "odom"  # the source changes its frame, after good poses
-    publish_until(ros, publisher, message, lambda: bridged.status().message.startswith("no pose can be used"))
+    ros.publish_until(publisher, message, lambda: bridged.status().message.startswith("no pose can be used"))
 
 
 def test_bodies_that_nobody_describes_are_named(ros: Ros, swarm_file: Path) -> None:
@@ -137,7 +125,7 @@ def test_a_body_of_which_a_shared_topic_says_nothing_is_named(ros: Ros, swarm_fi
     one.transform.rotation.w = 1.0
     publisher = ros.tester.create_publisher(TFMessage, "/tf", RELIABLE)
     words = "no messages received on /tf about body 'beta'"
-    publish_until(ros, publisher, TFMessage(transforms=[one]), lambda: bridged.status().message == words)
+    ros.publish_until(publisher, TFMessage(transforms=[one]), lambda: bridged.status().message == words)
 
 
 @pytest.mark.parametrize(

@@ -45,18 +45,6 @@ def _frequent_diagnostics(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(node, "_DIAGNOSTICS_PERIOD_S", 0.05)
 
 
-def publish_until(ros: Ros, publisher: Any, message: Any, condition: Any) -> None:
-    """Publish until something is so: what is sent by best effort may get lost."""
-
-    def happened() -> bool:
-        if not condition():
-            publisher.publish(message)
-            return False
-        return True
-
-    ros.until(happened)
-
-
 def test_markers_become_detections(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(KINDS, "apriltag", STAND_IN)
     parameters = overrides(family=FAMILY, rectified=False, marker_length=TRUTH.length)
@@ -71,7 +59,7 @@ def test_markers_become_detections(ros: Ros, monkeypatch: pytest.MonkeyPatch) ->
     info = CameraInfo(height=HEIGHT, width=WIDTH, distortion_model="plumb_bob", d=[0.0] * 5, k=CAMERA.ravel())
     info.header.frame_id = FRAME
     publisher = ros.tester.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
-    publish_until(ros, publisher, info, lambda: said() == "no messages received on /apriltag_detections")
+    ros.publish_until(publisher, info, lambda: said() == "no messages received on /apriltag_detections")
 
     found = MarkerDetectionArray(
         detections=[MarkerDetection(id=TRUTH.marker_id, corners_px=TRUTH.corners.ravel())]
@@ -80,15 +68,14 @@ def test_markers_become_detections(ros: Ros, monkeypatch: pytest.MonkeyPatch) ->
     publisher = ros.tester.create_publisher(
         MarkerDetectionArray, "apriltag_detections", qos_profile_sensor_data
     )
-    publish_until(
-        ros,
+    ros.publish_until(
         publisher,
         found,
         lambda: "dropped: foreign_frame" in values_of(newest_status(reports, "marker_bridge")),
     )
     assert not detections
     found.header.frame_id = FRAME
-    publish_until(ros, publisher, found, lambda: detections)
+    ros.publish_until(publisher, found, lambda: detections)
     assert (detections[0].header.frame_id, detections[0].header.stamp.sec) == (FRAME, 7)
     (row,) = detections[0].detections
     place = row.pose.pose.position

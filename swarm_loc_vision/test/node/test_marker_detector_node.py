@@ -67,21 +67,16 @@ class Camera:
             if parameters.get("image_transport") == "compressed"
             else (Image, "image_raw")
         )
-        self._image = tester.create_publisher(kind, topic, qos)
+        self.images = tester.create_publisher(kind, topic, qos)
         self._info = tester.create_publisher(CameraInfo, "camera_info", qos)
         self.detections: list[MarkerDetectionArray] = ros.listen(MarkerDetectionArray, "detections")
         self._diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
-        ros.until(lambda: self._image.get_subscription_count() and self._info.get_subscription_count())
+        ros.until(lambda: self.images.get_subscription_count() and self._info.get_subscription_count())
         ros.until(lambda: tester.count_publishers("detections") and tester.count_publishers("/diagnostics"))
 
     def calibrate(self, message: CameraInfo, words: str) -> None:
         """Publish a calibration until the node tells of it in its diagnostics."""
-
-        def told() -> bool:
-            self._info.publish(message)
-            return words in self.status().message
-
-        self._ros.until(told)
+        self._ros.publish_until(self._info, message, lambda: words in self.status().message)
 
     def status(self) -> DiagnosticStatus:
         """The newest diagnostics."""
@@ -94,21 +89,14 @@ class Camera:
     def see(self, message: Image | CompressedImage) -> MarkerDetectionArray:
         """Publish an image until its detections come; large best-effort messages may get lost."""
         stamp = message.header.stamp.sec
-        self._publish_until(message, lambda: any(d.header.stamp.sec == stamp for d in self.detections))
+        self._ros.publish_until(
+            self.images, message, lambda: any(d.header.stamp.sec == stamp for d in self.detections)
+        )
         return next(d for d in self.detections if d.header.stamp.sec == stamp)
 
     def see_dropped(self, message: Image | CompressedImage, reason: str) -> None:
         """Publish an image until it is counted as dropped."""
-        self._publish_until(message, lambda: f"dropped: {reason}" in self.values())
-
-    def _publish_until(self, message: Image | CompressedImage, condition: Any) -> None:
-        def happened() -> bool:
-            if not condition():
-                self._image.publish(message)
-                return False
-            return True
-
-        self._ros.until(happened)
+        self._ros.publish_until(self.images, message, lambda: f"dropped: {reason}" in self.values())
 
 
 @pytest.fixture(autouse=True)
@@ -156,7 +144,7 @@ def test_a_camera_that_falls_silent_is_told_each_time(ros: Ros, monkeypatch: pyt
     camera = Camera(ros)
     camera.calibrate(camera_info(), "image_raw")
     for number in (1, 2):
-        camera._publish_until(image(number), lambda: camera.status().message == "detecting")
+        ros.publish_until(camera.images, image(number), lambda: camera.status().message == "detecting")
         ros.until(lambda: camera.status().message.startswith(silence))
         assert camera.status().level == DiagnosticStatus.WARN
         ros.until(lambda: any(f"{silence}" in log.msg for log in logged))
@@ -179,11 +167,13 @@ def test_markers_that_fit_no_square_are_told(ros: Ros) -> None:
     camera = Camera(ros)
     camera.calibrate(camera_info(d=[0.4, 0.0, 0.0, 0.0, 0.0]), "image_raw")
     told = "markers fit no square: is camera_info that of this camera?"
-    camera._publish_until(image(1), lambda: camera.status().message.endswith(told))
+    ros.publish_until(camera.images, image(1), lambda: camera.status().message.endswith(told))
     assert camera.status().level == DiagnosticStatus.WARN
     assert int(camera.values()["markers that fit no square"]) > 0
     camera.calibrate(camera_info(), "detecting")
-    camera._publish_until(image(2), lambda: any(d.header.stamp.sec == 2 for d in camera.detections))
+    ros.publish_until(
+        camera.images, image(2), lambda: any(d.header.stamp.sec == 2 for d in camera.detections)
+    )
     ros.until(lambda: camera.status().message == "detecting")
 
 
@@ -197,7 +187,7 @@ def test_bad_images_are_dropped_and_counted(ros: Ros) -> None:
     camera.see_dropped(wrong_encoding, "encoding")
     camera.see_dropped(small, "size")
     dropped = int(camera.values()["dropped: size"])
-    camera._publish_until(short, lambda: int(camera.values()["dropped: size"]) > dropped)
+    ros.publish_until(camera.images, short, lambda: int(camera.values()["dropped: size"]) > dropped)
     assert not camera.detections
     assert float(camera.values()["CPU time per image [ms]"]) > 0.0  # bad ones cost time as well
     assert camera.see(image(4)).detections  # and nothing else has stopped
