@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from swarm_loc_drivers.sim.render import scene as scenery
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.renderer import Renderer, RobotCamera, Scene
-from swarm_loc_drivers.sim.render.rigs import Arena, floor
+from swarm_loc_drivers.sim.render.rigs import Arena, lying
 from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import CameraMount, FixedCamera, Robot
@@ -39,21 +39,9 @@ class CeilingRig:
         seed: int,
     ) -> None:
         backdrop = scenery.arena(arena.size, np.random.default_rng(seed))
-        tops = [
-            [
-                scenery.lying_marker(
-                    (face.x, face.y, face.yaw or 0.0),
-                    face.z,
-                    arena.family.pattern(face.id) != 0,
-                    arena.family.whole_size(face.size),
-                )
-                for face in robot.faces
-            ]
-            for robot in robots
-        ]
-        bodies = [[scenery.body(), scenery.tower(), *own] for own in tops]
+        bodies = [[scenery.body(), scenery.tower(), *lying(robot.faces, arena.family)] for robot in robots]
         # a camera has a place of its own, without a body, after the floor's markers and the robots
-        scene = Scene(backdrop, [], [floor(markers, arena.family), *bodies, *([] for _ in cameras)], flat=1)
+        scene = Scene(backdrop, [], [lying(markers, arena.family), *bodies, *([] for _ in cameras)], flat=1)
         self._renderer = Renderer(scene, model)
         self._feet = np.array([[camera.x, camera.y, 0.0] for camera in cameras])
         self._cameras = [

@@ -172,13 +172,13 @@ def overhead_model(settings: OverheadSettings) -> OverheadModel:
     )
 
 
-def floor(markers: Sequence[FloorMarker], family: Family) -> list[Patches]:
-    """Fiducials on the floor."""
+def lying(marks: Sequence[FloorMarker | Face], family: Family) -> list[Patches]:
+    """Markers that lie flat, on the floor or on a robot; faces without a yaw have 0."""
     return [
         scenery.lying_marker(
-            (one.x, one.y, one.yaw), one.z, family.pattern(one.id) != 0, family.whole_size(one.size)
+            (one.x, one.y, one.yaw or 0.0), one.z, family.pattern(one.id) != 0, family.whole_size(one.size)
         )
-        for one in markers
+        for one in marks
     ]
 
 
@@ -197,14 +197,13 @@ class OverheadRig:
     ) -> None:
         model = overhead_model(settings)
         count = len(scene.robots)
-        lying = floor(markers, family)
         shadow = scenery.shadow(
             settings.aerial_shadow, settings.aerial_shadow_yaw, settings.aerial_shadow_slope
         )
         shadows: list[Sequence[Patches]] = [[shadow] if settings.aerial_shadow else [] for _ in range(count)]
         robots = [[*parts, scenery.top_pattern()] for parts in scene.robots]
         self._renderer = Renderer(
-            replace(scene, robots=[lying, *shadows, *robots, []], flat=1 + count), model
+            replace(scene, robots=[lying(markers, family), *shadows, *robots, []], flat=1 + count), model
         )
         # the mast stands still at the last place, has no body, and carries the camera as a robot does
         mount = CameraMount(
