@@ -156,7 +156,8 @@ def _read(
         before = np.uint64(0)
         light = _flatten(cells[n], places, flat, plane)
         for level in (_MIDDLE, _LOW):
-            contrast[n] = light if light > 0.0 and _clear_cells(flat, light, level, places, clear) else 0.0
+            border = _clear_cells(flat, light, level, places, clear) if light > 0.0 else 0.0
+            contrast[n] = light if border <= _MAX_DARK_ERRORS else 0.0
             if contrast[n] < rules.min_contrast:
                 continue
             seen = np.uint64(0)
@@ -170,7 +171,7 @@ def _read(
                 continue
             if np.abs(clear).mean() - 2.0 * distance / count < _MIN_CORRELATION:
                 continue
-            if rules.scarce and not _is_clear(flat, light, level, places, clear):
+            if rules.scarce and (border > _CLEAR or np.abs(clear).min() < _CLEAR):
                 continue
             if rules.framed and not _has_margin(cells[n], light, level, places, plane):
                 continue
@@ -226,15 +227,17 @@ def _flatten(cells: FloatArray, places: _Places, sharp: FloatArray, plane: Float
 
 
 @cached_njit
-def _clear_cells(flat: FloatArray, light: float, level: float, places: _Places, clear: FloatArray) -> bool:
-    """Map data to -1 (dark) ... 1 (light) in `clear`; returns whether the border is dark.
+def _clear_cells(flat: FloatArray, light: float, level: float, places: _Places, clear: FloatArray) -> float:
+    """Map data to -1 (dark) ... 1 (light) in `clear`; returns the light of the border's inner ring in cells.
 
     The share `level` of `light` maps to 0.
     """
-    wrong = _light_in_border(flat, light, level, places)
     for bit in range(len(places.data)):
         clear[bit] = _clearness(flat[places.data[bit, 0], places.data[bit, 1]], light, level)
-    return wrong <= _MAX_DARK_ERRORS
+    border = 0.0
+    for i in range(len(places.ring)):
+        border += max(_clearness(flat[places.ring[i, 0], places.ring[i, 1]], light, level), 0.0)
+    return border
 
 
 @cached_njit
@@ -242,12 +245,6 @@ def _clearness(value: float, light: float, level: float) -> float:
     """A brightness above dark on a scale from -1 (dark) to 1 (light)."""
     above = value / light - level
     return float(min(max(above / (level if above < 0.0 else min(1.0 - level, 2.0 * level)), -1.0), 1.0))
-
-
-@cached_njit
-def _is_clear(flat: FloatArray, light: float, level: float, places: _Places, clear: FloatArray) -> bool:
-    """Whether data are clearly dark or light, and the border is dark."""
-    return bool(np.abs(clear).min() >= _CLEAR and _light_in_border(flat, light, level, places) <= _CLEAR)
 
 
 @cached_njit
@@ -260,15 +257,6 @@ def _has_margin(cells: FloatArray, light: float, level: float, places: _Places, 
         if _clearness(cells[row, column] - dark, light, level) < 0.0:
             return False
     return True
-
-
-@cached_njit
-def _light_in_border(flat: FloatArray, light: float, level: float, places: _Places) -> float:
-    """Number of light cells in the border's inner ring, weighted."""
-    wrong = 0.0
-    for i in range(len(places.ring)):
-        wrong += max(_clearness(flat[places.ring[i, 0], places.ring[i, 1]], light, level), 0.0)
-    return wrong
 
 
 @cached_njit
