@@ -58,27 +58,25 @@ class Layout:
     @cached_property
     def data(self) -> IntArray:
         """(bits, 2) rows and columns of the data cells in the area, in the order of bits."""
-        inner = self._distance < 0.5 * self.cells
-        outer = self._distance > 0.5 * self.side + 1.0
-        return np.ascontiguousarray(np.argwhere(inner | outer if self.surrounded else inner))
+        distance = self._distance(self.area)
+        is_data = (distance < 0.5 * self.cells) | (distance > 0.5 * self.side + 1.0)
+        return np.ascontiguousarray(np.argwhere(is_data))
 
     @cached_property
     def ring(self) -> IntArray:
         """(k, 2) rows and columns of the border's inner ring in the area."""
-        is_ring = (self._distance > 0.5 * self.cells) & (self._distance < 0.5 * self.cells + 1.0)
-        return np.ascontiguousarray(np.argwhere(is_ring))
+        return np.ascontiguousarray(np.argwhere(self._distance(self.area) == 0.5 * (self.cells + 1)))
 
     @cached_property
     def margin(self) -> IntArray:
         """(k, 2) rows and columns in the grid of the ring around the border; outermost for a thick one."""
-        row, column = np.abs(np.mgrid[: self.grid, : self.grid] - 0.5 * (self.grid - 1))
         place = 0.5 * (self.side + 1) if self.surrounded else 0.5 * (self.grid - 1)
-        return np.ascontiguousarray(np.argwhere(np.maximum(row, column) == place))
+        return np.ascontiguousarray(np.argwhere(self._distance(self.grid) == place))
 
-    @property
-    def _distance(self) -> NDArray[np.float64]:
-        """(area, area) distance of cells from the middle, as that of squares."""
-        row, column = np.abs(np.mgrid[: self.area, : self.area] - 0.5 * (self.area - 1))
+    @staticmethod
+    def _distance(count: int) -> NDArray[np.float64]:
+        """(count, count) larger one of the distances along rows and columns of cells from the middle."""
+        row, column = np.abs(np.mgrid[:count, :count] - 0.5 * (count - 1))
         return np.asarray(np.maximum(row, column))
 
     @property
