@@ -7,6 +7,7 @@ import warnings
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.swarm.swarm import FixedCamera
@@ -64,11 +65,9 @@ def floor_sigmas(ground: GroundCamera, height: float) -> tuple[float, float]:
         along = beside - place
         return np.column_stack([place, np.arctan2(along[:, 1], along[:, 0])])
 
-    changes = [seen(step) - seen(-step) for step in _STEP * np.eye(POSE_SIZE)]
-    slopes = np.stack(changes, axis=-1) / (2.0 * _STEP)
-    slopes[:, 2] = np.stack([np.arctan2(np.sin(c[:, 2]), np.cos(c[:, 2])) for c in changes], axis=-1) / (
-        2.0 * _STEP
-    )
+    changes = np.stack([seen(step) - seen(-step) for step in _STEP * np.eye(POSE_SIZE)], axis=-1)
+    changes[:, 2] = se2.wrap_angle(changes[:, 2])
+    slopes = changes / (2.0 * _STEP)
     slopes = slopes[np.isfinite(slopes).all(axis=(1, 2))]
     if height >= ground.centre[2] or not len(slopes):
         raise LocateError(
