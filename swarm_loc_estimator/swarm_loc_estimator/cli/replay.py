@@ -28,8 +28,8 @@ from swarm_loc_estimator.common.command_line import (
     add_set,
     command_parser,
     exit_with_message,
+    file_to_write,
     folder_to_write,
-    mcap_to_write,
     number_in,
     parameters_of,
     swarm_beside,
@@ -114,7 +114,10 @@ def _parser() -> argparse.ArgumentParser:
         "--learned", type=yaml_to_write, metavar="FILE", help="where to write what was learned"
     )
     parser.add_argument(
-        "--mcap", type=mcap_to_write, metavar="FILE", help="where to write poses, /tf and markers for viewers"
+        "--mcap",
+        type=file_to_write(".mcap"),
+        metavar="FILE",
+        help="where to write poses, /tf and markers for viewers",
     )
     parser.add_argument(
         "--tick", type=number_in(*TICKS_S, "s"), default=TICK_S, help="seconds between outputs"

@@ -127,24 +127,22 @@ def folder_to_write(text: str) -> Path:
     return path
 
 
-def yaml_to_write(text: str) -> Path:
-    """A type for argparse: a YAML file that can be written, with a picture of the same name beside it."""
-    path = Path(text)
-    if path.suffix not in (".yaml", ".yml"):
-        raise argparse.ArgumentTypeError(f"'{text}' must end in .yaml")
-    if path.is_dir():
-        raise argparse.ArgumentTypeError(f"{path} cannot be written: it is a folder")
-    folder_to_write(str(path.parent))
-    return path
+def file_to_write(*suffixes: str) -> Callable[[str], Path]:
+    """A type for argparse: a file with one of these suffixes that can be written. Nothing is created yet."""
+
+    def read(text: str) -> Path:
+        path = Path(text)
+        if path.suffix not in suffixes:
+            raise argparse.ArgumentTypeError(f"'{text}' must end in {' or '.join(suffixes)}")
+        if path.is_dir():
+            raise argparse.ArgumentTypeError(f"{path} cannot be written: it is a folder")
+        folder_to_write(str(path.parent))
+        return path
+
+    return read
 
 
-def mcap_to_write(text: str) -> Path:
-    """A type for argparse: an MCAP file that can be written; its folder is created."""
-    path = Path(text)
-    if path.suffix != ".mcap":
-        raise argparse.ArgumentTypeError(f"'{text}' must end in .mcap")
-    folder_to_write(str(path.parent)).mkdir(parents=True, exist_ok=True)
-    return path
+yaml_to_write = file_to_write(".yaml", ".yml")
 
 
 def add_bag(parser: argparse.ArgumentParser, content: str = "") -> None:

@@ -43,6 +43,7 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
     Raises:
         BagError: It cannot be written.
     """
+    path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".mcap_") as folder:
         bag = Path(folder) / "run"
         with BagWriter(bag, compress=True) as writer:

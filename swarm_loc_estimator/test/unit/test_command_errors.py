@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from argparse import ArgumentTypeError
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from swarm_loc_estimator.cli import calibrate, calibrate_ir, replay, survey
-from swarm_loc_estimator.common.command_line import exit_with_message, folder_to_write
+from swarm_loc_estimator.common.command_line import exit_with_message, file_to_write, folder_to_write
 from swarm_loc_estimator.common.parameters import UserError
 
 
@@ -53,4 +54,20 @@ def test_a_bag_that_is_not_there_is_said(
 
 def test_folders_are_not_made_before_there_is_anything_to_write(tmp_path: Path) -> None:
     assert folder_to_write(str(tmp_path / "a" / "b")) == tmp_path / "a" / "b"
+    assert file_to_write(".mcap")(str(tmp_path / "a" / "b.mcap")) == tmp_path / "a" / "b.mcap"
     assert not (tmp_path / "a").exists()
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("run.bag", "must end in .yaml or .yml"),
+        ("folder.yaml", "cannot be written: it is a folder"),
+        ("file/run.yml", "cannot be written: .*file is no folder that is writable"),
+    ],
+)
+def test_a_file_that_cannot_be_written_is_said(name: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "folder.yaml").mkdir()
+    (tmp_path / "file").touch()
+    with pytest.raises(ArgumentTypeError, match=said):
+        file_to_write(".yaml", ".yml")(str(tmp_path / name))

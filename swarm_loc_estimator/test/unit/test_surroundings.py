@@ -139,8 +139,8 @@ def test_map_and_goals_of_a_bag_come_to_viewers_and_to_the_page(bag: Path, tmp_p
     result = replay(bag, SWARM, keep_sightings=True)
     assert [int(one.grid.cells[0, 0]) for one in result.maps] == [5, 15, 25, 35]
     assert "1 messages of maps or goals are malformed." in result.remarks
-    write_mcap(result, tmp_path / "run.mcap")
-    with BagReader(tmp_path / "run.mcap") as reader:
+    write_mcap(result, tmp_path / "new" / "run.mcap")
+    with BagReader(tmp_path / "new" / "run.mcap") as reader:
         found: dict[str, list[bytes]] = {}
         for topic, _, _, data in reader.messages(["map", "a/goal", "b/goal"]):
             found.setdefault(topic, []).append(bytes(data))

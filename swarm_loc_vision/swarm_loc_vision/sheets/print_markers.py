@@ -18,7 +18,7 @@ from pathlib import Path
 from swarm_loc_estimator.common.command_line import (
     command_parser,
     exit_with_message,
-    folder_to_write,
+    file_to_write,
     number_in,
 )
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -36,20 +36,23 @@ from swarm_loc_vision.sheets.pages import (
     stickers_of,
 )
 
-_SIZE = re.compile(r"([1-9]\d?)x([1-9]\d?)")
+_BOARD_SIDE_M = 0.05
+_GRID = re.compile(r"([1-9]\d?)x([1-9]\d?)")
 
 
 @exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
+    if not options.board and (options.size is not None or options.first_id is not None):
+        raise SheetError("--size and --first-id are those of a board: give --board, too.")
     family = family_named(options.family)
     swarm = load_swarm(options.swarm_file) if options.swarm_file else Swarm()
     pages = pages_of(stickers_of(swarm), family, options.paper)
     if options.board:
         first = max(swarm.owner_of, default=-1) + 1 if options.first_id is None else options.first_id
         columns, rows = options.board
-        board = board_page(first, columns, rows, 1e3 * options.size, family, options.paper)
+        board = board_page(first, columns, rows, 1e3 * (options.size or _BOARD_SIDE_M), family, options.paper)
         if taken := [piece.sticker.id for piece in board.pieces if piece.sticker.id in swarm.owner_of]:
             raise SheetError(
                 f"marker {taken[0]} of the board is in {options.swarm_file}, too: see --first-id."
@@ -77,7 +80,10 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser(__doc__)
     parser.add_argument("swarm_file", metavar="SWARM_FILE", type=Path, nargs="?", help="swarm description")
     parser.add_argument(
-        "--out", type=_pdf, default=Path("markers.pdf"), help="the PDF (default: markers.pdf)"
+        "--out",
+        type=file_to_write(".pdf"),
+        default=Path("markers.pdf"),
+        help="the PDF (default: markers.pdf)",
     )
     parser.add_argument(
         "--family", choices=list(families()), default="artoolkit_bch_thin", help="as of marker_detector_node"
@@ -85,12 +91,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--paper", choices=list(PAPERS), default="a4", help="size of the sheets (default: a4)"
     )
-    parser.add_argument("--board", type=_size, metavar="COLUMNSxROWS", help="add a grid of markers")
+    parser.add_argument("--board", type=_grid, metavar="COLUMNSxROWS", help="add a grid of markers")
     parser.add_argument(
         "--size",
         type=number_in(0.005, 1.0, "m"),
-        default=0.05,
-        help="side of those markers (default: 0.05 m)",
+        help=f"side of those markers (default: {_BOARD_SIDE_M} m)",
     )
     parser.add_argument(
         "--first-id",
@@ -100,18 +105,9 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _pdf(text: str) -> Path:
-    """A PDF file that can be written."""
-    path = Path(text)
-    if path.suffix != ".pdf":
-        raise argparse.ArgumentTypeError(f"'{text}' must end in .pdf")
-    folder_to_write(str(path.parent))
-    return path
-
-
-def _size(text: str) -> list[int]:
+def _grid(text: str) -> list[int]:
     """Columns and rows."""
-    match = _SIZE.fullmatch(text)
+    match = _GRID.fullmatch(text)
     if match is None:
         raise argparse.ArgumentTypeError(f"'{text}' must be columns and rows, such as 3x4")
     return [int(number) for number in match.groups()]

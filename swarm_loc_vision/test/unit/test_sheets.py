@@ -179,6 +179,8 @@ def test_the_command_writes_sheets_and_the_places_of_a_board(
         (["--board", "1x1", "--size", "0.3"], "a board of 1 x 1 markers of 300 mm does not fit on a4 paper."),
         (["large.yaml"], "marker 3 of 200 mm does not fit on a4 paper."),
         (["bare.yaml"], "There is nothing to print: bare.yaml has no markers."),
+        (["swarm.yaml", "--size", "0.1"], "--size and --first-id are those of a board: give --board, too."),
+        (["swarm.yaml", "--first-id", "0"], "--size and --first-id are those of a board: give --board, too."),
         ([], "There is nothing to print: name a description, or --board."),
         (
             ["--board", "2x2", "--first-id", "248", "--family", "aruco_mip_36h12"],
