@@ -12,7 +12,7 @@ import pytest
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.pushbot.parameters import PushbotParameters
 from swarm_loc_drivers.sim.run import SimulatedRun
-from swarm_loc_drivers.sim.scenarios import droplets, eight
+from swarm_loc_drivers.sim.scenarios import eight
 from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_drivers.sim.sightings import observe_markers
 from swarm_loc_drivers.sim.worlds import ErrorModel
@@ -20,7 +20,7 @@ from swarm_loc_estimator.cli.new import main, start_lines
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.new_swarm import SwarmPlan
-from swarm_loc_estimator.swarm.robot_types import ROBOT_TYPES
+from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 ROOT = Path(__file__).parents[3]
@@ -32,17 +32,18 @@ def test_numbers_are_those_of_drivers_and_simulations() -> None:
         "pushbot": PushbotParameters("/dev/ttyUSB0"),
     }
     for name, driver in drivers.items():
-        assert ROBOT_TYPES[name].odometry == OdometryModel(driver.wheel_separation, driver.wheel_noise), name
-    assert ROBOT_TYPES["droplet"].odometry == droplets.MOTION
+        assert KNOWN_ROBOTS[name].odometry == OdometryModel(driver.wheel_separation, driver.wheel_noise), name
     for name in ("epuck", "epuck2", "pipuck"):
-        assert ROBOT_TYPES[name].camera == eight.CAMERA
-        faces = [(face.name, face.x, face.y, face.z, face.yaw, face.size) for face in ROBOT_TYPES[name].faces]
+        assert KNOWN_ROBOTS[name].camera == eight.CAMERA
+        faces = [
+            (face.name, face.x, face.y, face.z, face.yaw, face.size) for face in KNOWN_ROBOTS[name].faces
+        ]
         assert faces == [(face.name, face.x, face.y, face.z, face.yaw, face.size) for face in eight.faces(10)]
 
 
-@pytest.mark.parametrize("name", ROBOT_TYPES)
+@pytest.mark.parametrize("name", KNOWN_ROBOTS)
 def test_printed_commands_exist_with_their_options_on_their_pages(name: str) -> None:
-    for sensor in ROBOT_TYPES[name].sensors:
+    for sensor in KNOWN_ROBOTS[name].sensors:
         for line in start_lines(SwarmPlan(name, 2, name, (sensor,)), "swarm.yaml"):
             command = line.partition("#")[0].split()
             if not command:
@@ -53,9 +54,8 @@ def test_printed_commands_exist_with_their_options_on_their_pages(name: str) -> 
             assert f"\n{executable} = " in config["options.entry_points"]["console_scripts"]
             page = {"graph": "commands", "localizer_bridge": "motion_capture"}.get(executable, executable)
             text = (ROOT / package / "doc" / f"{page}.md").read_text(encoding="utf-8")
-            assert re.findall(r"-p (\S+):=", line) == [
-                option for option in re.findall(r"-p (\S+):=", line) if f"| `{option}` |" in text
-            ]
+            parameters = re.findall(r"-p (\S+):=", line)
+            assert [name for name in parameters if f"| `{name}` |" not in text] == []
             options = [word for word in rest if word.startswith("--") and word != "--ros-args"]
             assert [option for option in options if f"`{option}" not in text] == []
 

@@ -21,7 +21,7 @@ from typing import TypeVar
 from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.swarm.new_swarm import FAMILY_IDS, SwarmPlan, planned_swarm
-from swarm_loc_estimator.swarm.robot_types import ROBOT_TYPES, SENSORS
+from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS, SENSORS
 from swarm_loc_estimator.swarm.schema import SCHEMA_FILE, schema_text
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import MAX_NAME, MAX_ROBOTS, NAME
@@ -29,7 +29,7 @@ from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 Answer = TypeVar("Answer")
 QUESTIONS = {
-    "type": f"type of the robots: {', '.join(ROBOT_TYPES)}",
+    "type": f"type of the robots: {', '.join(KNOWN_ROBOTS)}",
     "robots": "number of robots",
     "prefix": "names of the robots begin with",
     "sensors": "what locates them, with commas between",
@@ -92,8 +92,8 @@ class Dialog:
 
 def asked_plan(dialog: Dialog) -> SwarmPlan:
     """The plan of a swarm by the answers of a user."""
-    name = dialog.answer("type", "epuck", _one_of(ROBOT_TYPES))
-    known = ROBOT_TYPES[name]
+    name = dialog.answer("type", "epuck", _one_of(KNOWN_ROBOTS))
+    known = KNOWN_ROBOTS[name]
     usual = SwarmPlan(name, 5, "robot" if name == "own" else name, known.usual_sensors)
     robots = dialog.answer("robots", str(usual.robots), number_in(1, MAX_ROBOTS))
     first = f"{usual.prefix}_" if usual.prefix[-1].isdigit() else usual.prefix

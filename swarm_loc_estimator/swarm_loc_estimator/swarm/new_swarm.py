@@ -12,7 +12,7 @@ from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.error_models import FixModel, ImuModel, OdometryModel
 from swarm_loc_estimator.swarm.ir_board import RobotIr
-from swarm_loc_estimator.swarm.robot_types import ROBOT_TYPES, KnownRobot
+from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS, KnownRobot
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
 
 FAMILY_IDS = MappingProxyType(
@@ -43,7 +43,7 @@ class SwarmPlan:
     """What a new description is to hold; lengths are in m.
 
     Attributes:
-        type: Of `ROBOT_TYPES`.
+        type: Of `KNOWN_ROBOTS`.
         robots: How many.
         prefix: Names are this and a number from 1 on.
         sensors: Of the sensors of the type.
@@ -69,7 +69,7 @@ class SwarmPlan:
     @property
     def known(self) -> KnownRobot:
         """The type of its robots."""
-        return ROBOT_TYPES[self.type]
+        return KNOWN_ROBOTS[self.type]
 
 
 def planned_swarm(plan: SwarmPlan) -> Swarm:

@@ -21,7 +21,7 @@ from swarm_loc_estimator.cli import (
 )
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.swarm.error_models import FixModel, ImuModel, OdometryModel, RandomWalk, SensorModel
-from swarm_loc_estimator.swarm.robot_types import ROBOT_TYPES, SENSORS
+from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS, SENSORS
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Landmark, StartSigma
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
@@ -84,7 +84,7 @@ def test_every_option_of_a_command_has_its_place(command: object, capsys: pytest
 
 
 def test_types_and_sensors_of_new_descriptions_have_their_place() -> None:
-    assert [word for word in (*ROBOT_TYPES, *SENSORS) if f"`{word}`" not in NEW_SWARM] == []
+    assert [word for word in (*KNOWN_ROBOTS, *SENSORS) if f"`{word}`" not in NEW_SWARM] == []
     for word, said in SENSORS.items():
         row = next(line for line in NEW_SWARM.splitlines() if line.startswith(f"| `{word}` | "))
         assert re.sub(r"\[(.*?)\]\(.*?\)", r"\1", row).replace("`", "") == f"| {word} | {said} |"

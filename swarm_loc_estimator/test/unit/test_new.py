@@ -11,14 +11,14 @@ import pytest
 from swarm_loc_estimator.cli.new import main
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.new_swarm import FAMILY_IDS, PlanError, SwarmPlan, planned_swarm
-from swarm_loc_estimator.swarm.robot_types import ROBOT_TYPES, SENSORS
+from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS, SENSORS
 from swarm_loc_estimator.swarm.schema import SCHEMA_FILE, schema_text
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
 def sensor_sets(name: str) -> list[tuple[str, ...]]:
     """What robots of a type can be located by."""
-    known = ROBOT_TYPES[name].sensors
+    known = KNOWN_ROBOTS[name].sensors
     sets = [some for count in range(1, len(known) + 1) for some in combinations(known, count)]
     return [some for some in sets if not {"mapper", "fix"} <= set(some)]
 
@@ -28,7 +28,7 @@ def answer(monkeypatch: pytest.MonkeyPatch, *answers: str) -> None:
     monkeypatch.setattr("sys.stdin", io.StringIO("".join(f"{one}\n" for one in answers)))
 
 
-@pytest.mark.parametrize("name", ROBOT_TYPES)
+@pytest.mark.parametrize("name", KNOWN_ROBOTS)
 def test_every_type_with_all_its_sensors_loads(tmp_path: Path, name: str) -> None:
     for sensors in sensor_sets(name):
         path = tmp_path / f"{'_'.join(sensors)}.yaml"
@@ -36,7 +36,7 @@ def test_every_type_with_all_its_sensors_loads(tmp_path: Path, name: str) -> Non
         options += ["--pitch", "2"] if "landmarks" in sensors else []
         assert main([str(path), "--yes", *options]) == 0
         swarm = load_swarm(path)
-        odometry = ROBOT_TYPES[name].odometry or OdometryModel()
+        odometry = KNOWN_ROBOTS[name].odometry or OdometryModel()
         assert [robot.odometry for robot in swarm.robots] == [odometry] * 2
         assert len(swarm.landmarks) == (4 if "landmarks" in sensors else 0)
         for robot in swarm.robots:
@@ -47,11 +47,11 @@ def test_every_type_with_all_its_sensors_loads(tmp_path: Path, name: str) -> Non
             assert robot.fix.systematic_share == ("mapper" in sensors)
             assert (robot.ir is not None) == (name == "droplet")
             assert robot.stands == robot.random_walk.moves == (name == "kilobot")
-            assert {face.size for face in robot.faces} <= {ROBOT_TYPES[name].marker_size}
+            assert {face.size for face in robot.faces} <= {KNOWN_ROBOTS[name].marker_size}
 
 
 def test_every_sensor_belongs_to_a_type() -> None:
-    assert {sensor for known in ROBOT_TYPES.values() for sensor in known.sensors} == set(SENSORS)
+    assert {sensor for known in KNOWN_ROBOTS.values() for sensor in known.sensors} == set(SENSORS)
 
 
 def test_the_file_says_what_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -101,7 +101,7 @@ def test_wrong_answers_are_asked_again_with_those_that_are_allowed(
     assert main([str(tmp_path / "swarm.yaml")]) == 0
     said = capsys.readouterr().out
     for sentence in (
-        f"'epuk' must be one of {', '.join(ROBOT_TYPES)}.",
+        f"'epuk' must be one of {', '.join(KNOWN_ROBOTS)}.",
         "0 must be a number in [1, 1000].",
         "many must be a number in [1, 1000].",
         "'2 robots' must be at most 60 letters, digits and underscores and start with a letter.",

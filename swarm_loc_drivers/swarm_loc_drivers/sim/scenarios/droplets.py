@@ -41,8 +41,8 @@ from swarm_loc_drivers.sim.scenarios.eight import rounded
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr
+from swarm_loc_estimator.swarm.robot_types import DROPLET_ODOMETRY
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 PITCH = 0.13
@@ -53,23 +53,6 @@ _ARRIVED, _TURNED = 0.004, 0.1
 _PATIENCE_NS = 30_000_000_000
 _FAST, _FAST_TURN = 0.02, 0.5
 """Faster than any Droplet: the direction counts."""
-
-MOTION = OdometryModel(
-    wheel_separation=0.044,
-    wheel_noise=5e-5,
-    distance_noise=5e-4,
-    lateral_noise=5e-4,
-    turn_noise=0.01,
-    max_speed=0.05,
-    max_turn_rate=0.3,
-    speed_change=0.003,
-    turn_rate_change=0.15,
-)
-"""Noise that covers the commanded motion of robots that err as in `D1` of `droplet/world.py`.
-
-Their steps are 8 % too long or short and lead aside, in every direction differently: a stretch of 5 cm goes
-4 mm and 0.03 rad wrong.
-"""
 
 
 @dataclass(frozen=True)
@@ -123,7 +106,7 @@ def describe_droplets(
             Robot(
                 name=f"droplet{index + 1}",
                 type="droplet",
-                odometry=MOTION,
+                odometry=DROPLET_ODOMETRY,
                 camera=None,
                 start=rounded(pose) if settings.start_known else None,
                 ir=RobotIr(_FIRST_ID + index, platform, "droplet", gains=gains[index] if gains else None),
