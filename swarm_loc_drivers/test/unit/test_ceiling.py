@@ -55,7 +55,7 @@ def still(poses: np.ndarray) -> Trajectories:
     return Trajectories(stamps_ns, np.tile(poses, (3, 1, 1)))
 
 
-def test_a_camera_is_located_to_a_millimetre_by_markers_on_the_floor(described: FixedCamera) -> None:
+def test_a_camera_is_located_to_four_millimetres_by_markers_on_the_floor(described: FixedCamera) -> None:
     off = np.array([described.x - HUNG.x, described.y - HUNG.y, described.z - HUNG.z])
     assert np.abs(off).max() < 0.004
     assert described.position_sigma < 0.001

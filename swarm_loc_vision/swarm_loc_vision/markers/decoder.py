@@ -27,7 +27,7 @@ second threshold increase it: with all 4096 ids to one or two of 100 000 random 
 _SHARPENING = 0.2
 """Share of the difference to each of its four neighbours that is added to a cell."""
 _MAX_DARK_ERRORS = 3.0
-"""Maximum number of light cells among those of the border's inner ring, which are 20 or more."""
+"""Maximum number of light cells among those of the border's inner ring, which are 16 or more."""
 _MAX_SLOPE = 0.5
 """Maximum difference of the border's brightness between its sides, relative to the contrast."""
 _MIDDLE, _LOW = 0.5, 0.28
@@ -36,8 +36,9 @@ _MIN_CORRELATION = 0.4
 """Minimum correlation of a candidate and its word. A black square with a speck of light has cells near the
 threshold that fit any word at little cost; it reaches 0.37, moving markers 0.5 and more."""
 _CLEAR = 0.3
-"""Minimum clearness of each cell where words are scarce, and maximum number of light cells in the border.
-Sharpening makes light cells among dark ones so light that those among light ones have no more than 0.4."""
+"""Where words are scarce, minimum clearness of data cells and maximum number of light cells in the border.
+Sharpening brightens light cells that have dark neighbours; compared with these, light cells among light ones
+have a clearness of 0.4 at most."""
 _FAR = 1e9
 _WEIGHED = 4
 """Maximum excess of different bits over the nearest word for words compared by weighted bits."""

@@ -173,7 +173,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def camera_maker(parameters: DetectorParameters) -> CreateCamera:
-    """Creates the detectors of a bag's cameras, which are those of robots or fixed by their namespaces."""
+    """Creates the detectors of a bag's cameras; a namespace names the camera's robot, or the fixed camera."""
     known = load_swarm(Path(parameters.swarm_file)).sources if parameters.swarm_file else ()
     names = {source.name for source in known}
 

@@ -110,7 +110,7 @@ class Layout:
         return np.asarray(self.unpacked(words)[:, inside, inside])
 
     def pattern(self, word: np.uint64) -> Cells:
-        """(side + 2 outside,) * 2 cells of a marker, 1 white."""
+        """Cells (side + 2 outside, side + 2 outside) of a marker, 1 white."""
         area = np.asarray(self.unpacked(np.array([word]))[0])
         if not self.surrounded:
             return np.asarray(np.pad(area, self.border - 1))

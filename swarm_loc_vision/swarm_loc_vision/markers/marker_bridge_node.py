@@ -1,4 +1,4 @@
-"""Passes markers that apriltag_ros or aruco_opencv have found on as detections with covariances.
+"""Turns markers that apriltag_ros or aruco_opencv have found into detections with covariances.
 
     ./run swarm_loc_vision marker_bridge_node --ros-args -r __ns:=/epuck1 -p source:=apriltag
 

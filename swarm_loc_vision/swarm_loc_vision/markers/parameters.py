@@ -1,4 +1,4 @@
-"""Parameters of `marker_detector_node`, and the detector that they describe."""
+"""Parameters about markers of `marker_detector_node` and `marker_bridge_node`, and what they describe."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ class MarkersInUse:
         "", "path of the swarm description: ids in use, sizes, faces of robots; empty: none"
     )
     robot: str = text(
-        "", "robot of the camera in swarm_file, or fixed camera there, for its mount; empty: a level camera"
+        "", "robot in swarm_file that carries the camera, or the fixed camera itself; empty: a level camera"
     )
 
 

@@ -15,7 +15,7 @@ from swarm_loc_vision.markers.families import Family
 PAPERS = {"a4": (210.0, 297.0), "letter": (215.9, 279.4), "a3": (297.0, 420.0)}
 """Width and height [mm]."""
 EDGE_MM = 10.0
-"""Printers leave so much of the paper white."""
+"""Width of the paper's edge, on which printers cannot print."""
 FOOT_MM = 14.0
 """Height of the ruler and its text."""
 STRIP_MM = 5.0
