@@ -88,3 +88,9 @@ def ros(pytestconfig: pytest.Config) -> Iterator[Ros]:
     faulthandler.enable(pytestconfig.stash[fault_handler_stderr_fd_key])
     yield ros
     ros.close()
+
+
+@pytest.fixture
+def frequent_diagnostics(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let nodes say at once what a test waits for."""
+    monkeypatch.setattr("swarm_loc_estimator.common.node._DIAGNOSTICS_PERIOD_S", 0.05)

@@ -16,18 +16,13 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from rclpy.time import Time
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_estimator.common import node as common_node
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.nodes.localizer_bridge import LocalizerBridge
 
+pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
+
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 POSES = {"alpha": (1.0, 2.0), "beta": (-1.0, 0.5)}
-
-
-@pytest.fixture(autouse=True)
-def _frequent_diagnostics(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the node say at once what the tests wait for."""
-    monkeypatch.setattr(common_node, "_DIAGNOSTICS_PERIOD_S", 0.05)
 
 
 class Bridged:

@@ -9,13 +9,12 @@ import cv2
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from node_world import Ros, overrides
+from node_world import Ros, newest_status, overrides, values_of
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from bench.aerial.pictures import DIAMETER, Look, control_pixels, draw_picture
 from bench.shared.parameter_table import markdown_table
-from swarm_loc_estimator.common import node
 from swarm_loc_msgs.msg import AnonymousDetectionArray
 from swarm_loc_vision.aerial.aerial_camera_node import AerialCameraNode
 from swarm_loc_vision.aerial.control_points import ControlPoints
@@ -23,15 +22,11 @@ from swarm_loc_vision.aerial.ground_control import Ground
 from swarm_loc_vision.aerial.ground_file import GroundFileError, save_ground
 from swarm_loc_vision.aerial.parameters import AerialParameters
 
+pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
+
 PICTURE = draw_picture(Look(tilt=0.3, robots=6), seed=2)
 HEIGHT, WIDTH = PICTURE.gray.shape
 FRAME = "aerial/camera_optical_frame"
-
-
-@pytest.fixture(autouse=True)
-def _frequent_diagnostics(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the node say at once what the tests wait for."""
-    monkeypatch.setattr(node, "_DIAGNOSTICS_PERIOD_S", 0.05)
 
 
 @pytest.fixture
@@ -87,12 +82,12 @@ class Overhead:
     @property
     def status(self) -> DiagnosticStatus:
         """The newest diagnostics."""
-        return self._diagnostics[-1].status[0] if self._diagnostics else DiagnosticStatus()
+        return newest_status(self._diagnostics, "aerial/aerial_camera")
 
     @property
     def values(self) -> dict[str, str]:
         """Its figures."""
-        return {pair.key: pair.value for pair in self.status.values}
+        return values_of(self.status)
 
     def show(self, number: int, condition: Any) -> None:
         """Publish calibration and image until something is so; large messages may get lost."""

@@ -15,13 +15,14 @@ from rclpy.qos import qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo
 
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
-from swarm_loc_estimator.common import node
 from swarm_loc_estimator.common.parameters import ParameterError, UserError
 from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
 from swarm_loc_vision.markers import marker_node
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.foreign_markers import KINDS, ForeignMarker
 from swarm_loc_vision.markers.marker_bridge_node import MarkerBridgeNode
+
+pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
 
 FAMILY = "apriltag_36h11"
 FRAME = "epuck1/camera_optical_frame"
@@ -37,12 +38,6 @@ STAND_IN = replace(
     KINDS["apriltag"], message_type="swarm_loc_msgs/msg/MarkerDetectionArray", markers=_markers
 )
 """Of a type that is installed everywhere; test_foreign_markers.py reads those of the other detectors."""
-
-
-@pytest.fixture(autouse=True)
-def _frequent_diagnostics(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the node say at once what the test waits for."""
-    monkeypatch.setattr(node, "_DIAGNOSTICS_PERIOD_S", 0.05)
 
 
 def test_markers_become_detections(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:

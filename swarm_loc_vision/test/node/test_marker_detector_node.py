@@ -9,18 +9,20 @@ import cv2
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from node_world import Ros, overrides
+from node_world import Ros, newest_status, overrides, values_of
 from rcl_interfaces.msg import Log
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
-from swarm_loc_estimator.common import health, node
+from swarm_loc_estimator.common import health
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
 from swarm_loc_vision.common import camera_node
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.marker_detector_node import MarkerDetectorNode
+
+pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
 
 FAMILY = "aruco_mip_36h12"
 IMAGE, TRUTHS = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())
@@ -80,11 +82,11 @@ class Camera:
 
     def status(self) -> DiagnosticStatus:
         """The newest diagnostics."""
-        return self._diagnostics[-1].status[0] if self._diagnostics else DiagnosticStatus()
+        return newest_status(self._diagnostics, "marker_detector")
 
     def values(self) -> dict[str, str]:
         """Its figures."""
-        return {pair.key: pair.value for pair in self.status().values}
+        return values_of(self.status())
 
     def see(self, message: Image | CompressedImage) -> MarkerDetectionArray:
         """Publish an image until its detections come; large best-effort messages may get lost."""
@@ -97,12 +99,6 @@ class Camera:
     def see_dropped(self, message: Image | CompressedImage, reason: str) -> None:
         """Publish an image until it is counted as dropped."""
         self._ros.publish_until(self.images, message, lambda: f"dropped: {reason}" in self.values())
-
-
-@pytest.fixture(autouse=True)
-def _frequent_diagnostics(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let the node say at once what the tests wait for."""
-    monkeypatch.setattr(node, "_DIAGNOSTICS_PERIOD_S", 0.05)
 
 
 def test_images_become_detections_with_their_stamp_and_frame(ros: Ros) -> None:
