@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 from droplet_rig import SECOND, world_of
+from emulator_process import asked
 
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.world import STEP_NS, SimulatedDroplet
@@ -26,22 +27,14 @@ def main() -> None:
         print(host.serve_pty(robots[0], Path(sys.argv[1])), flush=True)
         os.set_blocking(sys.stdin.fileno(), False)
         due_s = time.monotonic()
-        while (asked := _input()) != b"":
-            if asked is not None:
+        while (line := asked()) != b"":
+            if line is not None:
                 print(json.dumps(world.poses.tolist()), flush=True)
             world.step()
             for robot in robots[1:]:
                 robot.stream()
             due_s += STEP_NS / SECOND
             host.poll(max(0.0, due_s - time.monotonic()))
-
-
-def _input() -> bytes | None:
-    """What was asked; None if nothing."""
-    try:
-        return os.read(sys.stdin.fileno(), 100)
-    except BlockingIOError:
-        return None
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+from emulator_process import asked
 from epuck_body import DrivenBody
 
 from swarm_loc_drivers.epuck.hardware import EPUCK_MODELS
@@ -30,19 +31,11 @@ def main() -> None:
         else:
             print(host.serve_tcp(WifiFirmware(body), port=int(sys.argv[2])), flush=True)
         os.set_blocking(sys.stdin.fileno(), False)
-        while (asked := _input()) != b"":
-            if asked is not None:
+        while (line := asked()) != b"":
+            if line is not None:
                 answer = {"pose": body.pose.tolist(), "rates": body.rates, "steps": body.wheel_steps()}
                 print(json.dumps(answer), flush=True)
             host.poll(0.002)
-
-
-def _input() -> bytes | None:
-    """What was asked; None if nothing."""
-    try:
-        return os.read(sys.stdin.fileno(), 100)
-    except BlockingIOError:
-        return None
 
 
 if __name__ == "__main__":

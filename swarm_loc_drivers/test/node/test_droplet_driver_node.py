@@ -4,10 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import signal
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,6 +12,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from droplet_rig import IDS, TRIANGLE
+from emulator_process import EmulatorProcess
 from geometry_msgs.msg import Twist, Vector3
 from nav_msgs.msg import Odometry
 from node_world import Program, Ros, overrides, stamp_ns, values_of
@@ -23,46 +21,18 @@ from tf2_msgs.msg import TFMessage
 
 from swarm_loc_drivers.droplet.droplet_driver_node import DropletDriverNode
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_msgs.msg import BrightnessMatrix
 
-UNIT = Path(__file__).parents[1] / "unit"
-
-
-class Robots:
-    """Emulated robots."""
-
-    def __init__(self, link: Path) -> None:
-        path = os.pathsep.join([str(UNIT), os.environ.get("PYTHONPATH", "")])
-        self.process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("droplet_process.py")), str(link)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=os.environ | {"PYTHONPATH": path},
-        )
-        assert self._line() == str(link)
-
-    def _line(self) -> str:
-        assert self.process.stdout is not None
-        return self.process.stdout.readline().strip()
-
-    def poses(self) -> FloatArray:
-        """Where they are."""
-        assert self.process.stdin is not None
-        self.process.stdin.write("\n")
-        self.process.stdin.flush()
-        return np.array(json.loads(self._line()))
-
 
 @pytest.fixture
-def robots(tmp_path: Path) -> Iterator[Robots]:
-    robots = Robots(tmp_path / "droplet")
+def robots(tmp_path: Path) -> Iterator[EmulatorProcess]:
+    """Emulated robots, whose truth are their poses."""
+    robots = EmulatorProcess("droplet_process.py", str(tmp_path / "droplet"))
+    assert robots.place == str(tmp_path / "droplet")
     yield robots
-    with robots.process:
-        robots.process.kill()
+    robots.kill()
 
 
 def frames_of(heard: list[TFMessage]) -> set[str]:
@@ -70,7 +40,9 @@ def frames_of(heard: list[TFMessage]) -> set[str]:
     return {transform.child_frame_id for message in heard for transform in message.transforms}
 
 
-def test_a_droplet_walks_measures_and_stands_at_the_end(ros: Ros, robots: Robots, tmp_path: Path) -> None:
+def test_a_droplet_walks_measures_and_stands_at_the_end(
+    ros: Ros, robots: EmulatorProcess, tmp_path: Path
+) -> None:
     odometry: list[Odometry] = ros.listen(Odometry, "droplet1/odom")
     relayed: list[Odometry] = ros.listen(Odometry, "droplet3/odom")
     matrices: list[BrightnessMatrix] = ros.listen(BrightnessMatrix, "droplet1/brightness")
@@ -105,8 +77,8 @@ def test_a_droplet_walks_measures_and_stands_at_the_end(ros: Ros, robots: Robots
         ros.until(lambda: diagnostics and values_of(diagnostics[-1].status[0]).get("exchanges") == "2")
         timer.cancel()
         assert program.end(signal.SIGINT) == 0, program.output
-    first = robots.poses()
-    assert (robots.poses() == first).all()
+    first = np.array(robots.truth())
+    assert (np.array(robots.truth()) == first).all()
     moved = se2.between(TRIANGLE[0], first[0])
     # what it went until it stood is told until then
     ros.until(lambda: odometry[-1].pose.pose.position.x == pytest.approx(moved[0], abs=4e-3))

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -17,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from emulator_process import EmulatorProcess
 from epuck_body import GEOMETRY
 from epuck_rig import SQUARE
 from geometry_msgs.msg import Twist, Vector3
@@ -30,40 +27,6 @@ from tf2_msgs.msg import TFMessage
 from swarm_loc_drivers.epuck.hardware import PROXIMITY_BEARINGS
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-
-UNIT = Path(__file__).parents[1] / "unit"
-
-
-class Robot:
-    """An emulated robot."""
-
-    def __init__(self, *arguments: str) -> None:
-        path = os.pathsep.join([str(UNIT), os.environ.get("PYTHONPATH", "")])
-        self.process = subprocess.Popen(
-            [sys.executable, str(Path(__file__).with_name("epuck_process.py")), *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=os.environ | {"PYTHONPATH": path},
-        )
-        self.place = self._line()
-
-    def _line(self) -> str:
-        assert self.process.stdout is not None
-        return self.process.stdout.readline().strip()
-
-    def truth(self) -> dict[str, Any]:
-        """How it is."""
-        assert self.process.stdin is not None
-        self.process.stdin.write("\n")
-        self.process.stdin.flush()
-        truth: dict[str, Any] = json.loads(self._line())
-        return truth
-
-    def kill(self) -> None:
-        """Take its batteries out."""
-        with self.process:
-            self.process.kill()
 
 
 class Controller:
@@ -136,9 +99,9 @@ def robot(tmp_path: Path) -> Iterator[Start]:
     """Starts robots: on a serial port that always has one name, or behind TCP."""
     with ExitStack() as stack:
 
-        def start(over: str, port: str = "0") -> Robot:
+        def start(over: str, port: str = "0") -> EmulatorProcess:
             arguments = [str(tmp_path / "epuck"), "epuck1"] if over == "serial" else [port]
-            started = Robot(over, *arguments)
+            started = EmulatorProcess("epuck_process.py", over, *arguments)
             stack.callback(started.kill)
             return started
 

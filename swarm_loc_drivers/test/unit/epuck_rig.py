@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from background import Background
 from epuck_body import GEOMETRY, DrivenBody
 from numpy.typing import NDArray
 
@@ -41,19 +42,27 @@ class Emulator:
         self.body = body
         self._host = FirmwareHost()
         serve(self._host)
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
-
-    def _run(self) -> None:
-        while not self._ended.is_set():
-            self._host.poll(0.002)
-        self._host.close()
+        self._background = Background(lambda: self._host.poll(0.002))
 
     def kill(self) -> None:
         """Switch it off."""
-        self._ended.set()
-        self._thread.join()
+        self._background.end()
+        self._host.close()
+
+
+class Mute:
+    """A firmware that says nothing."""
+
+    def receive(self, _data: bytes) -> bytes:
+        """See `ConsoleFirmware`."""
+        return b""
+
+    def stream(self) -> bytes:
+        """See `ConsoleFirmware`."""
+        return b""
+
+    def disconnect(self) -> None:
+        """See `StreamFirmware`."""
 
 
 class Bench:
@@ -70,8 +79,6 @@ class Bench:
         )
         self.driver = EpuckDriver(params, listeners, time.monotonic_ns)
         self._silent = threading.Event()
-        self._ended = threading.Event()
-        self._ticker = threading.Thread(target=self._tick)
 
     def _keep(self, into: list[Item]) -> Callable[[Item], None]:
         def keep(item: Item) -> None:
@@ -84,16 +91,15 @@ class Bench:
     def start(self) -> None:
         """Begin."""
         self.driver.start()
-        self._ticker.start()
+        self._ticker = Background(self._tick, TICK_S)
 
     def _tick(self) -> None:
         """Say the velocity again and again, as a controller does."""
-        while not self._ended.wait(TICK_S):
-            if self._silent.is_set():
-                self.driver.tick()
-            else:
-                forward, turn_rate = self.velocity
-                self.driver.set_velocity((forward, 0.0, turn_rate))
+        if self._silent.is_set():
+            self.driver.tick()
+        else:
+            forward, turn_rate = self.velocity
+            self.driver.set_velocity((forward, 0.0, turn_rate))
 
     def fall_silent(self) -> None:
         """No velocities any more; ticks go on."""
@@ -131,8 +137,7 @@ class Bench:
 
     def stop(self) -> None:
         """End."""
-        self._ended.set()
-        self._ticker.join()
+        self._ticker.end()
         self.driver.stop()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -11,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from background import Background
 from droplet_rig import IDEAL, IDS, LINK, NOISE, SECOND, TRIANGLE, world_of
 
 from swarm_loc_drivers.common.odometry import OdometryState
@@ -36,17 +36,13 @@ class Emulator:
         robots = [DropletFirmware(SimulatedDroplet(world, robot)) for robot in range(len(world.ids))]
         self._host.serve_pty(robots[0], device)
         self._others = robots[1:]
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._run)
-        self._thread.start()
+        self._background = Background(self._step)
 
-    def _run(self) -> None:
-        while not self._ended.is_set():
-            self.world.step()
-            for robot in self._others:
-                robot.stream()
-            self._host.poll(0.5 * STEP_NS / SECOND)
-        self._host.close()
+    def _step(self) -> None:
+        self.world.step()
+        for robot in self._others:
+            robot.stream()
+        self._host.poll(0.5 * STEP_NS / SECOND)
 
     @property
     def moves(self) -> bool:
@@ -55,8 +51,8 @@ class Emulator:
 
     def kill(self) -> None:
         """Switch it off."""
-        self._ended.set()
-        self._thread.join()
+        self._background.end()
+        self._host.close()
 
 
 class Desk:
@@ -71,15 +67,12 @@ class Desk:
             lambda _, one: self.matrices.append(one),
         )
         self.driver = DropletDriver(params, listeners, clock)
-        self._ended = threading.Event()
-        self._ticker = threading.Thread(target=self._tick)
         self.driver.start()
-        self._ticker.start()
+        self._ticker = Background(self._tick, 0.01)
 
     def _tick(self) -> None:
-        while not self._ended.wait(0.01):
-            for name, velocity in self.velocity.items():
-                self.driver.set_velocity(name, velocity)
+        for name, velocity in self.velocity.items():
+            self.driver.set_velocity(name, velocity)
 
     def until(self, condition: Callable[[], object]) -> None:
         """Wait until something is so."""
@@ -90,8 +83,7 @@ class Desk:
 
     def stop(self) -> None:
         """End."""
-        self._ended.set()
-        self._ticker.join()
+        self._ticker.end()
         self.driver.stop()
 
 

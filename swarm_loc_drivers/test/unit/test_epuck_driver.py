@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from epuck_body import GEOMETRY
-from epuck_rig import PATIENCE_S, SQUARE, Robots, params_of
+from epuck_rig import PATIENCE_S, SQUARE, Mute, Robots, params_of
 
 from swarm_loc_drivers.epuck.hardware import EPUCK1
 from swarm_loc_estimator.common import se2
@@ -99,13 +99,6 @@ def test_a_port_that_is_not_there_is_named_and_waited_for(robots: Robots) -> Non
 
 
 def test_a_port_where_nobody_speaks_the_language_is_told(robots: Robots) -> None:
-    class Mute:
-        def receive(self, _: bytes) -> bytes:
-            return b""
-
-        def stream(self) -> bytes:
-            return b""
-
     robots.serial(EPUCK1, wrap=lambda _: Mute())
     quick = replace(params_of(robots.serial_address, "epuck1"), reply_timeout_s=0.02)
     bench = robots.bench(quick)

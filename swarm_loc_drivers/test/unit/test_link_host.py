@@ -5,23 +5,10 @@ from __future__ import annotations
 import socket
 from pathlib import Path
 
+from epuck_rig import Mute
+
 from swarm_loc_drivers.common.link import SerialLink
 from swarm_loc_drivers.sim.link_host import FirmwareHost
-
-
-class Mute:
-    """A firmware that says nothing."""
-
-    def receive(self, _data: bytes) -> bytes:
-        """See `ConsoleFirmware`."""
-        return b""
-
-    def stream(self) -> bytes:
-        """See `ConsoleFirmware`."""
-        return b""
-
-    def disconnect(self) -> None:
-        """See `StreamFirmware`."""
 
 
 def test_a_serial_port_is_used_while_a_driver_has_it_open(tmp_path: Path) -> None:
