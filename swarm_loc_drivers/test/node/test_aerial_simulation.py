@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
+from node_world import stamp_ns
 
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
@@ -42,8 +43,7 @@ def test_robots_are_located_by_a_camera_that_cannot_tell_them_apart(tmp_path: Pa
         for name in names:
 
             def on_truth(message: PoseStamped, name: str = name) -> None:
-                stamp, place = message.header.stamp, message.pose.position
-                truth[name][stamp.sec * 1_000_000_000 + stamp.nanosec] = (place.x, place.y)
+                truth[name][stamp_ns(message)] = (message.pose.position.x, message.pose.position.y)
 
             recorder.create_subscription(PoseStamped, f"{name}/ground_truth", on_truth, 1000)
 

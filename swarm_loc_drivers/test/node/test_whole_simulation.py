@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
+from node_world import stamp_ns
 
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
@@ -37,8 +38,7 @@ def test_robots_are_located_by_what_their_cameras_see(tmp_path: Path) -> None:
     seen: list[MarkerDetectionArray] = []
 
     def on_truth(message: PoseStamped) -> None:
-        stamp, place = message.header.stamp, message.pose.position
-        truth[stamp.sec * 1_000_000_000 + stamp.nanosec] = np.array([place.x, place.y])
+        truth[stamp_ns(message)] = np.array([message.pose.position.x, message.pose.position.y])
 
     with LiveGraph(nodes, tmp_path / "nodes.log") as graph:
         recorder = graph.recorder

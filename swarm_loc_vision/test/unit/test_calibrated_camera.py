@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from camera_messages import camera_info
 from scipy.spatial.transform import Rotation
 
 from bench.vision.scenes import CAMERA, FOCAL_PX, HEIGHT, WIDTH, Gray, Look, random_scene
@@ -18,21 +19,6 @@ from swarm_loc_vision.markers.families import family_named
 
 FAMILY = "aruco_mip_36h12"
 IMAGE, TRUTHS = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())
-
-
-def camera_info(roi: tuple[int, int, int, int] = (0, 0, 0, 0), binning: tuple[int, int] = (0, 0)) -> Any:
-    """The scene's camera; the region is its left and upper edge, width and height."""
-    names = ("x_offset", "y_offset", "width", "height")
-    return SimpleNamespace(
-        width=WIDTH,
-        height=HEIGHT,
-        distortion_model="plumb_bob",
-        d=[0.0] * 5,
-        k=CAMERA.ravel(),
-        roi=SimpleNamespace(**dict(zip(names, roi, strict=True))),
-        binning_x=binning[0],
-        binning_y=binning[1],
-    )
 
 
 class Seen(CalibratedCamera):

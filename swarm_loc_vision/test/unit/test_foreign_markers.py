@@ -11,12 +11,13 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from camera_messages import FRAME, camera_info, header
 from compiled_code import compiled_since, printed_by_process, signatures
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from bench.shared.parameter_table import markdown_table
-from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
+from bench.vision.scenes import CAMERA, Look, Truth, random_scene
 from swarm_loc_estimator.common.messages.cdr import decode
 from swarm_loc_estimator.common.messages.definitions import DETECTIONS
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
@@ -30,30 +31,8 @@ from swarm_loc_vision.markers.pose_solver import PoseSettings
 
 PAGE = Path(__file__).parents[2] / "doc" / "marker_bridge_node.md"
 TAG = "apriltag_36h11"
-FRAME = "camera_optical_frame"
 LENGTH = 0.05
 DISTORTION = (0.1, -0.05, 0.001, -0.002, 0.0)
-
-
-def header(frame: str = FRAME) -> SimpleNamespace:
-    return SimpleNamespace(frame_id=frame, stamp=SimpleNamespace(sec=3, nanosec=5))
-
-
-def camera_info(distortion: tuple[float, ...] = (0.0,) * 5) -> SimpleNamespace:
-    """The camera of the scenes; the rectified images have another focal length."""
-    rectified = np.hstack([np.diag([0.9, 0.9, 1.0]) @ CAMERA, np.zeros((3, 1))])
-    return SimpleNamespace(
-        header=header(),
-        width=WIDTH,
-        height=HEIGHT,
-        k=CAMERA.ravel(),
-        d=distortion,
-        p=rectified.ravel(),
-        distortion_model="plumb_bob",
-        roi=SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0),
-        binning_x=0,
-        binning_y=0,
-    )
 
 
 def tag(marker_id: int, corners: NDArray[Any], family: str = "tag36h11") -> SimpleNamespace:
@@ -173,7 +152,7 @@ def test_the_distortion_is_removed_unless_images_are_rectified() -> None:
     assert np.abs(bent - truth.corners).max() > 0.3
     straight = points[:, :2] / points[:, 2:] * 0.9 * CAMERA[0, 0] + 0.9 * CAMERA[:2, 2]
     for rectified, corners in ((False, bent), (True, straight)):
-        markers = bridge(camera_info(DISTORTION), rectified=rectified, lengths=lengths)
+        markers = bridge(camera_info(distortion=DISTORTION), rectified=rectified, lengths=lengths)
         (row,) = rows_of(markers.detect(tags(tag(truth.marker_id, corners[::-1] + 0.5))))
         assert row["position"] == pytest.approx(truth.position, abs=1e-4)
         assert row["corners_px"] == pytest.approx(corners, abs=1e-3)
@@ -247,9 +226,9 @@ def compiled_late() -> list[str]:
     precompile()
     _, truths, lengths = scene()
     before = signatures()
-    bridge(camera_info(DISTORTION), lengths=lengths).detect(tags(*map(by_apriltag, truths)))
+    bridge(camera_info(distortion=DISTORTION), lengths=lengths).detect(tags(*map(by_apriltag, truths)))
     bridge(lengths=lengths, settings=PoseSettings(tilt_sigma=0.1)).detect(tags(*map(by_apriltag, truths)))
-    aruco = bridge(camera_info(DISTORTION), source="aruco_opencv", lengths=lengths)
+    aruco = bridge(camera_info(distortion=DISTORTION), source="aruco_opencv", lengths=lengths)
     found = [by_aruco(truth, LENGTH, 2) for truth in truths]
     aruco.detect(SimpleNamespace(header=header(), markers=found, boards=[]))
     return compiled_since(before)
