@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from bad_wire import BadWire
 from droplet_rig import (
     IDEAL,
     IDS,
@@ -27,7 +28,6 @@ from swarm_loc_drivers.droplet.exchange import Brightness, Power
 from swarm_loc_drivers.droplet.hardware import FULL_POWER
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print, print_2014, print_2016
 from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, DropletErrors, SimulatedDroplet
-from swarm_loc_drivers.sim.link_host import ConsoleFirmware
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
@@ -219,35 +219,12 @@ def test_a_session_ends_with_the_robot_standing() -> None:
     assert (lab.world.poses == before).all()
 
 
-class Wire:
-    """Loses and twists bytes both ways."""
-
-    def __init__(self, firmware: ConsoleFirmware, share: float, seed: int) -> None:
-        self._firmware, self._share = firmware, share
-        self._rng = np.random.default_rng(seed)
-
-    def receive(self, data: bytes) -> bytes:
-        """Over the wire and back."""
-        return self._worn(self._firmware.receive(self._worn(data)))
-
-    def stream(self) -> bytes:
-        """What the robot says by itself."""
-        return self._worn(self._firmware.stream())
-
-    def _worn(self, data: bytes) -> bytes:
-        array = np.frombuffer(data, np.uint8).copy()
-        hit = self._rng.random(len(array)) < self._share
-        array[hit] = self._rng.integers(0, 256, hit.sum())
-        kept: bytes = array[~(hit & (self._rng.random(len(array)) < 0.7))].tobytes()
-        return kept
-
-
 @pytest.mark.parametrize("seed", range(3))
 def test_over_a_bad_wire_no_other_command_arrives_than_was_meant(seed: int) -> None:
     lab = Lab(world_of(), asking(IDS[1], period_s=1.0))
     (cable,) = lab.cables
     firmware = cable.firmware
-    cable.firmware = Wire(firmware, 0.002, seed)
+    cable.firmware = BadWire(firmware, 0.002, seed)
     assert isinstance(firmware, DropletFirmware)
     executed: list[str] = []
     execute = firmware._execute

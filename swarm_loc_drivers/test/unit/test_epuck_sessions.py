@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bad_wire import BadWire
 from epuck_body import GEOMETRY, PROXIMITY
 from epuck_rig import SQUARE, params_of
 from epuck_wire import MS, SECOND, Wire
@@ -87,34 +88,10 @@ def test_a_square(robot: EpuckParameters) -> None:
     assert (reading.proximity == PROXIMITY).all()
 
 
-class Lossy:
-    """A firmware at the end of a wire that loses and twists bytes in both directions."""
-
-    def __init__(self, firmware: SerialFirmware, share: float, seed: int) -> None:
-        self._firmware = firmware
-        self.stream = firmware.stream
-        self._rng = np.random.default_rng(seed)
-        self.share = share
-        self.hurt = 0
-
-    def receive(self, data: bytes) -> bytes:
-        """Bytes over the bad wire and back."""
-        return self._worn(self._firmware.receive(self._worn(data)))
-
-    def _worn(self, data: bytes) -> bytes:
-        array = np.frombuffer(data, np.uint8).copy()
-        hit = self._rng.random(len(array)) < self.share
-        lost = hit & (self._rng.random(len(array)) < 0.7)
-        array[hit] = self._rng.integers(0, 256, hit.sum())
-        self.hurt += int(hit.sum())
-        kept: bytes = array[~lost].tobytes()
-        return kept
-
-
 @pytest.mark.parametrize("seed", range(4))
 def test_a_serial_wire_that_loses_bytes(seed: int) -> None:
     wire = Wire(
-        replace(SERIAL, reply_timeout_s=0.1), lambda body: Lossy(SerialFirmware(body, EPUCK1), 0.004, seed)
+        replace(SERIAL, reply_timeout_s=0.1), lambda body: BadWire(SerialFirmware(body, EPUCK1), 0.004, seed)
     )
     wire.reconnects = True
     wire.drive(SQUARE[:4])
