@@ -1,7 +1,7 @@
 """Only nodes need ROS; all other modules can be imported without it.
 
 These may need it: modules named `*_node.py`; in the estimator `common/node.py`, all of `nodes/`, `watch/`
-and `offline/live/`, and the command `demo`, which plays into a live graph; in the drivers what publishes for
+and `offline/live/`, `doctor/listener.py`, and the command `demo`; in the drivers what publishes for
 nodes, named `*_diagnostics.py`, `*_messages.py`, `*_output.py` or `*_steering.py`.
 """
 
@@ -16,7 +16,7 @@ IMPORT_ALL_WITHOUT_ROS = """
 import importlib, pathlib, re, sys
 
 WITH_ROS = re.compile(
-    r"_node$|^swarm_loc_estimator\\.(common\\.node$|nodes\\.|watch\\.|offline\\.live\\.|cli\\.demo$)"
+    r"_node$|^swarm_loc_estimator\\.(common\\.node$|nodes\\.|watch\\.|offline\\.live\\.|doctor\\.listener$|cli\\.demo$)"
     r"|^swarm_loc_drivers\\..*_(diagnostics|messages|output|steering)$"
 )
 

@@ -23,7 +23,7 @@ from swarm_loc_estimator.common.command_line import (
     number_in,
     swarm_beside,
 )
-from swarm_loc_estimator.doctor.doctor import evidence_of_bag, examine
+from swarm_loc_estimator.doctor.doctor import evidence_of_bag, examine, lines_of
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 _DESCRIPTIONS = (".yaml", ".yml")
@@ -39,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     seconds = options.seconds or (_LIVE_S if is_live else _BAG_S)
     with ProgressLine() as progress:
         if is_live:
-            listen = import_module("swarm_loc_estimator.doctor.listener_node").listen
+            listen = import_module("swarm_loc_estimator.doctor.listener").listen
             evidence = listen(swarm, seconds, progress, use_sim_time=options.use_sim_time)
         else:
             evidence = evidence_of_bag(options.source, swarm, seconds, progress, options.remap)
@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         findings = examine(evidence)
     messages = sum(len(heard.messages) for heard in evidence.topics.values())
     print(f"{len(swarm.robots)} robots, {messages} messages on {len(evidence.topics)} topics.")
-    print("\n".join(f"- {finding}" for finding in findings) or "Nothing is wrong.")
+    print("\n".join(f"- {line}" for line in lines_of(findings)) or "Nothing is wrong.")
     return 1 if findings else 0
 
 

@@ -66,7 +66,7 @@ def _of_topic(topic: str, stamp_ns: IntArray, arrival_ns: IntArray, horizon_s: f
         problem = f"has stamps {delay_s:.2g} s old, which is beyond horizon_s ({horizon_s:g} s)"
         return [Finding(topic, problem, f"Its clock is behind, or its data are queued. {_SET_CLOCK}")]
     back = np.diff(stamp_ns) < 0
-    if topic.endswith("odometry") and back.mean() > _BACK and stamp_ns.size > 20:
+    if topic.endswith("odometry") and back.sum() > max(1, _BACK * stamp_ns.size):
         problem = f"has stamps that go back, {int(back.sum())} times"
         return [Finding(topic, problem, "Stop the second publisher, or the node that sets wrong stamps")]
     return []

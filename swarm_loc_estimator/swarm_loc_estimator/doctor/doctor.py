@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.doctor.clocks import check_clocks
 from swarm_loc_estimator.doctor.contents import check_contents, check_estimate
 from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, Message, same_type
@@ -28,6 +29,19 @@ def examine(evidence: Evidence) -> list[Finding]:
     What the estimator contradicts often follows from the rest, so it is added only where nothing else is.
     """
     return [one for check in CHECKS for one in check(evidence)] or [*check_estimate(evidence)]
+
+
+def lines_of(findings: Sequence[Finding]) -> list[str]:
+    """One line for each problem, with all that have it."""
+    abouts: dict[tuple[str, str], list[str]] = {}
+    for one in findings:
+        abouts.setdefault((one.problem, one.remedy), []).append(one.about)
+    return [
+        f"{names[0]} {problem}. {remedy}."
+        if len(names) == 1
+        else f"{listed(names)}: each {problem}. {remedy}."
+        for (problem, remedy), names in abouts.items()
+    ]
 
 
 def evidence_of_bag(

@@ -46,9 +46,6 @@ class Finding(NamedTuple):
     problem: str
     remedy: str
 
-    def __str__(self) -> str:
-        return f"{self.about} {self.problem}. {self.remedy}."
-
 
 class Publisher(NamedTuple):
     """A publisher in the live graph.

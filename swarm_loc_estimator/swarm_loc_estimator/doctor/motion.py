@@ -73,8 +73,7 @@ def check_motion(evidence: Evidence) -> Iterator[Finding]:
         seen, landmark, stamp_ns = _sightings(evidence, index, robot)
         if len(seen) < _MIN_ROWS:
             continue
-        norm = np.linalg.norm(seen, axis=1)
-        if np.median(seen[:, 2] / norm) < _AHEAD:
+        if np.median(seen[:, 2] - _AHEAD * np.linalg.norm(seen, axis=1)) <= 0.0:
             problem = "publishes positions of markers that are not in front of it"
             remedy = "Publish them in the optical frame: x right, y down, z forward"
             yield Finding(robot.name, problem, remedy)

@@ -110,6 +110,8 @@ def _rate(topic: InputTopic, heard: Heard) -> Iterator[Finding]:
     """Odometry that is rare or pauses."""
     between_s = 1e-9 * np.diff([arrival_ns for arrival_ns, _ in heard.messages])
     if between_s.size < 2:
+        problem = f"has {len(heard.messages)} messages in all"
+        yield Finding(topic.name, problem, "Publish odometry 5 times per second or more often")
         return
     usual_s, longest_s = float(np.median(between_s)), float(between_s.max())
     if usual_s > _SLOW_S:

@@ -12,7 +12,7 @@ from node_world import Ros, detection_bytes, odometry_bytes, sight
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from swarm_loc_estimator.doctor.doctor import examine
-from swarm_loc_estimator.doctor.listener_node import Listener
+from swarm_loc_estimator.doctor.listener import Listener
 from swarm_loc_estimator.offline.recorded_bag import unwatched
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_msgs.msg import MarkerDetectionArray
