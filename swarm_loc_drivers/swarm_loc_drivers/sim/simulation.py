@@ -16,7 +16,7 @@ from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import MAX_ROBOTS, laser_hz, led_hz
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
-from swarm_loc_drivers.sim.scenarios.eight import ARENA
+from swarm_loc_drivers.sim.scenarios.eight import ARENA, eight_starts, rounded
 from swarm_loc_drivers.sim.scenarios.eight_images import eight_floor
 from swarm_loc_drivers.sim.worlds import WorldError, start_of
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, check_parameter_file
@@ -141,6 +141,16 @@ def seen_from_above(swarm: Swarm) -> Swarm:
     return Swarm(tuple(robots))
 
 
+def placed_on_eight(swarm: Swarm) -> Swarm:
+    """The swarm as the world of e-pucks has it: who has no start stands at its place on the eight."""
+    starts = eight_starts(len(swarm.robots))
+    robots = (
+        replace(robot, start=robot.start or rounded(start))
+        for robot, start in zip(swarm.robots, starts, strict=True)
+    )
+    return replace(swarm, robots=tuple(robots))
+
+
 def _world(options: SimulationOptions, links: str, **own: ParameterValue) -> Parameters:
     """Parameters of a world's node."""
     shared: Parameters = {"swarm_file": options.swarm_file, "seed": options.seed, "rate": options.rate}
@@ -157,6 +167,9 @@ def _epuck_nodes(options: SimulationOptions, swarm: Swarm, links: str) -> list[N
         "wait_for_poses": True,
         "aerial": options.aerial,
     }
+    if any(robot.start is None for robot in swarm.robots):
+        world["swarm_file"] = f"{links}/placed.yaml"
+        save_swarm(placed_on_eight(swarm), Path(links) / "placed.yaml")
     estimator, cameras = described, []
     if options.aerial:
         estimator, ground = _aerial_files(options, Path(links))
@@ -254,7 +267,13 @@ def _check_pushbots(swarm: Swarm) -> None:
         )
 
 
-EPUCK = RobotType("epuck", check_swarm, _epuck_nodes, ("w2", "w0", "w2fast"), has_markers=True)
+EPUCK = RobotType(
+    "epuck",
+    lambda swarm: check_swarm(placed_on_eight(swarm)),
+    _epuck_nodes,
+    ("w2", "w0", "w2fast"),
+    has_markers=True,
+)
 ROBOT_TYPES = {
     one.name: one
     for one in (

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from swarm_loc_drivers.sim import simulate
@@ -20,7 +21,7 @@ from swarm_loc_vision.aerial.parameters import AerialParameters
 
 BAGS = Path(__file__).parents[3] / "bags"
 SECOND = 1_000_000_000
-TWO = Swarm((Robot("a"), Robot("b")))
+TWO = Swarm(tuple(Robot(name, start=(0.0, 0.0, 0.0)) for name in "ab"))
 
 
 def test_every_robot_has_a_driver_on_its_link_and_a_detector_for_its_camera() -> None:
@@ -63,6 +64,20 @@ def test_from_above_an_overhead_camera_is_all_that_locates(tmp_path: Path) -> No
     assert camera.parameter_file == "all.yaml"
 
 
+def test_e_pucks_without_a_start_stand_on_the_eight_and_the_estimator_does_not_know(tmp_path: Path) -> None:
+    swarm = load_swarm(BAGS / "eight_five_robots" / "swarm.yaml")
+    first, *others = swarm.robots
+    robots = (first, *(replace(robot, start=None) for robot in others))
+    save_swarm(replace(swarm, robots=robots), tmp_path / "swarm.yaml")
+    options = SimulationOptions(str(tmp_path / "swarm.yaml"), world="w0")
+    nodes = {node.full_name: node for node in graph_of(options, simulated_swarm(options), str(tmp_path))}
+    assert nodes["estimator"].parameters["swarm_file"] == options.swarm_file
+    placed = load_swarm(Path(str(nodes["epuck_world"].parameters["swarm_file"])))
+    found, expected = (np.array([robot.start for robot in one.robots], float) for one in (placed, swarm))
+    np.testing.assert_allclose(found, expected, atol=1e-6)
+    assert [replace(robot, start=None) for robot in placed.robots[1:]] == list(robots[1:])
+
+
 def test_droplets_get_a_table_one_fleet_of_drivers_and_a_tracker(tmp_path: Path) -> None:
     robots = load_swarm(BAGS / "droplets_twenty" / "swarm.yaml").robots
     swarm_file = tmp_path / "swarm.yaml"
@@ -96,7 +111,6 @@ def test_the_command_line_becomes_options() -> None:
     ("bag", "old", "new", "words"),
     [
         ("droplets_twenty", "", "", "robot 'droplet1' has no start pose"),
-        ("eight_one_robot_slow", "start:", "start: null #", "robot 'epuck1' has no start pose"),
         ("eight_one_robot_slow", "fileversion: 1", "fileversion: 2", "fileversion is 2 but must be 1"),
     ],
 )

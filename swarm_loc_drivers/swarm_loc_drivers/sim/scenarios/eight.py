@@ -112,10 +112,19 @@ def camera_exposures(rng: np.random.Generator, robots: int, truth: Trajectories)
 
 def drive_eight(rng: np.random.Generator, settings: EightSettings) -> tuple[Swarm, Trajectories, Records]:
     """Drive the eight; results as of `drive_robots`."""
-    path = Lemniscate(HALF_WIDTH)
-    offset = np.arange(settings.robots) * path.length / settings.robots
-    start, _ = path.at(offset)
-    return drive_robots(rng, settings, start, follow(path, offset, settings.speed, STEP_NS * 1e-9))
+    path, offset = Lemniscate(HALF_WIDTH), _offsets(settings.robots)
+    control = follow(path, offset, settings.speed, STEP_NS * 1e-9)
+    return drive_robots(rng, settings, eight_starts(settings.robots), control)
+
+
+def eight_starts(robots: int) -> FloatArray:
+    """Poses (N, 3) on the eight at which its robots begin."""
+    return Lemniscate(HALF_WIDTH).at(_offsets(robots))[0]
+
+
+def _offsets(robots: int) -> FloatArray:
+    """Lengths (N,) along the eight at which its robots begin [m]."""
+    return np.asarray(np.arange(robots) * Lemniscate(HALF_WIDTH).length / robots)
 
 
 def drive_robots(
@@ -206,8 +215,7 @@ class EightSteering:
 
     def __init__(self, robots: int, speed: float) -> None:
         path = Lemniscate(HALF_WIDTH)
-        offsets = np.arange(robots) * path.length / robots
-        self._control = [follow(path, offset[None], speed, 1e-9) for offset in offsets]
+        self._control = [follow(path, offset[None], speed, 1e-9) for offset in _offsets(robots)]
         self._begin_ns: int | None = None
 
     def command(self, robot: int, stamp_ns: int, pose: FloatArray) -> Velocity:

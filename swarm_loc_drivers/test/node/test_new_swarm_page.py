@@ -1,0 +1,55 @@
+"""The commands on the page of new swarms, word by word: description, sheets, simulation, doctor, poses."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+from node_world import Program, Ros
+
+from swarm_loc_estimator.common.launch import executable_path
+from swarm_loc_msgs.msg import SwarmPose, SwarmPoses
+
+PAGE = Path(__file__).parents[3] / "swarm_loc_estimator" / "doc" / "new_swarm.md"
+
+
+def commands() -> dict[str, tuple[str, list[str]]]:
+    """Executable -> its package and arguments, of the section about simulated robots."""
+    section = PAGE.read_text(encoding="utf-8").partition("## Try it without robots")[2]
+    found = [shlex.split(line) for line in re.findall(r"^\./run (.+)$", section, re.MULTILINE)]
+    return {name: (package, arguments) for package, name, *arguments in found}
+
+
+@pytest.mark.timeout(300)  # the renderer and the detector may have to be compiled first
+def test_a_new_swarm_is_simulated_and_located(
+    ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+
+    def run(name: str) -> str:
+        package, arguments = commands()[name]
+        done = subprocess.run(
+            [executable_path(package, name), *arguments], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    assert list(commands()) == ["new", "print_markers", "simulate", "doctor", "watch"]
+    assert "describes 3 robots and 20 landmarks" in run("new")
+    run("print_markers")
+    assert (tmp_path / "out" / "lab" / "markers.pdf").stat().st_size > 10_000
+    poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
+    package, arguments = commands()["simulate"]
+    program = {"package": package, "options": arguments}
+    with Program("simulate", tmp_path / "log", {}, **program) as simulation:  # type: ignore[arg-type]
+
+        def are_tracked() -> bool:
+            return bool(poses) and all(one.status == SwarmPose.STATUS_TRACKED for one in poses[-1].robots)
+
+        ros.until(are_tracked, 200.0)
+        assert run("doctor").endswith("Nothing is wrong.\n")
+        assert simulation.end(signal.SIGTERM) == 0
