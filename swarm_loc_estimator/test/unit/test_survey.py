@@ -177,6 +177,19 @@ def test_a_robot_that_takes_no_part_or_stands_costs_nothing() -> None:
     assert rms(errors(done.swarm, world.swarm)) < 0.02
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_wheels_that_turn_by_a_sixth_too_little_are_found(seed: int) -> None:
+    """Frames of odometry then turn by radians, while each step of them is known to a thousandth."""
+    world = simulate(replace(PLAN, duration_s=60.0), seed)
+    robots = tuple(
+        replace(robot, odometry=replace(robot.odometry, turn_scale=0.85)) for robot in world.swarm.robots
+    )
+    done = survey(recording_of(world), replace(world.swarm, robots=robots, landmarks=()))
+    assert rms(errors(done.swarm, world.swarm)) < 0.01
+    found = [robot.odometry.turn_scale for robot in done.swarm.robots]
+    assert found == pytest.approx([1.0] * len(found), abs=0.02)
+
+
 def test_an_inexact_landmark_that_nobody_saw_stays_as_it_is() -> None:
     world = simulate(PLAN, 3)
     unseen = Landmark(9999, 5.0, 5.0, position_sigma=0.02, yaw_sigma=0.1)

@@ -30,6 +30,8 @@ _SCALES = (50.0, 20.0, 10.0, 5.0)
 _ITERATIONS, _CONVERGED, _NEARLY = 15, 1e-2, 1e-3
 """Most steps of each scale, and the decrease of the cost that ends them: of the last scale and, as a share of
 the cost, of the others."""
+_RISES = 2
+"""Most steps in a row that may raise the cost."""
 _ORIGIN_SIGMA = 1e-5
 _YAW_SIGMA = 1.0
 """Of the heading of a landmark without one, which nothing determines [rad]."""
@@ -113,25 +115,32 @@ class Solver:
         return np.asarray(self._knot_column[first])
 
     def _descend(self, scale: float) -> None:
-        """Minimize the cost at one scale of the weights."""
-        damping, is_last = _DAMPING[0], scale == _SCALES[-1]
-        matrix, gradient, cost = self._normal(scale)
+        """Minimize the cost at one scale of the weights.
+
+        Large turns of the odometry frames leave errors of second order, which noise of steps makes expensive.
+        The next steps remove them, so some of these may follow before a step is taken back.
+        """
+        damping, rises = _DAMPING[0], 0
+        matrix, gradient, least = self._normal(scale)
+        best = self._knot, self._landmark, self._parameter, matrix, gradient
         for _ in range(_ITERATIONS):
-            step = _factor(matrix, damping).solve(gradient)
-            before = self._knot, self._landmark, self._parameter
-            self._apply(step)
-            new_matrix, new_gradient, new_cost = self._normal(scale)
-            if new_cost > cost:
-                self._knot, self._landmark, self._parameter = before
-                damping = 100.0 * damping
+            self._apply(_factor(matrix, damping).solve(gradient))
+            matrix, gradient, cost = self._normal(scale)
+            if cost <= least:
+                enough = _CONVERGED if scale == _SCALES[-1] else _NEARLY * least
+                has_converged, least, rises = least - cost < enough, cost, 0
+                best = self._knot, self._landmark, self._parameter, matrix, gradient
+                damping = max(_DAMPING[0], 0.01 * damping)
+                if has_converged:
+                    return
+            elif rises < _RISES:
+                rises += 1
+            else:
+                self._knot, self._landmark, self._parameter, matrix, gradient = best
+                damping, rises = 100.0 * damping, 0
                 if damping > _DAMPING[1]:
                     return
-                continue
-            damping = max(_DAMPING[0], 0.01 * damping)
-            has_converged = cost - new_cost < (_CONVERGED if is_last else _NEARLY * cost)
-            matrix, gradient, cost = new_matrix, new_gradient, new_cost
-            if has_converged:
-                return
+        self._knot, self._landmark, self._parameter, *_ = best
 
     def _apply(self, step: FloatArray) -> None:
         """Move all estimates by a step (n,)."""
