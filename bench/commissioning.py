@@ -126,10 +126,10 @@ def _recording(run: SimulatedRun, case: Case, seed: int) -> Recording:
 
 
 def _errors(done: Surveyed, true: Sequence[Landmark]) -> FloatArray:
-    """Errors (L, 2) of landmarks after a rigid fit."""
+    """Errors (L, 2) of landmarks after a rigid fit; those that were seen too rarely are left out."""
     found = {mark.id: (mark.x, mark.y) for mark in done.swarm.landmarks}
-    places, truth = [found[mark.id] for mark in true], [(mark.x, mark.y) for mark in true]
-    return fitted_errors(np.array(places), np.array(truth))
+    seen = [mark for mark in true if mark.id in found]
+    return fitted_errors(np.array([found[mark.id] for mark in seen]), np.array([(m.x, m.y) for m in seen]))
 
 
 def _localized(run: SimulatedRun, recording: Recording, swarm: Swarm) -> float:

@@ -23,6 +23,7 @@ from swarm_loc_estimator.common.command_line import (
     number_in,
     swarm_beside,
 )
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag, examine, lines_of
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
@@ -35,6 +36,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
     is_live = options.source.suffix in _DESCRIPTIONS
+    if is_live and options.remap:
+        raise UserError("--remap is for bags; remap topics of a live graph in their nodes.")
+    if options.use_sim_time and not is_live:
+        raise UserError("--use-sim-time is for a live graph; a bag has its own time.")
     swarm = load_swarm(options.swarm or (options.source if is_live else swarm_beside(options.source)))
     seconds = options.seconds or (_LIVE_S if is_live else _BAG_S)
     with ProgressLine() as progress:
@@ -47,6 +52,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         findings = examine(evidence)
     messages = sum(len(heard.messages) for heard in evidence.topics.values())
     print(f"{len(swarm.robots)} robots, {messages} messages on {len(evidence.topics)} topics.")
+    for remark in evidence.remarks:
+        print(f"Note: {remark}")
+    if evidence.is_cut:
+        print(f"Note: only the first {seconds:g} s of the bag were looked at; --seconds takes more.")
     print("\n".join(f"- {line}" for line in lines_of(findings)) or "Nothing is wrong.")
     return 1 if findings else 0
 

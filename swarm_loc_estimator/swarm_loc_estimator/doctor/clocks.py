@@ -13,6 +13,8 @@ _HOUR_S = 3600.0
 _AHEAD_S = 0.05
 _APART_S = 0.3
 """Difference of a clock from the others that is named [s]; delays of networks stay below."""
+_LATE_S = 0.8
+"""Detections that are later than odometry by more are named [s]; a detector takes .15 to .3 s."""
 _BACK = 0.02
 """Share of stamps before the one that arrived before, from which they are named."""
 _SENSORS = ("odometry", "detections", "imu", "ranges", "brightness")
@@ -29,11 +31,20 @@ def check_clocks(evidence: Evidence) -> Iterator[Finding]:
             topic = f"{evidence.source_name(robot)}'s {sensor}"
             found = _of_topic(topic, rows.stamp_ns[own], rows.arrival_ns[own], evidence.settings.horizon_s)
             yield from found
+            name, delay_s = evidence.source_name(robot), _delay_s(rows.stamp_ns[own], rows.arrival_ns[own])
             if not found and sensor == "odometry":
-                delays[evidence.source_name(robot)] = _delay_s(rows.stamp_ns[own], rows.arrival_ns[own])
+                delays[name] = delay_s
+            elif not found and sensor == "detections" and delay_s - delays.get(name, delay_s) > _LATE_S:
+                problem = f"arrive {delay_s:.2g} s after their stamps, but its odometry {delays[name]:.2g} s"
+                remedy = "Stamp images with their exposure, and synchronize the computer of the camera"
+                yield Finding(f"{name}'s detections", problem, remedy)
     usual = float(np.median([*delays.values()])) if delays else 0.0
+    if len(delays) == 2 and abs(np.diff([*delays.values()])[0]) > _APART_S:
+        apart = abs(float(np.diff([*delays.values()])[0]))
+        yield Finding(" and ".join(delays), f"have clocks {apart:.2g} s apart", "Synchronize them (chrony)")
+        return
     for robot_name, delay in delays.items():
-        if abs(delay - usual) > _APART_S and len(delays) > 2:
+        if abs(delay - usual) > _APART_S:
             which = "behind" if delay > usual else "ahead of"
             problem = f"has a clock {abs(delay - usual):.2g} s {which} those of the other robots"
             yield Finding(robot_name, problem, _SET_CLOCK)

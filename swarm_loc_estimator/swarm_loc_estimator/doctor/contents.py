@@ -23,8 +23,8 @@ _MIN_SIGHTINGS = 5
 _MIN_SHARE = 0.05
 """Smaller shares of dropped readings are not named."""
 _MIN_ROWS = 20
-_AWAY_M, _AWAY_SIGMAS = 0.1, 5.0
-"""Least distance from a start that is named [m], and least multiple of its standard deviation."""
+_AWAY_M, _TURNED, _AWAY_SIGMAS = 0.1, 0.35, 5.0
+"""Least distance [m] and angle [rad] from a start that are named, and least multiple of its sigmas."""
 _REASONS = MappingProxyType(
     {
         "no_camera": ("sees markers but has no camera in the description", "Describe its camera"),
@@ -63,6 +63,7 @@ def check_contents(evidence: Evidence) -> Iterator[Finding]:
     """Readings can be used."""
     yield from _unknown_markers(evidence)
     yield from _same_odometry(evidence)
+    yield from _too_fast(evidence)
     readings = _readings(evidence)
     for index, source in enumerate(evidence.swarm.sources):
         for reason, count in evidence.estimated.drops_of(index).items():
@@ -112,8 +113,11 @@ def _other_starts(evidence: Evidence) -> Iterator[Finding]:
         first, then = tracks.at(np.array([index, index]), stamps_ns).pose
         began = se2.compose(estimated.begin_pose[index], se2.between(then, first))
         away = math.hypot(*(began[:2] - np.array(robot.start[:2])))
-        if away > max(_AWAY_M, _AWAY_SIGMAS * max(robot.start_sigma.x, robot.start_sigma.y)):
-            problem = f"began at {began[0]:.2f}, {began[1]:.2f}, which is {away:.2f} m from its start"
+        turned, spread = abs(float(se2.wrap_angle(began[2] - robot.start[2]))), robot.start_sigma
+        is_away = away > max(_AWAY_M, _AWAY_SIGMAS * max(spread.x, spread.y))
+        if is_away or turned > max(_TURNED, _AWAY_SIGMAS * spread.theta):
+            problem = f"began at {began[0]:.2f}, {began[1]:.2f}, {began[2]:.2f} rad"
+            problem += f", which is {away:.2f} m and {math.degrees(turned):.0f} deg from its start"
             yield Finding(robot.name, problem, "Put it there, correct start, or leave start out")
 
 
@@ -158,6 +162,18 @@ def _unknown_markers(evidence: Evidence) -> Iterator[Finding]:
         which = listed([f"{marker} ({unknown[marker]} times)" for marker in most])
         remedy = "Describe them under landmarks, or ids of a robot; survey finds the places of landmarks"
         yield Finding(f"marker {which}", "was seen, but is in no description", remedy)
+
+
+def _too_fast(evidence: Evidence) -> Iterator[Finding]:
+    """Odometry whose usual speed is impossible, as in other units."""
+    rows = evidence.odometry
+    for index, robot in enumerate(evidence.swarm.robots):
+        pose, stamp_ns = rows.pose[rows.robot == index], rows.stamp_ns[rows.robot == index]
+        passed_s = 1e-9 * np.diff(stamp_ns)
+        speed = np.hypot(*np.diff(pose[:, :2], axis=0).T)[passed_s > 0.0] / passed_s[passed_s > 0.0]
+        if speed.size > _MIN_ROWS and np.median(speed) > robot.odometry.max_speed:
+            problem = f"moves at {np.median(speed):.2g} m/s by its odometry, beyond max_speed"
+            yield Finding(robot.name, problem, "Publish odometry in metres, or raise max_speed")
 
 
 def _same_odometry(evidence: Evidence) -> Iterator[Finding]:

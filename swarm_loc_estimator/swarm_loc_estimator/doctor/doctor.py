@@ -7,18 +7,23 @@ from pathlib import Path
 
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.health import listed
+from swarm_loc_estimator.common.messages.definitions import TRANSFORMS
 from swarm_loc_estimator.doctor.clocks import check_clocks
 from swarm_loc_estimator.doctor.contents import check_contents, check_estimate
 from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, Message, same_type
 from swarm_loc_estimator.doctor.frames import check_frames
 from swarm_loc_estimator.doctor.motion import check_motion
-from swarm_loc_estimator.doctor.pictures import COMPRESSED_IMAGE, IMAGE, check_pictures
-from swarm_loc_estimator.doctor.topics import check_topics
+from swarm_loc_estimator.doctor.pictures import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, check_pictures
+from swarm_loc_estimator.doctor.topics import DIAGNOSTICS, check_topics
 from swarm_loc_estimator.offline.recorded_bag import Progress, renamed_topics
-from swarm_loc_estimator.sensors.registry import input_topics
+from swarm_loc_estimator.sensors.registry import input_topics, kinds
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 CHECKS = (check_topics, check_clocks, check_frames, check_pictures, check_motion, check_contents)
+_LOOKED_AT = (
+    *(kind.message_type for kind in kinds().values()),
+    *(TRANSFORMS, DIAGNOSTICS, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO),
+)
 MAX_IMAGES = 20
 """Maximum number of images of a topic that are kept; what is wrong with one is wrong with all."""
 
@@ -69,11 +74,18 @@ def evidence_of_bag(
                 break
             keep(messages.setdefault(name, []), types[name], Message(log_ns, data))
             progress(min(1.0, reader.progress), "reading")
-    return Evidence(swarm, {name: Heard(kind, messages.get(name, [])) for name, kind in types.items()})
+        topics = {name: Heard(kind, messages.get(name, [])) for name, kind in types.items()}
+        is_cut = end_ns < reader.time_range_ns[1]
+        return Evidence(swarm, topics, remarks=tuple(reader.losses), is_cut=is_cut)
+
+
+def is_looked_at(message_type: str) -> bool:
+    """Whether a check looks at messages of a type; of all other topics only names and types matter."""
+    return any(same_type(message_type, one) for one in _LOOKED_AT)
 
 
 def keep(kept: list[Message], message_type: str, message: Message) -> None:
-    """Keep a message, unless it is one of many images."""
+    """Keep a message that a check looks at, unless it is one of many images."""
     is_image = same_type(message_type, IMAGE) or same_type(message_type, COMPRESSED_IMAGE)
-    if not is_image or len(kept) < MAX_IMAGES:
+    if is_looked_at(message_type) and (not is_image or len(kept) < MAX_IMAGES):
         kept.append(message)

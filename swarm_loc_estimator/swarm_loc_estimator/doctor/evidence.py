@@ -16,6 +16,7 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.sensors.conversion import InputConverter
+from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.registry import SENSORS, Batch, InputTopic, live_topics
@@ -109,21 +110,30 @@ class Evidence:
         swarm: The description.
         topics: By name, without a leading slash.
         is_live: Whether it comes from the live graph.
+        remarks: What could not be read, one sentence each.
+        is_cut: Whether there was more in the bag.
     """
 
     swarm: Swarm
     topics: Mapping[str, Heard]
     is_live: bool = False
+    remarks: Sequence[str] = ()
+    is_cut: bool = False
     settings: Settings = field(default_factory=Settings)
 
     @cached_property
     def inputs(self) -> tuple[InputTopic, ...]:
         """Topics that the estimator reads: shared ones where there are messages on them."""
         shared = any(
-            topic.kind.stands_for and topic.name in self.topics
+            topic.kind.stands_for and topic.name in self.topics and self.topics[topic.name].messages
             for topic in live_topics(self.swarm, shared=True)
         )
         return live_topics(self.swarm, shared=shared)
+
+    @property
+    def end_ns(self) -> int:
+        """Arrival of the last message of all."""
+        return max((one.messages[-1].arrival_ns for one in self.topics.values() if one.messages), default=0)
 
     def usable(self, topic: InputTopic) -> Heard | None:
         """The topic where it was found with the right type."""
@@ -149,11 +159,25 @@ class Evidence:
         return joined([SENSORS[sensor].nothing, *(part[sensor] for part in self.read[0])])
 
     @cached_property
+    def _valid(self) -> list[Mapping[str, Any]]:
+        """Valid odometry and turn rates, by sensor."""
+        converter = InputConverter(self.swarm, self.settings)
+        return [converter.convert(part).rows for part in self.read[0]]
+
+    @cached_property
     def odometry(self) -> OdometryRows:
         """All valid odometry."""
-        converter = InputConverter(self.swarm, self.settings)
-        parts = [converter.convert(part).rows.get("odometry", NO_ODOMETRY) for part in self.read[0]]
-        rows: OdometryRows = joined([NO_ODOMETRY, *parts])
+        rows: OdometryRows = joined(
+            [NO_ODOMETRY, *(part.get("odometry", NO_ODOMETRY) for part in self._valid)]
+        )
+        return rows
+
+    @cached_property
+    def turn_rates(self) -> TurnRateRows:
+        """All valid turn rates of gyroscopes."""
+        rows: TurnRateRows = joined(
+            [NO_TURN_RATES, *(part.get("imu", NO_TURN_RATES) for part in self._valid)]
+        )
         return rows
 
     @cached_property
@@ -205,9 +229,10 @@ def same_type(one: str, other: str) -> bool:
 def decoded(heard: Heard) -> tuple[list[Any], int]:
     """Messages of a topic as objects of `rosbags`, and how many are malformed."""
     messages, malformed = [], 0
+    kind = heard.type if "/msg/" in heard.type else heard.type.replace("/", "/msg/")
     for _, data in heard.messages:
         try:
-            messages.append(typestore().deserialize_cdr(data, heard.type))
+            messages.append(typestore().deserialize_cdr(data, kind))
         except (SerdeError, ValueError, IndexError, struct.error):
             malformed += 1
     return messages, malformed

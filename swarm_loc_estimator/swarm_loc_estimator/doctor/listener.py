@@ -12,7 +12,7 @@ from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from swarm_loc_estimator.common.node import MessageTypeError, message_class
-from swarm_loc_estimator.doctor.doctor import keep
+from swarm_loc_estimator.doctor.doctor import is_looked_at, keep
 from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message, Publisher
 from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -69,6 +69,8 @@ class Listener(Node):
             if name in self._types or name in _OWN or not self.count_publishers(full):
                 continue
             self._types[name] = types[0]
+            if not is_looked_at(types[0]):
+                continue
             try:
                 kind = message_class(types[0])
             except MessageTypeError:

@@ -36,8 +36,12 @@ _ROUNDS = 8
 _CLEARER = 0.5
 """Residual of a mirrored track over that of the true one, below which the sign is wrong."""
 _STANDS_M = 1e-4
-_SCALE, _YAW, _SIGNIFICANT = 0.15, math.radians(20.0), 5.0
+_SCALE, _YAW, _SIGNIFICANT = 0.15, math.radians(30.0), 5.0
 """Least errors of scale and yaw that are named, and least multiple of their sigma."""
+_TURN_NS, _MIN_TURN = 500_000_000, 2.0
+"""Turns of gyroscopes are compared over this time, and if wheels turn by this much in all [rad]."""
+_DEGREES, _SLACK = 20.0, 0.3
+"""Ratios of gyroscope to wheels from which units, sign or silence are named."""
 _AHEAD = 0.4
 """Least usual share of the optical z axis in the directions of markers."""
 
@@ -53,6 +57,32 @@ _WRONG: MappingProxyType[str, Change] = MappingProxyType(
 """What odometry may do wrong, and how it is undone for poses (k, 3)."""
 
 
+def _check_turns(evidence: Evidence, index: int, own: OdometryRows) -> Iterator[Finding]:
+    """Turns of a gyroscope beside those of the wheels."""
+    rates = chosen(evidence.turn_rates, evidence.turn_rates.robot == index)
+    if rates.stamp_ns.size < _MIN_ROWS or own.robot.size < _MIN_ROWS:
+        return
+    order, by = np.argsort(own.stamp_ns, kind="stable"), np.argsort(rates.stamp_ns, kind="stable")
+    own, rates = chosen(own, order), chosen(rates, by)
+    passed_s = 1e-9 * np.diff(rates.stamp_ns)
+    turned = np.append(0.0, np.cumsum(0.5 * (rates.rate[1:] + rates.rate[:-1]) * passed_s))
+    begin_ns = max(own.stamp_ns[0], rates.stamp_ns[0])
+    at_ns = np.arange(begin_ns, min(own.stamp_ns[-1], rates.stamp_ns[-1]), _TURN_NS)
+    by_wheels = np.diff(np.interp(at_ns, own.stamp_ns, np.unwrap(own.pose[:, 2])))
+    by_gyroscope = np.diff(np.interp(at_ns, rates.stamp_ns, turned))
+    if np.abs(by_wheels).sum() < _MIN_TURN:
+        return
+    ratio = float(by_gyroscope @ by_wheels / (by_wheels @ by_wheels))
+    name = f"{evidence.source_name(index)}'s gyroscope"
+    problem = f"measures {ratio:.2g} times the turns of the wheels"
+    if ratio > _DEGREES:
+        yield Finding(name, problem, "Publish radians per second")
+    elif ratio < -_SLACK:
+        yield Finding(name, problem, "Turns are positive to the left: correct its driver or mount (imu.roll)")
+    elif abs(ratio) < _SLACK:
+        yield Finding(name, problem, "Look at its driver: is angular_velocity set, and its z axis vertical?")
+
+
 class _Alignment(NamedTuple):
     """Scale and yaw [rad] between sightings and odometry, their sigma, and the residual [m]."""
 
@@ -66,10 +96,10 @@ def check_motion(evidence: Evidence) -> Iterator[Finding]:
     """Sightings of landmarks agree with odometry."""
     rows = evidence.odometry
     for index, robot in enumerate(evidence.swarm.robots):
-        camera = robot.camera
+        own, camera = chosen(rows, rows.robot == index), robot.camera
+        yield from _check_turns(evidence, index, own)
         if camera is None:
             continue
-        own = chosen(rows, rows.robot == index)
         seen, landmark, stamp_ns = _sightings(evidence, index, robot)
         if len(seen) < _MIN_ROWS:
             continue

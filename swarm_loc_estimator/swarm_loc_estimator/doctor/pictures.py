@@ -26,9 +26,14 @@ IMAGE_ENCODINGS = frozenset(
 
 def check_pictures(evidence: Evidence) -> Iterator[Finding]:
     """Cameras with images have intrinsics, and an encoding that the detectors read."""
+    cameras = tuple(f"{robot.name}/" for robot in evidence.swarm.robots if robot.camera is not None)
     for name, heard in evidence.topics.items():
         is_compressed = same_type(heard.type, COMPRESSED_IMAGE)
         if not is_compressed and not same_type(heard.type, IMAGE):
+            continue
+        if not name.startswith(cameras) or not name.removesuffix("/compressed").endswith("image_raw"):
+            continue
+        if "depth" in name:
             continue
         images, malformed = decoded(heard)
         if malformed:
@@ -44,7 +49,8 @@ def check_pictures(evidence: Evidence) -> Iterator[Finding]:
         # image_raw/compressed is a transport of image_raw, which has camera_info beside it
         namespace = name.removesuffix("/compressed").rpartition("/")[0]
         info_name = f"{namespace}/camera_info".lstrip("/")
-        infos, _ = decoded(evidence.topics.get(info_name, Heard(CAMERA_INFO)))
+        found = evidence.topics.get(info_name, Heard(""))
+        infos = decoded(found)[0] if same_type(found.type, CAMERA_INFO) else []
         yield from _of_intrinsics(
             name, info_name, infos[-1] if infos else None, None if is_compressed else image
         )

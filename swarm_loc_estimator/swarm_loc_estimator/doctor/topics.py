@@ -23,9 +23,11 @@ _STARTS = MappingProxyType(
 """What to do without the messages of a sensor."""
 _SLOW_S = 0.35
 """Longest usual time between two odometry messages [s]."""
-_PAUSE_S = 2.0
-"""Shortest pause of odometry that is named [s]."""
+_PAUSE_S, _SILENT_S = 2.0, 10.0
+"""Shortest pauses that are named: of odometry and gyroscopes, and at the end of detections [s]."""
+_PERIODIC = ("odometry", "imu", "detections")
 _SOLE = ("swarm/poses",)
+DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 
 
 def check_topics(evidence: Evidence) -> Iterator[Finding]:
@@ -46,8 +48,8 @@ def check_topics(evidence: Evidence) -> Iterator[Finding]:
                 f"has {counted.malformed} messages, none of which is a {topic.kind.message_type} of ROS 2",
                 "Rebuild its publisher with the messages of this workspace",
             )
-        elif heard is not None and counted.received and topic.kind.rows == "odometry":
-            yield from _rate(topic, heard)
+        elif heard is not None and counted.received and topic.kind.rows in _PERIODIC:
+            yield from _rate(topic, heard, evidence.end_ns)
     expected = {
         topic.name for topic in evidence.inputs if topic.expected and topic.name not in evidence.topics
     }
@@ -59,7 +61,7 @@ def check_topics(evidence: Evidence) -> Iterator[Finding]:
             )
     yield from _publishers(evidence)
     for name, heard in evidence.topics.items():
-        if same_type(heard.type, "diagnostic_msgs/msg/DiagnosticArray"):
+        if same_type(heard.type, DIAGNOSTICS):
             yield from _of_diagnostics(name, heard)
 
 
@@ -92,7 +94,7 @@ def _missing(evidence: Evidence, topic: InputTopic, heard: Heard | None, lone: d
     of_type.sort(key=lambda name: (name not in lone, not name.endswith(last), robot not in name, name))
     if of_type:
         how = "-r" if evidence.is_live else "--remap"
-        remedy = f"Remap it ({how} {of_type[0]}:={topic.name}), or correct the name in the description"
+        remedy = f"Remap it ({how} {topic.name}:={of_type[0]}), or correct the name in the description"
         return Finding(topic.name, f"has no messages; {listed(of_type)} has this type", remedy)
     return Finding(topic.name, "has no messages", _STARTS.get(topic.kind.rows, "Start its publisher"))
 
@@ -106,20 +108,27 @@ def _convert(topic: InputTopic) -> str:
     return "Publish the expected type, or give the topic another name"
 
 
-def _rate(topic: InputTopic, heard: Heard) -> Iterator[Finding]:
-    """Odometry that is rare or pauses."""
+def _rate(topic: InputTopic, heard: Heard, end_ns: int) -> Iterator[Finding]:
+    """Messages that are rare, pause, or ended; what a camera sees may pause, as there may be no markers."""
+    last_s = 1e-9 * (end_ns - heard.messages[-1].arrival_ns)
     between_s = 1e-9 * np.diff([arrival_ns for arrival_ns, _ in heard.messages])
+    if topic.kind.rows == "detections":
+        if last_s > max(_SILENT_S, 3.0 * between_s.max(initial=0.0)):
+            problem = f"has no messages in the last {last_s:.0f} s"
+            yield Finding(topic.name, problem, "Look whether its node still runs, and what its camera sees")
+        return
     if between_s.size < 2:
         problem = f"has {len(heard.messages)} messages in all"
-        yield Finding(topic.name, problem, "Publish odometry 5 times per second or more often")
+        yield Finding(topic.name, problem, "Publish it 5 times per second or more often")
         return
-    usual_s, longest_s = float(np.median(between_s)), float(between_s.max())
+    usual_s, longest_s = float(np.median(between_s)), max(last_s, float(between_s.max()))
     if usual_s > _SLOW_S:
         problem = f"has a message every {usual_s:.2g} s; poses are predicted with a constant speed meanwhile"
-        yield Finding(topic.name, problem, "Publish odometry 5 times per second or more often")
+        yield Finding(topic.name, problem, "Publish it 5 times per second or more often")
     elif longest_s > max(_PAUSE_S, 10.0 * usual_s):
         problem = f"pauses for up to {longest_s:.2g} s"
-        yield Finding(topic.name, problem, "Check the radio link and the load of the robot")
+        remedy = "Look whether its node still runs, and check the radio link and the load of the robot"
+        yield Finding(topic.name, problem, remedy)
 
 
 def _publishers(evidence: Evidence) -> Iterator[Finding]:

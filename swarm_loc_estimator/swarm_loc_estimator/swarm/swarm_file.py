@@ -217,7 +217,7 @@ class _Loader(TreeChecks):
         key = f"robots.{name}"
         mapping = self.mapping(tree, key, _ROBOT)
         type_name = mapping.get("type", "")
-        if type_name and (not isinstance(type_name, str) or type_name not in types):
+        if type_name not in (None, "") and (not isinstance(type_name, str) or type_name not in types):
             raise self.error(f"{key}.type", type_name, f"must be one of the types{nearest(type_name, types)}")
         own = self._layer(mapping, key, _ROBOT, of_robot=True)
         layers = [defaults, *([types[type_name]] if type_name else []), own]

@@ -13,11 +13,12 @@ import pytest
 
 from swarm_loc_estimator.cli import doctor as command
 from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.definitions import ODOMETRY, TRANSFORMS
+from swarm_loc_estimator.common.messages.definitions import IMU, ODOMETRY, TRANSFORMS
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag, examine, lines_of
 from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message, Publisher
 from swarm_loc_estimator.doctor.pictures import CAMERA_INFO, IMAGE
 from swarm_loc_estimator.offline.recorded_bag import unwatched
+from swarm_loc_estimator.swarm.error_models import ImuModel
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
@@ -153,6 +154,23 @@ def paused(evidence: Evidence) -> Evidence:
     return with_topics(evidence, epuck2__odom=Heard(ODOMETRY, kept))
 
 
+def ending(name: str) -> Change:
+    """Nothing on a topic after ten seconds."""
+
+    def change(evidence: Evidence) -> Evidence:
+        heard = evidence.topics[name]
+        kept = [one for one in heard.messages if one.arrival_ns - heard.messages[0].arrival_ns < 10e9]
+        return with_topics(evidence, **{name.replace("/", "__"): replace(heard, messages=kept)})
+
+    return change
+
+
+def in_millimetres(message: Any, _arrival_ns: int) -> None:
+    position = message.pose.pose.position
+    position.x, position.y = 1e3 * position.x, 1e3 * position.y
+    message.twist.twist.linear.x *= 1e3
+
+
 def two_robots_one_driver(evidence: Evidence) -> Evidence:
     return with_topics(evidence, epuck2__odom=evidence.topics["epuck1/odom"])
 
@@ -237,6 +255,35 @@ def started_elsewhere(swarm: Swarm) -> Swarm:
     return replace(swarm, robots=(one, replace(other, start=(x + 1.0, y, theta)), *rest))
 
 
+def started_turned(swarm: Swarm) -> Swarm:
+    one, other, *rest = swarm.robots
+    assert other.start is not None
+    x, y, theta = other.start
+    return replace(swarm, robots=(one, replace(other, start=(x, y, theta - 0.5 * np.pi)), *rest))
+
+
+def with_gyroscope(factor: float) -> Change:
+    """A robot with a gyroscope that measures the turn rates of its odometry, times a factor."""
+
+    def change(evidence: Evidence) -> Evidence:
+        types, messages = typestore().types, []
+        zero: Any = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+        turn: Any = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
+        for arrival_ns, data in evidence.topics[ODOM].messages:
+            odometry: Any = typestore().deserialize_cdr(data, ODOMETRY)
+            rate: Any = types["geometry_msgs/msg/Vector3"](0.0, 0.0, factor * odometry.twist.twist.angular.z)
+            message: Any = types[IMU](
+                odometry.header, turn, np.zeros(9), rate, np.zeros(9), zero, np.zeros(9)
+            )
+            messages.append(Message(arrival_ns, bytes(typestore().serialize_cdr(message, IMU))))
+        one, other, *rest = evidence.swarm.robots
+        other = replace(other, imu=ImuModel(turn_noise_density=1e-3))
+        swarm = replace(evidence.swarm, robots=(one, other, *rest))
+        return Evidence(swarm, {**evidence.topics, f"{ROBOT}/imu": Heard(IMU, messages)})
+
+    return change
+
+
 def landmark_elsewhere(swarm: Swarm) -> Swarm:
     first, *rest = swarm.landmarks
     return replace(swarm, landmarks=(replace(first, x=first.x + 0.5), *rest))
@@ -264,7 +311,7 @@ def never_located(evidence: Evidence) -> Evidence:
 WRONG: dict[str, tuple[Change, str, str]] = {
     "no odometry": (lambda e: with_topics(e, epuck2__odom=None), ODOM, "has no messages"),
     "no detections": (lambda e: with_topics(e, epuck2__detections=None), SEEN, "Start a detector"),
-    "other namespace": (renamed, ODOM, "Remap it (--remap robot2/odom:=epuck2/odom)"),
+    "other namespace": (renamed, ODOM, "Remap it (--remap epuck2/odom:=robot2/odom)"),
     "other type": (retyped, ODOM, "has the type geometry_msgs/msg/PoseStamped"),
     "malformed": (malformed, ODOM, "none of which is a nav_msgs/msg/Odometry"),
     "robot of no description": (of_nobody, "epuck9/odom", "belongs to no robot"),
@@ -284,6 +331,18 @@ WRONG: dict[str, tuple[Change, str, str]] = {
         "has 1 messages in all",
     ),
     "pauses": (paused, ODOM, "pauses for up to 5"),
+    "driver that dies": (ending(ODOM), ODOM, "pauses for up to 15"),
+    "detector that dies": (ending(SEEN), SEEN, "has no messages in the last 15 s"),
+    "odometry in millimetres": (edited([ODOM], in_millimetres), ROBOT, "Publish odometry in metres"),
+    "start turned": (with_swarm(started_turned), ROBOT, "and 90 deg from its start"),
+    "gyroscope in degrees": (with_gyroscope(57.3), f"{ROBOT}'s gyroscope", "Publish radians per second"),
+    "gyroscope upside down": (with_gyroscope(-1.0), f"{ROBOT}'s gyroscope", "positive to the left"),
+    "silent gyroscope": (with_gyroscope(0.0), f"{ROBOT}'s gyroscope", "is angular_velocity set"),
+    "late stamps of images": (
+        shifted([SEEN], -1.5),
+        f"{ROBOT}'s detections",
+        "Stamp images with their exposure",
+    ),
     "clock ahead": (shifted(BOTH, 3.0), f"{ROBOT}'s odometry", "in the future"),
     "clock behind": (shifted(BOTH, -0.7), ROBOT, "behind those of the other robots"),
     "old stamps": (shifted(BOTH, -60.0), f"{ROBOT}'s odometry", "which is beyond horizon_s"),
@@ -327,7 +386,7 @@ WRONG: dict[str, tuple[Change, str, str]] = {
     "not the optical frame": (edited([SEEN], in_body_axes), ROBOT, "Publish them in the optical frame"),
     "positions of zeros": (edited([SEEN], at_zero), ROBOT, "that are not in front of it"),
     "turned camera": (with_swarm(turned_camera), ROBOT, "Set camera.yaw to"),
-    "start elsewhere": (with_swarm(started_elsewhere), ROBOT, "1.00 m from its start"),
+    "start elsewhere": (with_swarm(started_elsewhere), ROBOT, "which is 1.00 m and 0 deg from its start"),
     "landmark elsewhere": (with_swarm(landmark_elsewhere), "landmark 100", "is other than described"),
     "exchanged ids": (with_swarm(exchanged_ids), "epuck1", "sees markers of its own"),
     "never located": (never_located, "alone", "cannot be located"),
@@ -354,9 +413,16 @@ def test_nothing_is_wrong_in_good_bags(bag: str, seconds: float) -> None:
     assert lines_of(examine(good(bag, seconds))) == []
 
 
+def test_a_good_gyroscope_is_not_accused() -> None:
+    findings = examine(with_gyroscope(1.0)(good()))
+    assert not [one for one in findings if one.about.endswith("gyroscope")]
+
+
 def test_the_command_prints_findings(capsys: pytest.CaptureFixture[str]) -> None:
     assert command.main([str(BAGS / "eight_five_robots"), "--seconds", "10"]) == 0
-    assert capsys.readouterr().out.endswith("Nothing is wrong.\n")
+    said = capsys.readouterr().out
+    assert said.endswith("Nothing is wrong.\n")
+    assert "only the first 10 s of the bag were looked at" in said
     assert command.main([str(BAGS / "eight_pictures")]) == 1
     said = capsys.readouterr().out
     assert "- epuck1/detections, epuck2/detections: each has no messages. Start a detector such as" in said
