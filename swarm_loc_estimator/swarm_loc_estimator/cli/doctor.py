@@ -45,9 +45,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with ProgressLine() as progress:
         if is_live:
             listen = import_module("swarm_loc_estimator.doctor.listener").listen
-            evidence = listen(swarm, seconds, progress, use_sim_time=options.use_sim_time)
+            evidence = listen(swarm, seconds, progress, options.namespace, use_sim_time=options.use_sim_time)
         else:
-            evidence = evidence_of_bag(options.source, swarm, seconds, progress, options.remap)
+            evidence = evidence_of_bag(
+                options.source, swarm, seconds, progress, options.remap, options.namespace
+            )
         progress(1.0, "checking")
         findings = examine(evidence)
     messages = sum(len(heard.messages) for heard in evidence.topics.values())
@@ -70,6 +72,7 @@ def _parser() -> argparse.ArgumentParser:
         type=number_in(1.0, 3600.0, "s"),
         help=f"how long to look (default: {_LIVE_S:g} s live, {_BAG_S:g} s of a bag)",
     )
+    parser.add_argument("--namespace", default="", help="namespace of the whole swarm, such as lab")
     parser.add_argument("--use-sim-time", action="store_true", help="take time from /clock")
     add_remap(parser)
     return parser

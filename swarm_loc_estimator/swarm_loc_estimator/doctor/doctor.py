@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.health import listed
@@ -50,7 +51,12 @@ def lines_of(findings: Sequence[Finding]) -> list[str]:
 
 
 def evidence_of_bag(
-    bag: Path, swarm: Swarm, seconds: float, progress: Progress, remap: Mapping[str, str]
+    bag: Path,
+    swarm: Swarm,
+    seconds: float,
+    progress: Progress,
+    remap: Mapping[str, str] = MappingProxyType({}),
+    namespace: str = "",
 ) -> Evidence:
     """The first seconds of a bag.
 
@@ -60,6 +66,7 @@ def evidence_of_bag(
         seconds: How much of it is read [s].
         progress: Called now and then.
         remap: Expected topic -> topic of the bag, see `renamed_topics`.
+        namespace: Of the whole swarm, "" for none.
 
     Raises:
         BagError: Nothing in the bag can be read, or a topic cannot be mapped.
@@ -74,7 +81,10 @@ def evidence_of_bag(
                 break
             keep(messages.setdefault(name, []), types[name], Message(log_ns, data))
             progress(min(1.0, reader.progress), "reading")
-        topics = {name: Heard(kind, messages.get(name, [])) for name, kind in types.items()}
+        prefix = f"{namespace.strip('/')}/"
+        topics = {
+            name.removeprefix(prefix): Heard(kind, messages.get(name, [])) for name, kind in types.items()
+        }
         is_cut = end_ns < reader.time_range_ns[1]
         return Evidence(swarm, topics, remarks=tuple(reader.losses), is_cut=is_cut)
 

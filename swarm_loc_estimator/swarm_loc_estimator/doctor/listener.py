@@ -28,16 +28,17 @@ class Listener(Node):
 
     Args:
         swarm: The description.
+        namespace: Of the whole swarm, "" for none.
         use_sim_time: Whether arrivals are by /clock.
     """
 
-    def __init__(self, swarm: Swarm, *, use_sim_time: bool) -> None:
-        super().__init__(
-            "doctor", parameter_overrides=[Parameter("use_sim_time", Parameter.Type.BOOL, use_sim_time)]
-        )
+    def __init__(self, swarm: Swarm, namespace: str = "", *, use_sim_time: bool) -> None:
+        override = Parameter("use_sim_time", Parameter.Type.BOOL, use_sim_time)
+        super().__init__("doctor", namespace=namespace, parameter_overrides=[override])
         self._swarm = swarm
         self._messages: dict[str, list[Message]] = {}
         self._types: dict[str, str] = {}
+        self._full: dict[str, str] = {}
 
     def listen(self, seconds: float, progress: Progress) -> Evidence:
         """What is heard in some seconds."""
@@ -55,7 +56,7 @@ class Listener(Node):
         return Evidence(
             self._swarm,
             {
-                name: Heard(kind, self._messages.get(name, []), self.publishers_of(name))
+                name: Heard(kind, self._messages.get(name, []), self.publishers_of(self._full[name]))
                 for name, kind in self._types.items()
             },
             is_live=True,
@@ -63,12 +64,12 @@ class Listener(Node):
 
     def _follow_topics(self) -> None:
         """Subscribe to topics that are new."""
-        own = self.get_namespace().strip("/")
+        own = self.get_namespace().rstrip("/")
         for full, types in self.get_topic_names_and_types():
-            name = full.strip("/").removeprefix(f"{own}/" if own else "")
+            name = full.removeprefix(f"{own}/").lstrip("/")
             if name in self._types or name in _OWN or not self.count_publishers(full):
                 continue
-            self._types[name] = types[0]
+            self._types[name], self._full[name] = types[0], full
             if not is_looked_at(types[0]):
                 continue
             try:
@@ -100,10 +101,12 @@ def _qos(name: str) -> QoSProfile:
     return QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def listen(swarm: Swarm, seconds: float, progress: Progress, *, use_sim_time: bool) -> Evidence:
+def listen(
+    swarm: Swarm, seconds: float, progress: Progress, namespace: str = "", *, use_sim_time: bool
+) -> Evidence:
     """What is heard of a swarm in some seconds."""
     rclpy.init()
-    node = Listener(swarm, use_sim_time=use_sim_time)
+    node = Listener(swarm, namespace, use_sim_time=use_sim_time)
     try:
         return node.listen(seconds, progress)
     finally:

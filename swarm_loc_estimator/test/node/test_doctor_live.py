@@ -6,6 +6,7 @@ import threading
 import time
 from pathlib import Path
 
+import pytest
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from node_world import Ros, detection_bytes, odometry_bytes, sight
@@ -20,13 +21,15 @@ from swarm_loc_msgs.msg import MarkerDetectionArray
 BEST_EFFORT = QoSProfile(depth=10, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
-def test_a_live_graph_is_heard(ros: Ros, swarm_file: Path) -> None:
+@pytest.mark.parametrize("namespace", ["", "lab"])
+def test_a_live_graph_is_heard(ros: Ros, swarm_file: Path, namespace: str) -> None:
     """Alpha is well but for its QoS; beta has another type, no detector, and its odometry elsewhere."""
-    odometry = ros.tester.create_publisher(Odometry, "alpha/odom", BEST_EFFORT)
-    detections = ros.tester.create_publisher(MarkerDetectionArray, "alpha/detections", 10)
-    ros.tester.create_publisher(PoseStamped, "beta/odom", 10)
-    ros.tester.create_publisher(Odometry, "beta/wheels", 10)
-    listener = Listener(load_swarm(swarm_file), use_sim_time=False)
+    prefix = f"/{namespace}/" if namespace else "/"
+    odometry = ros.tester.create_publisher(Odometry, f"{prefix}alpha/odom", BEST_EFFORT)
+    detections = ros.tester.create_publisher(MarkerDetectionArray, f"{prefix}alpha/detections", 10)
+    ros.tester.create_publisher(PoseStamped, f"{prefix}beta/odom", 10)
+    ros.tester.create_publisher(Odometry, f"{prefix}beta/wheels", 10)
+    listener = Listener(load_swarm(swarm_file), namespace, use_sim_time=False)
     stop = threading.Event()
 
     def drive() -> None:

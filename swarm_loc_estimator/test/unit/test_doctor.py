@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from swarm_loc_estimator.cli import doctor as command
-from swarm_loc_estimator.common.bags.writer import typestore
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
 from swarm_loc_estimator.common.messages.definitions import IMU, ODOMETRY, TRANSFORMS
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag, examine, lines_of
 from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message, Publisher
@@ -34,7 +35,7 @@ Change = Callable[[Evidence], Evidence]
 def good(bag: str = "eight_five_robots", seconds: float = 25.0) -> Evidence:
     """The first seconds of a bag of the repository."""
     swarm = load_swarm(BAGS / bag / "swarm.yaml")
-    return evidence_of_bag(BAGS / bag, swarm, seconds, unwatched, {})
+    return evidence_of_bag(BAGS / bag, swarm, seconds, unwatched)
 
 
 def with_topics(evidence: Evidence, **changed: Heard | None) -> Evidence:
@@ -447,3 +448,16 @@ def test_the_command_prints_findings(capsys: pytest.CaptureFixture[str]) -> None
 def test_any_evidence_is_looked_at(change: Change) -> None:
     """Nothing, single, broken and simultaneous messages raise neither errors nor warnings."""
     lines_of(examine(change(good(seconds=5.0))))
+
+
+def test_a_whole_swarm_may_be_in_a_namespace(tmp_path: Path) -> None:
+    bag, swarm = BAGS / "eight_five_robots", load_swarm(BAGS / "eight_five_robots" / "swarm.yaml")
+    with BagReader(bag) as reader, BagWriter(tmp_path / "bag") as writer:
+        for topic in reader.topics:
+            writer.add_topic(f"lab/{topic.name}", topic.type)
+        for name, _, log_ns, data in reader.messages():
+            if log_ns < reader.time_range_ns[0] + 5e9:
+                writer.write(f"lab/{name}", log_ns, data)
+    for namespace, is_wrong in (("", True), ("lab", False), ("/lab/", False)):
+        evidence = evidence_of_bag(tmp_path / "bag", swarm, 5.0, unwatched, namespace=namespace)
+        assert bool(examine(evidence)) == is_wrong
