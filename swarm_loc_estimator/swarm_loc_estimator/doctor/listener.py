@@ -53,10 +53,16 @@ class Listener(Node):
             progress((now_s - begin_s) / seconds, "listening")
             executor.spin_once(timeout_sec=0.1)
         executor.remove_node(self)
+        # messages before the first /clock have no time of arrival; without any /clock, that is the finding
+        is_timed = any(one.arrival_ns for kept in self._messages.values() for one in kept)
+        heard = {
+            name: [one for one in kept if one.arrival_ns or not is_timed]
+            for name, kept in self._messages.items()
+        }
         return Evidence(
             self._swarm,
             {
-                name: Heard(kind, self._messages.get(name, []), self.publishers_of(self._full[name]))
+                name: Heard(kind, heard.get(name, []), self.publishers_of(self._full[name]))
                 for name, kind in self._types.items()
             },
             is_live=True,
