@@ -6,8 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.doctor.evidence import Evidence, Finding
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.doctor.evidence import SETTINGS, Evidence, Finding
 
 _HOUR_S = 3600.0
 _AHEAD_S = 0.05
@@ -16,7 +16,7 @@ _APART_S = 0.3
 _LATE_S = 0.8
 """Detections that are later than odometry by more are named [s]; a detector takes .15 to .3 s."""
 _BACK = 0.02
-"""Share of stamps before the one that arrived before, from which they are named."""
+"""Share of stamps that are older than the stamp of the message before, from which they are named."""
 _SENSORS = ("odometry", "detections", "imu", "ranges", "brightness")
 _SET_CLOCK = "Synchronize it with the others (chrony)"
 
@@ -29,7 +29,7 @@ def check_clocks(evidence: Evidence) -> Iterator[Finding]:
         for robot in np.unique(rows.robot).tolist():
             own = rows.robot == robot
             topic = f"{evidence.source_name(robot)}'s {sensor}"
-            found = _of_topic(topic, rows.stamp_ns[own], rows.arrival_ns[own], evidence.settings.horizon_s)
+            found = _of_topic(topic, rows.stamp_ns[own], rows.arrival_ns[own])
             yield from found
             name, delay_s = evidence.source_name(robot), _delay_s(rows.stamp_ns[own], rows.arrival_ns[own])
             if not found and sensor == "odometry":
@@ -39,29 +39,28 @@ def check_clocks(evidence: Evidence) -> Iterator[Finding]:
                 remedy = "Stamp images with their exposure, and synchronize the computer of the camera"
                 yield Finding(f"{name}'s detections", problem, remedy)
     usual = float(np.median([*delays.values()])) if delays else 0.0
-    if len(delays) == 2 and abs(np.diff([*delays.values()])[0]) > _APART_S:
-        apart = abs(float(np.diff([*delays.values()])[0]))
-        yield Finding(" and ".join(delays), f"have clocks {apart:.2g} s apart", "Synchronize them (chrony)")
+    if len(delays) == 2:  # which of them is wrong cannot be seen
+        apart = max(delays.values()) - min(delays.values())
+        if apart > _APART_S:
+            yield Finding(
+                " and ".join(delays), f"have clocks {apart:.2g} s apart", "Synchronize them (chrony)"
+            )
         return
-    for robot_name, delay in delays.items():
-        if abs(delay - usual) > _APART_S:
-            which = "behind" if delay > usual else "ahead of"
-            problem = f"has a clock {abs(delay - usual):.2g} s {which} those of the other robots"
-            yield Finding(robot_name, problem, _SET_CLOCK)
+    for name, delay_s in delays.items():
+        if abs(delay_s - usual) > _APART_S:
+            which = "behind" if delay_s > usual else "ahead of"
+            problem = f"has a clock {abs(delay_s - usual):.2g} s {which} those of the other robots"
+            yield Finding(name, problem, _SET_CLOCK)
 
 
 def _delay_s(stamp_ns: IntArray, arrival_ns: IntArray) -> float:
-    return float(np.median(_seconds(stamp_ns, arrival_ns)))
+    """Median time from stamps to arrivals [s]."""
+    return 1e-9 * float(np.median(arrival_ns - stamp_ns))
 
 
-def _seconds(stamp_ns: IntArray, arrival_ns: IntArray) -> FloatArray:
-    """From stamps to arrivals [s]."""
-    return np.asarray(1e-9 * (arrival_ns - stamp_ns))
-
-
-def _of_topic(topic: str, stamp_ns: IntArray, arrival_ns: IntArray, horizon_s: float) -> list[Finding]:
+def _of_topic(topic: str, stamp_ns: IntArray, arrival_ns: IntArray) -> list[Finding]:
     """Stamps of one topic."""
-    delay_s = _delay_s(stamp_ns, arrival_ns)
+    delay_s, horizon_s = _delay_s(stamp_ns, arrival_ns), SETTINGS.horizon_s
     if (stamp_ns == 0).mean() > 0.5:
         return [Finding(topic, "has stamps of zero", "Let its node set header.stamp to the acquisition time")]
     if stamp_ns.size > 10 and np.ptp(stamp_ns) == 0:

@@ -1,4 +1,4 @@
-"""Contents of messages: what the estimator drops or contradicts, and markers that nobody describes."""
+"""Contents of messages: what the estimator drops or contradicts, unknown markers, other starts."""
 
 from __future__ import annotations
 
@@ -31,10 +31,6 @@ _REASONS = MappingProxyType(
         "no_odometry": ("publishes odometry but has none in the description", "Remove odometry: null"),
         "odometry_non_finite": ("publishes odometry that is not finite", "Look for NaN in its driver"),
         "odometry_absurd": ("publishes odometry beyond 1000 km", "Look at its driver and its units"),
-        "odometry_jump": (
-            "moves faster than max_speed or max_turn_rate by its odometry",
-            "Check units (metres, radians), or raise these values of the description",
-        ),
         "imu_non_finite": (
             "publishes turn rates that are not finite",
             "Look for NaN in the driver of the IMU",
@@ -45,7 +41,6 @@ _REASONS = MappingProxyType(
         "bad_covariance": ("publishes invalid covariances", "Publish symmetric, positive ones, or zeros"),
         "bad_content": ("publishes detections with an unknown content", "Set content to one of CONTENT_*"),
         "own_marker": ("sees markers of its own", "Check the ids of the description"),
-        "fix_frame": ("gets fixes in another frame than map", "Publish them in map, or set map_frame"),
         "fix_without_covariance": (
             "gets fixes without covariance",
             "Publish one, or describe fix.position_sigma",
@@ -53,7 +48,6 @@ _REASONS = MappingProxyType(
         "face_down": ("sees lying markers from below", "Check the pose of this camera in the description"),
         "not_flat": ("sees lying markers askew", "Check size and z of the markers, and the camera's pose"),
         "uwb_unknown_address": ("measures ranges to unknown addresses", "Describe these radios"),
-        "ir_unknown_id": ("hears boards with unknown ids", "Describe their ir.id"),
     }
 )
 """Reasons of drops -> what a robot or camera does, and what to do about it."""
@@ -66,7 +60,7 @@ def check_contents(evidence: Evidence) -> Iterator[Finding]:
     yield from _too_fast(evidence)
     readings = _readings(evidence)
     for index, source in enumerate(evidence.swarm.sources):
-        for reason, count in evidence.estimated.drops_of(index).items():
+        for reason, count in evidence.converted[1].of_robot[index].items():
             if reason in _REASONS and count > _MIN_SHARE * readings[:, index].sum():
                 problem, remedy = _REASONS[reason]
                 yield Finding(source.name, f"{problem} ({count} times)", remedy)
@@ -83,8 +77,8 @@ def check_estimate(evidence: Evidence) -> Iterator[Finding]:
         verb = "is" if len(some) == 1 else "are"
         yield Finding(listed([one.about for one in some]), f"{verb} {problem}: {some[0].text}", remedy)
     yield from _other_starts(evidence)
-    motion = [one in ("odometry", "imu") for one in SENSORS]
-    measured = _readings(evidence)[~np.array(motion)].sum(axis=0)
+    measures = [name not in ("odometry", "imu") for name in SENSORS]
+    measured = _readings(evidence)[measures].sum(axis=0)
     seen = evidence.rows("detections").detection["id"]
     for index, robot in enumerate(evidence.swarm.robots):
         is_seen = (
@@ -149,7 +143,7 @@ _CONTRADICTED = MappingProxyType(
 
 
 def _unknown_markers(evidence: Evidence) -> Iterator[Finding]:
-    """Markers that nobody describes, and described landmarks that nobody sees."""
+    """Markers that nobody describes."""
     detected = evidence.rows("detections").detection["id"]
     ids, counts = np.unique(detected, return_counts=True)
     unknown = {

@@ -76,7 +76,7 @@ def evidence_of_bag(
     with BagReader(bag, renamed_topics(remap, swarm, known)) as reader:
         types = {topic.name: topic.type for topic in reader.topics}
         end_ns = reader.time_range_ns[0] + round(seconds * 1e9)
-        for name, _, log_ns, data in reader.messages():
+        for name, _, log_ns, data in reader.messages([n for n, kind in types.items() if is_looked_at(kind)]):
             if log_ns > end_ns:
                 break
             keep(messages.setdefault(name, []), types[name], Message(log_ns, data))
@@ -95,7 +95,7 @@ def is_looked_at(message_type: str) -> bool:
 
 
 def keep(kept: list[Message], message_type: str, message: Message) -> None:
-    """Keep a message that a check looks at, unless it is one of many images."""
+    """Keep a message, unless it is one of many images."""
     is_image = same_type(message_type, IMAGE) or same_type(message_type, COMPRESSED_IMAGE)
-    if is_looked_at(message_type) and (not is_image or len(kept) < MAX_IMAGES):
+    if not is_image or len(kept) < MAX_IMAGES:
         kept.append(message)

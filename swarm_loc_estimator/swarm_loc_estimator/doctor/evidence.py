@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import struct
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -19,14 +19,16 @@ from swarm_loc_estimator.sensors.conversion import InputConverter
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
-from swarm_loc_estimator.sensors.registry import SENSORS, Batch, InputTopic, live_topics
-from swarm_loc_estimator.sensors.sensor import joined
+from swarm_loc_estimator.sensors.registry import SENSORS, Batch, InputTopic, Measurements, live_topics
+from swarm_loc_estimator.sensors.sensor import DropCounts, joined
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradicted, Contradiction
 from swarm_loc_estimator.timeline.estimate import Status
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 
+SETTINGS = Settings()
+"""Of the estimator."""
 _TICK_NS = 500_000_000
 _AT_ZERO = 0.05
 """Odometry begins at zero if x and y [m] and the heading [rad] are smaller."""
@@ -88,14 +90,12 @@ class Estimated(NamedTuple):
     """What the estimator made of all readings.
 
     Attributes:
-        drops_of: Numbers of dropped readings by reason, of a robot or camera.
         status: (N,) of the robots at the end.
         contradictions: Those that lasted, each as it was last.
         begin_ns: (N,) when a robot was tracked first; -1: never.
         begin_pose: (N, 3) its pose then.
     """
 
-    drops_of: Callable[[int], Mapping[str, int]]
     status: IntArray
     contradictions: list[Contradiction]
     begin_ns: IntArray
@@ -119,7 +119,6 @@ class Evidence:
     is_live: bool = False
     remarks: Sequence[str] = ()
     is_cut: bool = False
-    settings: Settings = field(default_factory=Settings)
 
     @cached_property
     def inputs(self) -> tuple[InputTopic, ...]:
@@ -156,42 +155,45 @@ class Evidence:
 
     def rows(self, sensor: str) -> Any:
         """All readings of a sensor, see `sensors/registry.py`."""
-        return joined([SENSORS[sensor].nothing, *(part[sensor] for part in self.read[0])])
+        return self._joined[sensor]
 
     @cached_property
-    def _valid(self) -> list[Mapping[str, Any]]:
-        """Valid odometry and turn rates, by sensor."""
-        converter = InputConverter(self.swarm, self.settings)
-        return [converter.convert(part).rows for part in self.read[0]]
+    def _joined(self) -> dict[str, Any]:
+        parts = self.read[0]
+        return {name: joined([one.nothing, *(part[name] for part in parts)]) for name, one in SENSORS.items()}
+
+    @cached_property
+    def converted(self) -> tuple[list[Measurements], DropCounts]:
+        """The measurements of all readings, and numbers of readings that cannot be used."""
+        converter = InputConverter(self.swarm, SETTINGS)
+        return [converter.convert(part) for part in self.read[0]], converter.drops
 
     @cached_property
     def odometry(self) -> OdometryRows:
         """All valid odometry."""
-        rows: OdometryRows = joined(
-            [NO_ODOMETRY, *(part.get("odometry", NO_ODOMETRY) for part in self._valid)]
-        )
+        found = (part.rows.get("odometry", NO_ODOMETRY) for part in self.converted[0])
+        rows: OdometryRows = joined([NO_ODOMETRY, *found])
         return rows
 
     @cached_property
     def turn_rates(self) -> TurnRateRows:
         """All valid turn rates of gyroscopes."""
-        rows: TurnRateRows = joined(
-            [NO_TURN_RATES, *(part.get("imu", NO_TURN_RATES) for part in self._valid)]
-        )
+        found = (part.rows.get("imu", NO_TURN_RATES) for part in self.converted[0])
+        rows: TurnRateRows = joined([NO_TURN_RATES, *found])
         return rows
 
     @cached_property
     def estimated(self) -> Estimated:
         """What the estimator makes of all readings."""
         swarm = replace(self.swarm, robots=tuple(map(self._without_old_start, range(len(self.swarm.robots)))))
-        estimator, robots = Estimator(swarm, self.settings), len(swarm.robots)
+        estimator, robots = Estimator(swarm, SETTINGS), len(swarm.robots)
         ticks, lasting = Counter[tuple[str, Contradicted]](), dict[tuple[str, Contradicted], Contradiction]()
         begin_ns, begin_pose = np.full(robots, -1), np.full((robots, 3), np.nan)
         status, count = np.full(robots, int(Status.WAITING)), 0
-        for part in self.read[0]:
+        for part in self.converted[0]:
             stamps_ns = np.arange(part.begin_ns + _TICK_NS, part.end_ns, _TICK_NS)
             for now_ns, arrived in zip(
-                [*stamps_ns.tolist(), part.end_ns], estimator.convert(part).until_each(stamps_ns), strict=True
+                [*stamps_ns.tolist(), part.end_ns], part.until_each(stamps_ns), strict=True
             ):
                 count += 1
                 estimator.receive(arrived)
@@ -204,7 +206,7 @@ class Evidence:
                     lasting[one.about, one.kind] = one
         least = max(_LASTING_TICKS, _LASTING_SHARE * count)
         found = [one for key, one in lasting.items() if ticks[key] >= least]
-        return Estimated(estimator.drops_of, status, found, begin_ns, begin_pose)
+        return Estimated(status, found, begin_ns, begin_pose)
 
     def is_at_start(self, index: int) -> bool:
         """Whether a robot was heard from its start on: its odometry began at zero."""

@@ -29,6 +29,7 @@ def check_frames(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 f"frame '{child}'", "is its own parent", "Correct header.frame_id of that transform"
             )
+    yield from _of_fixes(evidence)
     children = {child for _, child in parents}
     _, statistics, ingest = evidence.read
     parameters = EstimatorParameters()
@@ -41,3 +42,13 @@ def check_frames(evidence: Evidence) -> Iterator[Finding]:
             problem = f"is in frame '{found}', but the estimator publishes transforms for '{expected}'"
             remedy = "Set frame_id in the driver, or odom_frame (with tf_per_robot) of the estimator"
             yield Finding(topic.name, problem, remedy)
+
+
+def _of_fixes(evidence: Evidence) -> Iterator[Finding]:
+    """Fixes and aerial images that are not in `map`."""
+    _, statistics, ingest = evidence.read
+    for number, topic in enumerate(evidence.inputs):
+        found = ingest.frame_id(number)
+        if topic.kind.in_map and statistics[number].received and found != ingest.map_frame:
+            problem = f"is in frame '{found}', not in '{ingest.map_frame}'"
+            yield Finding(topic.name, problem, "Publish it in that frame, or set map_frame of the estimator")

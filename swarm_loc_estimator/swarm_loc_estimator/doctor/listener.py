@@ -24,7 +24,7 @@ _OWN = ("parameter_events", "rosout")
 
 
 class Listener(Node):
-    """Subscribes to all topics in the namespaces of a swarm.
+    """Subscribes to all topics whose messages a check looks at.
 
     Args:
         swarm: The description.
