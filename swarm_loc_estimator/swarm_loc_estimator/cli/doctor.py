@@ -25,7 +25,7 @@ from swarm_loc_estimator.common.command_line import (
 )
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag, examine, lines_of
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.swarm_file import NAME, load_swarm
 
 _DESCRIPTIONS = (".yaml", ".yml")
 _LIVE_S, _BAG_S = 20.0, 120.0
@@ -40,6 +40,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise UserError("--remap is for bags; remap topics of a live graph in their nodes.")
     if options.use_sim_time and not is_live:
         raise UserError("--use-sim-time is for a live graph; a bag has its own time.")
+    if options.namespace and not all(map(NAME.fullmatch, options.namespace.strip("/").split("/"))):
+        raise UserError(f"--namespace '{options.namespace}' must be names with slashes between, such as lab.")
     swarm = load_swarm(options.swarm or (options.source if is_live else swarm_beside(options.source)))
     seconds = options.seconds or (_LIVE_S if is_live else _BAG_S)
     with ProgressLine() as progress:

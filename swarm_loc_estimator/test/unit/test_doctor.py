@@ -85,3 +85,19 @@ def test_a_whole_swarm_may_be_in_a_namespace(tmp_path: Path) -> None:
     for namespace, is_wrong in (("", True), ("lab", False), ("/lab/", False)):
         evidence = evidence_of_bag(tmp_path / "bag", swarm, 5.0, unwatched, namespace=namespace)
         assert bool(examine(evidence)) == is_wrong
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["swarm.yaml", "--remap", "a:=b"], "--remap is for bags"),
+        (["bag", "--use-sim-time"], "--use-sim-time is for a live graph"),
+        (["bag", "--namespace", "two words"], "--namespace 'two words' must be names"),
+        (["nowhere"], "There is no bag 'nowhere'."),
+    ],
+)
+def test_wrong_options_end_with_one_sentence(
+    capsys: pytest.CaptureFixture[str], options: list[str], said: str
+) -> None:
+    assert command.main(options) == 1
+    assert said in capsys.readouterr().err
