@@ -8,11 +8,10 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.doctor.evidence import SETTINGS, Evidence, Finding
+from swarm_loc_estimator.sensors.ingest import CLOCKS_APART_S
 
 _HOUR_S = 3600.0
 _AHEAD_S = 0.05
-_APART_S = 0.3
-"""Difference of a clock from the others that is named [s]; delays of networks stay below."""
 _LATE_S = 0.8
 """Detections that are later than odometry by more are named [s]; a detector takes .15 to .3 s."""
 _BACK = 0.02
@@ -38,19 +37,15 @@ def check_clocks(evidence: Evidence) -> Iterator[Finding]:
                 problem = f"arrive {delay_s:.2g} s after their stamps, but its odometry {delays[name]:.2g} s"
                 remedy = "Stamp images with their exposure, and synchronize the computer of the camera"
                 yield Finding(f"{name}'s detections", problem, remedy)
-    usual = float(np.median([*delays.values()])) if delays else 0.0
     if len(delays) == 2:  # which of them is wrong cannot be seen
         apart = max(delays.values()) - min(delays.values())
-        if apart > _APART_S:
+        if apart > CLOCKS_APART_S:
             yield Finding(
                 " and ".join(delays), f"have clocks {apart:.2g} s apart", "Synchronize them (chrony)"
             )
-        return
-    for name, delay_s in delays.items():
-        if abs(delay_s - usual) > _APART_S:
-            which = "behind" if delay_s > usual else "ahead of"
-            problem = f"has a clock {abs(delay_s - usual):.2g} s {which} those of the other robots"
-            yield Finding(name, problem, _SET_CLOCK)
+    for robot, clock in evidence.read[2].clocks_apart().items():
+        if evidence.source_name(robot) in delays:
+            yield Finding(evidence.source_name(robot), clock.problem, clock.remedy)
 
 
 def _delay_s(stamp_ns: IntArray, arrival_ns: IntArray) -> float:

@@ -179,9 +179,11 @@ class Diagnostics:
         of_one = [topic.name for _, topic in self._of_swarm if not topic.kind.stands_for]
         common = self._duplicates_on([*self._sole, *of_one])
         self.duplicate_publishers = common.copy()
-        reports = []
+        reports, clocks_apart = [], self._ingest.clocks_apart()
         for index, source in enumerate(self._sources):
             lost = self._drop_troubles(index, drops_of[index]) if drops_of else []
+            if index in clocks_apart:
+                lost.append(clocks_apart[index].problem)
             report = self._source_report(index, source, estimate, now_ns, elapsed_s, lost)
             report.values |= drop_values(drops_of[index]) if drops_of else {}
             report.values["measurements used"] = str(used[index])

@@ -88,7 +88,11 @@ def read_bag(
             progress(reader.progress, "reading")
         unusable = _unusable(reader.topics, ingest, swarm)
         found = (*foreign.values(), *_strangers(reader.topics, ingest), *_missing(ingest, foreign), *unusable)
-        remarks = (*reader.losses, *found, *truth.remarks(), *maps.remarks())
+        clocks = (
+            f"{swarm.robots[robot].name} {one.problem}. {one.remedy}."
+            for robot, one in ingest.clocks_apart().items()
+        )
+        remarks = (*reader.losses, *found, *clocks, *truth.remarks(), *maps.remarks())
         unusable = () if any(one.received > one.malformed for one in ingest.statistics) else unusable
         tracks, shown = truth.tracks(), (maps.maps(), maps.goals())
         return BagSummary(range_ns, tracks, ingest.received(), remarks, unusable, *shown)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,9 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 MAX_PAUSE_NS = 3_600_000_000_000
 """Maximum time between arrivals; beyond it the clock was set, as on a robot without a hardware clock."""
 
+CLOCKS_APART_S = 0.2
+"""Difference between the clock of a robot and those of the others that is named [s]."""
+
 _STATISTICS_DTYPE = np.dtype(
     [
         (name, np.float64 if name == "late_sum_ns" else np.int64)  # a sum of absurd delays exceeds int64
@@ -34,6 +37,7 @@ _STATISTICS_DTYPE = np.dtype(
             "first_arrival_ns",
             "last_arrival_ns",
             "late_sum_ns",
+            "late_min_ns",
             "late_max_ns",
             "late_count",
         )
@@ -88,14 +92,42 @@ class InputStatistics:
         return int(self._row["late_sum_ns"][0])
 
     @property
+    def late_min_ns(self) -> int | None:
+        """Minimum delay since `restart`; None without messages."""
+        return int(self._row["late_min_ns"][0]) if self.late_count else None
+
+    @property
     def late_max_ns(self) -> int | None:
         """Maximum delay since `restart`; None without messages."""
         return int(self._row["late_max_ns"][0]) if self.late_count else None
 
     def restart(self) -> None:
         """Start a new interval for the delays."""
-        for name in ("late_sum_ns", "late_max_ns", "late_count"):
+        for name in ("late_sum_ns", "late_min_ns", "late_max_ns", "late_count"):
             self._row[name] = 0
+
+
+class WrongClock(NamedTuple):
+    """A robot's clock that is not that of the other robots.
+
+    Attributes:
+        apart_s: Its time minus theirs [s], as its description corrects it.
+        offset_s: `clock.offset_s` of its description that corrects it.
+    """
+
+    apart_s: float
+    offset_s: float
+
+    @property
+    def problem(self) -> str:
+        """What is wrong, the rest of a sentence."""
+        which = "ahead of" if self.apart_s > 0.0 else "behind"
+        return f"has a clock {abs(self.apart_s):.2g} s {which} those of the other robots"
+
+    @property
+    def remedy(self) -> str:
+        """What to do, a sentence without its full stop."""
+        return f"Synchronize it with the others (chrony), or set clock.offset_s to {self.offset_s:.3g}"
 
 
 class Ingest:
@@ -123,6 +155,9 @@ class Ingest:
         self._kinds = [*kinds().values()]
         place = {kind.name: number for number, kind in enumerate(self._kinds)}
         self._kind = np.array([place[topic.kind.name] for topic in self.topics], dtype=np.int64)
+        offsets_s = [robot.clock.offset_s for robot in swarm.robots] + [0.0] * (len(swarm.cameras) + 1)
+        self._clock_offset_ns = np.round(1e9 * np.array(offsets_s)).astype(np.int64)  # the last: the swarm
+        self._corrects_clocks = bool(self._clock_offset_ns.any())
         self._known = Known(map_frame, len(swarm.robots), swarm_key(robot.name for robot in swarm.robots))
         self._readers = [kind.create_reader(len(self.topics), self._known) for kind in self._kinds]
         self._counted = np.zeros(len(self.topics), dtype=_STATISTICS_DTYPE)
@@ -151,6 +186,27 @@ class Ingest:
         frame_ids: list[str] = self._readers[self._kind[handle]].frame_ids
         return frame_ids[handle]
 
+    def clocks_apart(self) -> dict[int, WrongClock]:
+        """Clocks of robots, by index, that are not those of the other robots.
+
+        They are compared by the least delays of odometry. Which of two robots is wrong cannot be seen, so
+        there must be three. Shared topics are not compared, since their messages have one stamp.
+        """
+        delay_ns = {
+            topic.robot: statistics.late_min_ns
+            for topic, statistics in zip(self.topics, self.statistics, strict=True)
+            if topic.kind.rows == "odometry" and topic.kind.of_each and statistics.late_min_ns is not None
+        }
+        if len(delay_ns) < 3:
+            return {}
+        usual_ns = float(np.median([*delay_ns.values()]))
+        apart_s = {robot: 1e-9 * (usual_ns - one_ns) for robot, one_ns in delay_ns.items()}
+        return {
+            robot: WrongClock(one_s, one_s + 1e-9 * float(self._clock_offset_ns[robot]))
+            for robot, one_s in apart_s.items()
+            if abs(one_s) > CLOCKS_APART_S
+        }
+
     def _read_forwards(self, batch: MessageBatch) -> Batch:
         of_message = self._kind[batch.topic]
         present = np.bincount(of_message, minlength=len(self._kinds))
@@ -162,8 +218,12 @@ class Ingest:
             part = batch if present[number] == batch.size else batch.chosen(of_message == number)
             with Guard(kind.name, part.size, dropped):
                 found = reader.read(part)
-                _count(self._counted, part.topic, part.log_ns, found.stamp_ns, found.valid)
-                read, unused = kind.columns_of(found, part, self._robot[part.topic], self._known)
+                robot, corrects = self._robot[part.topic], self._corrects_clocks and not kind.in_map
+                stamp_ns = found.stamp_ns - self._clock_offset_ns[robot] if corrects else found.stamp_ns
+                _count(self._counted, part.topic, part.log_ns, stamp_ns, found.valid)
+                read, unused = kind.columns_of(found, part, robot, self._known)
+                if corrects:
+                    read = read._replace(stamp_ns=read.stamp_ns - self._clock_offset_ns[read.robot])
                 # a sensor may have both topics of single robots and shared ones
                 before = rows.get(kind.rows)
                 rows[kind.rows] = read if before is None else in_order_of_arrival([before, read])
@@ -191,6 +251,7 @@ def _count(
             one.first_arrival_ns = arrival_ns[k]
         late_ns = arrival_ns[k] - stamp_ns[k]
         one.last_stamp_ns, one.last_arrival_ns = stamp_ns[k], arrival_ns[k]
+        one.late_min_ns = min(one.late_min_ns, late_ns) if one.late_count else late_ns
         one.late_max_ns = max(one.late_max_ns, late_ns) if one.late_count else late_ns
         one.late_sum_ns += late_ns
         one.late_count += 1

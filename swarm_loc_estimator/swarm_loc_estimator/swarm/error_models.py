@@ -130,6 +130,15 @@ class RandomWalk:
 
 
 @dataclass(frozen=True)
+class ClockModel:
+    """Clock of a robot, by which its odometry, detections, turn rates, ranges and brightness are stamped."""
+
+    offset_s: float = number(
+        0.0, "s", -1e9, 1e9, "its time minus the time of the estimator; taken off its stamps"
+    )
+
+
+@dataclass(frozen=True)
 class SensorModel:
     """Error model of a robot's sightings: noise, calibration and gate.
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from swarm_loc_estimator.common.parameters import number
 from swarm_loc_estimator.swarm.error_models import (
     TURN,
+    ClockModel,
     FixModel,
     ImuModel,
     OdometryModel,
@@ -143,6 +144,7 @@ class Robot:
         stands: True if it has no odometry; it moves only by `random_walk`.
         random_walk: Random walk without odometry.
         fix: Error model of its absolute fixes.
+        clock: Its clock.
         ir: Infrared board; None if it has none.
         uwb: UWB radio; None if it has none.
     """
@@ -160,6 +162,7 @@ class Robot:
     stands: bool = False
     random_walk: RandomWalk = RandomWalk()
     fix: FixModel = FixModel()
+    clock: ClockModel = ClockModel()
     ir: RobotIr | None = None
     uwb: UwbDevice | None = None
 

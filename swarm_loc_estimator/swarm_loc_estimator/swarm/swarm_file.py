@@ -2,7 +2,7 @@
 
 ```yaml
 fileversion: 1
-defaults:      # odometry, imu, random_walk, response, camera, sensor, fix, ir, uwb, faces, start_sigma
+defaults:      # odometry, imu, random_walk, response, camera, sensor, fix, clock, ir, uwb, faces, start_sigma
   sensor: {range_sigma: 0.1}
   landmark: {size: 0.06, position_sigma: 0.01, yaw_sigma: 0.02}  # without sigmas: surveyed exactly
 types:
@@ -54,7 +54,14 @@ from typing import TYPE_CHECKING, Any
 from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
-from swarm_loc_estimator.swarm.error_models import FixModel, ImuModel, OdometryModel, RandomWalk, SensorModel
+from swarm_loc_estimator.swarm.error_models import (
+    ClockModel,
+    FixModel,
+    ImuModel,
+    OdometryModel,
+    RandomWalk,
+    SensorModel,
+)
 from swarm_loc_estimator.swarm.ir_section import IrSection, Values
 from swarm_loc_estimator.swarm.motion_response import MotionResponse, MotionResponseError
 from swarm_loc_estimator.swarm.swarm import (
@@ -78,8 +85,8 @@ FILE_VERSION = 1
 
 _SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors")
 LAYER = (
-    *("odometry", "imu", "random_walk", "response", "camera", "sensor", "fix", "ir", "uwb", "faces"),
-    "start_sigma",
+    *("odometry", "imu", "random_walk", "response", "camera", "sensor", "fix", "clock", "ir", "uwb"),
+    *("faces", "start_sigma"),
 )
 _DEFAULTS = (*LAYER, "landmark")
 _ROBOT = ("type", *LAYER, "ids", "start")
@@ -90,6 +97,7 @@ MODELS: dict[str, type] = {
     "camera": CameraMount,
     "sensor": SensorModel,
     "fix": FixModel,
+    "clock": ClockModel,
     "start_sigma": StartSigma,
 }
 MAY_BE_NONE = ("odometry", "camera")

@@ -20,10 +20,9 @@ from swarm_loc_estimator.cli import (
     watch,
 )
 from swarm_loc_estimator.common.parameters import number_specs
-from swarm_loc_estimator.swarm.error_models import FixModel, ImuModel, OdometryModel, RandomWalk, SensorModel
 from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS, SENSORS
-from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Landmark, StartSigma
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Landmark
+from swarm_loc_estimator.swarm.swarm_file import MODELS, load_swarm
 from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 
 DOC = Path(__file__).parents[2] / "doc"
@@ -42,9 +41,7 @@ def table_of(cls: type, *required: str) -> str:
     return "\n".join(lines)
 
 
-@pytest.mark.parametrize(
-    "cls", [OdometryModel, ImuModel, RandomWalk, CameraMount, SensorModel, FixModel, Face, StartSigma]
-)
+@pytest.mark.parametrize("cls", [*MODELS.values(), Face])
 def test_every_number_of_a_robot_has_its_place(cls: type) -> None:
     assert table_of(cls) in SWARM_DESCRIPTION
 

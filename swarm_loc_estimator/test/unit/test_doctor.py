@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
-from wrong_setups import BAGS, WRONG, Change, good, with_gyroscope, with_topics
+from wrong_setups import BAGS, BOTH, ROBOT, WRONG, Change, good, shifted, with_gyroscope, with_topics
 
 from swarm_loc_estimator.cli import doctor as command
 from swarm_loc_estimator.common.bags.reader import BagReader
@@ -15,6 +17,7 @@ from swarm_loc_estimator.doctor.doctor import evidence_of_bag, examine, lines_of
 from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message
 from swarm_loc_estimator.doctor.pictures import IMAGE
 from swarm_loc_estimator.offline.recorded_bag import unwatched
+from swarm_loc_estimator.swarm.error_models import ClockModel
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
@@ -36,6 +39,17 @@ def test_what_is_wrong_is_named(name: str) -> None:
 )
 def test_nothing_is_wrong_in_good_bags(bag: str, seconds: float) -> None:
     assert lines_of(examine(good(bag, seconds))) == []
+
+
+def test_a_described_offset_makes_a_clock_good() -> None:
+    heard = shifted(BOTH, -0.3)(good())
+    robots = tuple(
+        replace(one, clock=ClockModel(-0.3)) if one.name == ROBOT else one for one in heard.swarm.robots
+    )
+    corrected = Evidence(replace(heard.swarm, robots=robots), heard.topics)
+    assert lines_of(examine(corrected)) == []
+    for sensor in ("odometry", "detections"):
+        assert np.array_equal(corrected.rows(sensor).stamp_ns, good().rows(sensor).stamp_ns)
 
 
 def test_a_good_gyroscope_is_not_accused() -> None:

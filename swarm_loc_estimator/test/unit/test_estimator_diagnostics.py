@@ -38,13 +38,13 @@ class Graph:
 
 
 class World:
-    """Diagnostics of a swarm of two, fed by hand."""
+    """Diagnostics of a swarm, fed by hand."""
 
-    def __init__(self, *, tf_per_robot: bool = False) -> None:
+    def __init__(self, swarm: Swarm = SWARM, *, tf_per_robot: bool = False) -> None:
         parameters = EstimatorParameters(tf_per_robot=tf_per_robot)
-        self.ingest = Ingest(SWARM)
+        self.ingest = Ingest(swarm)
         self.graph = Graph()
-        self.diagnostics = Diagnostics(SWARM, self.ingest, parameters, self.graph, ["swarm/poses"])
+        self.diagnostics = Diagnostics(swarm, self.ingest, parameters, self.graph, ["swarm/poses"])
         self.reports = self.diagnostics.reports
 
     def detections(self, now_ns: int) -> None:
@@ -186,6 +186,15 @@ def test_delays_of_another_clock_do_not_overflow() -> None:
     tracked = estimate(now_ns, Status.TRACKED, Status.TRACKED)
     _, b, _ = world.reports(now_ns, tracked, recent(), {})
     assert float(str(b.values["odom lateness mean [s]"])) == pytest.approx(1.7e9)
+
+
+def test_a_robot_with_a_clock_of_its_own_is_named() -> None:
+    world, now_ns = World(Swarm(tuple(Robot(name, camera=None) for name in "abc"))), 10 * SECOND
+    for late_s, problem in ((0.3, "has a clock 0.3 s behind those of the other robots"), (0.1, "tracked")):
+        for name, one_s in (("a", 0.0), ("b", late_s), ("c", 0.0)):
+            world.odometry(name, now_ns - round(one_s * SECOND), now_ns)
+        _, b, _, _ = world.reports(now_ns, estimate(now_ns, *[Status.TRACKED] * 3), recent(), {})
+        assert b.message == problem
 
 
 def test_with_transforms_per_robot_frames_have_no_prefix() -> None:

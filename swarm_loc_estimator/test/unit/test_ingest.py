@@ -20,18 +20,78 @@ from swarm_loc_estimator.common.messages.message_batch import MessageBatch, Seri
 from swarm_loc_estimator.common.messages.poses import (
     decode_odometry,
     decode_pose_stamped,
+    encode_fix,
     encode_odometry,
     encode_pose_stamped,
 )
 from swarm_loc_estimator.common.messages.streams import DetectionReader, PoseReader
 from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.swarm.error_models import ClockModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 Pose = tuple[float, float, float]
+SECOND = 10**9
 FRAMES = st.sampled_from(["", "a", "ab/odom", "robot17/odom", "r\u00f6/camera"])
 
 
 TWIST = (0.25, -0.125, 2.0)
+
+
+def test_clocks_are_compared_by_the_least_delays_and_corrected_by_their_descriptions() -> None:
+    names, late_ns = "abcd", {"a": 0, "b": 50_000_000, "c": 350_000_000, "d": -300_000_000}
+
+    def read(offset_s: float) -> Ingest:
+        ingest = Ingest(
+            Swarm(tuple(Robot(name, clock=ClockModel(offset_s * (name == "c"))) for name in names))
+        )
+        sent = [
+            SerializedMessage(
+                ingest.handle_of[f"{name}/odom"],
+                odometry("", SECOND * k - late_ns[name] - (k % 3) * 100_000_000, (0.0, 0.0, 0.0)),
+                SECOND * k,
+            )
+            for k in range(5, 15)
+            for name in names
+        ]
+        list(ingest.read(MessageBatch.of(sent)))
+        return ingest
+
+    found = read(0.0).clocks_apart()
+    assert [*found] == [2, 3]
+    assert found[2].apart_s == found[2].offset_s == pytest.approx(-0.325)
+    assert found[2].problem == "has a clock 0.33 s behind those of the other robots"
+    assert found[3].problem == "has a clock 0.33 s ahead of those of the other robots"
+    assert [*read(-0.325).clocks_apart()] == [3]
+    assert read(0.4).clocks_apart()[2].offset_s == pytest.approx(-0.325)
+
+
+def test_clocks_of_two_robots_are_not_judged() -> None:
+    ingest = Ingest(Swarm((Robot("a"), Robot("b"))))
+    sent = [
+        SerializedMessage(ingest.handle_of[f"{name}/odom"], odometry("", k, (0.0, 0.0, 0.0)), k + late_ns)
+        for k in range(SECOND, 2 * SECOND, SECOND // 10)
+        for name, late_ns in (("a", 0), ("b", SECOND))
+    ]
+    list(ingest.read(MessageBatch.of(sorted(sent, key=lambda one: one.log_ns))))
+    assert ingest.clocks_apart() == {}
+
+
+def test_offsets_of_clocks_leave_fixes_alone() -> None:
+    robots = (Robot("a", clock=ClockModel(0.5)), Robot("b"))
+    stamps = {}
+    for swarm in (Swarm(robots), Swarm((Robot("a"), Robot("b")))):
+        ingest = Ingest(swarm)
+        sent = [
+            SerializedMessage(ingest.handle_of["a/odom"], odometry("", SECOND, (0.0, 0.0, 0.0)), SECOND),
+            SerializedMessage(ingest.handle_of["a/detections"], detections("", SECOND, 2), SECOND),
+            SerializedMessage(
+                ingest.handle_of["a/fix"], encode_fix("map", SECOND, (0.0, 0.0, 0.0), np.eye(3)), SECOND
+            ),
+        ]
+        (batch,) = ingest.read(MessageBatch.of(sent))
+        for sensor in ("odometry", "detections", "fixes"):
+            stamps.setdefault(sensor, []).append(batch[sensor].stamp_ns[0] - SECOND)
+    assert stamps == {"odometry": [-SECOND // 2, 0], "detections": [-SECOND // 2, 0], "fixes": [0, 0]}
 
 
 def odometry(frame: str, stamp_ns: int, pose: Pose, child: str = "base") -> bytes:

@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.error_models import FixModel, OdometryModel, RandomWalk, SensorModel
+from swarm_loc_estimator.swarm.error_models import (
+    ClockModel,
+    FixModel,
+    OdometryModel,
+    RandomWalk,
+    SensorModel,
+)
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrMethod, RobotIr
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, StartSigma, Swarm
@@ -63,7 +69,7 @@ def swarms(draw: st.DrawFn) -> Swarm:
         )
     )
     robots: list[Robot] = []
-    kinds = (OdometryModel, RandomWalk, CameraMount, SensorModel, FixModel, StartSigma)
+    kinds = (OdometryModel, RandomWalk, CameraMount, SensorModel, FixModel, ClockModel, StartSigma)
     pool = {cls: [cls(), draw(build(cls))] for cls in kinds}
     face_numbers = draw(st.lists(numbers(Face), max_size=3))
     for name in names:
@@ -82,6 +88,7 @@ def swarms(draw: st.DrawFn) -> Swarm:
                     st.none() | st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6), st.floats(-6.28, 6.28))
                 ),
                 fix=draw(st.sampled_from(pool[FixModel])),
+                clock=draw(st.sampled_from(pool[ClockModel])),
                 start_sigma=draw(st.sampled_from(pool[StartSigma])),
                 stands=stands,
                 random_walk=draw(st.sampled_from(pool[RandomWalk])) if stands else RandomWalk(),

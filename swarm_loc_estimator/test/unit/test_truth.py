@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
 from swarm_loc_estimator.offline.calibration.recording import read_recording
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.swarm.error_models import ClockModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
@@ -228,6 +231,26 @@ def test_mapped_topics_give_the_same_poses(
     assert "filtered" not in capsys.readouterr().out
     read = read_recording(bag, swarm, remap=remap).odometry
     assert read.stamp_ns.tobytes() == read_recording(short, swarm).odometry.stamp_ns.tobytes()
+
+
+def test_a_clock_that_is_behind_is_named_and_its_description_corrects_it(tmp_path: Path, short: Path) -> None:
+    def delay(topic: str, message_type: str, data: bytes) -> tuple[str, str, bytes]:
+        if not data or topic not in ("epuck2/odom", "epuck2/detections"):
+            return topic, message_type, data
+        sec, nanosec = struct.unpack_from("<iI", data, 4)
+        stamp = divmod(sec * 10**9 + nanosec - 3 * 10**8, 10**9)
+        return topic, message_type, data[:4] + struct.pack("<iI", *stamp) + data[12:]
+
+    swarm, bag = load_swarm(DEMO / "swarm.yaml"), renamed(tmp_path / "bag", short, delay)
+    (remark,) = replay(bag, swarm).remarks
+    assert remark.startswith("epuck2 has a clock 0.3 s behind those of the other robots. Synchronize")
+    assert remark.endswith("or set clock.offset_s to -0.3.")
+    robots = tuple(
+        replace(one, clock=ClockModel(-0.3)) if one.name == "epuck2" else one for one in swarm.robots
+    )
+    corrected, expected = replay(bag, replace(swarm, robots=robots)), replay(short, swarm)
+    assert corrected.poses.tobytes() == expected.poses.tobytes()
+    assert not corrected.remarks
 
 
 def test_a_mapped_topic_takes_the_place_of_the_expected_one(short: Path) -> None:

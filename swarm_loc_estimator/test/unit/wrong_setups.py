@@ -362,6 +362,7 @@ WRONG: dict[str, tuple[Change, str, str]] = {
     ),
     "clock ahead": (shifted(BOTH, 3.0), f"{ROBOT}'s odometry", "in the future"),
     "clock behind": (shifted(BOTH, -0.7), ROBOT, "behind those of the other robots"),
+    "clock a little behind": (shifted(BOTH, -0.3), ROBOT, "or set clock.offset_s to -0.3"),
     "old stamps": (shifted(BOTH, -60.0), f"{ROBOT}'s odometry", "which is beyond horizon_s"),
     "another epoch": (shifted(BOTH, -1e8), f"{ROBOT}'s odometry", "of another time"),
     "no stamps": (stamped(0), f"{ROBOT}'s odometry", "has stamps of zero"),
