@@ -78,7 +78,7 @@ def test_clocks_of_two_robots_are_not_judged() -> None:
 
 def test_offsets_of_clocks_leave_fixes_alone() -> None:
     robots = (Robot("a", clock=ClockModel(0.5)), Robot("b"))
-    stamps = {}
+    stamps: dict[str, list[int]] = {}
     for swarm in (Swarm(robots), Swarm((Robot("a"), Robot("b")))):
         ingest = Ingest(swarm)
         sent = [
