@@ -1,8 +1,9 @@
-"""Find the places of landmarks from a bag in which robots drove around, without ground truth.
+"""Find the places of landmarks while robots drive around, without ground truth.
 
-    survey recording.mcap --swarm swarm.yaml --out surveyed.yaml
+    survey recording.mcap --swarm swarm.yaml --out surveyed.yaml     a bag
+    survey swarm.yaml --out surveyed.yaml                            the live graph, until Ctrl-C
 
-The swarm description has the robots; it is the `swarm.yaml` inside the bag's folder unless --swarm names
+The swarm description has the robots; that of a bag is the `swarm.yaml` inside its folder unless --swarm names
 another. Every marker that belongs to no robot is a landmark. Described landmarks are known places and give
 the frame, as starts of robots do; --all surveys them, too. Yaw and scale of cameras and the scales of
 odometry are corrected where the recording shows that they are wrong. Beside --out a picture of the same name
@@ -15,44 +16,75 @@ import argparse
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from importlib import import_module
 
 from swarm_loc_estimator.common.command_line import (
     ProgressLine,
-    add_bag,
-    add_remap,
+    add_live_or_bag,
     command_parser,
+    described,
     exit_with_message,
-    swarm_beside,
+    is_live,
     yaml_to_write,
 )
-from swarm_loc_estimator.offline.calibration.recording import read_recording
+from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.doctor.evidence import Evidence, same_type
+from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
 from swarm_loc_estimator.offline.survey.plots import draw
 from swarm_loc_estimator.offline.survey.survey import survey
+from swarm_loc_estimator.sensors.registry import kinds
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+
+_LIVE_S = 180.0
+_SENSORS = ("odometry", "imu", "detections")
 
 
 @exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
-    swarm = load_swarm(options.swarm or swarm_beside(options.bag))
+    live = is_live(options)
+    if not live and (options.seconds or options.namespace):
+        raise UserError("--seconds and --namespace are for a live graph; a bag is surveyed as a whole.")
+    swarm = load_swarm(described(options))
     if options.all:
         swarm = replace(swarm, landmarks=())
     with ProgressLine() as progress:
-        recording = read_recording(options.bag, swarm, progress, options.remap)
+        if live:
+            listen = import_module("swarm_loc_estimator.doctor.listener").listen
+            where, seconds = (options.namespace, _is_used), options.seconds or _LIVE_S
+            recording = _heard(listen(swarm, seconds, progress, *where, use_sim_time=options.use_sim_time))
+        else:
+            recording = read_recording(options.source, swarm, progress, options.remap)
         done = survey(recording, swarm, progress)
-    save_swarm(done.swarm, options.out, f"Surveyed with {options.bag.name}.")
+    save_swarm(done.swarm, options.out, f"Surveyed with {recording.name}.")
     print("\n".join([done.text, *recording.sentences(expected="unknown_id")]))  # those are the landmarks
     print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
     return 0
 
 
+def _is_used(message_type: str) -> bool:
+    """Whether a survey uses messages of a type."""
+    return any(same_type(message_type, one.message_type) for one in kinds().values() if one.rows in _SENSORS)
+
+
+def _heard(evidence: Evidence) -> Recording:
+    """What was heard of a live graph."""
+    return Recording(
+        "the live graph",
+        evidence.odometry,
+        evidence.rows("detections"),
+        {},
+        turn_rates=evidence.turn_rates,
+        dropped=evidence.converted[1].total,
+    )
+
+
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = command_parser(__doc__)
-    add_bag(parser)
-    add_remap(parser)
+    add_live_or_bag(parser, f"how long to listen to a live graph (default: {_LIVE_S:g} s, or until Ctrl-C)")
     parser.add_argument("--out", type=yaml_to_write, required=True, help="swarm description to write")
     parser.add_argument("--all", action="store_true", help="survey landmarks that are described, too")
     return parser

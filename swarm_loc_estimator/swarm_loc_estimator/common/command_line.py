@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import signal
 import sys
 import time
@@ -34,6 +35,7 @@ _INTERRUPTED = 130
 """Exit status of a program that SIGINT has ended, as shells count."""
 _REDRAW_S = 0.1
 _WIDTH = 30
+_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _ROS = ("ament_index_python", "launch", "launch_ros", "rclpy")
 _FOR_BAGS = ("lz4", "mcap", "rosbags", "zstandard")
 """Only for bags; rosdep knows no packages of them but by pip, so package.xml does not name them."""
@@ -163,6 +165,47 @@ def add_remap(parser: argparse.ArgumentParser) -> None:
 
     said = "topic of the bag to read in place of an expected one, such as '<robot>/odom:=<robot>/odometry'"
     parser.add_argument("--remap", action=Remap, default={}, metavar="EXPECTED:=TOPIC", help=said)
+
+
+_DESCRIPTIONS = (".yaml", ".yml")
+
+
+def add_live_or_bag(parser: argparse.ArgumentParser, seconds: str) -> None:
+    """Add the arguments of a command that listens to a live graph or reads a bag, see `is_live`.
+
+    Args:
+        parser: Of the command.
+        seconds: What --seconds says.
+    """
+    parser.add_argument("source", metavar="SWARM_FILE|BAG", type=Path, help="swarm description, or a bag")
+    parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
+    parser.add_argument("--seconds", type=number_in(1.0, 3600.0, "s"), help=seconds)
+    parser.add_argument("--namespace", default="", help="namespace of the whole swarm, such as lab")
+    parser.add_argument("--use-sim-time", action="store_true", help="take time from /clock")
+    add_remap(parser)
+
+
+def is_live(options: argparse.Namespace) -> bool:
+    """Whether a live graph is meant, since the source is a description.
+
+    Raises:
+        UserError: Options do not fit the source, or the namespace is none.
+    """
+    live = options.source.suffix in _DESCRIPTIONS
+    if live and options.remap:
+        raise UserError("--remap is for bags; remap topics of a live graph in their nodes.")
+    if options.use_sim_time and not live:
+        raise UserError("--use-sim-time is for a live graph; a bag has its own time.")
+    names = options.namespace.strip("/").split("/")
+    if options.namespace and not all(map(_NAME.fullmatch, names)):
+        raise UserError(f"--namespace '{options.namespace}' must be names with slashes between, such as lab.")
+    return live
+
+
+def described(options: argparse.Namespace) -> Path:
+    """Path of the swarm description: --swarm, the source itself, or the one beside the bag."""
+    live = options.source.suffix in _DESCRIPTIONS
+    return options.swarm or (options.source if live else swarm_beside(options.source))
 
 
 def swarm_beside(bag: Path) -> Path:

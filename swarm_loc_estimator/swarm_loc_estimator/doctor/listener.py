@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 
 import rclpy
@@ -10,6 +12,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.signals import SignalHandlerOptions
 
 from swarm_loc_estimator.common.node import MessageTypeError, message_class
 from swarm_loc_estimator.doctor.doctor import is_looked_at, keep
@@ -24,34 +27,44 @@ _OWN = ("parameter_events", "rosout")
 
 
 class Listener(Node):
-    """Subscribes to all topics whose messages a check looks at.
+    """Subscribes to the topics of a swarm.
 
     Args:
         swarm: The description.
         namespace: Of the whole swarm, "" for none.
+        is_wanted: Whether messages of a type are kept.
         use_sim_time: Whether arrivals are by /clock.
     """
 
-    def __init__(self, swarm: Swarm, namespace: str = "", *, use_sim_time: bool) -> None:
+    def __init__(
+        self,
+        swarm: Swarm,
+        namespace: str = "",
+        is_wanted: Callable[[str], bool] = is_looked_at,
+        *,
+        use_sim_time: bool,
+    ) -> None:
         override = Parameter("use_sim_time", Parameter.Type.BOOL, use_sim_time)
         super().__init__("doctor", namespace=namespace, parameter_overrides=[override])
         self._swarm = swarm
+        self._is_wanted = is_wanted
         self._messages: dict[str, list[Message]] = {}
         self._types: dict[str, str] = {}
         self._full: dict[str, str] = {}
 
     def listen(self, seconds: float, progress: Progress) -> Evidence:
-        """What is heard in some seconds."""
+        """What is heard in some seconds, or until SIGINT."""
         executor = SingleThreadedExecutor()
         executor.add_node(self)
         begin_s = time.monotonic()
         looked_s = begin_s - _LOOK_S
-        while (now_s := time.monotonic()) < begin_s + seconds:
-            if now_s - looked_s >= _LOOK_S:
-                self._follow_topics()
-                looked_s = now_s
-            progress((now_s - begin_s) / seconds, "listening")
-            executor.spin_once(timeout_sec=0.1)
+        with suppress(KeyboardInterrupt):
+            while (now_s := time.monotonic()) < begin_s + seconds:
+                if now_s - looked_s >= _LOOK_S:
+                    self._follow_topics()
+                    looked_s = now_s
+                progress((now_s - begin_s) / seconds, "listening")
+                executor.spin_once(timeout_sec=0.1)
         executor.remove_node(self)
         # messages before the first /clock have no time of arrival; without any /clock, that is the finding
         is_timed = any(one.arrival_ns for kept in self._messages.values() for one in kept)
@@ -76,7 +89,7 @@ class Listener(Node):
             if name in self._types or name in _OWN or not self.count_publishers(full):
                 continue
             self._types[name], self._full[name] = types[0], full
-            if not is_looked_at(types[0]):
+            if not self._is_wanted(types[0]):
                 continue
             try:
                 kind = message_class(types[0])
@@ -108,11 +121,17 @@ def _qos(name: str) -> QoSProfile:
 
 
 def listen(
-    swarm: Swarm, seconds: float, progress: Progress, namespace: str = "", *, use_sim_time: bool
+    swarm: Swarm,
+    seconds: float,
+    progress: Progress,
+    namespace: str = "",
+    is_wanted: Callable[[str], bool] = is_looked_at,
+    *,
+    use_sim_time: bool,
 ) -> Evidence:
-    """What is heard of a swarm in some seconds."""
-    rclpy.init()
-    node = Listener(swarm, namespace, use_sim_time=use_sim_time)
+    """What is heard of a swarm in some seconds, or until SIGINT."""
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    node = Listener(swarm, namespace, is_wanted, use_sim_time=use_sim_time)
     try:
         return node.listen(seconds, progress)
     finally:

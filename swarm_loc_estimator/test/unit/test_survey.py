@@ -266,3 +266,19 @@ def test_the_command_surveys_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture
     assert out.with_suffix(".png").stat().st_size > 10_000
     true = load_swarm(bag / "swarm.yaml")
     assert rms(errors(load_swarm(out), true)) < 0.005
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        (["bag", "--seconds", "9"], "--seconds and --namespace are for a live graph"),
+        (["bag", "--use-sim-time"], "--use-sim-time is for a live graph"),
+        (["swarm.yaml", "--remap", "a:=b"], "--remap is for bags"),
+        (["swarm.yaml", "--namespace", "a b"], "--namespace 'a b' must be names"),
+    ],
+)
+def test_options_that_do_not_fit_the_source_are_refused(
+    arguments: list[str], problem: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert command.main([*arguments, "--out", "surveyed.yaml"]) == 1
+    assert problem in capsys.readouterr().err
