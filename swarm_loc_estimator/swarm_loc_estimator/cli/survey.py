@@ -4,10 +4,10 @@
     survey swarm.yaml --out surveyed.yaml                            the live graph, until Ctrl-C
 
 The swarm description has the robots; that of a bag is the `swarm.yaml` inside its folder unless --swarm names
-another. Every marker that belongs to no robot is a landmark. Described landmarks are known places and give
-the frame, as starts of robots do; --all surveys them, too. Yaw and scale of cameras and the scales of
-odometry are corrected where the recording shows that they are wrong. Beside --out a picture of the same name
-shows the arena.
+another. Every marker that belongs to no robot is a landmark, and every such radio an anchor. Described
+landmarks are known places and give the frame, as starts of robots do; described anchors and fixed cameras
+stay. --all surveys all of them, too. Yaw and scale of cameras and the scales of odometry are corrected where
+the recording shows that they are wrong. Beside --out a picture of the same name shows the arena.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 _LIVE_S = 180.0
-_SENSORS = ("odometry", "imu", "detections")
+_SENSORS = ("odometry", "imu", "detections", "ranges")
 
 
 @exit_with_message
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise UserError("--seconds and --namespace are for a live graph; a bag is surveyed as a whole.")
     swarm = load_swarm(described(options))
     if options.all:
-        swarm = replace(swarm, landmarks=())
+        swarm = replace(swarm, landmarks=(), anchors=())
     with ProgressLine() as progress:
         if live:
             listen = import_module("swarm_loc_estimator.doctor.listener").listen
@@ -57,9 +57,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             recording = _heard(listen(swarm, seconds, progress, *where, use_sim_time=options.use_sim_time))
         else:
             recording = read_recording(options.source, swarm, progress, options.remap)
-        done = survey(recording, swarm, progress)
+        done = survey(recording, swarm, progress, cameras=options.all)
     save_swarm(done.swarm, options.out, f"Surveyed with {recording.name}.")
-    print("\n".join([done.text, *recording.sentences(expected="unknown_id")]))  # those are the landmarks
+    print(
+        "\n".join([done.text, *recording.sentences(("unknown_id", "uwb_unknown_address"))])
+    )  # those are surveyed
     print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
     return 0
 
@@ -77,6 +79,7 @@ def _heard(evidence: Evidence) -> Recording:
         evidence.rows("detections"),
         {},
         turn_rates=evidence.turn_rates,
+        ranges=evidence.rows("ranges"),
         dropped=evidence.converted[1].total,
     )
 
@@ -86,7 +89,9 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser(__doc__)
     add_live_or_bag(parser, f"how long to listen to a live graph (default: {_LIVE_S:g} s, or until Ctrl-C)")
     parser.add_argument("--out", type=yaml_to_write, required=True, help="swarm description to write")
-    parser.add_argument("--all", action="store_true", help="survey landmarks that are described, too")
+    parser.add_argument(
+        "--all", action="store_true", help="survey landmarks, anchors and cameras that are described, too"
+    )
     return parser
 
 

@@ -228,7 +228,7 @@ def test_what_cannot_be_used_is_not_read_and_said(tmp_path: Path) -> None:
     assert recording.odometry.robot.size == 99
     assert np.isfinite(recording.odometry.pose).all()
     assert "1 inputs are not used: odometry_non_finite." in recording.sentences()
-    assert recording.sentences(expected="odometry_non_finite") == list(recording.remarks)
+    assert recording.sentences(expected=["odometry_non_finite"]) == list(recording.remarks)
 
 
 def test_thinned_odometry_gives_nearly_the_same_poses() -> None:

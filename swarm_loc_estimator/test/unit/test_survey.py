@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from core_messages import detection
 from core_messages import joined as joined_detections
 from core_world import Plan, World, simulate
+from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.cli import survey as command
 from swarm_loc_estimator.common import se2
@@ -19,13 +21,15 @@ from swarm_loc_estimator.offline.survey.problem import problem_of
 from swarm_loc_estimator.offline.survey.solve import Solver
 from swarm_loc_estimator.offline.survey.start import start_of
 from swarm_loc_estimator.offline.survey.survey import survey
-from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
+from swarm_loc_estimator.sensors.camera import FROM_OPTICAL, NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
-from swarm_loc_estimator.sensors.sensor import chosen
+from swarm_loc_estimator.sensors.ranges import RangeRows
+from swarm_loc_estimator.sensors.sensor import chosen, in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import ImuModel
-from swarm_loc_estimator.swarm.swarm import Landmark, StartSigma, Swarm
+from swarm_loc_estimator.swarm.swarm import FixedCamera, Landmark, StartSigma, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 
 PLAN = Plan(robots=3, duration_s=25.0, arena=0.8, landmarks=8, start_known=(False,))
 BAGS = Path(__file__).parents[3] / "bags"
@@ -266,6 +270,109 @@ def test_the_command_surveys_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture
     assert out.with_suffix(".png").stat().st_size > 10_000
     true = load_swarm(bag / "swarm.yaml")
     assert rms(errors(load_swarm(out), true)) < 0.005
+
+
+CEILING = FixedCamera("ceiling", 0.2, -0.1, 2.5, yaw=0.7, pitch=1.4, roll=0.1)
+ANCHORS = (Anchor(0xA1, -3.0, 1.0, 2.0), Anchor(0xA2, 2.0, 3.0, 1.5))
+RADIO = UwbDevice(0, x=0.02, z=0.08, range_bias=0.1, range_scale=1.01)
+
+
+def located_start(world: World) -> Swarm:
+    """The world without landmarks, but with a known start of the first robot, which gives the frame."""
+    x, y, theta = world.truth[0, 0].tolist()
+    first = replace(world.swarm.robots[0], start=(x, y, theta), start_sigma=StartSigma(1e-3, 1e-3, 1e-3))
+    return replace(world.swarm, robots=(first, *world.swarm.robots[1:]), landmarks=())
+
+
+def seen_from_above(world: World, rng: np.random.Generator, wrong: float = 0.0) -> DetectionRows:
+    """What the camera at the ceiling sees: directions are good, distances are not."""
+    turn = Rotation.from_euler("ZYX", [CEILING.yaw, CEILING.pitch, CEILING.roll]).as_matrix() @ FROM_OPTICAL
+    rows, robots = [], len(world.swarm.robots)
+    for k in range(0, world.stamp_ns.size, 4):
+        for robot, pose in zip(world.swarm.robots, world.truth[k], strict=True):
+            face = robot.faces[0]
+            place = np.append(se2.transform_points(pose, [face.x, face.y]), face.z)
+            if rng.uniform() < wrong:
+                place[:2] += rng.uniform(-1.0, 1.0, 2)
+            optical = turn.T @ (place - [CEILING.x, CEILING.y, CEILING.z])
+            optical[:2] += 0.002 * optical[2] * rng.standard_normal(2)
+            one = detection(face.id, np.eye(4))
+            one["position"] = optical * (1.05 + 0.02 * rng.standard_normal())
+            rows.append((world.stamp_ns[k], one))
+    at_ns = np.array([at for at, _ in rows])
+    return DetectionRows(
+        np.full(at_ns.size, robots), at_ns, joined_detections([one for _, one in rows]), at_ns
+    )
+
+
+def measured_ranges(world: World, rng: np.random.Generator, wrong: float = 0.0) -> RangeRows:
+    rows = []
+    for k in range(0, world.stamp_ns.size, 2):
+        for robot, pose in enumerate(world.truth[k]):
+            antenna = np.append(se2.transform_points(pose, [RADIO.x, RADIO.y]), RADIO.z)
+            for anchor in ANCHORS:
+                true = float(np.linalg.norm(antenna - [anchor.x, anchor.y, anchor.z]))
+                late = abs(rng.normal(0.0, 2.0)) if rng.uniform() < wrong else 0.0
+                range_m = RADIO.range_scale * (true + late) + RADIO.range_bias + 0.05 * rng.standard_normal()
+                rows.append((robot, world.stamp_ns[k], anchor.address, range_m))
+    robots, at_ns, device, ranges = (np.array(column) for column in zip(*rows, strict=True))
+    device = device.astype(np.uint64)
+    return RangeRows(robots, at_ns, device, np.zeros_like(device), ranges, np.zeros(robots.size), at_ns)
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.2])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_fixed_camera_is_placed_by_the_robots_that_it_sees(seed: int, wrong: float) -> None:
+    world, rng = simulate(PLAN, seed), np.random.default_rng(seed)
+    recording = recording_of(world)
+    above = seen_from_above(world, rng, wrong)
+    recording = replace(recording, detections=in_order_of_arrival([recording.detections, above]))
+    stale = FixedCamera("ceiling", 5.0, 5.0, 3.0)
+    swarm = replace(located_start(world), cameras=(stale,))
+    (found,) = survey(recording, swarm, cameras=True).swarm.cameras
+    assert np.hypot(found.x - CEILING.x, found.y - CEILING.y) < 0.06
+    assert abs(found.z - CEILING.z) < 0.06
+    axes = [
+        Rotation.from_euler("ZYX", [one.yaw, one.pitch, one.roll]).as_matrix() for one in (found, CEILING)
+    ]
+    assert Rotation.from_matrix(axes[0] @ axes[1].T).magnitude() < 0.03
+    assert 1e-4 <= found.position_sigma < 0.02
+    assert survey(recording, swarm).swarm.cameras == (stale,)
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.2])
+@pytest.mark.parametrize("seed", range(2))
+def test_anchors_are_placed_by_their_ranges(seed: int, wrong: float) -> None:
+    world = simulate(replace(PLAN, duration_s=40.0), seed)
+    ranges = measured_ranges(world, np.random.default_rng(seed), wrong)
+    recording = replace(recording_of(world), ranges=ranges)
+    swarm = located_start(world)
+    robots = tuple(replace(robot, uwb=replace(RADIO, address=k)) for k, robot in enumerate(swarm.robots, 1))
+    done = survey(recording, replace(swarm, robots=robots))
+    assert [one.address for one in done.swarm.anchors] == [0xA1, 0xA2]
+    for one, true in zip(done.swarm.anchors, ANCHORS, strict=True):
+        error = np.hypot(one.x - true.x, one.y - true.y)
+        assert error < min(0.15, 5.0 * one.position_sigma + 0.02)
+    assert "0xa1" in done.text
+    known = replace(swarm, robots=robots, anchors=ANCHORS[:1])
+    assert survey(recording, known).swarm.anchors[0] == ANCHORS[0]
+
+
+def test_what_was_measured_rarely_is_named() -> None:
+    world = simulate(PLAN, 0)
+    ranges = measured_ranges(world, np.random.default_rng(0))
+    recording = replace(recording_of(world), ranges=chosen(ranges, np.arange(40)))
+    robots = tuple(
+        replace(robot, uwb=replace(RADIO, address=k)) for k, robot in enumerate(world.swarm.robots, 1)
+    )
+    swarm = replace(world.swarm, robots=robots, landmarks=(), cameras=(CEILING,))
+    done = survey(recording, swarm, cameras=True)
+    assert "Anchor 0xa1 was measured 20 x only and is left out; drive near it." in done.text
+    assert (
+        "Camera ceiling stays as it is described: it has seen robots whose paths are known 0 x" in done.text
+    )
+    assert done.swarm.cameras == (CEILING,)
+    assert not done.swarm.anchors
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ A fit runs the estimator over the same data a hundred times; the bag is read onl
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
@@ -24,6 +24,7 @@ from swarm_loc_estimator.sensors.fix import NO_FIXES, FixRows
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.infrared import NO_BRIGHTNESS, BrightnessRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
+from swarm_loc_estimator.sensors.ranges import NO_RANGES, RangeRows
 from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.sensors.sensor import chosen, joined
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
@@ -47,6 +48,7 @@ class Recording:
         brightness: Of all infrared boards.
         fixes: Of all robots.
         turn_rates: Of all IMUs.
+        ranges: Of all UWB radios, as they arrived.
         dropped: Number of dropped inputs by reason.
         remarks: Unreadable contents, one sentence each.
     """
@@ -58,13 +60,16 @@ class Recording:
     brightness: BrightnessRows = NO_BRIGHTNESS
     fixes: FixRows = NO_FIXES
     turn_rates: TurnRateRows = NO_TURN_RATES
+    ranges: RangeRows = NO_RANGES
     dropped: Mapping[str, int] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
 
-    def sentences(self, expected: str = "") -> list[str]:
-        """The remarks, and what was dropped for another reason than the expected one."""
+    def sentences(self, expected: Collection[str] = ()) -> list[str]:
+        """The remarks, and what was dropped for other reasons than the expected ones."""
         unused = (
-            f"{count} inputs are not used: {why}." for why, count in self.dropped.items() if why != expected
+            f"{count} inputs are not used: {why}."
+            for why, count in self.dropped.items()
+            if why not in expected
         )
         return [*self.remarks, *unused]
 
@@ -133,6 +138,7 @@ def read_recording(
         joined([NO_BRIGHTNESS, *(part["brightness"] for part in parts)]),
         joined([NO_FIXES, *(part["fixes"] for part in parts)]),
         joined([NO_TURN_RATES, *(rows.get("imu", NO_TURN_RATES) for rows in moved)]),
+        joined([NO_RANGES, *(part["ranges"] for part in parts)]),
         converter.drops.total,
         summary.remarks,
     )

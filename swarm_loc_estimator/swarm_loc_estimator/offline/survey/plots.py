@@ -1,4 +1,4 @@
-"""Picture of a survey: the arena with the ellipses of its landmarks, and the paths of the robots."""
+"""Picture of a survey: landmarks with ellipses, paths of robots, fixed cameras and anchors."""
 
 from __future__ import annotations
 
@@ -47,6 +47,11 @@ def draw(done: Surveyed, path: Path) -> Path:
     marks = [mark for mark, is_in in zip(problem.swarm.landmarks, placed, strict=True) if is_in]
     for mark, place in zip(marks, places.tolist(), strict=True):
         axis.annotate(str(mark.id), place, (4, 4), textcoords="offset points", fontsize=7, color=INK)
+    fixed = [(camera.name, camera.x, camera.y, "s") for camera in done.swarm.cameras]
+    fixed += [(hex(anchor.address), anchor.x, anchor.y, "^") for anchor in done.swarm.anchors]
+    for name, x, y, symbol in fixed:
+        axis.plot(x, y, symbol, color=INK, markersize=7)
+        axis.annotate(name, (x, y), (6, 4), textcoords="offset points", fontsize=8, color=INK)
     note = f"3-sigma ellipses, enlarged {factor:.0f} x" if factor > 1.0 else "3-sigma ellipses"
     axis.set_title(f"{len(marks)} landmarks ({note})", loc="left", fontsize=11, color=INK)
     save(figure, path)

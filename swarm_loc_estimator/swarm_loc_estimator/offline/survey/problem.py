@@ -68,6 +68,7 @@ class SurveyProblem:
         sightings: (m,) measurements of cameras; markers of landmarks are in the landmark's own frame.
         sides: (m, 2) knots of observer and target; -1: a landmark.
         tracks: (2, m, 3) poses of observer and target on their tracks.
+        odometry: The tracks.
         slip: (2, m, 3, 3) covariance of their slip since the knot, in the frame of the track.
         rare: Number of sightings by id, of markers that were seen too rarely.
     """
@@ -79,6 +80,7 @@ class SurveyProblem:
     sides: IntArray
     tracks: FloatArray
     slip: FloatArray
+    odometry: OdometryTracks
     rare: dict[int, int]
 
     @property
@@ -122,7 +124,7 @@ def problem_of(recording: Recording, swarm: Swarm) -> SurveyProblem:
         since = at.covariance - knots.sample.covariance[sides[side][moves]]
         slip[side, moves] = since * np.sign(np.trace(since, axis1=1, axis2=2))[:, None, None]
     is_known = np.array([mark.id in known for mark in described.landmarks], dtype=bool)
-    return SurveyProblem(described, is_known, knots, sightings, sides.T, poses, slip, rare)
+    return SurveyProblem(described, is_known, knots, sightings, sides.T, poses, slip, tracks, rare)
 
 
 def _with_landmarks(recording: Recording, swarm: Swarm) -> tuple[Swarm, dict[int, int]]:

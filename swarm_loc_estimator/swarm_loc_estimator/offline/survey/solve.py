@@ -52,6 +52,7 @@ class Solution:
         parameter: (N, 5) errors of turn bias, path scale, turn scale, camera yaw and camera scale.
         parameter_sigma: (N, 5) their standard deviations.
         landmark_covariance: (L, 3, 3) of x, y, yaw.
+        frame_covariance: (3, 3) of a knot in the middle: what is common to all is as uncertain.
         weight: (m,) of the sightings, from 0 for wrong ones to 1.
         used: (m,) whether both sides of the sighting are connected with the origin.
         variance_ratio: Mean squared residual of sightings by the described noise; 1 is ideal.
@@ -62,6 +63,7 @@ class Solution:
     parameter: FloatArray
     parameter_sigma: FloatArray
     landmark_covariance: FloatArray
+    frame_covariance: FloatArray
     weight: FloatArray
     used: BoolArray
     variance_ratio: float
@@ -280,10 +282,12 @@ class Solver:
             error = factor.covariance(self._landmark_column[index] + np.arange(3))
             covariance[index] = se2.pose_covariance(self._landmark[index], error)
         sigma = np.array([np.sqrt(np.diag(factor.covariance(one))) for one in self._parameter_column])
+        placed = self._knot_column[self._knot_column >= 0]
+        frame = factor.covariance(placed[placed.size // 2] + np.arange(3))
         weight = np.zeros(self.used.size)
         weight[self._rows] = self._weight
         return Solution(
-            self._knot, self._landmark, self._parameter, sigma, covariance, weight, self.used, ratio
+            self._knot, self._landmark, self._parameter, sigma, covariance, frame, weight, self.used, ratio
         )
 
 

@@ -1,17 +1,19 @@
-"""Survey landmarks: from a recording to a swarm description with places, and what is badly determined."""
+"""Survey: from a recording to a swarm description with places, and what is badly determined."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
+from swarm_loc_estimator.offline.survey.fixed import Paths, Placed, place_fixed
 from swarm_loc_estimator.offline.survey.problem import MIN_SIGHTINGS, SurveyProblem, problem_of
 from swarm_loc_estimator.offline.survey.solve import Solution, Solver
 from swarm_loc_estimator.offline.survey.start import start_of
@@ -48,14 +50,17 @@ class Surveyed:
     text: str
 
 
-def survey(recording: Recording, swarm: Swarm, progress: Progress = unwatched) -> Surveyed:
-    """Find the landmarks of a recording in which robots drove around.
+def survey(
+    recording: Recording, swarm: Swarm, progress: Progress = unwatched, *, cameras: bool = False
+) -> Surveyed:
+    """Find the landmarks and anchors of a recording in which robots drove around.
 
     Args:
-        recording: Odometry and detections.
+        recording: Odometry, detections and ranges.
         swarm: The robots. Landmarks that it describes, and starts, give the frame; without any, the first
             pose of the robot that has seen most is the origin.
         progress: Called now and then.
+        cameras: Whether described fixed cameras are placed anew.
 
     Raises:
         CalibrationError: Nobody has moved, or no marker that belongs to nobody was seen often enough.
@@ -74,8 +79,24 @@ def survey(recording: Recording, swarm: Swarm, progress: Progress = unwatched) -
         landmarks=tuple(_landmarks(problem, solution)),
         robots=tuple(_calibrated(robot, index, solution) for index, robot in enumerate(swarm.robots)),
     )
+    frame = max(1.0, solution.variance_ratio) * solution.frame_covariance
+    paths = Paths(partial(_poses, problem, solution), frame)
+    placed = place_fixed(recording, found, paths, cameras=cameras)
+    found = replace(found, cameras=placed.cameras, anchors=placed.anchors)
     path = se2.compose(solution.knot, problem.knots.sample.pose)
-    return Surveyed(found, problem, solution, path, _text(problem, solution, swarm, found))
+    return Surveyed(found, problem, solution, path, _text(problem, solution, swarm, found, placed))
+
+
+def _poses(problem: SurveyProblem, solution: Solution, robots: IntArray, stamps_ns: IntArray) -> FloatArray:
+    """Poses (k, 3) in map of robots (k,) at instants (k,); NaN: not known."""
+    knots, poses = problem.knots.nearest(robots, stamps_ns), np.full((robots.size, 3), np.nan)
+    end_ns = np.zeros(len(problem.swarm.robots), dtype=np.int64)
+    np.maximum.at(end_ns, problem.knots.robot, problem.knots.stamp_ns)
+    known = (knots >= 0) & (stamps_ns <= end_ns[robots])
+    known[known] = problem.odometry.has_started(robots[known], stamps_ns[known])
+    track = problem.odometry.at(robots[known], stamps_ns[known]).pose
+    poses[known] = se2.compose(solution.knot[knots[known]], track)
+    return poses
 
 
 def _landmarks(problem: SurveyProblem, solution: Solution) -> list[Landmark]:
@@ -116,7 +137,7 @@ def _calibrated(robot: Robot, index: int, solution: Solution) -> Robot:
     )
 
 
-def _text(problem: SurveyProblem, solution: Solution, before: Swarm, found: Swarm) -> str:
+def _text(problem: SurveyProblem, solution: Solution, before: Swarm, found: Swarm, placed: Placed) -> str:
     places = {mark.id: mark for mark in found.landmarks}
     lines = ["landmark        x [m]     y [m]  yaw [deg]  sigma [mm]  sightings  contradicting"]
     for index, mark in enumerate(problem.swarm.landmarks):
@@ -130,7 +151,10 @@ def _text(problem: SurveyProblem, solution: Solution, before: Swarm, found: Swar
             f"{one.id:8d} {one.x:12.3f} {one.y:9.3f} {yaw:>10} {sigma:11.1f} {rows.sum():10d} {wrong:13.0%}"
         )
     return "\n".join(
-        [*lines, "", *_corrections(before, found), *_frame(problem), *_remarks(problem, solution)]
+        [
+            *(*lines, "", *placed.lines, *([""] if placed.lines else [])),
+            *(*_corrections(before, found), *_frame(problem), *_remarks(problem, solution), *placed.remarks),
+        ]
     )
 
 
