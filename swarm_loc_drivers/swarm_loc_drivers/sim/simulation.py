@@ -10,15 +10,20 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from swarm_loc_drivers.sim.droplet.world import check_droplets
 from swarm_loc_drivers.sim.epuck.world import check_swarm
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import MAX_ROBOTS, laser_hz, led_hz
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
+from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings
+from swarm_loc_drivers.sim.scenarios.droplets import starts as droplet_starts
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, eight_starts, rounded
 from swarm_loc_drivers.sim.scenarios.eight_images import eight_floor
-from swarm_loc_drivers.sim.worlds import WorldError, start_of
+from swarm_loc_drivers.sim.worlds import WorldError
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, check_parameter_file
 from swarm_loc_estimator.common.parameters import ParameterError, number
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -77,15 +82,18 @@ class RobotType:
 
     Attributes:
         name: The type of the robots in a swarm description.
+        starts: Options, number of robots -> poses (N, 3) of those that the description gives no start.
         check: Raises a `UserError` for a swarm that its world cannot hold.
-        nodes: Options, swarm, folder for serial ports and files -> nodes in the order in which they start.
+        nodes: Options, swarm, folder for serial ports and files, file of the swarm with all starts -> nodes
+            in the order in which they start.
         worlds: Its error models, the default one first.
         has_markers: Whether marker detectors run, whose compiled code is to be prepared once for all.
     """
 
     name: str
+    starts: Callable[[SimulationOptions, int], FloatArray]
     check: Callable[[Swarm], None]
-    nodes: Callable[[SimulationOptions, Swarm, str], list[NodeSpec]]
+    nodes: Callable[[SimulationOptions, Swarm, str, str], list[NodeSpec]]
     worlds: tuple[str, ...] = ()
     has_markers: bool = False
 
@@ -118,7 +126,7 @@ def simulated_swarm(options: SimulationOptions) -> Swarm:
     kind = robot_type_of(swarm)
     if options.world and kind.worlds and options.world not in kind.worlds:
         raise ParameterError(f"argument world = '{options.world}' must be one of {', '.join(kind.worlds)}.")
-    kind.check(swarm)
+    kind.check(placed(options, swarm))
     return swarm
 
 
@@ -132,7 +140,11 @@ def graph_of(options: SimulationOptions, swarm: Swarm, links: str) -> list[NodeS
     """
     kind = robot_type_of(swarm)
     chosen = replace(options, world=options.world or next(iter(kind.worlds), ""))
-    return kind.nodes(chosen, swarm, links)
+    if all(robot.start is not None for robot in swarm.robots):
+        return kind.nodes(chosen, swarm, links, options.swarm_file)
+    whole = Path(links) / "placed.yaml"
+    save_swarm(placed(options, swarm), whole)
+    return kind.nodes(chosen, swarm, links, str(whole))
 
 
 def seen_from_above(swarm: Swarm) -> Swarm:
@@ -141,9 +153,15 @@ def seen_from_above(swarm: Swarm) -> Swarm:
     return Swarm(tuple(robots))
 
 
-def placed_on_eight(swarm: Swarm) -> Swarm:
-    """The swarm as the world of e-pucks has it: who has no start stands at its place on the eight."""
-    starts = eight_starts(len(swarm.robots))
+def placed(options: SimulationOptions, swarm: Swarm) -> Swarm:
+    """The swarm with a start for each robot; who has none stands where its world puts it.
+
+    Raises:
+        UserError: The world has no place for so many robots.
+    """
+    if all(robot.start is not None for robot in swarm.robots):
+        return swarm
+    starts = robot_type_of(swarm).starts(options, len(swarm.robots))
     robots = (
         replace(robot, start=robot.start or rounded(start))
         for robot, start in zip(swarm.robots, starts, strict=True)
@@ -151,25 +169,22 @@ def placed_on_eight(swarm: Swarm) -> Swarm:
     return replace(swarm, robots=tuple(robots))
 
 
-def _world(options: SimulationOptions, links: str, **own: ParameterValue) -> Parameters:
+def _world(swarm_file: str, options: SimulationOptions, links: str, **own: ParameterValue) -> Parameters:
     """Parameters of a world's node."""
-    shared: Parameters = {"swarm_file": options.swarm_file, "seed": options.seed, "rate": options.rate}
+    shared: Parameters = {"swarm_file": swarm_file, "seed": options.seed, "rate": options.rate}
     return {**shared, "link_folder": links, **own}
 
 
-def _epuck_nodes(options: SimulationOptions, swarm: Swarm, links: str) -> list[NodeSpec]:
+def _epuck_nodes(options: SimulationOptions, swarm: Swarm, links: str, whole: str) -> list[NodeSpec]:
     file = options.parameter_file
     described: Parameters = {"swarm_file": options.swarm_file}
-    world = _world(options, links, world=options.world, answer_within=_ANSWER_WITHIN_S)
+    world = _world(whole, options, links, world=options.world, answer_within=_ANSWER_WITHIN_S)
     steering: Parameters = {
         **described,
         "speed": options.speed,
         "wait_for_poses": True,
         "aerial": options.aerial,
     }
-    if any(robot.start is None for robot in swarm.robots):
-        world["swarm_file"] = f"{links}/placed.yaml"
-        save_swarm(placed_on_eight(swarm), Path(links) / "placed.yaml")
     estimator, cameras = described, []
     if options.aerial:
         estimator, ground = _aerial_files(options, Path(links))
@@ -207,12 +222,16 @@ def _aerial_files(options: SimulationOptions, folder: Path) -> tuple[Parameters,
     return {"swarm_file": str(swarm_file)}, {"control_points_file": str(floor_file)}
 
 
-def _droplet_nodes(options: SimulationOptions, swarm: Swarm, links: str) -> list[NodeSpec]:
+def _droplet_starts(options: SimulationOptions, robots: int) -> FloatArray:
+    return droplet_starts(DropletRunSettings(seed=options.seed, robots=robots))
+
+
+def _droplet_nodes(options: SimulationOptions, swarm: Swarm, links: str, whole: str) -> list[NodeSpec]:
     """Half of the Droplets wander; a tracker sees the first and the last one."""
     described: Parameters = {"swarm_file": options.swarm_file}
     tracked = list(dict.fromkeys((swarm.robots[0].name, swarm.robots[-1].name)))
-    world = _world(options, links, world=options.world, fixed=tracked)
-    steering: Parameters = {**described, "seed": options.seed, **_TIME}
+    world = _world(whole, options, links, world=options.world, fixed=tracked)
+    steering: Parameters = {"swarm_file": whole, "seed": options.seed, **_TIME}
     fleet: Parameters = {**described, "link_folder": links, **_TIME}
     file = options.parameter_file
     return [
@@ -223,14 +242,23 @@ def _droplet_nodes(options: SimulationOptions, swarm: Swarm, links: str) -> list
     ]
 
 
-def _pushbot_nodes(options: SimulationOptions, swarm: Swarm, links: str) -> list[NodeSpec]:
-    """Writes the laser calibrations of the trackers, too."""
+def _pushbot_starts(options: SimulationOptions, robots: int) -> FloatArray:
+    starts = floor_plan(options.plan).starts
+    if len(starts) < robots:
+        raise WorldError(
+            f"the floor plan '{options.plan}' has starts for {len(starts)} robots, not {robots}."
+        )
+    return np.column_stack([starts[:robots], np.zeros(robots)])
+
+
+def _pushbot_nodes(options: SimulationOptions, swarm: Swarm, links: str, whole: str) -> list[NodeSpec]:
+    """Writes the laser calibrations of the trackers, too. A mapper of several robots must know the starts."""
     robots = [robot.name for robot in swarm.robots]
     calibrate_lasers(robots, options.seed, Path(links))
-    described: Parameters = {"swarm_file": options.swarm_file}
+    described: Parameters = {"swarm_file": whole}
     leds = [f"{robot}={led_hz(index)}" for index, robot in enumerate(robots)] if len(robots) > 1 else []
     mapper: Parameters = {**described, **({"led_frequencies": leds} if leds else {}), **_TIME}
-    world = _world(options, links, plan=options.plan)
+    world = _world(whole, options, links, plan=options.plan)
     exploration: Parameters = {**described, "wait_for_poses": True, **_TIME}
     file = options.parameter_file
     nodes = [
@@ -253,13 +281,11 @@ def _pushbot_nodes(options: SimulationOptions, swarm: Swarm, links: str) -> list
 
 
 def _check_pushbots(swarm: Swarm) -> None:
-    """Make sure that all robots have a start, and lights of their own.
+    """Make sure that all robots have lights of their own.
 
     Raises:
-        WorldError: A start is missing, or there are too many robots.
+        WorldError: There are too many robots.
     """
-    for robot in swarm.robots:
-        start_of(robot)
     if len(swarm.robots) > MAX_ROBOTS:
         raise WorldError(
             f"{len(swarm.robots)} robots are more than the {MAX_ROBOTS} whose lights trackers can tell"
@@ -269,7 +295,8 @@ def _check_pushbots(swarm: Swarm) -> None:
 
 EPUCK = RobotType(
     "epuck",
-    lambda swarm: check_swarm(placed_on_eight(swarm)),
+    lambda _, robots: eight_starts(robots),
+    check_swarm,
     _epuck_nodes,
     ("w2", "w0", "w2fast"),
     has_markers=True,
@@ -278,8 +305,8 @@ ROBOT_TYPES = {
     one.name: one
     for one in (
         EPUCK,
-        RobotType("droplet", check_droplets, _droplet_nodes, ("d1", "d0")),
-        RobotType("pushbot", _check_pushbots, _pushbot_nodes),
+        RobotType("droplet", _droplet_starts, check_droplets, _droplet_nodes, ("d1", "d0")),
+        RobotType("pushbot", _pushbot_starts, _check_pushbots, _pushbot_nodes),
     )
 }
 """The kinds of robots that can be simulated, by the type in a swarm description."""

@@ -52,7 +52,7 @@ def test_launch_arguments_become_the_simulations_nodes(
     ("changed", "sentence"),
     [
         ({"swarm_file": "missing.yaml"}, "missing.yaml"),
-        ({"swarm_file": str(BAGS / "droplets_twenty" / "swarm.yaml")}, "'droplet1' has no start pose"),
+        ({"plan": "attic"}, "no floor plan 'attic'"),
         ({"params_file": "missing.yaml"}, "missing.yaml"),
         ({"rate": "abc"}, "argument rate = 'abc' must be a number in [0.01, 100]."),
         ({"rate": "0"}, "argument rate = '0' must be a number in [0.01, 100]."),

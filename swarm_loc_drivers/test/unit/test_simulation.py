@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,8 @@ from swarm_loc_drivers.sim import simulate
 from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
 from swarm_loc_drivers.sim.epuck.parts import Unanswered
 from swarm_loc_drivers.sim.simulation import ROBOT_TYPES, SimulationOptions, graph_of, simulated_swarm
-from swarm_loc_drivers.sim.worlds import WORLDS
+from swarm_loc_drivers.sim.worlds import WORLDS, WorldError
+from swarm_loc_estimator.cli import new
 from swarm_loc_estimator.common.parameters import ParameterError, parameter_specs
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -93,6 +95,34 @@ def test_droplets_get_a_table_one_fleet_of_drivers_and_a_tracker(tmp_path: Path)
         assert node.parameters.get("use_sim_time", False) is (name != "droplet_world")
 
 
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [("droplet", ["droplet_world", "droplet_steering"]), ("pushbot", ["pushbot_world", "mapper"])],
+)
+def test_robots_without_a_start_stand_where_their_world_puts_them(
+    tmp_path: Path, kind: str, told: list[str]
+) -> None:
+    assert new.main([str(tmp_path / "swarm.yaml"), "--yes", "--type", kind, "--robots", "3"]) == 0
+    options = SimulationOptions(str(tmp_path / "swarm.yaml"), plan="office")
+    swarm = simulated_swarm(options)
+    assert all(robot.start is None for robot in swarm.robots)
+    nodes = {node.full_name: node for node in graph_of(options, swarm, str(tmp_path))}
+    for name in told:
+        placed = load_swarm(Path(str(nodes[name].parameters["swarm_file"])))
+        starts = np.array([robot.start for robot in placed.robots], float)
+        assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(starts[:, :2], 2)) > 0.03
+    known = load_swarm(Path(str(nodes["estimator"].parameters["swarm_file"])))
+    assert all((robot.start is None) == (kind == "droplet") for robot in known.robots)
+
+
+def test_a_hall_without_room_for_all_is_named(tmp_path: Path) -> None:
+    assert new.main([str(tmp_path / "swarm.yaml"), "--yes", "--type", "pushbot", "--robots", "10"]) == 0
+    hall = tmp_path / "hall.yaml"
+    hall.write_text('{"free": [[0, 0, 3, 3]], "starts": [[1, 1], [2, 2]]}')
+    with pytest.raises(WorldError, match=r"the floor plan .*hall.yaml' has starts for 2 robots, not 10."):
+        simulated_swarm(SimulationOptions(str(tmp_path / "swarm.yaml"), plan=str(hall)))
+
+
 def test_every_error_model_belongs_to_a_robot_type_and_no_other_is_accepted() -> None:
     worlds = {world for kind in ROBOT_TYPES.values() for world in kind.worlds}
     assert worlds == {*WORLDS, *DROPLET_WORLDS}
@@ -110,7 +140,7 @@ def test_the_command_line_becomes_options() -> None:
 @pytest.mark.parametrize(
     ("bag", "old", "new", "words"),
     [
-        ("droplets_twenty", "", "", "robot 'droplet1' has no start pose"),
+        ("droplets_twenty", "ir: {id: 4097}", "ir: null", "robot 'droplet1' has no infrared board"),
         ("eight_one_robot_slow", "fileversion: 1", "fileversion: 2", "fileversion is 2 but must be 1"),
     ],
 )
