@@ -7,6 +7,7 @@
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The report
 (report.txt, report.html, overview.png, paths.png, errors.png) and the poses (poses.csv) are written to --out.
 --mcap writes poses, /tf, markers, and the bag's map and goals for RViz, Foxglove and other viewers.
+--tum writes poses and ground truth of each robot in the format of TUM, for evo and other tools.
 --learned writes the description with the self-calibrated parameters of cameras, odometry and landmarks; the
 parameters with a sigma in the description are estimated.
 """
@@ -35,7 +36,7 @@ from swarm_loc_estimator.common.command_line import (
     swarm_beside,
     yaml_to_write,
 )
-from swarm_loc_estimator.offline.export import write_mcap
+from swarm_loc_estimator.offline.export import write_mcap, write_tum
 from swarm_loc_estimator.offline.replay import TICK_S, TICKS_S, replay
 from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.offline.result import ReplayResult
@@ -74,6 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         write_poses(result, options.out / "poses.csv")
         if options.mcap:
             write_mcap(result, options.mcap)
+        if options.tum:
+            write_tum(result, options.tum)
     if options.learned:
         if not result.self_calibrated:
             print(_NOTHING_TO_LEARN, file=sys.stderr)
@@ -118,6 +121,12 @@ def _parser() -> argparse.ArgumentParser:
         type=file_to_write(".mcap"),
         metavar="FILE",
         help="where to write poses, /tf and markers for viewers",
+    )
+    parser.add_argument(
+        "--tum",
+        type=folder_to_write,
+        metavar="FOLDER",
+        help="where to write trajectories and ground truth for evo",
     )
     parser.add_argument(
         "--tick", type=number_in(*TICKS_S, "s"), default=TICK_S, help="seconds between outputs"

@@ -16,6 +16,7 @@ import pytest
 
 import swarm_loc_estimator
 from swarm_loc_estimator import Batch, Estimator, OdometryRows, ReplayResult, Robot, Swarm, replay
+from swarm_loc_estimator.offline.export import write_tum
 from swarm_loc_estimator.offline.report.table import text_report
 
 ROOT = Path(__file__).parents[3]
@@ -125,3 +126,19 @@ def test_the_example_prints_the_errors_of_the_report(result: ReplayResult) -> No
         name, position, heading, nees = line.split()
         (row,) = [one.split() for one in report if one.startswith(f"{name} ")]
         assert (position, heading, nees) == (row[2], row[7], row[12])
+
+
+def test_exported_trajectories_have_the_errors_of_the_report(result: ReplayResult, tmp_path: Path) -> None:
+    write_tum(result, tmp_path)
+    assert len([*tmp_path.iterdir()]) == 10
+    for name, summary in result.summaries.items():
+        found, truth = (np.loadtxt(tmp_path / f"{name}{end}.tum") for end in ("", "_truth"))
+        found = found[np.isin(found[:, 0], truth[:, 0])]
+        assert np.array_equal(found[:, 0], truth[:, 0])
+        away = np.linalg.norm(found[:, 1:3] - truth[:, 1:3], axis=1)
+        assert np.sqrt(np.mean(away**2)) == pytest.approx(summary.position_rmse, abs=1e-9)
+        turn = 2.0 * (np.arctan2(found[:, 6], found[:, 7]) - np.arctan2(truth[:, 6], truth[:, 7]))
+        turn = np.abs(np.arctan2(np.sin(turn), np.cos(turn)))
+        assert np.sqrt(np.mean(turn**2)) == pytest.approx(summary.heading_rmse, abs=1e-9)
+    stamps = (tmp_path / "epuck1.tum").read_text(encoding="utf-8").split("\n", 1)[0].split()[0]
+    assert int(stamps.replace(".", "")) in result.stamp_ns
