@@ -133,7 +133,7 @@ def draw_picture(look: Look, seed: int) -> Picture:
     tops[:, :2] = foot + lift * (poses[:, :2] - foot)
     for row in np.argsort(-np.linalg.norm(tops[:, :2] - foot, axis=1), kind="stable"):
         plan.put_robot(look, poses[row], tops[row], lift)
-    plan.light(look, poses, tops)
+    plan.light(look, poses, tops, lift)
     cells = np.nan_to_num((view - low) / fine - 0.5, nan=-1.0).astype(np.float32)
     light = cv2.remap(
         plan.image, cells[..., 0], cells[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -204,6 +204,15 @@ def _lay(image: Plain, depth: FloatArray, shade: float) -> None:
     """Paint where a depth [cells] is above 0."""
     share = np.clip(0.5 + depth, 0.0, 1.0).astype(np.float32)
     image[:] = image * (1.0 - share) + shade * share
+
+
+def _window(image: Plain, centre: FloatArray, reach: FloatArray) -> tuple[Plain, FloatArray]:
+    """The part of an image around a centre (2,), and the columns and rows (..., 2) of its cells."""
+    most = np.array(image.shape[::-1])
+    left, upper = np.clip(np.floor(centre - reach), 0, most).astype(int)
+    right, lower = np.clip(np.ceil(centre + reach), 0, most).astype(int)
+    grid = np.stack(np.meshgrid(np.arange(left, right), np.arange(upper, lower)), axis=-1)
+    return image[upper:lower, left:right], grid
 
 
 def _paint_top(
@@ -284,14 +293,10 @@ class _Plan:
             angle = self._rng.uniform(-math.pi, math.pi)
             way = look.motion * DIAMETER / self._step * np.array([math.cos(angle), math.sin(angle)])
         base, centre = ((place[:2] - self._low) / self._step - 0.5 for place in (pose, top))
-        reach = 1.6 * radius * lift + np.abs(way)
-        rows, columns = self.image.shape
-        left, upper = np.clip(np.floor(np.minimum(base, centre) - reach), 0, [columns, rows]).astype(int)
-        right, lower = np.clip(np.ceil(np.maximum(base, centre) + reach), 0, [columns, rows]).astype(int)
-        if left >= right or upper >= lower:
+        reach = 1.6 * radius * lift + np.abs(way) + 0.5 * np.abs(centre - base)
+        window, grid = _window(self.image, 0.5 * (base + centre), reach)
+        if not window.size:
             return
-        grid = np.stack(np.meshgrid(np.arange(left, right), np.arange(upper, lower)), axis=-1)
-        window = self.image[upper:lower, left:right]
         parts = self._rng.uniform(-1.0, 1.0, (_PARTS, 2)) if look.kind == "board" else np.zeros((0, 2))
         shares = np.linspace(-0.5, 0.5, _EXPOSURES) if look.motion > 0.0 else np.zeros(1)
         exposures = []
@@ -308,7 +313,7 @@ class _Plan:
             exposures.append(one)
         window[:] = np.mean(exposures, axis=0)
 
-    def light(self, look: Look, poses: FloatArray, tops: FloatArray) -> None:
+    def light(self, look: Look, poses: FloatArray, tops: FloatArray, lift: float) -> None:
         """Uneven light over all, shadows beside robots and of things that are not seen."""
         rows, columns = self.image.shape
         if look.gradient < 1.0:
@@ -335,7 +340,9 @@ class _Plan:
             cv2.fillConvexPoly(shade, hull, 1.0, cv2.LINE_AA)
         soft = cv2.GaussianBlur(shade, (0, 0), 0.08 * size)
         lit = np.zeros((rows, columns), np.float32)
+        radius = 0.5 * size * lift
         for top in tops:
-            centre = np.rint((top[:2] - self._low) / self._step).astype(int)
-            cv2.circle(lit, centre.tolist(), round(0.5 * size), 1.0, -1, cv2.LINE_AA)
+            centre = (top[:2] - self._low) / self._step - 0.5
+            window, grid = _window(lit, centre, np.full(2, radius + 1.0))
+            _lay(window, radius - np.linalg.norm(grid - centre, axis=-1), 1.0)
         self.image *= 1.0 - look.shadow * soft * (1.0 - lit)

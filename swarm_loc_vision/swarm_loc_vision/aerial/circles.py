@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.aerial.edge_positions import SHARES, EdgesOnRays, steepest, strongest
 from swarm_loc_vision.aerial.rectification import Brightness, Plain, logarithm
 
 _RADII = np.array([0.82, 0.91, 1.0, 1.09, 1.18])
@@ -79,9 +80,6 @@ def _shrunk(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 RAYS = 64
-_NEAREST, _FARTHEST, _SAMPLES = 0.45, 1.6, 47
-_SIDE = 5
-"""Number of samples compared on each side of an edge: an eighth of the diameter."""
 _WIDEST = 0.3
 """Largest relative difference of a rim from the expected radius."""
 _OFF = 0.12
@@ -94,18 +92,17 @@ _EVERY, _LIKELY = 4, 0.4
 _MIN_RAYS = 12
 _NOISES = 0.5
 """Least step of an edge over the noise of one pixel: its two sides are means over many pixels."""
-_SLACK_PX = 0.03
-"""Error of an edge that its neighbours share [px], on top of the residuals."""
+_TOGETHER = 3.0
+"""Neighbouring rays that share pixels, and so one error."""
+_MIN_PAIRS = 8
+"""Least opposite rays with edges that show the errors which move a centre."""
 
-_RAMP = 16
-"""Samples on each side of a blurred edge that show its ends: 0.4 of the radius."""
 _OVAL_RIDGE = 1.0
 """Prior information on the oval, in edges: half a rim says little of it."""
 
 _ANGLES = 2.0 * np.pi * np.arange(RAYS) / RAYS
 DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
 _OVALS = np.stack([np.cos(2.0 * _ANGLES), np.sin(2.0 * _ANGLES)], axis=1)
-_SHARES = np.linspace(_NEAREST, _FARTHEST, _SAMPLES)
 
 
 class Circles(NamedTuple):
@@ -230,15 +227,22 @@ class Rims:
         kind: NDArray[np.int64],
         soft: NDArray[np.bool_],
         without: Light | None = None,
+        *,
+        fine: bool = False,
     ) -> Circles:
-        """Fit outlines near centres (C, 2) of about radii (C,) [px]."""
+        """Fit outlines near centres (C, 2) of about radii (C,) [px].
+
+        `fine` takes edges where counts are steepest: slower, and exact where blur reaches other edges.
+        """
         low, high = (1.0 - _WIDEST) * radius, (1.0 + _WIDEST) * radius
         found = radius
         for _ in range(_ROUNDS):
             start = np.clip(found, low, high)
             length, normal = self.sides.outline(centre, start, kind)
             reach = start[:, None] * length
-            edge, step, is_edge = self.edges(centre, reach, without=without, radius=start, soft=soft)
+            edge, step, is_edge = self.edges(
+                centre, reach, without=without, radius=start, soft=soft, fine=fine
+            )
             away = edge - reach
             # narrower sides end anywhere between the rim of the top and those of a cylinder
             hidden = (kind[:, None] == PARTLY) & (length > 1.0)
@@ -260,9 +264,10 @@ class Rims:
         without: Light | None = None,
         radius: FloatArray | None = None,
         soft: NDArray[np.bool_] | None = None,
-    ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-        """The strongest edge on each `every`-th ray near `reach` (C, R) [px]: where, its step, if valid."""
-        places = reach[..., None, None] * (_SHARES[:, None] * DIRECTIONS[::every, None])
+        fine: bool = False,
+    ) -> EdgesOnRays:
+        """The strongest edge on each `every`-th ray near `reach` (C, R) [px]."""
+        places = reach[..., None, None] * (SHARES[:, None] * DIRECTIONS[::every, None])
         cells = centre[:, None, None] + places
         if without is None or radius is None:
             values = sampled(self.image.log, cells)
@@ -270,7 +275,8 @@ class Rims:
             values = logarithm(
                 sampled(self.image.plain, cells) - without(places / radius[:, None, None, None])
             )
-        return _strongest(values, reach, self.polarity, self._least, soft)
+        edges = strongest(values, reach, self.polarity, self._least, soft)
+        return steepest(values, reach, self.polarity, edges) if fine else edges
 
     def _least(self, darkest: FloatArray) -> FloatArray:
         """Least steps of edges by the logarithm of brightness on their darker side."""
@@ -287,51 +293,6 @@ def _masked_median(values: FloatArray, mask: NDArray[np.bool_], otherwise: Float
     """(C,) medians over the masked entries of each row (C, R)."""
     rows = zip(values, mask, otherwise, strict=True)
     return np.array([np.median(row[own]) if own.any() else default for row, own, default in rows])
-
-
-def _strongest(
-    values: FloatArray,
-    reach: FloatArray,
-    polarity: float,
-    least: Callable[[FloatArray], FloatArray],
-    soft: NDArray[np.bool_] | None,
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
-    """`Rims.edges` from values (C, R, S) along the rays."""
-    sums = np.concatenate([np.zeros((*values.shape[:2], 1)), np.cumsum(values, axis=2)], axis=2)
-    inner = (sums[..., _SIDE:-_SIDE] - sums[..., : -2 * _SIDE]) / _SIDE
-    outer = (sums[..., 2 * _SIDE :] - sums[..., _SIDE:-_SIDE]) / _SIDE
-    steps = polarity * (inner - outer)
-    best = np.argmax(steps, axis=2)
-    between = np.clip(best, 1, steps.shape[2] - 2)
-    rows = np.indices(best.shape)
-    left, mid, right = (steps[rows[0], rows[1], between + k] for k in (-1, 0, 1))
-    bend = left - 2.0 * mid + right
-    with np.errstate(divide="ignore", invalid="ignore"):
-        offset = np.where(bend < 0.0, 0.5 * (left - right) / bend, 0.0)
-    offset = np.clip(offset, -1.0, 1.0)
-    pitch = _SHARES[1] - _SHARES[0]
-    share = _SHARES[0] + pitch * (between + offset + _SIDE - 0.5)
-    if soft is not None and soft.any():
-        share[soft] = _halfway(np.exp(values[soft]), best[soft] + _SIDE, polarity)
-    step = steps[rows[0], rows[1], best]
-    darkest = np.minimum(inner.min(axis=2), outer.min(axis=2))
-    inside = (best > 0) & (best < steps.shape[2] - 1)
-    return share * reach, step, inside & (step > least(darkest))
-
-
-def _halfway(values: FloatArray, near: NDArray[np.int64], polarity: float) -> FloatArray:
-    """Where counts (C, R, S) along rays are halfway between those on both sides of blurred edges, in `reach`.
-
-    Motion makes an edge a ramp, the middle of which is the rim; the logarithm is steepest at its dark end.
-    """
-    window = np.clip(near[..., None] + np.arange(-_RAMP, _RAMP + 1), 0, values.shape[2] - 1)
-    counts = polarity * np.take_along_axis(values, window, axis=2)
-    above = counts - 0.5 * (counts[..., :1] + counts[..., -1:])
-    last = np.clip(np.argmax(above < 0.0, axis=2), 1, 2 * _RAMP)[..., None]
-    before, after = (np.take_along_axis(above, last - k, axis=2)[..., 0] for k in (1, 0))
-    part = np.clip(before / np.maximum(before - after, 1e-9), 0.0, 1.0)
-    index = np.take_along_axis(window, last - 1, axis=2)[..., 0] + part
-    return np.asarray(_SHARES[0] + (_SHARES[1] - _SHARES[0]) * index)
 
 
 def _fit(
@@ -358,10 +319,22 @@ def _fit(
     count = own.sum(axis=1)
     spread = np.sqrt(np.sum(own * residual**2, axis=1) / np.maximum(count - 5, 1))
     used = design * own[..., None]
-    # neighbouring rays share pixels: about every other ray is an independent measurement
-    variance = 2.0 * spread**2 + _SLACK_PX**2
+    variance = _TOGETHER * _moving(residual, own, spread)
     covariance = variance[:, None, None] * np.linalg.inv(np.swapaxes(used, 1, 2) @ design + ridge)[:, :2, :2]
     few = count < _MIN_RAYS
     own[few] = False
     solution = np.where(few[:, None], 0.0, solution[..., 0])
     return solution[:, :2], radius + solution[:, 2], solution[:, 3:], covariance, spread, own
+
+
+def _moving(residual: FloatArray, own: NDArray[np.bool_], spread: FloatArray) -> FloatArray:
+    """(C,) variance of edges without what is alike on opposite sides, which does not move a centre.
+
+    Motion and tilt, for example, blur both sides of a rim.
+    """
+    half = RAYS // 2
+    both = own[:, :half] & own[:, half:]
+    uneven = 0.5 * (residual[:, :half] - residual[:, half:])
+    pairs = both.sum(axis=1)
+    seen = 2.0 * np.sum(both * uneven**2, axis=1) / np.maximum(pairs - 2, 1)
+    return np.asarray(np.where(pairs >= _MIN_PAIRS, seen, spread**2))

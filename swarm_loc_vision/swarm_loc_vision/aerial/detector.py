@@ -10,7 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.aerial.circles import PARTLY, SIDES, TOP, Circles, Edges, Rims, Sides, likely, peaks
+from swarm_loc_vision.aerial.circles import (
+    PARTLY,
+    SIDES,
+    TOP,
+    Circles,
+    Edges,
+    Light,
+    Rims,
+    Sides,
+    likely,
+    peaks,
+)
 from swarm_loc_vision.aerial.ground_camera import GroundCamera
 from swarm_loc_vision.aerial.parameters import POLARITIES, AerialSettings
 from swarm_loc_vision.aerial.pattern import Marks, find_marks
@@ -35,7 +46,15 @@ _MAX_SPREAD, _MAX_SPREAD_PX = 0.03, 0.2
 """Largest rms distance of a disc's rim from a circle: a share of the radius, plus pixels."""
 _MAX_OVAL = 0.15
 """Largest second harmonic of a disc's outline, over its radius: what motion leaves."""
-_MOTION_SHARE = 4.0
+_MAX_SHIFT, _MAX_GROWTH = 0.2, 3.0
+"""Largest distance of a refined centre from the first one, in radii, and largest ratio of their sigmas."""
+_SHIFT_SHARE = 0.03
+"""Share of the square of that distance that is a variance of the refined centre."""
+_UNREFINED = 0.03
+"""Error of a centre that cannot be refined, one standard deviation in radii."""
+_PARALLAX_SHARE = 0.05
+"""Error of a centre by sides that its outline leaves out, over the distance of top and base in the image."""
+_MOTION_SHARE = 0.1
 """Variance of the place along the motion, in squares of the second harmonic."""
 _FLAT = ((TOP, True, 0.6),)
 _TALL = ((SIDES, False, 1.0), (PARTLY, False, 0.6), (TOP, True, 0.6), (SIDES, True, 0.6), (PARTLY, True, 0.4))
@@ -186,6 +205,7 @@ class AerialDetector:
         dropped |= {"other_contrast": int(np.sum(~is_strong)), "without_mark": int(np.sum(~alike))}
         kept = alike & is_strong
         circles, marks = circles.chosen(kept), Marks(*(column[kept] for column in marks))
+        circles = _refined(rims, circles, marks.light)
         places = grid.places(circles.centre)
         of_outline = circles.covariance + _of_motion(circles.oval)
         of_pixel = self._ground.pixel_covariances(places, of_outline * grid.metres_per_px**2)
@@ -277,11 +297,40 @@ def _apart(circles: Circles) -> NDArray[np.int64]:
     return np.array(kept, np.int64)
 
 
+def _refined(rims: Rims, circles: Circles, light: Light) -> Circles:
+    """Circles with their centres by the steepest counts of their rims, where these agree with the logarithm.
+
+    What moves a centre from one kind of edge to the other is what blurs rims unevenly: marks, neighbours,
+    motion. A small part of it stays, so that it counts as an error. So does a part of the parallax of
+    robots whose outline is not that of top and sides: their sides may be there, but little darker.
+    """
+    sharp = np.zeros(len(circles.radius), np.bool_)
+    fine = rims.measure(circles.centre, circles.radius, circles.kind, sharp, light, fine=True)
+    shift = fine.centre - circles.centre
+    sigmas = [np.sqrt(np.trace(one.covariance, axis1=1, axis2=2)) for one in (fine, circles)]
+    good = (fine.coverage >= _PART) & (sigmas[0] <= _MAX_GROWTH * sigmas[1])
+    good &= np.linalg.norm(shift, axis=1) <= _MAX_SHIFT * circles.radius
+    rough = circles.covariance + (_UNREFINED * circles.radius[:, None, None]) ** 2 * np.eye(2)
+    spread = np.where(good[:, None, None], fine.covariance + _SHIFT_SHARE * _outer(shift), rough)
+    parallax = rims.sides.share * (rims.sides.foot - circles.centre) * (circles.kind != SIDES)[:, None]
+    return circles._replace(
+        centre=np.where(good[:, None], fine.centre, circles.centre),
+        radius=np.where(good, fine.radius, circles.radius),
+        oval=np.where(good[:, None], fine.oval, circles.oval),
+        covariance=spread + _PARALLAX_SHARE**2 * _outer(parallax),
+    )
+
+
+def _outer(vectors: FloatArray) -> FloatArray:
+    """(N, 2, 2) products of vectors (N, 2) with themselves."""
+    return np.asarray(vectors[:, :, None] * vectors[:, None])
+
+
 def _of_motion(oval: FloatArray) -> FloatArray:
     """(N, 2, 2) covariance [px^2] of centres whose outlines have second harmonics (N, 2) [px].
 
-    Motion during the exposure draws an outline out. Where the robot was at the stamp is uncertain by about
-    as much, along the motion.
+    Motion during the exposure draws an outline out. The way may be uneven, so that its middle is not where
+    the robot was at the stamp.
     """
     size, (cos, sin) = np.hypot(*oval.T), oval.T
     along: FloatArray = (

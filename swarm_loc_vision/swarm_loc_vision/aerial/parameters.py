@@ -28,9 +28,11 @@ class AerialSettings:
         4.0, "1", 1.0, 1e3, "reprojection residual beyond which control points are refused, in their sigmas"
     )
     robot_height: float = number(0.0, "m", 0.0, 10.0, "height of the robots' tops above the floor")
-    robot_height_sigma: float = number(0.003, "m", 0.0, 1.0, "standard deviation of that height")
+    robot_height_sigma: float = number(
+        0.001, "m", 0.0, 1.0, "standard deviation of that height, one for all robots"
+    )
     pixel_sigma: float = number(
-        0.2, "px", 0.001, 10.0, "standard deviation of a robot's centre that all its edges share"
+        0.01, "px", 0.001, 10.0, "standard deviation of a robot's centre by the model of the lens"
     )
     robot_diameter: float = number(
         0.0, "m", 0.0, 10.0, "diameter of the pattern or blob on a robot; 0: estimated from the images"
