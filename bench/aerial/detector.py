@@ -13,10 +13,11 @@ from functools import reduce
 
 import numpy as np
 
-from bench.aerial.pictures import DIAMETER, Look, Picture, draw_picture
+from bench.aerial.pictures import DIAMETER, Look, Picture, control_pixels, draw_picture
 from bench.shared.common import Cell, ProgressLine, table
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_vision.aerial.control_points import ControlPoints, solve_pose
 from swarm_loc_vision.aerial.detector import AerialDetections, AerialDetector
 from swarm_loc_vision.aerial.parameters import AerialSettings
 
@@ -61,6 +62,9 @@ LOOKS: Mapping[str, Look] = {
     ),
 }
 """What varies, by name; the rest is as in the first."""
+SURVEYED = "plain", "tilt_40deg", "height_60mm"
+"""Looks that are also seen with what people measure: control points, and the height of tall robots."""
+_CONTROL_POINTS = 8
 
 
 @dataclass(frozen=True)
@@ -136,10 +140,16 @@ def measure(seed: int, seeds: int = SEEDS) -> dict[str, float]:
     figures: dict[str, float] = {}
     say = ProgressLine("pictures")
     rows: list[list[Cell]] = []
-    for name, look in LOOKS.items():
+    for name in (*LOOKS, *(f"surveyed_{name}" for name in SURVEYED)):
         say(name)
-        pictures = (draw_picture(look, seed + k) for k in range(seeds))
-        score = reduce(Score.joined, (_scored(picture, look.height) for picture in pictures))
+        look = LOOKS[name.removeprefix("surveyed_")]
+        scores = []
+        for k in range(seeds):
+            picture, settings = draw_picture(look, seed + k), exact(look)
+            if name not in LOOKS:
+                picture, settings = surveyed(picture, look, np.random.default_rng([seed + k, 1]))
+            scores.append(_scored(picture, settings))
+        score = reduce(Score.joined, scores)
         values = _values(score, seeds)
         told = {key: value for key, value in values.items() if math.isfinite(value)}
         figures |= {f"detector.{name}.{key}": value for key, value in told.items()}
@@ -169,9 +179,31 @@ def _values(score: Score, pictures: int) -> dict[str, float]:
     }
 
 
-def _scored(picture: Picture, height: float) -> Score:
+def exact(look: Look) -> AerialSettings:
+    """Settings for robots whose height is known."""
+    return AerialSettings(robot_diameter=DIAMETER, robot_height=look.height, robot_height_sigma=0.0)
+
+
+def surveyed(picture: Picture, look: Look, rng: np.random.Generator) -> tuple[Picture, AerialSettings]:
+    """A picture with the pose by control points of noise, and settings with a height measured with an error.
+
+    All noise is what the settings say.
+    """
+    settings = AerialSettings(robot_diameter=DIAMETER)
+    places, pixels = control_pixels(picture.ground, _CONTROL_POINTS, rng)
+    places[:, :2] += settings.control_sigma * rng.standard_normal((len(places), 2))
+    pixels += settings.control_sigma_px * rng.standard_normal(pixels.shape)
+    points = ControlPoints([f"p{k}" for k in range(len(places))], places, pixels)
+    ground = solve_pose(picture.ground.camera, points, settings).ground
+    if not look.height:
+        return replace(picture, ground=ground), replace(settings, robot_height_sigma=0.0)
+    height = look.height + settings.robot_height_sigma * float(rng.standard_normal())
+    return replace(picture, ground=ground), replace(settings, robot_height=height)
+
+
+def _scored(picture: Picture, settings: AerialSettings) -> Score:
     """A detector that has seen the picture before, so that what is done once does not count."""
-    detector = AerialDetector(AerialSettings(robot_diameter=DIAMETER, robot_height=height), picture.ground)
+    detector = AerialDetector(settings, picture.ground)
     detector.detect(picture.gray)
     begin_s = time.process_time()
     found = detector.detect(picture.gray)

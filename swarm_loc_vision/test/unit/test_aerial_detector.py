@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.aerial.detector import Score, score_picture
+from bench.aerial.detector import Score, exact, score_picture, surveyed
 from bench.aerial.pictures import DIAMETER, Look, Picture, draw_picture
 from swarm_loc_vision.aerial.circles import DIRECTIONS, SIDES, TOP, Sides
 from swarm_loc_vision.aerial.detector import AerialDetector
@@ -110,9 +110,49 @@ def test_pure_noise_and_flat_images_show_no_robots() -> None:
         assert len(AerialDetector(SETTINGS, picture.ground).detect(gray)) == 0
 
 
-def test_covariances_cover_the_errors() -> None:
-    nees = np.concatenate([scored(draw_picture(LOOKS["tilted wide lens"], seed)).nees for seed in range(2)])
-    assert nees.mean() < 2.5  # of two numbers; below where the shared error is smaller than pixel_sigma
+HONEST = {
+    "plain": Look(),
+    "15 px": Look(diameter_px=15.0),
+    "48 px": Look(diameter_px=48.0, robots=6),
+    "tilted": Look(tilt=math.radians(30.0)),
+    "shadows": Look(shadow=0.4),
+    "touching": Look(touching=0.8),
+    "noise": Look(noise=10.0),
+    "tall": Look(height=0.05),
+    "tall, narrower below": Look(height=0.05, taper=0.3),
+    "moving": Look(motion=0.2),
+}
+
+
+@pytest.mark.parametrize("name", HONEST)
+def test_covariances_are_as_large_as_the_errors(name: str) -> None:
+    look = HONEST[name]
+    nees = np.concatenate([scored(draw_picture(look, seed), exact(look)).nees for seed in range(31, 34)])
+    assert 0.7 < nees.mean() < 5.0  # of two numbers
+    assert np.quantile(nees, 0.95) < 20.0
+
+
+def test_covariances_contain_errors_of_control_points_and_height() -> None:
+    look, nees = Look(height=0.05, tilt=0.3), []
+    picture = draw_picture(look, seed=31)
+    for survey in range(8):
+        seen, settings = surveyed(picture, look, np.random.default_rng(survey))
+        nees.append(float(scored(seen, settings).nees.mean()))
+    assert 1.0 < np.mean(nees) < 4.0
+    # the error is common: the mean over robots scatters nearly as that of one robot
+    assert np.std(nees) > 0.5
+
+
+def test_a_mark_beside_a_blurred_rim_moves_no_centre() -> None:
+    ahead = []
+    for seed in range(3):
+        picture = draw_picture(Look(diameter_px=10.0), seed)
+        found = AerialDetector(SETTINGS, picture.ground).detect(picture.gray)
+        away = np.linalg.norm(found.place[:, None] - picture.poses[None, :, :2], axis=2).argmin(axis=0)
+        error = found.place[away] - picture.poses[:, :2]
+        front = np.stack([np.cos(picture.poses[:, 2]), np.sin(picture.poses[:, 2])], axis=1)
+        ahead.append(np.einsum("ni,ni->n", error, front))
+    assert abs(np.concatenate(ahead).mean()) < 0.005 * DIAMETER
 
 
 def test_detections_are_bounded_and_the_clearest_are_kept() -> None:
