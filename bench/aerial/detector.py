@@ -65,6 +65,7 @@ LOOKS: Mapping[str, Look] = {
 SURVEYED = "plain", "tilt_40deg", "height_60mm"
 """Looks that are also seen with what people measure: control points, and the height of tall robots."""
 _CONTROL_POINTS = 8
+_LENS_SIGMA_PX = 0.01
 
 
 @dataclass(frozen=True)
@@ -180,8 +181,9 @@ def _values(score: Score, pictures: int) -> dict[str, float]:
 
 
 def exact(look: Look) -> AerialSettings:
-    """Settings for robots whose height is known."""
-    return AerialSettings(robot_diameter=DIAMETER, robot_height=look.height, robot_height_sigma=0.0)
+    """Settings for robots and a lens that are known, as they are in drawn pictures."""
+    known = AerialSettings(robot_diameter=DIAMETER, robot_height_sigma=0.0, pixel_sigma=_LENS_SIGMA_PX)
+    return replace(known, robot_height=look.height)
 
 
 def surveyed(picture: Picture, look: Look, rng: np.random.Generator) -> tuple[Picture, AerialSettings]:
@@ -189,7 +191,7 @@ def surveyed(picture: Picture, look: Look, rng: np.random.Generator) -> tuple[Pi
 
     All noise is what the settings say.
     """
-    settings = AerialSettings(robot_diameter=DIAMETER)
+    settings = AerialSettings(robot_diameter=DIAMETER, pixel_sigma=_LENS_SIGMA_PX)
     places, pixels = control_pixels(picture.ground, _CONTROL_POINTS, rng)
     places[:, :2] += settings.control_sigma * rng.standard_normal((len(places), 2))
     pixels += settings.control_sigma_px * rng.standard_normal(pixels.shape)

@@ -32,7 +32,7 @@ class AerialSettings:
         0.001, "m", 0.0, 1.0, "standard deviation of that height, one for all robots"
     )
     pixel_sigma: float = number(
-        0.01, "px", 0.001, 10.0, "standard deviation of a robot's centre by the model of the lens"
+        0.1, "px", 0.001, 10.0, "standard deviation of a robot's centre by the model of the lens"
     )
     robot_diameter: float = number(
         0.0, "m", 0.0, 10.0, "diameter of the pattern or blob on a robot; 0: estimated from the images"
