@@ -22,7 +22,7 @@ from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSE, CONTENT_P
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.camera_detector import detection_rows
 from swarm_loc_vision.markers.detector import Detections, DetectorSettings, MarkerDetector
-from swarm_loc_vision.markers.families import draw_marker, family_named
+from swarm_loc_vision.markers.families import Family, draw_marker, family_named
 
 PHOTOS = Path(__file__).resolve().parents[4] / "shared" / "data" / "photos"
 Gray = NDArray[np.uint8]
@@ -62,27 +62,24 @@ def test_markers_of_all_families_are_found_where_they_are(name: str) -> None:
 
 
 CELL_PX = 10
-TAG_PX, GAP_PX = 10 * CELL_PX, 3 * CELL_PX
+GAP_PX = 3 * CELL_PX
 
 
-def kalibr_grid(rows: int, columns: int) -> NDArray[np.uint8]:
-    """A grid as Kalibr prints it: tags with a border of two cells, dark squares at their corners."""
-    family = family_named("apriltag_36h11_thick")
-    pitch = TAG_PX + GAP_PX
-    grid = np.full((rows * pitch + 5 * GAP_PX, columns * pitch + 5 * GAP_PX), 255, np.uint8)
+def grid_of(family: Family, rows: int, columns: int) -> Gray:
+    """A grid as Kalibr prints it, whose tags have a border of two cells: dark squares at their corners."""
+    tag = family.side * CELL_PX
+    grid = np.full((rows * (tag + GAP_PX) + 5 * GAP_PX, columns * (tag + GAP_PX) + 5 * GAP_PX), 255, np.uint8)
     for row, column in np.ndindex(rows + 1, columns + 1):
-        y, x = 2 * GAP_PX + row * pitch, 2 * GAP_PX + column * pitch
+        y, x = (2 * GAP_PX + place * (tag + GAP_PX) for place in (row, column))
         grid[y : y + GAP_PX, x : x + GAP_PX] = 0
         if row < rows and column < columns:
-            inside = np.s_[y + GAP_PX : y + GAP_PX + TAG_PX, x + GAP_PX : x + GAP_PX + TAG_PX]
+            inside = np.s_[y + GAP_PX : y + GAP_PX + tag, x + GAP_PX : x + GAP_PX + tag]
             grid[inside] = draw_marker(family, row * columns + column, CELL_PX, margin=0)
     return grid
 
 
-@pytest.mark.parametrize("width", [300, 480, 960])
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_all_tags_of_a_grid_of_kalibr_are_found_where_they_are(width: int, seed: int) -> None:
-    rng, grid = np.random.default_rng(seed), kalibr_grid(2, 4)
+def view_of(grid: Gray, width: int, rng: np.random.Generator) -> tuple[Gray, NDArray[np.float64]]:
+    """A grid seen aslant, about `width` pixels wide, and the homography from its pixels to the view's."""
     scale = width / grid.shape[1]
     outline = np.array([[0, 0], [grid.shape[1], 0], [grid.shape[1], grid.shape[0]], [0, grid.shape[0]]])
     seen = outline * scale + 40.0 + rng.uniform(-0.2, 0.2, (4, 2)) * scale * grid.shape[0]
@@ -94,16 +91,48 @@ def test_all_tags_of_a_grid_of_kalibr_are_found_where_they_are(width: int, seed:
     drawn = cv2.warpPerspective(grid, finer, (4 * size[0], 4 * size[1]), borderValue=255)
     image = cv2.GaussianBlur(cv2.resize(drawn, size, interpolation=cv2.INTER_AREA), (0, 0), 0.7)
     noisy = np.clip(30 + 0.7 * image + rng.normal(0.0, 3.0, image.shape), 0, 255).astype(np.uint8)
+    return noisy, np.asarray(to_image)
+
+
+def errors_in_grid(
+    found: Detections, family: Family, columns: int, to_image: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Errors (N, 4, 2) of corners of a grid's tags [px]."""
+    tag = family.side * CELL_PX
+    corner = np.array([[0, 0], [tag, 0], [tag, tag], [0, tag]])
+    place = np.stack([found.id % columns, found.id // columns], axis=1) * (tag + GAP_PX) + 3 * GAP_PX
+    return found.corners - cv2.perspectiveTransform((corner + place[:, None]).astype(float), to_image) + 0.5
+
+
+@pytest.mark.parametrize("width", [300, 480, 960])
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_all_tags_of_a_grid_of_kalibr_are_found_where_they_are(width: int, seed: int) -> None:
     family = family_named("apriltag_36h11_thick")
+    noisy, to_image = view_of(grid_of(family, 2, 4), width, np.random.default_rng(seed))
     found = MarkerDetector(DetectorSettings(), {family: None}).detect(noisy)
     assert sorted(found.id.tolist()) == [*range(8)]
-    pitch = TAG_PX + GAP_PX
-    corner = np.array([[0, 0], [TAG_PX, 0], [TAG_PX, TAG_PX], [0, TAG_PX]])
-    place = np.stack([found.id % 4, found.id // 4], axis=1) * pitch + 3 * GAP_PX
-    true = cv2.perspectiveTransform((corner + place[:, None]).astype(float), to_image) - 0.5
-    error = found.corners - true
+    error = errors_in_grid(found, family, 4, to_image)
     assert math.sqrt(np.mean(np.sum(np.square(error), axis=2))) < 0.12
     assert np.abs(error).max() < 0.5
+
+
+@pytest.mark.parametrize(
+    ("drawn", "expected"),
+    [("apriltag_36h11_thick", "apriltag_36h11"), ("apriltag_36h11", "apriltag_36h11_thick")],
+)
+@pytest.mark.parametrize("ids", [None, [*range(36)], [1, 17, 300]])
+def test_a_grid_with_another_border_shows_no_wrong_tag(
+    drawn: str, expected: str, ids: list[int] | None
+) -> None:
+    """Cells of another width differ in some bits, as many as few ids allow; what is read is in its place."""
+    family = family_named(drawn)
+    used = None if ids is None else np.array(ids)
+    detector = MarkerDetector(DetectorSettings(), {family_named(expected): used})
+    for seed, width in enumerate((200, 300, 480, 960)):
+        noisy, to_image = view_of(grid_of(family, 6, 6), width, np.random.default_rng(seed))
+        found = detector.detect(noisy)
+        assert (found.id < 36).all()
+        assert (np.abs(errors_in_grid(found, family, 6, to_image)) < 1.5).all()
 
 
 def test_corners_and_poses_are_as_sure_as_they_say() -> None:
