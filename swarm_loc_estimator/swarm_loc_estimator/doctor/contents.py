@@ -130,6 +130,10 @@ _CONTRADICTED = MappingProxyType(
             "constant in the pose of odometry",
             "Nothing, if twists are right: they are used",
         ),
+        Contradicted.UNMOVED: (
+            "moving with constant odometry",
+            "Look at its driver and encoders; where it has none, describe a random_walk",
+        ),
         Contradicted.POSE: ("elsewhere than expected", "Check its start, and the places of the landmarks"),
         Contradicted.SIGHTINGS: (
             "contradicted by sightings",

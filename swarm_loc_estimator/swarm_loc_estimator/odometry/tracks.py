@@ -132,6 +132,12 @@ class OdometryTracks:
         newest_ns = arrays.stamp_ns[np.arange(self._robots), np.maximum(arrays.filled - 1, 0)]
         return (arrays.twist_from_ns < newest_ns) & (newest_ns <= arrays.twist_until_ns)
 
+    def is_constant(self) -> BoolArray:
+        """Whether the pose of each robot (N,) has never changed, and its twist is not integrated."""
+        newest = np.maximum(self.arrays.filled - 1, 0)
+        never = np.isfinite(self.arrays.unmoved[np.arange(self._robots), newest, 0])
+        return np.asarray(never & (self.arrays.filled > 1) & ~self.integrates_twist())
+
     def had_fault(self, now_ns: int) -> BoolArray:
         """Whether the odometry of each robot (N,) has jumped or was reset within the last seconds."""
         return self._had_faults(now_ns, 0)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from swarm_loc_estimator.common.arrays import BoolArray
 from swarm_loc_estimator.filter.belief import NEVER_NS
 from swarm_loc_estimator.filter.integrity.fault_detection import excluded_pairs, is_contradicted
 from swarm_loc_estimator.filter.state import SwarmState
@@ -20,6 +21,7 @@ class Contradicted(Enum):
     ODOMETRY = "odometry"
     RESET = "odometry reset"
     CONSTANT = "constant odometry"
+    UNMOVED = "constant odometry of a moving robot"
     POSE = "pose"
     SIGHTINGS = "sightings"
     DESCRIPTION = "description"
@@ -41,7 +43,7 @@ class Contradiction(NamedTuple):
 
 
 def contradictions(
-    swarm: Swarm, state: SwarmState, tracks: OdometryTracks, now_ns: int
+    swarm: Swarm, state: SwarmState, tracks: OdometryTracks, unmoved: BoolArray, now_ns: int
 ) -> list[Contradiction]:
     """All faults detected at an instant.
 
@@ -49,6 +51,7 @@ def contradictions(
         swarm: Gives the names.
         state: Newest state.
         tracks: Odometry, to detect conflicting sources, resets and constant poses.
+        unmoved: (N,) robots that move although their odometry has never changed.
         now_ns: The instant.
     """
     names = [robot.name for robot in swarm.robots] + [f"landmark {mark.id}" for mark in swarm.landmarks]
@@ -63,6 +66,7 @@ def contradictions(
         *(_odometry(names[robot]) for robot in np.flatnonzero(conflicting).tolist()),
         *(_reset(names[robot]) for robot in np.flatnonzero(reset).tolist()),
         *(_constant(names[robot]) for robot in np.flatnonzero(tracks.integrates_twist()).tolist()),
+        *(_unmoved(names[robot]) for robot in np.flatnonzero(unmoved).tolist()),
         *(_pose(names[robot]) for robot in denied),
         *(_sightings(names[observer], names[source % len(names)]) for observer, source in aside),
         *(_description(names[source], source, state) for source in contradicted),
@@ -83,6 +87,11 @@ def _reset(name: str) -> Contradiction:
 def _constant(name: str) -> Contradiction:
     text = f"the odometry of {name} has a constant pose but a twist: integrating the twist"
     return Contradiction(name, Contradicted.CONSTANT, text)
+
+
+def _unmoved(name: str) -> Contradiction:
+    text = f"the odometry of {name} has a constant pose and no twist, although {name} moves"
+    return Contradiction(name, Contradicted.UNMOVED, text)
 
 
 def _pose(name: str) -> Contradiction:

@@ -21,6 +21,7 @@ from swarm_loc_estimator.sensors.registry import Batch, Measurements
 from swarm_loc_estimator.sensors.sensor import joined
 from swarm_loc_estimator.sensors.validation import REJECT_REASONS, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.constant_odometry import ConstantOdometry
 from swarm_loc_estimator.timeline.contradictions import Contradiction, contradictions
 from swarm_loc_estimator.timeline.estimate import Estimate, Status, TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.fusion import Fusion, Verdict
@@ -71,6 +72,7 @@ class Estimator:
 
     def _begin(self) -> None:
         self._now_ns: int | None = None
+        self._constant = ConstantOdometry(len(self.swarm.robots))
         self._odometry: list[OdometryRows] = []
         self._turn_rates: list[TurnRateRows] = []
 
@@ -136,6 +138,7 @@ class Estimator:
             self.drop(fault)
         else:
             self._timeline.add(command)
+            self._constant.forget(robot)
         return fault
 
     def forget(self, robot: int, stamp_ns: int) -> None:
@@ -189,7 +192,8 @@ class Estimator:
 
     def contradictions(self, now_ns: int) -> list[Contradiction]:
         """Contradicted robots and landmarks at an instant, robots first."""
-        return contradictions(self.swarm, self._timeline.state, self._tracks, now_ns)
+        unmoved = self._constant.contradicted(now_ns)
+        return contradictions(self.swarm, self._timeline.state, self._tracks, unmoved, now_ns)
 
     @property
     def is_self_calibrated(self) -> bool:
@@ -270,4 +274,8 @@ class Estimator:
 
     def _estimate(self, now_ns: int) -> Estimate:
         state = self._fusion.starts.with_starts(self._timeline.state, now_ns)
-        return estimate_at(state, self._tracks.arrays, self._limits, now_ns)
+        estimate = estimate_at(state, self._tracks.arrays, self._limits, now_ns)
+        self._constant.add(self._tracks.is_constant(), estimate)
+        contradicted = self._constant.contradicted(now_ns) & (estimate.status == Status.TRACKED)
+        estimate.status[contradicted] = Status.CONTRADICTED
+        return estimate

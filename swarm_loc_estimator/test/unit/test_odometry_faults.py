@@ -26,7 +26,7 @@ from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.timeline import HasBudget
 
 BAGS = Path(__file__).parents[3] / "bags"
@@ -348,3 +348,21 @@ def test_robots_with_twists_only_are_as_accurate_as_before(who: Sequence[int]) -
     assert {f"epuck{k + 1}" for k in who} == {text.split()[3] for text in named if "integrating" in text}
     assert result.overall.position_rmse < 0.004
     assert result.overall.nees < 4.0
+
+
+@pytest.mark.parametrize("who", [[2], range(5)])
+def test_constant_odometry_without_twists_is_named_and_its_robots_are_not_tracked(who: Sequence[int]) -> None:
+    """As on shared topics, whose messages have no twist, from drivers that do not fill the pose."""
+    world = Changed("eight_five_robots")
+
+    def change(batch: Batch, _begin_ns: int) -> Batch:
+        odometry = batch[ODOMETRY.name]
+        frozen = np.isin(odometry.robot, who)
+        odometry.pose[frozen], odometry.twist[frozen] = 0.0, np.nan
+        return batch
+
+    result, named = world.result(change)
+    assert {f"epuck{k + 1}" for k in who} == {text.split()[3] for text in named if "constant pose" in text}
+    tracked = result.status[result.stamp_ns > result.stamp_ns[0] + 15 * SECOND] == Status.TRACKED
+    assert tracked[:, list(who)].mean() < 0.05
+    assert tracked[:, [k for k in range(5) if k not in who]].all()
