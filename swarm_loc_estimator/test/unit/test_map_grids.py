@@ -151,6 +151,7 @@ def test_maps_survive_a_file(tmp_path: Path) -> None:
         ("origin: [0.0, 0.0, 0.0]", "origin: [0.0, 0.0]", "must be x, y and a yaw of 0"),
         ("origin: [0.0, 0.0, 0.0]", "origin: [0.0, 0.0, 0.5]", "must be x, y and a yaw of 0"),
         ("origin: [0.0, 0.0, 0.0]", f"origin: [{'9' * 30}, 0.0, 0.0]", "must lie in"),
+        ("occupied_thresh: 0.65", "occupied_thresh: " + "9" * 30, "occupied_thresh is .* but must lie in"),
         ("free_thresh: 0.196", "free_thresh: much", "free_thresh is 'much' but must be a number"),
         ("mode: trinary", "mode: binary", "mode is 'binary' but must be one of trinary, scale, raw"),
         ("negate: 0", "negate: 2", "negate is 2 but must be 0 or 1"),
