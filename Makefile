@@ -10,8 +10,7 @@ PYTHON ?= python3
 PACKAGES := swarm_loc_estimator swarm_loc_vision swarm_loc_drivers
 MYPY := ./run -- mypy --num-workers 2
 # Only the plug-ins named here: what else is installed on a machine must not change how tests run.
-# Byte code is kept, whatever a machine prefers: each worker would compile all tests anew.
-PYTEST := ./run -- env -u PYTHONDONTWRITEBYTECODE PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 pytest \
+PYTEST := ./run -- env PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 pytest \
     -p xdist.plugin -p pytest_timeout -p _hypothesis_pytestplugin --numprocesses 2 --dist worksteal
 
 .PHONY: demo test lint types unit node test-lowest house docs setup clean

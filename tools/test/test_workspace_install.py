@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from workspace import host, install
-from workspace.layout import VENV, WorkspaceError
+from workspace.layout import STATE, VENV, WorkspaceError
 
 
 @pytest.mark.parametrize(
@@ -57,6 +57,17 @@ def test_missing_tools_are_named_in_one_sentence(tmp_path: Path, monkeypatch: py
         WorkspaceError, match=r"^Missing on this machine: C compiler, C\+\+ compiler, cmake \(.*\)\.$"
     ):
         host.check_build_tools()
+
+
+def test_byte_code_is_kept_where_nobody_wants_it_beside_the_sources(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("PYTHONPYCACHEPREFIX", raising=False)
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    env = install.base_environment()
+    assert "PYTHONDONTWRITEBYTECODE" not in env
+    assert Path(env["PYTHONPYCACHEPREFIX"]).is_relative_to(STATE)
+
+    monkeypatch.delenv("PYTHONDONTWRITEBYTECODE")
+    assert "PYTHONPYCACHEPREFIX" not in install.base_environment()
 
 
 def _install_rclpy(prefix: Path, python: str) -> None:
