@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from workspace import install, tf2_msgs
+from workspace import install, shared, tf2_msgs
 from workspace.layout import LOGS, PACKAGES, ROOT, STATE, VENV_PYTHON, WorkspaceError
 from workspace.progress import run_logged, say, step
 from workspace.stamps import Stamp, digest, write_whole
@@ -33,6 +33,8 @@ COPIED = (
     "action/*",
 )
 """Files of a package that a build copies; all others are linked."""
+MESSAGES = ("swarm_loc_msgs", "tf2_msgs")
+"""Packages that take most of a build, and that clones share."""
 LINKED_ONE_BY_ONE = "launch/*"
 
 _COMPILE = """
@@ -67,7 +69,13 @@ def ensure() -> None:
         shutil.rmtree(INSTALL / name, ignore_errors=True)
     if "tf2_msgs" in stale:
         tf2_msgs.write(sources["tf2_msgs"])
-    _colcon_build({name: sources[name] for name in stale}, env)
+    keys = {name: key for name in stale if (key := shared_key(name))}
+    taken = [name for name, key in keys.items() if shared.take(key, INSTALL / name)]
+    if taken:
+        say(f"  {', '.join(taken)}: as another clone built")
+    _colcon_build({name: sources[name] for name in stale if name not in taken}, env)
+    for name in keys.keys() - taken:
+        shared.keep(keys[name], INSTALL / name)
     _mend_first_lines()
     for name in stale:
         stamps[name].write(inputs[name])
@@ -119,18 +127,25 @@ def environment() -> dict[str, str]:
     return env
 
 
+def shared_key(name: str) -> str:
+    """Name of a built package of messages in the user's cache; "": clones do not share it."""
+    versions = install.versions()
+    return f"{name}-{_inputs_anywhere(name, versions)}" if versions and name in MESSAGES else ""
+
+
 def _inputs(name: str) -> str:
     """Hash of everything on which the build of a package depends."""
-    facts = [str(ROOT), install.identity()]
+    return _inputs_anywhere(name, str(ROOT), install.identity())
+
+
+def _inputs_anywhere(name: str, *facts: str) -> str:
+    """Hash of the files on which the build of a package depends, and of further facts."""
     if name == "tf2_msgs":
         return digest([], *facts, *tf2_msgs.FILES.values())
     folder = ROOT / name
     names = [path.name for path in sorted(folder.glob(LINKED_ONE_BY_ONE))]
-    return digest(_copied(folder), *facts, *names)
-
-
-def _copied(folder: Path) -> Iterator[Path]:
-    return (path for pattern in COPIED for path in folder.glob(pattern) if path.is_file())
+    copied = (path for pattern in COPIED for path in folder.glob(pattern) if path.is_file())
+    return digest(copied, *facts, *names)
 
 
 def _colcon_build(sources: dict[str, Path], env: dict[str, str]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import platform
 import re
 import shutil
 import subprocess
@@ -75,6 +76,17 @@ def identity() -> str:
     facts = json.loads(STAMP.read() or "{}")
     python = next(VENV.glob("lib/python3*"), Path()).name
     return json.dumps([python, facts.get("ros"), facts.get("group.ros")])
+
+
+def versions() -> str:
+    """What a build of messages depends on beside their files; "" with a sourced ROS 2, whose parts vary."""
+    if host.ros_prefix():
+        return ""
+    wheels = (VENV.glob(f"lib/python3*/site-packages/{name}.dist-info") for name in ("ros_*", "numpy-*"))
+    flags = [os.environ.get(name, "") for name in ("CC", "CXX", "CFLAGS", "CXXFLAGS", "LDFLAGS")]
+    machine = [platform.machine(), *platform.libc_ver()]
+    names = sorted(wheel.name for group in wheels for wheel in group)
+    return json.dumps([identity(), names, flags, machine])
 
 
 def _create(*, system_packages: bool) -> None:
