@@ -175,7 +175,8 @@ class _ContentCache(NullCache):
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The compiled code for a signature; None if missing or unreadable."""
-        target_context.refresh()
+        # not refresh(): that also imports all that only compiling needs, which takes half a second
+        _core.runtime.rtsys.initialize(target_context)
         file = self._file(sig, target_context.codegen())
         try:
             data = file.read_bytes()
