@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
+from functools import cache
+
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import gammaincinv
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import inlined_njit
@@ -19,9 +21,30 @@ NO_HEADING = 1e4
 
 def gate_threshold(probability: ArrayLike, degrees_of_freedom: int = 2) -> FloatArray:
     """Chi-square quantile: gate threshold of the squared distance for an acceptance probability."""
-    half = 0.5 * degrees_of_freedom
-    threshold: FloatArray = 2.0 * gammaincinv(half, np.asarray(probability, dtype=float))
+    threshold: FloatArray = np.vectorize(_quantile, otypes=[float])(probability, degrees_of_freedom)
     return threshold
+
+
+@cache
+def _quantile(probability: float, degrees_of_freedom: int) -> float:
+    """Where `_exceeding` falls to the rest of a probability; SciPy has this, but takes long to import."""
+    low, high = 0.0, 1.0
+    while _exceeding(high, degrees_of_freedom) > 1.0 - probability:
+        low, high = high, 2.0 * high
+    while low < (middle := 0.5 * (low + high)) < high:
+        is_below = _exceeding(middle, degrees_of_freedom) > 1.0 - probability
+        low, high = (middle, high) if is_below else (low, middle)
+    return high
+
+
+def _exceeding(squared: float, degrees_of_freedom: int) -> float:
+    """Probability of a larger chi-square: the upper incomplete gamma function, by its recursion."""
+    half, order = 0.5 * squared, 1.0 - 0.5 * (degrees_of_freedom % 2)
+    probability = math.exp(-half) if order == 1.0 else math.erfc(math.sqrt(half))
+    while 2.0 * order < degrees_of_freedom:
+        probability += half**order * math.exp(-half) / math.gamma(order + 1.0)
+        order += 1.0
+    return probability
 
 
 POSE_GATE = float(gate_threshold(0.9999, 3))

@@ -11,7 +11,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import i0e, logsumexp
+import scipy
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gathered_between
@@ -111,7 +111,9 @@ def _rice(
     along = variance + (scale.sigma * way) ** 2
     likely = scale.mean + scale.sigma**2 * way * (distance - scale.mean * way) / along
     concentration = np.maximum(likely, 0.0) * distance * way / variance
-    log_density = np.log(i0e(concentration)) - np.log(2.0 * np.pi) - 0.5 * np.log(variance * along)
+    log_density = (
+        np.log(scipy.special.i0e(concentration)) - np.log(2.0 * np.pi) - 0.5 * np.log(variance * along)
+    )
     return log_density - 0.5 * (distance - scale.mean * way) ** 2 / along, concentration
 
 
@@ -158,7 +160,7 @@ def merged(
 ) -> Anchors:
     """Anchors at the newest image, one for each detection of `place` (k,), which may name one repeatedly."""
     places = np.unique(place)
-    weight = np.array([logsumexp(log_weight[place == one]) for one in places])
+    weight = np.array([scipy.special.logsumexp(log_weight[place == one]) for one in places])
     covariance = picture.covariance[places][:, :2, :2]
     return Anchors(point, stamp_ns, picture.pose[places, :2], covariance, weight, places)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
+import scipy
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.identification.picture import Picture
@@ -94,7 +94,7 @@ def _solved(costs: FloatArray) -> tuple[IntArray, float]:
     whole = np.full((r, n + r), _FORBIDDEN)
     whole[:, :n] = np.where(np.isfinite(costs), costs, _FORBIDDEN)
     whole[np.arange(r), n + np.arange(r)] = 0.0
-    rows, columns = linear_sum_assignment(whole)
+    rows, columns = scipy.optimize.linear_sum_assignment(whole)
     place = np.full(r, UNSEEN)
     place[rows] = np.where(columns < n, columns, UNSEEN)
     return place, float(whole[rows, columns].sum())

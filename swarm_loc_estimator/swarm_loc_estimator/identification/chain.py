@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import logsumexp
+import scipy
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
@@ -290,7 +290,7 @@ class Chains:
         log_absent = self.log_absent + math.log1p(-entering * self.model.detection_probability)
         whole = joined(tracks)
         weights = np.concatenate([whole.log_weight, *(one.log_weight for one in anchors), [log_absent]])
-        total, least = float(logsumexp(weights)), float(weights.max()) - _NEGLIGIBLE
+        total, least = float(scipy.special.logsumexp(weights)), float(weights.max()) - _NEGLIGIBLE
         kept = np.flatnonzero(whole.log_weight > least)
         if kept.size > _MAX_TRACKS:
             order = np.argsort(whole.log_weight[kept], kind="stable")[-_MAX_TRACKS:]

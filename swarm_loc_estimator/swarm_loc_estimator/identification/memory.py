@@ -6,7 +6,7 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import ConvexHull, QhullError
+import scipy
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.identification.chain import Chains
@@ -90,7 +90,7 @@ class IdentityMemory:
 def convex_hull(points: FloatArray) -> FloatArray:
     """Corners (h, 2) of the convex hull of points (n, 2), counter-clockwise; the two ends of a line."""
     try:
-        return np.asarray(points[ConvexHull(points).vertices])
-    except (QhullError, ValueError):  # fewer than three points, or all in a line
+        return np.asarray(points[scipy.spatial.ConvexHull(points).vertices])
+    except (scipy.spatial.QhullError, ValueError):  # fewer than three points, or all in a line
         ordered = np.unique(points, axis=0)
         return ordered[[0, -1]] if len(ordered) > 1 else ordered

@@ -15,8 +15,8 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit, reassociated_njit
@@ -165,7 +165,9 @@ def _soft(curve: AngleCurve) -> TabulatedCurve:
     """The curve's mean over a Gaussian."""
     angles, width = np.linspace(-math.pi, math.pi, 721, retstep=True)
     table = curve.table()
-    values = gaussian_filter1d([curve_at(table, a)[0] for a in angles[:-1]], _BLUR / width, mode="wrap")
+    values = scipy.ndimage.gaussian_filter1d(
+        [curve_at(table, a)[0] for a in angles[:-1]], _BLUR / width, mode="wrap"
+    )
     return TabulatedCurve(tuple(angles), (*values, values[0]))
 
 

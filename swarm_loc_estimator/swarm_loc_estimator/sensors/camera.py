@@ -8,15 +8,15 @@ error of its pose is the systematic share of its measurements.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
-from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.definitions import DETECTIONS as MESSAGE_TYPE
 from swarm_loc_estimator.common.messages.definitions import SWARM_DETECTIONS
 from swarm_loc_estimator.common.messages.detections import (
@@ -59,6 +59,13 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Robo
 
 FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation from the optical frame to x forward, y left, z up."""
+
+
+def _tilt(pitch: float, roll: float) -> FloatArray:
+    """Rotation (3, 3) of the axes of a camera that is turned down, and about its optical axis [rad]."""
+    down, level, across, upright = math.sin(pitch), math.cos(pitch), math.sin(roll), math.cos(roll)
+    rows = [[level, down * across, down * upright], [0.0, upright, -across]]
+    return np.array([*rows, [-down, level * across, level * upright]])
 
 
 class DetectionRows(NamedTuple):
@@ -107,7 +114,7 @@ class SightingConverter:
         mounts: list[CameraMount | FixedCamera] = [robot.camera or CameraMount() for robot in robots]
         mounts += fixed
         models = [source.sensor for source in swarm.sources]
-        tilts = [Rotation.from_euler("YX", [m.pitch, m.roll]).as_matrix() @ FROM_OPTICAL for m in mounts]
+        tilts = [_tilt(mount.pitch, mount.roll) @ FROM_OPTICAL for mount in mounts]
         sensors = [tuple(getattr(model, name) for name in SENSOR_DTYPE.names or ()) for model in models]
         sigmas = [(0.0, 0.0)] * len(robots) + [(one.position_sigma, one.yaw_sigma) for one in fixed]
         self._cameras = Cameras(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from scipy.interpolate import PchipInterpolator
+import scipy
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import number, number_specs
@@ -145,7 +145,7 @@ class TabulatedCurve:
 
     def table(self) -> CurveTable:
         """The curve in the form used by compiled code."""
-        curve = PchipInterpolator(self.angles, self.values)
+        curve = scipy.interpolate.PchipInterpolator(self.angles, self.values)
         at = np.linspace(-math.pi, math.pi, _TABLE_CELLS + 1)
         within = np.clip(at, self.angles[0], self.angles[-1])
         slopes = np.where(at == within, curve.derivative()(within), 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -37,6 +38,10 @@ SPAN_NS = 12 * SECOND
 RECORDED = ("aerial_five", "droplets_twenty", "eight_five_robots")
 
 
+# Each of these takes as long to import as numpy; that of linear algebra is loaded with compiled code.
+SLOW = tuple(f"scipy.{part}" for part in ("interpolate", "ndimage", "optimize", "spatial", "special"))
+
+
 class EnoughError(Exception):
     """The beginning of a bag is enough."""
 
@@ -44,6 +49,16 @@ class EnoughError(Exception):
 @pytest.mark.parametrize("size", ["small", "large", "sparse"])
 def test_nothing_is_compiled_once_data_come(size: Size) -> None:
     assert printed_by_process(__file__, size) == []
+
+
+def test_robots_that_see_markers_start_without_the_slow_parts_of_scipy() -> None:
+    started = (
+        "from swarm_loc_estimator.precompile import precompile\n"
+        "precompile('small', False)\n"
+        f"import sys; print([part for part in {SLOW} if part in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", started], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
 
 
 @pytest.mark.parametrize(

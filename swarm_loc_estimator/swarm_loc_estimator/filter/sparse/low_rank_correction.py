@@ -10,7 +10,7 @@ a: y is eliminated with T G on the right-hand side, and a is one dense block at 
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import blas
+import scipy
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, reassociated_njit
@@ -96,7 +96,7 @@ def _whiten(columns: FloatArray, matrix: FloatArray) -> None:
         inverse = np.array(matrix, order="F")
         if not invert_factor(inverse.reshape(-1, order="F"), len(inverse)):
             raise np.linalg.LinAlgError("the covariance of the copies is not positive definite")
-        blas.dtrmm(1.0, inverse, columns.T, lower=1, overwrite_b=1)
+        scipy.linalg.blas.dtrmm(1.0, inverse, columns.T, lower=1, overwrite_b=1)
 
 
 @cached_njit

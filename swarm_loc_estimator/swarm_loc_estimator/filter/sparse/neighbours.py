@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import Delaunay, QhullError, cKDTree
+import scipy
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
@@ -64,7 +64,7 @@ def near_pairs(places: FloatArray) -> IntArray:
     nearest = min(_NEAREST, count - 1)
     if nearest < 1:
         return np.zeros((0, 2), dtype=np.int64)
-    _, found = cKDTree(places).query(places, nearest + 1)
+    _, found = scipy.spatial.cKDTree(places).query(places, nearest + 1)
     of_each = np.column_stack([np.repeat(np.arange(count), nearest + 1), found.reshape(-1)])
     return np.concatenate([of_each, _gabriel(places)]).astype(np.int64)
 
@@ -72,14 +72,14 @@ def near_pairs(places: FloatArray) -> IntArray:
 def _gabriel(places: FloatArray) -> IntArray:
     """Pairs (k, 2) in whose diametral circle no other position lies."""
     try:
-        begin, neighbour = Delaunay(places).vertex_neighbor_vertices
-    except (QhullError, ValueError):  # fewer than four places, or all in a line
+        begin, neighbour = scipy.spatial.Delaunay(places).vertex_neighbor_vertices
+    except (scipy.spatial.QhullError, ValueError):  # fewer than four places, or all in a line
         order = np.lexsort((places[:, 1], places[:, 0]))
         return np.column_stack([order[:-1], order[1:]])
     pairs = np.column_stack([np.repeat(np.arange(len(places)), np.diff(begin)), neighbour])
     pairs = pairs[pairs[:, 0] < pairs[:, 1]]
     a, b = places[pairs[:, 0]], places[pairs[:, 1]]
-    nearest, _ = cKDTree(places).query(0.5 * (a + b))
+    nearest, _ = scipy.spatial.cKDTree(places).query(0.5 * (a + b))
     empty = nearest**2 >= 0.25 * np.sum((a - b) ** 2, axis=1) * (1.0 - 1e-9)
     gabriel: IntArray = pairs[empty]
     return gabriel
