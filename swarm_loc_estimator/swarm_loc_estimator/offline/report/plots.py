@@ -20,6 +20,7 @@ from swarm_loc_estimator.offline.report.style import (
     INK,
     SOFT,
     TRUTH,
+    Margins,
     WorldMap,
     broken,
     colour_of,
@@ -36,6 +37,9 @@ from swarm_loc_estimator.offline.result import ReplayResult
 _MAP_IN, _ERRORS_IN = 6.6, 4.4
 _ROOM_IN = 0.6
 """Height of title, legend and axes."""
+_AROUND_MAP = Margins(left=0.65, right=0.15, bottom=0.9, top=0.7, across=0.5, down=0.6)
+_AROUND_PATHS = Margins(left=0.65, right=0.15, bottom=0.5, top=0.35, across=0.2, down=0.5)
+_AROUND_ERRORS = Margins(left=0.7, right=0.15, bottom=0.5, top=0.7, across=0.5, down=0.2)
 _TAIL_NS = 6_000_000_000
 _SIGMAS = 3.0
 _ENLARGED = 20.0
@@ -71,7 +75,7 @@ def plot_overview(result: ReplayResult, path: Path) -> None:
             axes["h"], "heading error [deg]", lambda one: np.degrees(np.abs(one.error[:, 2])), result
         )
         axes["h"].set_xlabel("time [s]", color=SOFT, fontsize=9)
-    save(figure, path)
+    save(figure, path, _AROUND_MAP)
 
 
 def _until_truth_ends(result: ReplayResult) -> ReplayResult:
@@ -170,7 +174,7 @@ def _legend(figure: Figure, enlarged: float, *, judged: bool) -> None:
     meanings[-1].set_label(f"{_SIGMAS:.0f}-sigma ellipse{larger}")
     if judged:
         meanings.insert(1, Line2D([], [], color=TRUTH, linewidth=3.6, alpha=0.5, label="truth"))
-    figure.legend(handles=meanings, loc="outside lower left", ncols=4, frameon=False, fontsize=9)
+    figure.legend(handles=meanings, loc="lower left", ncols=4, frameon=False, fontsize=9)
 
 
 def _draw_errors(axis: Axes, title: str, of: Callable[[Errors], FloatArray], result: ReplayResult) -> None:
@@ -236,7 +240,7 @@ def plot_paths(result: ReplayResult, path: Path) -> bool:
         axes[place].set_visible(False)
         axes[place - columns].tick_params(labelbottom=True)
     label_map(axes[(rows - 1) * columns])
-    save(figure, path)
+    save(figure, path, _AROUND_PATHS)
     return True
 
 
@@ -273,7 +277,7 @@ def plot_errors(result: ReplayResult, path: Path) -> bool:
     if len(shown) < len(names):
         note += f"; the {len(shown)} of {len(names)} robots with the largest errors"
     figure.suptitle(note, x=0.005, ha="left", fontsize=9, color=SOFT)
-    save(figure, path)
+    save(figure, path, _AROUND_ERRORS)
     return True
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -70,14 +70,47 @@ def broken(stamp_ns: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> np
     return np.insert(rows, gaps, np.nan, axis=0)
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a PNG with few colours and without version or time: equal results give equal files."""
-    figure.set_layout_engine("constrained", w_pad=_PAD_IN, h_pad=_PAD_IN)
+class Margins(NamedTuple):
+    """Room around the axes of a figure, and between them [in]."""
+
+    left: float
+    right: float
+    bottom: float
+    top: float
+    across: float
+    down: float
+
+
+def save(figure: Figure, path: Path, margins: Margins | None = None) -> None:
+    """Write a PNG with few colours and without version or time: equal results give equal files.
+
+    Args:
+        figure: Of a grid of axes.
+        path: File to write.
+        margins: None: as texts need it, but to measure them takes longer than to draw.
+    """
+    if margins is None:
+        figure.set_layout_engine("constrained", w_pad=_PAD_IN, h_pad=_PAD_IN)
+    else:
+        _place(figure, margins)
     figure.set_dpi(_DPI)
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()  # savefig would draw twice, the first time only to arrange the axes
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    image.quantize(_PALETTE).save(path, format="png", optimize=True)
+    image.quantize(_PALETTE).save(path, format="png")
+
+
+def _place(figure: Figure, margins: Margins) -> None:
+    """Place the axes of a figure."""
+    width, height = figure.get_size_inches()
+    grid: Any = figure.axes[0].get_gridspec()
+    left, right, bottom, top, across, down = margins
+    inside = np.array([width - left - right, height - bottom - top])
+    gaps, counts = np.array([across, down]), np.array([grid.ncols, grid.nrows])
+    wspace, hspace = gaps * counts / (inside - gaps * (counts - 1))
+    figure.subplots_adjust(
+        left / width, bottom / height, 1.0 - right / width, 1.0 - top / height, wspace, hspace
+    )
 
 
 _MAX_POINTS = 8000
