@@ -19,8 +19,9 @@ HALF_A_SECOND = 25
 def test_errors_of_rows_do_not_last(seed: int) -> None:
     """What is left of them averages out over half a second; without the bias more lasts."""
     built = assembled(np.random.default_rng(seed))
-    first, _ = drive_at_wall(np.random.default_rng([seed, 1]), built, WallDriveSettings())
-    other, depths = drive_at_wall(np.random.default_rng([seed, 2]), built, WallDriveSettings())
+    first, _ = drive_at_wall(np.random.default_rng([seed, 1]), built, WallDriveSettings(speed=0.25))
+    far_away = WallDriveSettings(start=2.4, stop=0.8)
+    other, depths = drive_at_wall(np.random.default_rng([seed, 2]), built, far_away)
     found = fit_hyperbola(first)
     far = (depths > 0.8) & (depths < 2.3)
     rows, true_rows = other.rows[far], found.row_at_infinity + found.focal_base / depths[far]
