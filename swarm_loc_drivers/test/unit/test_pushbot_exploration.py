@@ -151,8 +151,8 @@ def test_five_robots_whose_starts_are_hardly_known_all_find_their_places() -> No
 
 def test_a_bag_gives_the_same_map_twice(tmp_path: Path) -> None:
     bag = tmp_path / "bag"
-    count = write_pushbot_bag(PushbotBagSettings(3, 50.0, 1, "corridor", 0.02), bag, "Of a test.")
-    assert count > 2 * 50 * 50
+    count = write_pushbot_bag(PushbotBagSettings(3, 25.0, 1, "corridor", 0.02), bag, "Of a test.")
+    assert count > 2 * 25 * 50
     files = []
     for name in ("a", "b"):
         out = tmp_path / name
@@ -166,7 +166,7 @@ def test_a_bag_gives_the_same_map_twice(tmp_path: Path) -> None:
 def test_the_events_of_a_bag_show_the_distances_of_the_bag(tmp_path: Path) -> None:
     """The tracker, with the calibration beside the bag, reads from the events what `laser` says."""
     bag = tmp_path / "bag"
-    write_pushbot_bag(PushbotBagSettings(3, 50.0, 2, "corridor", 0.02, events_s=2.0), bag, "Of a test.")
+    write_pushbot_bag(PushbotBagSettings(3, 10.0, 2, "corridor", 0.02, events_s=2.0), bag, "Of a test.")
     calibration = load_laser(bag / "pushbot1.yaml")
     tracker = LightTracker([LightSource(laser_hz(0), is_above=False)], (128, 128), TrackerSettings())
     told: dict[int, float] = {}
