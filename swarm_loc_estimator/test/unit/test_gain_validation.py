@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from ir_world import droplet, random_poses
 
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -102,11 +100,11 @@ def test_what_is_never_seen_says_nothing() -> None:
     assert not helpful_gains(PAPER, ROBOTS, dark).any()
 
 
-@settings(max_examples=3, deadline=None)
-@given(st.permutations(range(ROBOTS)))
-def test_the_order_of_robots_does_not_matter(order: list[int]) -> None:
+def test_the_order_of_robots_does_not_matter() -> None:
+    """All orders of three follow from an exchange of two and a cycle."""
     _, exchanges = exchanged(PAPER, 0.03, 60, 30)
-    places = np.array(order)
-    other = exchanges._replace(receiver=places[exchanges.receiver], transmitter=places[exchanges.transmitter])
-    one, two = (helpful_gains(PAPER, ROBOTS, said) for said in (exchanges, other))
-    np.testing.assert_array_equal(one, two[places])
+    one = helpful_gains(PAPER, ROBOTS, exchanges)
+    for places in np.array([[1, 0, 2], [1, 2, 0]]):
+        receiver, transmitter = places[exchanges.receiver], places[exchanges.transmitter]
+        two = helpful_gains(PAPER, ROBOTS, exchanges._replace(receiver=receiver, transmitter=transmitter))
+        np.testing.assert_array_equal(one, two[places])
