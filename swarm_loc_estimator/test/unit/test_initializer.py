@@ -109,7 +109,7 @@ def test_a_constraint_is_as_unsure_as_sampled_sightings_and_located_robots(kind:
     one, robot = sighting(rng, sees, kind, camera)
     spread = np.diag([1e-4, 2e-4, 3e-4])
     samples, value = [], one["value"].copy()
-    for _ in range(4000):
+    for _ in range(1500):
         one["value"] = value + rng.multivariate_normal(np.zeros(3), one["covariance"][0])
         base = rng.multivariate_normal(np.zeros(3), spread)
         other = OtherSide(1, -1, base, base, NO_NOISE)
