@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.replay_map import main, read_walls
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.settings import MapperSettings
@@ -30,11 +31,12 @@ def figures_of(name: str, leds: dict[str, float]) -> MapFigures:
 
 
 def test_one_pushbot_makes_the_same_map_twice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    files = []
+    bag, files = BAGS / "pushbot_one", []
+    copy_part(bag, tmp_path / "bag", 90.0)
+    beside = ["--swarm", str(bag / "swarm.yaml"), "--walls", str(bag / "walls.csv")]
     for name in ("a", "b"):
         out = tmp_path / name
-        walls = str(BAGS / "pushbot_one" / "walls.csv")
-        assert main([str(BAGS / "pushbot_one"), "--out", str(out), "--walls", walls]) == 0
+        assert main([str(tmp_path / "bag"), "--out", str(out), *beside]) == 0
         files.append({path.name: path.read_bytes() for path in out.iterdir()})
     assert set(files[0]) == {"map.yaml", "map.pgm", "map.png", "stops.csv"}
     assert files[0] == files[1]
