@@ -60,11 +60,18 @@ def run(folder: Path, cache: Path, used: str = USED) -> list[str]:
     return subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout.split()
 
 
-@pytest.fixture
-def cache(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def compiled(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A cache in which the code of `USED` has been compiled."""
-    assert run(tmp_path / "first", tmp_path / "cache") == ["False", "3.0", "0"]
-    return tmp_path / "cache"
+    folder = tmp_path_factory.mktemp("compiled")
+    assert run(folder / "first", folder / "cache") == ["False", "3.0", "0"]
+    return folder / "cache"
+
+
+@pytest.fixture
+def cache(tmp_path: Path, compiled: Path) -> Path:
+    """A copy of it, for one test."""
+    return shutil.copytree(compiled, tmp_path / "cache")
 
 
 def test_code_is_found_again_in_another_folder_and_in_a_copy_of_the_cache(
@@ -110,11 +117,10 @@ def test_a_damaged_file_is_compiled_again(tmp_path: Path, cache: Path, damage: s
     assert run(tmp_path / "first", cache)[1:] == ["3.0", "1"]
 
 
-def test_processes_that_compile_at_once_leave_whole_files(tmp_path: Path) -> None:
+def test_processes_that_compile_at_once_leave_whole_files(tmp_path: Path, compiled: Path) -> None:
     cache = tmp_path / "cache"
-    run(tmp_path / "first", tmp_path / "other cache")
     env = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
-    command = [sys.executable, "-B", str(tmp_path / "first" / "using.py")]
+    command = [sys.executable, "-B", str(compiled.parent / "first" / "using.py")]
     together = [subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True) for _ in range(4)]
     assert {process.communicate()[0].split()[1] for process in together} == {"3.0"}
     assert [process.returncode for process in together] == [0] * 4
