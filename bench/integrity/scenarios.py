@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -54,6 +55,7 @@ def _clean_w0(seed: int) -> Fault:
     return Fault(faults.simulate(settings_of(seed, W0)))
 
 
+@lru_cache(maxsize=1)  # scenarios of one seed share it
 def _clean(seed: int) -> Fault:
     return Fault(faults.simulate(settings_of(seed, CLEAN)))
 
@@ -103,9 +105,10 @@ def _wrong_scale(seed: int) -> Fault:
 
 
 def _turned_camera(seed: int) -> Fault:
-    settings = settings_of(seed, CLEAN)
-    turned = faults.simulate(settings, lambda swarm: faults.turned_camera(swarm, 0, math.radians(10.0)))
-    return Fault(faults.changed_cameras(faults.simulate(settings), turned, 0, FAULT_S[0]))
+    turned = faults.simulate(
+        settings_of(seed, CLEAN), lambda swarm: faults.turned_camera(swarm, 0, math.radians(10.0))
+    )
+    return Fault(faults.changed_cameras(_clean(seed).run, turned, 0, FAULT_S[0]))
 
 
 def _two_odometry_sources(seed: int) -> Fault:
