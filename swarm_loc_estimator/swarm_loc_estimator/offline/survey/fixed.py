@@ -80,7 +80,7 @@ def place_fixed(recording: Recording, swarm: Swarm, paths: Paths, *, cameras: bo
         recording: Detections of fixed cameras, and ranges.
         swarm: The description with corrected robots; described anchors stay, and other addresses are anchors.
         paths: Of the robots.
-        cameras: Whether described cameras are placed anew.
+        cameras: Whether described cameras are placed again.
     """
     placed = Placed(swarm.cameras, swarm.anchors, [], [])
     if cameras and swarm.cameras:

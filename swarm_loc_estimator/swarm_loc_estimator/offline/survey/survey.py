@@ -60,7 +60,7 @@ def survey(
         swarm: The robots. Landmarks that it describes, and starts, give the frame; without any, the first
             pose of the robot that has seen most is the origin.
         progress: Called now and then.
-        cameras: Whether described fixed cameras are placed anew.
+        cameras: Whether described fixed cameras are placed again.
 
     Raises:
         CalibrationError: Nobody has moved, or no marker that belongs to nobody was seen often enough.
