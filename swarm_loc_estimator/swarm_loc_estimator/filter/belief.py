@@ -49,6 +49,11 @@ class IntegrityArrays(NamedTuple):
         motion_likelihood: (N, scales) log-likelihood of each scale of the process noise.
         motion_scale: (N,) scale of the process noise of each robot.
         motion_explained: (N,) True if it stays 1, as scales of the robot's motion are described as estimated.
+        excess: (N, 3, 3) covariance of each robot's error beyond that of the filter, see
+            `integrity/repeated_errors.py`.
+        repeated: (N, S, 2, 3, 3) covariance of the errors of observer and target with the repeated error of
+            their pair.
+        repeated_at: (N, S, 2) place of the target, as the observer saw it last [m].
     """
 
     source: IntArray
@@ -77,6 +82,9 @@ class IntegrityArrays(NamedTuple):
     motion_likelihood: FloatArray
     motion_scale: FloatArray
     motion_explained: BoolArray
+    excess: FloatArray
+    repeated: FloatArray
+    repeated_at: FloatArray
 
 
 class BeliefArrays(NamedTuple):

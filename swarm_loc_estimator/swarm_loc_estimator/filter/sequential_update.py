@@ -21,6 +21,7 @@ from swarm_loc_estimator.filter.integrity.divergence import (
 )
 from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_excluded
 from swarm_loc_estimator.filter.integrity.motion_noise import learn
+from swarm_loc_estimator.filter.integrity.repeated_errors import count_repeated
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel, locates_alone
 from swarm_loc_estimator.odometry.look_up import look_up, new_sample
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
@@ -94,6 +95,7 @@ def update_in_order(
         if accepted:
             noise, jacobian = batch.noise[0], batch.jacobian[0]
             record_pair(measurements, k, belief, batch.pair[0])
+            count_repeated(measurements, k, belief, scratch.predicted, batch.columns[0], jacobian, noise)
             correct(
                 belief, update_one(belief.covariance, batch.columns[0], jacobian, batch.innovation[0], noise)
             )

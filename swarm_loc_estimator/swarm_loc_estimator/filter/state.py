@@ -239,6 +239,7 @@ class SwarmState:
         self.constraints.clear()
         self.windows.clear()
         self._restart_drift(tracked)
+        self.integrity.excess[:], self.integrity.repeated[:] = 0.0, 0.0
 
     def deinitialize(self, robot: int) -> None:
         """Remove the robot from the estimate until a fix initializes it."""
@@ -328,11 +329,13 @@ class SwarmState:
         self.integrity.gated_in_a_row[robots] = 0
         self.integrity.gated_fixes[robots] = 0
         self._restart_drift(robots)
+        self.integrity.excess[robots] = 0.0
         self.integrity.fault_score[robots] = 0.0
         self.integrity.confirmations[robots] = confirmations
         self.integrity.source[robots] = -1
         named = self.integrity.source % self.integrity.fault_score.size
-        self.integrity.evidence[np.isin(named, robots)] = 0.0
+        for column in (self.integrity.evidence, self.integrity.repeated):
+            column[np.isin(named, robots)] = 0.0
 
     def _forget_pairs(self, robot: int) -> None:
         """Clear the stored means of all pairs of the robot: its new errors are independent of them."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.se2_scalar import composed, wrap
+from swarm_loc_estimator.common.small_matrix import add_scaled
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED, inflate_suspect_covariance
 from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
@@ -119,6 +120,7 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, limits: TrackedLimits,
         look_up(tracks, i, out.stamp_ns, sample, 0)
         to = Preintegrated(out.stamp_ns, sample.covariance[0], sample.jacobian[0])
         write_predicted(belief, i, to, scratch, t, error)
+        add_scaled(error, belief.integrity.excess[i], 1.0)
         x, y, theta = composed(t[0], t[1], t[2], track[0], track[1], track[2])
         out.poses[i, 0], out.poses[i, 1], out.poses[i, 2] = x, y, wrap(theta)
         _pose_covariance(x, y, error, out.covariances[i])

@@ -90,6 +90,9 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         motion_likelihood=np.zeros((robots, LOG_SCALES.size)),
         motion_scale=np.ones(robots),
         motion_explained=np.zeros(robots, dtype=bool),
+        excess=np.zeros((robots, 3, 3)),
+        repeated=np.zeros((robots, _SOURCES, 2, 3, 3)),
+        repeated_at=np.zeros((robots, _SOURCES, 2)),
     )
 
 

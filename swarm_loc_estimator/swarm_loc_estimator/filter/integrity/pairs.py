@@ -137,6 +137,10 @@ def new_pair(state: IntegrityArrays, observer: int, source: int) -> int:
     state.evidence[observer, oldest] = 0.0
     state.outlier[observer, oldest] = state.trending[observer, oldest] = False
     forget_trend(state, observer, oldest)
+    for side in range(2):
+        for i in range(3):
+            for j in range(3):
+                state.repeated[observer, oldest, side, i, j] = 0.0
     return oldest
 
 
