@@ -6,8 +6,6 @@ import functools
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from ir_world import random_poses
 
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -53,10 +51,16 @@ def drawn(seed: int) -> Faults:
     return {(0, 0, elements[0]): 0.0, (1, 1, elements[1]): 0.0, (1, 2, elements[2]): 0.15}
 
 
+@functools.cache
+def found(count: int, seed: int) -> tuple[Exchanges, ElementVerdicts]:
+    """Exchanges of robots with drawn faults, and what is found."""
+    exchanges = exchanged(count, seed, drawn(seed))
+    return exchanges, find_dead_elements(PLATFORM, ROBOTS, exchanges)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_dead_and_shaded_elements_are_found_and_no_others(seed: int) -> None:
-    faults = drawn(seed)
-    verdicts = find_dead_elements(PLATFORM, ROBOTS, exchanged(400, seed, faults))
+    faults, (_, verdicts) = drawn(seed), found(400, seed)
     assert set(zip(*(side.tolist() for side in np.nonzero(verdicts.dead)), strict=True)) == set(faults)
     few = find_dead_elements(PLATFORM, ROBOTS, exchanged(60, seed, faults))
     assert verdicts.undecided.sum() < few.undecided.sum()
@@ -84,24 +88,17 @@ def test_one_geometry_says_little_however_often_it_was_measured(seed: int) -> No
 
 
 def test_readings_of_dead_elements_are_left_out() -> None:
-    exchanges = exchanged(240, 0, drawn(0))
-    verdicts = find_dead_elements(PLATFORM, ROBOTS, exchanges)
+    exchanges, verdicts = found(400, 0)
     left = np.isfinite(verdicts.without(exchanges).readings[:, 0])
     for k in range(len(left)):
         alive = [~verdicts.dead[side, robot[k]] for side, robot in enumerate(exchanges[:2])]
         np.testing.assert_array_equal(left[k], np.outer(*alive))
 
 
-@functools.cache
-def _found_in_order() -> tuple[Exchanges, ElementVerdicts]:
-    exchanges = exchanged(120, 3, drawn(3))
-    return exchanges, find_dead_elements(PLATFORM, ROBOTS, exchanges)
-
-
-@settings(max_examples=5, deadline=None)
-@given(st.permutations(range(ROBOTS)))
-def test_the_order_of_robots_does_not_matter(order: list[int]) -> None:
-    (exchanges, one), places = _found_in_order(), np.array(order)
+@pytest.mark.parametrize("order", [(1, 0, 2), (1, 2, 0)])
+def test_the_order_of_robots_does_not_matter(order: tuple[int, ...]) -> None:
+    """All orders of three follow from an exchange of two and a cycle."""
+    (exchanges, one), places = found(120, 3), np.array(order)
     other = exchanges._replace(receiver=places[exchanges.receiver], transmitter=places[exchanges.transmitter])
     two = find_dead_elements(PLATFORM, ROBOTS, other)
     np.testing.assert_array_equal(one.dead, two.dead[:, places])
