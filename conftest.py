@@ -78,13 +78,6 @@ def _own_ros_domain(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPa
         yield
 
 
-@pytest.fixture(autouse=True)
-def _frequent_diagnostics(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let nodes in the process of a node test say at once what it waits for."""
-    if "node" in request.path.parts:
-        monkeypatch.setattr("swarm_loc_estimator.common.node._DIAGNOSTICS_PERIOD_S", 0.05)
-
-
 @pytest.fixture
 def ros(pytestconfig: pytest.Config) -> Iterator[Ros]:
     """ROS, for one node test."""
@@ -95,3 +88,9 @@ def ros(pytestconfig: pytest.Config) -> Iterator[Ros]:
     faulthandler.enable(pytestconfig.stash[fault_handler_stderr_fd_key])
     yield ros
     ros.close()
+
+
+@pytest.fixture
+def frequent_diagnostics(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let nodes say at once what a test waits for."""
+    monkeypatch.setattr("swarm_loc_estimator.common.node._DIAGNOSTICS_PERIOD_S", 0.05)

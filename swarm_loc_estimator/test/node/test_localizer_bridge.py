@@ -19,6 +19,8 @@ from tf2_msgs.msg import TFMessage
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.nodes.localizer_bridge import LocalizerBridge
 
+pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
+
 RELIABLE = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 POSES = {"alpha": (1.0, 2.0), "beta": (-1.0, 0.5)}
 

@@ -22,6 +22,8 @@ from swarm_loc_vision.aerial.ground_control import Ground
 from swarm_loc_vision.aerial.ground_file import GroundFileError, save_ground
 from swarm_loc_vision.aerial.parameters import AerialParameters
 
+pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
+
 PICTURE = draw_picture(Look(tilt=0.3, robots=6), seed=2)
 HEIGHT, WIDTH = PICTURE.gray.shape
 FRAME = "aerial/camera_optical_frame"

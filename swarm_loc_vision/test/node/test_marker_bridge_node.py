@@ -22,6 +22,8 @@ from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.foreign_markers import KINDS, ForeignMarker
 from swarm_loc_vision.markers.marker_bridge_node import MarkerBridgeNode
 
+pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
+
 FAMILY = "apriltag_36h11"
 FRAME = "epuck1/camera_optical_frame"
 TRUTH = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())[1][0]

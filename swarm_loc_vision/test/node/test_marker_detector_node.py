@@ -22,6 +22,8 @@ from swarm_loc_vision.common import camera_node
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.marker_detector_node import MarkerDetectorNode
 
+pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
+
 FAMILY = "aruco_mip_36h12"
 IMAGE, TRUTHS = random_scene(np.random.default_rng(4), family_named(FAMILY), 8, Look())
 FRAME = "epuck1/camera_optical_frame"
