@@ -19,6 +19,7 @@ from swarm_loc_estimator.common.messages.detections import swarm_key
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.sensors.registry import Batch, InputTopic, input_topics, kinds
 from swarm_loc_estimator.sensors.sensor import Guard, Known, in_order_of_arrival
+from swarm_loc_estimator.swarm.error_models import MAX_OFFSET_S
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 MAX_PAUSE_NS = 3_600_000_000_000
@@ -127,7 +128,10 @@ class WrongClock(NamedTuple):
     @property
     def remedy(self) -> str:
         """What to do, a sentence without its full stop."""
-        return f"Synchronize it with the others (chrony), or set clock.offset_s to {self.offset_s:.3g}"
+        synchronize = "Synchronize it with the others (chrony)"
+        if abs(self.offset_s) > MAX_OFFSET_S:  # such as a clock that began in 1970
+            return synchronize
+        return f"{synchronize}, or set clock.offset_s to {round(self.offset_s, 3)}"
 
 
 class Ingest:

@@ -129,12 +129,20 @@ class RandomWalk:
         return self.position > 0.0 or self.heading > 0.0
 
 
+MAX_OFFSET_S = 1e9
+"""Greatest offset of a clock [s]."""
+
+
 @dataclass(frozen=True)
 class ClockModel:
     """Clock of a robot, by which its odometry, detections, turn rates, ranges and brightness are stamped."""
 
     offset_s: float = number(
-        0.0, "s", -1e9, 1e9, "its time minus the time of the estimator; taken off its stamps"
+        0.0,
+        "s",
+        -MAX_OFFSET_S,
+        MAX_OFFSET_S,
+        "its time minus the time of the estimator; taken off its stamps",
     )
 
 

@@ -25,7 +25,7 @@ from swarm_loc_estimator.common.messages.poses import (
     encode_pose_stamped,
 )
 from swarm_loc_estimator.common.messages.streams import DetectionReader, PoseReader
-from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.ingest import Ingest, WrongClock
 from swarm_loc_estimator.swarm.error_models import ClockModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
@@ -63,6 +63,21 @@ def test_clocks_are_compared_by_the_least_delays_and_corrected_by_their_descript
     assert found[3].problem == "has a clock 0.33 s ahead of those of the other robots"
     assert [*read(-0.325).clocks_apart()] == [3]
     assert read(0.4).clocks_apart()[2].offset_s == pytest.approx(-0.325)
+
+
+@pytest.mark.parametrize(
+    ("offset_s", "advice"),
+    [
+        (-0.3251, ", or set clock.offset_s to -0.325"),
+        (1234.5678, ", or set clock.offset_s to 1234.568"),
+        (-987654321.0987, ", or set clock.offset_s to -987654321.099"),
+        (-1.79e9, ""),
+    ],
+)
+def test_the_offset_to_set_is_exact_to_a_millisecond_and_in_range(offset_s: float, advice: str) -> None:
+    """A computer without a hardware clock begins in 1970."""
+    clock = WrongClock(offset_s, offset_s)
+    assert clock.remedy == f"Synchronize it with the others (chrony){advice}"
 
 
 def test_clocks_of_two_robots_are_not_judged() -> None:
