@@ -45,6 +45,7 @@ class ConstantOdometry:
         moved = np.hypot(*(position - self._from).T) > reach  # False for NaN
         self._moves_ns[moved] = np.roll(self._moves_ns[moved], 1, axis=1)
         self._moves_ns[moved, 0] = estimate.stamp_ns
+        self._moves_ns[~constant] = _LONG_AGO_NS  # such as a robot that was carried before it drove
         changed = moved | np.isnan(self._from[:, 0]) | np.isnan(position[:, 0])
         self._from[changed], self._from_variance[changed] = position[changed], variance[changed]
 

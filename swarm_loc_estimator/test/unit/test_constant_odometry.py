@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from core_messages import SECOND, T0
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.timeline.constant_odometry import ConstantOdometry
 from swarm_loc_estimator.timeline.estimate import Estimate, Status
 
@@ -15,16 +15,17 @@ TENTH = SECOND // 10
 
 
 def contradicted(
-    poses: FloatArray, *, constant: bool = True, sigma: FloatArray | float = SIGMA
+    poses: FloatArray, *, constant: BoolArray | bool = True, sigma: FloatArray | float = SIGMA
 ) -> list[bool]:
     """Whether a robot with poses (T, 3), ten a second, and their sigmas (T,) is contradicted at each."""
     odometry, found = ConstantOdometry(1), []
+    stands = np.broadcast_to(constant, len(poses))
     for k, (pose, one) in enumerate(zip(poses, np.broadcast_to(sigma, len(poses)), strict=True)):
         covariance = np.diag([one**2, one**2, 0.01])[None]
         status = np.array([Status.WAITING if np.isnan(pose[0]) else Status.TRACKED], np.uint8)
         now_ns = T0 + k * TENTH
         estimate = Estimate(now_ns, pose[None], covariance, pose[None], status, np.zeros(1))
-        odometry.add(np.array([constant]), estimate)
+        odometry.add(stands[k : k + 1], estimate)
         found.append(bool(odometry.contradicted(now_ns)[0]))
     return found
 
@@ -71,6 +72,12 @@ def test_it_is_forgotten_a_while_after_the_last_moves() -> None:
     found = contradicted(np.concatenate([drive(0.1, 2.0), np.tile([0.2, 0.0, 0.0], (400, 1))]))
     assert found[20 + 250]
     assert not found[20 + 310]
+
+
+def test_a_robot_that_was_carried_and_then_drives_is_no_longer_accused() -> None:
+    found = contradicted(drive(0.1, 10.0), constant=np.arange(100) < 50)
+    assert found[49]
+    assert not any(found[50:])
 
 
 def test_poses_that_were_set_are_no_moves() -> None:
