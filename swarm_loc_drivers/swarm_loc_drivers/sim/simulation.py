@@ -154,17 +154,21 @@ def seen_from_above(swarm: Swarm) -> Swarm:
 
 
 def placed(options: SimulationOptions, swarm: Swarm) -> Swarm:
-    """The swarm with a start for each robot; who has none stands where its world puts it.
+    """The swarm with a start for each robot; who has none stands where its world puts it, off the others.
 
     Raises:
         UserError: The world has no place for so many robots.
     """
-    if all(robot.start is not None for robot in swarm.robots):
+    described = [robot.start for robot in swarm.robots if robot.start is not None]
+    if len(described) == len(swarm.robots):
         return swarm
     starts = robot_type_of(swarm).starts(options, len(swarm.robots))
+    taken = np.array(described).reshape(-1, 3)[:, :2]
+    away = np.linalg.norm(starts[:, None, :2] - taken, axis=-1).min(axis=1, initial=np.inf)
+    free = iter(starts[np.sort(np.argsort(-away, kind="stable")[: len(starts) - len(described)])])
     robots = (
-        replace(robot, start=robot.start or rounded(start))
-        for robot, start in zip(swarm.robots, starts, strict=True)
+        robot if robot.start is not None else replace(robot, start=rounded(next(free)))
+        for robot in swarm.robots
     )
     return replace(swarm, robots=tuple(robots))
 

@@ -12,7 +12,13 @@ import pytest
 from swarm_loc_drivers.sim import simulate
 from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
 from swarm_loc_drivers.sim.epuck.parts import Unanswered
-from swarm_loc_drivers.sim.simulation import ROBOT_TYPES, SimulationOptions, graph_of, simulated_swarm
+from swarm_loc_drivers.sim.simulation import (
+    ROBOT_TYPES,
+    SimulationOptions,
+    graph_of,
+    placed,
+    simulated_swarm,
+)
 from swarm_loc_drivers.sim.worlds import WORLDS, WorldError
 from swarm_loc_estimator.cli import new
 from swarm_loc_estimator.common.parameters import ParameterError, parameter_specs
@@ -108,11 +114,26 @@ def test_robots_without_a_start_stand_where_their_world_puts_them(
     assert all(robot.start is None for robot in swarm.robots)
     nodes = {node.full_name: node for node in graph_of(options, swarm, str(tmp_path))}
     for name in told:
-        placed = load_swarm(Path(str(nodes[name].parameters["swarm_file"])))
-        starts = np.array([robot.start for robot in placed.robots], float)
+        whole = load_swarm(Path(str(nodes[name].parameters["swarm_file"])))
+        starts = np.array([robot.start for robot in whole.robots], float)
         assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(starts[:, :2], 2)) > 0.03
     known = load_swarm(Path(str(nodes["estimator"].parameters["swarm_file"])))
     assert all((robot.start is None) == (kind == "droplet") for robot in known.robots)
+
+
+@pytest.mark.parametrize("kind", ["epuck", "droplet", "pushbot"])
+def test_robots_without_a_start_keep_away_from_those_that_have_one(tmp_path: Path, kind: str) -> None:
+    """The last robot stands where the first would."""
+    file = tmp_path / "swarm.yaml"
+    assert new.main([str(file), "--yes", "--type", kind, "--robots", "5"]) == 0
+    options = SimulationOptions(str(file), plan="office")
+    swarm = load_swarm(file)
+    starts = [robot.start for robot in placed(options, swarm).robots]
+    first, *others, last = swarm.robots
+    mixed = replace(swarm, robots=(first, *others, replace(last, start=starts[0])))
+    found = placed(options, mixed).robots
+    assert found[-1].start == starts[0]
+    assert [robot.start for robot in found[:-1]] == starts[1:]
 
 
 def test_a_hall_without_room_for_all_is_named(tmp_path: Path) -> None:
