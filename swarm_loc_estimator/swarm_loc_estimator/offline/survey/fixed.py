@@ -3,7 +3,8 @@
 A fixed camera saw markers on robots whose poses are known by then, so its pose is that of the perspective
 from n points. An anchor was measured from many places, which is multilateration. Both are robust fits
 (Cauchy). Errors of neighbouring measurements are alike, so variances are those of a jackknife over spells of
-time, and of the frame of all paths.
+time, and of the frame of all paths. Nothing is placed that fits elsewhere as well: places on one line do not
+tell where about this line a camera or an anchor is.
 """
 
 from __future__ import annotations
@@ -34,6 +35,13 @@ _DRAWS, _DRAWN = 60, 6
 _OUTLIER = 5.0
 """Residuals of more standard deviations contradict the others."""
 _LEAST_SIGMA = 1e-4
+_MOST_SIGMA, _MOST_YAW_SIGMA = 1.0, 0.5
+"""Standard deviations [m], [rad] from which nothing is placed."""
+_TURNS = 16
+"""Other places are sought in so many directions about the line of all robots."""
+_AS_WELL, _ELSEWHERE, _ELSEWHERE_M = 1.2, 0.5, 0.3
+"""Another place fits as well if its residuals are larger by no more than this factor. It is farther away than
+this share of the distance from the line, and this length."""
 _DEPTH = 0.05
 """Least depth of a marker in front of a camera, of which its direction is computed [m]."""
 
@@ -101,7 +109,15 @@ def _with_cameras(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
                 f" {stamp_ns.size} x, and {MIN_MEASUREMENTS} are needed."
             )
             continue
-        located, wrong = _located(camera, optical, place, stamp_ns, paths)
+        fit = _located(camera, optical, place, stamp_ns, paths)
+        if fit is None:
+            found.append(camera)
+            remarks.append(
+                f"Camera {camera.name} stays as it is described, since other places fit as well: it has seen"
+                " robots on one line or at few places only; let them drive over the whole floor."
+            )
+            continue
+        located, wrong = fit
         found.append(located)
         sigma, yaw = 1e3 * located.position_sigma, math.degrees(located.yaw)
         numbers = (
@@ -132,10 +148,11 @@ def _sighted(
 
 def _located(
     camera: FixedCamera, optical: FloatArray, place: FloatArray, stamp_ns: IntArray, paths: Paths
-) -> tuple[FixedCamera, float]:
+) -> tuple[FixedCamera, float] | None:
     """A camera at the pose from which it sees markers (k, 3) of `map` at (k, 3), and the share of wrong ones.
 
-    Only directions are used: distances of a camera depend on its focal length and on sizes of markers.
+    Only directions are used: distances of a camera depend on its focal length and on sizes of markers. None:
+    other poses fit as well.
     """
     seen = optical[:, :2] / optical[:, 2:]
 
@@ -146,6 +163,12 @@ def _located(
     start = _aligned(optical, place)
     pose, sigma, wrong = _robust(residual, start, len(seen))
     rotation = Rotation.from_rotvec(pose[:3])
+
+    def turned(turn: Rotation, centre: FloatArray) -> FloatArray:
+        return np.append((turn * rotation).as_rotvec(), centre + turn.apply(pose[3:] - centre))
+
+    if not _is_unique(residual, pose, sigma, place, turned, lambda other: other[3:]):
+        return None
     height = float(np.median(place[:, 2]))
     below = np.median(optical, axis=0)
 
@@ -164,6 +187,8 @@ def _located(
     yaw, pitch, roll = (round(float(angle), 6) for angle in (yaw, pitch, roll))
     position_sigma = max(math.sqrt(0.5 * float(spread[0] + spread[1])), _LEAST_SIGMA)
     yaw_sigma = max(math.sqrt(float(spread[2])), _LEAST_SIGMA)
+    if position_sigma > _MOST_SIGMA or yaw_sigma > _MOST_YAW_SIGMA:
+        return None
     return FixedCamera(
         camera.name, x, y, z, yaw, pitch, roll, position_sigma, yaw_sigma, camera.sensor
     ), wrong
@@ -206,7 +231,14 @@ def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
         if own.sum() < MIN_MEASUREMENTS:
             remarks.append(f"{name} was measured {own.sum()} x only and is left out; drive near it.")
             continue
-        place, sigma, wrong = _multilaterated(at[own], measured[own], rows.stamp_ns[own], paths)
+        fit = _multilaterated(at[own], measured[own], rows.stamp_ns[own], paths)
+        if fit is None:
+            remarks.append(
+                f"{name} is left out, since other places fit as well: it was measured from one line or few"
+                " places only, or its ranges contradict each other; drive over the whole floor."
+            )
+            continue
+        place, sigma, wrong = fit
         x, y, z = (round(float(value), 4) for value in place)
         found.append(Anchor(address, x, y, z, position_sigma=sigma))
         numbers = f"{x:9.3f} {y:9.3f} {z:7.3f} {1e3 * sigma:22.1f} {wrong:14.0%}"
@@ -217,8 +249,11 @@ def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
 
 def _multilaterated(
     at: FloatArray, measured: FloatArray, stamp_ns: IntArray, paths: Paths
-) -> tuple[FloatArray, float, float]:
-    """Place (3,) at distances (k,) from places (k, 3), not below them; its sigma, and share of wrong ones."""
+) -> tuple[FloatArray, float, float] | None:
+    """Place (3,) at distances (k,) from places (k, 3), not below them; its sigma, and share of wrong ones.
+
+    None: other places fit as well.
+    """
 
     def residual(place: FloatArray, rows: BoolArray) -> FloatArray:
         return np.asarray(np.linalg.norm(at[rows] - place, axis=1) - measured[rows])[:, None]
@@ -228,11 +263,18 @@ def _multilaterated(
     starts = [_linear(at, measured, rng.choice(measured.size, _DRAWN, replace=False)) for _ in range(_DRAWS)]
     start = min(starts, key=lambda one: float(np.median(np.abs(residual(one, every)))))
     place, sigma, wrong = _robust(residual, start, measured.size)
+
+    def turned(turn: Rotation, centre: FloatArray) -> FloatArray:
+        return np.asarray(centre + turn.apply(place - centre))
+
+    if not _is_unique(residual, place, sigma, at, turned, lambda other: other[:2]):
+        return None
     spread = _jackknife(residual, place, sigma, stamp_ns, lambda other: other[:2])
     spread += paths.variances(place[:2])[:2]
     height = float(np.median(at[:, 2]))
     place[2] = height + abs(place[2] - height)  # ranges in a plane do not tell above from below
-    return place, max(math.sqrt(0.5 * float(spread.sum())), _LEAST_SIGMA), wrong
+    position_sigma = max(math.sqrt(0.5 * float(spread.sum())), _LEAST_SIGMA)
+    return None if position_sigma > _MOST_SIGMA else (place, position_sigma, wrong)
 
 
 def _linear(at: FloatArray, measured: FloatArray, rows: IntArray) -> FloatArray:
@@ -271,6 +313,40 @@ def _fitted(residual: Residual, start: FloatArray, sigma: float, rows: BoolArray
     return np.asarray(least_squares(whitened, start, loss="cauchy", x_scale="jac").x)
 
 
+def _is_unique(
+    residual: Residual,
+    best: FloatArray,
+    sigma: float,
+    at: FloatArray,
+    turned: Callable[[Rotation, FloatArray], FloatArray],
+    of: Callable[[FloatArray], FloatArray],
+) -> bool:
+    """Whether no parameters with another place fit as well.
+
+    If all robots were on a line, distances and directions stay as they are when all is turned about it.
+
+    Args:
+        residual: Of measurements at places (k, 3).
+        best: (p,) parameters, of which the last three are the place.
+        sigma: Of their residuals.
+        at: (k, 3) the places.
+        turned: The best parameters turned about a point (3,).
+        of: (3,) place that belongs to parameters, or (2,) where its height is known badly.
+    """
+    every = np.ones(len(at), dtype=bool)
+    good = at[np.linalg.norm(residual(best, every), axis=1) <= _OUTLIER * sigma]
+    centre = good.mean(axis=0)
+    line = np.linalg.svd(good - centre, full_matrices=False)[2][0]
+    apart = max(_ELSEWHERE * float(np.linalg.norm(np.cross(best[-3:] - centre, line))), _ELSEWHERE_M)
+    bound = _AS_WELL * max(float(np.median(np.abs(residual(best, every)))), sigma / 1.4826)
+    for angle in np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False)[1:]:
+        other = turned(Rotation.from_rotvec(angle * line), centre)
+        fits = float(np.median(np.abs(residual(other, every)))) < bound
+        if fits and np.linalg.norm(of(other) - of(best)) > apart:
+            return False
+    return True
+
+
 def _jackknife(
     residual: Residual,
     best: FloatArray,
@@ -279,8 +355,7 @@ def _jackknife(
     of: Callable[[FloatArray], FloatArray],
 ) -> FloatArray:
     """Variances (q,) of a function of the parameters, by leaving out one spell of time after the other."""
-    edges = np.quantile(stamp_ns, np.linspace(0.0, 1.0, _SPELLS + 1)[1:-1])
-    spell = np.searchsorted(edges, stamp_ns)
-    found = [of(_fitted(residual, best, sigma, spell != one)) for one in np.unique(spell).tolist()]
-    values, count = np.array(found), len(found)
-    return np.asarray((count - 1) / count * np.sum(np.square(values - values.mean(axis=0)), axis=0))
+    spell = np.empty(stamp_ns.size, dtype=np.int64)  # by rank, since few stamps may be all there are
+    spell[np.argsort(stamp_ns, kind="stable")] = np.arange(stamp_ns.size) * _SPELLS // stamp_ns.size
+    values = np.array([of(_fitted(residual, best, sigma, spell != one)) for one in range(_SPELLS)])
+    return np.asarray((_SPELLS - 1) / _SPELLS * np.sum(np.square(values - values.mean(axis=0)), axis=0))
