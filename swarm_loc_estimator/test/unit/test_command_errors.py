@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.cli import calibrate, calibrate_ir, replay, survey
+from swarm_loc_estimator.cli import calibrate, calibrate_ir, doctor, replay, survey
 from swarm_loc_estimator.common.command_line import exit_with_message, file_to_write, folder_to_write
 from swarm_loc_estimator.common.parameters import UserError
 
@@ -71,3 +71,13 @@ def test_a_file_that_cannot_be_written_is_said(name: str, said: str, tmp_path: P
     (tmp_path / "file").touch()
     with pytest.raises(ArgumentTypeError, match=said):
         file_to_write(".yaml", ".yml")(str(tmp_path / name))
+
+
+@pytest.mark.parametrize(("main", "more"), [(doctor.main, []), (survey.main, ["--out", "out.yaml"])])
+def test_a_folder_is_a_bag_whatever_its_name(
+    main: Callable[[list[str]], int], more: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    bag = tmp_path / "run.yaml"
+    bag.mkdir()
+    assert main([str(bag), *more]) == 1
+    assert f"{bag / 'swarm.yaml'} cannot be read" in capsys.readouterr().err
