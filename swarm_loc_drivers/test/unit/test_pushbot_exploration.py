@@ -31,6 +31,7 @@ from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.event_encoding import decode_events
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.scans import LightSightings
 from swarm_loc_vision.events.parameters import LightSource, TrackerSettings
 from swarm_loc_vision.events.tracker import LightTracker
 from swarm_loc_vision.laser.calibration import load_laser
@@ -114,12 +115,30 @@ def test_walls_and_robots_stop_a_drive_and_odometry_knows() -> None:
 def test_lights_are_seen_in_front_and_not_behind_walls() -> None:
     other = KinematicPushBot(ROOM, np.array([1.0, 2.5, 0.0]), EXACT, np.random.default_rng(2))
     body = robot(EXACT, math.pi / 2 - 0.2)
-    seen = body.lights(body.rest(0.1, [other]), {7: other})
+    seen = body.lights(body.rest(0.1, [other]).stamp_ns, {7: other})
     assert (seen.target == 7).all()
     assert len(seen.stamp_ns) == 5
     assert np.allclose(seen.bearing, 0.2, atol=0.05)  # one of two lights beside its middle
     away = robot(EXACT, -math.pi / 2)
-    assert not len(away.lights(away.rest(0.1, [other]), {7: other}).stamp_ns)
+    assert not len(away.lights(away.rest(0.1, [other]).stamp_ns, {7: other}).stamp_ns)
+
+
+def test_lights_are_seen_where_robots_were_at_the_time() -> None:
+    """One robot is simulated ahead of the other, which then drives away from where it was."""
+    exploration = Exploration(floor_plan("open12"), CooperativeMapper(), np.random.default_rng(2))
+    seen: list[tuple[int, LightSightings]] = []
+    exploration.on_lights = lambda robot, sightings: seen.append((robot, sightings))
+    for _ in range(2):
+        exploration.join(PushBotNoise(bearing=1e-6))
+    exploration.run(150.0)
+    traces = {key: one.trace for key, one in exploration.robots.items()}
+    assert {robot for robot, _ in seen} == {0, 1}
+    for robot, sightings in seen:
+        steps = np.round(sightings.stamp_ns / 20e6).astype(int)
+        own, other = traces[robot][steps], traces[1 - robot][steps]
+        way = (other - own)[:, :2]
+        off = wrap_angle(np.arctan2(way[:, 1], way[:, 0]) - own[:, 2] - sightings.bearing)
+        assert (np.hypot(*way.T) * np.abs(np.sin(off)) < 0.046).all()  # a light beside the middle
 
 
 @pytest.mark.parametrize(("plan", "seed"), [("corridor", 1), ("tee", 2)])

@@ -148,22 +148,22 @@ class KinematicPushBot:
         reported = self._odometry + step * np.arange(1, len(poses) + 1)[:, None] * ahead * (free > 0)
         return self._moved(poses, reported, others)
 
-    def lights(self, readings: Readings, others: dict[int, KinematicPushBot]) -> LightSightings:
-        """Sightings of the lights of other robots, by number, at the times of the newest readings (n,)."""
-        steps = np.round(readings.stamp_ns / (1e9 * PERIOD_S)).astype(np.int64)
+    def lights(self, stamp_ns: IntArray, others: dict[int, KinematicPushBot]) -> LightSightings:
+        """Sightings of the lights of other robots, by number, at times (n,) that all robots have lived."""
+        steps = np.round(stamp_ns / (1e9 * PERIOD_S)).astype(np.int64)
         own = self.positions_at(steps)
         rows: list[tuple[int, int, float]] = []
         for number, other in others.items():
             there = other.positions_at(steps)
             seen, bearing = _seen_lights(self._plan.walls, own, there)
             chosen = np.flatnonzero(seen)
-            rows += [(int(readings.stamp_ns[k]), number, float(bearing[k])) for k in chosen]
+            rows += [(int(stamp_ns[k]), number, float(bearing[k])) for k in chosen]
         rows.sort()
-        stamp_ns, target, bearings = (np.array(c) for c in zip(*rows, strict=True)) if rows else ([], [], [])
+        seen_ns, target, bearings = (np.array(c) for c in zip(*rows, strict=True)) if rows else ([], [], [])
         count = len(rows)
         noisy = np.asarray(bearings, dtype=float) + self._noise.bearing * self._rng.standard_normal(count)
         return LightSightings(
-            np.asarray(stamp_ns, dtype=np.int64),
+            np.asarray(seen_ns, dtype=np.int64),
             np.asarray(target, dtype=np.int64),
             noisy,
             np.full(count, self._noise.bearing),
@@ -304,7 +304,8 @@ class Exploration:
         arrivals: All stops so far.
         cpu_s: CPU time of the mapper [s].
         starts: By robot, the start pose (3,) that the mapper was given.
-        on_readings: Called with the number, readings and light sightings of a robot.
+        on_readings: Called with the number and readings of a robot.
+        on_lights: Called with the number and light sightings of a robot.
     """
 
     plan: FloorPlan
@@ -315,8 +316,10 @@ class Exploration:
     arrivals: list[Arrival] = field(default_factory=list)
     cpu_s: float = 0.0
     starts: dict[int, FloatArray] = field(default_factory=dict)
-    on_readings: Callable[[int, Readings, LightSightings | None], None] | None = None
+    on_readings: Callable[[int, Readings], None] | None = None
+    on_lights: Callable[[int, LightSightings], None] | None = None
     _odometry: dict[int, FloatArray] = field(default_factory=dict)
+    _unlooked_ns: dict[int, IntArray] = field(default_factory=dict)
 
     def join(self, noise: PushBotNoise) -> int:
         """Let another robot join at the plan's next start, with a random heading; its number."""
@@ -328,6 +331,7 @@ class Exploration:
         self.starts[robot] = known
         self.robots[robot] = KinematicPushBot(self.plan, pose, noise, self.rng)
         self._odometry[robot] = np.zeros(3)
+        self._unlooked_ns[robot] = np.zeros(0, dtype=np.int64)
         return robot
 
     def run(self, until_s: float, on_arrival: Callable[[Arrival], None] | None = None) -> None:
@@ -368,16 +372,32 @@ class Exploration:
             self._feed(robot, body.drive(length, others))
 
     def _feed(self, robot: int, readings: Readings) -> None:
-        """Pass readings and sightings of other robots to the mapper."""
+        """Pass readings to the mapper, and the lights that robots have seen until now."""
         self._odometry[robot] = readings.odometry[-1]
-        others = {key: one for key, one in self.robots.items() if key != robot}
-        sightings = self.robots[robot].lights(readings, others) if self.use_lights and others else None
+        self._unlooked_ns[robot] = np.concatenate([self._unlooked_ns[robot], readings.stamp_ns])
         if self.on_readings is not None:
-            self.on_readings(robot, readings, sightings)
+            self.on_readings(robot, readings)
         begin_s = time.process_time()
         self.mapper.add_readings(robot, readings)
-        if sightings is not None:
-            self.mapper.add_lights(robot, sightings)
+        self.cpu_s += time.process_time() - begin_s
+        if self.use_lights and len(self.robots) > 1:
+            for one in self.robots:
+                self._look_for_lights(one)
+
+    def _look_for_lights(self, robot: int) -> None:
+        """Pass sightings of other robots to the mapper, once it is known where these were at the time."""
+        others = {key: one for key, one in self.robots.items() if key != robot}
+        until_ns = round(1e9 * min(one.time_s for one in others.values()))
+        waiting_ns = self._unlooked_ns[robot]
+        count = int(np.searchsorted(waiting_ns, until_ns, side="right"))
+        self._unlooked_ns[robot] = waiting_ns[count:]
+        sightings = self.robots[robot].lights(waiting_ns[:count], others)
+        if not len(sightings.stamp_ns):
+            return
+        if self.on_lights is not None:
+            self.on_lights(robot, sightings)
+        begin_s = time.process_time()
+        self.mapper.add_lights(robot, sightings)
         self.cpu_s += time.process_time() - begin_s
 
     def _others(self, robot: int) -> list[KinematicPushBot]:

@@ -120,8 +120,10 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
     mapper = CooperativeMapper()
     exploration = Exploration(plan, mapper, np.random.default_rng(settings.seed))
     robots = range(settings.robots)
-    recorded: list[list[tuple[Readings, LightSightings | None]]] = [[] for _ in robots]
-    exploration.on_readings = lambda robot, readings, lights: recorded[robot].append((readings, lights))
+    recorded: list[list[Readings]] = [[] for _ in robots]
+    sighted: list[list[LightSightings]] = [[] for _ in robots]
+    exploration.on_readings = lambda robot, readings: recorded[robot].append(readings)
+    exploration.on_lights = lambda robot, sightings: sighted[robot].append(sightings)
     goals: list[list[Goal]] = [[] for _ in robots]
     covariances: list[list[FloatArray]] = [[] for _ in robots]
     maps: dict[int, bytes] = {}
@@ -144,9 +146,8 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
     built = assembled_robots(settings.seed, settings.robots)
     streams: list[Stream] = []
     for robot, name in enumerate(names):
-        readings = [one for one, _ in recorded[robot]]
-        streams += [_odometry(name, readings), _laser(name, readings, built[robot])]
-        streams += _lights(name, [lights for _, lights in recorded[robot] if lights is not None])
+        streams += [_odometry(name, recorded[robot]), _laser(name, recorded[robot], built[robot])]
+        streams += _lights(name, sighted[robot])
         streams += [_fixes(name, goals[robot], covariances[robot]), _goals(name, goals[robot])]
         streams.append(_truth(name, exploration.robots[robot].trace))
     streams.append(Stream("map", OCCUPANCY_GRID, np.array(list(maps), dtype=np.int64), list(maps.values())))
