@@ -76,13 +76,15 @@ class Bearings(NamedTuple):
     Attributes:
         begin: (m,) stop from which the light was seen.
         end: (m,) stop of the other robot.
-        turn: (m,) turn by odometry at which the light would be straight ahead [rad].
+        turn: (m,) turn by odometry at which it was seen [rad].
+        bearing: (m,) of the light in the robot's frame then [rad].
         sigma: (m,) [rad].
     """
 
     begin: IntArray
     end: IntArray
     turn: FloatArray
+    bearing: FloatArray
     sigma: FloatArray
 
 
@@ -137,7 +139,7 @@ def bearings(states: FloatArray, given: Bearings) -> Linearised:
     begin, end = states[given.begin], states[given.end]
     dx, dy = end[:, 0] - begin[:, 0], end[:, 1] - begin[:, 1]
     square = dx * dx + dy * dy
-    residual = wrap_angle(np.arctan2(dy, dx) - begin[:, 2] - begin[:, 3] * given.turn)
+    residual = wrap_angle(np.arctan2(dy, dx) - begin[:, 2] - begin[:, 3] * given.turn - given.bearing)
     one = np.ones_like(dx)
     jacobian = np.stack([dy / square, -dx / square, -one, -given.turn, -dy / square, dx / square], -1)
     robust = 1.0 + (residual / given.sigma) ** 2 / 9.0

@@ -298,7 +298,7 @@ class LightBook:
 
     def settle(self, graph: PoseGraph) -> None:
         """Add the bearings with known stops to the graph, one per pair of stops."""
-        found: dict[tuple[int, int], list[float]] = defaultdict(list)
+        found: dict[tuple[int, int], list[tuple[float, float]]] = defaultdict(list)
         for _ in range(len(self._pending)):
             one = self._pending.popleft()
             robot, target, stamp_ns, bearing = one
@@ -308,9 +308,9 @@ class LightBook:
             seer, seen = self._visit(robot, stamp_ns), self._visit(target, stamp_ns)
             if seer is not None and seen is not None:
                 turn = seer.stop.turn_at(stamp_ns) - seer.turn_begin
-                found[seer.node, seen.node].append(turn + bearing)
-        for (seer_node, seen_node), turns in found.items():
-            _add_bearing(graph, seer_node, seen_node, np.array(turns))
+                found[seer.node, seen.node].append((turn, bearing))
+        for (seer_node, seen_node), sighted in found.items():
+            _add_bearing(graph, seer_node, seen_node, *np.array(sighted).T)
 
     def _visit(self, robot: int, stamp_ns: int) -> Visit | None:
         """The stop of a robot at a time; None if it was driving."""
@@ -320,10 +320,18 @@ class LightBook:
         return None
 
 
-def _add_bearing(graph: PoseGraph, seer: int, seen: int, turns: FloatArray) -> None:
-    """Add the median of light directions (n,), given as turns by odometry [rad], as one bearing."""
-    middle = turns[0] + float(np.median(wrap_angle(turns - turns[0])))
+def _add_bearing(graph: PoseGraph, seer: int, seen: int, turn: FloatArray, bearing: FloatArray) -> None:
+    """Add the median of bearings (n,) of a light at turns (n,) by odometry as one bearing.
+
+    Where wheels slip, a robot that turns by more than a full turn sees the light again after more than a full
+    turn by odometry. So the bearing belongs to the turn of one sighting, not to any turn with its direction.
+    """
+    ratio = graph.states[seer, 3]
+    off = wrap_angle(ratio * (turn - turn[0]) + bearing - bearing[0])
+    middle = int(np.argsort(off, kind="stable")[len(off) // 2])
+    passes = np.abs(turn - turn[middle]) < math.pi
+    at = bearing[middle] + float(np.median(off[passes])) - off[middle]
     away = math.dist(graph.states[seer, :2], graph.states[seen, :2])
     if away > 2.0 * _LIGHT_OFFSET:
         sigma = math.hypot(_LEAST_SIGMA, _LIGHT_OFFSET / away)
-        graph.constraints.add_bearing(seer, seen, middle, sigma)
+        graph.constraints.add_bearing(seer, seen, float(turn[middle]), at, sigma)

@@ -40,9 +40,9 @@ class ConstraintLists:
         """Add a relative pose, see `constraints.Ties`."""
         self._ties.append((begin, end, np.concatenate([pose, sigma])))
 
-    def add_bearing(self, begin: int, end: int, turn: float, sigma: float) -> None:
+    def add_bearing(self, begin: int, end: int, turn: float, bearing: float, sigma: float) -> None:
         """Add the bearing of a robot's light at another stop, see `constraints.Bearings`."""
-        self._bearings.append((begin, end, np.array([turn, sigma])))
+        self._bearings.append((begin, end, np.array([turn, bearing, sigma])))
 
     @property
     def bearing_count(self) -> int:
@@ -71,7 +71,7 @@ class ConstraintLists:
             yield model.ties(states, model.Ties(begin, end, v[:, :3], v[:, 3:]))
         if self._bearings:
             begin, end, v = _arrays(self._bearings)
-            yield model.bearings(states, model.Bearings(begin, end, v[:, 0], v[:, 1]))
+            yield model.bearings(states, model.Bearings(begin, end, *v.T))
 
 
 def _arrays(rows: list[_Row]) -> tuple[IntArray, IntArray, FloatArray]:

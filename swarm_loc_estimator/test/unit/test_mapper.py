@@ -202,6 +202,34 @@ def test_a_light_turns_a_robot_that_sees_no_walls() -> None:
     assert mapper.graph.poses[begin, 2] == pytest.approx(bearing, abs=math.radians(2.0))
 
 
+def test_a_light_seen_twice_in_one_scan_of_wheels_that_slip_is_in_one_direction() -> None:
+    """By odometry the second time is a third of a radian more than a full turn after the first one."""
+    slip, off, ahead = 0.05, math.radians(6.0), 4.0 * math.pi + 0.3
+    mapper = CooperativeMapper(MapperSettings(usual_slip=slip, slip_sigma=1e-4))
+    heading = math.pi - (1.0 - slip) * ahead
+    told, sigma = np.array([2.0, 0.0, heading - off]), np.array([0.01, 0.01, math.radians(8.0)])
+    numbers = [mapper.join(np.zeros(3), KNOWN), mapper.join(told, sigma)]
+    turn = 0.02 * np.arange(1, 1000)
+    stamps = 20_000_000 * np.arange(1, 1000)
+    odometry = np.zeros((len(stamps), 3))
+    odometry[:, 2] = wrap_angle(turn)
+    for number in numbers:
+        mapper.add_readings(number, Readings(stamps, odometry, np.zeros(len(stamps)), 0.016))
+    again = ahead + 2.0 * math.pi / (1.0 - slip)
+    seen = (np.abs(turn - ahead) < 0.15) | (np.abs(turn - again) < 0.4)
+    bearing = wrap_angle((1.0 - slip) * (ahead - turn[seen]))
+    count = int(seen.sum())
+    mapper.add_lights(
+        1, LightSightings(stamps[seen], np.zeros(count, dtype=np.int64), bearing, np.full(count, 0.02))
+    )
+    for number in numbers:
+        mapper.leave(number)
+    mapper.graph.solve(10)
+    assert mapper.graph.constraints.bearing_count == 1
+    begin = np.flatnonzero(mapper.graph.robot[: mapper.graph.count] == 1)[0]
+    assert wrap_angle(mapper.graph.poses[begin, 2] - heading) == pytest.approx(0.0, abs=math.radians(2.0))
+
+
 def test_stops_are_told_from_drives() -> None:
     robot = RoomRobot(START, 0.0, None)
     parts = [robot.turn(1.0), robot.drive(0.5), robot.turn(-0.7), robot.drive(0.4)]

@@ -25,7 +25,7 @@ def kinds(rng: np.random.Generator) -> dict[str, Callable[[FloatArray, FloatArra
     sigma, robot = rng.uniform(0.01, 0.2, (3, 3)), np.array([0, 0, 1, 1])
     departures = model.Departures(FIRST, SECOND, turn, motion, sigma)
     ties = model.Ties(FIRST, SECOND, motion, sigma)
-    bearings = model.Bearings(FIRST, SECOND, turn, sigma[:, 0])
+    bearings = model.Bearings(FIRST, SECOND, turn, motion[:, 2], sigma[:, 0])
     return {
         "odometry": lambda s, _: model.odometry(s, departures),
         "ties": lambda s, _: model.ties(s, ties),
