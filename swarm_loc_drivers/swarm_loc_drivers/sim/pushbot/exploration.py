@@ -392,13 +392,9 @@ class Exploration:
         count = int(np.searchsorted(waiting_ns, until_ns, side="right"))
         self._unlooked_ns[robot] = waiting_ns[count:]
         sightings = self.robots[robot].lights(waiting_ns[:count], others)
-        if not len(sightings.stamp_ns):
-            return
-        if self.on_lights is not None:
+        if self.on_lights is not None and len(sightings.stamp_ns):
             self.on_lights(robot, sightings)
-        begin_s = time.process_time()
         self.mapper.add_lights(robot, sightings)
-        self.cpu_s += time.process_time() - begin_s
 
     def _others(self, robot: int) -> list[KinematicPushBot]:
         return [one for key, one in self.robots.items() if key != robot]
