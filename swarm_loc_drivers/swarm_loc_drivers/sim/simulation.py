@@ -140,11 +140,11 @@ def graph_of(options: SimulationOptions, swarm: Swarm, links: str) -> list[NodeS
     """
     kind = robot_type_of(swarm)
     chosen = replace(options, world=options.world or next(iter(kind.worlds), ""))
-    if all(robot.start is not None for robot in swarm.robots):
-        return kind.nodes(chosen, swarm, links, options.swarm_file)
-    whole = Path(links) / "placed.yaml"
-    save_swarm(placed(options, swarm), whole)
-    return kind.nodes(chosen, swarm, links, str(whole))
+    whole, file = placed(options, swarm), Path(options.swarm_file)
+    if whole is not swarm:
+        file = Path(links) / "placed.yaml"
+        save_swarm(whole, file)
+    return kind.nodes(chosen, swarm, links, str(file))
 
 
 def seen_from_above(swarm: Swarm) -> Swarm:
@@ -177,6 +177,11 @@ def _world(swarm_file: str, options: SimulationOptions, links: str, **own: Param
     """Parameters of a world's node."""
     shared: Parameters = {"swarm_file": swarm_file, "seed": options.seed, "rate": options.rate}
     return {**shared, "link_folder": links, **own}
+
+
+def _epuck_starts(_: SimulationOptions, robots: int) -> FloatArray:
+    """Places of an odd number of robots: of an even number, opposite ones would meet at the crossing."""
+    return eight_starts(robots + 1 - robots % 2)[:robots]
 
 
 def _epuck_nodes(options: SimulationOptions, swarm: Swarm, links: str, whole: str) -> list[NodeSpec]:
@@ -299,7 +304,7 @@ def _check_pushbots(swarm: Swarm) -> None:
 
 EPUCK = RobotType(
     "epuck",
-    lambda _, robots: eight_starts(robots),
+    _epuck_starts,
     check_swarm,
     _epuck_nodes,
     ("w2", "w0", "w2fast"),

@@ -101,6 +101,15 @@ def test_droplets_get_a_table_one_fleet_of_drivers_and_a_tracker(tmp_path: Path)
         assert node.parameters.get("use_sim_time", False) is (name != "droplet_world")
 
 
+@pytest.mark.parametrize("robots", [2, 4, 5, 12])
+def test_no_two_e_pucks_begin_at_one_place(tmp_path: Path, robots: int) -> None:
+    swarm_file = tmp_path / "swarm.yaml"
+    assert new.main([str(swarm_file), "--yes", "--type", "epuck", "--robots", str(robots)]) == 0
+    options = SimulationOptions(str(swarm_file))
+    starts = np.array([robot.start for robot in placed(options, simulated_swarm(options)).robots])
+    assert min(np.linalg.norm(a - b) for a, b in itertools.combinations(starts[:, :2], 2)) > 0.08
+
+
 @pytest.mark.parametrize(
     ("kind", "told"),
     [("droplet", ["droplet_world", "droplet_steering"]), ("pushbot", ["pushbot_world", "mapper"])],

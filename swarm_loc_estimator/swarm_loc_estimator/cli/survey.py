@@ -1,7 +1,7 @@
 """Find the places of landmarks while robots drive around, without ground truth.
 
     survey recording.mcap --swarm swarm.yaml --out surveyed.yaml     a bag
-    survey swarm.yaml --out surveyed.yaml                            the live graph, until Ctrl-C
+    survey swarm.yaml --out surveyed.yaml                            the live graph, until Ctrl-C or for 180 s
 
 The swarm description has the robots; that of a bag is the `swarm.yaml` inside its folder unless --swarm names
 another. Every marker that belongs to no robot is a landmark, and every such radio an anchor. Described
@@ -38,6 +38,8 @@ from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 _LIVE_S = 180.0
 _SENSORS = ("odometry", "imu", "detections", "ranges")
+_SURVEYED = ("unknown_id", "uwb_unknown_address")
+"""Reasons for which the estimator drops what a survey needs."""
 
 
 @exit_with_message
@@ -59,9 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             recording = read_recording(options.source, swarm, progress, options.remap)
         done = survey(recording, swarm, progress, cameras=options.all)
     save_swarm(done.swarm, options.out, f"Surveyed with {recording.name}.")
-    print(
-        "\n".join([done.text, *recording.sentences(("unknown_id", "uwb_unknown_address"))])
-    )  # those are surveyed
+    print("\n".join([done.text, *recording.sentences(_SURVEYED)]))
     print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
     return 0
 

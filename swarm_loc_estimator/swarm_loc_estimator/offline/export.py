@@ -61,7 +61,7 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
 def write_tum(result: ReplayResult, folder: Path) -> None:
     """Write trajectories as text, one line `seconds x y z qx qy qz qw` per pose in `map`.
 
-    `<robot>.tum` has the estimated poses, `<robot>_truth.tum` the ground truth at the same instants, as far
+    `<robot>.tum` has the estimated poses, `<robot>.truth.tum` the ground truth at the same instants, as far
     as it is known there. So evo, which pairs the nearest stamps, finds the errors of the report.
 
     Args:
@@ -75,7 +75,7 @@ def write_tum(result: ReplayResult, folder: Path) -> None:
         if robot.name in result.truth:
             truth, known = interpolate(result.truth[robot.name], result.stamp_ns, DEFAULT_GAP_NS)
             truth[~known] = np.nan
-            _write_tum(folder / f"{robot.name}_truth.tum", result.stamp_ns, truth + 0.0 * pose)
+            _write_tum(folder / f"{robot.name}.truth.tum", result.stamp_ns, truth + 0.0 * pose)
 
 
 def _write_tum(path: Path, stamp_ns: IntArray, pose: FloatArray) -> None:

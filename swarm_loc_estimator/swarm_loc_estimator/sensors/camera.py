@@ -62,7 +62,10 @@ FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def _tilt(pitch: float, roll: float) -> FloatArray:
-    """Rotation (3, 3) of the axes of a camera that is turned down, and about its optical axis [rad]."""
+    """Rotation (3, 3) of the axes of a camera that is turned down, and about its optical axis [rad].
+
+    SciPy's `Rotation` has this, too, but takes as long to import as numpy.
+    """
     down, level, across, upright = math.sin(pitch), math.cos(pitch), math.sin(roll), math.cos(roll)
     rows = [[level, down * across, down * upright], [0.0, upright, -across]]
     return np.array([*rows, [-down, level * across, level * upright]])

@@ -132,7 +132,7 @@ def test_exported_trajectories_have_the_errors_of_the_report(result: ReplayResul
     write_tum(result, tmp_path)
     assert len([*tmp_path.iterdir()]) == 10
     for name, summary in result.summaries.items():
-        found, truth = (np.loadtxt(tmp_path / f"{name}{end}.tum") for end in ("", "_truth"))
+        found, truth = (np.loadtxt(tmp_path / f"{name}{end}.tum") for end in ("", ".truth"))
         found = found[np.isin(found[:, 0], truth[:, 0])]
         assert np.array_equal(found[:, 0], truth[:, 0])
         away = np.linalg.norm(found[:, 1:3] - truth[:, 1:3], axis=1)

@@ -13,7 +13,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
-from swarm_loc_estimator.offline.survey.fixed import Paths, Placed, place_fixed
+from swarm_loc_estimator.offline.survey.cameras_and_anchors import Paths, Placed, place_fixed
 from swarm_loc_estimator.offline.survey.problem import MIN_SIGHTINGS, SurveyProblem, problem_of
 from swarm_loc_estimator.offline.survey.solve import Solution, Solver
 from swarm_loc_estimator.offline.survey.start import start_of
