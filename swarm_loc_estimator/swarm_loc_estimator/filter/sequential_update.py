@@ -95,10 +95,10 @@ def update_in_order(
         if accepted:
             noise, jacobian = batch.noise[0], batch.jacobian[0]
             record_pair(measurements, k, belief, batch.pair[0])
-            count_repeated(measurements, k, belief, scratch.predicted, batch.columns[0], jacobian, noise)
-            correct(
-                belief, update_one(belief.covariance, batch.columns[0], jacobian, batch.innovation[0], noise)
-            )
+            columns = batch.columns[0]
+            correction, gain = update_one(belief.covariance, columns, jacobian, batch.innovation[0], noise)
+            count_repeated(measurements, k, belief, scratch.predicted, gain[:, columns[:6]], jacobian, noise)
+            correct(belief, correction)
             for i in range(2):
                 learn(belief, sides[i], pose[i], measurements.stamp_ns[k])
         lost = count_gated(measurements, k, belief, accepted, limits)

@@ -247,7 +247,7 @@ class Fusion:
         gone = confirm_all(fields, belief, accepted)
         if accepted[0]:
             evaluated = batch.columns[0], batch.jacobian[0], batch.innovation[0], batch.noise[0]
-            correct(belief, update_one(belief.covariance, *evaluated))
+            correct(belief, update_one(belief.covariance, *evaluated)[0])
             learn_all(fields, belief, batch.pose)
         gone |= count_all_gated(fields, belief, accepted, self._limits)
         for robot in np.flatnonzero(gone).tolist():

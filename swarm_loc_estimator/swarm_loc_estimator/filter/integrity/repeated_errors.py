@@ -21,14 +21,12 @@ import math
 
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.small_matrix import (
     add_scaled,
     assign_matrix,
-    cholesky3,
     factor_numbers,
-    solve3,
 )
 from swarm_loc_estimator.filter.belief import BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.filter.integrity.pairs import find_pair
@@ -47,18 +45,18 @@ def count_repeated(
     k: int,
     belief: BeliefArrays,
     predicted: FloatArray,
-    columns: IntArray,
+    gain: FloatArray,
     jacobian: FloatArray,
     noise: FloatArray,
 ) -> None:
-    """Update the excess covariances of both robots of measurement k; the filter is updated by it afterwards.
+    """Update the excess covariances of both robots of measurement k.
 
     Args:
         measurements: (m,).
         k: Which one.
-        belief: Predicted, of a dense filter; its integrity is changed.
+        belief: Its integrity is changed.
         predicted: (3,) value.
-        columns: (DEPENDS_ON,) filter columns.
+        gain: (3, 6) of the poses of both sides; not used for a side that is missing.
         jacobian: (3, DEPENDS_ON) of the innovation.
         noise: (3, 3) of the measurement.
     """
@@ -70,10 +68,10 @@ def count_repeated(
         2 if measurements.target[k] >= 0 else 1,
     )
     state, after, wider = belief.integrity, np.zeros((2, 3, 3)), np.empty((2, 3, 3))
-    gain = _gain(belief.covariance, columns, jacobian, noise)
     kept = _kept(state, robots[0], place, measurements.kind[k], predicted)
     for i in range(sides):
-        left, own = _left(gain, jacobian, i, i), state.repeated[robots[i]]
+        own_gain = gain[:, 3 * i : 3 * i + 3].T
+        left, own = _left(own_gain, jacobian, i, i), state.repeated[robots[i]]
         for other in range(own.shape[0]):
             if state.source[robots[i], other] >= 0:
                 _multiply(left, own[other, 0])
@@ -81,9 +79,9 @@ def count_repeated(
         if i == 1:
             _multiply(left, pair)
         for j in range(sides):
-            left = _left(gain, jacobian, i, j)
+            left = _left(own_gain, jacobian, i, j)
             add_scaled(after[i], _times(_times(left, state.excess[robots[j]]), left.T), 1.0)
-        cross, new = _times(pair, gain[i].T), _times(gain[i], noise)
+        cross, new = _times(pair, own_gain.T), _times(own_gain, noise)
         for a in range(3):
             for b in range(3):
                 wider[i, a, b] = after[i, a, b] - kept * (cross[a, b] + cross[b, a])
@@ -125,30 +123,11 @@ def _multiply(left: FloatArray, matrix: FloatArray) -> None:
 @cached_njit
 def _left(gain: FloatArray, jacobian: FloatArray, i: int, j: int) -> FloatArray:
     """What the update leaves of the error of side j in that of side i (3, 3): a block of I - K H."""
-    left = _times(gain[i], jacobian[:, 3 * j : 3 * j + 3])
+    left = _times(gain, jacobian[:, 3 * j : 3 * j + 3])
     for a in range(3):
         for b in range(3):
             left[a, b] = (1.0 if i == j and a == b else 0.0) - left[a, b]
     return left
-
-
-@cached_njit
-def _gain(p: FloatArray, columns: IntArray, jacobian: FloatArray, noise: FloatArray) -> FloatArray:
-    """Gain (2, 3, 3) of the poses of both sides; undefined for a side that is missing."""
-    count, gain, s = columns.size, np.empty((2, 3, 3)), np.empty((3, 3))
-    projected = np.zeros((count, 3))
-    assign_matrix(s, noise)
-    for a in range(count):
-        for c in range(count):
-            for r in range(3):
-                projected[a, r] += p[columns[a], columns[c]] * jacobian[r, c]
-        for i in range(3):
-            for r in range(3):
-                s[i, r] += jacobian[i, a] * projected[a, r]
-    factor = cholesky3(s)
-    for a in range(6):
-        solve3(factor, projected[a], gain[a // 3, a % 3])
-    return gain
 
 
 @cached_njit
