@@ -71,6 +71,10 @@ def test_the_key_follows_messages_and_versions_but_not_the_folder(
     monkeypatch.setattr(install, "versions", lambda: "wheels 2")
     assert build.shared_key("swarm_loc_msgs") not in (here, "")
     monkeypatch.setattr(install, "versions", lambda: "wheels 1")
+    with monkeypatch.context() as other_generators:
+        other_generators.setattr(build, "PYTHON_ONLY", tmp_path / "swarm_loc_msgs/README.md")
+        assert build.shared_key("swarm_loc_msgs") not in (here, "")
+    assert build.shared_key("swarm_loc_msgs") == here
     (tmp_path / "swarm_loc_msgs/msg/Range.msg").write_text("float32 other\n", encoding="utf-8")
     assert build.shared_key("swarm_loc_msgs") not in (here, "")
 

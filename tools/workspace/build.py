@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from workspace import install, shared, tf2_msgs
+from workspace import host, install, shared, tf2_msgs
 from workspace.layout import LOGS, PACKAGES, ROOT, STATE, VENV_PYTHON, WorkspaceError
 from workspace.progress import run_logged, say, step
 from workspace.stamps import Stamp, digest, write_whole
@@ -36,6 +36,8 @@ COPIED = (
 MESSAGES = ("swarm_loc_msgs", "tf2_msgs")
 """Packages that take most of a build, and that clones share."""
 LINKED_ONE_BY_ONE = "launch/*"
+PYTHON_ONLY = Path(__file__).parent / "python_only/rosidl_default_generatorsConfig.cmake"
+"""CMake package that leaves out what no Python node loads of messages."""
 
 _COMPILE = """
 from functools import partial
@@ -140,6 +142,8 @@ def _inputs(name: str) -> str:
 
 def _inputs_anywhere(name: str, *facts: str) -> str:
     """Hash of the files on which the build of a package depends, and of further facts."""
+    if name in MESSAGES:
+        facts = (*facts, PYTHON_ONLY.read_text(encoding="utf-8"))
     if name == "tf2_msgs":
         return digest([], *facts, *tf2_msgs.FILES.values())
     folder = ROOT / name
@@ -154,6 +158,12 @@ def _colcon_build(sources: dict[str, Path], env: dict[str, str]) -> None:
     command: list[str | Path] = [VENV_PYTHON, "-m", "colcon", "--log-base", LOGS / "colcon"]
     command += ["build", "--symlink-install"]
     command += ["--build-base", BUILD, "--install-base", INSTALL, "--paths", *sources.values()]
+    if host.ros_prefix() is None:
+        command += [
+            "--cmake-args",
+            f"-Drosidl_default_generators_DIR={PYTHON_ONLY.parent}",
+            "-DBUILD_TESTING=OFF",
+        ]
     with step(f"building {', '.join(sources)}"):
         status, output = run_logged(command, "build.log", _colcon_status, env, ROOT)
     if status:

@@ -41,6 +41,9 @@ _FOREIGN = {*sys.stdlib_module_names, "numpy", "numba", "scipy", "llvmlite"}
 _PLAIN = (int, float, complex, str, bytes, type(None), type(...), np.generic, np.dtype)
 _core: Any = core  # most of it has no types
 _core.config.DISABLE_JIT = 0  # NUMBA_DISABLE_JIT has no effect: only compiled code reads records
+if "NUMBA_OPT" not in os.environ:
+    # numba's 3 compiles for a quarter longer, and the code is no faster: loops are short or branch
+    _core.config.OPT = type(_core.config.OPT)(1)
 _registry: Any = core.registry
 _types = _core.types
 _OPTIONS = f"numba {numba.__version__}, Python {sys.version}"
@@ -341,7 +344,8 @@ def _functions_of(module: ModuleType) -> Iterator[Any]:
 
 def _digest(parts: list[str], codegen: Any) -> str:
     checked = _core.config.BOUNDSCHECK
-    text = "\n".join([_OPTIONS, f"boundscheck {checked}", repr(codegen.magic_tuple()), *parts])
+    level = int(_core.config.OPT)
+    text = "\n".join([_OPTIONS, f"boundscheck {checked} opt {level}", repr(codegen.magic_tuple()), *parts])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 
