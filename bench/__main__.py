@@ -11,6 +11,7 @@ BENCHMARKS = {
     "commissioning": "bench.commissioning",
     "droplet": "bench.droplet",
     "droplet_real": "bench.droplet.real",
+    "drivers": "bench.graph.drivers",
     "epuck": "bench.epuck",
     "inputs": "bench.inputs",
     "integrity": "bench.integrity",
