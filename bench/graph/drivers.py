@@ -33,7 +33,7 @@ from swarm_loc_drivers.epuck.hardware import EPUCK2
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.world import EpuckWorldParameters, SimulatedEpuck, make_world
 from swarm_loc_drivers.sim.link_host import FirmwareHost
-from swarm_loc_estimator.common.launch import NodeSpec
+from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue
 from swarm_loc_estimator.offline.live.graph import LiveGraph, Recorder, cpu_seconds
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
@@ -171,7 +171,11 @@ def _nodes(robots: int, work: Path) -> list[NodeSpec]:
     nodes = [NodeSpec("swarm_loc_estimator", "estimator_node", "estimator", "", estimator)]
     for name in (f"epuck{k + 1}" for k in range(robots)):
         # robots pause in the measurement, which their drivers shall not take for a lost link
-        driver = {"address": f"{work}/{name}", "reading_rate": RATE_HZ, "reply_timeout_s": 10.0}
+        driver: dict[str, ParameterValue] = {
+            "address": f"{work}/{name}",
+            "reading_rate": RATE_HZ,
+            "reply_timeout_s": 10.0,
+        }
         nodes.append(NodeSpec("swarm_loc_drivers", "epuck_driver_node", "epuck_driver", name, driver))
     return nodes
 
