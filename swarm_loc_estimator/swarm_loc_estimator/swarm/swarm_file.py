@@ -132,10 +132,10 @@ RESERVED_NAMES = frozenset(
     ]
 )
 """Names of topics, nodes and frames that a robot's namespace must not collide with."""
-MAX_ROBOTS = 1000
+MAX_ROBOTS = 5000
 """Maximum number of robots; larger swarms have not been tested."""
-MAX_STATES = 10_000
-"""Maximum number of states of the dense filter, whose covariance then has 800 MB per checkpoint."""
+MAX_PARAMETERS = 10_000
+"""Maximum number of states beside the poses; the dense filter's covariance then has 800 MB per checkpoint."""
 
 
 class SwarmFileError(UserError):
@@ -213,10 +213,11 @@ class _Loader(TreeChecks):
             swarm = Swarm(robots, landmarks, cameras, anchors)
         except SwarmError as error:
             raise self.said(str(error).removesuffix(".")) from error
-        states = ParameterTable.of(swarm.robots, swarm.surveyed).filter_size
-        if states > MAX_STATES:
+        states = ParameterTable.of(swarm.robots, swarm.surveyed).filter_size - 3 * len(robots)
+        if states > MAX_PARAMETERS:
             raise self.said(
-                f"what has a sigma makes a filter of {states} states but must make at most {MAX_STATES}"
+                f"what has a sigma makes {states} states beside the poses"
+                f" but must make at most {MAX_PARAMETERS}"
             )
         return swarm
 

@@ -45,7 +45,7 @@ def test_a_bad_parameter_ends_the_node_with_one_sentence(
 @pytest.mark.parametrize(
     ("robot", "sentence"),
     [
-        ("  robot{}: {{}}", "robots names 10000 robots but must name at most 1000."),
+        ("  robot{}: {{}}", "robots names 10000 robots but must name at most 5000."),
         (
             LONG_ROBOT,
             "has more than the 2000000 bytes that are allowed.",

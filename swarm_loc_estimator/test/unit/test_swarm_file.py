@@ -247,17 +247,17 @@ def test_names_that_topics_and_frames_have_are_refused(tmp_path: Path, name: str
         (f"fileversion: 1\nrobots: {{a: {{start: {{x: {'9' * 400}, y: 0, theta: 0}}}}}}", "must lie in"),
         (f"fileversion: 1\nrobots: {{{'a' * 65}: }}", "must have at most 64 characters"),
         (
-            "fileversion: 1\nrobots:\n" + "".join(f"  a{k}:\n" for k in range(1001)),
-            "robots names 1001 robots but must name at most 1000",
+            "fileversion: 1\nrobots:\n" + "".join(f"  a{k}:\n" for k in range(5001)),
+            "robots names 5001 robots but must name at most 5000",
         ),
         (
             "fileversion: 1\nrobots:\n" + "".join(f"  a{k}: {{}}\n" for k in range(10_000)),
-            "robots names 10000 robots but must name at most 1000",
+            "robots names 10000 robots but must name at most 5000",
         ),
         (
             "fileversion: 1\ndefaults: {landmark: {position_sigma: 0.01}}\nrobots: {a: {}}\nlandmarks:\n"
-            + "".join(f"  {k}: {{x: {k}, y: 0}}\n" for k in range(3_333)),
-            "what has a sigma makes a filter of 10002 states but must make at most 10000",
+            + "".join(f"  {k}: {{x: {k}, y: 0}}\n" for k in range(3_334)),
+            "what has a sigma makes 10002 states beside the poses but must make at most 10000",
         ),
         ("#" * 2_000_001, "has more than the 2000000 bytes that are allowed"),
         ("%YAML 1.1\n---\nfileversion: 010", "fileversion is 10 but must be 1"),
