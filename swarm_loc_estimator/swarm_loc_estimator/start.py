@@ -24,6 +24,7 @@ replay = Program("swarm_loc_estimator.cli.replay")
 replay_map = Program("swarm_loc_estimator.cli.replay_map")
 schema = Program("swarm_loc_estimator.cli.schema")
 survey = Program("swarm_loc_estimator.cli.survey")
+sweep = Program("swarm_loc_estimator.cli.sweep")
 watch = Program("swarm_loc_estimator.cli.watch")
 watch_node = Program("swarm_loc_estimator.watch.watch_node")
 
@@ -39,6 +40,7 @@ WITHOUT_ROS = (
         replay_map,
         schema,
         survey,
+        sweep,
     ),
 )
 

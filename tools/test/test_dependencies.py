@@ -23,6 +23,7 @@ KEYS = {
     for module in (
         "aiohttp",
         "hypothesis",
+        "joblib",
         "matplotlib",
         "numba",
         "numpy",
@@ -35,6 +36,8 @@ KEYS = {
 """What rosdep calls modules that are no ROS packages."""
 FOR_BAGS = {"lz4", "mcap", "rosbags", "zstandard"}
 """rosdep knows no packages of them but by pip, and bloom refuses a package that depends on such ones."""
+CLUSTERS = {"distributed", "ray"}
+"""Only for sweeps on a cluster, imported by name: rosdep knows no packages of them; benchmarks run them."""
 PIP_NAMES = {"python3-pil": "pillow"}
 """What pip calls packages in which rosdep's name is another one."""
 LOADED_BY_NAME = {"swarm_loc_estimator": {"event_camera_msgs"}}
@@ -91,13 +94,14 @@ def test_a_wheel_of_the_estimator_requires_what_it_imports_as_the_workspace_does
     required = config["options"]["install_requires"].splitlines()
     required += [line for lines in config["options.extras_require"].values() for line in lines.splitlines()]
     of_wheel = least_versions(*required)
-    workspace = least_versions(*(ROOT / "requirements" / "workspace.txt").read_text("utf-8").splitlines())
+    files = [ROOT / "requirements" / f"{name}.txt" for name in ("workspace", "bench")]
+    workspace = least_versions(*(line for file in files for line in file.read_text("utf-8").splitlines()))
     assert {name: workspace[name] for name in of_wheel} == of_wheel
     keys = imported(ROOT / "swarm_loc_estimator", ["swarm_loc_estimator"])
     from_pip = {
         PIP_NAMES.get(key, key.removeprefix("python3-")) for key in keys if key.startswith("python3-")
     }
-    assert {name.replace("_", "-") for name in of_wheel} == from_pip | FOR_BAGS
+    assert {name.replace("_", "-") for name in of_wheel} == from_pip | FOR_BAGS | CLUSTERS
 
 
 @pytest.mark.parametrize("name", ["swarm_loc_vision", "swarm_loc_drivers"])

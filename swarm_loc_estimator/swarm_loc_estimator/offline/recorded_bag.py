@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,6 +15,7 @@ from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.messages.cdr import CdrError
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
+from swarm_loc_estimator.common.parameters import UserError, number, number_specs
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.offline.ground_truth import TruthReader, truth_topics
@@ -28,6 +30,61 @@ Progress = Callable[[float, str], None]
 
 def unwatched(_share: float, _what: str) -> None:
     """Ignore the progress."""
+
+
+class LossError(UserError):
+    """A loss that cannot be used; the message is one sentence."""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """Messages that are dropped at random before the estimator, as on a bad network.
+
+    Whether a message is lost depends on the seed, its topic and its place among the messages of this topic;
+    with a greater share the same messages are lost and others beside them.
+
+    Raises:
+        LossError: A number is out of range.
+    """
+
+    share: float = number(0.0, "1", 0.0, 0.99, "share of the messages that are lost")
+    seed: int = number(0, "1", 0, 2**32 - 1, "chooses which ones")
+
+    def __post_init__(self) -> None:
+        for name, spec in number_specs(type(self)).items():
+            if not spec.allows(value := getattr(self, name)):
+                raise LossError(f"{name} = {value} of a loss must lie in {spec.range_text}.")
+
+
+NOTHING_LOST = Loss()
+
+
+class Network:
+    """Passes on the messages that are not lost.
+
+    Args:
+        loss: Which are.
+        topics: Names; the index is the number in a batch.
+
+    Attributes:
+        lost: Number of messages.
+    """
+
+    def __init__(self, loss: Loss, topics: Sequence[str]) -> None:
+        self.lost = 0
+        self._share = loss.share
+        self._draws = [np.random.default_rng([loss.seed, zlib.crc32(name.encode())]) for name in topics]
+
+    def passed(self, batch: MessageBatch) -> MessageBatch:
+        """The messages of a batch, in order of arrival, that are not lost."""
+        if not self._share:
+            return batch
+        keeps = np.ones(batch.size, dtype=np.bool_)
+        for topic in np.unique(batch.topic).tolist():
+            rows = np.flatnonzero(batch.topic == topic)
+            keeps[rows] = self._draws[topic].random(rows.size) >= self._share
+        self.lost += int(np.sum(~keeps))
+        return batch.chosen(keeps)
 
 
 @dataclass(frozen=True)
@@ -59,6 +116,7 @@ def read_bag(
     take: Callable[[Batch], None],
     progress: Progress,
     remap: Mapping[str, str] = MappingProxyType({}),
+    loss: Loss = NOTHING_LOST,
 ) -> BagSummary:
     """Read a bag once.
 
@@ -68,11 +126,13 @@ def read_bag(
         take: Called with the inputs, in order of arrival.
         progress: Called now and then.
         remap: Expected topic -> topic of the bag, see `renamed_topics`.
+        loss: Inputs that are not passed on; ground truth, maps and goals are complete.
 
     Raises:
         BagError: Nothing in the bag can be read, or a topic cannot be mapped.
     """
     ingest, maps = Ingest(swarm), MapReader(swarm)
+    network = Network(loss, [*ingest.handle_of])
     known = [*ingest.handle_of, *truth_topics(swarm), *maps.topics]
     with BagReader(bag, renamed_topics(remap, swarm, known)) as reader:
         truth = TruthReader(swarm, reader.topics)
@@ -81,7 +141,7 @@ def read_bag(
         range_ns = reader.time_range_ns
         foreign = _foreign(reader.topics, ingest)
         for batch in reader.batches(["" if name in foreign else name for name in known]):
-            for inputs in ingest.read(batch.chosen(batch.topic < first_truth)):
+            for inputs in ingest.read(network.passed(batch.chosen(batch.topic < first_truth))):
                 take(inputs)
             truth.add(_from(batch.chosen(batch.topic < first_map), first_truth))
             maps.add(_from(batch, first_map))
@@ -92,6 +152,8 @@ def read_bag(
             f"{swarm.robots[robot].name} {one.problem}. {one.remedy}."
             for robot, one in ingest.clocks_apart().items()
         )
+        if network.lost:
+            found = (f"{network.lost} messages were dropped at random: {loss.share:g} of all.", *found)
         remarks = (*reader.losses, *found, *clocks, *truth.remarks(), *maps.remarks())
         unusable = () if any(one.received > one.malformed for one in ingest.statistics) else unusable
         tracks, shown = truth.tracks(), (maps.maps(), maps.goals())

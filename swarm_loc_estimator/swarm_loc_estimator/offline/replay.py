@@ -22,7 +22,7 @@ from swarm_loc_estimator.common.command_line import swarm_beside
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.identification.memory import Identities
-from swarm_loc_estimator.offline.recorded_bag import Progress, read_bag, unwatched
+from swarm_loc_estimator.offline.recorded_bag import NOTHING_LOST, Loss, Progress, read_bag, unwatched
 from swarm_loc_estimator.offline.result import AerialImage, ReplayResult
 from swarm_loc_estimator.offline.spool import Spool
 from swarm_loc_estimator.sensors.aerial import AerialRows
@@ -50,6 +50,7 @@ def replay(
     tick_s: float = TICK_S,
     stamp_ns: npt.NDArray[np.int64] | None = None,
     remap: Mapping[str, str] = MappingProxyType({}),
+    loss: Loss = NOTHING_LOST,
     keep_sightings: bool = False,
     progress: Progress = unwatched,
 ) -> ReplayResult:
@@ -62,6 +63,7 @@ def replay(
         tick_s: Time between two outputs [s].
         stamp_ns: (T,) increasing; outputs at these instants instead, such as those of a live run.
         remap: Expected topic -> topic of the bag to read instead; `<robot>` in both stands for each robot.
+        loss: Messages that are dropped at random before the estimator; ground truth is complete.
         keep_sightings: Whether sightings and aerial images are kept for display, too.
         progress: Called now and then with the share done and what is being done.
 
@@ -76,7 +78,7 @@ def replay(
     schedule = periodic if stamp_ns is None else ListedSchedule(_increasing(stamp_ns))
     estimator = Estimator(swarm, settings)
     runner = Runner(estimator, schedule, keep_sightings=keep_sightings)
-    summary = read_bag(bag, swarm, runner.take, progress, remap)
+    summary = read_bag(bag, swarm, runner.take, progress, remap, loss)
     if summary.unusable:
         raise BagError(
             "\n".join([f"'{bag}' holds no message that the estimator can use.", *summary.unusable])

@@ -35,7 +35,7 @@ def run(*arguments):
 """
 COMMANDS = {
     *("calibrate", "calibrate_ir", "doctor", "import_droplets", "import_mrclam", "new"),
-    *("replay", "replay_map", "schema", "survey"),
+    *("replay", "replay_map", "schema", "survey", "sweep"),
 }
 NODES = {"estimator_node", "localizer_bridge", "mapper_node", "markers_node", "play", "watch_node"}
 STARTERS = {"demo", "graph", "watch"}

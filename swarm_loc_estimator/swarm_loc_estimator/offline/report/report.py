@@ -126,13 +126,18 @@ def html_report(result: ReplayResult, pictures: dict[str, Path]) -> str:
         _remarks(result),
         _errors(result),
         _player(result),
-        *(_picture(heading, path) for heading, path in pictures.items()),
+        *(picture(heading, path) for heading, path in pictures.items()),
         _self_calibration(result),
         _counters(result),
     ]
+    return page_of(result.title, parts)
+
+
+def page_of(title: str, parts: Sequence[str]) -> str:
+    """A page in the style of reports, of parts that are HTML; empty ones are left out."""
     head = (
         '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{escape(result.title)}</title><style>{_STYLE}</style>"
+        f"<title>{escape(title)}</title><style>{_STYLE}</style>"
     )
     body = "\n".join(part for part in parts if part)
     return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
@@ -207,7 +212,7 @@ def _self_calibration(result: ReplayResult) -> str:
     return f"{title}{table if rows else ''}<p>{escape(sentence)}</p>"
 
 
-def _picture(heading: str, path: Path) -> str:
+def picture(heading: str, path: Path) -> str:
     """A plot embedded in the page."""
     data = base64.b64encode(path.read_bytes()).decode("ascii")
     name = escape(heading)

@@ -1,0 +1,65 @@
+"""Replay bags with many settings, losses and seeds: one table, with plots.
+
+    sweep sweep.yaml
+    sweep sweep.yaml --out out/horizons
+    sweep sweep.yaml --backend ray --cluster 192.168.1.10:6379
+
+The file names bags and a grid of settings; every combination is replayed, see doc/sweep.md. table.csv has
+one row per replay; sweep.html and the PNG files show what each varied value does. An interrupted sweep goes
+on from where it was when it is started again, and its table is the same, byte for byte. Replays that failed
+are rows with the reason, and the next run tries them again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from swarm_loc_estimator.common.command_line import (
+    ProgressLine,
+    command_parser,
+    exit_with_message,
+    folder_to_write,
+)
+from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.offline.sweep.grid import read_sweep
+from swarm_loc_estimator.offline.sweep.jobs import run_sweep
+from swarm_loc_estimator.offline.sweep.report import rows_of, write_results
+from swarm_loc_estimator.offline.sweep.workers import NAMES, Backend
+
+
+@exit_with_message
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    options = _parser().parse_args(arguments)
+    if options.cluster and options.backend == "loky":
+        raise UserError("--cluster is for --backend ray or dask; loky has the processes of this machine.")
+    sweep = read_sweep(options.file)
+    with ProgressLine() as progress:
+        backend = Backend(options.backend, options.cluster)
+        finished = run_sweep(sweep, options.out / "jobs.jsonl", backend, progress)
+        progress(1.0, "writing the table and plots")
+        rows = rows_of(sweep, finished)
+        page = write_results(rows, sweep.varied, options.out)
+    print(f"{len(rows)} replays\nTable: {options.out / 'table.csv'}\nPage:  {page}")
+    if failed := [row for row in rows if row["failure"]]:
+        first = f"the first: {failed[0]['failure']}"
+        print(f"{len(failed)} of {len(rows)} replays failed, {first}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    """The command line."""
+    parser = command_parser(__doc__)
+    parser.add_argument("file", metavar="SWEEP_FILE", type=Path, help="what is replayed")
+    parser.add_argument("--out", type=folder_to_write, default="out/sweep", help="folder for the results")
+    parser.add_argument("--backend", choices=NAMES, default=NAMES[0], help="what runs the replays")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="a running cluster of Ray or Dask")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

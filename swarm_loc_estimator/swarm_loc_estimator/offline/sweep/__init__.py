@@ -1,0 +1,1 @@
+"""Sweeps: many deterministic replays of a grid of settings, their table and plots."""
