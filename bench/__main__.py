@@ -22,6 +22,7 @@ BENCHMARKS = {
     "reading": "bench.peers.reading",
     "scaling": "bench.peers.scaling",
     "soak": "bench.graph.soak",
+    "sweep": "bench.sweep",
     "vision": "bench.vision",
     "watch": "bench.watch",
 }

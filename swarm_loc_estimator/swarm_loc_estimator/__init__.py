@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.mapping.scans import Readings as Readings
     from swarm_loc_estimator.offline.metrics import Errors as Errors
     from swarm_loc_estimator.offline.metrics import ErrorSummary as ErrorSummary
+    from swarm_loc_estimator.offline.recorded_bag import Loss as Loss
     from swarm_loc_estimator.offline.replay import replay as replay
     from swarm_loc_estimator.offline.report.report import write_report as write_report
     from swarm_loc_estimator.offline.result import ReplayResult as ReplayResult
@@ -53,6 +54,7 @@ _MODULES = {
     "swarm_loc_estimator.mapping.messages": ("decode_laser",),
     "swarm_loc_estimator.mapping.scans": ("UNSEEN", "LightSightings", "Readings"),
     "swarm_loc_estimator.offline.metrics": ("Errors", "ErrorSummary"),
+    "swarm_loc_estimator.offline.recorded_bag": ("Loss",),
     "swarm_loc_estimator.offline.replay": ("replay",),
     "swarm_loc_estimator.offline.report.report": ("write_report",),
     "swarm_loc_estimator.offline.result": ("ReplayResult",),

@@ -17,9 +17,12 @@ from swarm_loc_estimator.cli import (
     replay,
     replay_map,
     survey,
+    sweep,
     watch,
 )
 from swarm_loc_estimator.common.parameters import number_specs
+from swarm_loc_estimator.offline.sweep.grid import KEYS, read_sweep
+from swarm_loc_estimator.offline.sweep.jobs import FIGURES
 from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS, SENSORS
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Landmark
 from swarm_loc_estimator.swarm.swarm_file import MODELS, load_swarm
@@ -63,6 +66,17 @@ def test_the_example_of_overhead_cameras_is_a_swarm(tmp_path: Path) -> None:
     assert all(face.lies for robot in swarm.robots for face in robot.faces)
 
 
+def test_the_page_of_sweeps_has_all_keys_and_columns_and_its_example_is_a_sweep(tmp_path: Path) -> None:
+    page = (DOC / "sweep.md").read_text(encoding="utf-8")
+    assert [key for key in KEYS if f"| `{key}` |" not in page] == []
+    assert [column for column in FIGURES if f"`{column}`" not in page] == []
+    (example,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    (tmp_path / "bags").symlink_to(DOC.parents[1] / "bags")
+    (tmp_path / "sweep.yaml").write_text(example, encoding="utf-8")
+    read = read_sweep(tmp_path / "sweep.yaml")
+    assert f"makes {len(read.jobs)} replays" in page
+
+
 def test_every_number_of_radios_has_its_place() -> None:
     page = (DOC / "uwb.md").read_text(encoding="utf-8")
     assert table_of(UwbDevice) in page
@@ -70,7 +84,7 @@ def test_every_number_of_radios_has_its_place() -> None:
 
 
 @pytest.mark.parametrize(
-    "command", [new, replay, replay_map, calibrate, calibrate_ir, import_mrclam, survey, watch]
+    "command", [new, replay, replay_map, calibrate, calibrate_ir, import_mrclam, survey, sweep, watch]
 )
 def test_every_option_of_a_command_has_its_place(command: object, capsys: pytest.CaptureFixture[str]) -> None:
     main: Callable[[list[str]], int] = command.main  # type: ignore[attr-defined]

@@ -110,12 +110,12 @@ def test_one_name_loads_neither_the_filter_nor_plots_nor_a_server(name: str) -> 
 def test_the_page_names_what_there_is_and_its_code_runs() -> None:
     text = PAGE.read_text(encoding="utf-8")
     blocks = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
-    assert len(blocks) == 3
+    assert len(blocks) == 4
     printed = [run("-c", block).split("\n") for block in blocks]
     assert float(printed[0][0]) == pytest.approx(0.0027, abs=1e-4)
     assert [line.split()[0] for line in printed[1][:-1]] == [f"epuck{k}" for k in range(1, 6)]
-    assert printed[2][0] == "[[0.02 0.   0.  ]]"
-    assert printed[2][1] == "{}"
+    assert printed[3][0] == "[[0.02 0.   0.  ]]"
+    assert printed[3][1] == "{}"
 
 
 def test_the_example_prints_the_errors_of_the_report(result: ReplayResult) -> None:

@@ -16,7 +16,7 @@ from swarm_loc_estimator.cli.sweep import main
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.sweep import grid, jobs
-from swarm_loc_estimator.offline.sweep.grid import SweepFileError, read_sweep
+from swarm_loc_estimator.offline.sweep.grid import Job, SweepFileError, read_sweep
 from swarm_loc_estimator.offline.sweep.jobs import FIGURES, outcome
 from swarm_loc_estimator.offline.sweep.report import Row, _span, write_results
 
@@ -60,7 +60,7 @@ def finished(folder: Path) -> Path:
 def test_every_combination_is_a_job_in_the_order_of_the_file(folder: Path) -> None:
     shutil.copytree(folder / "short", folder / "again")
     written(folder, "fileversion: 1\nrobots: {alone: {}}", "other.yaml")
-    bags = "bags: [short, 'a*']\nswarms: [short/swarm.yaml, other.yaml]\n"
+    bags = "bags: [short, 'a*', '*']\nswarms: [short/swarm.yaml, other.yaml]\n"
     sweep = read_sweep(written(folder, bags + GRID))
     assert len(sweep.jobs) == 2 * 2 * 2 * 3  # where nothing is lost, seeds do not matter
     assert [*sweep.jobs[0].cells] == ["bag", "swarm", "horizon_s", "lost", "seed"]
@@ -126,12 +126,16 @@ def test_a_job_is_another_when_anything_changes_that_determines_its_result(folde
         ),
         ("bags: [short]\nlost: [0, 1]", "parameter lost[1] = 1.0 must lie in [0, 0.99]"),
         ("bags: [short]\nlost: [0.1, 0.1]", "lost is [0.1, 0.1] but must be a list of at least one value"),
+        (
+            "bags: [short]\nsettings: {horizon_s: [1, 1.0]}",
+            "settings.horizon_s is [1, 1.0] but must be a list",
+        ),
         ("bags: [short]\nlost: [0.1]\nseeds: [0.5]", "parameter seeds[0] = 0.5 must be a whole number"),
         (
             "bags: [short]\nseeds: [1]",
             "seeds choose which messages are lost, but lost names no share above 0",
         ),
-        ("bags: [short]\nworkers: 0", "parameter workers[0] = 0 must lie in [1, 4096]"),
+        ("bags: [short]\nworkers: 0", "parameter workers = 0 must lie in [1, 4096]"),
     ],
 )
 def test_what_cannot_be_run_is_one_sentence(
@@ -173,7 +177,7 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The keys of the jobs that run from now on."""
     ran: list[str] = []
 
-    def watched(job: jobs.Job) -> jobs.Line:
+    def watched(job: Job) -> jobs.Line:
         ran.append(job.key)
         return outcome(job)
 
@@ -233,9 +237,9 @@ def test_a_fault_of_the_program_ends_one_job(folder: Path, monkeypatch: pytest.M
 
 def test_ctrl_c_ends_a_sweep_with_what_is_finished(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = written(folder, "bags: [short]\n" + GRID)
-    done: list[jobs.Job] = []
+    done: list[Job] = []
 
-    def interrupted(job: jobs.Job) -> jobs.Line:
+    def interrupted(job: Job) -> jobs.Line:
         done.append(job)
         if len(done) > 2:
             raise KeyboardInterrupt
@@ -296,7 +300,7 @@ def test_without_truth_the_page_shows_what_the_estimator_reports(tmp_path: Path)
 
 
 def test_bands_are_those_of_seeds_alone() -> None:
-    found = [{"seed": None, "x": 1.0}, {"seed": 1, "x": 3.0}, {"seed": 2, "x": 7.0}]
+    found: list[Row] = [{"seed": None, "x": 1.0}, {"seed": 1, "x": 3.0}, {"seed": 2, "x": 7.0}]
     np.testing.assert_array_equal(_span([found, found[:1], []], "x").T, [[2, 3, 4], [1, 1, 1], [np.nan] * 3])
 
 

@@ -1,15 +1,4 @@
-"""Reader of sweeps: a YAML file to the list of all replays, in the order of the table.
-
-```yaml
-bags: [eight_five_robots, recordings/*]   # paths or patterns, from the folder of this file
-swarms: [swarm.yaml, other.yaml]          # left out: the swarm.yaml beside each bag
-settings:                                 # of the estimator; every combination is replayed
-  horizon_s: [0.5, 2.0]
-lost: [0.0, 0.1]                          # shares of the messages that are dropped at random
-seeds: [1, 2, 3]                          # choose which messages are lost
-workers: 2                                # left out: one for each processor
-```
-"""
+"""Reader of sweeps, see doc/sweep.md: a YAML file to the list of all replays, in the order of the table."""
 
 from __future__ import annotations
 
@@ -41,7 +30,7 @@ from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 from swarm_loc_estimator.timeline.settings import Settings
 
 MAX_JOBS = 100_000
-_KEYS = ("bags", "swarms", "settings", "lost", "seeds", "workers")
+KEYS = ("bags", "swarms", "settings", "lost", "seeds", "workers")
 _SETTINGS = {spec.name: spec for spec in parameter_specs(Settings)}
 _SHARE, _SEED = parameter_specs(Loss)
 _WORKERS = ParameterSpec("workers", 1, "", NumberSpec("1", 1, 4096, False, "replays at a time"))
@@ -96,29 +85,34 @@ def read_sweep(path: Path) -> Sweep:
         YamlTreeError: The file is no YAML.
         SwarmFileError: A swarm description cannot be used.
     """
-    return _Reader(path).sweep(read_tree(path))
+    return _SweepReader(path).sweep(read_tree(path))
 
 
-class _Reader(TreeChecks):
+class _SweepReader(TreeChecks):
     """Checks one file."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, SweepFileError)
         self._folder = path.absolute().parent
+        # a version stays the same while the package is developed
+        self._program = _digest(sorted(Path(__file__).parents[2].rglob("*.py")))
+        self._content = cache(lambda bag: _digest(_storages(bag)))
+        self._described = cache(lambda path: ((swarm := load_swarm(path)), joblib.hash(swarm)))
 
     def sweep(self, tree: Tree) -> Sweep:
         """All replays of the file."""
-        said = self.mapping(tree, WHOLE_FILE, _KEYS, required=("bags",))
-        bags = [bag for k, one in enumerate(self._some(said["bags"], "bags")) for bag in self._bags(one, k)]
-        swarms = [str(one) for one in self._some(said["swarms"], "swarms")] if "swarms" in said else [""]
+        said = self.mapping(tree, WHOLE_FILE, KEYS, required=("bags",))
+        found = [bag for k, one in enumerate(self._some(said["bags"], "bags")) for bag in self._bags(one, k)]
+        bags = list(dict.fromkeys(found))
+        swarms = self._some(said["swarms"], "swarms") if "swarms" in said else [""]
         given = self.mapping(said.get("settings"), "settings", _SETTINGS)
-        grid = {name: self._values(one, f"settings.{name}", _SETTINGS[name]) for name, one in given.items()}
-        lost = self._values(said.get("lost", [0.0]), "lost", _SHARE)
+        grid = {name: self._some(one, f"settings.{name}", _SETTINGS[name]) for name, one in given.items()}
+        lost = self._some(said.get("lost", [0.0]), "lost", _SHARE)
         if "seeds" in said and not any(lost):
             raise self.said("seeds choose which messages are lost, but lost names no share above 0")
-        seeds = self._values(said.get("seeds", [1]), "seeds", _SEED)
-        losses = [pair for share in lost for pair in itertools.product([share], seeds if share else [None])]
-        workers = self._values([said["workers"]], "workers", _WORKERS)[0] if "workers" in said else -1
+        seeds = self._some(said.get("seeds", [1]), "seeds", _SEED)
+        losses = [(share, seed) for share in lost for seed in (seeds if share else [None])]
+        workers = self._checked(said["workers"], "workers", _WORKERS) if "workers" in said else -1
         count = len(bags) * len(swarms) * math.prod(map(len, grid.values())) * len(losses)
         if count > MAX_JOBS:
             raise self.said(f"it makes {count} replays but must make at most {MAX_JOBS}")
@@ -131,28 +125,29 @@ class _Reader(TreeChecks):
         axes = {"swarm": swarms, **grid, "lost": lost}
         return Sweep(tuple(jobs), tuple(name for name in axes if len(axes[name]) > 1), int(workers))
 
-    def _bags(self, text: Tree, number: int) -> list[str]:
+    def _bags(self, text: str, number: int) -> list[str]:
         """Paths of bags, from the folder of the file, that fit a path or pattern."""
-        found = sorted(glob.glob(str(text), root_dir=self._folder, recursive=True))  # noqa: PTH207 - pathlib refuses absolute patterns
-        if glob.has_magic(str(text)):
+        found = sorted(glob.glob(text, root_dir=self._folder, recursive=True))  # noqa: PTH207 - pathlib refuses absolute patterns
+        if glob.has_magic(text):
             found = [one for one in found if _storages(self._folder / one)]
         if not found:
             raise self.error(f"bags[{number}]", text, "must be a bag or a pattern of bags")
         return found
 
-    def _some(self, tree: Tree, key: str) -> list[Tree]:
-        """A list of at least one value, each once."""
-        values = self.items(tree, key)
-        if not values or len({*map(str, values)}) < len(values):
+    def _some(self, tree: Tree, key: str, spec: ParameterSpec | None = None) -> list[Any]:
+        """A list of at least one value, each once: those of a parameter, or texts."""
+        values = [
+            self._checked(one, f"{key}[{k}]", spec) if spec else str(one)
+            for k, one in enumerate(self.items(tree, key))
+        ]
+        if not values or len({*values}) < len(values):
             raise self.error(key, tree, "must be a list of at least one value, each once")
         return values
 
-    def _values(self, tree: Tree, key: str, spec: ParameterSpec) -> list[Any]:
-        """The values of a parameter."""
+    def _checked(self, value: Tree, key: str, spec: ParameterSpec) -> Any:
+        """The value of a parameter."""
         try:
-            return [
-                replace(spec, name=f"{key}[{k}]").checked(one) for k, one in enumerate(self._some(tree, key))
-            ]
+            return replace(spec, name=key).checked(value)
         except ParameterError as error:
             raise self.said(str(error).removesuffix(".")) from error
 
@@ -160,31 +155,12 @@ class _Reader(TreeChecks):
         """One replay."""
         path = self._folder / bag
         swarm = swarm or str((Path(bag) if path.is_dir() else Path(bag).parent) / "swarm.yaml")
-        described, digest = _described(self._folder / swarm)
+        described, digest = self._described(self._folder / swarm)
         settings, loss = replace(Settings(), **values), Loss(share, seed or 0)  # type: ignore[arg-type]
-        determined = (program_digest(), _content(path), digest, settings, loss)
+        determined = (self._program, self._content(path), digest, settings, loss)
         key = hashlib.sha256(repr(determined).encode()).hexdigest()
         cells = {"bag": bag, "swarm": swarm, **values, "lost": share, "seed": seed}
         return Job(path, described, settings, loss, key, cells)
-
-
-@cache
-def _described(path: Path) -> tuple[Swarm, str]:
-    """A swarm, and a hash of it."""
-    swarm = load_swarm(path)
-    return swarm, joblib.hash(swarm)
-
-
-@cache
-def _content(bag: Path) -> str:
-    """Hash of the files of a bag that are read."""
-    return _digest(_storages(bag))
-
-
-@cache
-def program_digest() -> str:
-    """Hash of the sources of this package: its version is the same while it is developed."""
-    return _digest(sorted(Path(__file__).parents[2].rglob("*.py")))
 
 
 def _storages(bag: Path) -> list[Path]:

@@ -25,7 +25,7 @@ Row = Mapping[str, Any]
 """Column -> value; None where there is none."""
 
 _FAILURE = "failure"
-_LOG_FROM = 20.0
+_LOG_FROM = 10.0
 """Ratio of the greatest to the least value from which their axis is logarithmic."""
 _UNITS = {name: spec.unit for name, spec in number_specs(Settings).items()}
 _UNITS["lost"] = "share of the messages"
