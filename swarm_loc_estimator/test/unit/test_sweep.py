@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import shutil
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -265,6 +267,18 @@ def test_a_missing_package_is_one_sentence(
 def test_a_cluster_needs_a_back_end(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(written(folder, "bags: [short]"), "--cluster", "here:1") == 1
     assert "--cluster is for --backend ray or dask" in capsys.readouterr().err
+
+
+def test_a_cluster_of_ray_where_nobody_answers_is_named(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "ray", ModuleType("ray"))
+    monkeypatch.setitem(sys.modules, "ray.util.joblib.ray_backend", ModuleType("ray_backend"))
+    with socket.create_server(("127.0.0.1", 0)) as closed:
+        port = closed.getsockname()[1]
+    for address in (f"127.0.0.1:{port}", "127.0.0.1", "127.0.0.1:no"):
+        assert run(written(folder, "bags: [short]"), "--backend", "ray", "--cluster", address) == 1
+        assert capsys.readouterr().err.startswith(f"--cluster {address} is not reached: ")
 
 
 def test_a_replay_needs_nothing_of_sweeps() -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module
+from socket import create_connection
 from typing import Any, Literal, NamedTuple, get_args
+from urllib.parse import urlsplit
 
 import joblib
 
@@ -13,6 +15,7 @@ from swarm_loc_estimator.common.parameters import UserError
 
 Name = Literal["loky", "ray", "dask"]
 NAMES: tuple[Name, ...] = get_args(Name)
+_PATIENCE_S = 10.0
 
 
 class BackendError(UserError):
@@ -58,7 +61,10 @@ def _ray(count: int, address: str | None) -> Iterator[dict[str, Any]]:
     """Actors of Ray."""
     ray, backend = _loaded("ray", "ray"), _loaded("ray.util.joblib.ray_backend", "ray")
     options = {"address": address} if address else {"num_cpus": None if count < 0 else count}
-    with _reached(address, ConnectionError):
+    with _reached(address):
+        if address:  # Ray itself asks an address where nobody answers for many minutes
+            place = urlsplit(address if "//" in address else f"//{address}")
+            create_connection((place.hostname, place.port), _PATIENCE_S).close()
         ray.init(**options, logging_level="ERROR", log_to_driver=False)
     try:
         pool = backend.RayBackend()
@@ -75,17 +81,17 @@ def _dask(count: int, address: str | None) -> Iterator[dict[str, Any]]:
     """Workers of Dask."""
     client = _loaded("distributed", "dask").Client
     local = {"n_workers": None if count < 0 else count, "threads_per_worker": 1, "dashboard_address": None}
-    with _reached(address, OSError):
+    with _reached(address):
         connected = client(address) if address else client(**local)
     with connected:
         yield {"backend": "dask"}
 
 
 @contextmanager
-def _reached(address: str | None, error: type[Exception]) -> Iterator[None]:
+def _reached(address: str | None) -> Iterator[None]:
     try:
         yield
-    except error as cause:
+    except (OSError, ValueError) as cause:
         raise BackendError(f"--cluster {address} is not reached: {' '.join(str(cause).split())}.") from cause
 
 
