@@ -1,4 +1,4 @@
-"""Make the map of a bag with laser distances and odometry, and draw it.
+"""Make the map of a bag with laser distances, or scans of lidars, and odometry, and draw it.
 
     replay_map recording --out out/hall
     replay_map recording --swarm swarm.yaml --walls walls.csv --led pushbot1=1000 --led pushbot2=1050
@@ -70,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     picture = draw_map(mapper.occupancy(), mapper.graph.poses, walls, options.out / "map.png", title)
     name_of = {number: name for name, number in numbers.items() if number is not None}
     write_stops(mapper, name_of, options.out / "stops.csv")
-    for reason, count in feed.all_drops.items():
+    for reason, count in (feed.all_drops + feed.dropped_beams).items():
         print(f"dropped: {count} {reason}")
     print(figures or "nothing to compare with: no ground truth in the bag, no --walls")
     print(f"{mapper.graph.count} stops; map: {path}, {image}; picture: {picture}")

@@ -17,8 +17,6 @@ _FREE_STEP, _HIT_STEP = 0.25, 0.9
 """Change of the log odds of a cell by one ray."""
 _POINT_HIT = 0.25
 """Share of `_HIT_STEP` for a reflection without a fitted line."""
-_FREE_RANGE_SHARE = 0.76
-"""Share of the range that counts as free without a reflection."""
 _SHARP_M = 0.03
 """Standard deviation of a wall above which the increase of the log odds is reduced."""
 
@@ -31,7 +29,7 @@ def draw_stop(
     pose: FloatArray,
     stop: int,
     lines: Lines,
-    max_range: float,
+    free: float,
 ) -> None:
     """Add the evidence of a stop to a grid; cells outside of it are ignored.
 
@@ -42,13 +40,13 @@ def draw_stop(
         pose: (3,) of the stop.
         stop: Its number.
         lines: Of all stops.
-        max_range: Of the laser [m].
+        free: Distance that is free in a direction without reflection [m].
     """
     for m in range(BINS):
         kind, distance = lines.kind[stop, m], lines.distance[stop, m]
         if kind == UNKNOWN:
             continue
-        hit, end = 0.0, _FREE_RANGE_SHARE * max_range
+        hit, end = 0.0, free
         if kind == LINE:
             sigma = distance * distance * math.sqrt(lines.variance[stop, m])
             hit, end = _HIT_STEP / (1.0 + (sigma / _SHARP_M) ** 2), distance - 0.03 - 1.5 * sigma
@@ -137,7 +135,7 @@ def draw_map(
         max_cells: Maximum number of cells; a larger map is cropped around its centre.
         background: A map with the same cell size, drawn below the stops.
     """
-    reach = scans.max_range + 0.1
+    reach = scans.beams.reach[:count].max(initial=0.0) + 0.1
     places = scans.states[:count, :2]
     points = [places - reach, places + reach]
     if background is not None:
@@ -147,7 +145,7 @@ def draw_map(
     if background is not None:
         _lay_below(log_odds, corner, background)
     for stop in range(count):
-        draw_stop(log_odds, corner, CELL, scans.states[stop, :3], stop, scans.lines, scans.max_range)
+        draw_stop(log_odds, corner, CELL, scans.states[stop, :3], stop, scans.lines, scans.beams.free[stop])
     return OccupancyMap(corner, CELL, np.clip(log_odds, -LOG_ODDS_CAP, LOG_ODDS_CAP))
 
 

@@ -169,6 +169,8 @@ _MIN_FIT, _MAX_SIGMA, _MAX_SIGMAS = 0.5, 0.03, 4.0
 _TIE_SIGMA = np.array([0.03, 0.03, 0.012])
 _LOOP_TARGETS, _MIN_LOOP_OVERLAP = 9, 0.2
 _LOOP_GATE = 0.05
+_SWEEP_HOPS = 6
+"""Matches in a row that connect two sweeps, which are closer together than stops of laser pointers."""
 
 
 def close_loop(graph: PoseGraph, stop: int) -> bool:
@@ -228,9 +230,10 @@ def refine(graph: PoseGraph, stop: int, against: list[int]) -> bool:
 
 
 def _unconnected(graph: PoseGraph, stop: int) -> list[int]:
-    """Old stops nearby, nearest first, that are matched neither with this stop nor with its targets."""
-    near = {stop, *graph.targets.get(stop, ())}
-    connected = near.union(*(graph.targets.get(one, ()) for one in near))
+    """Old stops nearby, nearest first, that are connected with this stop only over many others."""
+    connected = {stop, *graph.targets.get(stop, ())}
+    for _ in range(_SWEEP_HOPS if graph.is_sweep(stop) else 1):
+        connected = connected.union(*(graph.targets.get(one, ()) for one in connected))
     away, robot = graph.distances(stop), graph.robot
     return [
         int(one)

@@ -1,13 +1,13 @@
 """The cooperative mapper: computes poses, one map and next goals from the readings of many robots.
 
-A robot stops, scans by turning in place, and drives on. Each stop becomes a node of the pose graph; its beams
-are matched against those of stops of all robots. Robots may join and leave at any time.
+A robot with a laser pointer stops, scans by turning in place, and drives on; one with a lidar scans while it
+drives. Each stop, and a sweep of a lidar wherever its robot has moved on, becomes a node of the pose graph;
+its beams are matched against those of stops of all robots. Robots may join and leave at any time.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
 from itertools import pairwise
 
 import numpy as np
@@ -26,14 +26,19 @@ from swarm_loc_estimator.mapping.localization import (
     find_slip,
 )
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
-from swarm_loc_estimator.mapping.scans import LightSightings, Readings, turn_ratio
+from swarm_loc_estimator.mapping.scans import UNSEEN, LightSightings, Readings, turn_ratio
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.mapping.stops import MIN_TURN, MotionTracker, ScanStop
+from swarm_loc_estimator.mapping.stops import MIN_TURN, ScanStop
+from swarm_loc_estimator.mapping.track import Located, Track
 
 START_TURN = 4.5 * math.pi
 """Turn by odometry of a complete first scan [rad]: a slow quarter that fixes the heading, then two turns."""
 SCAN_TURN = 2.14 * math.pi
 """Turn by odometry at every later stop [rad]; enough for a full turn despite slip."""
+_SWEEP_STEP, _SWEEP_TURN = 0.3, math.radians(20.0)
+"""Motion by odometry after which the next sweep of a lidar is used: path [m], turn [rad]."""
+_SWEEP_DISTANCE_NOISE = 0.2
+"""Error of paths between sweeps, per path: slip is the same in all, so they must not count as many."""
 _START_PARTS = (0.25 * math.pi, *(0.5 * math.pi * k for k in range(1, 9)))
 """Turns at which a first scan is split into parts, each a stop [rad]."""
 _TURN_TOLERANCE = 0.03
@@ -43,41 +48,6 @@ _LOST_SIGMA, _CHECK_EVERY = 0.15, 4
 """Maximum position standard deviation [m]; above it a robot returns to an old stop nearby (home)."""
 _RESTART_SIGMA = np.array([0.10, 0.10, math.radians(5.0)])
 _HOME_AGE, _HOME_RADIUS, _AT_HOME = 10, 4.0, 0.5
-
-
-@dataclass
-class _Track:
-    """State of one robot.
-
-    Attributes:
-        prior: (3,) start pose.
-        prior_sigma: (3,) standard deviations of the start pose.
-        motion: Detects stops.
-        stop: The current stop.
-        node: Its newest stop in the graph.
-        is_known: Whether `stop` is in the graph, as `node`.
-        passes: Whether the next stop replaces `node` because the graph is full.
-        left: (3,) pose by odometry at departure from `node`.
-        last: (3,) newest pose by odometry.
-        path: Length driven since the departure [m].
-        target: (2,) final target position [m].
-        goal: Its next stop.
-        home: (2,) old stop to which it returns to reduce its position uncertainty [m].
-    """
-
-    prior: FloatArray
-    prior_sigma: FloatArray
-    motion: MotionTracker = field(default_factory=MotionTracker)
-    stop: ScanStop | None = None
-    node: int | None = None
-    is_known: bool = False
-    passes: bool = False
-    left: FloatArray = field(default_factory=lambda: np.zeros(3))
-    last: FloatArray | None = None
-    path: float = 0.0
-    target: FloatArray | None = None
-    goal: Goal | None = None
-    home: FloatArray | None = None
 
 
 class CooperativeMapper:
@@ -100,7 +70,7 @@ class CooperativeMapper:
         self.graph = PoseGraph(self.settings)
         self.visits = VisitationMap()
         self.counters = {"scans": 0, "scans_refused": 0, "loops_closed": 0, "odometry_restarts": 0}
-        self._tracks: dict[int, _Track] = {}
+        self._tracks: dict[int, Track] = {}
         self._lights = LightBook()
         self.background: OccupancyMap | None = None
         self.begin_ns: dict[int, int] = {}
@@ -109,7 +79,7 @@ class CooperativeMapper:
     def join(self, pose: FloatArray, sigma: FloatArray) -> int:
         """Add a robot with a start pose (3,) in map and standard deviations (3,); returns its number."""
         robot = self.graph.add_robot()
-        self._tracks[robot] = _Track(np.asarray(pose, dtype=float), np.asarray(sigma, dtype=float))
+        self._tracks[robot] = Track(np.asarray(pose, dtype=float), np.asarray(sigma, dtype=float))
         return robot
 
     def leave(self, robot: int) -> None:
@@ -137,11 +107,27 @@ class CooperativeMapper:
                 self._drive(track, run.readings.odometry)
                 self._lights.note_time(robot, int(run.readings.stamp_ns[-1]))
 
-    def _restart_track(self, robot: int, track: _Track) -> _Track:
+    def add_sweep(self, robot: int, sweep: ScanStop) -> None:
+        """Process a sweep of a robot's lidar, newer than all before, if the robot has moved since."""
+        track, place = self._tracks[robot], sweep.arrival[None]
+        step = Readings(sweep.stamp_ns[:1], place, np.full(1, UNSEEN), math.nan)
+        if any(run.jumps for run in track.motion.runs(step)):
+            track = self._restart_track(robot, track)
+        self._drive(track, place)
+        if track.node is not None:
+            x, y, turn = between(track.left, sweep.arrival)
+            if math.hypot(x, y) < _SWEEP_STEP and abs(turn) < _SWEEP_TURN:
+                return
+        self.graph.known_slips.add(robot)  # no turn by odometry is in a sweep
+        self._enter(robot, track, sweep, len(sweep.turn))
+        track.is_known, track.left, track.path = False, sweep.arrival, 0.0
+        track.located = Located(int(sweep.stamp_ns[0]), self.graph.poses[track.node].copy())
+
+    def _restart_track(self, robot: int, track: Track) -> Track:
         """Restart a robot's track near its last pose after odometry jumped, as by a restart of its driver."""
         self.counters["odometry_restarts"] += 1
         pose = self.pose(robot)
-        fresh = _Track(track.prior, track.prior_sigma) if pose is None else _Track(pose, _RESTART_SIGMA)
+        fresh = Track(track.prior, track.prior_sigma) if pose is None else Track(pose, _RESTART_SIGMA)
         fresh.motion = track.motion
         self._tracks[robot] = fresh
         return fresh
@@ -171,6 +157,10 @@ class CooperativeMapper:
         track = self._tracks[robot]
         return track.goal if track.is_known else None
 
+    def located(self, robot: int) -> Located | None:
+        """Where a robot was when its newest scan was complete; None before the first."""
+        return self._tracks[robot].located
+
     def newest_stop(self, robot: int) -> int | None:
         """Number of the newest stop of a robot in the graph."""
         return self._tracks[robot].node
@@ -194,13 +184,13 @@ class CooperativeMapper:
         align_all(self.graph)
         self._map = None
 
-    def _driven(self, track: _Track, odometry: FloatArray) -> FloatArray:
+    def _driven(self, track: Track, odometry: FloatArray) -> FloatArray:
         """Poses (..., 3) in map of odometry poses (..., 3) since the newest stop."""
         left = self.graph.states[track.node, :3].copy()
         left[2] = self.graph.heading_at_departure(track.node) if track.node is not None else 0.0
         return compose(left, between(track.left, odometry))
 
-    def _drive(self, track: _Track, odometry: FloatArray) -> None:
+    def _drive(self, track: Track, odometry: FloatArray) -> None:
         """Process odometry poses (n, 3) of a driving robot."""
         if track.last is not None:
             steps = np.diff(np.vstack([track.last, odometry])[:, :2], axis=0)
@@ -210,7 +200,7 @@ class CooperativeMapper:
         if track.node is not None:
             self.visits.add(self._driven(track, odometry)[:, :2])
 
-    def _look(self, robot: int, track: _Track, stop: ScanStop) -> None:
+    def _look(self, robot: int, track: Track, stop: ScanStop) -> None:
         """Add a stop to the graph when its scan is complete."""
         around = min(2.02 * math.pi / (1.0 - self.graph.slip[robot]), SCAN_TURN - _TURN_TOLERANCE)
         if not track.is_known:
@@ -224,7 +214,7 @@ class CooperativeMapper:
             track.stop = again
             self._look(robot, track, again)
 
-    def _depart(self, robot: int, track: _Track) -> None:
+    def _depart(self, robot: int, track: Track) -> None:
         """Finish a stop when the robot departs."""
         stop, track.stop = track.stop, None
         if stop is None or not len(stop.turn):
@@ -242,7 +232,7 @@ class CooperativeMapper:
             track.path = math.dist(stop.arrival[:2], stop.departure[:2])
         track.stop, track.is_known = None, False
 
-    def _note_visit(self, robot: int, track: _Track, stop: ScanStop) -> None:
+    def _note_visit(self, robot: int, track: Track, stop: ScanStop) -> None:
         """Record a finished stop, for light bearings by and of this robot."""
         if track.node is not None:
             begin_ns, end_ns = int(stop.stamp_ns[stop.begin]), int(stop.stamp_ns[-1])
@@ -250,15 +240,14 @@ class CooperativeMapper:
             self._lights.note_time(robot, end_ns)
             self._lights.settle(self.graph)
 
-    def _update_scan(self, track: _Track) -> None:
+    def _update_scan(self, track: Track) -> None:
         """Set all readings of the newest stop as its scan."""
         stop = track.stop
         if stop is not None and track.is_known and track.node is not None:
-            turn = stop.turn[stop.begin :] - stop.begin_turn
-            self.graph.set_scan(track.node, turn, stop.inverse[stop.begin :])
+            self.graph.set_scan(track.node, stop.scan(stop.begin, len(stop.turn)))
             self._map = None
 
-    def _enter(self, robot: int, track: _Track, stop: ScanStop, count: int) -> None:
+    def _enter(self, robot: int, track: Track, stop: ScanStop, count: int) -> None:
         """Add the first `count` readings of a stop as a node (several for a first scan) and align it."""
         self.counters["scans"] += 1
         self._map = None
@@ -268,15 +257,17 @@ class CooperativeMapper:
             return
         motion = between(track.left, stop.arrival)
         sigma = self._motion_sigma(track.path, abs(float(motion[2])))
+        if stop.reach:
+            sigma[0] += _SWEEP_DISTANCE_NOISE * track.path
         pose = self._driven(track, stop.arrival)
         begin = track.node
         if track.passes:
-            node = self._replace(track.node, pose, sigma, stop.sigma)
+            node = self._replace(track.node, pose, sigma, stop)
         else:
-            node = self.graph.add_stop(robot, pose, stop.sigma)
+            node = self.graph.add_stop(robot, pose, stop.sigma, stop.reach)
             self.graph.constraints.add_departure(begin, node, self.graph.turned[begin], motion, sigma)
         self.begin_ns[node] = int(stop.stamp_ns[0])
-        self.graph.set_scan(node, stop.turn[:count], stop.inverse[:count])
+        self.graph.set_scan(node, stop.scan(0, count))
         track.node, track.passes = node, self.graph.count > self.settings.max_stops
         if node != begin and not find_slip(self.graph, begin, node):
             return
@@ -285,11 +276,11 @@ class CooperativeMapper:
         if close_loop(self.graph, node):
             self.counters["loops_closed"] += 1
 
-    def _replace(self, node: int, pose: FloatArray, motion_sigma: FloatArray, sigma: float) -> int:
+    def _replace(self, node: int, pose: FloatArray, motion_sigma: FloatArray, stop: ScanStop) -> int:
         """Replace a robot's newest stop by its next one, since the graph is full; returns its number."""
         known = np.sqrt(np.maximum(np.diag(self.graph.covariance(node)), 0.0))
         self._lights.forget_node(node)
-        self.graph.reuse_stop(node, pose, sigma)
+        self.graph.reuse_stop(node, pose, stop.sigma, stop.reach)
         drive = np.array([*np.full(2, motion_sigma[:2].max()), motion_sigma[2]])
         self.graph.constraints.add_prior(node, pose, np.hypot(known, drive))
         return node
@@ -306,7 +297,7 @@ class CooperativeMapper:
             ]
         )
 
-    def _enter_first(self, robot: int, track: _Track, stop: ScanStop, count: int) -> None:
+    def _enter_first(self, robot: int, track: Track, stop: ScanStop, count: int) -> None:
         """Add the parts of a first scan as nodes; the first part fixes the start heading."""
         turn, inverse = stop.turn[:count], stop.inverse[:count]
         furthest = np.maximum.accumulate(np.abs(turn))
@@ -319,9 +310,8 @@ class CooperativeMapper:
         nodes: list[int] = []
         pose = track.prior
         for first, last in pairwise(bounds):
-            before = turn[first - 1] if first else 0.0
-            node = self.graph.add_stop(robot, pose, stop.sigma)
-            self.graph.set_scan(node, turn[first:last] - before, inverse[first:last])
+            node = self.graph.add_stop(robot, pose, stop.sigma, stop.reach)
+            self.graph.set_scan(node, stop.scan(first, last))
             if nodes:
                 turned = self.graph.turned[nodes[-1]]
                 self.graph.constraints.add_departure(nodes[-1], node, turned, np.zeros(3), _PART_SIGMA)
@@ -336,7 +326,7 @@ class CooperativeMapper:
         self.graph.place[nodes] = nodes[0]
         align_start(self.graph, nodes, track.prior_sigma)
 
-    def _choose_goal(self, robot: int, track: _Track, stop: ScanStop) -> None:
+    def _choose_goal(self, robot: int, track: Track, stop: ScanStop) -> None:
         """Set the next goal of a robot."""
         node = track.node
         if node is None:
@@ -360,8 +350,9 @@ class CooperativeMapper:
         number = track.goal.number + 1 if track.goal else 1
         there = goal_by_odometry(pose, odometry, hop, ratio)
         track.goal = Goal(number, hop, there, int(stop.stamp_ns[stop.looked - 1]), pose)
+        track.located = Located(track.goal.stamp_ns, pose)
 
-    def _look_for_home(self, track: _Track, node: int) -> None:
+    def _look_for_home(self, track: Track, node: int) -> None:
         """Send a robot with a large position sigma back to an old stop nearby from which walls were seen."""
         graph = self.graph
         if track.home is not None and math.dist(track.home, graph.states[node, :2]) < _AT_HOME:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
 
@@ -11,13 +11,14 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.definitions import LASER, LIGHTS, ODOMETRY
+from swarm_loc_estimator.common.messages.definitions import LASER, LASER_SCAN, LIGHTS, ODOMETRY
 from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.common.se2 import between, compose, exp, log
+from swarm_loc_estimator.common.se2 import between, compose
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.mapping.messages import decode_laser, decode_lights
-from swarm_loc_estimator.mapping.scans import UNSEEN, LightSightings, Readings
+from swarm_loc_estimator.mapping.messages import decode_laser, decode_lights, decode_scan
+from swarm_loc_estimator.mapping.pairing import ReadingPairer, SweepPairer
+from swarm_loc_estimator.mapping.scans import LightSightings
 from swarm_loc_estimator.swarm.swarm import Robot
 
 _LEAST_SIGMA = np.array([0.02, 0.02, 0.01])
@@ -40,90 +41,6 @@ def fix_covariance(covariance: FloatArray) -> FloatArray:
     return whole
 
 
-MAX_WAITING = 500
-"""Maximum numbers of queued odometry messages and distances; the oldest are dropped."""
-MAX_GAP_NS = 500_000_000
-"""Maximum gap over which odometry is interpolated."""
-_SIGMAS = 301
-"""Number of distances over which the median sigma is taken."""
-
-
-class ReadingPairer:
-    """Interpolates odometry at the stamp of each distance of one robot.
-
-    Attributes:
-        drops: Reason -> number of dropped messages.
-    """
-
-    def __init__(self) -> None:
-        self.drops: Counter[str] = Counter()
-        self._odometry: deque[tuple[int, FloatArray]] = deque(maxlen=MAX_WAITING)
-        self._distances: deque[tuple[int, float]] = deque()
-        self._sigmas: deque[float] = deque(maxlen=_SIGMAS)
-
-    @property
-    def newest_ns(self) -> float:
-        """Stamp of the newest odometry; -inf before the first."""
-        return self._odometry[-1][0] if self._odometry else -math.inf
-
-    def add_odometry(self, stamp_ns: int, pose: FloatArray) -> None:
-        """Add a pose (3,) by odometry."""
-        if not np.isfinite(pose).all():
-            self.drops["odometry_not_finite"] += 1
-        elif stamp_ns <= self.newest_ns:
-            self.drops["odometry_too_old"] += 1
-        else:
-            self._odometry.append((stamp_ns, np.asarray(pose, dtype=float)))
-
-    def add_distance(self, stamp_ns: int, distance: float, sigma: float) -> None:
-        """Add a distance [m] with its standard deviation; NaN: no reflection."""
-        seen = math.isfinite(distance) and distance > 0.0 and math.isfinite(sigma) and sigma > 0.0
-        if self._distances and stamp_ns <= self._distances[-1][0]:
-            self.drops["laser_too_old"] += 1
-            return
-        if not seen and not math.isnan(distance):
-            self.drops["laser_bad_value"] += 1
-            return
-        if seen:
-            self._sigmas.append(sigma / (distance * distance))
-        if len(self._distances) == MAX_WAITING:
-            self._distances.popleft()
-            self.drops["laser_without_odometry"] += 1
-        self._distances.append((stamp_ns, 1.0 / distance if seen else UNSEEN))
-
-    def ready(self) -> Readings | None:
-        """The readings with known odometry, in order; None if there are none."""
-        rows: list[tuple[int, FloatArray, float]] = []
-        while self._distances and self._distances[0][0] <= self.newest_ns:
-            stamp_ns, inverse = self._distances.popleft()
-            pose = self._pose_at(stamp_ns)
-            if pose is None:
-                self.drops["laser_without_odometry"] += 1
-            else:
-                rows.append((stamp_ns, pose, inverse))
-        if not rows:
-            return None
-        stamps, poses, inverses = zip(*rows, strict=True)
-        return Readings(np.array(stamps, dtype=np.int64), np.array(poses), np.array(inverses), self._sigma())
-
-    def _sigma(self) -> float:
-        """Median standard deviation of recent inverse distances; NaN if there are none."""
-        return float(np.median(self._sigmas)) if self._sigmas else math.nan
-
-    def _pose_at(self, stamp_ns: int) -> FloatArray | None:
-        """Pose (3,) by odometry at a time up to the newest stamp; None: unknown."""
-        while len(self._odometry) > 1 and self._odometry[1][0] <= stamp_ns:
-            self._odometry.popleft()
-        begin_ns, begin = self._odometry[0]
-        if begin_ns == stamp_ns or len(self._odometry) == 1:
-            return begin if begin_ns == stamp_ns else None
-        end_ns, end = self._odometry[1]
-        if stamp_ns < begin_ns or end_ns - begin_ns > MAX_GAP_NS:
-            return None
-        share = (stamp_ns - begin_ns) / (end_ns - begin_ns)
-        return compose(begin, exp(share * log(between(begin, end))))
-
-
 ORIGIN_SIGMA = np.full(3, 1e-3)
 """Start uncertainty of the first robot if undescribed: its start defines the origin of the map."""
 _FREQUENCY_TOLERANCE_HZ = 5.0
@@ -139,11 +56,19 @@ class MapperInput(Enum):
 
     ODOMETRY = ("odom", ODOMETRY)
     LASER = ("laser", LASER)
+    SCAN = ("scan", LASER_SCAN)
     LIGHTS = ("lights", LIGHTS)
 
     def __init__(self, topic: str, message_type: str) -> None:
         self.topic = topic
         self.message_type = message_type
+
+
+def inputs_of(robot: Robot, *, lights: bool = False) -> tuple[MapperInput, ...]:
+    """The inputs without which a robot cannot map; with `lights`, those of robots with event cameras, too."""
+    if robot.lidar.is_used:
+        return (MapperInput.ODOMETRY, MapperInput.SCAN)
+    return (MapperInput.ODOMETRY, MapperInput.LASER, *([MapperInput.LIGHTS] if lights else []))
 
 
 class MapperInputError(UserError):
@@ -179,14 +104,17 @@ class MapperFeed:
         self.received: Counter[tuple[int, MapperInput]] = Counter()
         self._robots = robots
         self._mapper = mapper
-        self._pairers = [ReadingPairer() for _ in robots]
+        self._pairers: list[ReadingPairer | SweepPairer] = [
+            SweepPairer(robot.lidar) if robot.lidar.is_used else ReadingPairer() for robot in robots
+        ]
         self._number: dict[int, int] = {}
         self._begin: dict[int, FloatArray] = {}
-        index_of = {robot.name: index for index, robot in enumerate(robots)}
+        index_of = {robot.name: k for k, robot in enumerate(robots) if not robot.lidar.is_used}
         self._light_of = [(hz, index_of[name]) for name, hz in frequencies.items() if name in index_of]
         self._readers: dict[MapperInput, Callable[[int, bytes], None]] = {
             MapperInput.ODOMETRY: self._read_odometry,
             MapperInput.LASER: self._read_laser,
+            MapperInput.SCAN: self._read_laser,
             MapperInput.LIGHTS: self._read_lights,
         }
 
@@ -198,8 +126,11 @@ class MapperFeed:
         except CdrError:
             self.drops["bad_message"] += 1
             return
-        readings = self._pairers[robot].ready()
-        if readings is not None:
+        pairer = self._pairers[robot]
+        if isinstance(pairer, SweepPairer):
+            for sweep in pairer.ready():
+                self._mapper.add_sweep(self._joined(robot, sweep.arrival), sweep)
+        elif (readings := pairer.ready()) is not None:
             self._mapper.add_readings(self._joined(robot, readings.odometry[0]), readings)
 
     @property
@@ -210,6 +141,11 @@ class MapperFeed:
             total.update(pairer.drops)
         return total
 
+    @property
+    def dropped_beams(self) -> Counter[str]:
+        """Reason -> number of dropped beams of all lidars."""
+        return sum((pairer.dropped_beams for pairer in self._pairers), Counter())
+
     def number(self, robot: int) -> int | None:
         """The mapper's number of a robot by its index; None: not joined yet."""
         return self._number.get(robot)
@@ -217,7 +153,7 @@ class MapperFeed:
     def missing(self) -> Iterator[str]:
         """Required topics without a message so far."""
         for index, robot in enumerate(self._robots):
-            for kind in (MapperInput.ODOMETRY, MapperInput.LASER):
+            for kind in inputs_of(robot):
                 if not self.received[index, kind]:
                     yield f"{robot.name}/{kind.topic}"
 
@@ -240,8 +176,12 @@ class MapperFeed:
         self._pairers[robot].add_odometry(message.stamp_ns, pose)
 
     def _read_laser(self, robot: int, data: bytes) -> None:
-        message = decode_laser(data)
-        self._pairers[robot].add_distance(message.stamp_ns, message.distance, message.sigma)
+        pairer = self._pairers[robot]
+        if isinstance(pairer, SweepPairer):
+            pairer.add_scan(decode_scan(data))
+        else:
+            message = decode_laser(data)
+            pairer.add_distance(message.stamp_ns, message.distance, message.sigma)
 
     def _read_lights(self, robot: int, data: bytes) -> None:
         rows = []

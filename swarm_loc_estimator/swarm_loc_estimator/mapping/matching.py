@@ -40,13 +40,11 @@ class Scans(NamedTuple):
         states: (k, 4) x [m], y [m], theta [rad] on arrival, true turn over turn by odometry.
         beams: Their beams.
         lines: Lines fitted to the beams.
-        max_range: Maximum range of the laser [m].
     """
 
     states: FloatArray
     beams: Beams
     lines: Lines
-    max_range: float
 
 
 @cached_njit
@@ -68,7 +66,7 @@ def beam_residual(
     """
     states, lines = scans.states, scans.lines
     measured = scans.beams.inverse[k, i]
-    angle = states[k, 2] + states[k, 3] * scans.beams.turn[k, i]
+    angle = states[k, 2] + scans.beams.bearing[k, i] + states[k, 3] * scans.beams.turn[k, i]
     ux, uy = math.cos(angle), math.sin(angle)
     dx, dy = states[k, 0] - states[j, 0], states[k, 1] - states[j, 1]
     cos, sin = math.cos(states[j, 2]), math.sin(states[j, 2])
@@ -85,11 +83,12 @@ def beam_residual(
         return OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     predicted = incidence / distance
     sigma = scans.beams.sigma[k]
-    if predicted < 1.0 / scans.max_range + _RANGE_SIGMAS * sigma:
+    if predicted < 1.0 / scans.beams.reach[k] + _RANGE_SIGMAS * sigma:
         return UNUSABLE, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     per_metre = predicted / distance
     line_sigma = math.sqrt(lines.variance[j, m]) * lines.distance[j, m] / size  # of its distance [m]
-    variance = sigma**2 + (per_metre * line_sigma) ** 2 + (per_metre * _ROUGHNESS) ** 2
+    noise = sigma**2 / scans.beams.weight[k, i]
+    variance = noise + (per_metre * line_sigma) ** 2 + (per_metre * _ROUGHNESS) ** 2
     residual = measured - predicted
     if residual * residual > _GATE_VARIANCES * variance + (gate * per_metre) ** 2:
         return OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -152,7 +151,7 @@ def _jacobian(
 ) -> None:
     """Write the derivative (7,) of the inverse distance predicted on a line at a distance, with a normal."""
     states, turn = scans.states, scans.beams.turn[k, i]
-    angle = states[k, 2] + states[k, 3] * turn
+    angle = states[k, 2] + scans.beams.bearing[k, i] + states[k, 3] * turn
     ux, uy = math.cos(angle), math.sin(angle)
     dx, dy = states[k, 0] - states[j, 0], states[k, 1] - states[j, 1]
     per_metre = (nx * ux + ny * uy) / (distance * distance)

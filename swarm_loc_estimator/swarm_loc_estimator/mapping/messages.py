@@ -9,8 +9,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import CdrError, decode, nanoseconds
-from swarm_loc_estimator.common.messages.definitions import LASER, LIGHTS, OCCUPANCY_GRID
+from swarm_loc_estimator.common.messages.definitions import LASER, LASER_SCAN, LIGHTS, OCCUPANCY_GRID
 from swarm_loc_estimator.common.messages.poses import planar_pose
 from swarm_loc_estimator.common.parameters import ParameterError
 
@@ -62,6 +63,19 @@ class LaserMessage(NamedTuple):
     row: float
 
 
+class ScanMessage(NamedTuple):
+    """A sensor_msgs/LaserScan; its stamp is the time of the first beam."""
+
+    stamp_ns: int
+    angle_min: float
+    angle_max: float
+    angle_increment: float
+    time_increment: float
+    range_min: float
+    range_max: float
+    ranges: FloatArray
+
+
 class LightMessage(NamedTuple):
     """One light of swarm_loc_msgs/LightBearingArray."""
 
@@ -79,6 +93,17 @@ def decode_laser(data: bytes) -> LaserMessage:
     """
     message = decode(data, LASER)
     return LaserMessage(nanoseconds(message.header.stamp), message.distance, message.sigma, message.v_px)
+
+
+def decode_scan(data: bytes) -> ScanMessage:
+    """Read a sensor_msgs/LaserScan.
+
+    Raises:
+        CdrError: The bytes are not one.
+    """
+    message = decode(data, LASER_SCAN)
+    numbers = {name: float(getattr(message, name)) for name in ScanMessage._fields[1:-1]}
+    return ScanMessage(nanoseconds(message.header.stamp), **numbers, ranges=message.ranges.astype(float))
 
 
 def decode_lights(data: bytes) -> list[LightMessage]:

@@ -13,7 +13,7 @@ from swarm_loc_estimator.common.se2 import compose
 from swarm_loc_estimator.mapping import constraints as model
 from swarm_loc_estimator.mapping.constraints import STOP_UNKNOWNS, NormalEquations, NormalFactor
 from swarm_loc_estimator.mapping.matching import Scans, agreement, match_pairs
-from swarm_loc_estimator.mapping.scans import Beams, Lines, fit_lines, no_beams, no_lines, set_beams
+from swarm_loc_estimator.mapping.scans import Beams, Lines, Scan, fit_lines, no_beams, no_lines, set_beams
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
 _Row = tuple[int, int, FloatArray]
@@ -88,6 +88,8 @@ _SMALL_STEP = (1e-3, 1e-3, 5e-4)
 MATCH_GATE = 0.03
 """Maximum distance of a matched beam from its line in the final solution [m]."""
 _OVERLAP_STRIDE = 6
+_FREE_RANGE_SHARE = 0.76
+"""Share of the range of a laser pointer that counts as free without a reflection."""
 _MIN_SEEN_BINS = 15
 """Directions with a usable line, one degree each, from which a stop sees walls."""
 
@@ -133,7 +135,7 @@ class PoseGraph:
     @property
     def scans(self) -> Scans:
         """The stops as input of scan matching."""
-        return Scans(self.states, self._beams, self._lines, self.settings.max_range)
+        return Scans(self.states, self._beams, self._lines)
 
     @property
     def poses(self) -> FloatArray:
@@ -146,24 +148,42 @@ class PoseGraph:
         seen: BoolArray = self._lines.usable[: self.count].sum(axis=1) >= _MIN_SEEN_BINS
         return seen
 
+    def is_sweep(self, stop: int) -> bool:
+        """Whether a stop is a sweep of a lidar."""
+        return bool(self._beams.free[stop] == self._beams.reach[stop])
+
     def add_robot(self) -> int:
         """Add a robot; returns its number."""
         self.slip = np.append(self.slip, self.settings.usual_slip)
         self._factored = -1
         return len(self.slip) - 1
 
-    def add_stop(self, robot: int, pose: FloatArray, sigma: float) -> int:
-        """Add a stop at a pose (3,); `sigma`: of its inverse distances [1/m]. Returns its number."""
+    def add_stop(self, robot: int, pose: FloatArray, sigma: float, reach: float = 0.0) -> int:
+        """Add a stop; returns its number.
+
+        Args:
+            robot: Number of the robot.
+            pose: (3,) in map.
+            sigma: Standard deviation of its inverse distances [1/m].
+            reach: Range of its lidar [m]; 0: it has a laser pointer.
+        """
         if self.count == len(self.states):
             self._grow()
         k = self.count
         self.count += 1
         self.states[k] = (*pose[:3], 1.0 - self.slip[robot])
         self.robot[k], self.place[k] = robot, k
-        self._beams.sigma[k] = sigma
+        self._set_laser(k, sigma, reach)
         return k
 
-    def reuse_stop(self, stop: int, pose: FloatArray, sigma: float) -> None:
+    def _set_laser(self, stop: int, sigma: float, reach: float) -> None:
+        """Note the laser of a stop, see `add_stop`."""
+        pointer = self.settings.max_range
+        self._beams.sigma[stop] = sigma
+        self._beams.reach[stop] = reach or pointer
+        self._beams.free[stop] = reach or _FREE_RANGE_SHARE * pointer
+
+    def reuse_stop(self, stop: int, pose: FloatArray, sigma: float, reach: float = 0.0) -> None:
         """Replace a stop by a new one of the same robot under the same number; see `add_stop`."""
         self.constraints.remove_stop(stop)
         self.targets = {
@@ -173,14 +193,14 @@ class PoseGraph:
         }
         self.starts.discard(stop)
         self.states[stop] = (*pose[:3], 1.0 - self.slip[self.robot[stop]])
-        self._beams.sigma[stop] = sigma
+        self._set_laser(stop, sigma, reach)
         self._factored = -1
 
-    def set_scan(self, stop: int, turn: FloatArray, inverse: FloatArray) -> None:
-        """Set the beams (n,) of a stop: turn by odometry since arrival [rad], inverse distances [1/m]."""
-        set_beams(self._beams, stop, turn, inverse)
-        self.turned[stop] = turn[-1]
-        self._turned_all[stop] = np.abs(turn).max()
+    def set_scan(self, stop: int, scan: Scan) -> None:
+        """Set the beams of a stop; the next drive begins at the first beam of a lidar, else the last."""
+        set_beams(self._beams, stop, scan)
+        self.turned[stop] = 0.0 if isinstance(scan.bearing, np.ndarray) else scan.turn[-1]
+        self._turned_all[stop] = np.abs(scan.turn).max()
         self.fit(stop)
 
     def slip_sigma(self, robot: int) -> float:
@@ -207,7 +227,7 @@ class PoseGraph:
     def fit(self, stop: int) -> None:
         """Fit the lines of a stop with its current turn ratio."""
         ratio = self._fitted_ratio[stop] = self.states[stop, 3]
-        fit_lines(stop, ratio, self.settings.max_range, self._beams, self._lines)
+        fit_lines(stop, ratio, self._beams.reach[stop], self._beams, self._lines)
 
     def overlap(self, stop: int, other: int) -> float:
         """Share of the beams of a stop that fit the lines of another."""
@@ -225,7 +245,7 @@ class PoseGraph:
         away = self.distances(stop)
         found: list[int] = []
         for other in np.argsort(away, kind="stable"):
-            if away[other] > 0.88 * self.settings.max_range or len(found) == limit:
+            if away[other] > 0.88 * self._beams.reach[stop] or len(found) == limit:
                 break
             if other != stop and self.overlap(stop, int(other)) > least:
                 found.append(int(other))

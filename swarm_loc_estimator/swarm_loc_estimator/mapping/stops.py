@@ -12,7 +12,7 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.mapping.scans import Readings
+from swarm_loc_estimator.mapping.scans import Readings, Scan
 
 MIN_TURN = 0.5
 """Minimum turn of a scan [rad]."""
@@ -45,7 +45,12 @@ class ScanStop:
         begin: Number of readings that belong to earlier nodes.
         looked: Number of readings when it became a node; 0: not a node yet.
         total: Number of all readings, including dropped ones.
+        reach: Range of the lidar of which this is a sweep [m]; 0: readings of a laser pointer.
     """
+
+    bearing: FloatArray | float = 0.0
+    weight: FloatArray | float = 1.0
+    reach = 0.0
 
     def __init__(self, arrival: FloatArray) -> None:
         self.arrival = self.departure = arrival
@@ -54,6 +59,29 @@ class ScanStop:
         self.inverse = np.zeros(0)
         self.sigma = 1.0
         self.begin = self.looked = self.total = 0
+
+    @classmethod
+    def of_sweep(cls, stamp_ns: int, pose: FloatArray, scan: Scan, sigma: float, reach: float) -> ScanStop:
+        """A sweep of a lidar as a stop of no duration.
+
+        Args:
+            stamp_ns: Time of the first beam.
+            pose: (3,) by odometry then.
+            scan: Its beams, from where the robot was then.
+            sigma: Standard deviation of an inverse distance with a weight of 1 [1/m].
+            reach: Range of the lidar [m].
+        """
+        stop = cls(pose)
+        stop.turn, stop.inverse, stop.bearing, stop.weight = scan
+        stop.stamp_ns = np.full(len(scan.turn), stamp_ns)
+        stop.sigma, stop.reach = sigma, reach
+        return stop
+
+    def scan(self, first: int, last: int) -> Scan:
+        """The beams from `first` on and before `last`, with turns since the one before."""
+        before = self.turn[first - 1] if first else 0.0
+        turn, inverse = self.turn[first:last] - before, self.inverse[first:last]
+        return Scan(turn, inverse, self.bearing, self.weight)
 
     def extend(self, readings: Readings) -> None:
         """Append readings."""

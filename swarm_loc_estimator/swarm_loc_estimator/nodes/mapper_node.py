@@ -1,9 +1,10 @@
-"""Builds one map with many PushBots, as a ROS 2 node.
+"""Builds one map with many robots, by laser pointers or lidars, as a ROS 2 node.
 
     ./run swarm_loc_estimator mapper_node --ros-args -p swarm_file:=swarm.yaml
 
-It subscribes to `<robot>/odom`, `<robot>/laser` and `<robot>/lights`. It publishes `map`, `visitation`,
-`<robot>/goal`, `<robot>/fix` (the estimator, which owns the transforms, fuses it) and `/diagnostics`.
+It subscribes to `<robot>/odom`, `<robot>/laser` and `<robot>/lights`, or `<robot>/scan`. It publishes `map`,
+`visitation`, `<robot>/goal`, `<robot>/fix` (the estimator, which owns the transforms, fuses it) and
+`/diagnostics`.
 Services: `~/save_map`, `~/reset`. Parameters: see `doc/mapper_node.md`.
 """
 
@@ -17,7 +18,7 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.time import Time
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
@@ -31,8 +32,15 @@ from swarm_loc_estimator.mapping.exploration import Goal
 from swarm_loc_estimator.mapping.grid import CELL, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import MapFileError, load_map, save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput, MapperInputError, fix_covariance
+from swarm_loc_estimator.mapping.mapper_feed import (
+    MapperFeed,
+    MapperInput,
+    MapperInputError,
+    fix_covariance,
+    inputs_of,
+)
 from swarm_loc_estimator.mapping.messages import led_frequencies
+from swarm_loc_estimator.mapping.track import Located
 from swarm_loc_estimator.nodes.mapper_precompile import precompile
 from swarm_loc_estimator.nodes.parameters import (
     MapperParameters,
@@ -75,10 +83,11 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self._clear()
         self._create_publishers()
         for index, robot in enumerate(self._robots):
-            for kind in MapperInput if self._frequencies else (MapperInput.ODOMETRY, MapperInput.LASER):
+            for kind in inputs_of(robot, lights=bool(self._frequencies)):
                 take = partial(self._on_message, index, kind)
                 topic = f"{robot.name}/{kind.topic}"
-                self.create_subscription(message_class(kind.message_type), topic, take, _INPUT_QOS, raw=True)
+                qos = qos_profile_sensor_data if kind is MapperInput.SCAN else _INPUT_QOS
+                self.create_subscription(message_class(kind.message_type), topic, take, qos, raw=True)
         self.create_service(Trigger, "~/save_map", self._on_save)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._jumps = self.get_clock().create_jump_callback(BACKWARDS, post_callback=self._on_jump)
@@ -91,7 +100,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self._mapper = CooperativeMapper(self.params.settings)
         self._mapper.background = self._background
         self.feed = MapperFeed(self._robots, self._mapper, self._frequencies)
-        self._goal_stamps: dict[int, int] = {}
+        self._located: dict[int, Located] = {}
         self._published: OccupancyMap | None = None
 
     def _create_publishers(self) -> None:
@@ -106,14 +115,15 @@ class MapperNode(ConfiguredNode[MapperParameters]):
     def _on_message(self, robot: int, kind: MapperInput, data: bytes) -> None:
         self.feed.add(robot, kind, data)
         number = self.feed.number(robot)
-        goal = self._mapper.goal(number) if number is not None else None
-        if number is None or goal is None or self._goal_stamps.get(robot) == goal.stamp_ns:
+        located = self._mapper.located(number) if number is not None else None
+        if number is None or located is None or self._located.get(robot) is located:
             return
-        self._goal_stamps[robot] = goal.stamp_ns
-        frame = self.params.map_frame
+        self._located[robot] = located
+        frame, goal = self.params.map_frame, self._mapper.goal(number)
         covariance = fix_covariance(self._mapper.covariance(number))
-        self._fixes[robot].publish(fix_message(goal, covariance, frame))
-        self._goals[robot].publish(goal_message(goal, frame))
+        self._fixes[robot].publish(fix_message(located, covariance, frame))
+        if goal is not None:
+            self._goals[robot].publish(goal_message(goal, frame))
 
     def _publish_map(self) -> None:
         """Publish the map and the visits if the map has changed."""
@@ -157,7 +167,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
             "stops": graph.count,
             "bearings": graph.constraints.bearing_count,
             **self._mapper.counters,
-            **drop_values(self.feed.all_drops),
+            **drop_values(self.feed.all_drops + self.feed.dropped_beams),
         }
         for kind in MapperInput:
             count = sum(self.feed.received[index, kind] for index in range(len(self._robots)))
@@ -201,12 +211,12 @@ def goal_message(goal: Goal, frame: str) -> PoseStamped:
     return message
 
 
-def fix_message(goal: Goal, covariance: FloatArray, frame: str) -> PoseWithCovarianceStamped:
-    """Pose of a robot when its goal was chosen, with a covariance (3, 3); see `fix_covariance`."""
+def fix_message(located: Located, covariance: FloatArray, frame: str) -> PoseWithCovarianceStamped:
+    """Pose of a robot at a scan, with a covariance (3, 3); see `fix_covariance`."""
     message = PoseWithCovarianceStamped()
     message.header.frame_id = frame
-    message.header.stamp = Time(nanoseconds=goal.stamp_ns).to_msg()
-    _set_pose(message.pose.pose, goal.pose)
+    message.header.stamp = Time(nanoseconds=located.stamp_ns).to_msg()
+    _set_pose(message.pose.pose, located.pose)
     full = planar_covariance(0.0, 0.0, 0.0)
     full[PLANE] = covariance
     message.pose.covariance = full.ravel()

@@ -19,7 +19,7 @@ from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
+from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, inputs_of
 from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.offline.ground_truth import TruthReader
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
@@ -37,7 +37,8 @@ def replay_map(
     """Map a bag; returns the mapper after a last optimization, and its feed with the counts of used inputs.
 
     Args:
-        bag: With `<robot>/odom`, `<robot>/laser` and, if frequencies are given, `<robot>/lights`.
+        bag: With `<robot>/odom`, `<robot>/laser` and, if frequencies are given, `<robot>/lights`; of robots
+            with a lidar `<robot>/scan`.
         robots: The robots that map.
         settings: Of the mapper.
         frequencies: Robot -> frequency of its LEDs [Hz].
@@ -49,7 +50,9 @@ def replay_map(
     mapper = CooperativeMapper(settings)
     feed = MapperFeed(robots, mapper, frequencies)
     source = {
-        f"{robot.name}/{kind.topic}": (k, kind) for k, robot in enumerate(robots) for kind in MapperInput
+        f"{robot.name}/{kind.topic}": (k, kind)
+        for k, robot in enumerate(robots)
+        for kind in inputs_of(robot, lights=True)
     }
     with BagReader(bag) as reader:
         for number, (topic, message_type, _, data) in enumerate(reader.messages(source)):

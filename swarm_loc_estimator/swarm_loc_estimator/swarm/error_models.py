@@ -117,6 +117,26 @@ class ImuModel:
 
 
 @dataclass(frozen=True)
+class LidarModel:
+    """Mount and noise of a robot's 2-D lidar, whose sweeps the mapper uses."""
+
+    range_sigma: float = number(0.0, "m", 0.0, 1.0, "noise of a range; 0: the robot has no lidar")
+    range_sigma_per_m: float = number(0.01, "1", 0.0, 1.0, "growth of this noise with the range [m per m]")
+    x: float = number(0.0, "m", -10.0, 10.0, "forward of base_link")
+    y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")
+    yaw: float = number(0.0, "rad", -TURN, TURN, "turned to the left; 3.1416: its zero is backwards")
+    min_range: float = number(0.0, "m", 0.0, 10.0, "nearer ranges are dropped, as those below range_min")
+    max_range: float = number(
+        12.0, "m", 0.2, 50.0, "where range_max is greater or missing: space is free up to here", above=True
+    )
+
+    @property
+    def is_used(self) -> bool:
+        """Whether the robot has a lidar."""
+        return self.range_sigma > 0.0
+
+
+@dataclass(frozen=True)
 class RandomWalk:
     """Random walk of a robot without odometry, given by the growth of its pose variance."""
 

@@ -19,6 +19,7 @@ from swarm_loc_estimator.swarm.error_models import (
     ClockModel,
     FixModel,
     ImuModel,
+    LidarModel,
     OdometryModel,
     RandomWalk,
     SensorModel,
@@ -135,6 +136,7 @@ class Robot:
         type: Name of its type; "" if it has none.
         odometry: Error model of its odometry.
         imu: Error model of its IMU.
+        lidar: Its lidar, for mapping.
         response: True share of the reported motion; None: all of it.
         camera: Pose of its camera; None if it has none.
         sensor: Error model of its sightings.
@@ -153,6 +155,7 @@ class Robot:
     type: str = ""
     odometry: OdometryModel = OdometryModel()
     imu: ImuModel = ImuModel()
+    lidar: LidarModel = LidarModel()
     response: MotionResponse | None = None
     camera: CameraMount | None = CameraMount()
     sensor: SensorModel = SensorModel()

@@ -2,7 +2,8 @@
 
 ```yaml
 fileversion: 1
-defaults:      # odometry, imu, random_walk, response, camera, sensor, fix, clock, ir, uwb, faces, start_sigma
+defaults:      # odometry, imu, lidar, random_walk, response, camera, sensor, fix, clock, ir, uwb, faces,
+               # start_sigma
   sensor: {range_sigma: 0.1}
   landmark: {size: 0.06, position_sigma: 0.01, yaw_sigma: 0.02}  # without sigmas: surveyed exactly
 types:
@@ -58,6 +59,7 @@ from swarm_loc_estimator.swarm.error_models import (
     ClockModel,
     FixModel,
     ImuModel,
+    LidarModel,
     OdometryModel,
     RandomWalk,
     SensorModel,
@@ -85,14 +87,15 @@ FILE_VERSION = 1
 
 _SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors")
 LAYER = (
-    *("odometry", "imu", "random_walk", "response", "camera", "sensor", "fix", "clock", "ir", "uwb"),
-    *("faces", "start_sigma"),
+    *("odometry", "imu", "lidar", "random_walk", "response", "camera", "sensor", "fix", "clock", "ir"),
+    *("uwb", "faces", "start_sigma"),
 )
 _DEFAULTS = (*LAYER, "landmark")
 _ROBOT = ("type", *LAYER, "ids", "start")
 MODELS: dict[str, type] = {
     "odometry": OdometryModel,
     "imu": ImuModel,
+    "lidar": LidarModel,
     "random_walk": RandomWalk,
     "camera": CameraMount,
     "sensor": SensorModel,

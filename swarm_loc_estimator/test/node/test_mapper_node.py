@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,17 +12,19 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from mapping_world import RoomRobot
+from mapping_world import LIDAR, LidarRobot, RoomRobot, scan_bytes
 from nav_msgs.msg import OccupancyGrid, Odometry
 from node_world import T0_NS, Ros, odometry_bytes, overrides, stamp_ns, values_of
-from rclpy.qos import DurabilityPolicy, QoSProfile
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.serialization import serialize_message
 from rclpy.time import Time
+from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Trigger
 
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.grid import CELL
 from swarm_loc_estimator.mapping.map_file import load_map
+from swarm_loc_estimator.mapping.mapper_feed import MapperInput
 from swarm_loc_estimator.mapping.scans import Readings
 from swarm_loc_estimator.nodes.mapper_node import MapperNode
 from swarm_loc_msgs.msg import LaserDistance
@@ -112,6 +116,39 @@ def test_a_robot_looks_around_and_gets_a_map_a_fix_and_a_goal(ros: Ros, files: P
     assert load_map(files / "map.yaml", CELL).occupied.sum() > 100
     assert ros.call(Trigger, "mapper/reset", Trigger.Request()).success
     assert node.feed.received.total() == 0
+
+
+def more_scans(node: MapperNode, before: int) -> bool:
+    """Whether the node has received a scan since it had `before`."""
+    return node.feed.received[0, MapperInput.SCAN] > before
+
+
+def test_a_lidar_is_read_by_best_effort_and_locates_a_robot_that_drives(ros: Ros, files: Path) -> None:
+    robot = LidarRobot(np.random.default_rng(1))
+    start = dict(zip(("x", "y", "theta"), robot.start.tolist(), strict=True))
+    sigma = dict.fromkeys(start, 0.001)
+    about = f"{{start: {start}, start_sigma: {sigma}, lidar: {asdict(LIDAR)}}}".replace("'", "")
+    text = f"fileversion: 1\ndefaults: {{fix: {{systematic_share: 1.0}}}}\nrobots: {{alpha: {about}}}\n"
+    (files / "swarm.yaml").write_text(text, encoding="utf-8")
+    node = mapper(ros, files)
+    goals = ros.listen(PoseStamped, "alpha/goal")
+    fixes = ros.listen(PoseWithCovarianceStamped, "alpha/fix")
+    odometry = ros.tester.create_publisher(Odometry, "alpha/odom", QoSProfile(depth=200))
+    scans = ros.tester.create_publisher(LaserScan, "alpha/scan", qos_profile_sensor_data)
+    ros.until(lambda: odometry.get_subscription_count() and scans.get_subscription_count())
+    for at_ns in range(T0_NS, T0_NS + 5_000_000_000, 200_000_000):
+        pose = robot.odometry(np.array([at_ns - T0_NS]))[0]
+        odometry.publish(odometry_bytes("alpha", at_ns, tuple(pose.tolist())))
+        scan = scan_bytes(robot.scan(at_ns - T0_NS)._replace(stamp_ns=at_ns))
+        ros.publish_until(scans, scan, partial(more_scans, node, node.feed.received[0, MapperInput.SCAN]))
+    ros.until(lambda: len(fixes) >= 4)
+    for fix in fixes:
+        truth = robot.pose(stamp_ns(fix) - T0_NS)
+        place = fix.pose.pose.position
+        assert math.dist((place.x, place.y), truth[:2]) < 0.03
+        assert 0.02**2 <= fix.pose.covariance[0] < 0.05**2
+    assert not goals
+    assert set(node.feed.all_drops) <= {"scan_too_old"}  # what is sent again
 
 
 def test_what_is_missing_and_what_is_wrong_is_told(ros: Ros, files: Path) -> None:

@@ -1,14 +1,19 @@
-"""What the tests of mapping share: a room with one niche, and a robot that looks around in it."""
+"""What the tests of mapping share: a room with one niche, and robots that look around in it."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.common.messages.cdr import encode
+from swarm_loc_estimator.common.messages.definitions import LASER_SCAN
+from swarm_loc_estimator.common.se2 import compose, exp, wrap_angle
+from swarm_loc_estimator.mapping.messages import ScanMessage
 from swarm_loc_estimator.mapping.scans import Readings
+from swarm_loc_estimator.swarm.error_models import LidarModel
 
 PERIOD_NS = 20_000_000
 MAX_RANGE = 2.5
@@ -101,3 +106,49 @@ class RoomRobot:
         reported = odometry.copy()
         reported[:, 2] = wrap_angle(odometry[:, 2])
         return Readings(stamps, reported, inverse, SIGMA)
+
+
+LIDAR = LidarModel(range_sigma=0.01, range_sigma_per_m=0.01, x=0.05, y=-0.02, yaw=0.5 * math.pi)
+"""Of `LidarRobot`, on a mount off the centre."""
+SWEEP_NS, BEAMS = 200_000_000, 360
+
+
+class LidarRobot:
+    """A robot that drives a circle in the room without slip, and its lidar.
+
+    Args:
+        rng: Of the lidar's noise; None: exact.
+    """
+
+    start = np.array([1.7, 0.8, 0.0])
+
+    def __init__(self, rng: np.random.Generator | None = None) -> None:
+        self._rng = rng
+
+    def odometry(self, stamp_ns: NDArray[np.int64]) -> FloatArray:
+        """Poses (n, 3) by odometry at times (n,); it drives at 0.2 m/s and turns by 0.4 rad/s."""
+        return exp(np.multiply.outer(stamp_ns * 1e-9, [0.2, 0.0, 0.4]))
+
+    def pose(self, stamp_ns: int) -> FloatArray:
+        """The true pose (3,)."""
+        return compose(self.start, self.odometry(np.array([stamp_ns]))[0])
+
+    def scan(self, stamp_ns: int) -> ScanMessage:
+        """The sweep that begins at a time; every beam leaves from where the robot then is."""
+        beam_ns = stamp_ns + SWEEP_NS // BEAMS * np.arange(BEAMS)
+        step = 2.0 * math.pi / BEAMS
+        beams = np.stack([np.zeros(BEAMS), np.zeros(BEAMS), step * np.arange(BEAMS)], axis=-1)
+        mounted = compose(compose(self.start, self.odometry(beam_ns)), [LIDAR.x, LIDAR.y, LIDAR.yaw])
+        ranges = np.array([distance_in_room(*ray) for ray in compose(mounted, beams).tolist()])
+        if self._rng is not None:
+            sigma = LIDAR.range_sigma + LIDAR.range_sigma_per_m * ranges
+            ranges += sigma * self._rng.standard_normal(BEAMS)
+        return ScanMessage(stamp_ns, 0.0, 2.0 * math.pi, step, SWEEP_NS // BEAMS * 1e-9, 0.12, 3.5, ranges)
+
+
+def scan_bytes(scan: ScanMessage) -> bytes:
+    """A sensor_msgs/LaserScan."""
+    header = {"stamp": scan.stamp_ns, "frame_id": "a/base_scan"}
+    fields = {**scan._asdict(), "header": header, "ranges": scan.ranges.astype(np.float32)}
+    del fields["stamp_ns"]
+    return encode(fields, LASER_SCAN)

@@ -28,6 +28,7 @@ from swarm_loc_estimator.mapping.scans import (
     LINE,
     MAX_BEAMS,
     Beams,
+    Scan,
     fit_lines,
     no_beams,
     no_lines,
@@ -42,11 +43,12 @@ POSES = np.array([[1.5, 1.2, 0.4], [1.9, 1.4, -2.0]])
 def scans(noise: np.random.Generator | None = None, ratio: float = 1.0) -> Scans:
     """Two stops in the room."""
     beams, lines = no_beams(2), no_lines(2)
+    beams.reach[:] = MAX_RANGE
     for stop, pose in enumerate(POSES):
         beams.sigma[stop] = SIGMA
-        set_beams(beams, stop, TURN, inverse_distances(pose, pose[2] + ratio * TURN, noise))
+        set_beams(beams, stop, Scan(TURN, inverse_distances(pose, pose[2] + ratio * TURN, noise)))
         fit_lines(stop, ratio, MAX_RANGE, beams, lines)
-    return Scans(np.column_stack([POSES, [ratio, ratio]]), beams, lines, MAX_RANGE)
+    return Scans(np.column_stack([POSES, [ratio, ratio]]), beams, lines)
 
 
 def test_a_line_is_normal_over_distance() -> None:
@@ -61,7 +63,7 @@ def test_a_line_is_normal_over_distance() -> None:
 def test_beams_of_more_than_one_stop_are_thinned_and_nothing_is_free() -> None:
     beams, lines = no_beams(1), no_lines(1)
     turn = np.linspace(0.0, 2.0 * math.pi, 3 * MAX_BEAMS)
-    set_beams(beams, 0, turn, np.zeros(len(turn)))
+    set_beams(beams, 0, Scan(turn, np.zeros(len(turn))))
     beams.sigma[0] = SIGMA
     fit_lines(0, 1.0, MAX_RANGE, beams, lines)
     assert beams.counts[0] == MAX_BEAMS
@@ -120,22 +122,25 @@ def test_jacobians_are_those_of_finite_differences(change: list[float], beam: in
 def only(found: Scans, beam: int) -> Beams:
     """Beams of which the first stop has one."""
     beams = no_beams(2)
-    set_beams(beams, 0, found.beams.turn[0, beam : beam + 1], found.beams.inverse[0, beam : beam + 1])
-    beams.sigma[:] = SIGMA
+    chosen = slice(beam, beam + 1)
+    set_beams(beams, 0, Scan(found.beams.turn[0, chosen], found.beams.inverse[0, chosen]))
+    beams.sigma[:], beams.reach[:] = SIGMA, MAX_RANGE
     return beams
 
 
 def in_corridor(rng: np.random.Generator) -> Scans:
     """Two stops between two endless walls along x, 2.6 m apart."""
     beams, lines = no_beams(2), no_lines(2)
+    beams.reach[:] = MAX_RANGE
     for stop, pose in enumerate(POSES):
         sine = np.sin(pose[2] + TURN)
         distance = np.where(sine > 0.0, 2.6 - pose[1], pose[1]) / np.maximum(np.abs(sine), 1e-9)
         seen = distance < MAX_RANGE
         beams.sigma[stop] = SIGMA
-        set_beams(beams, stop, TURN, seen / distance + seen * SIGMA * rng.standard_normal(len(TURN)))
+        inverse = seen / distance + seen * SIGMA * rng.standard_normal(len(TURN))
+        set_beams(beams, stop, Scan(TURN, inverse))
         fit_lines(stop, 1.0, MAX_RANGE, beams, lines)
-    return Scans(np.column_stack([POSES, [1.0, 1.0]]), beams, lines, MAX_RANGE)
+    return Scans(np.column_stack([POSES, [1.0, 1.0]]), beams, lines)
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -12,6 +12,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.mapping import constraints as model
 from swarm_loc_estimator.mapping.constraints import NormalEquations
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
+from swarm_loc_estimator.mapping.scans import Scan
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
 SEEDS = range(5)
@@ -90,7 +91,7 @@ def test_a_chain_is_as_unsure_as_its_odometry_adds_up() -> None:
     sigma = np.array([0.02, 0.01, 1e-4])
     stops = [graph.add_stop(0, np.array([float(k), 0.0, 0.0]), 0.02) for k in range(5)]
     for stop in stops:
-        graph.set_scan(stop, np.zeros(1), np.zeros(1))
+        graph.set_scan(stop, Scan(np.zeros(1), np.zeros(1)))
     graph.constraints.add_prior(0, np.zeros(3), np.full(3, 1e-4))
     for begin, end in pairwise(stops):
         graph.constraints.add_departure(begin, end, 0.0, np.array([1.0, 0.0, 0.0]), sigma)
@@ -105,7 +106,7 @@ def test_stops_outgrow_the_room_that_there_was() -> None:
     graph.add_robot()
     for k in range(150):
         stop = graph.add_stop(0, np.array([k, 0.0, 0.0]), 0.02)
-        graph.set_scan(stop, np.linspace(0.0, 1.0, 10), np.full(10, 0.5))
+        graph.set_scan(stop, Scan(np.linspace(0.0, 1.0, 10), np.full(10, 0.5)))
     assert graph.count == 150
     assert (graph.scans.beams.counts[:150] == 10).all()
     assert graph.poses[:, 0].tolist() == list(range(150))

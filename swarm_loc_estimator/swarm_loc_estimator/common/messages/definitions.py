@@ -19,6 +19,7 @@ MESSAGE_PACKAGE = "swarm_loc_msgs"
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 IMU = "sensor_msgs/msg/Imu"
+LASER_SCAN = "sensor_msgs/msg/LaserScan"
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
 POSE_WITH_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -69,6 +70,9 @@ sensor_msgs/Image: Header header, uint32 height, uint32 width, string encoding, 
 sensor_msgs/Imu: Header header, geometry_msgs/Quaternion orientation, float64[9] orientation_covariance,
     geometry_msgs/Vector3 angular_velocity, float64[9] angular_velocity_covariance,
     geometry_msgs/Vector3 linear_acceleration, float64[9] linear_acceleration_covariance
+sensor_msgs/LaserScan: Header header, float32 angle_min, float32 angle_max, float32 angle_increment,
+    float32 time_increment, float32 scan_time, float32 range_min, float32 range_max, float32[] ranges,
+    float32[] intensities
 sensor_msgs/RegionOfInterest: uint32 x_offset, uint32 y_offset, uint32 height, uint32 width, bool do_rectify
 sensor_msgs/CameraInfo: Header header, uint32 height, uint32 width, string distortion_model, float64[] d,
     float64[9] k, float64[9] r, float64[12] p, uint32 binning_x, uint32 binning_y, RegionOfInterest roi

@@ -1,0 +1,223 @@
+"""Scans of lidars: what of them is used, motion during a sweep, and the map of a robot that does not stop."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mapping_world import BEAMS, LIDAR, ROOM, SWEEP_NS, LidarRobot, scan_bytes
+
+from swarm_loc_estimator.cli.replay_map import main
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
+from swarm_loc_estimator.common.messages.definitions import LASER_SCAN, ODOMETRY
+from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
+from swarm_loc_estimator.common.se2 import between, compose, transform_points
+from swarm_loc_estimator.mapping.map_file import load_map
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
+from swarm_loc_estimator.mapping.messages import ScanMessage, decode_scan
+from swarm_loc_estimator.mapping.pairing import SweepPairer
+from swarm_loc_estimator.mapping.stops import ScanStop
+from swarm_loc_estimator.swarm.error_models import LidarModel
+from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+
+ODOMETRY_NS = 40_000_000
+TURTLE = Robot(
+    "a", start=tuple(LidarRobot.start.tolist()), start_sigma=StartSigma(1e-3, 1e-3, 1e-3), lidar=LIDAR
+)
+
+
+def odometry(stamp_ns: int, pose: FloatArray) -> bytes:
+    unknown = UNKNOWN_COVARIANCE
+    stamps, zero = np.array([stamp_ns]), np.zeros((1, 3))
+    return encode_odometry("a/odom", "a/base_link", stamps, pose[None], zero, unknown, unknown)[0]
+
+
+def messages(until_ns: int, seed: int) -> list[tuple[MapperInput, int, bytes]]:
+    """What the robot sends: odometry, and each sweep when it is over."""
+    robot = LidarRobot(np.random.default_rng(seed))
+    sent = [
+        (MapperInput.ODOMETRY, at_ns, odometry(at_ns, robot.odometry(np.array([at_ns]))[0]))
+        for at_ns in range(0, until_ns + 1, ODOMETRY_NS)
+    ]
+    sweeps = range(0, until_ns - SWEEP_NS + 1, SWEEP_NS)
+    sent += [(MapperInput.SCAN, at_ns + SWEEP_NS, scan_bytes(robot.scan(at_ns))) for at_ns in sweeps]
+    return sorted(sent, key=lambda one: one[1])
+
+
+def changed(ranges: list[float], **fields: Any) -> ScanMessage:
+    """A scan of an instant."""
+    last = 0.1 * (len(ranges) - 1)
+    return ScanMessage(5, 0.0, last, 0.1, 0.0, 0.2, 4.0, np.array(ranges))._replace(**fields)
+
+
+def one_stop(pairer: SweepPairer, scan: ScanMessage) -> ScanStop:
+    """The stop of a scan by a robot that stands."""
+    pairer.add_odometry(0, np.zeros(3))
+    pairer.add_scan(scan)
+    pairer.add_odometry(10, np.zeros(3))
+    (stop,) = pairer.ready()
+    return stop
+
+
+def test_a_scan_is_read_as_others_write_it() -> None:
+    types: Any = typestore().types
+    numbers = {"angle_min": -1.0, "angle_max": 1.0, "angle_increment": 0.5, "time_increment": 0.25}
+    numbers |= {"scan_time": 9.0, "range_min": 0.125, "range_max": 3.5}
+    stamp = types["builtin_interfaces/msg/Time"](sec=1, nanosec=7)
+    header = types["std_msgs/msg/Header"](stamp=stamp, frame_id="laser")
+    ranges = np.array([0.5, math.inf, 1.5, 2.0, 2.5], dtype=np.float32)
+    message = types[LASER_SCAN](header=header, **numbers, ranges=ranges, intensities=ranges)
+    found = decode_scan(bytes(typestore().serialize_cdr(message, LASER_SCAN)))
+    assert found[:-1] == (1_000_000_007, -1.0, 1.0, 0.5, 0.25, 0.125, 3.5)
+    assert found.ranges.tolist() == ranges.tolist()
+
+
+def test_beams_that_say_nothing_are_counted_by_reason_and_the_others_are_used() -> None:
+    pairer = SweepPairer(LidarModel(range_sigma=0.01, range_sigma_per_m=0.01, min_range=0.3))
+    ranges = [1.0, math.nan, math.inf, -math.inf, 0.0, 0.1, 0.25, 4.5, 3.0, -1.0]
+    stop = one_stop(pairer, changed(ranges))
+    assert dict(pairer.dropped_beams) == {"beam_not_a_number": 1, "beam_too_near": 5, "beam_too_far": 1}
+    assert not pairer.drops
+    assert stop.bearing == pytest.approx([0.0, 0.2, 0.8])
+    assert stop.inverse == pytest.approx([1.0, 0.0, 1.0 / 3.0])
+    assert stop.reach == 4.0
+    sigma = stop.sigma / np.sqrt(stop.weight)
+    assert sigma == pytest.approx([0.02, 0.05 / 16.0, 0.04 / 9.0])
+
+
+@pytest.mark.parametrize("range_max", [0.0, math.inf, math.nan, 50.0])
+def test_a_range_beyond_what_is_described_is_free_space(range_max: float) -> None:
+    pairer = SweepPairer(LidarModel(range_sigma=0.01, max_range=2.0))
+    stop = one_stop(pairer, changed([1.0, 3.0, math.inf], range_max=range_max))
+    assert stop.inverse == pytest.approx([1.0, 0.0, 0.0])
+    assert stop.reach == 2.0
+    assert not any(pairer.dropped_beams.values())
+
+
+@pytest.mark.parametrize(
+    ("ranges", "fields", "reason"),
+    [
+        ([1.0, 1.0], {"angle_increment": 0.0}, "scan_bad_geometry"),
+        ([1.0, 1.0], {"angle_min": math.nan}, "scan_bad_geometry"),
+        ([1.0, 1.0], {"time_increment": math.inf}, "scan_bad_geometry"),
+        ([1.0, 1.0], {"time_increment": -0.1}, "scan_bad_geometry"),
+        ([1.0, 1.0], {"time_increment": 2.1}, "scan_bad_geometry"),
+        ([1.0] * 70, {}, "scan_bad_geometry"),
+        ([1.0] * 5, {"angle_max": 0.2}, "scan_wrong_length"),
+        ([], {"angle_max": 0.0}, "scan_wrong_length"),
+        ([math.nan, 0.0], {}, "scan_without_beams"),
+        ([1.0, 1.0], {"stamp_ns": -1}, "scan_too_old"),
+    ],
+)
+def test_a_scan_that_cannot_be_used_is_dropped_with_a_reason(
+    ranges: list[float], fields: dict[str, Any], reason: str
+) -> None:
+    pairer = SweepPairer(LIDAR)
+    pairer.add_scan(changed([1.0], stamp_ns=0))
+    pairer.add_scan(changed(ranges, **fields))
+    assert dict(pairer.drops) == {reason: 1}
+    assert [one.inverse.size for one in pairer.ready()] == []  # there is no odometry yet
+
+
+def test_scans_without_odometry_do_not_wait_for_ever() -> None:
+    pairer = SweepPairer(LIDAR)
+    for k in range(60):
+        pairer.add_scan(changed([1.0], stamp_ns=k))
+    assert pairer.drops["scan_without_odometry"] == 10
+    pairer.add_odometry(70, np.zeros(3))
+    assert not list(pairer.ready())
+    assert pairer.drops["scan_without_odometry"] == 60
+
+
+def test_the_motion_during_a_sweep_is_taken_out_of_it() -> None:
+    """Walls are where they are, seen from where the robot was at the first beam, wherever the lidar sits."""
+    robot, pairer, begin_ns = LidarRobot(), SweepPairer(LIDAR), 1_010_000_000
+    for at_ns in range(1_000_000_000, 1_300_000_000, ODOMETRY_NS):
+        pairer.add_odometry(at_ns, robot.odometry(np.array([at_ns]))[0])
+    pairer.add_scan(robot.scan(begin_ns))
+    (stop,) = pairer.ready()
+    assert stop.stamp_ns[0] == begin_ns
+    assert compose(robot.start, stop.arrival) == pytest.approx(robot.pose(begin_ns), abs=1e-9)
+    angle = stop.bearing + stop.turn
+    points = np.stack([np.cos(angle), np.sin(angle)], axis=-1) / stop.inverse[:, None]
+    x, y = transform_points(robot.pose(begin_ns), points).T
+    off = np.min(np.abs([x - ROOM[0], x - ROOM[2], y - ROOM[1], y - ROOM[3]]), axis=0)
+    on_walls = (y < ROOM[3] + 1e-3) & ((x < 1.19) | (x > 2.01) | (y < 2.0))  # but for the niche
+    assert on_walls.sum() > 300
+    assert off[on_walls].max() < 1e-6
+    moved = between(robot.pose(begin_ns), robot.pose(begin_ns + SWEEP_NS))
+    assert stop.turn[-1] == pytest.approx(moved[2] * (BEAMS - 1) / BEAMS, abs=1e-6)
+
+
+def test_a_robot_that_does_not_stop_makes_a_map() -> None:
+    mapper = CooperativeMapper()
+    feed = MapperFeed([TURTLE], mapper, {})
+    assert list(feed.missing()) == ["a/odom", "a/scan"]
+    for kind, _, data in messages(12_000_000_000, seed=3):
+        feed.add(0, kind, data)
+    mapper.finish()
+    assert not feed.all_drops
+    assert 10 <= mapper.graph.count <= 20
+    robot = LidarRobot()
+    truth = np.array([robot.pose(at_ns) for at_ns in mapper.begin_ns.values()])
+    off = between(truth, mapper.graph.poses)
+    assert np.hypot(off[:, 0], off[:, 1]).max() < 0.02
+    assert np.abs(off[:, 2]).max() < math.radians(0.6)
+    located = mapper.located(0)
+    assert located is not None
+    assert located.pose == pytest.approx(robot.pose(located.stamp_ns), abs=0.03)
+    assert mapper.goal(0) is None
+    occupancy = mapper.occupancy()
+    x, y = occupancy.centres(occupancy.occupied).T
+    outside = np.min(np.abs([x - ROOM[0], x - ROOM[2], y - ROOM[1], y - ROOM[3]]), axis=0)
+    assert len(x) > 300
+    assert np.median(outside) < 0.02
+    assert occupancy.free[tuple(occupancy.index(LidarRobot.start[None, :2])[0])]
+
+
+def test_a_robot_that_stands_adds_one_sweep() -> None:
+    mapper, robot = CooperativeMapper(), LidarRobot()
+    feed = MapperFeed([TURTLE], mapper, {})
+    scan = robot.scan(0)._replace(time_increment=0.0)
+    for k in range(20):
+        feed.add(0, MapperInput.ODOMETRY, odometry(k * SWEEP_NS, np.zeros(3)))
+        feed.add(0, MapperInput.SCAN, scan_bytes(scan._replace(stamp_ns=k * SWEEP_NS)))
+    assert mapper.graph.count == mapper.counters["scans"] == 1
+
+
+def test_odometry_that_restarts_does_not_move_the_robot_in_the_map() -> None:
+    mapper, robot = CooperativeMapper(), LidarRobot(np.random.default_rng(1))
+    feed = MapperFeed([TURTLE], mapper, {})
+    for at_ns in range(0, 8_000_000_000, ODOMETRY_NS):
+        pose = robot.odometry(np.array([at_ns]))[0]
+        shift = [3.0, 0.0, 1.0] if at_ns >= 4_000_000_000 else np.zeros(3)
+        feed.add(0, MapperInput.ODOMETRY, odometry(at_ns, compose(shift, pose)))
+        if at_ns % SWEEP_NS == 0:
+            feed.add(0, MapperInput.SCAN, scan_bytes(robot.scan(at_ns)))
+    assert mapper.counters["odometry_restarts"] == 1
+    located = mapper.located(0)
+    assert located is not None
+    assert located.pose == pytest.approx(robot.pose(located.stamp_ns), abs=0.06)
+
+
+def test_a_bag_gives_the_same_map_twice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("a/odom", ODOMETRY)
+        bag.add_topic("a/scan", LASER_SCAN)
+        for kind, at_ns, data in messages(5_000_000_000, seed=1):
+            bag.write(f"a/{kind.topic}", at_ns, data)
+    save_swarm(Swarm((TURTLE,)), tmp_path / "bag" / "swarm.yaml")
+    files = []
+    for name in ("x", "y"):
+        assert main([str(tmp_path / "bag"), "--out", str(tmp_path / name)]) == 0
+        files.append({path.name: path.read_bytes() for path in (tmp_path / name).iterdir()})
+    assert set(files[0]) == {"map.yaml", "map.pgm", "map.png", "stops.csv"}
+    assert files[0] == files[1]
+    assert load_map(tmp_path / "x" / "map.yaml", 0.02).occupied.sum() > 200
+    assert "beam_too_near" not in capsys.readouterr().out
