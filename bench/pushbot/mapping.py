@@ -20,6 +20,9 @@ UNSEEN = ("bend", "atrium", "tee")
 WIDE = ("open12", "corridor25")
 """Halls whose walls are out of the laser's range, or do not tell how far along a robot is."""
 SLIPS = (0.0, 0.02, 0.05)
+LIDAR_SLIPS = (0.02, 0.035, 0.05)
+"""Shares of paths and turns that wheels lose, of seeds 1, 2 and 3 and so on."""
+LIDAR_MINUTES = 5.0
 _SPEED_ROBOTS = (1, 2, 5, 10)
 _SPEED_MINUTES = 5.0
 _MAX_PROCESSES = 2
@@ -81,6 +84,11 @@ def planned(effort: MappingEffort) -> dict[str, list[RunSettings]]:
     jobs["five_robots"] = seeds(effort.team_seeds, half, "corridor", robots=5)
     jobs["two_robots.no_lights"] = seeds(effort.team_seeds, half, "corridor", robots=2, lights=False)
     jobs["five_robots.no_lights"] = seeds(effort.team_seeds, half, "corridor", robots=5, lights=False)
+    for plan in PLANS:
+        jobs[f"lidar.{plan}"] = [
+            RunSettings(plan, LIDAR_SLIPS[k % len(LIDAR_SLIPS)], k + 1, min(whole, LIDAR_MINUTES), lidar=True)
+            for k in range(effort.team_seeds)
+        ]
     for robots in _SPEED_ROBOTS:
         jobs[f"speed{robots}"] = seeds(1, min(whole, _SPEED_MINUTES), "corridor", robots=robots)
     return jobs
@@ -97,6 +105,9 @@ def figures_of(results: Mapping[str, Sequence[RunResult]]) -> dict[str, float]:
         figures[f"{name}.good_share"] = float(np.mean([one.is_good for one in runs]))
         reached = [math.isfinite(one.coverage_90_s) for one in runs]
         figures[f"{name}.coverage_90_share"] = float(np.mean(reached))
+        if runs[0].settings.lidar:
+            figures[f"{name}.worst_wall_cm"] = max(one.wall_cm for one in runs)
+            figures[f"{name}.sweep_ms"] = _median(runs, "sweep_ms")
         if name in WIDE:
             figures[f"{name}.misleading_share"] = float(np.mean([one.misleading_share for one in runs]))
             unreported = sum(one.diverged_unreported for one in runs)

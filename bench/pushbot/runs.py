@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from bench.pushbot.lidar import LidarDrive
 from bench.pushbot.particle_mapper import ParticleMapper
 from swarm_loc_drivers.sim.pushbot.exploration import Arrival, Exploration, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan
@@ -40,6 +41,7 @@ class RunSettings:
         lights: Whether LEDs of other robots are seen.
         printed: Whether the paper's method makes the map.
         checks_covariances: Whether poses are compared with their covariances at each arrival.
+        lidar: Whether the robot has a lidar, see `bench.pushbot.lidar`, in place of a laser pointer.
     """
 
     plan: str
@@ -51,6 +53,7 @@ class RunSettings:
     lights: bool = True
     printed: bool = False
     checks_covariances: bool = False
+    lidar: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,7 @@ class RunResult:
         path: (m, 3) robot, x, y of all poses [m].
         misleading_share: Share of poses off by more than 5 sigma and 2 cm when told; NaN: not compared.
         diverged_unreported: 1 if one was off by more than `DIVERGED_CM` and 3 sigma, else 0.
+        sweep_ms: CPU time per sweep of a lidar [ms]; NaN: it has none.
     """
 
     settings: RunSettings
@@ -94,6 +98,7 @@ class RunResult:
     path: FloatArray
     misleading_share: float = math.nan
     diverged_unreported: float = 0.0
+    sweep_ms: float = math.nan
 
     @property
     def is_diverged(self) -> bool:
@@ -115,6 +120,8 @@ def run(settings: RunSettings) -> RunResult:
     """Simulate and score one run."""
     plan = floor_plan(settings.plan)
     rng = np.random.default_rng([settings.seed, round(1e3 * settings.slip), settings.robots])
+    if settings.lidar:
+        return _run_lidar(settings, plan, rng)
     mapper: CooperativeMapper | ParticleMapper
     mapper = ParticleMapper(rng.spawn(1)[0]) if settings.printed else CooperativeMapper()
     exploration = Exploration(plan, mapper, rng, use_lights=settings.lights)
@@ -135,6 +142,17 @@ def run(settings: RunSettings) -> RunResult:
     mapper.finish()
     found = _score(settings, plan, exploration, mapper, _final(mapper, exploration, places), covered.since_s)
     return _compared(found, exploration, np.array(covariances)) if covariances else found
+
+
+def _run_lidar(settings: RunSettings, plan: FloorPlan, rng: np.random.Generator) -> RunResult:
+    """A run of a robot with a lidar; its arrivals are the sweeps in the graph."""
+    mapper = CooperativeMapper()
+    drive = LidarDrive.starting(plan, mapper, settings.slip, rng)
+    drive.run(60.0 * settings.minutes)
+    mapper.finish()
+    final = mapper.graph.poses[: len(drive.arrivals)].copy()
+    found = _score(settings, plan, drive, mapper, final, math.nan)
+    return replace(found, sweep_ms=1e3 * drive.cpu_s / drive.sweeps)
 
 
 def _compared(result: RunResult, exploration: Exploration, covariances: FloatArray) -> RunResult:
@@ -212,7 +230,7 @@ def _final(
 def _score(
     settings: RunSettings,
     plan: FloorPlan,
-    exploration: Exploration,
+    exploration: Exploration | LidarDrive,
     mapper: CooperativeMapper | ParticleMapper,
     final: FloatArray,
     coverage_90_s: float,

@@ -34,6 +34,7 @@ def test_every_kind_of_run_is_planned() -> None:
     assert {one.slip for one in jobs["ring"]} == {0.0, 0.02, 0.05}
     assert len({one.seed for one in jobs["ring"]}) == 20
     assert jobs["five_robots"][0].minutes == 10.0
+    assert [(one.slip, one.seed) for one in jobs["lidar.ring"]] == [(0.02, 1), (0.035, 2), (0.05, 3)]
 
 
 def test_what_two_cores_carry_counts_only_events_that_came() -> None:
@@ -81,6 +82,17 @@ def test_a_short_run_is_scored_and_comes_out_the_same_twice() -> None:
     assert 0.05 < first.coverage < 0.9
     assert first.wall_aligned_cm < 4.0
     assert np.array_equal(first.cells, second.cells)
+
+
+def test_a_lidar_maps_a_hall_with_wheels_that_slip() -> None:
+    found = run(RunSettings("office", 0.05, 1, minutes=0.5, lidar=True))
+    assert found.wall_cm < 3.0
+    assert found.worst_cm < 6.0
+    assert found.coverage > 0.15
+    assert 0.0 < found.sweep_ms < 200.0
+    figures = figures_of({"lidar.office": [found]})
+    assert figures["lidar.office.diverged"] == 0.0
+    assert figures["lidar.office.worst_wall_cm"] == found.wall_cm
 
 
 def test_the_printed_tracker_is_moved_by_noise_and_the_product_of_weights_is_not() -> None:
