@@ -40,7 +40,7 @@ CLUSTERS = {"distributed", "ray"}
 """Only for sweeps on a cluster, imported by name: rosdep knows no packages of them; benchmarks run them."""
 PIP_NAMES = {"python3-pil": "pillow"}
 """What pip calls packages in which rosdep's name is another one."""
-LOADED_BY_NAME = {"swarm_loc_estimator": {"event_camera_msgs"}}
+LOADED_BY_NAME = {"swarm_loc_estimator": {"event_camera_msgs", "sensor_msgs"}}
 """Packages that `message_class` imports."""
 HERE = {"_typeshed", "bench", "workspace"} | {path.stem for path in ROOT.glob("swarm_loc_*/test/**/*.py")}
 """Of the type checker, or of this workspace and in none of its packages."""

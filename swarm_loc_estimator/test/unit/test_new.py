@@ -102,8 +102,8 @@ def test_wrong_answers_are_asked_again_with_those_that_are_allowed(
     said = capsys.readouterr().out
     for sentence in (
         f"'epuk' must be one of {', '.join(KNOWN_ROBOTS)}.",
-        "0 must be a number in [1, 1000].",
-        "many must be a number in [1, 1000].",
+        "0 must be a number in [1, 5000].",
+        "many must be a number in [1, 5000].",
         "'2 robots' must be at most 60 letters, digits and underscores and start with a letter.",
         "'infrared' must be of robots, landmarks, aerial, fix.",
         f"'qr' must be one of {', '.join(FAMILY_IDS)}.",
@@ -118,7 +118,7 @@ def test_wrong_answers_are_asked_again_with_those_that_are_allowed(
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (["--robots", "0"], "--robots: 0 must be a number in [1, 1000]."),
+        (["--robots", "0"], "--robots: 0 must be a number in [1, 5000]."),
         (["--type", "tank"], "--type: 'tank' must be one of epuck,"),
         (["--sensors", "imu"], "--sensors: 'imu' must be of robots, landmarks, aerial, fix."),
         (["--type", "pushbot", "--sensors", "mapper,fix"], "mapper and fix publish on the same topic"),
@@ -158,7 +158,7 @@ def test_answers_that_end_too_early_are_one_sentence(
 
 
 @pytest.mark.parametrize("family", FAMILY_IDS)
-@pytest.mark.parametrize("robots", [1, 9, 20, 46, 113, 1000])
+@pytest.mark.parametrize("robots", [1, 9, 20, 46, 113, 1000, 5000])
 def test_ids_are_in_the_family_and_landmarks_above_all_others(family: str, robots: int) -> None:
     plan = SwarmPlan("epuck", robots, "e", ("robots", "landmarks"), family=family)
     if 5 * robots + 20 > FAMILY_IDS[family]:
