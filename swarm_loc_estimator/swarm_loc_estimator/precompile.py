@@ -112,7 +112,7 @@ def _swarm(*, infrared: bool) -> Swarm:
 
 
 def _run(settings: Settings, *, infrared: bool, fused: bool = True) -> None:
-    """Run an estimator for two seconds; if not `fused`, measurements are read only."""
+    """Run an estimator for two seconds; if not `fused`, measurements are converted only."""
     swarm = _swarm(infrared=infrared)
     estimator, ingest = Estimator(swarm, settings), Ingest(swarm)
     light = _light() if infrared else np.zeros((0, 6, 6))
@@ -140,6 +140,8 @@ def _run(settings: Settings, *, infrared: bool, fused: bool = True) -> None:
             for batch in ingest.read(MessageBatch.of(messages)):
                 if is_taken:
                     estimator.receive(batch)
+                else:
+                    estimator.convert(batch)
         estimator.tick(now_ns)
         estimator.contradictions(now_ns)
     _call_rare(swarm)
