@@ -64,7 +64,7 @@ def _ray(count: int, address: str | None) -> Iterator[dict[str, Any]]:
     with _reached(address):
         if address:  # Ray itself asks an address where nobody answers for many minutes
             place = urlsplit(address if "//" in address else f"//{address}")
-            create_connection((place.hostname, place.port), _PATIENCE_S).close()
+            create_connection((place.hostname, place.port or 0), _PATIENCE_S).close()
         ray.init(**options, logging_level="ERROR", log_to_driver=False)
     try:
         pool = backend.RayBackend()
