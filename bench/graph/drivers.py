@@ -14,21 +14,19 @@ from __future__ import annotations
 import argparse
 import os
 import re
-import signal
 import subprocess
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
-from multiprocessing.context import SpawnProcess
 from pathlib import Path
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 
-from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
+from bench.shared.common import OUT, plot_by_size, table, write_figures
 from swarm_loc_drivers.epuck.hardware import EPUCK2
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.world import EpuckWorldParameters, SimulatedEpuck, make_world
@@ -70,6 +68,7 @@ class Counts:
         self._recorder, self._robots = recorder, robots
         self._published: dict[str, int] = {}
         self._unchanged: dict[str, int] = {}
+        self._last_received = -1
         self.all_heard_s = 0.0
         """When the estimator first reported a message of every robot."""
         recorder.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 1000)
@@ -111,8 +110,6 @@ class Counts:
                 self._note(status.name, self._last_received, self.received)
                 self._last_received = self.received
 
-    _last_received = -1
-
     def _note(self, name: str, before: int | None, now: int) -> None:
         self._unchanged[name] = self._unchanged.get(name, 0) + 1 if before == now else 0
 
@@ -123,22 +120,22 @@ def measure(robots: int, discovery: str, duration_s: float) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as folder:
         work = Path(folder)
         save_swarm(_swarm(robots), work / "swarm.yaml")
-        with _emulated(work) as emulator, _server() if discovery == SERVER else nullcontext():
+        with _emulated(work) as robots_answer, _server() if discovery == SERVER else nullcontext():
             began_s = time.time()
             with LiveGraph(_nodes(robots, work), log) as graph:
                 counts = Counts(graph.recorder, robots)
                 graph.wait_for(counts.are_all_heard, "receive odometry of every robot", _PATIENCE_S)
-                before = _settled(graph, counts, emulator)
+                before = _settled(graph, counts, robots_answer)
                 pids = [graph.process(name).pid for name in ("estimator", "epuck1/epuck_driver")]
                 cpu_s = [cpu_seconds(pid) for pid in pids]
                 measured_s = time.monotonic()
-                os.kill(emulator.pid or 0, signal.SIGCONT)
+                robots_answer.send(True)
                 until_s = measured_s + duration_s
                 graph.wait_for(lambda: time.monotonic() > until_s, "go on", _PATIENCE_S)
                 used = [cpu_seconds(pid) - at_first for pid, at_first in zip(pids, cpu_s, strict=True)]
                 measured_s = time.monotonic() - measured_s
-                after = _settled(graph, counts, emulator)
-                os.kill(emulator.pid or 0, signal.SIGCONT)
+                after = _settled(graph, counts, robots_answer)
+                robots_answer.send(True)
     sent, received = np.subtract(after, before).tolist()
     connected_s = max(float(match[1]) for match in _CONNECTED.finditer(log.read_text(encoding="utf-8")))
     figures = (
@@ -180,40 +177,43 @@ def _nodes(robots: int, work: Path) -> list[NodeSpec]:
     return nodes
 
 
-def _settled(graph: LiveGraph, counts: Counts, emulator: SpawnProcess) -> tuple[int, int]:
+def _settled(graph: LiveGraph, counts: Counts, robots_answer: Connection) -> tuple[int, int]:
     """Let the robots pause, and wait until nothing is on its way; messages published and received so far."""
-    os.kill(emulator.pid or 0, signal.SIGSTOP)
+    robots_answer.send(False)
     counts.begin_to_settle()
     graph.wait_for(counts.have_settled, "settle", _PATIENCE_S)
     return counts.published, counts.received
 
 
 @contextmanager
-def _emulated(work: Path) -> Iterator[SpawnProcess]:
-    """A process that answers at a serial port for each robot of a swarm."""
+def _emulated(work: Path) -> Iterator[Connection]:
+    """Serial ports at which a process answers for each robot while True was the last thing sent to it."""
     context = get_context("spawn")
-    begun, begin = context.Pipe(duplex=False)
-    process = context.Process(target=_emulate, args=(work, begin), daemon=True)
+    orders, theirs = context.Pipe()
+    process = context.Process(target=_emulate, args=(work, theirs), daemon=True)
     process.start()
-    begin.close()
-    try:
-        begun.recv()  # ends without an answer if the process does
-        yield process
-    finally:
-        process.kill()
-        process.join()
+    theirs.close()
+    with orders:
+        orders.recv()  # raises EOFError if the process ends before
+        yield orders
+    process.join()
 
 
-def _emulate(work: Path, begin: Connection) -> None:
-    """Answer until killed."""
+def _emulate(work: Path, orders: Connection) -> None:
+    """Answer, or pause, as ordered, until the other end of the pipe is closed."""
     parameters = EpuckWorldParameters(swarm_file=str(work / "swarm.yaml"), arena_x=100.0, arena_y=100.0)
     swarm, world = make_world(parameters)
     host = FirmwareHost()
     for index, robot in enumerate(swarm.robots):
         host.serve_pty(SerialFirmware(SimulatedEpuck(world, index), EPUCK2), work / robot.name)
-    begin.send(len(swarm.robots))
-    while True:
-        host.poll(_CYCLE_S)
+    orders.send(len(swarm.robots))
+    answers = True
+    with suppress(EOFError):
+        while True:
+            if orders.poll(0.0 if answers else None):
+                answers = orders.recv()
+            else:
+                host.poll(_CYCLE_S)
 
 
 @contextmanager
@@ -249,14 +249,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for robots, figures in found.items()
     ]
     print(table(["robots", "discovery", *_UNITS.values()], rows))
-    shown = ("start_up_s", "discovery_s", "estimator_core")
-    figure, axes = new_plot(len(shown), width=3.4)
-    for axis, name in zip(axes, shown, strict=True):
-        for discovery, found in results.items():
-            axis.plot(list(found), [one[name] for one in found.values()], "o-", label=discovery)
-        axis.set(xlabel="driver processes", ylabel=_UNITS[name], xlim=(0.0, None), ylim=(0.0, None))
-    axes[0].legend(title="discovery")
-    print(f"plot: {save_plot(figure, 'drivers')}")
+    shown = {name: _UNITS[name] for name in ("start_up_s", "discovery_s", "estimator_core")}
+    print(f"plot: {plot_by_size('drivers', results, shown, 'driver processes', 'discovery')}")
     all_figures = {
         f"{discovery}{robots}.{name}": value
         for discovery, found in results.items()

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.graph.shared_bag import write_shared_bag
-from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
+from bench.shared.common import OUT, plot_by_size, table, write_figures
 from swarm_loc_drivers.sim.run import SimulatedRun
 from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
@@ -106,14 +106,8 @@ def run(recording: SimulatedRun, *, shared: bool) -> dict[str, float]:
 
 def draw(results: dict[str, dict[int, dict[str, float]]]) -> None:
     """Plot figures over the size of the swarm."""
-    names = ("start_up_s", "estimator_core", "memory_mb", "pose_age_ms")
-    figure, axes = new_plot(len(names), width=3.4)
-    for axis, name in zip(axes, names, strict=True):
-        for layout, found in results.items():
-            axis.plot(list(found), [one[name] for one in found.values()], "o-", label=layout)
-        axis.set(xlabel="robots", ylabel=_UNITS[name], xlim=(0.0, None), ylim=(0.0, None))
-    axes[0].legend(title="topics")
-    print(f"plot: {save_plot(figure, 'large_swarms')}")
+    shown = {name: _UNITS[name] for name in ("start_up_s", "estimator_core", "memory_mb", "pose_age_ms")}
+    print(f"plot: {plot_by_size('large_swarms', results, shown, 'robots', 'topics')}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -91,6 +91,31 @@ def save_plot(figure: Figure, name: str, folder: Path = OUT) -> Path:
     return path
 
 
+def plot_by_size(
+    name: str,
+    results: Mapping[str, Mapping[int, Mapping[str, float]]],
+    figures: Mapping[str, str],
+    sizes: str,
+    legend: str,
+) -> Path:
+    """Plot figures over sizes, a line for each variant, as out/NAME.png; returns the file.
+
+    Args:
+        name: Of the plot.
+        results: Variant -> size -> figure -> value.
+        figures: Figure to plot -> label with its unit.
+        sizes: What the sizes count.
+        legend: Title of the variants.
+    """
+    figure, axes = new_plot(len(figures), width=3.4)
+    for axis, (key, label) in zip(axes, figures.items(), strict=True):
+        for variant, found in results.items():
+            axis.plot(list(found), [one[key] for one in found.values()], "o-", label=variant)
+        axis.set(xlabel=sizes, ylabel=label, xlim=(0.0, None), ylim=(0.0, None))
+    axes[0].legend(title=legend)
+    return save_plot(figure, name)
+
+
 def _text(cell: Cell) -> str:
     if cell is None:
         return "-"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import gc
 import os
 import signal
@@ -54,6 +55,9 @@ _WAKE_S = 0.2
 _LEAVE_S = 0.7
 """The process ends this long after a signal, even if it is busy. Destroying thousands of publishers takes DDS
 20 s, since for each of them it announces all remaining ones."""
+_SHUTDOWN_S = 60.0
+"""A node that is being destroyed for so long never ends: Fast DDS may wait for a lock in shared memory that
+a killed process held."""
 _CLOCK_THROTTLE_S = 10.0
 _DIAGNOSTICS_PERIOD_S = 1.0
 _UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"
@@ -225,9 +229,11 @@ def run_node(name: str, create: Callable[[], ConfiguredNode[Any]], *, leaves_at_
         return 0
     finally:
         stop.defer()
+        faulthandler.dump_traceback_later(_SHUTDOWN_S, exit=True)
         if node is not None:
             node.destroy_node()
         rclpy.try_shutdown()
+        faulthandler.cancel_dump_traceback_later()
 
 
 def _start_ros() -> None:

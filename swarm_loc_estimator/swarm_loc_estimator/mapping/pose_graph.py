@@ -199,7 +199,7 @@ class PoseGraph:
     def set_scan(self, stop: int, scan: Scan) -> None:
         """Set the beams of a stop; the next drive begins at the first beam of a lidar, else the last."""
         set_beams(self._beams, stop, scan)
-        self.turned[stop] = 0.0 if isinstance(scan.bearing, np.ndarray) else scan.turn[-1]
+        self.turned[stop] = 0.0 if self.is_sweep(stop) else scan.turn[-1]
         self._turned_all[stop] = np.abs(scan.turn).max()
         self.fit(stop)
 

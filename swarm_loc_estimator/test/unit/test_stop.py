@@ -70,3 +70,30 @@ running.run_node("compiling", create, leaves_at_once=True)
 
 def test_a_signal_while_the_node_is_made_ends_the_process_with_status_0() -> None:
     assert subprocess.run([sys.executable, "-c", _COMPILING], check=False).returncode == 0
+
+
+_NEVER_DESTROYED = """
+import threading
+from swarm_loc_estimator.common import node as running
+
+class Node:
+    def run(self, stop):
+        return 0
+
+    def destroy_node(self):
+        lock = threading.Lock()
+        lock.acquire()
+        lock.acquire()
+
+running._SHUTDOWN_S = 0.2
+running._start_ros = lambda: None
+running.run_node("stuck", Node)
+"""
+
+
+def test_a_node_that_cannot_be_destroyed_ends_with_a_traceback() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", _NEVER_DESTROYED], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert "in destroy_node" in done.stderr
