@@ -210,12 +210,12 @@ class BagReader:
         if not path.exists():
             raise BagError(f"There is no bag '{path}'.")
         if not path.is_dir():
-            if path.is_file() and _is_storage(path):
+            if path.is_file() and is_storage(path):
                 return [path]
             hint = _ROS_1.replace("NAME", str(path.with_suffix(""))) if path.suffix == ".bag" else _EXPECTED
             raise BagError(f"'{path}' is no bag: {hint}.")
         recorded = self._listed()
-        paths = sorted(filter(_is_storage, path.iterdir()), key=_part_number)
+        paths = sorted(filter(is_storage, path.iterdir()), key=_part_number)
         paths = [one for one in paths if one.suffix in _STORAGES or one.with_suffix("") not in paths]
         self._own_losses += [
             f"{name}: the file is missing, its messages are lost."
@@ -245,7 +245,7 @@ class BagReader:
         return [str(name) for name in files] if isinstance(files, list) else []
 
 
-def _is_storage(path: Path) -> bool:
+def is_storage(path: Path) -> bool:
     """Whether the name is that of a storage file, plain or compressed."""
     return (path if path.suffix not in PACKED else path.with_suffix("")).suffix in _STORAGES
 

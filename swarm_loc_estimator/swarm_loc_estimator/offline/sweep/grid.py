@@ -14,6 +14,7 @@ from typing import Any
 
 import joblib
 
+from swarm_loc_estimator.common.bags.reader import is_storage
 from swarm_loc_estimator.common.parameters import (
     NumberSpec,
     ParameterError,
@@ -166,7 +167,7 @@ class _SweepReader(TreeChecks):
 def _storages(bag: Path) -> list[Path]:
     """The files of a bag with messages, plain or compressed."""
     files = sorted(bag.iterdir()) if bag.is_dir() else [bag]
-    return [one for one in files if {".mcap", ".db3"} & {*one.suffixes} and one.is_file()]
+    return [one for one in files if is_storage(one) and one.is_file()]
 
 
 def _digest(files: Sequence[Path]) -> str:
