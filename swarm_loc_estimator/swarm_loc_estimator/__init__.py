@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.offline.replay import replay as replay
     from swarm_loc_estimator.offline.report.report import write_report as write_report
     from swarm_loc_estimator.offline.result import ReplayResult as ReplayResult
+    from swarm_loc_estimator.offline.tum import read_truth as read_truth
     from swarm_loc_estimator.sensors.camera import DetectionRows as DetectionRows
     from swarm_loc_estimator.sensors.fix import FixRows as FixRows
     from swarm_loc_estimator.sensors.odometry import OdometryRows as OdometryRows
@@ -58,6 +59,7 @@ _MODULES = {
     "swarm_loc_estimator.offline.replay": ("replay",),
     "swarm_loc_estimator.offline.report.report": ("write_report",),
     "swarm_loc_estimator.offline.result": ("ReplayResult",),
+    "swarm_loc_estimator.offline.tum": ("read_truth",),
     "swarm_loc_estimator.sensors.camera": ("DetectionRows",),
     "swarm_loc_estimator.sensors.sighting_kernels": ("CONTENT_POSE", "CONTENT_POSE_TWO"),
     "swarm_loc_estimator.sensors.fix": ("FixRows",),

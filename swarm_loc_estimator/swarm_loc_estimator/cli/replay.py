@@ -7,6 +7,7 @@
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The report
 (report.txt, report.html, overview.png, paths.png, errors.png) and the poses (poses.csv) are written to --out.
 --mcap writes poses, /tf, markers, and the bag's map and goals for RViz, Foxglove and other viewers.
+--truth reads ground truth from files in the format of TUM in place of that of the bag.
 --tum writes poses and ground truth of each robot in the format of TUM, for evo and other tools.
 --learned writes the description with the self-calibrated parameters of cameras, odometry and landmarks; the
 parameters with a sigma in the description are estimated.
@@ -36,10 +37,11 @@ from swarm_loc_estimator.common.command_line import (
     swarm_beside,
     yaml_to_write,
 )
-from swarm_loc_estimator.offline.export import write_mcap, write_tum
+from swarm_loc_estimator.offline.export import write_mcap
 from swarm_loc_estimator.offline.replay import TICK_S, TICKS_S, replay
 from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.offline.tum import read_truth, write_tum
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.self_calibration import swapped_signs
@@ -67,6 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             settings,
             tick_s=options.tick,
             remap=options.remap,
+            truth=read_truth(options.truth, swarm) if options.truth else {},
             keep_sightings=True,
             progress=progress,
         )
@@ -121,6 +124,9 @@ def _parser() -> argparse.ArgumentParser:
         type=file_to_write(".mcap"),
         metavar="FILE",
         help="where to write poses, /tf and markers for viewers",
+    )
+    parser.add_argument(
+        "--truth", type=Path, metavar="FOLDER", help="folder of <robot>.truth.tum, in place of the bag's"
     )
     parser.add_argument(
         "--tum",

@@ -1,8 +1,7 @@
-"""Write a run for other programs: MCAP for viewers, TUM trajectories for evo."""
+"""Write a run as MCAP for viewers."""
 
 from __future__ import annotations
 
-import math
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.definitions import (
     MARKERS,
@@ -25,7 +24,7 @@ from swarm_loc_estimator.common.messages.estimates import (
     TransformsEncoder,
 )
 from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
-from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
+from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.watch.markers import MarkersEncoder
 
@@ -56,36 +55,6 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
             for one in result.maps:
                 writer.write("map", one.log_ns, one.data)
         shutil.move(bag / "run.mcap", path)
-
-
-def write_tum(result: ReplayResult, folder: Path) -> None:
-    """Write trajectories as text, one line `seconds x y z qx qy qz qw` per pose in `map`.
-
-    `<robot>.tum` has the estimated poses, `<robot>.truth.tum` the ground truth at the same instants, as far
-    as it is known there. So evo, which pairs the nearest stamps, finds the errors of the report.
-
-    Args:
-        result: The run.
-        folder: Created if missing; files of the same names are replaced.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    for index, robot in enumerate(result.swarm.robots):
-        pose = result.poses[:, index]
-        _write_tum(folder / f"{robot.name}.tum", result.stamp_ns, pose)
-        if robot.name in result.truth:
-            truth, known = interpolate(result.truth[robot.name], result.stamp_ns, DEFAULT_GAP_NS)
-            truth[~known] = np.nan
-            _write_tum(folder / f"{robot.name}.truth.tum", result.stamp_ns, truth + 0.0 * pose)
-
-
-def _write_tum(path: Path, stamp_ns: IntArray, pose: FloatArray) -> None:
-    """Write the finite ones of poses (T, 3)."""
-    with path.open("w", encoding="utf-8") as file:
-        for at_ns, (x, y, theta) in zip(stamp_ns.tolist(), pose.tolist(), strict=True):
-            if math.isfinite(x + y + theta):
-                seconds, rest = divmod(at_ns, 10**9)
-                z, w = math.sin(0.5 * theta), math.cos(0.5 * theta)
-                file.write(f"{seconds}.{rest:09d} {x:.12g} {y:.12g} 0 0 0 {z:.12g} {w:.12g}\n")
 
 
 def _add_tracks(topic: str, tracks: Mapping[str, Trajectory], writer: BagWriter) -> None:

@@ -51,6 +51,7 @@ def replay(
     stamp_ns: npt.NDArray[np.int64] | None = None,
     remap: Mapping[str, str] = MappingProxyType({}),
     loss: Loss = NOTHING_LOST,
+    truth: Mapping[str, Trajectory] = MappingProxyType({}),
     keep_sightings: bool = False,
     progress: Progress = unwatched,
 ) -> ReplayResult:
@@ -64,6 +65,7 @@ def replay(
         stamp_ns: (T,) increasing; outputs at these instants instead, such as those of a live run.
         remap: Expected topic -> topic of the bag to read instead; `<robot>` in both stands for each robot.
         loss: Messages that are dropped at random before the estimator; ground truth is complete.
+        truth: Robot name -> ground truth that replaces that of the bag, such as from `read_truth`.
         keep_sightings: Whether sightings and aerial images are kept for display, too.
         progress: Called now and then with the share done and what is being done.
 
@@ -90,7 +92,7 @@ def replay(
         remarks.append(f"{jumps}; no poses are given meanwhile.")
     found = estimator.contradictions(summary.range_ns[1])
     remarks += [f"Note: {one.text}." for one in found if one.kind is Contradicted.CONSTANT]
-    result = runner.result(bag.name, summary.range_ns, summary.truth, summary.received)
+    result = runner.result(bag.name, summary.range_ns, {**summary.truth, **truth}, summary.received)
     if estimator.origin:
         remarks.append(
             f"No start, landmark or fix: poses are relative to {estimator.origin}, without errors."
