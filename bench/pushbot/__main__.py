@@ -1,4 +1,4 @@
-"""PushBots: event tracker, laser calibration, driver, and maps made by one robot and by many.
+"""PushBots: event tracker, laser calibration, driver, pose graph, and maps made by one robot and by many.
 
     make bench-pushbot
     make bench-pushbot ARGS="--parts mapping --seeds 3 --team-seeds 1"
@@ -23,7 +23,7 @@ from collections.abc import Sequence
 
 from bench.shared.common import write_figures
 
-PARTS = ("tracker", "calibration", "driver", "mapping")
+PARTS = ("tracker", "calibration", "driver", "graph", "mapping")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -50,6 +50,10 @@ def _measure(part: str, options: argparse.Namespace) -> dict[str, float]:
         from bench.pushbot.driver import measure_driver  # noqa: PLC0415
 
         return measure_driver(options.tracker_seeds)
+    if part == "graph":
+        from bench.pushbot.gtsam_graph import measure_graphs  # noqa: PLC0415
+
+        return measure_graphs(options.graph_seeds, 0.5 * options.minutes)
     from bench.pushbot.mapping import MappingEffort, measure_mapping  # noqa: PLC0415
 
     return measure_mapping(
@@ -63,7 +67,8 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--tracker-seeds", type=int, default=5, help="of tracker, calibration and driver")
     parser.add_argument("--seeds", type=int, default=20, help="of each of three halls with one robot")
     parser.add_argument("--team-seeds", type=int, default=6, help="of teams, other halls, and other methods")
-    parser.add_argument("--minutes", type=float, default=20.0, help="of one robot; teams get half")
+    parser.add_argument("--graph-seeds", type=int, default=3, help="of maps solved by gtsam, too")
+    parser.add_argument("--minutes", type=float, default=20.0, help="of one robot; teams and graph get half")
     parser.add_argument("--processes", type=int, default=2, help="at a time, 2 at most")
     return parser
 

@@ -120,3 +120,12 @@ def test_the_logarithm_of_the_paper_is_tens_of_centimetres_off() -> None:
     one = calibrate(1)
     assert np.sqrt(np.mean(one.hyperbola_cm**2)) < 1.0
     assert np.sqrt(np.mean(one.logarithm_cm**2)) > 20.0
+
+
+@pytest.mark.parametrize("kind", ["pointer", "lidar"])
+def test_gtsam_takes_the_same_step_and_has_the_same_covariances(kind: str) -> None:
+    peer = pytest.importorskip("bench.pushbot.gtsam_graph", exc_type=ImportError)
+    found = peer.compared(peer.mapped(kind, 1, 0.5).graph)
+    assert found["stops"] > 3
+    assert found["step_difference_m"] < 1e-9
+    assert found["sigma_ratio_difference"] < 1e-6

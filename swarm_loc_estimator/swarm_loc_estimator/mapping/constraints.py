@@ -216,18 +216,22 @@ class NormalEquations:
         self._rows.append(rows[both])
         self._columns.append(columns[both])
 
-    def solve(self) -> tuple[FloatArray, NormalFactor]:
-        """The step (u,), zero for fixed unknowns, and the factor for covariances."""
+    def system(self) -> tuple[csc_matrix, FloatArray]:
+        """The matrix (f, f) and right side (f,) of the free unknowns."""
         diagonal = np.arange(self._size)
         values = np.concatenate([*self._values, np.full(self._size, _DAMPING)])
         rows = np.concatenate([*self._rows, diagonal])
         columns = np.concatenate([*self._columns, diagonal])
-        matrix = csc_matrix((values, (rows, columns)), shape=(self._size, self._size))
+        return csc_matrix((values, (rows, columns)), shape=(self._size, self._size)), self._gradient
+
+    def solve(self) -> tuple[FloatArray, NormalFactor]:
+        """The step (u,), zero for fixed unknowns, and the factor for covariances."""
+        matrix, gradient = self.system()
         factor = splu(
             matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
         )
         step = np.zeros(len(self._free))
-        step[self._free] = factor.solve(self._gradient)
+        step[self._free] = factor.solve(gradient)
         return step, NormalFactor(factor, self._place)
 
 

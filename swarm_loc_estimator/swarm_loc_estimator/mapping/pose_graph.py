@@ -276,10 +276,7 @@ class PoseGraph:
             moves[list(free)] = True
         unknowns = np.concatenate([np.repeat(moves, STOP_UNKNOWNS), np.ones(len(self.slip), dtype=bool)])
         for _ in range(iterations):
-            equations = NormalEquations(unknowns)
-            equations.add(self._linearised())
-            self._add_matches(equations, moves, gate, stride)
-            step, factor = equations.solve()
+            step, factor = self.equations(unknowns, gate, stride).solve()
             if free is None:
                 self._factor, self._factored = factor, count
             if self._apply(step):
@@ -287,6 +284,19 @@ class PoseGraph:
         for stop in np.flatnonzero(moves):
             if abs(self.states[stop, 3] - self._fitted_ratio[stop]) > _REFIT_RATIO:
                 self.fit(int(stop))
+
+    def equations(self, free: BoolArray, gate: float = MATCH_GATE, stride: int = 2) -> NormalEquations:
+        """The normal equations at the present states.
+
+        Args:
+            free: (u,) free unknowns, those of all stops and then the slips.
+            gate: See `beam_residual` [m].
+            stride: Every `stride`-th beam is used.
+        """
+        equations = NormalEquations(free)
+        equations.add(self._linearised())
+        self._add_matches(equations, free[: STOP_UNKNOWNS * self.count : STOP_UNKNOWNS], gate, stride)
+        return equations
 
     def covariance(self, stop: int) -> FloatArray:
         """Covariance (3, 3) of the pose of a stop."""
