@@ -17,6 +17,7 @@ from swarm_loc_estimator.common.command_line import (
     ProgressLine,
     add_bag,
     add_remap,
+    add_truth,
     command_parser,
     exit_with_message,
     number_in,
@@ -26,6 +27,7 @@ from swarm_loc_estimator.common.command_line import (
 from swarm_loc_estimator.offline.calibration.fit import EVALUATIONS, Options, calibrate
 from swarm_loc_estimator.offline.calibration.plots import draw, text_of
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
+from swarm_loc_estimator.offline.tum import read_truth
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
@@ -37,7 +39,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = Options(plain=options.plain, response=not options.no_response, evaluations=options.evaluations)
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
     with ProgressLine() as progress:
-        recording = read_recording(options.bag, swarm, progress, options.remap)
+        truth = read_truth(options.truth, swarm)
+        recording = read_recording(options.bag, swarm, progress, options.remap, truth)
         done = calibrate(recording, swarm, chosen, progress)
     save_swarm(done.swarm, options.out, f"Calibrated with {options.bag.name}. {done.warning}".rstrip())
     print("\n".join([text_of(done), *recording.sentences(), *_unused(recording)]))
@@ -55,8 +58,9 @@ def _unused(recording: Recording) -> list[str]:
 def _parser() -> argparse.ArgumentParser:
     """The command line."""
     parser = command_parser(__doc__)
-    add_bag(parser, " with <robot>/ground_truth")
+    add_bag(parser, " with <robot>/ground_truth, or with --truth")
     add_remap(parser)
+    add_truth(parser)
     parser.add_argument("--out", type=yaml_to_write, required=True, help="swarm description to write")
     parser.add_argument("--plain", action="store_true", help="fit only noise, calibrate nothing")
     parser.add_argument(

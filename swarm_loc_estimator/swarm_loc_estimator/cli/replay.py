@@ -28,6 +28,7 @@ from swarm_loc_estimator.common.command_line import (
     add_bag,
     add_remap,
     add_set,
+    add_truth,
     command_parser,
     exit_with_message,
     file_to_write,
@@ -69,7 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             settings,
             tick_s=options.tick,
             remap=options.remap,
-            truth=read_truth(options.truth, swarm) if options.truth else {},
+            truth=read_truth(options.truth, swarm),
             keep_sightings=True,
             progress=progress,
         )
@@ -115,6 +116,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = command_parser(__doc__)
     add_bag(parser)
     add_remap(parser)
+    add_truth(parser)
     parser.add_argument("--out", type=folder_to_write, default="out/replay", help="folder for the report")
     parser.add_argument(
         "--learned", type=yaml_to_write, metavar="FILE", help="where to write what was learned"
@@ -124,9 +126,6 @@ def _parser() -> argparse.ArgumentParser:
         type=file_to_write(".mcap"),
         metavar="FILE",
         help="where to write poses, /tf and markers for viewers",
-    )
-    parser.add_argument(
-        "--truth", type=Path, metavar="FOLDER", help="folder of <robot>.truth.tum, in place of the bag's"
     )
     parser.add_argument(
         "--tum",

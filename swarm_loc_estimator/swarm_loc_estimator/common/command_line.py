@@ -167,6 +167,12 @@ def add_remap(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--remap", action=Remap, default={}, metavar="EXPECTED:=TOPIC", help=said)
 
 
+def add_truth(parser: argparse.ArgumentParser) -> None:
+    """Add `--truth FOLDER`, of `tum.read_truth`."""
+    said = "folder of <robot>.truth.tum in place of the bag's ground truth"
+    parser.add_argument("--truth", type=Path, metavar="FOLDER", help=said)
+
+
 _DESCRIPTIONS = (".yaml", ".yml")
 
 

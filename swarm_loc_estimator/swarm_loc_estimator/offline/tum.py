@@ -55,13 +55,15 @@ def _write(path: Path, stamp_ns: IntArray, pose: FloatArray) -> None:
                 file.write(f"{seconds}.{rest:09d} {x:.12g} {y:.12g} 0 0 0 {z:.12g} {w:.12g}\n")
 
 
-def read_truth(folder: Path, swarm: Swarm) -> dict[str, Trajectory]:
-    """Robot name -> its ground truth in `map`, of the files `<robot>.truth.tum` in a folder.
+def read_truth(folder: Path | None, swarm: Swarm) -> dict[str, Trajectory]:
+    """Robot name -> its ground truth in `map`, of the files `<robot>.truth.tum` in a folder; None has none.
 
     Raises:
         TumError: There is none, or a line is no pose.
         YamlTreeError: A file cannot be read.
     """
+    if folder is None:
+        return {}
     names = [f"{robot.name}{_TRUTH}" for robot in swarm.robots]
     truth = {
         robot.name: read_tum(folder / name)

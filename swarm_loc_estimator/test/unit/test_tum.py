@@ -10,8 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from swarm_loc_estimator.cli.calibrate import main as calibrate
 from swarm_loc_estimator.cli.replay import main
 from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.offline.calibration.recording import read_recording
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.report.table import text_report
 from swarm_loc_estimator.offline.result import ReplayResult
@@ -105,3 +107,16 @@ def test_a_folder_without_ground_truth_is_refused(result: ReplayResult, tmp_path
     (tmp_path / f"{name}.tum").write_text(LINE)  # an estimate, as --tum writes it
     with pytest.raises(TumError, match=rf"has no ground truth of a robot, such as {name}\.truth\.tum\."):
         read_truth(tmp_path, result.swarm)
+
+
+def test_a_calibration_uses_ground_truth_of_files(result: ReplayResult, tmp_path: Path) -> None:
+    swarm, name = result.swarm, result.swarm.robots[0].name
+    first = Trajectory(np.array([1, 2, 2, 3]), np.arange(12.0).reshape(4, 3))
+    assert read_recording(BAG, swarm, truth={name: first}).truth[name].stamp_ns.tolist() == [1, 2, 3]
+    write_tum(result, tmp_path)
+    (short := tmp_path / "short").mkdir()
+    lines = (tmp_path / f"{name}.truth.tum").read_text().splitlines(keepends=True)
+    (short / f"{name}.truth.tum").write_text("".join(lines[:2]))
+    for folder, status in ((short, 1), (tmp_path, 0)):
+        out = ["--out", str(tmp_path / "new.yaml"), "--plain", "--evaluations", "1"]
+        assert calibrate([str(BAG), "--truth", str(folder), *out]) == status

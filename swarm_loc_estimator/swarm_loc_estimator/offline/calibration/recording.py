@@ -113,6 +113,7 @@ def read_recording(
     swarm: Swarm,
     progress: Progress = unwatched,
     remap: Mapping[str, str] = MappingProxyType({}),
+    truth: Mapping[str, Trajectory] = MappingProxyType({}),
 ) -> Recording:
     """Read a bag once.
 
@@ -121,12 +122,14 @@ def read_recording(
         swarm: Robots whose messages are read.
         progress: Called now and then with the share done and what is being done.
         remap: Expected topic -> topic of the bag, see `renamed_topics`.
+        truth: Robot name -> ground truth that replaces that of the bag.
 
     Raises:
         BagError: Nothing in the bag can be read, or a topic cannot be mapped.
     """
     parts: list[Batch] = []
     summary = read_bag(bag, swarm, parts.append, progress, remap)
+    tracks = {**summary.truth, **truth}
     converter = InputConverter(swarm, Settings())
     moved = [converter.convert(part).rows for part in parts]
     detections = [part["detections"] for part in parts if part["detections"].robot.size]
@@ -134,7 +137,7 @@ def read_recording(
         bag.name,
         joined([NO_ODOMETRY, *(rows.get("odometry", NO_ODOMETRY) for rows in moved)]),
         joined(detections or [NO_DETECTIONS]),
-        {name: _each_stamp_once(track.stamp_ns, track.pose) for name, track in summary.truth.items()},
+        {name: _each_stamp_once(track.stamp_ns, track.pose) for name, track in tracks.items()},
         joined([NO_BRIGHTNESS, *(part["brightness"] for part in parts)]),
         joined([NO_FIXES, *(part["fixes"] for part in parts)]),
         joined([NO_TURN_RATES, *(rows.get("imu", NO_TURN_RATES) for rows in moved)]),
