@@ -1,4 +1,4 @@
-"""Shared parts of all nodes: start and stop, parameters, ticks and clocks, publishers of topics."""
+"""Shared parts of all nodes: start and stop, diagnostics, ticks and clocks, publishers of topics."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from importlib import import_module
 from types import FrameType
 from typing import Any, Generic, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
@@ -25,7 +25,6 @@ from rclpy.exceptions import ParameterException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Task
@@ -35,13 +34,8 @@ from rosgraph_msgs.msg import Clock as ClockMessage
 
 from swarm_loc_estimator.common.health import Health, Report
 from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS
-from swarm_loc_estimator.common.parameters import (
-    ParameterSpec,
-    UserError,
-    Value,
-    from_values,
-    parameter_specs,
-)
+from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.common.ros_parameters import declare_parameters, read_parameters
 
 Parameters = TypeVar("Parameters")
 
@@ -135,6 +129,7 @@ class ConfiguredNode(Node, Generic[Parameters]):
     Args:
         name: Default name of the node.
         parameters: The dataclass, see `declare_parameters`.
+        reads_parameters: Whether to read them now; else `params` is not set.
         node_arguments: Further arguments of `rclpy.node.Node`.
 
     Attributes:
@@ -145,9 +140,13 @@ class ConfiguredNode(Node, Generic[Parameters]):
         UserError: A parameter, or a file that it names, cannot be used.
     """
 
-    def __init__(self, name: str, parameters: type[Parameters], **node_arguments: Any) -> None:
-        super().__init__(name, **node_arguments)
-        self.params = declare_parameters(self, parameters)
+    def __init__(
+        self, name: str, parameters: type[Parameters], *, reads_parameters: bool = True, **node_arguments: Any
+    ) -> None:
+        Node.__init__(self, name, **node_arguments)
+        declare_parameters(self, parameters)
+        if reads_parameters:
+            self.params = read_parameters(self, parameters)
         self.health = Health(self.get_logger().warning)
 
     @property
@@ -268,61 +267,6 @@ def spin(node: Node, stop: Stop, *companions: Node) -> int:
     return 0
 
 
-def declare_parameters(node: Node, cls: type[Parameters]) -> Parameters:
-    """Declare the parameters of a dataclass (see `common/parameters.py`), read-only, and return their values.
-
-    Raises:
-        ParameterError: A value has the wrong type or is out of range.
-    """
-    node.add_on_set_parameters_callback(_refuse_clock_change)
-    specs = parameter_specs(cls)
-    return from_values(cls, {spec.name: _declare(node, spec) for spec in specs})
-
-
-def _refuse_clock_change(parameters: Sequence[Parameter]) -> SetParametersResult:
-    """Refuse a change of use_sim_time: stamps of the two clocks are not comparable."""
-    changed = any(parameter.name == "use_sim_time" for parameter in parameters)
-    reason = "use_sim_time is read at the start only: restart the node." if changed else ""
-    return SetParametersResult(successful=not changed, reason=reason)
-
-
-def _declare(node: Node, spec: ParameterSpec) -> Value:
-    """Declare one parameter and return its value.
-
-    rclpy would refuse a value with a traceback that lacks the unit. So the value is checked here, while the
-    parameter still has a dynamic type; then it gets its descriptor.
-    """
-    given = node.declare_parameter(spec.name, spec.default, ParameterDescriptor(dynamic_typing=True))
-    value = spec.checked(given.value)
-    node.set_parameters([Parameter(spec.name, _TYPES[type(spec.default)], value)])
-    node.set_descriptor(spec.name, _descriptor(spec))
-    return value
-
-
-_TYPES = {
-    bool: Parameter.Type.BOOL,
-    int: Parameter.Type.INTEGER,
-    float: Parameter.Type.DOUBLE,
-    str: Parameter.Type.STRING,
-    tuple: Parameter.Type.STRING_ARRAY,
-}
-
-
-def _descriptor(spec: ParameterSpec) -> ParameterDescriptor:
-    """The descriptor that `ros2 param describe` prints."""
-    kind = _TYPES[type(spec.default)].value
-    descriptor = ParameterDescriptor(type=kind, description=spec.doc, read_only=True)
-    descriptor.additional_constraints = spec.range_text
-    number = spec.number
-    if number is None:
-        return descriptor
-    if isinstance(spec.default, int):
-        descriptor.integer_range = [IntegerRange(from_value=int(number.low), to_value=int(number.high))]
-    else:
-        descriptor.floating_point_range = [FloatingPointRange(from_value=number.low, to_value=number.high)]
-    return descriptor
-
-
 class Ticks:
     """Calls back once per period of a node's clock; missed periods are skipped, never queued.
 
@@ -334,6 +278,9 @@ class Ticks:
         node: Has the clock; its executor calls back.
         period_s: Period [s].
         on_tick: The callback.
+
+    Attributes:
+        stop: Ends the ticks, but for one that the executor has queued.
     """
 
     def __init__(self, node: Node, period_s: float, on_tick: Callable[[], None]) -> None:
@@ -343,9 +290,11 @@ class Ticks:
         self._ticked = 0
         self._is_due = False
         if node.get_clock().ros_time_is_active:
-            self._jumps = node.get_clock().create_jump_callback(_EACH_CHANGE, post_callback=self._on_time)
+            jumps = node.get_clock().create_jump_callback(_EACH_CHANGE, post_callback=self._on_time)
+            self.stop: Callable[[], object] = jumps.unregister
         else:  # a timer by a clock that nobody sets
-            node.create_timer(period_s, on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            timer = node.create_timer(period_s, on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
+            self.stop = partial(node.destroy_timer, timer)
 
     @property
     def _number(self) -> int:

@@ -1,6 +1,6 @@
 """Parameters with default, unit, range and documentation, and the base class of users' errors.
 
-A frozen dataclass is filled from ROS parameters (`common.node.declare_parameters`), checks a swarm file
+A frozen dataclass is filled from ROS parameters (`common.ros_parameters`), checks a swarm file
 or the settings, and gives the tables under doc/. A field with the metadata `numbers_of` holds a
 dataclass of numbers, each of which is a parameter; a field with `is_internal` is not a parameter.
 """
@@ -137,6 +137,11 @@ def choice(default: str, choices: Sequence[str], doc: str) -> Any:
 def flag(default: bool, doc: str) -> Any:
     """A dataclass field for a boolean."""
     return field(default=default, metadata={"doc": doc})
+
+
+def autostart() -> Any:
+    """The flag that the parameters of each managed node have, see `common/lifecycle.py`."""
+    return flag(True, "configure and activate at the start; false: wait for a lifecycle manager")
 
 
 def texts(doc: str) -> Any:

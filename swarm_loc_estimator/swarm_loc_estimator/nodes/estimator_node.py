@@ -7,7 +7,7 @@ It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness`, `<r
 to `swarm/odom`, `swarm/detections` and `swarm/fixes` in their place. It publishes
 `swarm/poses`, `<robot>/pose`, `aerial/identities`, `/diagnostics`, and `/tf` (map to `<robot>/odom`, which no
 other node may publish) or, with `tf_per_robot`, `<robot>/tf`.
-Services: `~/reset`, `~/set_robot_pose`. Parameters: see `doc/estimator_node.md`.
+Services: `~/reset`, `~/set_robot_pose`, and those of a managed node. Parameters: see `doc/estimator_node.md`.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ from std_srvs.srv import Trigger
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Level, Report
 from swarm_loc_estimator.common.jit import is_precompiled
+from swarm_loc_estimator.common.lifecycle import ManagedNode
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.node import BACKWARDS, ConfiguredNode, Ticks, run_node
+from swarm_loc_estimator.common.node import BACKWARDS, Ticks, run_node
 from swarm_loc_estimator.nodes.estimator_diagnostics import (
     Diagnostics,
     TickCost,
@@ -53,6 +54,7 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.thinning import SHED_REASONS, Thinning
+from swarm_loc_msgs.srv import SetRobotPose
 
 _ORDINARY_DROPS = frozenset(
     {
@@ -73,10 +75,13 @@ _ORDINARY_DROPS = frozenset(
 """Drops that are ordinary and not logged: late, duplicate or outlying data and infrared out of range.
 Drops under overload have a warning of their own."""
 
+INACTIVE = "Nothing was changed: the estimator is not active."
+"""Answer of the services while it is not."""
+
 CreateEstimator = Callable[[Swarm, Settings], Estimator]
 
 
-class EstimatorNode(ConfiguredNode[EstimatorParameters]):
+class EstimatorNode(ManagedNode[EstimatorParameters]):
     """Takes messages, runs the estimator once per tick and publishes the estimate.
 
     Args:
@@ -86,13 +91,23 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
 
     def __init__(self, create_estimator: CreateEstimator = Estimator, **node_arguments: Any) -> None:
         super().__init__("estimator", EstimatorParameters, **node_arguments)
+        self._create_estimator = create_estimator
+        self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(SetRobotPose, "~/set_robot_pose", self._on_set_robot_pose)
+        self.autostart()
+
+    def prepare(self) -> None:
+        """Read the description and compile."""
         self._swarm = load_swarm(Path(self.params.swarm_file))
         has_infrared = any(robot.ir is not None for robot in self._swarm.robots)
         compiled = partial(precompile, size_of(self._swarm, self.params.settings), has_infrared)
         if not is_precompiled(compiled):
             self.get_logger().info("compiling the estimator for this machine: one to three minutes")
         compiled()
-        self._estimator = create_estimator(self._swarm, self.params.settings)
+
+    def begin(self) -> None:
+        """Estimate anew: what was known before a pause may be wrong by now."""
+        self._estimator = self._create_estimator(self._swarm, self.params.settings)
         shared = self.params.shared_topics
         self._ingest = Ingest(self._swarm, self.params.map_frame, live_topics(self._swarm, shared=shared))
         self._estimate: Estimate | None = None
@@ -108,10 +123,14 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         self._lost = 0
         self._static_transforms = StaticTransforms(self, self._swarm, self.params)
         self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop)
-        self.create_service(Trigger, "~/reset", self._on_reset)
         frame = self.params.map_frame
-        PoseCommands(self, self._swarm, self._estimator, frame, by_topics=not shared)
-        self._start_timers()
+        self._commands = PoseCommands(self, self._swarm, self._estimator, frame, by_topics=not shared)
+        self._start_ticks()
+
+    @property
+    def status_name(self) -> str:
+        """First part of the names of its statuses, which name robots, too."""
+        return str(self.get_name())
 
     @property
     def subscriptions(self) -> Iterator[Subscription]:
@@ -128,13 +147,11 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         sole = ["swarm/poses", *(["/clock"] if self.get_clock().ros_time_is_active else [])]
         return Diagnostics(self._swarm, self._ingest, self.params, self, sole)
 
-    def _start_timers(self) -> None:
-        self._ticks = Ticks(self, self.params.tick_period_s, self._on_tick)
+    def _start_ticks(self) -> None:
+        self.at_end(Ticks(self, self.params.tick_period_s, self._on_tick).stop)
         # messages received before a backward jump must not be stamped after it
-        self._jumps_back = self.get_clock().create_jump_callback(
-            BACKWARDS, pre_callback=partial(self._receive, self._time_ns)
-        )
-        self.start_diagnostics(self._on_diagnostics)
+        before_jumps = partial(self._receive, self._time_ns)
+        self.at_end(self.get_clock().create_jump_callback(BACKWARDS, pre_callback=before_jumps).unregister)
         self.get_logger().info(
             f"ready: {len(self._swarm.robots)} robots and {len(self._swarm.landmarks)} landmarks"
             f" of '{self.params.swarm_file}'"
@@ -144,7 +161,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
 
     def _on_tick(self) -> None:
         begin_s = time.perf_counter()
-        if not self._time_ns():
+        if not (self.is_active and self._time_ns()):
             return
         self._shedding.begin_tick(begin_s, self._pace.waited_s(self._time_ns()))
         self._receive(partial(newest_time_ns, self))
@@ -211,7 +228,8 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         """Frame of all poses."""
         return f"{self._origin}/start" if self._origin else self.params.map_frame
 
-    def _on_diagnostics(self) -> None:
+    def report(self) -> None:
+        """Publish one report per robot and one of the estimator."""
         begin_s = time.perf_counter()
         now_s = time.monotonic()
         elapsed_s, self._reported_s = now_s - self._reported_s, now_s
@@ -222,7 +240,7 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
             missing, reports = self._diagnostics.missing_text(), self._make_reports(cost, elapsed_s)
         self.health.warn_of("missing", {self._time_ns() > 0: missing} if missing else {}, PATIENCE_S)
         for report in reports:
-            report.name = f"{self.get_name()}: {report.name}".removesuffix(": estimator")
+            report.name = f"{self.status_name}: {report.name}".removesuffix(": estimator")
         # inputs are taken for poses, so counts belong to the stamp of the poses
         stamp = Time(nanoseconds=self._estimate.stamp_ns) if self._estimate is not None else None
         self.publish_reports(*reports, stamp=stamp)
@@ -261,11 +279,22 @@ class EstimatorNode(ConfiguredNode[EstimatorParameters]):
         return [*robots, merged([whole, *causes], "estimator")]
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if not self.is_active:
+            response.message = INACTIVE
+            return response
         self._estimator.drop("reset", len(self._inputs.take(self._time_ns)))
         self._estimator.reset()
         response.success, response.message = True, "All robots restart at their configured poses."
         self.get_logger().info("estimator reset by service")
         return response
+
+    def _on_set_robot_pose(
+        self, request: SetRobotPose.Request, response: SetRobotPose.Response
+    ) -> SetRobotPose.Response:
+        if not self.is_active:
+            response.message = INACTIVE
+            return response
+        return self._commands.on_request(request, response)
 
 
 main = partial(run_node, "estimator_node", EstimatorNode, leaves_at_once=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, field
 
-from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text, texts
+from swarm_loc_estimator.common.parameters import ParameterError, autostart, choice, flag, number, text, texts
 from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.nodes.localizer_sources import SOURCES
 from swarm_loc_estimator.timeline.settings import Settings
@@ -15,6 +15,7 @@ from swarm_loc_estimator.timeline.settings import Settings
 class EstimatorParameters:
     """Parameters of `estimator_node`; those of the estimator itself are its settings."""
 
+    autostart: bool = autostart()
     swarm_file: str = text("", "path of the swarm description", required=True)
     tick_period_s: float = number(
         0.05, "s", 0.005, 1.0, "period of the node's clock in which data is used and poses are published"

@@ -54,7 +54,7 @@ class PoseCommands:
     """Sets the pose of a robot, or deinitializes it until the next fix, at the user's request.
 
     Args:
-        node: Owns the service and the subscriptions.
+        node: Owns the subscriptions.
         swarm: The robots.
         estimator: Executes the commands.
         map_frame: Required frame of the poses.
@@ -68,16 +68,16 @@ class PoseCommands:
         self._swarm = swarm
         self._estimator = estimator
         self._map_frame = map_frame
-        node.create_service(SetRobotPose, "~/set_robot_pose", self._on_request)
         for index, robot in enumerate(swarm.robots if by_topics else ()):
             on_pose = partial(self._on_initial_pose, index)
             node.create_subscription(
                 PoseWithCovarianceStamped, f"{robot.name}/initialpose", on_pose, QoSProfile(depth=10)
             )
 
-    def _on_request(
+    def on_request(
         self, request: SetRobotPose.Request, response: SetRobotPose.Response
     ) -> SetRobotPose.Response:
+        """Execute a request of the service; the response says what was done, or why not."""
         try:
             response.message = self._obey(request)
             response.success = True

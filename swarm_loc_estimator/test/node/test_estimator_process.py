@@ -91,13 +91,13 @@ def test_the_sentence_about_a_parameter(
     assert str(caught.value) == sentence
 
 
-def test_parameters_describe_themselves_and_cannot_be_changed(node: EstimatorNode) -> None:
+def test_parameters_describe_themselves_and_cannot_be_changed_while_active(node: EstimatorNode) -> None:
     descriptor = node.describe_parameter("horizon_s")
-    assert descriptor.read_only
     assert "delay" in descriptor.description
     assert descriptor.floating_point_range[0].to_value == 60.0
     (result,) = node.set_parameters([Parameter("horizon_s", value=3.0)])
     assert not result.successful
+    assert result.reason == "parameter horizon_s cannot be set while the node is active."
 
 
 @pytest.mark.parametrize(

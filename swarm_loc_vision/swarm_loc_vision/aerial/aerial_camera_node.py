@@ -28,12 +28,20 @@ class AerialCameraNode(CameraNode[AerialParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("aerial_camera", AerialParameters, **node_arguments)
+        self.autostart()
+
+    def prepare(self) -> None:
+        """Read the control points."""
         params, path = self.params, self.params.control_points_file
         ground = load_ground(Path(path)) if path else Ground()
         gray_of = TRANSPORTS[params.image_transport].gray_of
         self._camera = AerialCamera(params.settings, params.polarity, ground, gray_of)
         self._said = ""
-        self.start(self._camera, self.images(params.image_transport), AnonymousDetectionArray)
+        self.use(self._camera, self.images(params.image_transport), AnonymousDetectionArray)
+
+    def begin(self) -> None:
+        """Publish detections, or say why there will be none."""
+        super().begin()
         self.trouble()
 
     def figures(self) -> dict[str, str]:

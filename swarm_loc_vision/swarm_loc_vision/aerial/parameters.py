@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.parameters import choice, number, text
+from swarm_loc_estimator.common.parameters import autostart, choice, number, text
 from swarm_loc_vision.common.images import TRANSPORTS
 
 BRIGHT, DARK = 1.0, -1.0
@@ -60,6 +60,7 @@ class AerialSettings:
 class AerialParameters:
     """Parameters of `aerial_camera_node`."""
 
+    autostart: bool = autostart()
     image_transport: str = choice("raw", tuple(TRANSPORTS), "transport: uncompressed images, or JPEG or PNG")
     control_points_file: str = text(
         "", "path of the control points, floor markers and intrinsics; without one nothing is published"

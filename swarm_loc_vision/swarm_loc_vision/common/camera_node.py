@@ -10,7 +10,8 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
-from swarm_loc_estimator.common.node import ConfiguredNode, Parameters
+from swarm_loc_estimator.common.lifecycle import ManagedNode
+from swarm_loc_estimator.common.node import Parameters
 from swarm_loc_vision.common.calibrated_camera import Calibration
 from swarm_loc_vision.common.camera import CameraError
 from swarm_loc_vision.common.images import TRANSPORTS, ImageError
@@ -36,12 +37,8 @@ class Input(NamedTuple):
     qos: QoSProfile
 
 
-class CameraNode(ConfiguredNode[Parameters]):
+class CameraNode(ManagedNode[Parameters]):
     """Receives the images of one camera and publishes what is found in them; subclasses report on it."""
-
-    def __init__(self, name: str, parameters: type[Parameters], **node_arguments: Any) -> None:
-        super().__init__(name, parameters, **node_arguments)
-        self._cost_s = 0.0
 
     def images(self, transport_name: str) -> Input:
         """The camera's images by one of `TRANSPORTS`."""
@@ -50,16 +47,21 @@ class CameraNode(ConfiguredNode[Parameters]):
         topic = self.resolve_topic_name("image_raw") + transport.suffix
         return Input(_MESSAGES[transport.message_type], topic, IMAGE_QOS)
 
-    def start(self, camera: Calibration, source: Input, detections: type) -> None:
-        """Publish what is found in messages, and diagnostics.
+    def use(self, camera: Calibration, source: Input, detections: type) -> None:
+        """Publish what is found in messages while the node is active.
 
         Args:
             camera: Finds it.
             source: Its messages.
             detections: Class of the messages published.
         """
-        self._source, self._topic = camera, source.topic
-        self._detections = self.create_publisher(detections, "detections", QoSProfile(depth=10))
+        self._source, self._input, self._found = camera, source, detections
+        self._cost_s = 0.0
+
+    def begin(self) -> None:
+        """Publish what is found in messages."""
+        source, self._topic = self._input, self._input.topic
+        self._detections = self.create_publisher(self._found, "detections", QoSProfile(depth=10))
         overriding = QoSOverridingOptions([QoSPolicyKind.RELIABILITY])
         self.create_subscription(
             CameraInfo,
@@ -71,7 +73,6 @@ class CameraNode(ConfiguredNode[Parameters]):
         self.create_subscription(
             source.message_class, self._topic, self._on_message, source.qos, qos_overriding_options=overriding
         )
-        self.start_diagnostics(self._on_diagnostics)
 
     def figures(self) -> dict[str, str]:
         """Values for the diagnostics beside images, cost and drops."""
@@ -82,12 +83,16 @@ class CameraNode(ConfiguredNode[Parameters]):
         raise NotImplementedError
 
     def _on_camera_info(self, message: CameraInfo) -> None:
+        if not self.is_active:
+            return
         try:
             self._source.calibrate(message)
         except CameraError as error:
             self.get_logger().error(str(error), throttle_duration_sec=_THROTTLE_S)
 
     def _on_message(self, message: Any) -> None:
+        if not self.is_active:
+            return
         begin_s = time.process_time()
         try:
             self._detections.publish(self._source.detect(message))
@@ -97,7 +102,8 @@ class CameraNode(ConfiguredNode[Parameters]):
             self._cost_s += time.process_time() - begin_s
             self.health.received(self._topic)
 
-    def _on_diagnostics(self) -> None:
+    def report(self) -> None:
+        """Publish the state of the camera."""
         source, missing = self._source, self._missing()
         self.health.warn_of("missing", {"": missing} if missing else {}, PATIENCE_S)
         self.health.warn_of_drops()

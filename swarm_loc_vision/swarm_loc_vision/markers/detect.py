@@ -33,6 +33,7 @@ from swarm_loc_estimator.common.command_line import (
 )
 from swarm_loc_estimator.common.messages.cdr import CdrError, decode
 from swarm_loc_estimator.common.messages.definitions import DETECTIONS
+from swarm_loc_estimator.common.parameters import Value
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.camera import CameraError
 from swarm_loc_vision.common.images import TRANSPORTS, ImageError, Transport
@@ -157,7 +158,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     beside = swarm_beside(options.bag)
     swarm_file = options.swarm or (beside if beside.exists() else None)
     described = "" if swarm_file is None else str(swarm_file)
-    given = {"image_transport": "raw", "robot": "", "swarm_file": described}
+    given: dict[str, Value] = {
+        "autostart": True,
+        "image_transport": "raw",
+        "robot": "",
+        "swarm_file": described,
+    }
     parameters = parameters_of(DetectorParameters, options.set, given)
     images = ImageBag(options.bag, camera_maker(parameters))
     with ProgressLine() as progress:

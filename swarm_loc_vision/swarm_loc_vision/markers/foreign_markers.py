@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.detections import encode_detections
-from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number
+from swarm_loc_estimator.common.parameters import ParameterError, autostart, choice, flag, number
 from swarm_loc_vision.common.calibrated_camera import Calibration, camera_of
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.common.images import ImageError
@@ -120,6 +120,7 @@ class ForeignParameters(MarkersInUse):
         tuple(dict.fromkeys(name for kind in KINDS.values() for name in kind.families)),
         "kind of marker; apriltag finds no aruco, aruco_opencv no apriltag_standard_41h12",
     )
+    autostart: bool = autostart()
     source: str = choice("apriltag", tuple(KINDS), "the other detector")
     rectified: bool = flag(
         True, "whether it sees rectified images, so that P of camera_info counts, not K and distortion"

@@ -24,9 +24,13 @@ class MarkerBridgeNode(MarkerNode[ForeignParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("marker_bridge", ForeignParameters, **node_arguments)
+        self.autostart()
+
+    def prepare(self) -> None:
+        """Read which markers there are, and find the messages of the other detector."""
         camera, kind = ForeignMarkers(self.params), KINDS[self.params.source]
         topic = self.resolve_topic_name(kind.topic)
-        self.publish_markers(camera, Input(message_class(kind.message_type), topic, qos_profile_sensor_data))
+        self.use_markers(camera, Input(message_class(kind.message_type), topic, qos_profile_sensor_data))
 
 
 main = partial(run_node, "marker_bridge_node", MarkerBridgeNode)

@@ -23,10 +23,14 @@ class MarkerDetectorNode(MarkerNode[DetectorParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("marker_detector", DetectorParameters, **node_arguments)
+        self.autostart()
+
+    def prepare(self) -> None:
+        """Read which markers there are."""
         parameters = self.params
         gray_of = TRANSPORTS[parameters.image_transport].gray_of
         camera = CameraDetector(detector_maker(parameters), gray_of, parameters.settings.ambiguity)
-        self.publish_markers(camera, self.images(parameters.image_transport))
+        self.use_markers(camera, self.images(parameters.image_transport))
 
 
 main = partial(run_node, "marker_detector_node", MarkerDetectorNode)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_msgs.msg import MarkerDetectionArray
@@ -21,22 +21,23 @@ _MAX_MISFIT_SHARE = 0.1
 class MarkerNode(CameraNode[Markers]):
     """Publishes the markers of a camera."""
 
-    def __init__(self, name: str, parameters: type[Markers], **node_arguments: Any) -> None:
-        super().__init__(name, parameters, **node_arguments)
-        self._told = (0, 0)  # markers and misfits
-
-    def publish_markers(self, camera: CameraDetector | ForeignMarkers, source: Input) -> None:
-        """Publish the markers in messages, once all is compiled.
+    def use_markers(self, camera: CameraDetector | ForeignMarkers, source: Input) -> None:
+        """Publish the markers in messages while the node is active, and compile what that needs.
 
         Args:
             camera: Finds them.
             source: Its messages.
         """
         self._camera = camera
+        self._told = (0, 0)  # markers and misfits
         if not is_precompiled(precompile):
             self.get_logger().info("compiling for this machine: about half a minute")
         precompile()
-        self.start(camera, source, MarkerDetectionArray)
+        self.use(camera, source, MarkerDetectionArray)
+
+    def begin(self) -> None:
+        """Publish the markers in messages."""
+        super().begin()
         self.get_logger().info(f"ready: markers of family {self.params.family}")
 
     def figures(self) -> dict[str, str]:

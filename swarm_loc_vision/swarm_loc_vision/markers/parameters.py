@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.parameters import ParameterError, choice, text, texts
+from swarm_loc_estimator.common.parameters import ParameterError, autostart, choice, text, texts
 from swarm_loc_estimator.swarm.swarm import CameraMount, FixedCamera, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.camera import Camera
@@ -48,6 +48,7 @@ class MarkersInUse:
 class DetectorParameters(MarkersInUse):
     """Parameters of `marker_detector_node`."""
 
+    autostart: bool = autostart()
     image_transport: str = choice("raw", tuple(TRANSPORTS), "transport: uncompressed images, or JPEG or PNG")
     settings: DetectorSettings = field(
         default_factory=DetectorSettings, metadata={"numbers_of": DetectorSettings}
