@@ -25,8 +25,8 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode[Parameters]):
     """A node that reads its parameters when it is configured, and works while it is active.
 
     What a transition has made, attributes as well as publishers, subscriptions and timers, exists until the
-    opposite transition. So an activation starts anew. An executor may still handle events that it had queued
-    before: callbacks that need what is gone ask `is_active`.
+    opposite transition. So an activation starts from scratch. An executor may still handle events that it
+    had queued before: callbacks that need what is gone ask `is_active`.
 
     Args:
         name: Default name of the node.

@@ -106,7 +106,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         compiled()
 
     def begin(self) -> None:
-        """Estimate anew: what was known before a pause may be wrong by now."""
+        """Estimate from scratch: what was known before a pause may be wrong by now."""
         self._estimator = self._create_estimator(self._swarm, self.params.settings)
         shared = self.params.shared_topics
         self._ingest = Ingest(self._swarm, self.params.map_frame, live_topics(self._swarm, shared=shared))

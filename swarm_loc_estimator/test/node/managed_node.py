@@ -28,12 +28,30 @@ class Manager:
     def __init__(self, ros: Ros, node: str) -> None:
         self._ros = ros
         self._node = node
+        self._client = ros.tester.create_client(ChangeState, f"{node}/change_state")
+        self._wait_for_answers()
         self.events: list[TransitionEvent] = ros.listen(TransitionEvent, f"{node}/transition_event")
 
     def change(self, transition: int) -> bool:
         """Whether a transition succeeded."""
-        request = ChangeState.Request(transition=Transition(id=transition))
-        return bool(self._ros.call(ChangeState, f"{self._node}/change_state", request).success)
+        future = self._client.call_async(ChangeState.Request(transition=Transition(id=transition)))
+        self._ros.until(future.done)
+        return bool(future.result().success)
+
+    def _wait_for_answers(self) -> None:
+        """Ask for a transition that no state has until the node answers: DDS may lose its first answers."""
+        self._ros.until(self._client.service_is_ready)
+        asked: list[Any] = []
+
+        def is_answered() -> bool:
+            asked.append(
+                self._client.call_async(
+                    ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CREATE))
+                )
+            )
+            return any(future.done() for future in asked)
+
+        self._ros.until(is_answered)
 
     def changes(self, *transitions: int) -> str:
         """The state after transitions, which must succeed."""

@@ -77,7 +77,7 @@ def test_an_activation_starts_anew(ros: Ros, swarm_file: Path) -> None:
     assert manager.changes(CONFIGURE, ACTIVATE) == "active"
     robots.wait_for_estimator()
     now_ns = robots.run_until(T0_NS, lambda: robots.located("beta"))
-    ros.until(lambda: any(status.name == "estimator: beta" for status in heard[-1].status))
+    ros.until(lambda: newest_status(heard, "estimator: beta").name)
 
     assert manager.changes(DEACTIVATE) == "inactive"
     ros.until(lambda: not ros.tester.count_publishers("swarm/poses"))
