@@ -63,7 +63,7 @@ class Manager:
         answer = self._ros.call(GetState, f"{self._node}/get_state", GetState.Request())
         return str(answer.current_state.label)
 
-    def set(self, **values: Any) -> str:
+    def set_values(self, **values: Any) -> str:
         """Set a parameter; the reason of a refusal, "" if there was none."""
         request = SetParameters.Request(
             parameters=[Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]

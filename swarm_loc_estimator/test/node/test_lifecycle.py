@@ -51,15 +51,15 @@ def test_an_estimator_waits_until_its_description_is_right(ros: Ros, tmp_path: P
     sentence = "parameter horizon_s = 100.0 must lie in [0.05, 60] s."
     assert not manager.change(CONFIGURE)
     ros.until(lambda: any(entry.msg == sentence for entry in log))
-    assert manager.set(horizon_s=100.0) == sentence
-    assert not manager.set(horizon_s=3)
+    assert manager.set_values(horizon_s=100.0) == sentence
+    assert not manager.set_values(horizon_s=3)
     assert not manager.change(CONFIGURE)
     assert manager.state() == "unconfigured"
     ros.until(lambda: any(str(path) in entry.msg for entry in log))
     path.write_text(SWARM_YAML, encoding="utf-8")
     assert not manager.change(ACTIVATE)  # which rclpy alone would not survive
     assert manager.changes(CONFIGURE) == "inactive"
-    assert manager.set(horizon_s=4.0) == "parameter horizon_s cannot be set while the node is inactive."
+    assert manager.set_values(horizon_s=4.0) == "parameter horizon_s cannot be set while the node is inactive."
     ros.until(lambda: newest_status(heard, "estimator").message == "inactive: nothing is published")
     assert not ros.tester.count_publishers("swarm/poses")
     assert not ros.tester.count_subscribers("alpha/odom")
@@ -111,7 +111,7 @@ def test_a_cleaned_up_estimator_takes_another_swarm(ros: Ros, swarm_file: Path, 
     other.write_text(SWARM_YAML.replace("beta", "gamma"), encoding="utf-8")
     manager = managed(ros, swarm_file)
     assert manager.changes(CONFIGURE, ACTIVATE, DEACTIVATE, CLEANUP) == "unconfigured"
-    assert manager.set(swarm_file=str(other)) == ""
+    assert manager.set_values(swarm_file=str(other)) == ""
     assert manager.changes(CONFIGURE, ACTIVATE) == "active"
     ros.until(lambda: ros.tester.count_subscribers("gamma/odom"))
     assert not ros.tester.count_subscribers("beta/odom")
