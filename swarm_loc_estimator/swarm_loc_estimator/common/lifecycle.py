@@ -92,6 +92,11 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode[Parameters]):
                 raise self._mistake
         self._starts_itself = False
 
+    def destroy_node(self) -> None:
+        """Destroy the node; its state machine, which rclpy leaves, would keep its name for `/rosout`."""
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
     def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
         """Read the parameters and prepare."""
         return self._make(self._configure)
