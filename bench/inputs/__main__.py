@@ -11,7 +11,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable, Mapping, Sequence
 
-from bench.inputs import apriltag_msgs, families, imu, mocap, no_map, overhead, uwb
+from bench.inputs import apriltag_msgs, families, imu, lidar_map, mocap, no_map, overhead, uwb
 from bench.shared.common import ProgressLine, table, write_figures
 
 PARTS: Mapping[str, Callable[[Sequence[int], ProgressLine], Mapping[str, float]]] = {
@@ -22,6 +22,7 @@ PARTS: Mapping[str, Callable[[Sequence[int], ProgressLine], Mapping[str, float]]
     "families": families.measure,
     "imu": imu.measure,
     "no_map": no_map.measure,
+    "lidar_map": lidar_map.measure,
 }
 """Part -> its function. Figures start with the name of the part, or twist_only (imu) or merge (no_map)."""
 

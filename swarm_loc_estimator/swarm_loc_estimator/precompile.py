@@ -85,7 +85,7 @@ def precompile(size: Size, infrared: bool) -> None:
 def _compile_updates() -> None:
     """Fuse no measurements: the sequential update takes as long to compile as all that comes before it."""
     swarm = _swarm(infrared=False)
-    fusion = Fusion(swarm, Settings().resolved_for(swarm), OdometryTracks(swarm.robots))
+    fusion = Fusion(swarm, Settings().resolved_for(swarm), OdometryTracks(swarm.robots), {})
     none = np.zeros(0, MEASUREMENT_DTYPE)
     fusion.step(fusion.new_state(), none, np.zeros(0, np.uint8), np.zeros(0))
 

@@ -41,6 +41,7 @@ class Kind(IntEnum):
     CARTESIAN = 0  # forward [m], left [m]
     POLAR = 1  # range [m], bearing [rad], positive to the left
     ANONYMOUS = 2  # an unknown robot was at `value` in map; marker_id: index of the detection in the image
+    SCAN = 3  # a lidar's sweep in a known map, without `value`; marker_id: stamp of its first beam [ns]
 
 
 class Command(IntEnum):
@@ -214,7 +215,7 @@ MODELS: dict[int, MeasurementModel] = {
         2,  # the heading is not gated, see `gating.position_distance`
         _predict_built_in,
         _innovation_built_in,
-        None if kind == Kind.ANONYMOUS else _itself,
+        None if kind > POLAR else _itself,
     )
     for kind in Kind
 }

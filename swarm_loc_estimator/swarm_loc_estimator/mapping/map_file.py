@@ -66,8 +66,8 @@ def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
     return yaml_path, image_path
 
 
-def load_map(path: Path, cell: float) -> OccupancyMap:
-    """Read a map of any of map_server's modes, with cells of the given size [m].
+def load_map(path: Path, cell: float | None = None) -> OccupancyMap:
+    """Read a map of any of map_server's modes, with cells of the given size [m]; None: its own.
 
     Pixels of another size are resampled by nearest neighbour.
 
@@ -95,6 +95,10 @@ def load_map(path: Path, cell: float) -> OccupancyMap:
     log_odds = _log_odds(shade, mode, free, occupied)[pixels]
     if mode == "scale":
         log_odds[~seen] = 0.0
+    if cell is None:
+        return OccupancyMap(
+            np.array(origin[:2]), numbers["resolution"], np.ascontiguousarray(log_odds[::-1].T)
+        )
     scale = cell / numbers["resolution"]
     if not math.isclose(scale, 1.0, rel_tol=1e-3):
         log_odds = _resampled(log_odds, scale, checks)

@@ -75,6 +75,11 @@ class ScanMessage(NamedTuple):
     range_max: float
     ranges: FloatArray
 
+    @property
+    def frame_id(self) -> str:
+        """Not read: the mount is that of the swarm description."""
+        return ""
+
 
 class LightMessage(NamedTuple):
     """One light of swarm_loc_msgs/LightBearingArray."""

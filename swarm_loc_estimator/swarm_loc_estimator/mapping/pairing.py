@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from collections import Counter, deque
 from collections.abc import Iterator
-from typing import NamedTuple
 
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.common.se2 import between, compose, transform_points
+from swarm_loc_estimator.common.se2 import between
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.mapping.messages import ScanMessage
 from swarm_loc_estimator.mapping.scans import UNSEEN, Readings, Scan
 from swarm_loc_estimator.mapping.stops import ScanStop
+from swarm_loc_estimator.mapping.sweeps import LidarSweep, read_sweep
 from swarm_loc_estimator.swarm.error_models import LidarModel
 
 MAX_WAITING = 500
@@ -107,30 +107,8 @@ class ReadingPairer(OdometryQueue):
         return float(np.median(self._sigmas)) if self._sigmas else math.nan
 
 
-_MAX_SWEEP_S, _MAX_SWEEP_TURN = 2.0, 6.5
-"""Longest time [s] and greatest angle [rad] from the first to the last beam of a scan."""
-
-
-class _Sweep(NamedTuple):
-    """Beams (n,) of a scan that are used.
-
-    Attributes:
-        stamp_ns: Time of the first beam of the scan.
-        beam_ns: (n,) times of the beams.
-        angle: (n,) directions in the frame of the lidar [rad].
-        distance: (n,) [m]; infinite: nothing up to `reach`.
-        reach: Range of the lidar [m].
-    """
-
-    stamp_ns: int
-    beam_ns: IntArray
-    angle: FloatArray
-    distance: FloatArray
-    reach: float
-
-
 class SweepPairer(OdometryQueue):
-    """Checks the scans of one robot's lidar and takes the robot's motion during each sweep out of them.
+    """Takes a robot's motion during each sweep of its lidar out of it.
 
     Args:
         lidar: Mount and noise of the lidar.
@@ -139,50 +117,22 @@ class SweepPairer(OdometryQueue):
     def __init__(self, lidar: LidarModel) -> None:
         super().__init__()
         self._lidar = lidar
-        self._sweeps: deque[_Sweep] = deque()
+        self._sweeps: deque[LidarSweep] = deque()
         self._newest_ns = -math.inf
 
     def add_scan(self, scan: ScanMessage) -> None:
         """Add a scan; what cannot be used of it is counted."""
-        count, step, duration_s = len(scan.ranges), scan.angle_increment, 0.0
-        numbers = (scan.angle_min, scan.angle_max, step, scan.time_increment)
-        if all(map(math.isfinite, numbers)):
-            duration_s = scan.time_increment * (count - 1)
-        if not all(map(math.isfinite, numbers)) or step == 0.0 or not 0.0 <= duration_s <= _MAX_SWEEP_S:
-            self.drops["scan_bad_geometry"] += 1
-        elif abs((scan.angle_max - scan.angle_min) / step + 1.0 - count) > 1.5 or not count:
-            self.drops["scan_wrong_length"] += 1  # many drivers are one off
-        elif abs(step) * (count - 1) > _MAX_SWEEP_TURN:
-            self.drops["scan_bad_geometry"] += 1
-        elif scan.stamp_ns <= self._newest_ns:
-            self.drops["scan_too_old"] += 1
-        else:
-            self._newest_ns = scan.stamp_ns
-            self._queue(scan)
-
-    def _queue(self, scan: ScanMessage) -> None:
-        """Queue the valid beams of a scan, by REP 117: what met nothing is infinitely far."""
-        far = scan.range_max if math.isfinite(scan.range_max) and scan.range_max > 0.0 else math.inf
-        reach = min(far, self._lidar.max_range)
-        near = max(scan.range_min, self._lidar.min_range) if math.isfinite(scan.range_min) else 0.0
-        wrong = {
-            "beam_not_a_number": np.isnan(scan.ranges),
-            "beam_too_near": (scan.ranges < near) | (scan.ranges <= 0.0),
-            "beam_too_far": np.isfinite(scan.ranges) & (scan.ranges > far),
-        }
-        for reason, beams in wrong.items():
-            self.dropped_beams[reason] += int(beams.sum())
-        used = np.flatnonzero(~np.logical_or.reduce(list(wrong.values())))
-        if not len(used):
-            self.drops["scan_without_beams"] += 1
+        sweep = read_sweep(scan, self._lidar, self.drops, self.dropped_beams)
+        if sweep is None:
             return
+        if scan.stamp_ns <= self._newest_ns:
+            self.drops["scan_too_old"] += 1
+            return
+        self._newest_ns = scan.stamp_ns
         if len(self._sweeps) == _MAX_SWEEPS:
             self._sweeps.popleft()
             self.drops["scan_without_odometry"] += 1
-        beam_ns = scan.stamp_ns + np.round(used * (scan.time_increment * 1e9)).astype(np.int64)
-        distance = np.where(scan.ranges[used] > reach, math.inf, scan.ranges[used])
-        angle = scan.angle_min + used.astype(float) * scan.angle_increment
-        self._sweeps.append(_Sweep(scan.stamp_ns, beam_ns, angle, distance, reach))
+        self._sweeps.append(sweep)
 
     def ready(self) -> Iterator[ScanStop]:
         """The sweeps with known odometry, in order."""
@@ -194,12 +144,11 @@ class SweepPairer(OdometryQueue):
             else:
                 self.drops["scan_without_odometry"] += 1
 
-    def _stop(self, sweep: _Sweep, pose: FloatArray, motion: FloatArray) -> ScanStop:
+    def _stop(self, sweep: LidarSweep, pose: FloatArray, motion: FloatArray) -> ScanStop:
         """The sweep from a pose (3,) of the robot, which had moved by `motion` (n, 3) at each beam."""
-        lidar, seen = self._lidar, np.isfinite(sweep.distance)
+        lidar, seen = self._lidar, sweep.seen
         distance = np.where(seen, sweep.distance, sweep.reach)
-        ray = distance[:, None] * np.stack([np.cos(sweep.angle), np.sin(sweep.angle)], axis=-1)
-        x, y = transform_points(compose(motion, np.array([lidar.x, lidar.y, lidar.yaw])), ray).T
+        x, y = sweep.ends(lidar, motion).T
         noise = (lidar.range_sigma + lidar.range_sigma_per_m * distance) / distance**2
         sigma = (lidar.range_sigma + lidar.range_sigma_per_m * sweep.reach) / sweep.reach**2
         scan = Scan(

@@ -20,7 +20,7 @@ from swarm_loc_estimator.sensors.registry import InputTopic
 from swarm_loc_estimator.swarm.swarm import FixedCamera, Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradiction
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
-from swarm_loc_estimator.timeline.fusion import Verdict
+from swarm_loc_estimator.timeline.verdicts import Verdict
 
 _FULL_LOAD = 0.95
 _CAUSES = {

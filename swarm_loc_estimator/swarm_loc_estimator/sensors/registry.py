@@ -15,13 +15,15 @@ from swarm_loc_estimator.sensors.camera import DETECTIONS
 from swarm_loc_estimator.sensors.fix import FIXES
 from swarm_loc_estimator.sensors.imu import TURN_RATES
 from swarm_loc_estimator.sensors.infrared import BRIGHTNESS
+from swarm_loc_estimator.sensors.lidar import SCANS
 from swarm_loc_estimator.sensors.odometry import ODOMETRY
 from swarm_loc_estimator.sensors.ranges import RANGES
 from swarm_loc_estimator.sensors.sensor import InputKind, Sensor, chosen
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 SENSORS: dict[str, Sensor] = {
-    sensor.name: sensor for sensor in (ODOMETRY, TURN_RATES, DETECTIONS, BRIGHTNESS, FIXES, RANGES, AERIAL)
+    sensor.name: sensor
+    for sensor in (ODOMETRY, TURN_RATES, DETECTIONS, BRIGHTNESS, FIXES, RANGES, SCANS, AERIAL)
 }
 """All sensors by name. Simultaneous measurements are fused in this order."""
 
@@ -58,7 +60,9 @@ def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
         InputTopic(f"{robot.name}/{kind.topic}", kind, index, kind.expected_of(robot))
         for index, robot in enumerate(swarm.robots)
         for kind in kinds().values()
-        if kind.of_each and (kind.expected_of(robot) or not kind.only_expected)
+        if kind.of_each
+        and (kind.expected_of(robot) or not kind.only_expected)
+        and (swarm.map is not None or not kind.needs_map)
     )
     of_cameras = (
         InputTopic(f"{camera.name}/{kind.topic}", kind, index)

@@ -162,6 +162,7 @@ class InputKind:
         only_expected: True if robots of which it is not expected have no such topic.
         of_cameras: True if each fixed camera has such a topic, too.
         in_map: True if readings must be in the frame `map`.
+        needs_map: True if there are such topics only for a swarm with a map.
         stands_for: Name of the sensor whose topics of single robots it replaces; "" if none.
     """
 
@@ -175,6 +176,7 @@ class InputKind:
     only_expected: bool = False
     of_cameras: bool = False
     in_map: bool = False
+    needs_map: bool = False
     stands_for: str = ""
 
     @property

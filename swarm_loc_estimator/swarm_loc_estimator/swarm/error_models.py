@@ -118,7 +118,7 @@ class ImuModel:
 
 @dataclass(frozen=True)
 class LidarModel:
-    """Mount and noise of a robot's 2-D lidar, whose sweeps the mapper uses."""
+    """Mount and noise of a robot's 2-D lidar, for mapping and for localization in a map."""
 
     range_sigma: float = number(0.0, "m", 0.0, 1.0, "noise of a range; 0: the robot has no lidar")
     range_sigma_per_m: float = number(0.01, "1", 0.0, 1.0, "growth of this noise with the range [m per m]")
@@ -128,6 +128,9 @@ class LidarModel:
     min_range: float = number(0.0, "m", 0.0, 10.0, "nearer ranges are dropped, as those below range_min")
     max_range: float = number(
         12.0, "m", 0.2, 50.0, "where range_max is greater or missing: space is free up to here", above=True
+    )
+    map_sigma: float = number(
+        0.02, "m", 0.0, 1.0, "error of the walls of the map in which it localizes, beside that of its cells"
     )
 
     @property

@@ -97,6 +97,7 @@ def swarm_schema() -> Schema:
                 "propertyNames": free_names,
             },
             "anchors": {"type": ["array", "null"], "items": anchor, "description": "fixed radios"},
+            "map": {"type": ["string", "null"], "minLength": 1, "description": "map's .yaml; null: none"},
         },
         "definitions": {**{name: _model(name) for name in MODELS}, **_other_sections()},
     }

@@ -27,6 +27,7 @@ from swarm_loc_estimator.swarm.error_models import (
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
+    from pathlib import Path
 
     from swarm_loc_estimator.swarm.ir_board import RobotIr
     from swarm_loc_estimator.swarm.motion_response import MotionResponse
@@ -136,7 +137,7 @@ class Robot:
         type: Name of its type; "" if it has none.
         odometry: Error model of its odometry.
         imu: Error model of its IMU.
-        lidar: Its lidar, for mapping.
+        lidar: Its lidar, for mapping and for localization in a map.
         response: True share of the reported motion; None: all of it.
         camera: Pose of its camera; None if it has none.
         sensor: Error model of its sightings.
@@ -220,7 +221,7 @@ class SwarmError(ValueError):
 
 @dataclass(frozen=True)
 class Swarm:
-    """All robots, landmarks, fixed cameras and UWB anchors.
+    """All robots, landmarks, fixed cameras and UWB anchors, and the map of walls that lidars see.
 
     Raises:
         SwarmError: A name, a marker id, the id of an infrared board or the address of a radio appears twice,
@@ -231,6 +232,7 @@ class Swarm:
     landmarks: tuple[Landmark, ...] = ()
     cameras: tuple[FixedCamera, ...] = ()
     anchors: tuple[Anchor, ...] = ()
+    map: Path | None = None
 
     def __post_init__(self) -> None:
         names = Counter(one.name for one in self.sources)

@@ -41,6 +41,7 @@ cameras:                  # fixed ones, which see markers on robots
   ceiling1: {x: -1.0, y: 0.5, z: 2.5, position_sigma: 0.001, sensor: {residual_position_sigma: 0.001}}
 anchors:                  # UWB radios, see doc/uwb.md
   - {address: 0x10, x: 0.0, y: 5.0, z: 2.1}
+map: floor.yaml           # walls that lidars see, as of map_server, from here; null or left out: none
 ```
 Numbers, units, ranges and defaults are those of the classes in `swarm/swarm.py`.
 """
@@ -85,7 +86,7 @@ if TYPE_CHECKING:
 
 FILE_VERSION = 1
 
-_SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors")
+_SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors", "map")
 LAYER = (
     *("odometry", "imu", "lidar", "random_walk", "response", "camera", "sensor", "fix", "clock", "ir"),
     *("uwb", "faces", "start_sigma"),
@@ -189,7 +190,7 @@ class _Loader(TreeChecks):
 
     def __init__(self, path: Path, error: type[ValueError]) -> None:
         super().__init__(path, error)
-        self._ir = IrSection(self, path.parent)
+        self._ir, self._folder = IrSection(self, path.parent), path.parent
 
     def swarm(self, tree: Tree) -> Swarm:
         """Parse the whole file."""
@@ -213,7 +214,7 @@ class _Loader(TreeChecks):
         cameras = tuple(self._fixed_camera(name, tree) for name, tree in fixed)
         anchors = read_anchors(self, sections.get("anchors"))
         try:
-            swarm = Swarm(robots, landmarks, cameras, anchors)
+            swarm = Swarm(robots, landmarks, cameras, anchors, self._map(sections.get("map")))
         except SwarmError as error:
             raise self.said(str(error).removesuffix(".")) from error
         states = ParameterTable.of(swarm.robots, swarm.surveyed).filter_size - 3 * len(robots)
@@ -223,6 +224,12 @@ class _Loader(TreeChecks):
                 f" but must make at most {MAX_PARAMETERS}"
             )
         return swarm
+
+    def _map(self, name: Tree) -> Path | None:
+        """Parse the path of a map."""
+        if name is not None and (not isinstance(name, str) or not name):
+            raise self.error("map", name, "must be the path of a map's .yaml file, from here")
+        return None if name is None else (self._folder / name).resolve()
 
     def _robot(self, name: str, tree: Tree, defaults: _Layer, types: Mapping[str, _Layer]) -> Robot:
         """Parse one robot from its three layers."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import textwrap
 from dataclasses import asdict
+from os.path import relpath
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -84,6 +85,7 @@ def _tree(swarm: Swarm, folder: Path) -> Mapping:
         "landmarks": landmarks,
         "cameras": {one.name: _fixed_camera(one) for one in swarm.cameras},
         "anchors": anchors,
+        "map": None if swarm.map is None else relpath(swarm.map, folder),
     }
     return {key: value for key, value in tree.items() if value}
 

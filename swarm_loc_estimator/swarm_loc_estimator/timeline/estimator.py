@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from typing import cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -16,6 +17,7 @@ from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.conversion import InputConverter
 from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.sensors.imu import TURN_RATES, TurnRateRows
+from swarm_loc_estimator.sensors.lidar import SCANS, SweepStore
 from swarm_loc_estimator.sensors.odometry import ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.registry import Batch, Measurements
 from swarm_loc_estimator.sensors.sensor import joined
@@ -24,11 +26,12 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.constant_odometry import ConstantOdometry
 from swarm_loc_estimator.timeline.contradictions import Contradiction, contradictions
 from swarm_loc_estimator.timeline.estimate import Estimate, Status, TrackedLimits, estimate_at
-from swarm_loc_estimator.timeline.fusion import Fusion, Verdict
+from swarm_loc_estimator.timeline.fusion import Fusion
 from swarm_loc_estimator.timeline.self_calibration import learned, learns
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.sightings import Recent
 from swarm_loc_estimator.timeline.timeline import HasBudget, Timeline
+from swarm_loc_estimator.timeline.verdicts import Verdict, drops_by_reason
 
 __all__ = ["Estimate", "Estimator", "Status"]
 
@@ -57,7 +60,8 @@ class Estimator:
         self._limits = TrackedLimits.of(swarm, self.settings)
         self._tracks = OdometryTracks(swarm.robots)
         self._converter = InputConverter(swarm, self.settings)
-        self._fusion = Fusion(swarm, self.settings, self._tracks)
+        self._sweeps = cast(SweepStore, self._converter.accumulators[SCANS.name])
+        self._fusion = Fusion(swarm, self.settings, self._tracks, self._sweeps.sweeps)
         grouped_s = self.settings.state_period_s + self.settings.fusion_period_s
         self._lookback_ns = self._tracks.lookback_ns + round(
             0.5e9 * grouped_s
@@ -232,8 +236,9 @@ class Estimator:
         self._use_odometry()
         if fuse:
             self._timeline.advance(newest_ns, has_budget)
+            needed_ns = min([oldest_ns, *self._timeline.measurements["stamp_ns"][:1].tolist()])
             for accumulator in self._converter.accumulators.values():
-                accumulator.forget_before(oldest_ns)
+                accumulator.forget_before(needed_ns if accumulator is self._sweeps else oldest_ns)
         return self._estimate(now_ns)
 
     def _check_clock(self, now_ns: int) -> int:
@@ -262,12 +267,8 @@ class Estimator:
         self._timeline.invalidate(change.changed_from_ns)
 
     def _timeline_drops(self) -> dict[str, int]:
-        verdicts = self._timeline.verdict_counts()
         return {
-            "gated": int(verdicts[Verdict.GATED]),
-            "not_localized": int(verdicts[Verdict.NOT_LOCALIZED]),
-            "aerial_unassigned": int(verdicts[Verdict.UNASSIGNED]),
-            "aerial_ambiguous": int(verdicts[Verdict.AMBIGUOUS]),
+            **drops_by_reason(self._timeline.verdict_counts()),
             "duplicate": self._timeline.duplicates,
             "too_old": self._timeline.too_old,
         }

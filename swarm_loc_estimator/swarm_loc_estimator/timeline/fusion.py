@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,28 +54,17 @@ from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.aerial_images import PictureFusion, as_fixes, relieve_seen
 from swarm_loc_estimator.timeline.configured_starts import ConfiguredStarts
-from swarm_loc_estimator.timeline.scheduling import middle_of_period
+from swarm_loc_estimator.timeline.map_scans import MapScans, Sweeps
+from swarm_loc_estimator.timeline.scheduling import middle_of_period, parts_by_way
 from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.verdicts import Verdict
 
 _SURER_AT_FIRST = 1.5
 """`lost_heading_sigma` over the maximum standard deviation of the heading at initialization."""
-_NO_IMAGE_NS = np.iinfo(np.int64).min
 _PAIRS_PER_ROBOT = 32
 """Maximum number of observed robots per robot with a stored mean of infrared measurements."""
 _CONTRADICTED_DESCRIPTION, _CONTRADICTED_WITHIN_NS = 2, 60_000_000_000
 """All parameters are re-estimated if this number of robots and landmarks is contradicted in this time."""
-
-
-class Verdict(IntEnum):
-    """Outcome of a measurement."""
-
-    OPEN = sequential_update.OPEN  # not processed yet
-    USED = sequential_update.USED
-    GATED = sequential_update.GATED  # rejected by the innovation gate
-    CONSTRAINT = 3  # stored to initialize a robot
-    NOT_LOCALIZED = 4  # neither side is localized, or a robot has no odometry yet
-    UNASSIGNED = 5  # an anonymous detection that matches no robot
-    AMBIGUOUS = 6  # an anonymous detection that matches several robots
 
 
 class Fusion:
@@ -86,13 +74,14 @@ class Fusion:
         swarm: Robots and landmarks.
         settings: Fusion period and thresholds.
         tracks: Odometry of the robots.
+        sweeps: Sweeps of lidars by robot and stamp.
 
     Attributes:
         is_sparse: True for a large swarm: only covariances of neighbours are kept.
         starts: Initializes robots at their configured starts.
     """
 
-    def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks) -> None:
+    def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks, sweeps: Sweeps) -> None:
         self._tracks = tracks
         self._policy = settings.policy
         self._limits = LossLimits(
@@ -106,6 +95,7 @@ class Fusion:
         self._initializer = Initializer(tracks, settings.fix_window_s, surer)
         self._local = LocalFrame(swarm, tracks, self._initializer, settings.origin_after_s)
         self._pictures = PictureFusion(swarm, settings, tracks)
+        self._scans = MapScans(swarm, settings, tracks, sweeps)
         self._table = ParameterTable.of(swarm.robots, swarm.surveyed, in_blocks=self.is_sparse)
         self._pairs = _PAIRS_PER_ROBOT if any(robot.ir is not None for robot in swarm.robots) else 0
 
@@ -130,15 +120,9 @@ class Fusion:
             nis: (m,) normalized innovation squared, written; NaN if not evaluated.
         """
         nis[:] = np.nan
-        anonymous = measurements["kind"] == Kind.ANONYMOUS
-        if not anonymous.any():
-            self._fuse(state, measurements, verdicts, nis)
-            return
-        image_ns = np.where(anonymous, measurements["stamp_ns"], _NO_IMAGE_NS)
-        edges = [0, *(np.flatnonzero(np.diff(image_ns)) + 1).tolist(), measurements.size]
-        for begin, end in itertools.pairwise(edges):
-            part = slice(begin, end)
-            fuse = self._fuse_image if anonymous[begin] else self._fuse
+        ways = {int(Kind.ANONYMOUS): self._fuse_image, int(Kind.SCAN): self._fuse_scan}
+        for part in parts_by_way(measurements):
+            fuse = ways.get(int(measurements["kind"][part.start]), self._fuse)
             fuse(state, measurements[part], verdicts[part], nis[part])
 
     def _fuse(
@@ -196,6 +180,15 @@ class Fusion:
         )
         unclear = assignment.robot[~known] == AMBIGUOUS
         verdicts[~known] = np.where(unclear, Verdict.AMBIGUOUS, unknown)
+
+    def _fuse_scan(
+        self, state: SwarmState, one: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray
+    ) -> None:
+        """Fuse the scan (1,) of a lidar."""
+        self.starts.initialize_measured(state, one)
+        fix, verdicts[:] = self._scans.fix_of(state, one)
+        if fix is not None:
+            self._fuse(state, fix, verdicts, nis)
 
     def _fuse_in_order(
         self, state: SwarmState, measurements: MeasurementArray, verdicts: NDArray[np.uint8], nis: FloatArray

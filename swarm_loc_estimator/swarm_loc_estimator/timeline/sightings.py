@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.messages.cdr import CdrError, decode, encode, nanoseconds
 from swarm_loc_estimator.common.messages.definitions import SWARM_SIGHTINGS
 from swarm_loc_estimator.filter.measurement_model import Command, MeasurementArray
-from swarm_loc_estimator.timeline.fusion import Verdict
+from swarm_loc_estimator.timeline.verdicts import Verdict
 
 RECENT_NS = 2_000_000_000
 """Maximum age of reported measurements."""
@@ -61,7 +61,8 @@ def newest_sightings(recent: Recent, now_ns: int) -> Sightings:
     robot, landmark = rows["target"], rows["landmark"]
     target = np.where(landmark > 0, -landmark, robot)
     observer = rows["observer"]
-    chosen = np.flatnonzero((rows["command"] == Command.NONE) & ((landmark > 0) | (robot >= 0)))[::-1]
+    shown = (rows["command"] == Command.NONE) & (verdicts <= Verdict.NOT_LOCALIZED)
+    chosen = np.flatnonzero(shown & ((landmark > 0) | (robot >= 0)))[::-1]
     # np.unique keeps the first of equal keys, which is the newest in reversed order
     _, places = np.unique((observer[chosen] << 32) + target[chosen], return_index=True)
     kept = chosen[places]

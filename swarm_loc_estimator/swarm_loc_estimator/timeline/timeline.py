@@ -18,9 +18,9 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.timeline.buffer import MeasurementBuffer
-from swarm_loc_estimator.timeline.fusion import Verdict
 from swarm_loc_estimator.timeline.scheduling import end_of_period, middle_of_period
 from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.verdicts import Verdict
 
 Step = Callable[[SwarmState, MeasurementArray, NDArray[np.uint8], FloatArray], None]
 HasBudget = Callable[[], bool]

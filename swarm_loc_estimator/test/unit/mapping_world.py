@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import encode
 from swarm_loc_estimator.common.messages.definitions import LASER_SCAN
 from swarm_loc_estimator.common.se2 import compose, exp, wrap_angle
+from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.messages import ScanMessage
 from swarm_loc_estimator.mapping.scans import Readings
 from swarm_loc_estimator.swarm.error_models import LidarModel
@@ -152,3 +154,16 @@ def scan_bytes(scan: ScanMessage) -> bytes:
     fields = {**scan._asdict(), "header": header, "ranges": scan.ranges.astype(np.float32)}
     del fields["stamp_ns"]
     return encode(fields, LASER_SCAN)
+
+
+def room_map(cell: float) -> OccupancyMap:
+    """The exact map of the room: with cells of 5 cm, its walls are on centres of cells."""
+    corner = np.array([-0.325, -0.325])
+    count = np.ceil((np.array([ROOM[2], NICHE[3]]) + 0.7) / cell).astype(int)
+    x, y = np.meshgrid(*(corner[k] + (np.arange(count[k]) + 0.5) * cell for k in (0, 1)), indexing="ij")
+    outside = np.ones(x.shape, dtype=bool)
+    for left, lower, right, upper in (ROOM, (NICHE[0], ROOM[1], *NICHE[2:])):
+        inside = (x > left + 1e-6) & (x < right - 1e-6) & (y > lower + 1e-6) & (y < upper - 1e-6)
+        outside &= ~inside
+    distance = scipy.ndimage.distance_transform_edt(outside)
+    return OccupancyMap(corner, cell, np.where(~outside, -5.0, np.where(distance <= 1.0, 5.0, 0.0)))

@@ -21,7 +21,6 @@ from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, Kind
 from swarm_loc_estimator.offline.export import write_mcap
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
-from swarm_loc_estimator.timeline.fusion import Verdict
 from swarm_loc_estimator.timeline.sightings import (
     Recent,
     Sightings,
@@ -29,6 +28,7 @@ from swarm_loc_estimator.timeline.sightings import (
     encode_sightings,
     newest_sightings,
 )
+from swarm_loc_estimator.timeline.verdicts import Verdict
 from swarm_loc_estimator.watch.markers import MarkersEncoder, ellipses
 
 SECOND = 1_000_000_000

@@ -15,7 +15,7 @@ from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
-from swarm_loc_estimator.timeline.fusion import Verdict
+from swarm_loc_estimator.timeline.verdicts import Verdict
 
 SECOND = 1_000_000_000
 SWARM = Swarm((Robot("a", odometry=OdometryModel(timeout_s=1.0)), Robot("b", camera=None)))

@@ -190,7 +190,7 @@ def test_a_robot_unsure_at_one_of_many_measurements_is_lost_in_whatever_order_th
     stamps_ns = T0 + np.array([0, SECOND // 10])
     tracks.extend(np.zeros(2, dtype=np.int64), stamps_ns, np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0]]))
     limits = Settings(lost_sigma=0.05, lost_heading_sigma=10.0)
-    steps = Fusion(swarm, limits, tracks)
+    steps = Fusion(swarm, limits, tracks, {})
     state = steps.new_state()
     state.initialize(0, InitialPose(np.zeros(3), np.diag([1e-6, 1e-6, 1.0])), Preintegrated.begin(T0))
     fixes = about_robots(0, stamps_ns, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), Kind.CARTESIAN)

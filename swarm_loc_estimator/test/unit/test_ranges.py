@@ -28,9 +28,9 @@ from swarm_loc_estimator.sensors.ranges import RANGE, RANGE_DIFFERENCE
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
-from swarm_loc_estimator.timeline.fusion import Verdict
 from swarm_loc_estimator.timeline.scheduling import Policy
 from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.verdicts import Verdict
 
 DOC = Path(__file__).parents[2] / "doc" / "uwb.md"
 SIGMA = 0.02

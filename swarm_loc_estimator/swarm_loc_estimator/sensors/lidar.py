@@ -1,0 +1,125 @@
+"""Scans of lidars in the map of the swarm description, matched by `timeline/map_scans.py`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.messages.definitions import LASER_SCAN
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageColumns
+from swarm_loc_estimator.filter.measurement_model import Kind
+from swarm_loc_estimator.mapping.messages import ScanMessage, decode_scan
+from swarm_loc_estimator.mapping.sweeps import LidarSweep, read_sweep
+from swarm_loc_estimator.sensors.fix import about_robots
+from swarm_loc_estimator.sensors.sensor import NO_MEASUREMENTS, NO_ROWS, Change, InputKind, Known, Sensor
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+
+
+class ScanRows(NamedTuple):
+    """Scans (s,).
+
+    Attributes:
+        robot: (s,) index of the robot.
+        stamp_ns: (s,) time of the first beam.
+        scan: (s,) of `ScanMessage`.
+        arrival_ns: (s,) arrival times.
+    """
+
+    robot: IntArray
+    stamp_ns: IntArray
+    scan: NDArray[Any]
+    arrival_ns: IntArray
+
+
+NO_SCANS = ScanRows(NO_ROWS, NO_ROWS, np.zeros(0, dtype=object), NO_ROWS)
+
+
+class SweepStore:
+    """Keeps sweeps until they are fused, and measurements that stand for them.
+
+    The stamp of a measurement is the time of its last beam, so all odometry during the sweep is before it.
+
+    Args:
+        swarm: Robots with their lidars.
+
+    Attributes:
+        drops: Reason -> number of unusable scans.
+        sweeps: LidarSweep by robot and stamp of its first beam [ns].
+    """
+
+    def __init__(self, swarm: Swarm) -> None:
+        self._lidars = [robot.lidar for robot in swarm.robots]
+        self._beams: Counter[str] = Counter()
+        self.drops: Counter[str] = Counter()
+        self.sweeps: dict[tuple[int, int], LidarSweep] = {}
+
+    @property
+    def counters(self) -> dict[str, int]:
+        """Sweeps are counted as measurements."""
+        return {}
+
+    def take(self, rows: ScanRows) -> Change:
+        """Add scans."""
+        nothing = np.zeros((len(rows.scan), 3))
+        added = about_robots(rows.robot, rows.stamp_ns, nothing, np.eye(3)[None], Kind.SCAN)
+        usable = np.ones(len(rows.scan), dtype=bool)
+        columns = rows.robot.tolist(), rows.stamp_ns.tolist(), rows.scan
+        for k, (robot, stamp_ns, scan) in enumerate(zip(*columns, strict=True)):
+            sweep = read_sweep(scan, self._lidars[robot], self.drops, self._beams)
+            if sweep is None:
+                usable[k] = False
+                continue
+            shift_ns = stamp_ns - sweep.stamp_ns  # of the robot's clock
+            sweep = sweep._replace(stamp_ns=stamp_ns, beam_ns=sweep.beam_ns + shift_ns)
+            self.sweeps.setdefault((robot, stamp_ns), sweep)
+            added["stamp_ns"][k], added["marker_id"][k] = sweep.beam_ns[-1], stamp_ns
+        return Change(added[usable], NO_MEASUREMENTS)
+
+    def forget_before(self, oldest_ns: int) -> None:
+        """Discard sweeps that ended before an instant."""
+        for key in [key for key, sweep in self.sweeps.items() if sweep.beam_ns[-1] < oldest_ns]:
+            del self.sweeps[key]
+
+    def restart(self) -> None:
+        """Discard all sweeps."""
+        self.sweeps.clear()
+
+
+def _columns(
+    found: MessageColumns[ScanMessage], batch: MessageBatch, robot: IntArray, _known: Known
+) -> tuple[ScanRows, Mapping[str, int]]:
+    scans = np.empty(len(found.messages), dtype=object)
+    for k, message in enumerate(found.messages):
+        scans[k] = message
+    arrival_ns = batch.log_ns[found.valid]
+    return ScanRows(robot[found.valid], found.stamp_ns[found.valid], scans, arrival_ns), {}
+
+
+def _has_lidar(robot: Robot) -> bool:
+    return robot.lidar.is_used
+
+
+SCANS = Sensor(
+    "scans",
+    NO_SCANS,
+    (
+        InputKind(
+            "scans",
+            "scan",
+            LASER_SCAN,
+            lambda n, _: EachReader(n, decode_scan),
+            _columns,
+            _has_lidar,
+            only_expected=True,
+            needs_map=True,
+        ),
+    ),
+    create_accumulator=SweepStore,
+)
+"""The sensor, see `registry.SENSORS`."""

@@ -1,0 +1,98 @@
+"""Localization of robots with lidars in a known map: each scan becomes an absolute fix.
+
+The timeline matches a scan when its turn comes, at its stamp, from the pose predicted then, and again when
+older data arrive. So poses do not depend on the order of arrival.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.se2 import between
+from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED, count_missed, count_seen
+from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.filter.state import IN_MAP, SwarmState
+from swarm_loc_estimator.mapping.map_file import load_map
+from swarm_loc_estimator.mapping.map_matching import BLOCKED, OFF_MAP, WallMap, match, wall_map
+from swarm_loc_estimator.mapping.sweeps import LidarSweep
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.sensors.fix import about_robots
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.estimate import TrackedLimits, estimate_at
+from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.verdicts import Verdict
+
+_SYSTEMATIC_SHARE = 0.7
+"""Share of a match's variance that the next scans have, too: what is wrong with the map at a place."""
+_MAX_MISSED, _MAX_AT_START = 10.0, 3.0
+"""Fault scores at which a robot is lost whose scans contradict the map, and before its start is confirmed."""
+_ALL = 3
+Sweeps = Mapping[tuple[int, int], LidarSweep]
+"""Sweeps by robot and stamp of the first beam [ns]."""
+
+
+class MapScans:
+    """Matches scans to the map of a swarm.
+
+    Args:
+        swarm: The map, and robots with lidars.
+        settings: Thresholds of lost robots.
+        tracks: Odometry of the robots.
+        sweeps: Sweeps by robot and stamp.
+
+    Raises:
+        UserError: The map cannot be read, or has no walls or no free space.
+    """
+
+    def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks, sweeps: Sweeps) -> None:
+        self._tracks, self._sweeps = tracks, sweeps
+        self._lidars = [robot.lidar for robot in swarm.robots]
+        self._limits = TrackedLimits.of(swarm, settings)
+        self._walls: WallMap | None = None
+        if swarm.map is not None:
+            self._walls = wall_map(load_map(swarm.map), swarm.map)
+            nothing = np.zeros((0, 2)), np.zeros(2), np.zeros(0)
+            match(self._walls, *nothing, np.zeros(3), np.eye(3))  # compiles before data come
+
+    def fix_of(self, state: SwarmState, one: MeasurementArray) -> tuple[MeasurementArray | None, Verdict]:
+        """Match a scan (1,); returns its fix (1,), or None and why there is none.
+
+        Args:
+            state: Its fault scores are changed.
+            one: The scan, whose robot is initialized if its start is known.
+        """
+        robot, stamp_ns = int(one["target"][0]), int(one["stamp_ns"][0])
+        sweep = self._sweeps.get((robot, int(one["marker_id"][0])))
+        if self._walls is None or sweep is None or state.origin != IN_MAP or not state.tracked[robot]:
+            return None, Verdict.NOT_LOCALIZED
+        estimate = estimate_at(state, self._tracks.arrays, self._limits, stamp_ns)
+        beams = self._beams(robot, stamp_ns, sweep)
+        walls = self._walls._replace(variance=self._walls.variance + self._lidars[robot].map_sigma ** 2)
+        found = match(walls, *beams, estimate.poses[robot], estimate.covariances[robot])
+        if found.outcome == OFF_MAP:
+            confirmed = state.integrity.confirmations[robot] >= CONFIRMED
+            if count_missed(state.integrity, robot, 1.0) >= (_MAX_MISSED if confirmed else _MAX_AT_START):
+                state.deinitialize(robot)  # later ones may fit by chance, elsewhere
+            return None, Verdict.OFF_MAP
+        if found.outcome == BLOCKED:
+            return None, Verdict.BLOCKED
+        count_seen(state.integrity, robot)
+        if found.determined < _ALL:  # as in a corridor: it does not confirm a start
+            state.integrity.confirmed_ns[robot] = stamp_ns
+        fix = about_robots(robot, stamp_ns, found.pose[None], found.covariance[None], Kind.CARTESIAN)
+        fix["systematic_share"] = _SYSTEMATIC_SHARE
+        return fix, Verdict.OPEN
+
+    def _beams(
+        self, robot: int, stamp_ns: int, sweep: LidarSweep
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Beams of a sweep that met something, from the robot's pose at an instant, see `match`."""
+        lidar, seen = self._lidars[robot], sweep.seen
+        at_ns = np.append(sweep.beam_ns, stamp_ns)
+        poses = self._tracks.at(np.full(at_ns.size, robot), at_ns).pose
+        ends = sweep.ends(lidar, between(poses[-1], poses[:-1]))[seen]
+        sigma = lidar.range_sigma + lidar.range_sigma_per_m * sweep.distance[seen]
+        return ends, np.array([lidar.x, lidar.y]), sigma**2

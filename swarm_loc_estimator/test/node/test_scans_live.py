@@ -1,0 +1,86 @@
+"""Scans of a lidar over DDS: the estimator takes them and corrects a start by the map of the description."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from pathlib import Path
+
+import pytest
+from nav_msgs.msg import Odometry
+from node_world import SECOND, T0_NS, Ros, odometry_bytes, overrides, stamp_ns
+from rclpy.qos import qos_profile_sensor_data
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import LaserScan
+from std_msgs.msg import Header
+
+from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
+from swarm_loc_msgs.msg import SwarmPose, SwarmPoses
+
+BEAMS = 180
+SWARM_YAML = """
+fileversion: 1
+map: floor.yaml
+robots:
+  alpha:
+    camera: null
+    lidar: {range_sigma: 0.01}
+    start: {x: 0.1, y: -0.1, theta: 0.05}
+    start_sigma: {x: 0.1, y: 0.1, theta: 0.1}
+"""
+MAP_YAML = """
+image: floor.pgm
+resolution: 0.05
+origin: [-2.025, -1.525, 0.0]
+occupied_thresh: 0.65
+free_thresh: 0.196
+"""
+WIDTH, HEIGHT = 81, 61
+
+
+def write_map(folder: Path) -> None:
+    """A room of 4 x 3 m around the origin, with walls on centres of cells."""
+    rows = [[0 if x in (0, WIDTH - 1) else 254 for x in range(WIDTH)] for _ in range(HEIGHT)]
+    rows[0] = rows[-1] = [0] * WIDTH
+    pixels = b"".join(bytes(row) for row in rows)
+    (folder / "floor.pgm").write_bytes(f"P5 {WIDTH} {HEIGHT} 255\n".encode() + pixels)
+    (folder / "floor.yaml").write_text(MAP_YAML, encoding="utf-8")
+
+
+def scan_at(now_ns: int) -> LaserScan:
+    """What a lidar sees from the middle of the room."""
+    step = 2.0 * math.pi / BEAMS
+    angles = [step * k for k in range(BEAMS)]
+    ranges = [min(2.0 / max(abs(math.cos(one)), 1e-9), 1.5 / max(abs(math.sin(one)), 1e-9)) for one in angles]
+    header = Header(stamp=Time(nanoseconds=now_ns).to_msg(), frame_id="alpha/base_scan")
+    shape = {"angle_max": step * (BEAMS - 1), "angle_increment": step, "range_min": 0.1, "range_max": 8.0}
+    return LaserScan(header=header, **shape, ranges=ranges)
+
+
+def is_estimated(poses: list[SwarmPoses], before: int, now_ns: int) -> bool:
+    """Whether an estimate at an instant has come after some."""
+    return any(stamp_ns(one) == now_ns for one in poses[before:])
+
+
+def test_scans_correct_a_start(ros: Ros, tmp_path: Path) -> None:
+    path = tmp_path / "swarm.yaml"
+    path.write_text(SWARM_YAML, encoding="utf-8")
+    write_map(tmp_path)
+    ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True)))
+    clock = ros.tester.create_publisher(Clock, "/clock", 10)
+    odometry = ros.tester.create_publisher(Odometry, "alpha/odom", 100)
+    scans = ros.tester.create_publisher(LaserScan, "alpha/scan", qos_profile_sensor_data)
+    poses = ros.listen(SwarmPoses, "swarm/poses")
+    ros.until(lambda: all(one.get_subscription_count() for one in (clock, odometry, scans)))
+    ros.until(lambda: ros.tester.count_publishers("swarm/poses"))
+    for step in range(8):
+        now_ns, before = T0_NS + step * SECOND // 2, len(poses)
+        odometry.publish(odometry_bytes("alpha", now_ns))
+        scans.publish(scan_at(now_ns))
+        clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+        ros.until(partial(is_estimated, poses, before, now_ns))
+
+    (alpha,) = poses[-1].robots
+    assert alpha.status == SwarmPose.STATUS_TRACKED
+    assert (alpha.x, alpha.y, alpha.theta) == pytest.approx((0.0, 0.0, 0.0), abs=0.02)

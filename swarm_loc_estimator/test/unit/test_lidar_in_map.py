@@ -1,0 +1,164 @@
+"""Robots with lidars in a known map: poses, replay, order of arrival, wrong starts, descriptions."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from core_geometry import nees, wrapped
+from mapping_world import LIDAR, SWEEP_NS, LidarRobot, room_map, scan_bytes
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.definitions import LASER_SCAN, ODOMETRY
+from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
+from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.mapping.map_file import save_map
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.registry import input_topics
+from swarm_loc_estimator.swarm.swarm import Pose2, Robot, StartSigma, Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.timeline.contradictions import Contradicted
+from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
+
+CELL, ODOMETRY_NS = 0.05, 40_000_000
+SIGMA = StartSigma(0.05, 0.05, 0.05)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of the room."""
+    return save_map(room_map(CELL), tmp_path_factory.mktemp("maps") / "room")[0]
+
+
+def swarm_at(room: Path | None, start: FloatArray) -> Swarm:
+    x, y, theta = start.tolist()
+    pose: Pose2 = (x, y, theta)
+    return Swarm((Robot("a", start=pose, start_sigma=SIGMA, lidar=LIDAR),), map=room)
+
+
+def sent(until_ns: int, seed: int, blocked: int = 0) -> list[tuple[str, int, bytes]]:
+    """Topic, arrival and bytes: odometry, and each sweep when it is over, with some beams at people."""
+    robot, unknown = LidarRobot(np.random.default_rng(seed)), UNKNOWN_COVARIANCE
+    found = []
+    for at_ns in range(0, until_ns + 1, ODOMETRY_NS):
+        pose = robot.odometry(np.array([at_ns]))
+        frames = ("a/odom", "a/base_link")
+        data = encode_odometry(*frames, np.array([at_ns]), pose, np.zeros((1, 3)), unknown, unknown)[0]
+        found.append(("a/odom", at_ns, data))
+    for k, at_ns in enumerate(range(0, until_ns - SWEEP_NS + 1, SWEEP_NS)):
+        scan = robot.scan(at_ns)
+        beams = np.arange(7 * k, 7 * k + blocked) % len(scan.ranges)
+        scan.ranges[beams] = np.minimum(scan.ranges[beams], 0.5)
+        found.append(("a/scan", at_ns + SWEEP_NS, scan_bytes(scan)))
+    return sorted(found, key=lambda one: one[1])
+
+
+def hand_in(estimator: Estimator, messages: list[tuple[str, int, bytes]]) -> list[Estimate]:
+    """Hand in messages one by one; returns the estimate after each."""
+    ingest, estimates = Ingest(estimator.swarm), []
+    for topic, at_ns, data in messages:
+        one = SerializedMessage(ingest.handle_of[topic], data, at_ns)
+        for batch in ingest.read(MessageBatch.of([one])):
+            estimator.receive(batch)
+        estimates.append(estimator.tick(at_ns))
+    return estimates
+
+
+def test_poses_are_right_within_their_covariance(room: Path) -> None:
+    """Over seeds, with a start off by its standard deviation and a quarter of the beams at people."""
+    until_ns, squares = 4_000_000_000, []
+    for seed in range(8):
+        start = LidarRobot.start + np.random.default_rng(seed).standard_normal(3) * 0.05
+        swarm = swarm_at(room, start)
+        estimator = Estimator(swarm)
+        estimate = hand_in(estimator, sent(until_ns, seed, blocked=90))[-1]
+        error = wrapped(estimate.poses[0] - LidarRobot().pose(until_ns))
+        assert estimate.status[0] == Status.TRACKED
+        assert np.hypot(error[0], error[1]) < CELL
+        assert abs(error[2]) < 0.03
+        assert estimator.used >= 18
+        squares.append(float(nees(error[None], estimate.covariances)[0]))
+    assert np.mean(squares) < 4.5
+
+
+def test_the_order_of_arrival_does_not_matter(room: Path) -> None:
+    until_ns, swarm = 1_200_000_000, swarm_at(room, LidarRobot.start + np.array([0.03, -0.04, 0.03]))
+    messages = sent(until_ns, seed=1)
+    mixed = [messages[k] for k in 1 + np.random.default_rng(3).permutation(len(messages) - 1)]
+    results = []
+    for order in (messages, [messages[0], *mixed]):
+        estimator = Estimator(swarm)
+        results.append(hand_in(estimator, [(topic, until_ns, data) for topic, _, data in order])[-1])
+        assert estimator.used == 6
+    assert results[1].poses == pytest.approx(results[0].poses, abs=1e-9)
+    assert results[1].covariances == pytest.approx(results[0].covariances, abs=1e-9)
+
+
+def test_a_bag_gives_the_same_poses_twice_byte_for_byte(room: Path, tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("a/odom", ODOMETRY)
+        bag.add_topic("a/scan", LASER_SCAN)
+        for topic, at_ns, data in sent(5_000_000_000, seed=2):
+            bag.write(topic, at_ns, data)
+    swarm = swarm_at(room, LidarRobot.start + np.array([0.05, 0.0, 0.0]))
+    first, second = (replay(tmp_path / "bag", swarm) for _ in range(2))
+    assert first.poses.tobytes() == second.poses.tobytes()
+    assert first.covariances.tobytes() == second.covariances.tobytes()
+    assert first.poses[-1, 0, :2] == pytest.approx(LidarRobot().pose(int(first.stamp_ns[-1]))[:2], abs=CELL)
+
+
+@pytest.mark.parametrize("shift", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.6)])
+def test_a_wrong_start_is_never_tracked(room: Path, shift: tuple[float, float, float]) -> None:
+    estimator = Estimator(swarm_at(room, LidarRobot.start + shift))
+    statuses = [int(one.status[0]) for one in hand_in(estimator, sent(3_000_000_000, seed=1))]
+    assert Status.TRACKED not in statuses
+    assert statuses[-1] == Status.WAITING
+    assert estimator.drops["scan_off_map"] == 3
+
+
+def test_a_robot_that_is_carried_away_is_contradicted_and_then_lost(room: Path) -> None:
+    """Its odometry has not noticed: scans of another place come from a robot that was at home before."""
+    until_ns, home, unknown = 8_000_000_000, LidarRobot(), UNKNOWN_COVARIANCE
+    estimator, names = Estimator(swarm_at(room, home.start)), set()
+    assert hand_in(estimator, sent(until_ns, seed=1))[-1].status[0] == Status.TRACKED
+    stands, elsewhere = home.odometry(np.array([until_ns])), home.scan(until_ns // 2)
+    status = []
+    for at_ns in range(until_ns + SWEEP_NS, until_ns + 13 * SWEEP_NS, SWEEP_NS):
+        frames, stamps = ("a/odom", "a/base_link"), np.array([at_ns])
+        odometry = encode_odometry(*frames, stamps, stands, np.zeros((1, 3)), unknown, unknown)[0]
+        scan = scan_bytes(elsewhere._replace(stamp_ns=at_ns - SWEEP_NS))
+        status += hand_in(estimator, [("a/odom", at_ns, odometry), ("a/scan", at_ns, scan)])
+        names |= {one.kind for one in estimator.contradictions(at_ns) if one.about == "a"}
+    assert Contradicted.POSE in names
+    assert status[-1].status[0] == Status.WAITING
+
+
+def test_scans_are_only_taken_with_a_map(room: Path) -> None:
+    with_map, without = swarm_at(room, LidarRobot.start), swarm_at(None, LidarRobot.start)
+    assert "a/scan" in {topic.name for topic in input_topics(with_map)}
+    assert "a/scan" not in {topic.name for topic in input_topics(without)}
+    blind = replace(with_map, robots=(replace(with_map.robots[0], lidar=type(LIDAR)()),))
+    assert "a/scan" not in {topic.name for topic in input_topics(blind)}
+
+
+def test_the_description_names_the_map_from_its_folder(room: Path, tmp_path: Path) -> None:
+    swarm = swarm_at(room, LidarRobot.start)
+    save_swarm(swarm, tmp_path / "x" / "swarm.yaml")
+    assert load_swarm(tmp_path / "x" / "swarm.yaml") == swarm
+    assert f"map: ../../{room.parent.name}/room.yaml" in (tmp_path / "x" / "swarm.yaml").read_text()
+
+
+def test_a_wrong_map_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "swarm.yaml"
+    path.write_text("fileversion: 1\nrobots: {a: {}}\nmap: 3\n", encoding="utf-8")
+    with pytest.raises(UserError, match=r"map is 3 but must be the path of a map's .yaml file, from here"):
+        load_swarm(path)
+    path.write_text("fileversion: 1\nrobots: {a: {}}\nmap: none.yaml\n", encoding="utf-8")
+    with pytest.raises(UserError, match=r"none\.yaml"):
+        Estimator(load_swarm(path))
