@@ -51,7 +51,7 @@ UNDETERMINED_SIGMA = 2.0
 """Standard deviation where walls tell nothing [m, or rad times the mean range]; robots are lost before."""
 _THROUGH_M = 0.25
 """A beam that ends so far behind a wall has gone through it [m]."""
-_MIN_BEAMS, _MIN_FIT, _MAX_THROUGH = 20, 0.4, 0.15
+_MIN_BEAMS, _MIN_FIT, _MAX_THROUGH = 20, 0.5, 0.1
 """Minimum number and share of beams that fit, and maximum share of beams that go through walls."""
 
 _UNKNOWN, _FREE, _WALL = 0, 1, 2

@@ -29,7 +29,9 @@ _SYSTEMATIC_SHARE = 0.7
 """Share of a match's variance that the next scans have, too: what is wrong with the map at a place."""
 _MAX_MISSED, _MAX_AT_START = 10.0, 3.0
 """Fault scores at which a robot is lost whose scans contradict the map, and before its start is confirmed."""
-_ALL = 3
+_ALL, _SURE_FIT = 3, 0.65
+"""Number of directions and share of fitting beams with which a scan confirms a start: elsewhere, walls like
+those at home are seen now and then."""
 Sweeps = Mapping[tuple[int, int], LidarSweep]
 """Sweeps by robot and stamp of the first beam [ns]."""
 
@@ -80,10 +82,12 @@ class MapScans:
         if found.outcome == BLOCKED:
             return None, Verdict.BLOCKED
         count_seen(state.integrity, robot)
-        if found.determined < _ALL:  # as in a corridor: it does not confirm a start
+        if found.determined < _ALL or found.fitting < _SURE_FIT:  # does not confirm a start
             state.integrity.confirmed_ns[robot] = stamp_ns
         fix = about_robots(robot, stamp_ns, found.pose[None], found.covariance[None], Kind.CARTESIAN)
         fix["systematic_share"] = _SYSTEMATIC_SHARE
+        # with an alternative it locates no robot alone: it was sought near the pose that may be wrong
+        fix["has_alternative"], fix["alternative"] = 1, fix["value"]
         return fix, Verdict.OPEN
 
     def _beams(

@@ -122,6 +122,17 @@ def test_a_wrong_start_is_never_tracked(room: Path, shift: tuple[float, float, f
     assert estimator.drops["scan_off_map"] == 3
 
 
+def test_a_scan_with_many_people_does_not_confirm_a_start(room: Path) -> None:
+    """But it is used."""
+    until_ns, start = 3_000_000_000, LidarRobot.start + np.array([0.03, 0.0, 0.0])
+    found = {}
+    for blocked in (30, 150):
+        estimator = Estimator(swarm_at(room, start))
+        found[blocked] = hand_in(estimator, sent(until_ns, seed=1, blocked=blocked))[-1].status[0]
+        assert estimator.used >= 10
+    assert found == {30: Status.TRACKED, 150: Status.UNCONFIRMED}
+
+
 def test_a_robot_that_is_carried_away_is_contradicted_and_then_lost(room: Path) -> None:
     """Its odometry has not noticed: scans of another place come from a robot that was at home before."""
     until_ns, home, unknown = 8_000_000_000, LidarRobot(), UNKNOWN_COVARIANCE
