@@ -59,7 +59,8 @@ def test_an_estimator_waits_until_its_description_is_right(ros: Ros, tmp_path: P
     path.write_text(SWARM_YAML, encoding="utf-8")
     assert not manager.change(ACTIVATE)  # which rclpy alone would not survive
     assert manager.changes(CONFIGURE) == "inactive"
-    assert manager.set_values(horizon_s=4.0) == "parameter horizon_s cannot be set while the node is inactive."
+    refusal = "parameter horizon_s cannot be set while the node is inactive."
+    assert manager.set_values(horizon_s=4.0) == refusal
     ros.until(lambda: newest_status(heard, "estimator").message == "inactive: nothing is published")
     assert not ros.tester.count_publishers("swarm/poses")
     assert not ros.tester.count_subscribers("alpha/odom")
