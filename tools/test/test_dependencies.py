@@ -36,8 +36,8 @@ KEYS = {
 """What rosdep calls modules that are no ROS packages."""
 FOR_BAGS = {"lz4", "mcap", "rosbags", "zstandard"}
 """rosdep knows no packages of them but by pip, and bloom refuses a package that depends on such ones."""
-CLUSTERS = {"distributed", "ray"}
-"""Only for sweeps on a cluster, imported by name: rosdep knows no packages of them; benchmarks run them."""
+FOR_SWEEPS = {"distributed", "optuna", "ray"}
+"""For sweeps on clusters and fits, imported by name: rosdep knows no packages of them, benchmarks do."""
 PIP_NAMES = {"python3-pil": "pillow"}
 """What pip calls packages in which rosdep's name is another one."""
 LOADED_BY_NAME = {"swarm_loc_estimator": {"event_camera_msgs", "sensor_msgs"}}
@@ -101,7 +101,7 @@ def test_a_wheel_of_the_estimator_requires_what_it_imports_as_the_workspace_does
     from_pip = {
         PIP_NAMES.get(key, key.removeprefix("python3-")) for key in keys if key.startswith("python3-")
     }
-    assert {name.replace("_", "-") for name in of_wheel} == from_pip | FOR_BAGS | CLUSTERS
+    assert {name.replace("_", "-") for name in of_wheel} == from_pip | FOR_BAGS | FOR_SWEEPS
 
 
 @pytest.mark.parametrize("name", ["swarm_loc_vision", "swarm_loc_drivers"])

@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
 LIMITS = {
-    "product_lines": 72_100,
+    "product_lines": 72_250,
     "files_under_40": 60,
     "files_over_400": 0,
     "import_circles": 0,

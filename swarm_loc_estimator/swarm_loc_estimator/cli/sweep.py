@@ -7,14 +7,15 @@
 The file names bags and a grid of settings; every combination is replayed, see doc/sweep.md. table.csv has
 one row per replay; sweep.html and the PNG files show what each varied value does. An interrupted sweep goes
 on from where it was when it is started again, and its table is the same, byte for byte. Replays that failed
-are rows with the reason, and the next run tries them again.
+are rows with the reason, and the next run tries them again. A section `fit` searches ranges of settings for
+the best values, by optuna.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from swarm_loc_estimator.common.command_line import (
@@ -24,8 +25,9 @@ from swarm_loc_estimator.common.command_line import (
     folder_to_write,
 )
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.offline.sweep.grid import read_sweep
-from swarm_loc_estimator.offline.sweep.jobs import run_sweep
+from swarm_loc_estimator.offline.sweep.fit import Fitted, run_fit
+from swarm_loc_estimator.offline.sweep.grid import Fit, read_sweep
+from swarm_loc_estimator.offline.sweep.jobs import Line, run_sweep
 from swarm_loc_estimator.offline.sweep.report import rows_of, write_results
 from swarm_loc_estimator.offline.sweep.workers import NAMES, Backend
 
@@ -39,16 +41,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sweep = read_sweep(options.file)
     with ProgressLine() as progress:
         backend = Backend(options.backend, options.cluster)
-        finished = run_sweep(sweep, options.out / "jobs.jsonl", backend, progress)
+        path, best = options.out / "jobs.jsonl", ""
+        if (fit := sweep.fit) is None:
+            finished: Mapping[str, Line] = run_sweep(sweep, path, backend, progress)
+        else:
+            found = run_fit(sweep, fit, path, backend, progress)
+            sweep, finished, best = found.sweep, found.finished, _best_of(found, fit)
         progress(1.0, "writing the table and plots")
         rows = rows_of(sweep, finished)
         page = write_results(rows, sweep.varied, options.out)
-    print(f"{len(rows)} replays\nTable: {options.out / 'table.csv'}\nPage:  {page}")
+    print(f"{len(rows)} replays\n{best}Table: {options.out / 'table.csv'}\nPage:  {page}")
     if failed := [row for row in rows if row["failure"]]:
         first = f"the first: {failed[0]['failure']}"
         print(f"{len(failed)} of {len(rows)} replays failed, {first}", file=sys.stderr)
         return 1
     return 0
+
+
+def _best_of(found: Fitted, fit: Fit) -> str:
+    """A line with the best values of a fit."""
+    if not found.values:
+        return f"Best:    none: no trial has {fit.minimize} of all its replays\n"
+    chosen = "".join(f" --set {name}={value:.6g}" for name, value in found.values.items())
+    before = "" if found.mean_before is None else f", {found.mean_before:.6g} with the defaults"
+    return f"Best: {chosen}\n       mean {fit.minimize} {found.mean:.6g}{before}\n"
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -21,7 +21,7 @@ from swarm_loc_estimator.cli import (
     watch,
 )
 from swarm_loc_estimator.common.parameters import number_specs
-from swarm_loc_estimator.offline.sweep.grid import KEYS, read_sweep
+from swarm_loc_estimator.offline.sweep.grid import KEYS, MINIMIZED, read_sweep
 from swarm_loc_estimator.offline.sweep.jobs import FIGURES
 from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS, SENSORS
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Landmark
@@ -66,15 +66,19 @@ def test_the_example_of_overhead_cameras_is_a_swarm(tmp_path: Path) -> None:
     assert all(face.lies for robot in swarm.robots for face in robot.faces)
 
 
-def test_the_page_of_sweeps_has_all_keys_and_columns_and_its_example_is_a_sweep(tmp_path: Path) -> None:
+def test_the_page_of_sweeps_has_all_keys_and_columns_and_its_examples_are_sweeps(tmp_path: Path) -> None:
     page = (DOC / "sweep.md").read_text(encoding="utf-8")
     assert [key for key in KEYS if f"| `{key}` |" not in page] == []
     assert [column for column in FIGURES if f"`{column}`" not in page] == []
-    (example,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    assert [key for key in (*MINIMIZED, "trials", "ranges", "minimize") if f"`{key}`" not in page] == []
     (tmp_path / "bags").symlink_to(DOC.parents[1] / "bags")
-    (tmp_path / "sweep.yaml").write_text(example, encoding="utf-8")
-    read = read_sweep(tmp_path / "sweep.yaml")
-    assert f"makes {len(read.jobs)} replays" in page
+    read = []
+    for example in re.findall(r"```yaml\n(.*?)```", page, re.DOTALL):
+        (tmp_path / "sweep.yaml").write_text(example, encoding="utf-8")
+        read.append(read_sweep(tmp_path / "sweep.yaml"))
+    grid, fit = read
+    assert f"makes {len(grid.jobs)} replays" in page
+    assert fit.fit is not None
 
 
 def test_every_number_of_radios_has_its_place() -> None:

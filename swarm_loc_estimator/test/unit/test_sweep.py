@@ -16,11 +16,13 @@ import pytest
 from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.sweep import main
 from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.offline.recorded_bag import Loss
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.sweep import grid, jobs
 from swarm_loc_estimator.offline.sweep.grid import Job, SweepFileError, read_sweep
 from swarm_loc_estimator.offline.sweep.jobs import FIGURES, outcome
 from swarm_loc_estimator.offline.sweep.report import Row, _span, write_results
+from swarm_loc_estimator.timeline.settings import Settings
 
 DEMO = Path(__file__).parents[3] / "bags" / "eight_one_robot_fast"
 GRID = "settings: {horizon_s: [0.1, 2]}\nlost: [0, 0.3]\nseeds: [1, 2]\nworkers: 1\n"
@@ -127,6 +129,25 @@ def test_a_job_is_another_when_anything_changes_that_determines_its_result(folde
             "parameter settings.horizon_s[1] = 99.0 must lie in [0.05, 60] s",
         ),
         ("bags: [short]\nlost: [0, 1]", "parameter lost[1] = 1.0 must lie in [0, 0.99]"),
+        ("bags: [short]\nfit: {trials: 9}", "fit lacks ranges"),
+        ("bags: [short]\nfit: {trials: 9, ranges: {}}", "must name at least one setting"),
+        ("bags: [short]\nfit: {trials: 1, ranges: {horizon_s: [1, 2]}}", "must lie in [2, 10000]"),
+        (
+            "bags: [short]\nfit: {trials: 9, ranges: {horizon_s: [2, 1]}}",
+            "fit.ranges.horizon_s is [2, 1] but must be its least and its greatest value",
+        ),
+        (
+            "bags: [short]\nfit: {trials: 9, ranges: {horizon_s: [1, 99]}}",
+            "parameter fit.ranges.horizon_s = 99.0 must lie in [0.05, 60] s",
+        ),
+        (
+            "bags: [short]\nsettings: {horizon_s: [1]}\nfit: {trials: 9, ranges: {horizon_s: [1, 2]}}",
+            "must be of a number that is not in settings, too",
+        ),
+        (
+            "bags: [short]\nfit: {minimize: nees, trials: 9, ranges: {horizon_s: [1, 2]}}",
+            "fit.minimize is 'nees' but must be one of position_rmse_m,",
+        ),
         ("bags: [short]\nlost: [0.1, 0.1]", "lost is [0.1, 0.1] but must be a list of at least one value"),
         (
             "bags: [short]\nsettings: {horizon_s: [1, 1.0]}",
@@ -250,6 +271,54 @@ def test_ctrl_c_ends_a_sweep_with_what_is_finished(folder: Path, monkeypatch: py
     monkeypatch.setattr(jobs, "outcome", interrupted)
     assert run(file) == 130
     assert finished(folder).read_text(encoding="utf-8").count("\n") == 2
+
+
+RANGES = "{horizon_s: [0.05, 3], lost_heading_sigma: [0.3, 2]}"
+FIT = f"lost: [0.3]\nworkers: 1\nfit: {{trials: 10, ranges: {RANGES}}}\n"
+
+
+def test_a_fit_finds_no_worse_values_than_the_defaults(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("optuna")
+    file = written(folder, "bags: [short]\n" + FIT)
+    assert run(file) == 0
+    said, first = capsys.readouterr().out, table(folder)
+    lines = [line.split(",") for line in first.splitlines()]
+    head, body = lines[0], lines[1:]
+    assert len(body) == 10
+    assert head[:6] == ["bag", "swarm", "horizon_s", "lost_heading_sigma", "lost", "seed"]
+    errors = [float(row[head.index("position_rmse_m")]) for row in body]
+    best = body[errors.index(min(errors))]
+    assert f"--set horizon_s={best[2]} --set lost_heading_sigma={best[3]}" in said
+    assert f"{min(errors):.6g}, {errors[0]:.6g} with the defaults" in said
+    assert (folder / "out" / "horizon_s.png").exists()
+
+    stored = finished(folder).read_bytes()
+    finished(folder).write_bytes(stored[: len(stored) // 2])
+    assert run(file) == 0
+    assert table(folder) == first
+    again = replay(folder / "short", settings=Settings(horizon_s=float(best[2])), loss=Loss(0.3, 1))
+    assert again.overall.position_rmse == pytest.approx(min(errors), rel=0.02)
+
+
+def test_a_fit_without_ground_truth_has_no_best_values(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("optuna")
+    monkeypatch.setattr(jobs, "outcome", lambda job: {"key": job.key, "figures": dict.fromkeys(FIGURES)})
+    assert run(written(folder, "bags: [short]\n" + FIT)) == 0
+    assert "none: no trial has position_rmse_m of all its replays" in capsys.readouterr().out
+
+
+def test_a_fit_without_optuna_is_one_sentence(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    assert run(written(folder, "bags: [short]\n" + FIT)) == 1
+    error = capsys.readouterr().err
+    assert "pip install 'swarm_loc_estimator[optuna]'" in error
+    assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize("backend", ["ray", "dask"])

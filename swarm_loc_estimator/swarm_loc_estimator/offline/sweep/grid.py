@@ -6,7 +6,7 @@ import glob
 import hashlib
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -31,10 +31,16 @@ from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 from swarm_loc_estimator.timeline.settings import Settings
 
 MAX_JOBS = 100_000
-KEYS = ("bags", "swarms", "settings", "lost", "seeds", "workers")
+KEYS = ("bags", "swarms", "settings", "lost", "seeds", "workers", "fit")
+MINIMIZED = (
+    *("position_rmse_m", "position_median_m", "position_p95_m", "position_max_m"),
+    *("heading_rmse_deg", "misleading_share"),
+)
+"""Columns of the table that a fit can minimize."""
 _SETTINGS = {spec.name: spec for spec in parameter_specs(Settings)}
 _SHARE, _SEED = parameter_specs(Loss)
 _WORKERS = ParameterSpec("workers", 1, "", NumberSpec("1", 1, 4096, False, "replays at a time"))
+_TRIALS = ParameterSpec("trials", 1, "", NumberSpec("1", 2, 10_000, False, "sets of values that are tried"))
 _BLOCK = 2**22
 
 
@@ -62,6 +68,29 @@ class Job:
     key: str
     cells: dict[str, Value | None]
 
+    def having(self, values: Mapping[str, Value]) -> Job:
+        """The same replay with other values of settings."""
+        settings = replace(self.settings, **values)  # type: ignore[arg-type]
+        key = hashlib.sha256(f"{self.key} {settings}".encode()).hexdigest()
+        lost, seed = self.cells["lost"], self.cells["seed"]
+        cells = {**{name: self.cells[name] for name in self.cells if name not in {"lost", "seed"}}, **values}
+        return replace(self, settings=settings, key=key, cells={**cells, "lost": lost, "seed": seed})
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A search for the values of settings with the least mean of a column over all replays.
+
+    Attributes:
+        minimize: The column.
+        trials: Number of sets of values that are tried.
+        ranges: Setting -> least and greatest value; whole numbers for those that are.
+    """
+
+    minimize: str
+    trials: int
+    ranges: Mapping[str, tuple[float, float]]
+
 
 @dataclass(frozen=True)
 class Sweep:
@@ -71,11 +100,13 @@ class Sweep:
         jobs: The replays.
         varied: Columns with more than one value, but for bag and seed.
         workers: Number of replays at a time; -1: one for each processor.
+        fit: Makes the replays of each trial from these; None: there is no fit.
     """
 
     jobs: tuple[Job, ...]
     varied: tuple[str, ...]
     workers: int
+    fit: Fit | None = None
 
 
 def read_sweep(path: Path) -> Sweep:
@@ -114,7 +145,9 @@ class _SweepReader(TreeChecks):
         seeds = self._some(said.get("seeds", [1]), "seeds", _SEED)
         losses = [(share, seed) for share in lost for seed in (seeds if share else [None])]
         workers = self._checked(said["workers"], "workers", _WORKERS) if "workers" in said else -1
+        fit = self._fit(said["fit"], grid) if "fit" in said else None
         count = len(bags) * len(swarms) * math.prod(map(len, grid.values())) * len(losses)
+        count *= fit.trials if fit else 1
         if count > MAX_JOBS:
             raise self.said(f"it makes {count} replays but must make at most {MAX_JOBS}")
         jobs = [
@@ -123,8 +156,27 @@ class _SweepReader(TreeChecks):
                 bags, swarms, itertools.product(*grid.values()), losses
             )
         ]
-        axes = {"swarm": swarms, **grid, "lost": lost}
-        return Sweep(tuple(jobs), tuple(name for name in axes if len(axes[name]) > 1), int(workers))
+        axes = {"swarm": swarms, **grid, **(fit.ranges if fit else {}), "lost": lost}
+        return Sweep(tuple(jobs), tuple(name for name in axes if len(axes[name]) > 1), int(workers), fit)
+
+    def _fit(self, tree: Tree, grid: Collection[str]) -> Fit:
+        """The section `fit`."""
+        said = self.mapping(tree, "fit", ("minimize", "trials", "ranges"), required=("trials", "ranges"))
+        minimize = said.get("minimize", MINIMIZED[0])
+        if minimize not in MINIMIZED:
+            raise self.error("fit.minimize", minimize, f"must be one of {', '.join(MINIMIZED)}")
+        ranges = {}
+        for name, one in self.mapping(said["ranges"], "fit.ranges", _SETTINGS).items():
+            spec, key = _SETTINGS[name], f"fit.ranges.{name}"
+            if spec.number is None or isinstance(spec.default, bool) or name in grid:
+                raise self.error(key, one, "must be of a number that is not in settings, too")
+            bounds = [self._checked(bound, key, spec) for bound in self.items(one, key)]
+            if len(bounds) != 2 or not bounds[0] < bounds[1]:
+                raise self.error(key, one, "must be its least and its greatest value")
+            ranges[name] = (bounds[0], bounds[1])
+        if not ranges:
+            raise self.error("fit.ranges", said["ranges"], "must name at least one setting")
+        return Fit(minimize, int(self._checked(said["trials"], "fit.trials", _TRIALS)), ranges)
 
     def _bags(self, text: str, number: int) -> list[str]:
         """Paths of bags, from the folder of the file, that fit a path or pattern."""

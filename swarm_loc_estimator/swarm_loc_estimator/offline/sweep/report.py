@@ -27,6 +27,8 @@ Row = Mapping[str, Any]
 _FAILURE = "failure"
 _LOG_FROM = 10.0
 """Ratio of the greatest to the least value from which their axis is logarithmic."""
+_TICKS = 12
+"""Maximum number of values that are labelled, and joined by lines."""
 _UNITS = {name: spec.unit for name, spec in number_specs(Settings).items()}
 _UNITS["lost"] = "share of the messages"
 _WITHOUT_TRUTH = "No ground truth to compare with: the plots show what the estimator itself reports."
@@ -89,6 +91,7 @@ def write_results(rows: Sequence[Row], varied: Sequence[str], folder: Path) -> P
 def draw(rows: Sequence[Row], by: str, metrics: Sequence[Metric], path: Path) -> None:
     """Plot metrics against one column: a line per bag, the mean over all else, and the span of the seeds."""
     values = list(dict.fromkeys(row[by] for row in rows))
+    is_many = len(values) > _TICKS
     bags = list(dict.fromkeys(row["bag"] for row in rows))
     short = len({Path(bag).name for bag in bags}) == len(bags)
     figure = Figure(figsize=(4.2 * len(metrics), 3.6 + 0.2 * ((len(bags) + 2) // 3)))
@@ -103,11 +106,14 @@ def draw(rows: Sequence[Row], by: str, metrics: Sequence[Metric], path: Path) ->
             low, mean, high = scale * _span(
                 [[r for r in own if r[by] == one] for one in values], metric.column
             )
-            (line,) = axis.plot(places, mean, "o-", color=colour_of(index), markersize=4, linewidth=1.6)
+            (line,) = axis.plot(
+                places, mean, "o" if is_many else "o-", color=colour_of(index), markersize=4, linewidth=1.6
+            )
             line.set_label(Path(bag).name if short else bag)
-            axis.fill_between(places, low, high, color=colour_of(index), alpha=0.18, linewidth=0)
+            if not is_many:
+                axis.fill_between(places, low, high, color=colour_of(index), alpha=0.18, linewidth=0)
         axis.set_ylim(bottom=0.0)
-    note = "line: mean over all other values; band: least to greatest mean of the seeds"
+    note = "means over all other values" + ("" if is_many else "; band: least to greatest mean of the seeds")
     handles, labels = figure.axes[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower left", ncols=3, frameon=False, fontsize=9)
     figure.suptitle(note, x=0.005, ha="left", fontsize=9, color=SOFT)
@@ -124,7 +130,8 @@ def _place(axis: Axes, by: str, values: Sequence[Any]) -> list[float]:
     if min(values) > 0.0 and max(values) > _LOG_FROM * min(values):
         axis.set_xscale("log")
         axis.minorticks_off()
-    axis.set_xticks(values, [f"{one:g}" for one in values])
+    if len(values) <= _TICKS:
+        axis.set_xticks(values, [f"{one:g}" for one in values])
     return [float(one) for one in values]
 
 

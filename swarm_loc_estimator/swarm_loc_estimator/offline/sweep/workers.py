@@ -59,7 +59,7 @@ def _loky(_count: int, _address: str | None) -> Iterator[dict[str, Any]]:
 @contextmanager
 def _ray(count: int, address: str | None) -> Iterator[dict[str, Any]]:
     """Actors of Ray."""
-    ray, backend = _loaded("ray", "ray"), _loaded("ray.util.joblib.ray_backend", "ray")
+    ray, backend = loaded("ray", "ray"), loaded("ray.util.joblib.ray_backend", "ray")
     options = {"address": address} if address else {"num_cpus": None if count < 0 else count}
     with _reached(address):
         if address:  # Ray itself asks an address where nobody answers for many minutes
@@ -79,7 +79,7 @@ def _ray(count: int, address: str | None) -> Iterator[dict[str, Any]]:
 @contextmanager
 def _dask(count: int, address: str | None) -> Iterator[dict[str, Any]]:
     """Workers of Dask."""
-    client = _loaded("distributed", "dask").Client
+    client = loaded("distributed", "dask").Client
     local = {"n_workers": None if count < 0 else count, "threads_per_worker": 1, "dashboard_address": None}
     with _reached(address):
         connected = client(address) if address else client(**local)
@@ -95,10 +95,14 @@ def _reached(address: str | None) -> Iterator[None]:
         raise BackendError(f"--cluster {address} is not reached: {' '.join(str(cause).split())}.") from cause
 
 
-def _loaded(module: str, extra: str) -> Any:
-    """A module that only some sweeps need."""
+def loaded(module: str, extra: str) -> Any:
+    """A module that only some sweeps need.
+
+    Raises:
+        BackendError: It is not installed.
+    """
     try:
         return import_module(module)
     except ImportError as error:
-        needed = f"--backend {extra} needs a package that is not installed"
+        needed = f"{extra} needs a package that is not installed"
         raise BackendError(f"{needed}: pip install 'swarm_loc_estimator[{extra}]' ({error}).") from error
