@@ -27,7 +27,7 @@ Row = Mapping[str, Any]
 _FAILURE = "failure"
 _LOG_FROM = 10.0
 """Ratio of the greatest to the least value from which their axis is logarithmic."""
-_TICKS = 12
+_TICKS = 8
 """Maximum number of values that are labelled, and joined by lines."""
 _UNITS = {name: spec.unit for name, spec in number_specs(Settings).items()}
 _UNITS["lost"] = "share of the messages"
@@ -90,7 +90,8 @@ def write_results(rows: Sequence[Row], varied: Sequence[str], folder: Path) -> P
 
 def draw(rows: Sequence[Row], by: str, metrics: Sequence[Metric], path: Path) -> None:
     """Plot metrics against one column: a line per bag, the mean over all else, and the span of the seeds."""
-    values = list(dict.fromkeys(row[by] for row in rows))
+    values: list[Any] = list(dict.fromkeys(row[by] for row in rows))
+    values = values if isinstance(values[0], str) else sorted(values)
     is_many = len(values) > _TICKS
     bags = list(dict.fromkeys(row["bag"] for row in rows))
     short = len({Path(bag).name for bag in bags}) == len(bags)
