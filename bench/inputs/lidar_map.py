@@ -19,7 +19,18 @@ from tempfile import TemporaryDirectory
 import numpy as np
 import scipy
 
-from bench.pushbot.lidar import BEAMS, LIDAR, NAME, NEAREST, LidarBody, LidarDrive, scan_message
+from bench.pushbot.lidar import (
+    BEAMS,
+    LIDAR,
+    NAME,
+    NEAREST,
+    ODOMETRY_STEPS,
+    SWEEP_STEPS,
+    LidarBody,
+    LidarDrive,
+    scan_message,
+)
+from bench.pushbot.mapping import LIDAR_SLIPS, PLANS
 from bench.shared.common import ProgressLine
 from swarm_loc_drivers.sim.pushbot.exploration import PERIOD_S, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan
@@ -38,14 +49,11 @@ from swarm_loc_estimator.swarm.swarm import Pose2, Robot, StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
 from swarm_loc_estimator.timeline.estimator import Estimator
 
-PLANS = ("corridor", "office", "ring")
 CELL = 0.05
 MAP_SIGMAS = {"exact": 0.02, "drawn": 0.05}
 BLOCKED = 0.25
-SLIPS = (0.02, 0.035, 0.05)
 _ODOMETRY = OdometryModel(wheel_separation=0.16, distance_scale_sigma=0.05, turn_scale_sigma=0.05)
 _START = StartSigma(0.05, 0.05, math.radians(3.0))
-_SWEEP_STEPS, _ODOMETRY_STEPS = 10, 2
 _PEOPLE, _NEAR_M, _FAR_M = 3, 0.4, 1.5
 _EVALUATE_FROM_S, _RUN_S, _MAP_MINUTES = 2.0, 60.0, 5.0
 _WRONG_STARTS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
@@ -133,7 +141,7 @@ def exact_map(plan: FloorPlan, cell: float = CELL) -> OccupancyMap:
 def drawn_map(plan: FloorPlan, minutes: float, seed: int) -> OccupancyMap:
     """The map that the mapper draws on a drive."""
     rng = np.random.default_rng([seed, 77])
-    drive = LidarDrive.starting(plan, CooperativeMapper(), SLIPS[seed % len(SLIPS)], rng)
+    drive = LidarDrive.starting(plan, CooperativeMapper(), LIDAR_SLIPS[seed % len(LIDAR_SLIPS)], rng)
     drive.run(60.0 * minutes)
     drive.mapper.finish()
     return drive.mapper.occupancy()
@@ -175,7 +183,7 @@ def drive(
     """
     rng = np.random.default_rng(seed)
     pose = np.array([*plan.starts[0], rng.uniform(-math.pi, math.pi)])
-    body = LidarBody(plan, pose.copy(), PushBotNoise(slip=SLIPS[seed % len(SLIPS)]), rng)
+    body = LidarBody(plan, pose.copy(), PushBotNoise(slip=LIDAR_SLIPS[seed % len(LIDAR_SLIPS)]), rng)
     said = pose + rng.standard_normal(3) * [_START.x, _START.y, _START.theta] + start_shift
     start: Pose2 = (float(said[0]), float(said[1]), float(said[2]))
     lidar = replace(LIDAR, map_sigma=map_sigma)
@@ -186,15 +194,15 @@ def drive(
     for step in range(round(until_s / PERIOD_S) + 1):
         now_ns = round(step * PERIOD_S * 1e9)
         now = np.array([now_ns])
-        if step % _ODOMETRY_STEPS == 0:
+        if step % ODOMETRY_STEPS == 0:
             rows = OdometryRows.without_twist(zero, now, body.odometry[None].copy(), now)
             estimator.receive(Batch.of(now_ns, now_ns, odometry=rows))
-        if step and step % _SWEEP_STEPS == 0:
-            ranges = body.ranges(step - _SWEEP_STEPS)
+        if step and step % SWEEP_STEPS == 0:
+            ranges = body.ranges(step - SWEEP_STEPS)
             if blocked:
                 ranges = block(ranges, blocked, rng, now_ns * 1e-9)
             scans = np.empty(1, dtype=object)
-            scans[0] = decode_scan(scan_message(round((step - _SWEEP_STEPS) * PERIOD_S * 1e9), ranges))
+            scans[0] = decode_scan(scan_message(round((step - SWEEP_STEPS) * PERIOD_S * 1e9), ranges))
             stamp = np.array([scans[0].stamp_ns])
             begin_s = time.process_time()
             estimator.receive(Batch.of(now_ns, now_ns, scans=ScanRows(zero, stamp, scans, now)))

@@ -35,7 +35,7 @@ BEAMS = 360
 NEAREST, FARTHEST = 0.12, 3.5
 NAME = "turtlebot"
 _DROPOUT = 0.01
-_SWEEP_STEPS, _ODOMETRY_STEPS = round(SWEEP_S / PERIOD_S), 2
+SWEEP_STEPS, ODOMETRY_STEPS = round(SWEEP_S / PERIOD_S), 2
 _TURN_RATE, _STEER, _TURN_ON_SPOT = 0.8, 2.0, 0.6
 _CLEAR, _ARRIVED = 0.2, 0.15
 _TRIES, _MIN_HOP, _MAX_HOP = 600, 0.6, 5.0
@@ -120,8 +120,8 @@ class LidarBody:
 
     def ranges(self, begin: int) -> FloatArray:
         """Ranges (BEAMS,) of the sweep that began at a step, as the lidar reports them [m]."""
-        share = np.arange(BEAMS) / BEAMS * _SWEEP_STEPS
-        poses = np.array([*self.trace[begin : begin + _SWEEP_STEPS], self.pose])
+        share = np.arange(BEAMS) / BEAMS * SWEEP_STEPS
+        poses = np.array([*self.trace[begin : begin + SWEEP_STEPS], self.pose])
         poses[:, 2] = np.unwrap(poses[:, 2])
         at = np.stack([np.interp(share, np.arange(len(poses)), column) for column in poses.T], axis=-1)
         beam = np.stack(
@@ -179,13 +179,13 @@ class LidarDrive:
         known = np.diag([1e-4] * 6)
         for step in range(round(until_s / PERIOD_S) + 1):
             stamp_ns = round(step * PERIOD_S * 1e9)
-            if step % _ODOMETRY_STEPS == 0:
+            if step % ODOMETRY_STEPS == 0:
                 stamps, pose = np.array([stamp_ns]), body.odometry[None]
                 frames = (f"{NAME}/odom", f"{NAME}/base_link")
                 data = encode_odometry(*frames, stamps, pose, np.zeros((1, 3)), known, UNKNOWN_COVARIANCE)[0]
                 self._feed(feed, MapperInput.ODOMETRY, data)
-            if step and step % _SWEEP_STEPS == 0:
-                begin = step - _SWEEP_STEPS
+            if step and step % SWEEP_STEPS == 0:
+                begin = step - SWEEP_STEPS
                 data = scan_message(round(begin * PERIOD_S * 1e9), body.ranges(begin))
                 self._feed(feed, MapperInput.SCAN, data)
                 self.sweeps += 1
