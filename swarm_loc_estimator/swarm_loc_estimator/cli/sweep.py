@@ -25,8 +25,8 @@ from swarm_loc_estimator.common.command_line import (
     folder_to_write,
 )
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.offline.sweep.fit import Fitted, run_fit
-from swarm_loc_estimator.offline.sweep.grid import Fit, read_sweep
+from swarm_loc_estimator.offline.sweep.fit import Best, run_fit
+from swarm_loc_estimator.offline.sweep.grid import read_sweep
 from swarm_loc_estimator.offline.sweep.jobs import Line, run_sweep
 from swarm_loc_estimator.offline.sweep.report import rows_of, write_results
 from swarm_loc_estimator.offline.sweep.workers import NAMES, Backend
@@ -41,30 +41,30 @@ def main(arguments: Sequence[str] | None = None) -> int:
     sweep = read_sweep(options.file)
     with ProgressLine() as progress:
         backend = Backend(options.backend, options.cluster)
-        path, best = options.out / "jobs.jsonl", ""
+        path, best = options.out / "jobs.jsonl", None
         if (fit := sweep.fit) is None:
             finished: Mapping[str, Line] = run_sweep(sweep, path, backend, progress)
         else:
-            found = run_fit(sweep, fit, path, backend, progress)
-            sweep, finished, best = found.sweep, found.finished, _best_of(found, fit)
+            sweep, finished, best = run_fit(sweep, fit, path, backend, progress)
         progress(1.0, "writing the table and plots")
         rows = rows_of(sweep, finished)
         page = write_results(rows, sweep.varied, options.out)
-    print(f"{len(rows)} replays\n{best}Table: {options.out / 'table.csv'}\nPage:  {page}")
+    print(f"{len(rows)} replays\nTable: {options.out / 'table.csv'}\nPage:  {page}")
+    if best is not None:
+        print(_text_of(best))
     if failed := [row for row in rows if row["failure"]]:
         first = f"the first: {failed[0]['failure']}"
         print(f"{len(failed)} of {len(rows)} replays failed, {first}", file=sys.stderr)
-        return 1
-    return 0
+    if fit is not None and best is None:
+        print(f"No trial has {fit.minimize} of all its replays.", file=sys.stderr)
+    return int(bool(failed) or (fit is not None and best is None))
 
 
-def _best_of(found: Fitted, fit: Fit) -> str:
-    """A line with the best values of a fit."""
-    if not found.values:
-        return f"Best:    none: no trial has {fit.minimize} of all its replays\n"
-    chosen = "".join(f" --set {name}={value:.6g}" for name, value in found.values.items())
-    before = "" if found.mean_before is None else f", {found.mean_before:.6g} with the defaults"
-    return f"Best: {chosen}\n       mean {fit.minimize} {found.mean:.6g}{before}\n"
+def _text_of(best: Best) -> str:
+    """The best values as options, and what they gain."""
+    options = "".join(f" --set {name}={value:.6g}" for name, value in best.values.items())
+    before = "" if best.mean_before is None else f", {best.mean_before:.6g} with the defaults"
+    return f"Best: {options}\n       mean {best.minimized} {best.mean:.6g}{before}"
 
 
 def _parser() -> argparse.ArgumentParser:

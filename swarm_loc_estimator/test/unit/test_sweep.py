@@ -16,6 +16,8 @@ import pytest
 from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.sweep import main
 from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.mapping.grid import OccupancyMap
+from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.offline.recorded_bag import Loss
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.sweep import grid, jobs
@@ -94,11 +96,20 @@ def test_a_job_is_another_when_anything_changes_that_determines_its_result(folde
     first = key()
     assert first == key("settings: {horizon_s: [2.0]}")  # the default
     assert len({first, key("settings: {horizon_s: [1.9]}"), key("lost: [0.1]")}) == 3
+    bag = "mapped"
+    shutil.copytree(folder / "short", folder / bag)
+    with (folder / bag / "swarm.yaml").open("a", encoding="utf-8") as description:
+        description.write("map: floor.yaml\n")
+    keys = set()
+    for size in (4, 5):
+        save_map(OccupancyMap(np.zeros(2), 0.1, np.ones((size, size))), folder / bag / "floor.yaml")
+        keys.add(key())
+    assert len({first, *keys}) == 3
     bag = "described"
     shutil.copytree(folder / "short", folder / bag)
-    description = folder / bag / "swarm.yaml"
-    text = description.read_text(encoding="utf-8")
-    description.write_text(text + "# a comment\n", encoding="utf-8")
+    described = folder / bag / "swarm.yaml"
+    text = described.read_text(encoding="utf-8")
+    described.write_text(text + "# a comment\n", encoding="utf-8")
     assert key() == first
     bag = "renamed"
     shutil.copytree(folder / "short", folder / bag)
@@ -307,8 +318,8 @@ def test_a_fit_without_ground_truth_has_no_best_values(
 ) -> None:
     pytest.importorskip("optuna")
     monkeypatch.setattr(jobs, "outcome", lambda job: {"key": job.key, "figures": dict.fromkeys(FIGURES)})
-    assert run(written(folder, "bags: [short]\n" + FIT)) == 0
-    assert "none: no trial has position_rmse_m of all its replays" in capsys.readouterr().out
+    assert run(written(folder, "bags: [short]\n" + FIT)) == 1
+    assert capsys.readouterr().err == "No trial has position_rmse_m of all its replays.\n"
 
 
 def test_a_fit_without_optuna_is_one_sentence(

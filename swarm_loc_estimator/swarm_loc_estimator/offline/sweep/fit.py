@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,22 +21,34 @@ _AT_ONCE = 8
 """Trials that are chosen at a time, whatever the number of workers, so that it does not change the table."""
 
 
+class Best(NamedTuple):
+    """The best trial of a fit.
+
+    Attributes:
+        values: Setting -> value.
+        minimized: The column that it minimizes.
+        mean: Of this column.
+        mean_before: The same with the defaults; None: they are not in the ranges, or have no figure.
+    """
+
+    values: Mapping[str, Value]
+    minimized: str
+    mean: float
+    mean_before: float | None
+
+
 class Fitted(NamedTuple):
     """A finished fit.
 
     Attributes:
         sweep: With the replays of all trials.
         finished: Key of a job -> its line.
-        values: The best ones; empty if each trial had a replay that failed or that nothing is known of.
-        mean: Of the minimized column, with these values.
-        mean_before: The same with the defaults; None: they are not in the ranges, or have no figure.
+        best: None if each trial had a replay without the figure.
     """
 
     sweep: Sweep
     finished: Mapping[str, Line]
-    values: Mapping[str, Value]
-    mean: float = math.nan
-    mean_before: float | None = None
+    best: Best | None
 
 
 def run_fit(sweep: Sweep, fit: Fit, path: Path, backend: Backend, progress: Progress) -> Fitted:
@@ -67,22 +78,23 @@ def run_fit(sweep: Sweep, fit: Fit, path: Path, backend: Backend, progress: Prog
     for first in range(0, fit.trials, _AT_ONCE):
         trials = [study.ask(searched) for _ in range(min(_AT_ONCE, fit.trials - first))]
         asked = [[job.having(trial.params) for job in sweep.jobs] for trial in trials]
-        jobs += itertools.chain(*asked)
+        batch = tuple(itertools.chain(*asked))
+        jobs += batch
 
         def at(share: float, what: str, first: int = first, count: int = len(trials)) -> None:
             progress((first + share * count) / fit.trials, f"trial {first + 1} and next ones: {what}")
 
-        finished |= run_sweep(replace(sweep, jobs=tuple(itertools.chain(*asked))), path, backend, at)
+        finished |= run_sweep(replace(sweep, jobs=batch), path, backend, at)
         for trial, own in zip(trials, asked, strict=True):
             mean = _mean(own, finished, fit.minimize)
             study.tell(trial, mean, state=None if mean is not None else optuna.trial.TrialState.FAIL)
     every = replace(sweep, jobs=tuple({job.key: job for job in jobs}.values()))
     complete = study.get_trials(states=[optuna.trial.TrialState.COMPLETE])
     if not complete:
-        return Fitted(every, finished, {})
+        return Fitted(every, finished, None)
     best = min(complete, key=lambda trial: trial.value)
     before = complete[0].value if complete[0].params == defaults else None
-    return Fitted(every, finished, best.params, best.value, before)
+    return Fitted(every, finished, Best(best.params, fit.minimize, best.value, before))
 
 
 def _mean(jobs: Sequence[Job], finished: Mapping[str, Line], column: str) -> float | None:

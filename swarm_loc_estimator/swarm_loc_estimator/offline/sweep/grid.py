@@ -24,6 +24,7 @@ from swarm_loc_estimator.common.parameters import (
     parameter_specs,
 )
 from swarm_loc_estimator.common.yaml_tree import Tree, read_tree
+from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.offline.recorded_bag import Loss
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -57,7 +58,7 @@ class Job:
         swarm: Its robots and landmarks.
         settings: Of the estimator.
         loss: Messages that are lost.
-        key: Hash of all that determines the result: contents of bag and swarm, settings, loss, program.
+        key: Hash of all that determines the result: contents of bag, swarm and map, settings, loss, program.
         cells: Its values by column of the table; None: no seed where nothing is lost.
     """
 
@@ -116,6 +117,7 @@ def read_sweep(path: Path) -> Sweep:
         SweepFileError: A key or value cannot be used, or there is no such bag.
         YamlTreeError: The file is no YAML.
         SwarmFileError: A swarm description cannot be used.
+        MapFileError: The map that it names cannot be used.
     """
     return _SweepReader(path).sweep(read_tree(path))
 
@@ -129,7 +131,7 @@ class _SweepReader(TreeChecks):
         # a version stays the same while the package is developed
         self._program = _digest(sorted(Path(__file__).parents[2].rglob("*.py")))
         self._content = cache(lambda bag: _digest(_storages(bag)))
-        self._described = cache(lambda path: ((swarm := load_swarm(path)), joblib.hash(swarm)))
+        self._described = cache(_described)
 
     def sweep(self, tree: Tree) -> Sweep:
         """All replays of the file."""
@@ -214,6 +216,12 @@ class _SweepReader(TreeChecks):
         key = hashlib.sha256(repr(determined).encode()).hexdigest()
         cells = {"bag": bag, "swarm": swarm, **values, "lost": share, "seed": seed}
         return Job(path, described, settings, loss, key, cells)
+
+
+def _described(path: Path) -> tuple[Swarm, str]:
+    """A swarm, and a hash of its description and map."""
+    swarm = load_swarm(path)
+    return swarm, joblib.hash((swarm, None if swarm.map is None else load_map(swarm.map)))
 
 
 def _storages(bag: Path) -> list[Path]:
