@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError
@@ -41,6 +40,8 @@ def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
     Raises:
         MapFileError: They cannot be written.
     """
+    from PIL import Image  # noqa: PLC0415 - an estimator without a map starts without it
+
     image_path, yaml_path = path.with_suffix(".pgm"), path.with_suffix(".yaml")
     pixels = np.full(occupancy.log_odds.shape, _UNKNOWN, dtype=np.uint8)
     pixels[occupancy.free], pixels[occupancy.occupied] = _FREE, _OCCUPIED
@@ -141,6 +142,8 @@ def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     Raises:
         UserError: It cannot be read, or is too large.
     """
+    from PIL import Image  # noqa: PLC0415 - as above
+
     data = read_file(path, _MAX_BYTES)
     try:
         with Image.open(io.BytesIO(data)) as opened:

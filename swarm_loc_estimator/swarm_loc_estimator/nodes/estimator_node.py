@@ -52,6 +52,7 @@ from swarm_loc_estimator.sensors.registry import live_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
+from swarm_loc_estimator.timeline.map_scans import walls_of
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.thinning import SHED_REASONS, Thinning
 from swarm_loc_msgs.srv import SetRobotPose
@@ -97,13 +98,14 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self.autostart()
 
     def prepare(self) -> None:
-        """Read the description and compile."""
+        """Read the description and its map, and compile."""
         self._swarm = load_swarm(Path(self.params.swarm_file))
         has_infrared = any(robot.ir is not None for robot in self._swarm.robots)
         compiled = partial(precompile, size_of(self._swarm, self.params.settings), has_infrared)
         if not is_precompiled(compiled):
             self.get_logger().info("compiling the estimator for this machine: one to three minutes")
         compiled()
+        walls_of(self._swarm)  # each activation reads them again; here they are refused or compiled for
 
     def begin(self) -> None:
         """Estimate from scratch: what was known before a pause may be wrong by now."""

@@ -36,6 +36,19 @@ Sweeps = Mapping[tuple[int, int], LidarSweep]
 """Sweeps by robot and stamp of the first beam [ns]."""
 
 
+def walls_of(swarm: Swarm) -> WallMap | None:
+    """Read the map of a swarm, if it has one, and compile the matching before data come.
+
+    Raises:
+        UserError: The map cannot be read, or has no walls or no free space.
+    """
+    if swarm.map is None:
+        return None
+    walls = wall_map(load_map(swarm.map), swarm.map)
+    match(walls, np.zeros((0, 2)), np.zeros(2), np.zeros(0), np.zeros(3), np.eye(3))
+    return walls
+
+
 class MapScans:
     """Matches scans to the map of a swarm.
 
@@ -53,11 +66,7 @@ class MapScans:
         self._tracks, self._sweeps = tracks, sweeps
         self._lidars = [robot.lidar for robot in swarm.robots]
         self._limits = TrackedLimits.of(swarm, settings)
-        self._walls: WallMap | None = None
-        if swarm.map is not None:
-            self._walls = wall_map(load_map(swarm.map), swarm.map)
-            nothing = np.zeros((0, 2)), np.zeros(2), np.zeros(0)
-            match(self._walls, *nothing, np.zeros(3), np.eye(3))  # compiles before data come
+        self._walls = walls_of(swarm)
 
     def fix_of(self, state: SwarmState, one: MeasurementArray) -> tuple[MeasurementArray | None, Verdict]:
         """Match a scan (1,); returns its fix (1,), or None and why there is none.

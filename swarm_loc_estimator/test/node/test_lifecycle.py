@@ -56,6 +56,9 @@ def test_an_estimator_waits_until_its_description_is_right(ros: Ros, tmp_path: P
     assert not manager.change(CONFIGURE)
     assert manager.state() == "unconfigured"
     ros.until(lambda: any(str(path) in entry.msg for entry in log))
+    path.write_text(f"{SWARM_YAML}\nmap: floor.yaml\n", encoding="utf-8")
+    assert not manager.change(CONFIGURE)
+    ros.until(lambda: any("floor.yaml" in entry.msg for entry in log))
     path.write_text(SWARM_YAML, encoding="utf-8")
     assert not manager.change(ACTIVATE)  # which rclpy alone would not survive
     assert manager.changes(CONFIGURE) == "inactive"
@@ -64,9 +67,9 @@ def test_an_estimator_waits_until_its_description_is_right(ros: Ros, tmp_path: P
     ros.until(lambda: newest_status(heard, "estimator").message == "inactive: nothing is published")
     assert not ros.tester.count_publishers("swarm/poses")
     assert not ros.tester.count_subscribers("alpha/odom")
-    ros.until(lambda: len(manager.events) == 6)  # two of each attempt to configure
+    ros.until(lambda: len(manager.events) == 8)  # two of each attempt to configure
     assert [event.goal_state.label for event in manager.events] == [
-        *("configuring", "unconfigured") * 2,
+        *("configuring", "unconfigured") * 3,
         *("configuring", "inactive"),
     ]
 
