@@ -333,7 +333,7 @@ def shedding_report(cost: TickCost) -> Report:
     share = cost.shed / cost.sightings if cost.sightings else 0.0
     values: dict[str, object] = {"sightings left out [1]": _figure(share)}
     if not cost.shed:
-        return Report("shedding", "all measurements are used", values=values)
+        return Report("shedding", "nothing is left out for lack of time", values=values)
     dropped = f"{cost.shed} of {cost.sightings} measurements"
     sentence = f"overload: dropped {dropped} ({100.0 * share:.0f} %), uniformly over robots"
     return Report("shedding", sentence, Level.WARN, values)
