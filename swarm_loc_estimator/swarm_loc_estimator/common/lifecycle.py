@@ -39,10 +39,10 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode[Parameters]):
 
     def __init__(self, name: str, parameters: type[Parameters], **node_arguments: Any) -> None:
         ConfiguredNode.__init__(self, name, parameters, reads_parameters=False, **node_arguments)
-        LifecycleNodeMixin.__init__(self)
         self._cls = parameters
         self._specs = {spec.name: spec for spec in parameter_specs(parameters)}
         self._starts_itself = read_parameter(self, self._specs["autostart"], read_only=False)
+        LifecycleNodeMixin.__init__(self)
         self._made: list[ExitStack] = []
         self._mistake: Exception | None = None
         self._answer = self._service_change_state.callback
@@ -89,6 +89,7 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode[Parameters]):
         for change in (self.trigger_configure, self.trigger_activate):
             change()
             if self._mistake is not None:
+                self.destroy_node()  # nobody else can: there is no node to the caller
                 raise self._mistake
         self._starts_itself = False
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import signal
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
@@ -23,6 +26,7 @@ from node_world import (
 from rcl_interfaces.msg import Log
 from std_srvs.srv import Trigger
 
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_msgs.msg import SwarmPose
 from swarm_loc_msgs.srv import SetRobotPose
@@ -164,3 +168,17 @@ def test_a_signal_ends_the_process_in_each_state(
         assert all(map(manager.change, transitions)), program.output
         assert program.end(signal.SIGINT) == 0
         assert "Traceback" not in program.output
+
+
+@pytest.mark.parametrize("wrong", [{}, {"autostart": 3}])
+def test_an_estimator_that_cannot_start_leaves_no_node(
+    ros: Ros, tmp_path: Path, wrong: dict[str, Any]
+) -> None:
+    gc.disable()  # which would hide a node that only reference cycles keep
+    try:
+        with suppress(UserError):
+            EstimatorNode(parameter_overrides=overrides(swarm_file=str(tmp_path / "nowhere.yaml"), **wrong))
+            pytest.fail("it has started")
+        ros.until(lambda: "estimator" not in ros.tester.get_node_names())
+    finally:
+        gc.enable()
