@@ -32,8 +32,7 @@ from swarm_loc_estimator.offline.survey.survey import Surveyed, survey
 from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
 
 WRONG_SHARE = 0.1
-BAG_SEED = 3
-"""Seed of bags/eight_five_robots."""
+BAG_SEED = 3  # Seed of bags/eight_five_robots
 
 
 @dataclass(frozen=True)

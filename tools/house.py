@@ -30,15 +30,10 @@ WORDS = re.compile(rf"\b({'|'.join(PRIVATE_WORDS)})\b", re.IGNORECASE)
 
 @dataclass(frozen=True)
 class Module:
-    """A Python file of the product.
+    """A Python file of the product."""
 
-    Attributes:
-        name: Dotted name below the repository's packages.
-        path: Path of the file.
-    """
-
-    name: str
-    path: Path
+    name: str  # Dotted name below the repository's packages
+    path: Path  # Path of the file
 
     @cached_property
     def text(self) -> str:

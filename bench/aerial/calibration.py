@@ -21,15 +21,10 @@ _BINS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99, 1.0 + 1e-
 
 
 class Reliability(NamedTuple):
-    """Answers by their probabilities.
+    """Answers by their probabilities."""
 
-    Attributes:
-        probability: (a,) of each best answer.
-        right: (a,) whether it was.
-    """
-
-    probability: FloatArray
-    right: BoolArray
+    probability: FloatArray  # (a,) of each best answer
+    right: BoolArray  # (a,) whether it was
 
     def binned(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Mean probability, share of right answers and count of each bin that is not empty."""

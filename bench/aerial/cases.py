@@ -24,8 +24,7 @@ from swarm_loc_vision.aerial.parameters import AerialSettings
 
 FOLDER = Path(__file__).parents[3] / "shared" / "cases"
 _DIAMETER = 0.08
-_FLAT_HEIGHT = 0.03
-"""Height of the tops of robots without visible sides, by their parallax [m]."""
+_FLAT_HEIGHT = 0.03  # Height of the tops of robots without visible sides, by their parallax [m]
 _PLACES = np.array(
     [
         [-1.2704, -0.5216],

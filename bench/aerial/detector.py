@@ -22,8 +22,7 @@ from swarm_loc_vision.aerial.detector import AerialDetections, AerialDetector
 from swarm_loc_vision.aerial.parameters import AerialSettings
 
 SEEDS = 5
-_MATCHED = 0.3
-"""Of a diameter: a detection so near is of that robot."""
+_MATCHED = 0.3  # Of a diameter: a detection so near is of that robot
 
 _WIDE = Look(field_of_view=math.radians(100.0), barrel=-0.12, diameter_px=20.0)
 LOOKS: Mapping[str, Look] = {
@@ -70,25 +69,15 @@ _LENS_SIGMA_PX = 0.01
 
 @dataclass(frozen=True)
 class Score:
-    """Detections beside the truth.
+    """Detections beside the truth."""
 
-    Attributes:
-        robots: How many there are.
-        missed: Of them, not found.
-        false: Detections of nothing.
-        position_m: (F,) distances of those that were found.
-        heading: (H,) errors of headings that were told [rad].
-        nees: (F,) normalized squared errors of places; 2 is ideal.
-        seconds: CPU time.
-    """
-
-    robots: int
-    missed: int
-    false: int
-    position_m: FloatArray
-    heading: FloatArray
-    nees: FloatArray
-    seconds: float = 0.0
+    robots: int  # How many there are
+    missed: int  # Of them, not found
+    false: int  # Detections of nothing
+    position_m: FloatArray  # (F,) distances of those that were found
+    heading: FloatArray  # (H,) errors of headings that were told [rad]
+    nees: FloatArray  # (F,) normalized squared errors of places; 2 is ideal
+    seconds: float = 0.0  # CPU time
 
     def joined(self, other: Score) -> Score:
         """Both together."""

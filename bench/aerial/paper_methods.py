@@ -35,15 +35,10 @@ def own_displacement(speeds: ArrayLike, turn_rates: ArrayLike, step_s: float) ->
 
 
 class Relation(NamedTuple):
-    """How displacements in an image relate to a robot's own.
+    """How displacements in an image relate to a robot's own."""
 
-    Attributes:
-        heading: (...) theta [rad].
-        scale: (...) lambda, in units of the image per metre.
-    """
-
-    heading: FloatArray
-    scale: FloatArray
+    heading: FloatArray  # (...) theta [rad]
+    scale: FloatArray  # (...) lambda, in units of the image per metre
 
 
 def relation(displacement: ArrayLike, own: ArrayLike) -> Relation:
@@ -58,15 +53,10 @@ def relation(displacement: ArrayLike, own: ArrayLike) -> Relation:
 
 
 class Fit(NamedTuple):
-    """Chains of positions fitted by a robot's own motion.
+    """Chains of positions fitted by a robot's own motion."""
 
-    Attributes:
-        coefficient: (...) c.
-        cost: (...) sum of squared residuals over the positions' variance, and the scale's misfit.
-    """
-
-    coefficient: ComplexArray
-    cost: FloatArray
+    coefficient: ComplexArray  # (...) c
+    cost: FloatArray  # (...) sum of squared residuals over the positions' variance, and the scale's misfit
 
 
 def fit_chains(

@@ -33,67 +33,39 @@ _SLICES, _EXPOSURES, _PARTS = 12, 13, 14
 
 @dataclass(frozen=True)
 class Look:
-    """What a picture is like.
+    """What a picture is like."""
 
-    Attributes:
-        diameter_px: Of robots in the middle of the picture.
-        robots: How many.
-        kind: `pattern`, or plain discs: `dark`, `bright`; `board`, dark with bright parts; `led`, a bright
-            spot with soft rims.
-        tilt: Of the camera [rad].
-        barrel: Radial distortion k1 of the lens.
-        field_of_view: Across [rad].
-        gradient: Brightness at the dark end of the floor over that at the bright one.
-        shadow: Share of the light that shadows take.
-        touching: Share of the robots that touch another one.
-        noise: Of the sensor, one standard deviation [counts].
-        floor: Brightness of the floor, 0 to 1.
-        texture: Of the floor, one standard deviation of its brightness.
-        clutter: Things on the floor that are no robots.
-        blur_px: Of the optics, one standard deviation.
-        height: Of the robots [m].
-        wall: Brightness of their sides.
-        taper: Share of the diameter that is missing at the floor.
-        motion: Way of each robot while the shutter is open, in any direction, in diameters.
-        boards: One standard deviation of the brightness of the floor's boards.
-    """
-
-    diameter_px: float = 24.0
-    robots: int = 12
+    diameter_px: float = 24.0  # Of robots in the middle of the picture
+    robots: int = 12  # How many
+    # `pattern`, or plain discs: `dark`, `bright`; `board`, dark with bright parts; `led`, a bright spot with
+    # soft rims
     kind: str = "pattern"
-    tilt: float = 0.0
-    barrel: float = 0.0
-    field_of_view: float = math.radians(60.0)
-    gradient: float = 1.0
-    shadow: float = 0.0
-    touching: float = 0.0
-    noise: float = 2.0
-    floor: float = 0.55
-    texture: float = 0.02
-    clutter: int = 6
-    blur_px: float = 0.6
-    height: float = 0.0
-    wall: float = 0.06
-    taper: float = 0.0
-    motion: float = 0.0
-    boards: float = 0.0
+    tilt: float = 0.0  # Of the camera [rad]
+    barrel: float = 0.0  # Radial distortion k1 of the lens
+    field_of_view: float = math.radians(60.0)  # Across [rad]
+    gradient: float = 1.0  # Brightness at the dark end of the floor over that at the bright one
+    shadow: float = 0.0  # Share of the light that shadows take
+    touching: float = 0.0  # Share of the robots that touch another one
+    noise: float = 2.0  # Of the sensor, one standard deviation [counts]
+    floor: float = 0.55  # Brightness of the floor, 0 to 1
+    texture: float = 0.02  # Of the floor, one standard deviation of its brightness
+    clutter: int = 6  # Things on the floor that are no robots
+    blur_px: float = 0.6  # Of the optics, one standard deviation
+    height: float = 0.0  # Of the robots [m]
+    wall: float = 0.06  # Brightness of their sides
+    taper: float = 0.0  # Share of the diameter that is missing at the floor
+    motion: float = 0.0  # Way of each robot while the shutter is open, in any direction, in diameters
+    boards: float = 0.0  # One standard deviation of the brightness of the floor's boards
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture with what is true of it.
+    """A picture with what is true of it."""
 
-    Attributes:
-        gray: (height, width).
-        ground: The camera.
-        poses: (N, 3) of the robots in map.
-        has_heading: Whether their pattern shows a heading.
-    """
-
-    gray: NDArray[np.uint8]
-    ground: GroundCamera
-    poses: FloatArray
-    has_heading: bool
+    gray: NDArray[np.uint8]  # (height, width)
+    ground: GroundCamera  # The camera
+    poses: FloatArray  # (N, 3) of the robots in map
+    has_heading: bool  # Whether their pattern shows a heading
 
 
 def overhead_camera(look: Look, rng: np.random.Generator) -> GroundCamera:

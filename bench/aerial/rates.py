@@ -6,21 +6,15 @@ import math
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-SWARMS = (2, 5, 10, 20, 50)
-"""Sizes of swarms for which everything is measured."""
+SWARMS = (2, 5, 10, 20, 50)  # Sizes of swarms for which everything is measured
 _NORMAL_95 = 1.959964
 
 
 class Rate(NamedTuple):
-    """A share of trials.
+    """A share of trials."""
 
-    Attributes:
-        successes: How many.
-        trials: Of how many.
-    """
-
-    successes: int
-    trials: int
+    successes: int  # How many
+    trials: int  # Of how many
 
     @property
     def share(self) -> float:
@@ -39,15 +33,10 @@ class Rate(NamedTuple):
 
 @dataclass
 class Results:
-    """What was measured.
+    """What was measured."""
 
-    Attributes:
-        rates: By the name of the figure.
-        values: Other figures by name.
-    """
-
-    rates: dict[str, Rate] = field(default_factory=dict)
-    values: dict[str, float] = field(default_factory=dict)
+    rates: dict[str, Rate] = field(default_factory=dict)  # By the name of the figure
+    values: dict[str, float] = field(default_factory=dict)  # Other figures by name
 
     def count(self, name: str, successes: int, trials: int) -> None:
         """Note a success rate, and tell of it."""

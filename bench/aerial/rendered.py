@@ -35,15 +35,11 @@ from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities
 
 WORLD = "w2"
 WORLDS_RUN, DURATION_S = 3, 30.0
-PICTURE = OUT / "aerial_names.png"
-"""Where an overhead image with names goes."""
-_SETTLED_S = 2.0
-"""So long after a robot was located its errors count."""
+PICTURE = OUT / "aerial_names.png"  # Where an overhead image with names goes
+_SETTLED_S = 2.0  # So long after a robot was located its errors count
 _PATIENCE_S = 120.0
-_MAX_GAP_NS = 200_000_000
-"""Between true poses."""
-_KEPT = 20
-"""Images that wait for their detections and identities."""
+_MAX_GAP_NS = 200_000_000  # Between true poses
+_KEPT = 20  # Images that wait for their detections and identities
 _INK, _HALO = (40, 220, 255), (0, 0, 0)
 
 Say = Callable[[str], None]
@@ -51,18 +47,13 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class AerialRun:
-    """What came of one run.
+    """What came of one run."""
 
-    Attributes:
-        located: (N,) when each robot was located, after they began to drive [s]; infinite: it was not.
-        errors: (K, 3) x, y [m] and heading [rad] of located robots.
-        detections_per_image: Mean.
-        picture: The last image with the names that the robots found for themselves; None: there is none.
-    """
-
+    # (N,) when each robot was located, after they began to drive [s]; infinite: it was not
     located: FloatArray
-    errors: FloatArray
-    detections_per_image: float
+    errors: FloatArray  # (K, 3) x, y [m] and heading [rad] of located robots
+    detections_per_image: float  # Mean
+    # The last image with the names that the robots found for themselves; None: there is none
     picture: NDArray[np.uint8] | None
 
     @property

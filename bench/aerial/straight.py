@@ -12,8 +12,7 @@ from bench.aerial.rates import SWARMS, Results
 from bench.aerial.worlds import PERIOD_S
 from swarm_loc_estimator.common.arrays import FloatArray
 
-_SIGMA = 0.025
-"""Of each coordinate [unit]; with it the printed method has about the printed rate."""
+_SIGMA = 0.025  # Of each coordinate [unit]; with it the printed method has about the printed rate
 _SCALE_SIGMA = 0.03
 _SPEED = 0.1
 _ARENA = (30.0, 22.0)

@@ -12,8 +12,7 @@ from bench.aerial.rates import SWARMS, Results
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 
-_SIGMA = np.radians(1.4)
-"""Of a heading: the mean deviation of a turn is then 1.6 degrees, as printed."""
+_SIGMA = np.radians(1.4)  # Of a heading: the mean deviation of a turn is then 1.6 degrees, as printed
 _LARGEST_TURN = np.radians(90.0)
 _ROTATIONS = (2, 3, 4)
 

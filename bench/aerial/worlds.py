@@ -24,58 +24,36 @@ if TYPE_CHECKING:
 PERIOD_S = 10.0
 PERIOD_NS = 10_000_000_000
 _STEP_S = 0.05
-_ROBOT = 0.2
-"""Distance at which two robots meet [unit]."""
+_ROBOT = 0.2  # Distance at which two robots meet [unit]
 _MAX_CHANGE_S = 3.0
 _TURN = np.radians(20.0)
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Of a world.
+    """Of a world."""
 
-    Attributes:
-        robots: n.
-        images: How many.
-        arena: Width and height of the rectangle [unit].
-        sigma: Noise of each coordinate of a detection [unit].
-        scale_sigma: By what share the scale is off, one standard deviation; drawn for each world.
-        detected: Share of robots in the picture that are detected.
-        false_detections: Mean number of further detections of an image.
-        view: Share of the arena's width and height, in the middle, that the camera sees.
-        scale: The true scale besides.
-        drift: Standard deviation of the scale's change from image to image.
-    """
-
-    robots: int = 2
-    images: int = 2
-    arena: tuple[float, float] = (30.0, 22.0)
-    sigma: float = 0.05
-    scale_sigma: float = 0.02
-    detected: float = 1.0
-    false_detections: float = 0.0
-    view: float = 1.0
-    scale: float = 1.0
-    drift: float = 0.0
+    robots: int = 2  # n
+    images: int = 2  # How many
+    arena: tuple[float, float] = (30.0, 22.0)  # Width and height of the rectangle [unit]
+    sigma: float = 0.05  # Noise of each coordinate of a detection [unit]
+    scale_sigma: float = 0.02  # By what share the scale is off, one standard deviation; drawn for each world
+    detected: float = 1.0  # Share of robots in the picture that are detected
+    false_detections: float = 0.0  # Mean number of further detections of an image
+    view: float = 1.0  # Share of the arena's width and height, in the middle, that the camera sees
+    scale: float = 1.0  # The true scale besides
+    drift: float = 0.0  # Standard deviation of the scale's change from image to image
 
 
 @dataclass(frozen=True)
 class World:
-    """What was simulated.
+    """What was simulated."""
 
-    Attributes:
-        own: (k, n) where each robot is at each image by its own motion, complex [unit].
-        own_heading: (k, n) likewise its heading, zero at first [rad].
-        position: (k, n) where it truly is.
-        images: Of each the detections (d,), complex.
-        robot: Of each which robot (d,) every detection is; -1: none.
-    """
-
-    own: ComplexArray
-    own_heading: FloatArray
-    position: ComplexArray
-    images: list[ComplexArray]
-    robot: list[IntArray]
+    own: ComplexArray  # (k, n) where each robot is at each image by its own motion, complex [unit]
+    own_heading: FloatArray  # (k, n) likewise its heading, zero at first [rad]
+    position: ComplexArray  # (k, n) where it truly is
+    images: list[ComplexArray]  # Of each the detections (d,), complex
+    robot: list[IntArray]  # Of each which robot (d,) every detection is; -1: none
 
     def place_of(self, robot: int, image: int) -> int:
         """Which detection of an image is a robot; -1: none."""

@@ -38,8 +38,7 @@ CENTIMETRES = (6, 8, 10, 12, 13, 14, 15, 16, 18, 20, 24, 28)
 POSES, LIVE, REPLAYS = 12000, 2, 6
 MISMATCH, CALIBRATION, COUPLES = 0.1, 200, 12
 """How much elements of each of so many couples of robots differ, and their exchanges to calibrate with."""
-DIAMETER_CM = 4.4
-"""Within which the paper finds all ranges (section V)."""
+DIAMETER_CM = 4.4  # Within which the paper finds all ranges (section V)
 _TIMED, _REPEATS = 200, 20
 _SEED = 3
 _UNITS = np.array([100.0, np.degrees(1.0), np.degrees(1.0)])
@@ -47,23 +46,14 @@ _UNITS = np.array([100.0, np.degrees(1.0), np.degrees(1.0)])
 
 @dataclass(frozen=True)
 class Errors:
-    """Errors of one estimator at some ranges.
+    """Errors of one estimator at some ranges."""
 
-    Attributes:
-        mean: (3,) mean absolute error [cm, deg, deg].
-        rms: (3,) likewise root mean square.
-        worst: (3,) largest.
-        nees: Ideally 3.
-        found: Share of poses that there are.
-        within: Share of ranges that err by less than the robot's diameter.
-    """
-
-    mean: FloatArray
-    rms: FloatArray
-    worst: FloatArray
-    nees: float
-    found: float
-    within: float
+    mean: FloatArray  # (3,) mean absolute error [cm, deg, deg]
+    rms: FloatArray  # (3,) likewise root mean square
+    worst: FloatArray  # (3,) largest
+    nees: float  # Ideally 3
+    found: float  # Share of poses that there are
+    within: float  # Share of ranges that err by less than the robot's diameter
 
     @classmethod
     def of(cls, solutions: IrSolutions, poses: FloatArray) -> Errors:

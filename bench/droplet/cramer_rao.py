@@ -10,8 +10,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_with_slopes
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
-_FAR = 8.0
-"""Beyond so many sigmas from saturation a reading holds all information, or none."""
+_FAR = 8.0  # Beyond so many sigmas from saturation a reading holds all information, or none
 
 
 def information(platform: IrPlatform, poses: ArrayLike) -> FloatArray:

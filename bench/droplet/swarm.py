@@ -48,8 +48,7 @@ from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 ROBOTS = 20
 DURATION_S, SETTLED_S = 90.0, 45.0
-CALIBRATED, CALIBRATION_S = 3, 60.0
-"""So many of the bags are replayed once more, calibrated."""
+CALIBRATED, CALIBRATION_S = 3, 60.0  # So many of the bags are replayed once more, calibrated
 _ELSEWHERE = 1000
 WORLD = "d1"
 DRIVER_PROCESSES = 2
@@ -58,25 +57,15 @@ _SILENCE_PATIENCE_S = 60.0
 
 @dataclass(frozen=True)
 class Outcome:
-    """Mean errors of one run.
+    """Mean errors of one run."""
 
-    Attributes:
-        name: Of the run.
-        position_cm: [cm].
-        heading_deg: [deg].
-        nees: Ideally 3.
-        worst_cm: Largest error of a position [cm].
-        located_s: When the last robot was located, from the start [s].
-        located: Share of poses that there are.
-    """
-
-    name: str
-    position_cm: float
-    heading_deg: float
-    nees: float
-    worst_cm: float
-    located_s: float
-    located: float
+    name: str  # Of the run
+    position_cm: float  # [cm]
+    heading_deg: float  # [deg]
+    nees: float  # Ideally 3
+    worst_cm: float  # Largest error of a position [cm]
+    located_s: float  # When the last robot was located, from the start [s]
+    located: float  # Share of poses that there are
 
 
 def outcome_of(result: ReplayResult) -> Outcome:

@@ -68,25 +68,15 @@ Prepare = Callable[[Swarm], Swarm]
 
 @dataclass(frozen=True)
 class Case:
-    """One row of the report.
+    """One row of the report."""
 
-    Attributes:
-        name: Of its figures.
-        robots: How many drive the eight; 0: the dense block.
-        seeds: Of the worlds.
-        world: Hidden imperfections.
-        speed: [m/s].
-        filter: How the swarm is described and what the estimator does, of `FILTERS`.
-        relative: Whether sightings between robots are used.
-    """
-
-    name: str
-    robots: int
-    seeds: int
-    world: ErrorModel
-    speed: float = SLOW
-    filter: str = "white"
-    relative: bool = True
+    name: str  # Of its figures
+    robots: int  # How many drive the eight; 0: the dense block
+    seeds: int  # Of the worlds
+    world: ErrorModel  # Hidden imperfections
+    speed: float = SLOW  # [m/s]
+    filter: str = "white"  # How the swarm is described and what the estimator does, of `FILTERS`
+    relative: bool = True  # Whether sightings between robots are used
 
 
 @dataclass(frozen=True)

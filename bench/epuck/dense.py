@@ -34,17 +34,11 @@ _FIRST_FACE_ID = 1000
 
 @dataclass(frozen=True)
 class DenseSettings:
-    """What to simulate.
+    """What to simulate."""
 
-    Attributes:
-        seed: Two runs with the same settings are identical.
-        duration_s: [s].
-        errors: The imperfections.
-    """
-
-    seed: int = 1
-    duration_s: float = 54.0
-    errors: ErrorModel = W0
+    seed: int = 1  # Two runs with the same settings are identical
+    duration_s: float = 54.0  # [s]
+    errors: ErrorModel = W0  # The imperfections
 
 
 def blind_robots() -> NDArray[np.int64]:

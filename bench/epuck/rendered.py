@@ -34,29 +34,17 @@ _PICTURES_S = 1.5
 
 @dataclass(frozen=True)
 class RenderedRun:
-    """Results of one world.
+    """Results of one world."""
 
-    Attributes:
-        seed: Of the world.
-        swarm_file: Description for world and estimator.
-        bag: Messages of robots and cameras at their times of arrival.
-        described_bag: The same, but detections with unknown covariance.
-        live: Poses of the graph while the robots drove.
-        age_s: (A,) age of these poses when received [s].
-        seen: Robot name -> its detections, in order.
-        cpu_s: Node -> CPU time of its process [s].
-        pictures: Robot name and stamp -> image, of the last ones.
-    """
-
-    seed: int
-    swarm_file: Path
-    bag: Path
-    described_bag: Path
-    live: ReplayResult
-    age_s: NDArray[np.float64]
-    seen: dict[str, list[DetectionArrayMessage]]
-    cpu_s: dict[str, float]
-    pictures: dict[tuple[str, int], Image]
+    seed: int  # Of the world
+    swarm_file: Path  # Description for world and estimator
+    bag: Path  # Messages of robots and cameras at their times of arrival
+    described_bag: Path  # The same, but detections with unknown covariance
+    live: ReplayResult  # Poses of the graph while the robots drove
+    age_s: NDArray[np.float64]  # (A,) age of these poses when received [s]
+    seen: dict[str, list[DetectionArrayMessage]]  # Robot name -> its detections, in order
+    cpu_s: dict[str, float]  # Node -> CPU time of its process [s]
+    pictures: dict[tuple[str, int], Image]  # Robot name and stamp -> image, of the last ones
 
     @property
     def begin_ns(self) -> int:

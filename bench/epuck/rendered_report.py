@@ -32,25 +32,18 @@ OUTPUT_NS = 100_000_000
 """Interval of the compared poses, as in the other rows of the benchmark; poses come twice as often."""
 _LANDMARK_COLOUR = "#E69F00"
 _PICTURE_IN = (12.8, 9.6)
-_WIDE_PX = 50.0
-"""The distance is written below wider markers only."""
+_WIDE_PX = 50.0  # The distance is written below wider markers only
 
 Describe = Callable[[Swarm], Swarm]
 
 
 @dataclass(frozen=True)
 class Rendered:
-    """Results of one world.
+    """Results of one world."""
 
-    Attributes:
-        run: The recorded run.
-        seen: Statistics of detections.
-        paper: The same data by the filter of the paper.
-    """
-
-    run: RenderedRun
-    seen: Seen
-    paper: ReplayResult
+    run: RenderedRun  # The recorded run
+    seen: Seen  # Statistics of detections
+    paper: ReplayResult  # The same data by the filter of the paper
 
 
 def rendered_worlds(

@@ -26,23 +26,14 @@ True poses are known twenty times a second, and wheels slip in between.
 
 @dataclass(frozen=True)
 class Seen:
-    """Statistics of the images of a run.
+    """Statistics of the images of a run."""
 
-    Attributes:
-        frames: Images taken while the robots drove, except the last ones.
-        lost: Images without a message of detections.
-        detections: Detections in the others.
-        visible: Visible markers in the others.
-        found: Visible markers that were detected.
-        false_ids: Detections of markers that are not there.
-    """
-
-    frames: int
-    lost: int
-    detections: int
-    visible: int
-    found: int
-    false_ids: int
+    frames: int  # Images taken while the robots drove, except the last ones
+    lost: int  # Images without a message of detections
+    detections: int  # Detections in the others
+    visible: int  # Visible markers in the others
+    found: int  # Visible markers that were detected
+    false_ids: int  # Detections of markers that are not there
 
 
 def count_seen(run: RenderedRun) -> Seen:

@@ -15,28 +15,18 @@ from swarm_loc_drivers.sim.render.rigs import CameraRig
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 
-_CLOSEST = 0.01
-"""What is nearer to the camera's plane is not projected [m]."""
-_SHEET, _SQUARE = 0, 1
-"""Places of a marker's white sheet and of its black square among its patches."""
+_CLOSEST = 0.01  # What is nearer to the camera's plane is not projected [m]
+_SHEET, _SQUARE = 0, 1  # Places of a marker's white sheet and of its black square among its patches
 
 
 class Views(NamedTuple):
-    """The markers whose front looks at a camera, one row each.
+    """The markers whose front looks at a camera, one row each."""
 
-    Attributes:
-        id: (M,) of the marker.
-        corners: (M, 4, 2) of the black square, clockwise from the marker's own upper left [px].
-        margin: (M,) how far inside the image its sheet lies, negative where it is cut off [px].
-        incidence: (M,) angle between its normal and the line of sight [rad].
-        hidden: (M,) whether a robot stands before a part of its sheet.
-    """
-
-    id: NDArray[np.uint32]
-    corners: FloatArray
-    margin: FloatArray
-    incidence: FloatArray
-    hidden: NDArray[np.bool_]
+    id: NDArray[np.uint32]  # (M,) of the marker
+    corners: FloatArray  # (M, 4, 2) of the black square, clockwise from the marker's own upper left [px]
+    margin: FloatArray  # (M,) how far inside the image its sheet lies, negative where it is cut off [px]
+    incidence: FloatArray  # (M,) angle between its normal and the line of sight [rad]
+    hidden: NDArray[np.bool_]  # (M,) whether a robot stands before a part of its sheet
 
     @property
     def side_px(self) -> FloatArray:

@@ -41,8 +41,7 @@ MULTICAST, SERVER = "multicast", "server"
 RATE_HZ = 10.0
 DURATION_S = 30.0
 _PATIENCE_S = 900.0
-_SETTLED_REPORTS = 3
-"""Reports of each driver without another reading, until counts are said to have settled."""
+_SETTLED_REPORTS = 3  # Reports of each driver without another reading, until counts are said to have settled
 _SPACING_M = 0.5
 _CYCLE_S = 0.01
 _CONNECTED = re.compile(r"\[(\d+\.\d+)\] \[\w+\.epuck_driver\]: connected to")

@@ -28,13 +28,10 @@ from swarm_loc_estimator.timeline.thinning import SHED_REASONS
 
 SIZES = (100, 300, 1000)
 DURATION_S = 30.0
-SETTLING_S = 5.0
-"""Errors are computed after this time."""
+SETTLING_S = 5.0  # Errors are computed after this time
 OWN, SHARED = "own", "shared"
-LAYOUTS = (OWN, SHARED)
-"""Layouts of topics."""
-_FIGURES_OF = {OWN: "live", SHARED: "shared"}
-"""Prefixes of the names of figures."""
+LAYOUTS = (OWN, SHARED)  # Layouts of topics
+_FIGURES_OF = {OWN: "live", SHARED: "shared"}  # Prefixes of the names of figures
 _PARAMETERS = "estimator: {{ros__parameters: {{shared_topics: {shared}}}}}\n"
 _UNITS = {
     "start_up_s": "start-up [s]",

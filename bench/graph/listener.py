@@ -47,21 +47,14 @@ def starting_swarm(errors: ErrorModel) -> Swarm:
 
 @dataclass
 class Listener:
-    """Records messages of a graph.
+    """Records messages of a graph."""
 
-    Attributes:
-        graph: The graph; its recorder subscribes.
-        names: Of the robots.
-        looked_at: The robot whose images are recorded.
-        kept: Robot and topic -> times of arrival by the graph's clock [ns], and messages.
-        pictures: Robot and stamp -> image.
-    """
-
-    graph: LiveGraph
-    names: Sequence[str]
-    looked_at: str = ""
+    graph: LiveGraph  # The graph; its recorder subscribes
+    names: Sequence[str]  # Of the robots
+    looked_at: str = ""  # The robot whose images are recorded
+    # Robot and topic -> times of arrival by the graph's clock [ns], and messages
     kept: dict[tuple[str, str], tuple[list[int], list[bytes]]] = field(default_factory=dict)
-    pictures: dict[tuple[str, int], Image] = field(default_factory=dict)
+    pictures: dict[tuple[str, int], Image] = field(default_factory=dict)  # Robot and stamp -> image
 
     def __post_init__(self) -> None:
         recorder = self.graph.recorder

@@ -17,8 +17,7 @@ from swarm_loc_estimator.common.messages.detections import (
     swarm_key,
 )
 
-PERIOD_NS = 10_000_000
-"""All that arrives within this goes out together, at its end."""
+PERIOD_NS = 10_000_000  # All that arrives within this goes out together, at its end
 
 
 def write_shared_bag(run: SimulatedRun, folder: Path, comment: str) -> int:

@@ -33,8 +33,7 @@ if TYPE_CHECKING:
 FRAMES = 20
 _NOWHERE = np.full(3, np.nan)
 _HEADER = SimpleNamespace(frame_id="camera", stamp=SimpleNamespace(sec=0, nanosec=0))
-_SIGMA_PX = {"own": 0.05, "cv2.aruco": 0.4, "pupil 1": 0.15}
-"""Detectors and the error of their corners."""
+_SIGMA_PX = {"own": 0.05, "cv2.aruco": 0.4, "pupil 1": 0.15}  # Detectors and the error of their corners
 _OTHERS = ("cv2.aruco", "pupil 1")
 
 

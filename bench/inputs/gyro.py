@@ -12,8 +12,7 @@ from swarm_loc_estimator.sensors.imu import TurnRateRows
 from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import ImuModel
 
-RATE_HZ = 50.0
-"""Rate of the messages of an IMU."""
+RATE_HZ = 50.0  # Rate of the messages of an IMU
 
 
 def simulate_gyroscopes(rng: np.random.Generator, run: LivedRun, imu: ImuModel) -> TurnRateRows:

@@ -61,21 +61,13 @@ _WRONG_STARTS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 
 @dataclass(frozen=True)
 class LidarRun:
-    """Errors of one drive, at each sweep.
+    """Errors of one drive, at each sweep."""
 
-    Attributes:
-        error: (n, 3) estimated minus true x [m], y [m], theta [rad].
-        covariance: (n, 3, 3).
-        tracked: (n,) whether the robot was TRACKED.
-        cpu_ms: Per scan, all of the estimator.
-        drops: Unused data by reason.
-    """
-
-    error: FloatArray
-    covariance: FloatArray
-    tracked: BoolArray
-    cpu_ms: float
-    drops: dict[str, int]
+    error: FloatArray  # (n, 3) estimated minus true x [m], y [m], theta [rad]
+    covariance: FloatArray  # (n, 3, 3)
+    tracked: BoolArray  # (n,) whether the robot was TRACKED
+    cpu_ms: float  # Per scan, all of the estimator
+    drops: dict[str, int]  # Unused data by reason
 
 
 def _figures(runs: Sequence[LidarRun]) -> dict[str, float]:

@@ -35,20 +35,15 @@ if TYPE_CHECKING:
 ROBOTS = 5
 DURATION_S = 60.0
 SECOND_NS = 1_000_000_000
-STEP_NS = SECOND_NS // 50
-"""Period of odometry."""
+STEP_NS = SECOND_NS // 50  # Period of odometry
 FIX_NS = SECOND_NS // 30
 TICK_NS = SECOND_NS // 10
 SETTLING_NS = 3 * SECOND_NS
-LATENCY_NS = 10_000_000
-"""From the exposure to the stamp of a message."""
-LOST = 0.1
-"""Share of single fixes that are lost."""
-BLACKOUT_S, BETWEEN_BLACKOUTS_S = (0.5, 3.0), 10.0
-"""Duration of longer drop-outs, and their mean distance."""
+LATENCY_NS = 10_000_000  # From the exposure to the stamp of a message
+LOST = 0.1  # Share of single fixes that are lost
+BLACKOUT_S, BETWEEN_BLACKOUTS_S = (0.5, 3.0), 10.0  # Duration of longer drop-outs, and their mean distance
 POSITION_SIGMA, HEADING_SIGMA = 0.001, np.radians(0.3)
-OFFSET = np.array([0.02, -0.01, 0.5 * np.pi])
-"""Pose of the tracked body in base_link."""
+OFFSET = np.array([0.02, -0.01, 0.5 * np.pi])  # Pose of the tracked body in base_link
 MODEL = OdometryModel()
 _UNKNOWN = np.diag([1e2, 1e2, 1e2])
 

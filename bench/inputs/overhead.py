@@ -37,38 +37,24 @@ from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
 from swarm_loc_estimator.timeline.estimator import Status
 
 DURATION_S = 20.0
-_SETTLED_NS = 3 * 10**9
-"""From here on errors count."""
+_SETTLED_NS = 3 * 10**9  # From here on errors count
 _HAND_OVER_NS = 500_000_000
 """Jumps count as those of a hand-over so long after a camera sees a robot anew or for the last time."""
-_NEW_NS = 10**9
-"""A camera that did not see a robot for so long sees it anew."""
+_NEW_NS = 10**9  # A camera that did not see a robot for so long sees it anew
 
 
 class Tracked(NamedTuple):
-    """What the estimator made of a run.
+    """What the estimator made of a run."""
 
-    Attributes:
-        stamp_ns: (K,) of ticks.
-        poses: (K, N, 3), NaN before a robot is located.
-        errors: (K, N, 3).
-        nees: (K, N).
-        jumps: (K, N) how far a tick moved a robot besides its odometry [m].
-        hands_over: (K, N) whether one camera has just taken over from another.
-        tracked: (K, N).
-        cpu_s: Time that the estimator took [s].
-        drops: Data not used, by reason.
-    """
-
-    stamp_ns: IntArray
-    poses: FloatArray
-    errors: FloatArray
-    nees: FloatArray
-    jumps: FloatArray
-    hands_over: NDArray[np.bool_]
-    tracked: NDArray[np.bool_]
-    cpu_s: float
-    drops: Mapping[str, int]
+    stamp_ns: IntArray  # (K,) of ticks
+    poses: FloatArray  # (K, N, 3), NaN before a robot is located
+    errors: FloatArray  # (K, N, 3)
+    nees: FloatArray  # (K, N)
+    jumps: FloatArray  # (K, N) how far a tick moved a robot besides its odometry [m]
+    hands_over: NDArray[np.bool_]  # (K, N) whether one camera has just taken over from another
+    tracked: NDArray[np.bool_]  # (K, N)
+    cpu_s: float  # Time that the estimator took [s]
+    drops: Mapping[str, int]  # Data not used, by reason
 
     @property
     def counts(self) -> NDArray[np.bool_]:

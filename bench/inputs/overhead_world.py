@@ -38,8 +38,7 @@ ARENA = (4.6, 3.4)
 FAMILY = family_named("aruco_mip_36h12")
 MODEL = CameraModel(k1=-0.08, exposure_s=0.004)
 TOP = Face("top", 0, 0.0, 0.0, 0.105, 0.0, size=0.05, lies=True)
-PLACES = [(x, y) for x in (-1.1, 1.1) for y in (-0.8, 0.8)]
-"""Where the cameras are meant to hang."""
+PLACES = [(x, y) for x in (-1.1, 1.1) for y in (-0.8, 0.8)]  # Where the cameras are meant to hang
 _HEIGHT = 2.5
 _ASIDE, _TILT = 0.03, math.radians(1.5)
 _FLOOR = [(x, y) for x in (-2.1, -1.1, 0.0, 1.1, 2.1) for y in (-1.5, 0.0, 1.5)]
@@ -55,21 +54,13 @@ _RESIDUAL = SensorModel(residual_position_sigma=0.0003, residual_heading_sigma=0
 
 @dataclass(frozen=True)
 class OverheadRun(LivedRun):
-    """A run under ceiling cameras.
+    """A run under ceiling cameras."""
 
-    Attributes:
-        hidden: Where the cameras truly hang.
-        detections: In order of arrival.
-        images: Number of images.
-        cpu_s: Time that the detectors took [s].
-        picture: An image.
-    """
-
-    hidden: tuple[FixedCamera, ...]
-    detections: DetectionRows
-    images: int
-    cpu_s: float
-    picture: NDArray[np.uint8]
+    hidden: tuple[FixedCamera, ...]  # Where the cameras truly hang
+    detections: DetectionRows  # In order of arrival
+    images: int  # Number of images
+    cpu_s: float  # Time that the detectors took [s]
+    picture: NDArray[np.uint8]  # An image
 
 
 def simulate_overhead(seed: int, duration_s: float, say: Callable[[str], None]) -> OverheadRun:

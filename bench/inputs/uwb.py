@@ -32,22 +32,15 @@ _ANCHORS, _AMONG_ROBOTS = Plan(), Plan(robots=4, anchors=0, between_robots=True,
 _UNKNOWN_START, _NLOS = Plan(robots=4, known_starts=0, duration_s=20.0), Plan(nlos=0.2)
 _SETTLED_TICKS = 20
 _RIGHT_M = 0.2
-_BATCH_TICKS = slice(100, None, 50)
-"""Ticks at which gtsam solves the whole past."""
+_BATCH_TICKS = slice(100, None, 50)  # Ticks at which gtsam solves the whole past
 
 
 class _Case(NamedTuple):
-    """All runs of one plan.
+    """All runs of one plan."""
 
-    Attributes:
-        worlds: The runs.
-        results: Their estimates.
-        squared: (K, N) squared distances from the truth of each.
-    """
-
-    worlds: list[UwbWorld]
-    results: list[UwbResult]
-    squared: list[FloatArray]
+    worlds: list[UwbWorld]  # The runs
+    results: list[UwbResult]  # Their estimates
+    squared: list[FloatArray]  # (K, N) squared distances from the truth of each
 
 
 def measure(seeds: Sequence[int], say: ProgressLine) -> dict[str, float]:

@@ -37,62 +37,36 @@ _FIRST_ANCHOR = 100
 
 @dataclass(frozen=True)
 class Plan:
-    """What to simulate.
+    """What to simulate."""
 
-    Attributes:
-        robots: N.
-        anchors: Number of anchors.
-        duration_s: [s].
-        between_robots: Whether robots measure each other, too.
-        known_starts: Number of robots with a start, the first ones.
-        nlos: Share of ranges that are too long, for seconds per link.
-        sigma: Noise of a range [m].
-    """
-
-    robots: int = 3
-    anchors: int = 4
-    duration_s: float = 60.0
-    between_robots: bool = False
-    known_starts: int = 99
-    nlos: float = 0.0
-    sigma: float = 0.05
+    robots: int = 3  # N
+    anchors: int = 4  # Number of anchors
+    duration_s: float = 60.0  # [s]
+    between_robots: bool = False  # Whether robots measure each other, too
+    known_starts: int = 99  # Number of robots with a start, the first ones
+    nlos: float = 0.0  # Share of ranges that are too long, for seconds per link
+    sigma: float = 0.05  # Noise of a range [m]
 
 
 class Ranges(NamedTuple):
-    """Ranges (k,) in order of their stamps.
+    """Ranges (k,) in order of their stamps."""
 
-    Attributes:
-        step: (k,) number of the step of the truth at which it was measured.
-        robot: (k,) who measured.
-        device: (k,) the other robot, or N plus the index of the anchor.
-        range: (k,) [m].
-        arrival_ns: (k,).
-    """
-
-    step: IntArray
-    robot: IntArray
-    device: IntArray
-    range: FloatArray
-    arrival_ns: IntArray
+    step: IntArray  # (k,) number of the step of the truth at which it was measured
+    robot: IntArray  # (k,) who measured
+    device: IntArray  # (k,) the other robot, or N plus the index of the anchor
+    range: FloatArray  # (k,) [m]
+    arrival_ns: IntArray  # (k,)
 
 
 @dataclass(frozen=True)
 class UwbWorld:
-    """A simulated run.
+    """A simulated run."""
 
-    Attributes:
-        plan: What was simulated.
-        swarm: Its description.
-        truth: (T, N, 3) at every step.
-        odometry: (T, N, 3) as reported.
-        ranges: All ranges.
-    """
-
-    plan: Plan
-    swarm: Swarm
-    truth: FloatArray
-    odometry: FloatArray
-    ranges: Ranges
+    plan: Plan  # What was simulated
+    swarm: Swarm  # Its description
+    truth: FloatArray  # (T, N, 3) at every step
+    odometry: FloatArray  # (T, N, 3) as reported
+    ranges: Ranges  # All ranges
 
     @property
     def tick_steps(self) -> IntArray:
@@ -219,17 +193,11 @@ def messages(world: UwbWorld, ingest: Ingest) -> list[SerializedMessage]:
 
 
 class UwbResult(NamedTuple):
-    """Estimates at the ticks.
+    """Estimates at the ticks."""
 
-    Attributes:
-        error: (K, N, 3) NaN where not located.
-        covariance: (K, N, 3, 3).
-        status: (K, N) of `Status`.
-    """
-
-    error: FloatArray
-    covariance: FloatArray
-    status: IntArray
+    error: FloatArray  # (K, N, 3) NaN where not located
+    covariance: FloatArray  # (K, N, 3, 3)
+    status: IntArray  # (K, N) of `Status`
 
 
 def run(world: UwbWorld) -> UwbResult:

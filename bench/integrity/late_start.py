@@ -18,8 +18,7 @@ from swarm_loc_estimator.timeline.estimator import Status
 LATE_START = "late_start_mapping"
 _PLANS, _SLIPS = ("corridor", "office", "ring"), (0.01, 0.02, 0.04)
 _DURATION_S, _LATE_S = 160.0, (10.0, 90.0)
-_RIGHT_M = 0.3
-"""Distance from the truth that a mapper's first map may be off."""
+_RIGHT_M = 0.3  # Distance from the truth that a mapper's first map may be off
 _MAX_GAP_NS = 1_000_000_000
 
 

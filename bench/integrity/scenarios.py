@@ -19,11 +19,9 @@ from swarm_loc_estimator.swarm.error_models import SensorModel
 
 DURATION_S = 60.0
 FAULT_S = (15.0, 45.0)
-_FACE = 20
-"""A marker of the second robot."""
+_FACE = 20  # A marker of the second robot
 
-DETECTOR = SensorModel(forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06)
-"""Noise as described."""
+DETECTOR = SensorModel(forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06)  # Noise as described
 CLEAN = replace(W0, forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06, described=DETECTOR)
 SYSTEMATIC = replace(W2, forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06, described=DETECTOR)
 """Systematic errors of w2 that the description does not contain."""
@@ -31,19 +29,14 @@ SYSTEMATIC = replace(W2, forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.
 
 @dataclass(frozen=True)
 class Fault:
-    """A run with a fault.
+    """A run with a fault."""
 
-    Attributes:
-        run: The run.
-        ends_s: End of the fault, after which the estimate should recover; None: it does not end.
-        about: Name of the faulty robot or landmark, if it depends on the seed.
-        hidden_s: Begin and end of the time in which no data that has arrived shows the fault.
-    """
-
-    run: SimulatedRun
+    run: SimulatedRun  # The run
+    # End of the fault, after which the estimate should recover; None: it does not end
     ends_s: float | None = None
+    # Begin and end of the time in which no data that has arrived shows the fault
     hidden_s: tuple[float, float] | None = None
-    about: str = ""
+    about: str = ""  # Name of the faulty robot or landmark, if it depends on the seed
 
 
 def settings_of(seed: int, errors: ErrorModel) -> EightSettings:
@@ -115,8 +108,7 @@ def _two_odometry_sources(seed: int) -> Fault:
     return Fault(faults.second_odometry(_clean(seed).run, 0, FAULT_S[0], 20.0))
 
 
-_BLIND_S = 10.0
-"""Time without sightings of and by a robot whose odometry is reset."""
+_BLIND_S = 10.0  # Time without sightings of and by a robot whose odometry is reset
 
 
 def _reset_blind(seed: int, *, at_origin: bool) -> Fault:

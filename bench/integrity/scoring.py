@@ -22,46 +22,28 @@ _STEADY_S = 3.0
 
 
 class Estimated(NamedTuple):
-    """Estimates and their errors.
+    """Estimates and their errors."""
 
-    Attributes:
-        time_s: (T,) since the run began [s].
-        error: (T, N, 3) estimate minus truth; NaN where not located.
-        covariance: (T, N, 3, 3).
-        tracked: (T, N) whether the status is TRACKED.
-    """
-
-    time_s: FloatArray
-    error: FloatArray
-    covariance: FloatArray
-    tracked: BoolArray
+    time_s: FloatArray  # (T,) since the run began [s]
+    error: FloatArray  # (T, N, 3) estimate minus truth; NaN where not located
+    covariance: FloatArray  # (T, N, 3, 3)
+    tracked: BoolArray  # (T, N) whether the status is TRACKED
 
 
 @dataclass(frozen=True)
 class Score:
-    """One run of a scenario.
+    """One run of a scenario."""
 
-    Attributes:
-        misleading_share: Share of robot-seconds TRACKED with an error beyond 5 sigma and 2 cm.
-        tracked_share: Of robot-seconds after the first second.
-        position_m: RMSE while tracked, after the first second.
-        nees: Mean normalised error squared of the same, 3 is ideal.
-        recovery_s: From the fault's end until each robot is right and tracked for 3 s; NaN: it has no end.
-        time_s: (T,) of the ticks.
-        error_m: (T, N) distance from the truth; NaN where not located.
-        misleading: (T, N) whether misleading.
-        reported: Reported contradictions by name and kind.
-    """
-
-    misleading_share: float
-    tracked_share: float
-    position_m: float
-    nees: float
+    misleading_share: float  # Share of robot-seconds TRACKED with an error beyond 5 sigma and 2 cm
+    tracked_share: float  # Of robot-seconds after the first second
+    position_m: float  # RMSE while tracked, after the first second
+    nees: float  # Mean normalised error squared of the same, 3 is ideal
+    # From the fault's end until each robot is right and tracked for 3 s; NaN: it has no end
     recovery_s: float
-    time_s: FloatArray
-    error_m: FloatArray
-    misleading: BoolArray
-    reported: frozenset[tuple[str, Contradicted]] = frozenset()
+    time_s: FloatArray  # (T,) of the ticks
+    error_m: FloatArray  # (T, N) distance from the truth; NaN where not located
+    misleading: BoolArray  # (T, N) whether misleading
+    reported: frozenset[tuple[str, Contradicted]] = frozenset()  # Reported contradictions by name and kind
 
 
 def score(fault: Fault) -> Score:

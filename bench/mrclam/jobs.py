@@ -29,55 +29,36 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 MODELS = ("plain", "calibrated")
-ONLINE = "landmarks_robots"
-"""The column with landmarks and robots."""
+ONLINE = "landmarks_robots"  # The column with landmarks and robots
 SMOOTHER = "smoother"
 WORK = OUT / "mrclam"
 TICK_S, BLIND_TICK_S = 0.1, 0.5
-EARLY_S = 600.0
-"""Published errors are those of the first 600 s."""
+EARLY_S = 600.0  # Published errors are those of the first 600 s
 _REPLAYS = 3
 _SHARE_PRINTED = 0.1
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run of a set.
+    """One run of a set."""
 
-    Attributes:
-        number: Of the set.
-        model: "plain" or "calibrated".
-        column: Of the table.
-        seeing: For blind_robots, the two robots that see landmarks.
-    """
-
-    number: int
-    model: str
-    column: str
-    seeing: tuple[int, int] | None = None
+    number: int  # Of the set
+    model: str  # "plain" or "calibrated"
+    column: str  # Of the table
+    seeing: tuple[int, int] | None = None  # For blind_robots, the two robots that see landmarks
 
 
 @dataclass(frozen=True)
 class Sums:
-    """Sums of squared errors, which add up over runs.
+    """Sums of squared errors, which add up over runs."""
 
-    Attributes:
-        count: Of poses.
-        position: Sum of squared position errors [m^2].
-        heading: Sum of squared heading errors [rad^2].
-        nees: Sum of normalized errors squared.
-        nees_count: Their number.
-        misleading: Number of poses TRACKED with an error beyond 5 sigma and 2 cm.
-        early: Mean position error over the first 600 s [m].
-    """
-
-    count: int
-    position: float
-    heading: float
-    nees: float
-    nees_count: int
-    misleading: int
-    early: float = math.nan
+    count: int  # Of poses
+    position: float  # Sum of squared position errors [m^2]
+    heading: float  # Sum of squared heading errors [rad^2]
+    nees: float  # Sum of normalized errors squared
+    nees_count: int  # Their number
+    misleading: int  # Number of poses TRACKED with an error beyond 5 sigma and 2 cm
+    early: float = math.nan  # Mean position error over the first 600 s [m]
 
     def __add__(self, other: Sums) -> Sums:
         return Sums(
@@ -102,32 +83,20 @@ class Sums:
 
 @dataclass(frozen=True)
 class Done:
-    """Result of a job.
+    """Result of a job."""
 
-    Attributes:
-        job: The job.
-        sums: Its errors; None without ground truth.
-        failure: Why it has failed, one sentence; "" if it has not.
-    """
-
-    job: Job
-    sums: Sums | None
-    failure: str = ""
+    job: Job  # The job
+    sums: Sums | None  # Its errors; None without ground truth
+    failure: str = ""  # Why it has failed, one sentence; "" if it has not
 
 
 @dataclass(frozen=True)
 class Results:
-    """Results of all jobs.
+    """Results of all jobs."""
 
-    Attributes:
-        figures: By name, such as set1.calibrated.smoother.nees.
-        early: Mean errors of the first minutes by set and model [m].
-        failures: Sentences by set, model and column.
-    """
-
-    figures: dict[str, float]
-    early: dict[tuple[int, str], float]
-    failures: dict[tuple[int, str, str], str]
+    figures: dict[str, float]  # By name, such as set1.calibrated.smoother.nees
+    early: dict[tuple[int, str], float]  # Mean errors of the first minutes by set and model [m]
+    failures: dict[tuple[int, str, str], str]  # Sentences by set, model and column
 
 
 def collected(all_done: Iterable[Done]) -> Results:

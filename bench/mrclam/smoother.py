@@ -36,16 +36,12 @@ from swarm_loc_estimator.timeline.settings import Settings
 _FLOOR = np.diag([1e-10, 1e-10, 1e-10])
 """Least covariance of a motion factor; that of a standing robot would be zero."""
 _UNKNOWN = np.array([30.0, 30.0, 10.0])
-_BEND = 3.0
-"""Width of the Cauchy loss of sightings [sigma], in place of the filter's gate."""
-_NEES_POSES = 400
-"""Number of poses of each robot for the NEES; marginal covariances are slow."""
+_BEND = 3.0  # Width of the Cauchy loss of sightings [sigma], in place of the filter's gate
+_NEES_POSES = 400  # Number of poses of each robot for the NEES; marginal covariances are slow
 _MAX_ROUNDS = 25
-_SETTLED = 1e-4
-"""The solution has converged if a step reduces the error by less than this share."""
+_SETTLED = 1e-4  # The solution has converged if a step reduces the error by less than this share
 _SHORTEST_STEP = 1e-3
-_BIAS_STEP = 0.1
-"""A bias is constant for this share of its time constant."""
+_BIAS_STEP = 0.1  # A bias is constant for this share of its time constant
 
 
 class SmootherError(Exception):
@@ -54,19 +50,12 @@ class SmootherError(Exception):
 
 @dataclass(frozen=True)
 class _Nodes:
-    """Poses to solve for; their index is the key.
+    """Poses to solve for; their index is the key."""
 
-    Attributes:
-        stamps_ns: Per robot, ascending.
-        compared: Per robot, indices of those that are compared with ground truth.
-        first: (N,) key of each robot's first pose.
-        initial: (V, 3) initial values.
-    """
-
-    stamps_ns: list[IntArray]
-    compared: list[IntArray]
-    first: IntArray
-    initial: FloatArray
+    stamps_ns: list[IntArray]  # Per robot, ascending
+    compared: list[IntArray]  # Per robot, indices of those that are compared with ground truth
+    first: IntArray  # (N,) key of each robot's first pose
+    initial: FloatArray  # (V, 3) initial values
 
     def keys(self, robots: IntArray, stamps_ns: IntArray) -> IntArray:
         """Keys (m,) of poses; -1 for robot -1."""

@@ -28,11 +28,9 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.common.arrays import FloatArray
 
 SIZES = (100, 300, 1000)
-ROBOT_SECONDS = 12_000.0
-"""A run of N robots is N-th of this long, and 40 s at most."""
+ROBOT_SECONDS = 12_000.0  # A run of N robots is N-th of this long, and 40 s at most
 PATH_SIGMA, TURN_SIGMA, YAW_SIGMA = 0.03, 0.05, 0.03
-SURVEY_SIGMA = (0.02, 0.02)
-"""Of a landmark's place, either way [m], and of its yaw [rad]."""
+SURVEY_SIGMA = (0.02, 0.02)  # Of a landmark's place, either way [m], and of its yaw [rad]
 
 
 def simulate_calibrated(settings: GridSettings) -> SimulatedRun:

@@ -35,17 +35,11 @@ _FLOOR = np.diag([1e-11, 1e-11, 1e-11])
 
 @dataclass(frozen=True)
 class _Nodes:
-    """The poses to solve for, sorted by robot and stamp; the position in these arrays is the key.
+    """The poses to solve for, sorted by robot and stamp; the position in these arrays is the key."""
 
-    Attributes:
-        robot: (V,).
-        stamp_ns: (V,).
-        first: (N,) key of each robot's first pose.
-    """
-
-    robot: IntArray
-    stamp_ns: IntArray
-    first: IntArray
+    robot: IntArray  # (V,)
+    stamp_ns: IntArray  # (V,)
+    first: IntArray  # (N,) key of each robot's first pose
 
     def key(self, robot: IntArray, stamp_ns: IntArray) -> IntArray:
         """The keys (M,) of poses that exist."""

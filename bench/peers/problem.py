@@ -20,15 +20,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PeerResult:
-    """What a peer made of a run.
+    """What a peer made of a run."""
 
-    Attributes:
-        poses: (K, N, 3) in map at the K output stamps.
-        cpu_s: CPU time of this process, all threads, from the first datum to the last pose [s].
-    """
-
-    poses: FloatArray
-    cpu_s: float
+    poses: FloatArray  # (K, N, 3) in map at the K output stamps
+    cpu_s: float  # CPU time of this process, all threads, from the first datum to the last pose [s]
 
 
 class Odometry:
@@ -97,27 +92,17 @@ class Odometry:
 
 @dataclass(frozen=True)
 class Sightings:
-    """All sightings of a run as columns, in order of their pictures' arrival.
+    """All sightings of a run as columns, in order of their pictures' arrival."""
 
-    Attributes:
-        observer: (S,) robot index.
-        target: (S,) robot index; -1 for a landmark.
-        stamp_ns: (S,).
-        arrival_ns: (S,).
-        value: (S, 3) marker in the camera's plane: forward [m], left [m], direction out of its face [rad].
-        sigma: (S, 3) of the value.
-        mount: (S, 3) camera in the observer's base_link.
-        marker: (S, 3) in the target's base_link; a landmark in map.
-    """
-
-    observer: IntArray
-    target: IntArray
-    stamp_ns: IntArray
-    arrival_ns: IntArray
+    observer: IntArray  # (S,) robot index
+    target: IntArray  # (S,) robot index; -1 for a landmark
+    stamp_ns: IntArray  # (S,)
+    arrival_ns: IntArray  # (S,)
+    # (S, 3) marker in the camera's plane: forward [m], left [m], direction out of its face [rad]
     value: FloatArray
-    sigma: FloatArray
-    mount: FloatArray
-    marker: FloatArray
+    sigma: FloatArray  # (S, 3) of the value
+    mount: FloatArray  # (S, 3) camera in the observer's base_link
+    marker: FloatArray  # (S, 3) in the target's base_link; a landmark in map
 
     def __getitem__(self, rows: slice | NDArray[np.bool_] | IntArray) -> Sightings:
         return Sightings(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
@@ -156,28 +141,18 @@ def starts_of(run: SimulatedRun) -> tuple[FloatArray, FloatArray]:
 
 @dataclass(frozen=True)
 class RelativePoses:
-    """Sightings as relative poses for pose graphs.
+    """Sightings as relative poses for pose graphs."""
 
-    Attributes:
-        pose: (S, 3) the target's base_link in the observer's; for a landmark, the observer's in map.
-        covariance: (S, 3, 3) of the error x, y, theta in the frame of `pose`.
-    """
-
-    pose: FloatArray
-    covariance: FloatArray
+    pose: FloatArray  # (S, 3) the target's base_link in the observer's; for a landmark, the observer's in map
+    covariance: FloatArray  # (S, 3, 3) of the error x, y, theta in the frame of `pose`
 
 
 @dataclass(frozen=True)
 class Moves:
-    """Where robots are at a sighting's stamp, seen from where they are at the stamp wanted.
+    """Where robots are at a sighting's stamp, seen from where they are at the stamp wanted."""
 
-    Attributes:
-        pose: (S, 3) base_link at the sighting's stamp in base_link at the wanted stamp.
-        covariance: (S, 3, 3) in the frame of `pose`.
-    """
-
-    pose: FloatArray
-    covariance: FloatArray
+    pose: FloatArray  # (S, 3) base_link at the sighting's stamp in base_link at the wanted stamp
+    covariance: FloatArray  # (S, 3, 3) in the frame of `pose`
 
 
 def no_moves(count: int) -> Moves:

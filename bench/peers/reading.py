@@ -35,12 +35,10 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.common.arrays import FloatArray
 
 DEMO = Path(__file__).resolve().parents[2] / "bags" / "eight_five_robots"
-MRCLAM_S = 300.0
-"""How much of a set is read [s]; costs per message do not change with the length."""
+MRCLAM_S = 300.0  # How much of a set is read [s]; costs per message do not change with the length
 REPEATS = 3
 
-Messages = Iterator[tuple[str, bytes]]
-"""Type and bytes of one after the other."""
+Messages = Iterator[tuple[str, bytes]]  # Type and bytes of one after the other
 
 
 class Figures(NamedTuple):

@@ -41,8 +41,7 @@ DURATION_S = 20.0
 PEER_ROBOT_SECONDS = 1500.0
 """Peers get the first part of a large swarm's run: their cost per second does not change with its length."""
 WARM_UP_S = 2.0
-SETTLING_S = 3.0
-"""Errors count from here on."""
+SETTLING_S = 3.0  # Errors count from here on
 
 
 def measure(robots: int, duration_s: float, seed: int, settings: Settings) -> dict[str, float]:

@@ -22,17 +22,11 @@ _NEVER = 1_000_000
 
 @dataclass(frozen=True)
 class ShapeRuns:
-    """What to run.
+    """What to run."""
 
-    Attributes:
-        duration_s: Of a run [s].
-        exact_s: The exact filter has so much of it at most [s], and is compared there.
-        seeds: One run each.
-    """
-
-    duration_s: float
-    exact_s: float
-    seeds: tuple[int, ...]
+    duration_s: float  # Of a run [s]
+    exact_s: float  # The exact filter has so much of it at most [s], and is compared there
+    seeds: tuple[int, ...]  # One run each
 
 
 def measure_shape(shape: Shape, robots: int, runs: ShapeRuns) -> dict[str, float]:

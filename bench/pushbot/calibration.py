@@ -31,23 +31,14 @@ def logarithm_depth(a: float, b: float, row: float) -> float:
 
 
 class Calibrated(NamedTuple):
-    """One robot's calibration.
+    """One robot's calibration."""
 
-    Attributes:
-        truth: (p_inf, f b) as it was put together.
-        found: What the fit gives.
-        drive: What it was fitted to.
-        hyperbola_cm: (D,) errors of depths read by it from true rows.
-        logarithm_cm: Likewise by the logarithm of the paper.
-        window_cm: (W,) errors of single windows, as the calibration reads them.
-    """
-
-    truth: tuple[float, float]
-    found: LaserCalibration
-    drive: Drive
-    hyperbola_cm: FloatArray
-    logarithm_cm: FloatArray
-    window_cm: FloatArray
+    truth: tuple[float, float]  # (p_inf, f b) as it was put together
+    found: LaserCalibration  # What the fit gives
+    drive: Drive  # What it was fitted to
+    hyperbola_cm: FloatArray  # (D,) errors of depths read by it from true rows
+    logarithm_cm: FloatArray  # Likewise by the logarithm of the paper
+    window_cm: FloatArray  # (W,) errors of single windows, as the calibration reads them
 
 
 def calibrate(seed: int) -> Calibrated:

@@ -16,10 +16,8 @@ from swarm_loc_drivers.sim.pushbot.event_camera import Blinking
 from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 
 _STEP_S = 0.005
-_POLLS = 4
-"""A firmware hands on no more than two of its buffers at once."""
-_BAUD_RATE = 1_000_000_000
-"""Ten of them at once are to test the driver and the graph, not the wire."""
+_POLLS = 4  # A firmware hands on no more than two of its buffers at once
+_BAUD_RATE = 1_000_000_000  # Ten of them at once are to test the driver and the graph, not the wire
 
 
 class StandingBody:

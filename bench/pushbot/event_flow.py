@@ -22,8 +22,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import executable_path
 from swarm_loc_estimator.offline.live.graph import cpu_seconds
 
-RATE = 300_000
-"""Events of each robot [1/s]."""
+RATE = 300_000  # Events of each robot [1/s]
 FIRST_PORT = 57_100
 _SECONDS = 6.0
 _START_S, _SETTLE_S = 120.0, 2.0
@@ -31,23 +30,15 @@ _EVENTS, _PACKETS, _LOST = "events", "packets", "packets lost on the way"
 
 
 class Measured(NamedTuple):
-    """What came of robots at once.
+    """What came of robots at once."""
 
-    Attributes:
-        events_per_s: Events of each robot that its tracker has taken [1/s].
-        lost: Share of packets that were lost between driver and tracker, as the tracker's diagnostics count.
-        driver: Cores of one driver.
-        tracker: Cores of one tracker.
-        feed: Cores of the process that plays all robots.
-        others: Cores that the rest of the machine had, of all there are.
-    """
-
-    events_per_s: float
+    events_per_s: float  # Events of each robot that its tracker has taken [1/s]
+    # Share of packets that were lost between driver and tracker, as the tracker's diagnostics count
     lost: float
-    driver: float
-    tracker: float
-    feed: float
-    others: float
+    driver: float  # Cores of one driver
+    tracker: float  # Cores of one tracker
+    feed: float  # Cores of the process that plays all robots
+    others: float  # Cores that the rest of the machine had, of all there are
 
 
 class EventFlow:

@@ -29,8 +29,7 @@ if TYPE_CHECKING:
 
 SLIP, PLAN = 0.02, "corridor"
 _REPEATS = 5
-_STOP_STRIDE = 10
-"""Covariances of every tenth stop are compared."""
+_STOP_STRIDE = 10  # Covariances of every tenth stop are compared
 
 
 def measure_graphs(seeds: int, minutes: float) -> dict[str, float]:

@@ -66,25 +66,15 @@ def _has_room(walls: FloatArray, here: FloatArray, place: FloatArray) -> bool:
 
 @dataclass
 class LidarBody:
-    """The robot's truth and odometry.
+    """The robot's truth and odometry."""
 
-    Attributes:
-        plan: Where it is.
-        pose: (3,) true pose.
-        noise: Errors of its wheels; `slip` is of paths, too.
-        rng: Source of all noise.
-        odometry: (3,) pose by odometry.
-        trace: True poses (3,), one every `PERIOD_S`.
-        bumps: Always 0: it is steered around walls.
-    """
-
-    plan: FloorPlan
-    pose: FloatArray
-    noise: PushBotNoise
-    rng: np.random.Generator
-    odometry: FloatArray = field(default_factory=lambda: np.zeros(3))
-    trace: list[FloatArray] = field(default_factory=list)
-    bumps: int = 0
+    plan: FloorPlan  # Where it is
+    pose: FloatArray  # (3,) true pose
+    noise: PushBotNoise  # Errors of its wheels; `slip` is of paths, too
+    rng: np.random.Generator  # Source of all noise
+    odometry: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,) pose by odometry
+    trace: list[FloatArray] = field(default_factory=list)  # True poses (3,), one every `PERIOD_S`
+    bumps: int = 0  # Always 0: it is steered around walls
     _target: FloatArray | None = None
 
     def step(self) -> None:
@@ -146,21 +136,13 @@ def scan_message(stamp_ns: int, ranges: FloatArray) -> bytes:
 
 @dataclass
 class LidarDrive:
-    """One robot whose messages go to one mapper.
+    """One robot whose messages go to one mapper."""
 
-    Attributes:
-        mapper: Makes the map.
-        robots: The robot by its number in the mapper.
-        arrivals: A pose for each sweep in the graph.
-        sweeps: Number of sweeps.
-        cpu_s: CPU time of decoding and mapping [s].
-    """
-
-    mapper: CooperativeMapper
-    robots: dict[int, LidarBody]
-    arrivals: list[Arrival] = field(default_factory=list)
-    sweeps: int = 0
-    cpu_s: float = 0.0
+    mapper: CooperativeMapper  # Makes the map
+    robots: dict[int, LidarBody]  # The robot by its number in the mapper
+    arrivals: list[Arrival] = field(default_factory=list)  # A pose for each sweep in the graph
+    sweeps: int = 0  # Number of sweeps
+    cpu_s: float = 0.0  # CPU time of decoding and mapping [s]
 
     @classmethod
     def starting(

@@ -15,13 +15,11 @@ from bench.pushbot.runs import RunResult, RunSettings, run
 from bench.shared.common import Cell, table
 
 PLANS = ("corridor", "office", "ring")
-UNSEEN = ("bend", "atrium", "tee")
-"""Halls that nothing was developed in."""
+UNSEEN = ("bend", "atrium", "tee")  # Halls that nothing was developed in
 WIDE = ("open12", "corridor25")
 """Halls whose walls are out of the laser's range, or do not tell how far along a robot is."""
 SLIPS = (0.0, 0.02, 0.05)
-LIDAR_SLIPS = (0.02, 0.035, 0.05)
-"""Shares of paths and turns that wheels lose, of seeds 1, 2 and 3 and so on."""
+LIDAR_SLIPS = (0.02, 0.035, 0.05)  # Shares of paths and turns that wheels lose, of seeds 1, 2 and 3 and so on
 LIDAR_MINUTES = 5.0
 _SPEED_ROBOTS = (1, 2, 5, 10)
 _SPEED_MINUTES = 5.0
@@ -31,19 +29,12 @@ _POSES = ("position_cm", "heading_deg", "online_position_cm", "wall_cm", "wall_a
 
 @dataclass(frozen=True)
 class MappingEffort:
-    """How much is run.
+    """How much is run."""
 
-    Attributes:
-        seeds: Of each hall with one robot; slips take turns.
-        team_seeds: Of runs with several robots, of other halls, of the paper's method, and at .3 px.
-        minutes: Of a run of one robot; teams get half of it.
-        processes: At a time.
-    """
-
-    seeds: int
-    team_seeds: int
-    minutes: float
-    processes: int
+    seeds: int  # Of each hall with one robot; slips take turns
+    team_seeds: int  # Of runs with several robots, of other halls, of the paper's method, and at .3 px
+    minutes: float  # Of a run of one robot; teams get half of it
+    processes: int  # At a time
 
 
 def measure_mapping(effort: MappingEffort) -> dict[str, float]:

@@ -27,21 +27,13 @@ _LONG_AGO_NS = -(1 << 62)
 
 @dataclass(frozen=True)
 class PaperSettings:
-    """What the paper's equation (1) needs.
+    """What the paper's equation (1) needs."""
 
-    Attributes:
-        eta: Influence of an event; beyond 0.5 the sum of weights is not stable.
-        time_sigma: Of the weight of time [s].
-        distance_sigma: Of the weight of distance [px].
-        is_product: Whether the weights are multiplied instead of summed.
-        sigma: Standard deviation that is reported [px]; the paper knows none.
-    """
-
-    eta: float = 0.5
-    time_sigma: float = 60e-6
-    distance_sigma: float = 3.0
-    is_product: bool = False
-    sigma: float = 0.83
+    eta: float = 0.5  # Influence of an event; beyond 0.5 the sum of weights is not stable
+    time_sigma: float = 60e-6  # Of the weight of time [s]
+    distance_sigma: float = 3.0  # Of the weight of distance [px]
+    is_product: bool = False  # Whether the weights are multiplied instead of summed
+    sigma: float = 0.83  # Standard deviation that is reported [px]; the paper knows none
 
 
 class _Lights(NamedTuple):

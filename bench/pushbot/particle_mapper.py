@@ -36,10 +36,8 @@ from swarm_loc_estimator.mapping.scans import LightSightings, Readings
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
 _FREE = -0.3
-_ACROSS, _ALONG = 0.1, 0.05
-"""Standard deviations of the ellipse, per distance."""
-_REACH = 2.0
-"""The ellipse ends after so many of them."""
+_ACROSS, _ALONG = 0.1, 0.05  # Standard deviations of the ellipse, per distance
+_REACH = 2.0  # The ellipse ends after so many of them
 _CAP = 1.0
 
 
@@ -86,8 +84,7 @@ def values_at_ends(
 
 _PARTICLES = 200
 _EVERY = 25
-_FLOOR = 0.05
-"""Weight of a beam that ends where the map says nothing."""
+_FLOOR = 0.05  # Weight of a beam that ends where the map says nothing
 _DISTANCE_NOISE, _TURN_NOISE, _HEADING_NOISE = 0.02, math.radians(4.0), math.radians(0.4)
 _MIN_PATH = 0.5
 _MARGIN_CELLS = 160
@@ -96,21 +93,13 @@ _OCCUPIED = 0.3
 
 @dataclass
 class _Tribe:
-    """Particles of one robot.
+    """Particles of one robot."""
 
-    Attributes:
-        particles: (p, 3) poses.
-        odometry: (3,) the newest pose by odometry.
-        goal: Where to go.
-        count: How many readings came.
-        stamp_ns: Of the newest.
-    """
-
-    particles: FloatArray
-    odometry: FloatArray | None = None
-    goal: Goal | None = None
-    count: int = 0
-    stamp_ns: int = 0
+    particles: FloatArray  # (p, 3) poses
+    odometry: FloatArray | None = None  # (3,) the newest pose by odometry
+    goal: Goal | None = None  # Where to go
+    count: int = 0  # How many readings came
+    stamp_ns: int = 0  # Of the newest
 
     @property
     def mean(self) -> FloatArray:

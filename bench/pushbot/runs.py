@@ -20,8 +20,7 @@ from swarm_loc_estimator.offline.metrics import is_misleading, nees
 
 DIVERGED_CM = 30.0
 GOOD_CM, GOOD_DEG = 10.0, 2.0
-COVERED_M = 0.06
-"""A piece of wall is covered if a cell so near is occupied."""
+COVERED_M = 0.06  # A piece of wall is covered if a cell so near is occupied
 COVERED_SHARE = 0.9
 _LOOK_EVERY_S = 10.0
 _UNREPORTED_SIGMAS = 3.0
@@ -29,76 +28,44 @@ _UNREPORTED_SIGMAS = 3.0
 
 @dataclass(frozen=True)
 class RunSettings:
-    """One run.
+    """One run."""
 
-    Attributes:
-        plan: Name of the floor plan.
-        slip: Share of turns that wheels lose.
-        seed: Of all noise.
-        minutes: How long.
-        robots: How many.
-        pixel: Noise of the tracker [px].
-        lights: Whether LEDs of other robots are seen.
-        printed: Whether the paper's method makes the map.
-        checks_covariances: Whether poses are compared with their covariances at each arrival.
-        lidar: Whether the robot has a lidar, see `bench.pushbot.lidar`, in place of a laser pointer.
-    """
-
-    plan: str
-    slip: float
-    seed: int
-    minutes: float = 20.0
-    robots: int = 1
-    pixel: float = 0.1
-    lights: bool = True
-    printed: bool = False
-    checks_covariances: bool = False
+    plan: str  # Name of the floor plan
+    slip: float  # Share of turns that wheels lose
+    seed: int  # Of all noise
+    minutes: float = 20.0  # How long
+    robots: int = 1  # How many
+    pixel: float = 0.1  # Noise of the tracker [px]
+    lights: bool = True  # Whether LEDs of other robots are seen
+    printed: bool = False  # Whether the paper's method makes the map
+    checks_covariances: bool = False  # Whether poses are compared with their covariances at each arrival
+    # Whether the robot has a lidar, see `bench.pushbot.lidar`, in place of a laser pointer
     lidar: bool = False
 
 
 @dataclass(frozen=True)
 class RunResult:
-    """What came of a run; errors are against the truth, in the frame of the first robot's start.
+    """What came of a run; errors are against the truth, in the frame of the first robot's start."""
 
-    Attributes:
-        settings: Of the run.
-        position_cm: Error of the robots' last poses, mean over the robots.
-        heading_deg: Likewise.
-        worst_cm: Largest error of any pose after the last solution.
-        online_position_cm: Median error of poses at the time when they were told.
-        online_worst_cm: The largest of these.
-        aligned_cm: RMS error of all poses after one rigid fit.
-        wall_cm: Mean distance of occupied cells from a wall.
-        wall_aligned_cm: Likewise after the fit.
-        coverage: Share of walls with an occupied cell nearby.
-        coverage_90_s: When this was nine tenths, as told at the time and after the fit; NaN: never.
-        cpu_s_per_s: Time that mapping took, per second.
-        bumps: How often a robot hit something.
-        cells: (n, 2) occupied cells [m].
-        path: (m, 3) robot, x, y of all poses [m].
-        misleading_share: Share of poses off by more than 5 sigma and 2 cm when told; NaN: not compared.
-        diverged_unreported: 1 if one was off by more than `DIVERGED_CM` and 3 sigma, else 0.
-        sweep_ms: CPU time per sweep of a lidar [ms]; NaN: it has none.
-    """
-
-    settings: RunSettings
-    position_cm: float
-    heading_deg: float
-    worst_cm: float
-    online_position_cm: float
-    online_worst_cm: float
-    aligned_cm: float
-    wall_cm: float
-    wall_aligned_cm: float
-    coverage: float
-    coverage_90_s: float
-    cpu_s_per_s: float
-    bumps: int
-    cells: FloatArray
-    path: FloatArray
+    settings: RunSettings  # Of the run
+    position_cm: float  # Error of the robots' last poses, mean over the robots
+    heading_deg: float  # Likewise
+    worst_cm: float  # Largest error of any pose after the last solution
+    online_position_cm: float  # Median error of poses at the time when they were told
+    online_worst_cm: float  # The largest of these
+    aligned_cm: float  # RMS error of all poses after one rigid fit
+    wall_cm: float  # Mean distance of occupied cells from a wall
+    wall_aligned_cm: float  # Likewise after the fit
+    coverage: float  # Share of walls with an occupied cell nearby
+    coverage_90_s: float  # When this was nine tenths, as told at the time and after the fit; NaN: never
+    cpu_s_per_s: float  # Time that mapping took, per second
+    bumps: int  # How often a robot hit something
+    cells: FloatArray  # (n, 2) occupied cells [m]
+    path: FloatArray  # (m, 3) robot, x, y of all poses [m]
+    # Share of poses off by more than 5 sigma and 2 cm when told; NaN: not compared
     misleading_share: float = math.nan
-    diverged_unreported: float = 0.0
-    sweep_ms: float = math.nan
+    diverged_unreported: float = 0.0  # 1 if one was off by more than `DIVERGED_CM` and 3 sigma, else 0
+    sweep_ms: float = math.nan  # CPU time per sweep of a lidar [ms]; NaN: it has none
 
     @property
     def is_diverged(self) -> bool:

@@ -17,16 +17,14 @@ from swarm_loc_estimator.common.messages.event_encoding import Events
 from swarm_loc_vision.events.parameters import LightSource, TrackerSettings
 from swarm_loc_vision.events.tracker import LightTracker
 
-NOISES = (0.0, 1.0, 5.0, 15.0, 30.0)
-"""Noise events of a pixel [1/s]; the bar is at 15."""
+NOISES = (0.0, 1.0, 5.0, 15.0, 30.0)  # Noise events of a pixel [1/s]; the bar is at 15
 BAR_NOISE = 15.0
 DEPTHS_M = (0.3, 0.6, 1.0, 1.5, 2.0, 2.5)
 SIZE = (128, 128)
 _STEP_US, _STEPS = 5_000, 200
 _LASER, _LED = Blinking(2222, 1111), Blinking(1000, 500)
 SOURCES = (LightSource(450.0, is_above=False), LightSource(1000.0, is_above=True))
-_SKIPPED = 5
-"""Windows in which a light is found at first."""
+_SKIPPED = 5  # Windows in which a light is found at first
 
 MakeTracker = Callable[[], LightTracker]
 TRACKERS: dict[str, MakeTracker] = {
@@ -40,17 +38,11 @@ TRACKERS: dict[str, MakeTracker] = {
 
 
 class Scene(NamedTuple):
-    """A second of events with a laser spot that wanders slowly, and an LED.
+    """A second of events with a laser spot that wanders slowly, and an LED."""
 
-    Attributes:
-        events: Of each step.
-        stamps_us: (K,) middles of the steps [us].
-        places: (K, 2) true places of the spot there [px].
-    """
-
-    events: list[CameraEvents]
-    stamps_us: FloatArray
-    places: FloatArray
+    events: list[CameraEvents]  # Of each step
+    stamps_us: FloatArray  # (K,) middles of the steps [us]
+    places: FloatArray  # (K, 2) true places of the spot there [px]
 
 
 def scene(noise_rate: float, depth: float, seed: int) -> Scene:

@@ -22,8 +22,7 @@ if TYPE_CHECKING:
 
     from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 
-OUT = Path(__file__).resolve().parents[2] / "out"
-"""Folder of results."""
+OUT = Path(__file__).resolve().parents[2] / "out"  # Folder of results
 
 _STYLE = {
     "figure.constrained_layout.use": True,

@@ -35,17 +35,11 @@ _COLUMNS = ("robot", "stamp_ns", "arrival_ns")
 
 @dataclass(frozen=True)
 class CoreResult:
-    """Estimates of a run.
+    """Estimates of a run."""
 
-    Attributes:
-        cpu_s: [s].
-        poses: (K, N, 3) at every tick.
-        covariances: (K, N, 3, 3).
-    """
-
-    cpu_s: float
-    poses: FloatArray
-    covariances: FloatArray
+    cpu_s: float  # [s]
+    poses: FloatArray  # (K, N, 3) at every tick
+    covariances: FloatArray  # (K, N, 3, 3)
 
 
 def run_core(run: SimulatedRun, tick_ns: IntArray, settings: Settings) -> CoreResult:

@@ -22,15 +22,10 @@ _BLUR_PX, _NOISE = 0.6, 2.0
 
 @dataclass(frozen=True)
 class BchFigures:
-    """What came of it.
+    """What came of it."""
 
-    Attributes:
-        ids_right: Ids that were read right in all rotations and with both borders.
-        us_per_candidate: To find the nearest of all 4096 words in all rotations, CPU time.
-    """
-
-    ids_right: int
-    us_per_candidate: float
+    ids_right: int  # Ids that were read right in all rotations and with both borders
+    us_per_candidate: float  # To find the nearest of all 4096 words in all rotations, CPU time
 
 
 def measure_bch() -> BchFigures:

@@ -24,14 +24,12 @@ LOOKS = {
     "noisy": Look(noise=8.0),
 }
 """Kinds of images."""
-MARKERS = 20
-"""In an image, at most."""
+MARKERS = 20  # In an image, at most
 SIDES_PX = (10.0, 14.0, 18.0, 24.0, 40.0, 80.0, math.inf)
 INCIDENCES = tuple(math.radians(a) for a in (0.0, 30.0, 50.0, 70.0))
 BLURS_PX = (1.0, 3.0, 5.0, 8.0)
 _NEAR_PX = 3.0
-_FLIPPED = 0.35
-"""A rotation further off than this is the mirrored one [rad]."""
+_FLIPPED = 0.35  # A rotation further off than this is the mirrored one [rad]
 
 
 @dataclass
@@ -71,8 +69,7 @@ class Score:
         return float(np.sqrt(np.nanmean(np.square(self.corner_px))))
 
 
-Scores = dict[str, dict[str, Score]]
-"""Kind of image -> detector -> score."""
+Scores = dict[str, dict[str, Score]]  # Kind of image -> detector -> score
 
 
 def compare(seeds: Sequence[int], frames: int) -> Scores:

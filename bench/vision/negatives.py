@@ -15,8 +15,7 @@ from swarm_loc_vision.markers.layouts import Layout
 
 _INK, _PAPER, _MARGIN_PX = 25.0, 225.0, 20
 _FEW_IDS = np.arange(16)
-_FINE = 4
-"""Points per pixel, each way."""
+_FINE = 4  # Points per pixel, each way
 
 
 def random_squares(seeds: Sequence[int], frames: int, markers: int) -> tuple[int, int]:

@@ -18,8 +18,7 @@ from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.detector import Detections, DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import Family, family_named
 
-FAMILY = "apriltag_36h11"
-"""The one that all of them read."""
+FAMILY = "apriltag_36h11"  # The one that all of them read
 
 
 @dataclass(frozen=True)

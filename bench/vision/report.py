@@ -29,20 +29,13 @@ _BINS = {"side_px": SIDES_PX, "incidence": INCIDENCES, "blur": BLURS_PX}
 
 @dataclass(frozen=True)
 class VisionResult:
-    """All that was measured.
+    """All that was measured."""
 
-    Attributes:
-        scores: Kind of image -> detector -> score.
-        bch: The ids of the paper's markers.
-        squares: Random squares that were shown.
-        square_ids: Ids read from them, all false.
-        black_square_ids: Black squares with a speck that were read as an id, by family and number of ids.
-    """
-
-    scores: Scores
-    bch: BchFigures
-    squares: int
-    square_ids: int
+    scores: Scores  # Kind of image -> detector -> score
+    bch: BchFigures  # The ids of the paper's markers
+    squares: int  # Random squares that were shown
+    square_ids: int  # Ids read from them, all false
+    # Black squares with a speck that were read as an id, by family and number of ids
     black_square_ids: dict[str, int]
 
     def figures(self) -> dict[str, float]:

@@ -52,22 +52,16 @@ BARS_MS = {5: 100.0, 300: 150.0, 1000: 250.0}
 LOADED = (5, 300)
 DEMO_BAG = OUT.parent / "bags" / "eight_five_robots"
 _PATIENCE_MS = 60_000
-_SETTLED = 20
-"""So many poses are painted before any counts."""
+_SETTLED = 20  # So many poses are painted before any counts
 
 Samples = dict[str, list[float]]
 
 
 class Source(NamedTuple):
-    """Where poses come from.
+    """Where poses come from."""
 
-    Attributes:
-        swarm_file: Whose.
-        commands: Programs that publish them.
-    """
-
-    swarm_file: Path
-    commands: Sequence[Sequence[str]]
+    swarm_file: Path  # Whose
+    commands: Sequence[Sequence[str]]  # Programs that publish them
 
 
 def stand_in(robots: int, work: Path) -> Source:

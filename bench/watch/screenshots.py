@@ -36,21 +36,13 @@ MAPPED = RunSettings("office", slip=0.02, seed=1, minutes=6.0, robots=3)
 
 
 class Picture(NamedTuple):
-    """What to photograph.
+    """What to photograph."""
 
-    Attributes:
-        name: Of the file.
-        bag: What was recorded; None: the run of the mapper.
-        share: At which part of the run.
-        theme: light or dark.
-        selected: The robot whose numbers are shown, -1 for none.
-    """
-
-    name: str
-    bag: Path | None
-    share: float
-    theme: str
-    selected: int
+    name: str  # Of the file
+    bag: Path | None  # What was recorded; None: the run of the mapper
+    share: float  # At which part of the run
+    theme: str  # light or dark
+    selected: int  # The robot whose numbers are shown, -1 for none
 
 
 def photograph(browser: Browser, picture: Picture, work: Path, out: Path) -> Path:

@@ -38,8 +38,7 @@ FOR_BAGS = {"lz4", "mcap", "rosbags", "zstandard"}
 """rosdep knows no packages of them but by pip, and bloom refuses a package that depends on such ones."""
 FOR_SWEEPS = {"distributed", "optuna", "ray"}
 """For sweeps on clusters and fits, imported by name: rosdep knows no packages of them, benchmarks do."""
-PIP_NAMES = {"python3-pil": "pillow"}
-"""What pip calls packages in which rosdep's name is another one."""
+PIP_NAMES = {"python3-pil": "pillow"}  # What pip calls packages in which rosdep's name is another one
 LOADED_BY_NAME = {"swarm_loc_estimator": {"event_camera_msgs", "sensor_msgs"}}
 """Packages that `message_class` imports."""
 HERE = {"_typeshed", "bench", "workspace"} | {path.stem for path in ROOT.glob("swarm_loc_*/test/**/*.py")}

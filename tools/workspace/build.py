@@ -19,8 +19,7 @@ from workspace.stamps import Stamp, digest, write_whole
 
 BUILD = STATE / "build"
 INSTALL = STATE / "install"
-OVERLAY = STATE / "overlay.json"
-"""Environment variable -> entries that the built packages prepend."""
+OVERLAY = STATE / "overlay.json"  # Environment variable -> entries that the built packages prepend
 
 COPIED = (
     "package.xml",
@@ -33,8 +32,7 @@ COPIED = (
     "action/*",
 )
 """Files of a package that a build copies; all others are linked."""
-MESSAGES = ("swarm_loc_msgs", "tf2_msgs")
-"""Packages that take most of a build, and that clones share."""
+MESSAGES = ("swarm_loc_msgs", "tf2_msgs")  # Packages that take most of a build, and that clones share
 LINKED_ONE_BY_ONE = "launch/*"
 PYTHON_ONLY = Path(__file__).parent / "python_only/rosidl_default_generatorsConfig.cmake"
 """CMake package that leaves out what no Python node loads of messages."""

@@ -12,8 +12,7 @@ from pathlib import Path
 from workspace.layout import ROOT, WorkspaceError
 
 LOWEST_PYTHON = (3, 10)
-HIGHEST_WHEEL_PYTHON = (3, 13)
-"""The newest Python version that the ROS wheels support."""
+HIGHEST_WHEEL_PYTHON = (3, 13)  # The newest Python version that the ROS wheels support
 
 
 def ros_prefix() -> Path | None:

@@ -9,8 +9,7 @@ VENV = ROOT / ".venv"
 VENV_PYTHON = VENV / "bin" / "python"
 REQUIREMENTS = ROOT / "requirements"
 
-STATE = ROOT / ".workspace"
-"""Folder of everything that set-up creates except the virtual environment."""
+STATE = ROOT / ".workspace"  # Folder of everything that set-up creates except the virtual environment
 LOGS = STATE / "log"
 
 PACKAGES = ("swarm_loc_msgs", "swarm_loc_estimator", "swarm_loc_vision", "swarm_loc_drivers")

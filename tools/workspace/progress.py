@@ -11,8 +11,7 @@ from pathlib import Path
 
 from workspace.layout import LOGS
 
-SHOWN_EVERY_S = 5.0
-"""Period of status lines where the output is not a terminal [s]."""
+SHOWN_EVERY_S = 5.0  # Period of status lines where the output is not a terminal [s]
 
 
 def say(text: str) -> None:

@@ -11,8 +11,7 @@ from pathlib import Path
 
 from workspace.layout import ROOT
 
-_ROOT_MARK = b"@workspace@"
-"""Stands for the folder of a workspace in the texts of a kept package."""
+_ROOT_MARK = b"@workspace@"  # Stands for the folder of a workspace in the texts of a kept package
 _KEPT_S = 30 * 86400.0
 
 

@@ -14,8 +14,7 @@ from swarm_loc_estimator.common.se2 import wrap_angle
 
 _RADIUS_MM = 22.0
 _NEAREST_MM = 46.0
-_FIRST_SUM = 2.0739212652
-"""Divides the plain sum, for want of the cosines, before the first range."""
+_FIRST_SUM = 2.0739212652  # Divides the plain sum, for want of the cosines, before the first range
 _REACH, _GAP, _RATE, _SHIFT = 778.0270114700, 528.0270114700, 24.3675811184, 0.0259969683
 _LIMITS = ((110.0, 1.0), (200.0, 1.5))
 """Below a range [mm] a matrix may differ by so much; beyond all of them it is refused."""

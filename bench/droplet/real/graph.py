@@ -37,29 +37,20 @@ SETTINGS = Settings(lost_heading_sigma=1.5, fix_window_s=60.0)
 """Headings of robots that turn by themselves are seldom surer than the default; it is 7 to 20 s from one
 exchange of two robots to the next."""
 LIVE_RATE = 10.0
-REACH_M, MIN_EXCHANGES = 0.2, 5
-"""Who lit its emitters so often so near to a receiver can be seen."""
+REACH_M, MIN_EXCHANGES = 0.2, 5  # Who lit its emitters so often so near to a receiver can be seen
 _STOOD_S, _STOOD_M, _STOOD_RAD = 30.0, 0.0035, np.radians(8.0)
 """Between two sightings so little apart the importer takes a robot to have stood."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A recording through the estimator.
+    """A recording through the estimator."""
 
-    Attributes:
-        score: As `bench.integrity` has it, of the instants with truth.
-        estimated: What it is of.
-        located_share: Share of the robots that can be seen that were located at all.
-        position_cm: (K,) errors of the poses told as tracked whose truth is known.
-        heading_deg: (K,) likewise, without sign.
-    """
-
-    score: Score
-    estimated: Estimated
-    located_share: float
-    position_cm: FloatArray
-    heading_deg: FloatArray
+    score: Score  # As `bench.integrity` has it, of the instants with truth
+    estimated: Estimated  # What it is of
+    located_share: float  # Share of the robots that can be seen that were located at all
+    position_cm: FloatArray  # (K,) errors of the poses told as tracked whose truth is known
+    heading_deg: FloatArray  # (K,) likewise, without sign
 
     @property
     def figures(self) -> dict[str, float]:

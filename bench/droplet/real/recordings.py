@@ -19,21 +19,13 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recording whose robots are numbered across all recordings.
+    """A recording whose robots are numbered across all recordings."""
 
-    Attributes:
-        name: Of the file, without its ending.
-        bag: What it was imported to.
-        swarm: As the importer describes it.
-        data: All exchanges whose poses are known.
-        clear: Those of them with nobody in between.
-    """
-
-    name: str
-    bag: Path
-    swarm: Swarm
-    data: BoardReadings
-    clear: BoardReadings
+    name: str  # Of the file, without its ending
+    bag: Path  # What it was imported to
+    swarm: Swarm  # As the importer describes it
+    data: BoardReadings  # All exchanges whose poses are known
+    clear: BoardReadings  # Those of them with nobody in between
 
 
 def read_folder(folder: Path, names: list[str], work: Path) -> list[Recorded]:

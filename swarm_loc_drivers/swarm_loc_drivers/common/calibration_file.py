@@ -21,25 +21,15 @@ class CalibrationFileError(UserError):
 
 @dataclass(frozen=True)
 class CameraCalibration:
-    """Calibration of a camera: the content of sensor_msgs/CameraInfo.
+    """Calibration of a camera: the content of sensor_msgs/CameraInfo."""
 
-    Attributes:
-        width: Columns of the image [px].
-        height: Rows [px].
-        model: Distortion model.
-        distortion: Coefficients of the distortion model.
-        matrix: K (9,) row-major [px].
-        rectification: R (9,) row-major.
-        projection: P (12,) row-major [px].
-    """
-
-    width: int
-    height: int
-    model: str
-    distortion: tuple[float, ...]
-    matrix: tuple[float, ...]
-    rectification: tuple[float, ...]
-    projection: tuple[float, ...]
+    width: int  # Columns of the image [px]
+    height: int  # Rows [px]
+    model: str  # Distortion model
+    distortion: tuple[float, ...]  # Coefficients of the distortion model
+    matrix: tuple[float, ...]  # K (9,) row-major [px]
+    rectification: tuple[float, ...]  # R (9,) row-major
+    projection: tuple[float, ...]  # P (12,) row-major [px]
 
 
 def load_calibration(path: Path, width: int, height: int) -> CameraCalibration:

@@ -40,17 +40,11 @@ class Link(Protocol):
 
 @dataclass(frozen=True)
 class Address:
-    """Where a robot answers.
+    """Where a robot answers."""
 
-    Attributes:
-        device: Serial port; "" for TCP.
-        host: Name or number of a computer; "" for a serial port.
-        port: TCP port.
-    """
-
-    device: str = ""
-    host: str = ""
-    port: int = 0
+    device: str = ""  # Serial port; "" for TCP
+    host: str = ""  # Name or number of a computer; "" for a serial port
+    port: int = 0  # TCP port
 
     def __str__(self) -> str:
         host = f"[{self.host}]" if ":" in self.host else self.host

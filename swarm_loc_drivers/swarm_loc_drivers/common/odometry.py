@@ -12,21 +12,13 @@ from swarm_loc_estimator.common.arrays import FloatArray
 
 @dataclass(frozen=True)
 class OdometryState:
-    """Odometry at an instant.
+    """Odometry at an instant."""
 
-    Attributes:
-        stamp_ns: Acquisition [ns].
-        pose: (3,) x [m], y [m], theta [rad] of base_link in odom.
-        covariance: (3, 3) of the pose.
-        twist: (3,) forward [m/s], to the left [m/s], turn rate [rad/s] since the state before.
-        twist_covariance: (3, 3).
-    """
-
-    stamp_ns: int
-    pose: FloatArray
-    covariance: FloatArray
-    twist: FloatArray
-    twist_covariance: FloatArray
+    stamp_ns: int  # Acquisition [ns]
+    pose: FloatArray  # (3,) x [m], y [m], theta [rad] of base_link in odom
+    covariance: FloatArray  # (3, 3) of the pose
+    twist: FloatArray  # (3,) forward [m/s], to the left [m/s], turn rate [rad/s] since the state before
+    twist_covariance: FloatArray  # (3, 3)
 
 
 def carried_on(covariance: FloatArray, dx: float, dy: float) -> FloatArray:
@@ -36,22 +28,16 @@ def carried_on(covariance: FloatArray, dx: float, dy: float) -> FloatArray:
     return carried
 
 
-_STEP_VARIANCE = 1.0 / 12.0
-"""Variance of the truncation error of a counter [steps^2]."""
+_STEP_VARIANCE = 1.0 / 12.0  # Variance of the truncation error of a counter [steps^2]
 _FORWARD_TURN = np.ix_((0, 2), (0, 2))
 
 
 @dataclass(frozen=True)
 class WheelGeometry:
-    """The two driven wheels of a robot.
+    """The two driven wheels of a robot."""
 
-    Attributes:
-        metres_per_step: Path of a wheel per step of its counter [m].
-        wheel_separation: [m].
-    """
-
-    metres_per_step: float
-    wheel_separation: float
+    metres_per_step: float  # Path of a wheel per step of its counter [m]
+    wheel_separation: float  # [m]
 
     def commands_for(
         self, speed: float, turn_rate: float, limit: float, period_s: float = 1.0

@@ -16,8 +16,7 @@ from swarm_loc_drivers.common.session import Session, SessionError
 _MIN_PAUSE_S, _MAX_PAUSE_S = 0.1, 2.0
 NO_CLOCK = "waiting for simulated time: nothing on /clock yet"
 """Why a driver has not tried to connect yet: a simulated robot has its link when time begins."""
-MAX_STOP_S = 3.0
-"""How long the driver tries to stop a robot that may be moving before it gives up."""
+MAX_STOP_S = 3.0  # How long the driver tries to stop a robot that may be moving before it gives up
 
 
 SomeSession = TypeVar("SomeSession", bound=Session)

@@ -25,8 +25,7 @@ from swarm_loc_estimator.common.messages.poses import PLANE
 ODOMETRY_QOS = QoSProfile(depth=10)
 _TF_QOS = QoSProfile(depth=100)
 
-_FIXED_VARIANCE = 1e-9
-"""Variance of z, roll and pitch, and least variance of all other components."""
+_FIXED_VARIANCE = 1e-9  # Variance of z, roll and pitch, and least variance of all other components
 
 
 def stamp_message(stamp_ns: int) -> TimeMessage:

@@ -8,12 +8,10 @@ from collections import Counter
 from collections.abc import Generator
 from typing import Protocol, TypeVar
 
-_MAX_RECEIVED = 1 << 16
-"""Bytes kept while an answer is awaited: a camera may still be streaming."""
+_MAX_RECEIVED = 1 << 16  # Bytes kept while an answer is awaited: a camera may still be streaming
 
 Result = TypeVar("Result")
-Talk = Generator[None, None, Result]
-"""Part of a conversation; it continues at every step."""
+Talk = Generator[None, None, Result]  # Part of a conversation; it continues at every step
 
 
 class SessionError(Exception):
@@ -21,17 +19,11 @@ class SessionError(Exception):
 
 
 class Session(Protocol):
-    """A conversation with one robot.
+    """A conversation with one robot."""
 
-    Attributes:
-        ending: Set it to stop the robot and end the conversation.
-        connected: Whether the robot has answered.
-        ended: Whether the conversation has ended; the robot stands.
-    """
-
-    ending: bool
-    connected: bool
-    ended: bool
+    ending: bool  # Set it to stop the robot and end the conversation
+    connected: bool  # Whether the robot has answered
+    ended: bool  # Whether the conversation has ended; the robot stands
 
 
 class TalkSession(ABC):

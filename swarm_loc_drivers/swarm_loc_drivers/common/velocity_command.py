@@ -9,11 +9,9 @@ from collections.abc import Callable
 STANDING_CLOCK_S = 1.0
 """A clock that stands still for so long of real time counts as dead, and the robot stops [s]."""
 
-MAX_VELOCITY = 1e3
-"""[m/s] and [rad/s]; larger velocities are dropped as errors."""
+MAX_VELOCITY = 1e3  # [m/s] and [rad/s]; larger velocities are dropped as errors
 
-Velocity = tuple[float, float, float]
-"""Forward [m/s], to the left [m/s], turning to the left [rad/s]."""
+Velocity = tuple[float, float, float]  # Forward [m/s], to the left [m/s], turning to the left [rad/s]
 STILL: Velocity = (0.0, 0.0, 0.0)
 
 

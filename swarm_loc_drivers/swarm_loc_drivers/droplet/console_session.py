@@ -20,14 +20,11 @@ from swarm_loc_drivers.droplet.hardware import HANDLING_NS, message_ns
 from swarm_loc_drivers.droplet.protocol import Echo, Said
 
 Result = TypeVar("Result")
-Talk = Generator[int, None, Result]
-"""Yields the time [ns] at which to continue at the latest."""
+Talk = Generator[int, None, Result]  # Yields the time [ns] at which to continue at the latest
 
-MARGIN_NS = 15_000_000
-"""Tolerance for the robot's clock, which counts milliseconds [ns]."""
+MARGIN_NS = 15_000_000  # Tolerance for the robot's clock, which counts milliseconds [ns]
 _TRIES = 8
-_ERASED_AT_ONCE = 7
-"""Each deleted character is answered by three; more at once would be lost."""
+_ERASED_AT_ONCE = 7  # Each deleted character is answered by three; more at once would be lost
 
 _COUNTED = {
     protocol.Broken: "broken_matrices",

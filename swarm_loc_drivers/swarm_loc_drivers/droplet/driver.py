@@ -16,22 +16,17 @@ from swarm_loc_drivers.droplet.odometry import CommandedMotion
 from swarm_loc_drivers.droplet.parameters import DropletParameters
 from swarm_loc_drivers.droplet.session import DropletMover, DropletSession
 
-OWN = ""
-"""Name of the robot at the cable."""
-_READ_S, _STOP_READ_S = 0.05, 0.01
-"""Longest wait for bytes in a step, and while robots are stopped [s]."""
+OWN = ""  # Name of the robot at the cable
+_READ_S, _STOP_READ_S = 0.05, 0.01  # Longest wait for bytes in a step, and while robots are stopped [s]
 
 
 @dataclass(frozen=True)
 class DropletListeners:
-    """Receivers of the robots' data, called in the driver's thread.
+    """Receivers of the robots' data, called in the driver's thread."""
 
-    Attributes:
-        odometry: Receives names, `OWN` for the robot at the cable, and states.
-        brightness: Receives the id of the robot at the cable and its matrices.
-    """
-
+    # Receives names, `OWN` for the robot at the cable, and states
     odometry: Callable[[str, OdometryState], None]
+    # Receives the id of the robot at the cable and its matrices
     brightness: Callable[[int, Brightness], None]
 
 

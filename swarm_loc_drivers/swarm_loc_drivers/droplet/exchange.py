@@ -26,10 +26,8 @@ from swarm_loc_drivers.droplet.protocol import Matrix, Said, SendAborted
 
 _BRIGHTER = 1.5
 """Least ratio of the sums of the far and the near matrix of a pair, at any distance up to 30 cm."""
-_PATIENCE_NS = 100_000_000
-"""Tolerance for the arrival of a matrix [ns]."""
-_MAX_SKIPPED = 32
-"""Most turns after which an unreachable robot is asked again."""
+_PATIENCE_NS = 100_000_000  # Tolerance for the arrival of a matrix [ns]
+_MAX_SKIPPED = 32  # Most turns after which an unreachable robot is asked again
 _MAX_BACKOFF_S = 0.3
 
 
@@ -42,19 +40,12 @@ class Power(IntEnum):
 
 @dataclass(frozen=True)
 class Brightness:
-    """Readings of one robot's sensors for another robot's emitters.
+    """Readings of one robot's sensors for another robot's emitters."""
 
-    Attributes:
-        stamp_ns: Middle of the exchange [ns]; of both powers, where both were measured.
-        transmitter: Id of the robot that emitted.
-        power: Power of the emitters.
-        readings: (n, n) [count], sensors by emitters.
-    """
-
-    stamp_ns: int
-    transmitter: int
-    power: Power
-    readings: NDArray[np.int64]
+    stamp_ns: int  # Middle of the exchange [ns]; of both powers, where both were measured
+    transmitter: int  # Id of the robot that emitted
+    power: Power  # Power of the emitters
+    readings: NDArray[np.int64]  # (n, n) [count], sensors by emitters
 
 
 Publish = Callable[[Brightness], None]
@@ -62,21 +53,13 @@ Publish = Callable[[Brightness], None]
 
 @dataclass(frozen=True)
 class PollingSettings:
-    """Settings of polled exchanges.
+    """Settings of polled exchanges."""
 
-    Attributes:
-        partners: Ids of the robots to ask, in turn.
-        period_s: Time between the beginnings of two exchanges [s]; 0: only on request.
-        retries: Number of repeated requests.
-        powers: Powers for FAR and NEAR; with one of them the power is not changed.
-        least_brightness: A far matrix without a brighter reading shows no robot [count].
-    """
-
-    partners: tuple[int, ...]
-    period_s: float
-    retries: int
-    powers: tuple[int, ...]
-    least_brightness: int
+    partners: tuple[int, ...]  # Ids of the robots to ask, in turn
+    period_s: float  # Time between the beginnings of two exchanges [s]; 0: only on request
+    retries: int  # Number of repeated requests
+    powers: tuple[int, ...]  # Powers for FAR and NEAR; with one of them the power is not changed
+    least_brightness: int  # A far matrix without a brighter reading shows no robot [count]
 
 
 class MatrixValidator:

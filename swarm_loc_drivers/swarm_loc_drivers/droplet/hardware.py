@@ -10,12 +10,10 @@ from typing import NamedTuple
 BAUD_RATE = 115_200
 ELEMENTS = 6
 RADIUS_M = 0.022
-FULL_POWER = 256
-"""Power of the infrared emitters; 0 is off."""
+FULL_POWER = 256  # Power of the infrared emitters; 0 is off
 
 TURN_CLOCKWISE, TURN_COUNTERCLOCKWISE = 6, 7
-WALKS = range(6)
-"""Direction d walks towards d times 60 degrees clockwise from the front."""
+WALKS = range(6)  # Direction d walks towards d times 60 degrees clockwise from the front
 DIRECTIONS = range(8)
 
 _TICK_S = 1.024e-3
@@ -28,15 +26,10 @@ _UNCALIBRATED_WALK_MM, _UNCALIBRATED_TURN_DEG = 600, 2000
 
 @dataclass(frozen=True)
 class DropletModel:
-    """Type of a Droplet.
+    """Type of a Droplet."""
 
-    Attributes:
-        name: Name in parameters.
-        directions: Directions in which it can move.
-    """
-
-    name: str
-    directions: tuple[int, ...]
+    name: str  # Name in parameters
+    directions: tuple[int, ...]  # Directions in which it can move
 
 
 DROPLET = DropletModel("droplet", tuple(DIRECTIONS))
@@ -46,19 +39,12 @@ DROPLET_MODELS = {model.name: model for model in (DROPLET, AUDIO_DROPLET)}
 
 
 class Gait(NamedTuple):
-    """Motion of one step in a direction.
+    """Motion of one step in a direction."""
 
-    Attributes:
-        step_s: Duration [s].
-        forward: Path ahead [m].
-        left: Path to the left [m].
-        turn: Turn to the left [rad].
-    """
-
-    step_s: float
-    forward: float
-    left: float
-    turn: float
+    step_s: float  # Duration [s]
+    forward: float  # Path ahead [m]
+    left: float  # Path to the left [m]
+    turn: float  # Turn to the left [rad]
 
     @property
     def velocity(self) -> tuple[float, float, float]:
@@ -89,27 +75,19 @@ def gait(direction: int, trims: Sequence[int], per_kilostep: int) -> Gait | None
 
 
 _MS = 1_000_000
-_BYTE_NS = 2_500_000
-"""From a comment in the firmware; ten bits at 3200 baud would be 3.1 ms."""
-_HEADER = 7
-"""Sender, checksum, length and flags, target."""
-MAX_MESSAGE = 40
-"""Longest message; receivers reject a longer one [bytes]."""
+_BYTE_NS = 2_500_000  # From a comment in the firmware; ten bits at 3200 baud would be 3.1 ms
+_HEADER = 7  # Sender, checksum, length and flags, target
+MAX_MESSAGE = 40  # Longest message; receivers reject a longer one [bytes]
 
-HANDLING_NS = 5 * _MS
-"""From the last byte of a command until its execution."""
-SET_POWER_DELAY_NS = 10 * _MS
-"""From the command to change the power until it has changed."""
-EMIT_DELAY_NS = 5 * _MS
-"""From the command to emit until the call."""
+HANDLING_NS = 5 * _MS  # From the last byte of a command until its execution
+SET_POWER_DELAY_NS = 10 * _MS  # From the command to change the power until it has changed
+EMIT_DELAY_NS = 5 * _MS  # From the command to emit until the call
 CALL_NS = (_HEADER + 1) * _BYTE_NS
-LEAD_NS = 32 * _MS
-"""From the beginning of the call to the first flash."""
+LEAD_NS = 32 * _MS  # From the beginning of the call to the first flash
 FLASH_NS, GAP_NS = 16 * _MS, 10 * _MS
 EXCHANGE_NS = LEAD_NS + ELEMENTS * (FLASH_NS + GAP_NS)
 """From the beginning of the call until all robots listen again."""
-PRINT_DELAY_NS = 10 * _MS
-"""From the end of the exchange until the matrix is printed."""
+PRINT_DELAY_NS = 10 * _MS  # From the end of the exchange until the matrix is printed
 
 
 def message_ns(length: int) -> int:

@@ -22,17 +22,11 @@ _ALL_OR_NONE = 1.0 / 3.0
 
 @dataclass(frozen=True)
 class MotionNoise:
-    """Noise of commanded motion.
+    """Noise of commanded motion."""
 
-    Attributes:
-        walk_noise: Variance along and across of a walk per metre [m^2/m].
-        veer_noise: Variance of the heading per metre walked [rad^2/m].
-        turn_noise: Variance of a turn per radian [rad^2/rad].
-    """
-
-    walk_noise: float
-    veer_noise: float
-    turn_noise: float
+    walk_noise: float  # Variance along and across of a walk per metre [m^2/m]
+    veer_noise: float  # Variance of the heading per metre walked [rad^2/m]
+    turn_noise: float  # Variance of a turn per radian [rad^2/rad]
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,8 @@ ERASE = b"\b"
 """Deletes the last character of the line; the console answers `\\b \\b` even for an empty line."""
 BACKSPACES_PER_ERASE = 2
 
-MAX_LINE = 63
-"""The line buffer has 64 characters, including the terminator."""
-MAX_TARGETED_LINE = 31
-"""A command for another robot is copied to a buffer of 32 characters without a check."""
+MAX_LINE = 63  # The line buffer has 64 characters, including the terminator
+MAX_TARGETED_LINE = 31  # A command for another robot is copied to a buffer of 32 characters without a check
 MAX_STEPS = 0xFFFF
 
 GET_ID = "get_id"
@@ -122,17 +120,11 @@ class RangeBearing(NamedTuple):
 
 
 class Matrix(NamedTuple):
-    """A brightness matrix.
+    """A brightness matrix."""
 
-    Attributes:
-        emitter: Id of the emitting robot; None if the format lacks it.
-        receiver: Id of the measuring robot; None if the format lacks it.
-        brightness: One row per emitter, one count per sensor.
-    """
-
-    emitter: int | None
-    receiver: int | None
-    brightness: tuple[tuple[int, ...], ...]
+    emitter: int | None  # Id of the emitting robot; None if the format lacks it
+    receiver: int | None  # Id of the measuring robot; None if the format lacks it
+    brightness: tuple[tuple[int, ...], ...]  # One row per emitter, one count per sensor
 
 
 class SilentSensor(NamedTuple):
@@ -196,15 +188,10 @@ Event = (
 
 
 class Said(NamedTuple):
-    """A line that the console has printed.
+    """A line that the console has printed."""
 
-    Attributes:
-        stamp_ns: Arrival of its first character [ns].
-        event: Its meaning.
-    """
-
-    stamp_ns: int
-    event: Event
+    stamp_ns: int  # Arrival of its first character [ns]
+    event: Event  # Its meaning
 
 
 _COMMANDS = (

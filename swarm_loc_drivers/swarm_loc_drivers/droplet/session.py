@@ -18,25 +18,17 @@ from swarm_loc_drivers.droplet.protocol import Identity, MotorTrims, MoveStarted
 from swarm_loc_drivers.droplet.tdma import TdmaExchange, TdmaSettings
 
 _TRIES = 3
-_IDLE_NS = 20_000_000
-"""Period of checks for new work while the console is silent [ns]."""
+_IDLE_NS = 20_000_000  # Period of checks for new work while the console is silent [ns]
 
 
 @dataclass(frozen=True)
 class SessionSettings:
-    """Settings of a session.
+    """Settings of a session."""
 
-    Attributes:
-        model: Type of the robot.
-        elements: Number of emitters and of sensors of all robots.
-        reply_timeout_s: Timeout of an echo or an answer [s].
-        exchanges: Method of measuring brightness.
-    """
-
-    model: DropletModel
-    elements: int
-    reply_timeout_s: float
-    exchanges: PollingSettings | TdmaSettings
+    model: DropletModel  # Type of the robot
+    elements: int  # Number of emitters and of sensors of all robots
+    reply_timeout_s: float  # Timeout of an echo or an answer [s]
+    exchanges: PollingSettings | TdmaSettings  # Method of measuring brightness
 
 
 class DropletSession:
@@ -182,8 +174,7 @@ class DropletSession:
             self._mover.motion.begin(self._console.now_ns, self._gaits[started.direction], started.steps)
 
 
-Gaits = Mapping[int, Gait]
-"""Gaits of the directions in which a robot can move."""
+Gaits = Mapping[int, Gait]  # Gaits of the directions in which a robot can move
 
 _STAND = None
 

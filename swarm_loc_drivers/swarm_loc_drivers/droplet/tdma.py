@@ -28,33 +28,21 @@ from swarm_loc_drivers.droplet.hardware import (
 )
 from swarm_loc_drivers.droplet.protocol import Matrix, Said
 
-_LATEST = 0.5
-"""Share of a half after which no emission begins, since it might end in the next half."""
-_LATE_START_NS = 60_000_000
-"""Usual delay of an emission after the beginning of its half [ns]."""
-_LATE_NS = 500_000_000
-"""Longest delay of a matrix after its turn [ns]."""
-MIN_TURN_S = 4.0 * EMITTED_AFTER_NS * 1e-9
-"""Shortest turn: an emission must fit into half of its half [s]."""
+_LATEST = 0.5  # Share of a half after which no emission begins, since it might end in the next half
+_LATE_START_NS = 60_000_000  # Usual delay of an emission after the beginning of its half [ns]
+_LATE_NS = 500_000_000  # Longest delay of a matrix after its turn [ns]
+MIN_TURN_S = 4.0 * EMITTED_AFTER_NS * 1e-9  # Shortest turn: an emission must fit into half of its half [s]
 
 
 @dataclass(frozen=True)
 class TdmaSettings:
-    """Settings of time-division exchanges.
+    """Settings of time-division exchanges."""
 
-    Attributes:
-        turn: Turn of this robot, from 0.
-        turns: Number of turns.
-        turn_s: Duration of a turn [s].
-        powers: Powers for FAR and NEAR; with one of them only the second half is used.
-        known: Ids that may emit; empty: any.
-    """
-
-    turn: int
-    turns: int
-    turn_s: float
-    powers: tuple[int, ...]
-    known: tuple[int, ...]
+    turn: int  # Turn of this robot, from 0
+    turns: int  # Number of turns
+    turn_s: float  # Duration of a turn [s]
+    powers: tuple[int, ...]  # Powers for FAR and NEAR; with one of them only the second half is used
+    known: tuple[int, ...]  # Ids that may emit; empty: any
 
 
 class TdmaExchange:

@@ -27,17 +27,11 @@ _READ_S = 0.02
 
 @dataclass(frozen=True)
 class EpuckListeners:
-    """Receivers of the robot's data, called in the driver's thread.
+    """Receivers of the robot's data, called in the driver's thread."""
 
-    Attributes:
-        odometry: Receives every new state.
-        proximity: Receives stamps [ns] and raw values (8,).
-        image: Receives images.
-    """
-
-    odometry: Callable[[OdometryState], None]
-    proximity: Callable[[int, NDArray[np.int64]], None]
-    image: Callable[[CameraImage], None]
+    odometry: Callable[[OdometryState], None]  # Receives every new state
+    proximity: Callable[[int, NDArray[np.int64]], None]  # Receives stamps [ns] and raw values (8,)
+    image: Callable[[CameraImage], None]  # Receives images
 
 
 class EpuckDriver(RobotDriver[EpuckSession]):

@@ -11,18 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 from swarm_loc_drivers.common.odometry import WheelGeometry
 from swarm_loc_estimator.common.arrays import FloatArray
 
-STEPS_PER_TURN = 1000
-"""20 steps of the motor, gear 50:1."""
+STEPS_PER_TURN = 1000  # 20 steps of the motor, gear 50:1
 
 PROXIMITY_BEARINGS = tuple(math.radians(-d) for d in (17.0, 46.0, 90.0, 151.0, -151.0, -90.0, -46.0, -17.0))
 """Directions of ps0..ps7 in base_link [rad], positive to the left; the robot numbers them clockwise."""
 
-PROXIMITY_RADIUS_M = 0.035
-"""Distance of the proximity sensors from the centre of the robot."""
+PROXIMITY_RADIUS_M = 0.035  # Distance of the proximity sensors from the centre of the robot
 
 _COUNTER_SPAN = 1 << 16
-_AROUND_IMAGE = 11
-"""Two speeds before an image, its header of 3 bytes, and two speeds after it."""
+_AROUND_IMAGE = 11  # Two speeds before an image, its header of 3 bytes, and two speeds after it
 
 
 @dataclass(frozen=True)
@@ -31,21 +28,14 @@ class EpuckModel:
 
     A timer of `timer_hz` makes a step every whole number of its ticks, so few rates are possible at high
     speeds: an e-puck makes 625 steps/s on a command of 600.
-
-    Attributes:
-        name: Name in parameters.
-        max_command: Largest command; larger ones are clamped silently [steps/s].
-        timer_hz: Frequency of the timer [1/s].
-        answer_buffer: Largest answer in the serial protocol; a longer one overruns the memory [bytes].
-        largest_setting: Largest image that the firmware accepts as a setting [bytes of pixels].
-        zooms: Zooms of the camera; the firmware silently replaces another one by the last of these.
     """
 
-    name: str
-    max_command: int
-    timer_hz: int
-    answer_buffer: int
-    largest_setting: int
+    name: str  # Name in parameters
+    max_command: int  # Largest command; larger ones are clamped silently [steps/s]
+    timer_hz: int  # Frequency of the timer [1/s]
+    answer_buffer: int  # Largest answer in the serial protocol; a longer one overruns the memory [bytes]
+    largest_setting: int  # Largest image that the firmware accepts as a setting [bytes of pixels]
+    # Zooms of the camera; the firmware silently replaces another one by the last of these
     zooms: tuple[int, ...]
 
     @property
@@ -117,8 +107,7 @@ _RAW = np.array([4095.0, 2133.33, 1465.73, 601.46, 383.84, 234.93, 158.03, 120.0
 
 MIN_RANGE_M = 0.005
 MAX_RANGE_M = 0.06
-FIELD_OF_VIEW = 0.26
-"""Opening of a sensor's cone [rad]."""
+FIELD_OF_VIEW = 0.26  # Opening of a sensor's cone [rad]
 
 
 def raw_of_distance(distance_m: ArrayLike) -> FloatArray:

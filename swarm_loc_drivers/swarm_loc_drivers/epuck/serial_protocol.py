@@ -47,32 +47,20 @@ def code(letter: str) -> int:
 
 
 class Readings(NamedTuple):
-    """Periodic readings.
+    """Periodic readings."""
 
-    Attributes:
-        left_counter: Steps of the left wheel, 16 bits, wrapping.
-        right_counter: Steps of the right wheel, 16 bits, wrapping.
-        proximity: Raw values of ps0..ps7.
-    """
-
-    left_counter: int
-    right_counter: int
-    proximity: tuple[int, ...]
+    left_counter: int  # Steps of the left wheel, 16 bits, wrapping
+    right_counter: int  # Steps of the right wheel, 16 bits, wrapping
+    proximity: tuple[int, ...]  # Raw values of ps0..ps7
 
 
 @dataclass(frozen=True)
 class Request:
-    """A chain of binary commands and the frame of its reply.
+    """A chain of binary commands and the frame of its reply."""
 
-    Attributes:
-        data: The bytes to send.
-        mark: Bytes at the beginning and the end of the reply.
-        size: Number of bytes between the marks.
-    """
-
-    data: bytes
-    mark: bytes
-    size: int
+    data: bytes  # The bytes to send
+    mark: bytes  # Bytes at the beginning and the end of the reply
+    size: int  # Number of bytes between the marks
 
 
 def readings_request(left: int, right: int, *, is_new: bool) -> Request:

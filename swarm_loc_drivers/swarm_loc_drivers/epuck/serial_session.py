@@ -14,8 +14,7 @@ from swarm_loc_drivers.epuck.hardware import decode_rgb565
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, Reading, Speeds
 
-_MAX_MISSED = 5
-"""Missed replies in a row after which the link is reopened."""
+_MAX_MISSED = 5  # Missed replies in a row after which the link is reopened
 _NS = 1_000_000_000
 
 

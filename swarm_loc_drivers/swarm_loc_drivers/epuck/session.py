@@ -18,63 +18,38 @@ Speeds = Callable[[], tuple[int, int]]
 
 @dataclass(frozen=True)
 class CameraSettings:
-    """Images to request.
+    """Images to request."""
 
-    Attributes:
-        width: [px].
-        height: [px].
-        zoom: Camera pixels per pixel.
-        period_s: Between two images over a serial port [s].
-    """
-
-    width: int
-    height: int
-    zoom: int
-    period_s: float
+    width: int  # [px]
+    height: int  # [px]
+    zoom: int  # Camera pixels per pixel
+    period_s: float  # Between two images over a serial port [s]
 
 
 @dataclass(frozen=True)
 class Reading:
-    """Sensor values.
+    """Sensor values."""
 
-    Attributes:
-        stamp_ns: Acquisition [ns].
-        doubt_ns: Uncertainty of the stamp in both directions [ns].
-        left_counter: Steps of the left wheel, 16 bits, wrapping.
-        right_counter: Steps of the right wheel, 16 bits, wrapping.
-        proximity: (8,) raw values of ps0..ps7.
-    """
-
-    stamp_ns: int
-    doubt_ns: int
-    left_counter: int
-    right_counter: int
-    proximity: NDArray[np.int64]
+    stamp_ns: int  # Acquisition [ns]
+    doubt_ns: int  # Uncertainty of the stamp in both directions [ns]
+    left_counter: int  # Steps of the left wheel, 16 bits, wrapping
+    right_counter: int  # Steps of the right wheel, 16 bits, wrapping
+    proximity: NDArray[np.int64]  # (8,) raw values of ps0..ps7
 
 
 @dataclass(frozen=True)
 class CameraImage:
-    """An image of the robot's camera.
+    """An image of the robot's camera."""
 
-    Attributes:
-        stamp_ns: Best estimate of the exposure time [ns].
-        pixels: (height, width, 3) RGB.
-    """
-
-    stamp_ns: int
-    pixels: Image
+    stamp_ns: int  # Best estimate of the exposure time [ns]
+    pixels: Image  # (height, width, 3) RGB
 
 
 class EpuckSession(Session, Protocol):
-    """A conversation with one e-puck.
+    """A conversation with one e-puck."""
 
-    Attributes:
-        found: Measurements; the reader empties the list.
-        is_idle: Whether no answer is pending: the next step sends a request.
-    """
-
-    found: list[Reading | CameraImage]
-    is_idle: bool
+    found: list[Reading | CameraImage]  # Measurements; the reader empties the list
+    is_idle: bool  # Whether no answer is pending: the next step sends a request
 
     def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
         """Go on; what to send.

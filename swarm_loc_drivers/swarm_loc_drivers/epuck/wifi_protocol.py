@@ -59,19 +59,12 @@ _BAD, _UNDECIDED = 0, -1
 
 @dataclass(frozen=True)
 class Command:
-    """A command; LEDs and sound stay off.
+    """A command; LEDs and sound stay off."""
 
-    Attributes:
-        left: Speed of the left wheel [steps/s].
-        right: Speed of the right wheel [steps/s].
-        camera: Whether images are to be streamed.
-        sensors: Whether sensor values are to be streamed.
-    """
-
-    left: int
-    right: int
-    camera: bool
-    sensors: bool
+    left: int  # Speed of the left wheel [steps/s]
+    right: int  # Speed of the right wheel [steps/s]
+    camera: bool  # Whether images are to be streamed
+    sensors: bool  # Whether sensor values are to be streamed
 
     def encode(self) -> bytes:
         """Encode as 21 bytes."""
@@ -81,17 +74,11 @@ class Command:
 
 @dataclass(frozen=True)
 class Message:
-    """One message of the robot.
+    """One message of the robot."""
 
-    Attributes:
-        id: IMAGE_ID, SENSORS_ID or NOTHING_ID.
-        payload: Pixels (RGB565), sensor values (SENSORS_DTYPE), or nothing.
-        stamp_ns: Arrival of its first byte [ns].
-    """
-
-    id: int
-    payload: bytes
-    stamp_ns: int
+    id: int  # IMAGE_ID, SENSORS_ID or NOTHING_ID
+    payload: bytes  # Pixels (RGB565), sensor values (SENSORS_DTYPE), or nothing
+    stamp_ns: int  # Arrival of its first byte [ns]
 
     @property
     def sensors(self) -> np.void:

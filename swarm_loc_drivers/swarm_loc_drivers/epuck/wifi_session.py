@@ -15,10 +15,8 @@ from swarm_loc_drivers.epuck.hardware import decode_rgb565
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.session import CameraImage, Reading, Speeds
 
-_REPEAT_S = 0.1
-"""A command is repeated after so long, since the robot may have dropped it [s]."""
-_JITTER_NS = 50_000_000
-"""Allowed jitter of the time between two messages [ns]."""
+_REPEAT_S = 0.1  # A command is repeated after so long, since the robot may have dropped it [s]
+_JITTER_NS = 50_000_000  # Allowed jitter of the time between two messages [ns]
 _FIRMWARE_PAUSE_S = 1.5
 """The firmware pauses for 1 s after an error between its two chips. It never closes a connection and supports
 few of them, so a pause must not lead to a reconnection."""

@@ -6,12 +6,9 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import IntArray
 
-_WINDOW_NS = 2_000_000_000
-"""Window of the smallest delay; the clocks drift by less than 0.1 ms within it."""
-_MAX_AHEAD_US = 250_000
-"""Longest time that one of the board's 4092 buffered events waits [us]."""
-_LEAK = 1e-4
-"""Share by which periods are shortened, so that a late estimate recovers."""
+_WINDOW_NS = 2_000_000_000  # Window of the smallest delay; the clocks drift by less than 0.1 ms within it
+_MAX_AHEAD_US = 250_000  # Longest time that one of the board's 4092 buffered events waits [us]
+_LEAK = 1e-4  # Share by which periods are shortened, so that a late estimate recovers
 _US = 1000
 
 

@@ -17,21 +17,15 @@ from swarm_loc_drivers.pushbot.parameters import PushbotParameters
 from swarm_loc_drivers.pushbot.session import NO_STOP, PushbotSession
 
 _READ_S = 0.02
-_BATCH_S = 0.002
-"""Shortest time between two reads [s]; each read has a fixed cost."""
+_BATCH_S = 0.002  # Shortest time between two reads [s]; each read has a fixed cost
 
 
 @dataclass(frozen=True)
 class PushbotListeners:
-    """Receivers of the robot's data, called in the driver's thread.
+    """Receivers of the robot's data, called in the driver's thread."""
 
-    Attributes:
-        odometry: Receives every new state.
-        events: Receives packets of events.
-    """
-
-    odometry: Callable[[OdometryState], None]
-    events: Callable[[EventPacket], None]
+    odometry: Callable[[OdometryState], None]  # Receives every new state
+    events: Callable[[EventPacket], None]  # Receives packets of events
 
 
 class PushbotDriver(RobotDriver[PushbotSession]):

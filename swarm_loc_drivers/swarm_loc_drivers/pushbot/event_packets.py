@@ -10,27 +10,18 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import BoolArray, IntArray
 from swarm_loc_estimator.common.messages.event_encoding import Events, encode_events
 
-MAX_EVENTS = 1 << 16
-"""Most events of a packet."""
+MAX_EVENTS = 1 << 16  # Most events of a packet
 
 
 @dataclass(frozen=True)
 class EventPacket:
-    """A packet of events.
+    """A packet of events."""
 
-    Attributes:
-        stamp_ns: Time of the first event [ns].
-        board_ns: The same by the board's own clock [ns].
-        number: Number of the packet on this link.
-        data: The events, encoded.
-        count: Number of events.
-    """
-
-    stamp_ns: int
-    board_ns: int
-    number: int
-    data: bytes
-    count: int
+    stamp_ns: int  # Time of the first event [ns]
+    board_ns: int  # The same by the board's own clock [ns]
+    number: int  # Number of the packet on this link
+    data: bytes  # The events, encoded
+    count: int  # Number of events
 
 
 class EventPackets:

@@ -18,12 +18,9 @@ from swarm_loc_drivers.pushbot.hardware import TIMESTAMPS
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.jit import cached_njit, note_precompiled
 
-CONFIRMATIONS = 8
-"""Consecutive events that confirm a jump of time."""
-MAX_LINE = 256
-"""Longer lines are dropped."""
-_MAX_HELD = 1024
-"""Most bytes that wait for the confirmation of a jump; then it is accepted."""
+CONFIRMATIONS = 8  # Consecutive events that confirm a jump of time
+MAX_LINE = 256  # Longer lines are dropped
+_MAX_HELD = 1024  # Most bytes that wait for the confirmation of a jump; then it is accepted
 _MAX_GAP_US = 250_000
 _MAX_SHORT_GAP_US = 16_384
 """A longer silence of the camera counts as a jump of time; the second value is for 16-bit timestamps."""
@@ -34,21 +31,14 @@ _TIME, _RAW, _STARTED = range(3)
 
 
 class Parsed(NamedTuple):
-    """Content of a piece of bytes.
+    """Content of a piece of bytes."""
 
-    Attributes:
-        x: (N,) columns of events [px].
-        y: (N,) rows of events [px].
-        polarity: (N,) the polarity bit as sent, 0 or 1.
-        time_us: (N,) the board's clock, unwrapped, from an arbitrary instant on [us]; zeros without one.
-        lines: Lines without their end, each with the number of events before it.
-    """
-
-    x: NDArray[np.uint8]
-    y: NDArray[np.uint8]
-    polarity: NDArray[np.uint8]
+    x: NDArray[np.uint8]  # (N,) columns of events [px]
+    y: NDArray[np.uint8]  # (N,) rows of events [px]
+    polarity: NDArray[np.uint8]  # (N,) the polarity bit as sent, 0 or 1
+    # (N,) the board's clock, unwrapped, from an arbitrary instant on [us]; zeros without one
     time_us: IntArray
-    lines: list[tuple[int, bytes]]
+    lines: list[tuple[int, bytes]]  # Lines without their end, each with the number of events before it
 
 
 class EventParser:

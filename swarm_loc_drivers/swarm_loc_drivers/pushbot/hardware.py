@@ -10,18 +10,13 @@ from dataclasses import dataclass
 
 from swarm_loc_drivers.common.odometry import WheelGeometry
 
-SENSOR_PX = 128
-"""Rows and columns of the event camera."""
-MAX_VELOCITY = 100
-"""Largest velocity; larger ones are clamped silently [1]."""
+SENSOR_PX = 128  # Rows and columns of the event camera
+MAX_VELOCITY = 100  # Largest velocity; larger ones are clamped silently [1]
 VELOCITY_PERIOD_S = 0.021
 """A wheel at velocity v makes v ticks in this time: a counter from 20 to 0, once a millisecond."""
-MAX_TICK_RATE = MAX_VELOCITY / VELOCITY_PERIOD_S
-"""[ticks/s]."""
-TICK_SPAN = 1 << 32
-"""Wheel ticks are sent as signed integers of 32 bits."""
-BAUD_RATE = 4_000_000
-"""Baud rate after every reset [bit/s]."""
+MAX_TICK_RATE = MAX_VELOCITY / VELOCITY_PERIOD_S  # [ticks/s]
+TICK_SPAN = 1 << 32  # Wheel ticks are sent as signed integers of 32 bits
+BAUD_RATE = 4_000_000  # Baud rate after every reset [bit/s]
 
 TIMESTAMPS = {"none": 0, "delta": -1, "16bit": 2, "24bit": 3, "32bit": 4}
 """Names of the timestamps of events and their bytes; -1: difference to the last event, 1 to 4 bytes."""
@@ -29,21 +24,13 @@ TIMESTAMPS = {"none": 0, "delta": -1, "16bit": 2, "24bit": 3, "32bit": 4}
 
 @dataclass(frozen=True)
 class FirmwareGeneration:
-    """Differences between firmware generations.
+    """Differences between firmware generations."""
 
-    Attributes:
-        name: Name in messages.
-        tick_bit: Number of the sensor of the wheel ticks; identifies the generation, see `??S`.
-        formats: Names of timestamps -> digit of the command `!E`.
-        sensor_prefix: Characters before the mask of `!S+`.
-        has_decay: Whether velocities decay, so that the robot stops by itself when commands end.
-    """
-
-    name: str
-    tick_bit: int
-    formats: dict[str, int]
-    sensor_prefix: str
-    has_decay: bool
+    name: str  # Name in messages
+    tick_bit: int  # Number of the sensor of the wheel ticks; identifies the generation, see `??S`
+    formats: dict[str, int]  # Names of timestamps -> digit of the command `!E`
+    sensor_prefix: str  # Characters before the mask of `!S+`
+    has_decay: bool  # Whether velocities decay, so that the robot stops by itself when commands end
 
 
 FIRST_FIRMWARE = FirmwareGeneration(

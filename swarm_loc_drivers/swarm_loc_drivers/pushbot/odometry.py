@@ -8,10 +8,8 @@ from swarm_loc_drivers.common.odometry import DeadReckoning, OdometryState, Whee
 from swarm_loc_drivers.pushbot.hardware import MAX_TICK_RATE, tick_difference
 from swarm_loc_drivers.pushbot.session import WheelTicks
 
-_MAX_RATE = 2.0 * MAX_TICK_RATE
-"""Largest rate of a wheel, also while its controller catches up [ticks/s]."""
-_SLACK_S = 0.15
-"""Largest error of a stamp [s]."""
+_MAX_RATE = 2.0 * MAX_TICK_RATE  # Largest rate of a wheel, also while its controller catches up [ticks/s]
+_SLACK_S = 0.15  # Largest error of a stamp [s]
 _MAX_CORRECTION_S = 0.5
 """Stamps step back by at most so much when a smaller delay is found, or events arrive after ticks [s]."""
 

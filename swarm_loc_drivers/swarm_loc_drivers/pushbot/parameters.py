@@ -12,10 +12,8 @@ from swarm_loc_drivers.pushbot.stop_and_go import StopAndGoSettings
 from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text, texts
 from swarm_loc_estimator.swarm.swarm import Swarm
 
-TCP_PORT = 56000
-"""TCP port of the radio's transparent link."""
-_MIN_FREQUENCY = 10.0
-"""Lowest blink frequency that the tracker detects [Hz]; 0 is off."""
+TCP_PORT = 56000  # TCP port of the radio's transparent link
+_MIN_FREQUENCY = 10.0  # Lowest blink frequency that the tracker detects [Hz]; 0 is off
 
 
 @dataclass(frozen=True)

@@ -15,23 +15,17 @@ QUERY_FORMAT = b"?E\n"
 EVENTS_ON = b"E+\n"
 EVENTS_OFF = b"E-\n"
 MOTORS_ON = b"!M+\n"
-BRAKE = b"!M0=%0\n!M1=%0\n"
-"""Stop the wheels at once; the velocity controller forgets its remaining error."""
+BRAKE = b"!M0=%0\n!M1=%0\n"  # Stop the wheels at once; the velocity controller forgets its remaining error
 MOTORS_OFF = b"!M-\n"
 STOP_SENSORS = b"!S-\n"
 
 
 @dataclass(frozen=True)
 class Lights:
-    """Blink frequencies of a PushBot's lights [Hz]; 0 is off. Both LEDs share one timer.
+    """Blink frequencies of a PushBot's lights [Hz]; 0 is off. Both LEDs share one timer."""
 
-    Attributes:
-        laser: Laser pointer.
-        leds: LEDs on top, front and rear.
-    """
-
-    laser: float
-    leds: float
+    laser: float  # Laser pointer
+    leds: float  # LEDs on top, front and rear
 
 
 def event_format(generation: FirmwareGeneration, timestamps: str) -> bytes:
@@ -65,12 +59,9 @@ def _blink(timer: str, outputs: tuple[int, ...], frequency: float) -> bytes:
     return "".join(f"{line}\n" for line in lines).encode()
 
 
-BANNER = re.compile(rb"EDVS-4337[^\n]*\n")
-"""Line of a board that has started."""
-FORMAT = re.compile(rb"-E(\d)\n")
-"""The answer to `?E`."""
-LAST_SENSORS = re.compile(rb"(?:EVENTS.RATE|MOTOR.SENSORS)[^\n]*\n\n")
-"""The end of the answer to `??S`."""
+BANNER = re.compile(rb"EDVS-4337[^\n]*\n")  # Line of a board that has started
+FORMAT = re.compile(rb"-E(\d)\n")  # The answer to `?E`
+LAST_SENSORS = re.compile(rb"(?:EVENTS.RATE|MOTOR.SENSORS)[^\n]*\n\n")  # The end of the answer to `??S`
 
 _TICK_SENSOR = re.compile(rb"^ *(\d+) [\d ]*MOTOR.SENSORS", re.MULTILINE)
 _TICKS = re.compile(rb"-S(\d+) (-?\d{1,10}) (-?\d{1,10})\r?")

@@ -26,8 +26,7 @@ from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS
 from swarm_loc_estimator.common.messages.event_encoding import ENCODING
 from swarm_loc_estimator.common.node import message_class, run_node
 
-EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Holds half a second of packets."""
+EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)  # Holds half a second of packets
 _RATES = ("events", "packets", "readings")
 _WRONG = {
     "bad_cmd_vel": "velocities that were not finite or too large",

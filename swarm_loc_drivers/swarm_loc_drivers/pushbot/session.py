@@ -25,35 +25,23 @@ from swarm_loc_drivers.pushbot.parameters import PushbotParameters
 
 @dataclass(frozen=True)
 class WheelTicks:
-    """A reading of the wheels' counters.
+    """A reading of the wheels' counters."""
 
-    Attributes:
-        stamp_ns: Best estimate of the acquisition time [ns].
-        left: Ticks of the left wheel, 32 bits, wrapping.
-        right: Ticks of the right wheel, 32 bits, wrapping.
-    """
-
-    stamp_ns: int
-    left: int
-    right: int
+    stamp_ns: int  # Best estimate of the acquisition time [ns]
+    left: int  # Ticks of the left wheel, 32 bits, wrapping
+    right: int  # Ticks of the right wheel, 32 bits, wrapping
 
 
 Velocities = Callable[[], tuple[int, int]]
 """Commands for the left and the right wheel [ticks per 21 ms]; called just before they are sent."""
 
-NO_STOP = "the wheels go on turning although the stop is repeated"
-"""What a robot does that does not stop."""
-_BOOT_S = 2.0
-"""Time in which a board starts, in addition to that of an answer [s]."""
+NO_STOP = "the wheels go on turning although the stop is repeated"  # What a robot does that does not stop
+_BOOT_S = 2.0  # Time in which a board starts, in addition to that of an answer [s]
 _ATTEMPTS = 3
-_REPEAT_S = 0.4
-"""A constant velocity is repeated after so long; a decaying one holds for a second [s]."""
-_REPEAT_STOP_S = 0.1
-"""A stop is repeated after so long while the wheels turn [s]."""
-_STILL_S = 0.1
-"""The wheels stand when their ticks have not changed for so long [s]."""
-_STOP_S = 1.0
-"""The wheels must stand so long after a stop, and two periods of their ticks later [s]."""
+_REPEAT_S = 0.4  # A constant velocity is repeated after so long; a decaying one holds for a second [s]
+_REPEAT_STOP_S = 0.1  # A stop is repeated after so long while the wheels turn [s]
+_STILL_S = 0.1  # The wheels stand when their ticks have not changed for so long [s]
+_STOP_S = 1.0  # The wheels must stand so long after a stop, and two periods of their ticks later [s]
 
 
 class PushbotSession(TalkSession):

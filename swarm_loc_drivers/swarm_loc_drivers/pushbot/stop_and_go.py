@@ -19,8 +19,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import number
 from swarm_loc_estimator.common.se2 import wrap_angle
 
-_SLOW_TURN = 0.5 * math.pi
-"""Beginning of the first scan, which defines the heading of the whole map [rad]."""
+_SLOW_TURN = 0.5 * math.pi  # Beginning of the first scan, which defines the heading of the whole map [rad]
 _SLOW_SHARE, _FIRST_SHARE = 1.0 / 6.0, 0.5
 """Shares of the turn rate at that beginning and in the rest of the first scan."""
 _GAIN, _MIN_RATE, _MIN_SPEED, _COURSE_GAIN = 2.0, 0.15, 0.04, 1.5
@@ -44,17 +43,11 @@ class StopAndGoSettings:
 
 
 class MapGoal(NamedTuple):
-    """A goal of a mapper for a robot.
+    """A goal of a mapper for a robot."""
 
-    Attributes:
-        stamp_ns: Time of the decision.
-        pose: (3,) pose of the robot in map at that time.
-        position: (2,) goal in map [m].
-    """
-
-    stamp_ns: int
-    pose: FloatArray
-    position: FloatArray
+    stamp_ns: int  # Time of the decision
+    pose: FloatArray  # (3,) pose of the robot in map at that time
+    position: FloatArray  # (2,) goal in map [m]
 
 
 @dataclass

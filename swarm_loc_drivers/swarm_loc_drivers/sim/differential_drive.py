@@ -31,30 +31,19 @@ Controller = Callable[[int, FloatArray], tuple[FloatArray, FloatArray]]
 
 @dataclass(frozen=True)
 class Drive:
-    """A differential drive and its imperfections.
+    """A differential drive and its imperfections."""
 
-    Attributes:
-        wheel_separation: [m].
-        wheel_noise: Variance of a wheel's path per metre rolled [m].
-        turn_slip: Share of every commanded turn that is lost, in [0, 1).
-    """
-
-    wheel_separation: float
-    wheel_noise: float
-    turn_slip: float = 0.0
+    wheel_separation: float  # [m]
+    wheel_noise: float  # Variance of a wheel's path per metre rolled [m]
+    turn_slip: float = 0.0  # Share of every commanded turn that is lost, in [0, 1)
 
 
 @dataclass(frozen=True)
 class Driven:
-    """True and reported tracks of a drive.
+    """True and reported tracks of a drive."""
 
-    Attributes:
-        truth: (T + 1, N, 3) true poses in map.
-        reported: (T + 1, N, 3) poses by odometry, each robot's own frame, starting at zero.
-    """
-
-    truth: FloatArray
-    reported: FloatArray
+    truth: FloatArray  # (T + 1, N, 3) true poses in map
+    reported: FloatArray  # (T + 1, N, 3) poses by odometry, each robot's own frame, starting at zero
 
 
 class LastingNoise:

@@ -19,15 +19,10 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 
 @dataclass(frozen=True)
 class Trajectories:
-    """Poses of N robots at T common stamps; between two stamps a robot keeps its twist.
+    """Poses of N robots at T common stamps; between two stamps a robot keeps its twist."""
 
-    Attributes:
-        stamp_ns: (T,) int64, evenly spaced.
-        poses: (T, N, 3), x [m], y [m], theta [rad] in map.
-    """
-
-    stamp_ns: NDArray[np.int64]
-    poses: NDArray[np.float64]
+    stamp_ns: NDArray[np.int64]  # (T,) int64, evenly spaced
+    poses: NDArray[np.float64]  # (T, N, 3), x [m], y [m], theta [rad] in map
 
     def at(self, robot: NDArray[np.integer] | int, stamp_ns: NDArray[np.int64]) -> NDArray[np.float64]:
         """The pose (..., 3) of each `robot` at each `stamp_ns` (broadcast together).
@@ -80,26 +75,18 @@ FRAME_DTYPE = np.dtype(
 SIGHTING_DTYPE = np.dtype([("marker_id", "<u4"), ("value", "<f8", (3,))])
 """One marker: forward [m] and left [m] of the camera, its normal from the optical axis [rad]."""
 
-START_NS = 1_000 * 10**9
-"""Start time of simulated runs."""
+START_NS = 1_000 * 10**9  # Start time of simulated runs
 
-Records = NDArray[Any]
-"""A structured array of one of the types above."""
+Records = NDArray[Any]  # A structured array of one of the types above
 
 
 @dataclass(frozen=True)
 class LivedRun:
-    """Data common to all simulated swarms.
+    """Data common to all simulated swarms."""
 
-    Attributes:
-        swarm: The description available to a user, without the hidden errors of the world.
-        truth: True poses of the robots in map.
-        odometry: (M,) of ODOMETRY_DTYPE in order of arrival.
-    """
-
-    swarm: Swarm
-    truth: Trajectories
-    odometry: Records
+    swarm: Swarm  # The description available to a user, without the hidden errors of the world
+    truth: Trajectories  # True poses of the robots in map
+    odometry: Records  # (M,) of ODOMETRY_DTYPE in order of arrival
 
     @property
     def start_ns(self) -> int:
@@ -119,15 +106,10 @@ class LivedRun:
 
 @dataclass(frozen=True)
 class SimulatedRun(LivedRun):
-    """A simulated swarm with cameras from start to end.
+    """A simulated swarm with cameras from start to end."""
 
-    Attributes:
-        frames: (F,) of FRAME_DTYPE in order of arrival; lost images are not there.
-        sightings: (S,) of SIGHTING_DTYPE, grouped by frame.
-    """
-
-    frames: Records
-    sightings: Records
+    frames: Records  # (F,) of FRAME_DTYPE in order of arrival; lost images are not there
+    sightings: Records  # (S,) of SIGHTING_DTYPE, grouped by frame
 
     def masked(self, kept: NDArray[np.bool_]) -> SimulatedRun:
         """The run with some of its sightings (S,) only; frames stay, empty ones too."""
@@ -146,22 +128,16 @@ def in_order_of_arrival(records: Records, end_ns: int) -> Records:
 
 @dataclass(frozen=True)
 class Lateness:
-    """Delay between measurement and arrival, uniform between two bounds.
+    """Delay between measurement and arrival, uniform between two bounds."""
 
-    Attributes:
-        low_s: Shortest delay [s].
-        high_s: Longest delay [s].
-    """
-
-    low_s: float
-    high_s: float
+    low_s: float  # Shortest delay [s]
+    high_s: float  # Longest delay [s]
 
 
 CAMERA_LATENESS = Lateness(0.150, 0.300)
 """Exposure, marker detection and wireless link of the e-puck paper, section V-B."""
 
-ODOMETRY_LATENESS = Lateness(0.002, 0.020)
-"""A few bytes on the same wireless link."""
+ODOMETRY_LATENESS = Lateness(0.002, 0.020)  # A few bytes on the same wireless link
 
 
 def arrival_ns(rng: np.random.Generator, stamp_ns: NDArray[np.int64], late: Lateness) -> NDArray[np.int64]:

@@ -29,19 +29,12 @@ Exposures = tuple[NDArray[np.int64], NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class View:
-    """Limits of visibility of a camera.
+    """Limits of visibility of a camera."""
 
-    Attributes:
-        field_of_view: Full horizontal angle [rad].
-        nearest: Minimum distance to a marker [m].
-        farthest: Maximum distance [m].
-        incidence: Maximum angle between a marker's normal and the line to the camera [rad].
-    """
-
-    field_of_view: float
-    nearest: float
-    farthest: float
-    incidence: float
+    field_of_view: float  # Full horizontal angle [rad]
+    nearest: float  # Minimum distance to a marker [m]
+    farthest: float  # Maximum distance [m]
+    incidence: float  # Maximum angle between a marker's normal and the line to the camera [rad]
 
     def sees(self, marker: FloatArray) -> NDArray[np.bool_]:
         """Whether markers (..., 3) are in view (...); camera frame: x forward, y left, normal."""

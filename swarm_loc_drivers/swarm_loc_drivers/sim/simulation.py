@@ -35,8 +35,7 @@ Parameters = dict[str, ParameterValue]
 
 _ESTIMATOR, _VISION, _DRIVERS = "swarm_loc_estimator", "swarm_loc_vision", "swarm_loc_drivers"
 _TIME: Parameters = {"use_sim_time": True}
-_ANSWER_WITHIN_S = 0.15
-"""Images of real robots take so long to become detections, too."""
+_ANSWER_WITHIN_S = 0.15  # Images of real robots take so long to become detections, too
 _AERIAL_RATE_HZ = 3.0
 _AERIAL_CAMERA: Parameters = {
     "robot_height": TOP_HEIGHT,
@@ -51,50 +50,36 @@ _AERIAL_CAMERA: Parameters = {
 
 @dataclass(frozen=True)
 class SimulationOptions:
-    """Options of a simulation.
+    """Options of a simulation."""
 
-    Attributes:
-        swarm_file: Path of the swarm description.
-        world: Error model of robots and sensors; "": the default of the robots' type.
-        seed: Random seed of these errors.
-        speed: Speed of e-pucks along the eight [m/s].
-        rate: Simulated seconds per second, as far as the machine keeps up.
-        plan: The hall of PushBots, see `floor_plan`.
-        aerial: Whether e-pucks are located by an overhead camera only, which cannot tell them apart.
-        parameter_file: Path of a ROS parameter file for all nodes, None for none.
-    """
-
-    swarm_file: str
-    world: str = ""
-    seed: int = number(1, "1", 0, 2**31 - 1, "random seed of these errors")
+    swarm_file: str  # Path of the swarm description
+    world: str = ""  # Error model of robots and sensors; "": the default of the robots' type
+    seed: int = number(1, "1", 0, 2**31 - 1, "random seed of these errors")  # Random seed of these errors
+    # Speed of e-pucks along the eight [m/s]
     speed: float = number(0.06, "m/s", 0.001, 0.12, "speed of e-pucks along the eight")
+    # Simulated seconds per second, as far as the machine keeps up
     rate: float = number(
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
     )
-    plan: str = "corridor"
+    plan: str = "corridor"  # The hall of PushBots, see `floor_plan`
+    # Whether e-pucks are located by an overhead camera only, which cannot tell them apart
     aerial: bool = False
-    parameter_file: str | None = None
+    parameter_file: str | None = None  # Path of a ROS parameter file for all nodes, None for none
 
 
 @dataclass(frozen=True)
 class RobotType:
-    """How one kind of robot is simulated.
+    """How one kind of robot is simulated."""
 
-    Attributes:
-        name: The type of the robots in a swarm description.
-        starts: Options, number of robots -> poses (N, 3) of those that the description gives no start.
-        check: Raises a `UserError` for a swarm that its world cannot hold.
-        nodes: Options, swarm, folder for serial ports and files, file of the swarm with all starts -> nodes
-            in the order in which they start.
-        worlds: Its error models, the default one first.
-        has_markers: Whether marker detectors run, whose compiled code is to be prepared once for all.
-    """
-
-    name: str
+    name: str  # The type of the robots in a swarm description
+    # Options, number of robots -> poses (N, 3) of those that the description gives no start
     starts: Callable[[SimulationOptions, int], FloatArray]
-    check: Callable[[Swarm], None]
+    check: Callable[[Swarm], None]  # Raises a `UserError` for a swarm that its world cannot hold
+    # Options, swarm, folder for serial ports and files, file of the swarm with all starts -> nodes in the
+    # order in which they start
     nodes: Callable[[SimulationOptions, Swarm, str, str], list[NodeSpec]]
-    worlds: tuple[str, ...] = ()
+    worlds: tuple[str, ...] = ()  # Its error models, the default one first
+    # Whether marker detectors run, whose compiled code is to be prepared once for all
     has_markers: bool = False
 
 

@@ -25,8 +25,7 @@ from swarm_loc_estimator.common.parameters import ParameterError
 _CLOCK_QOS = QoSProfile(depth=10)
 _TRUTH_QOS = QoSProfile(depth=10)
 _HELD_WAKE_S = 0.002
-_MAX_LAG_S = 0.1
-"""A world that cannot keep up continues from now and does not catch up."""
+_MAX_LAG_S = 0.1  # A world that cannot keep up continues from now and does not catch up
 _QUIET_S, _FAREWELL_S = 0.5, MAX_STOP_S + 1.0
 """A world that is to stop goes on until no driver has been connected for so long, and at most so long [s].
 

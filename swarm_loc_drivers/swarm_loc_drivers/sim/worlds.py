@@ -19,41 +19,24 @@ PRINTED_SENSOR = SensorModel(forward_sigma=0.026, left_sigma=0.029, heading_sigm
 
 @dataclass(frozen=True)
 class ErrorModel:
-    """Imperfections of one simulated world; all sigmas are one standard deviation.
+    """Imperfections of one simulated world; all sigmas are one standard deviation."""
 
-    Attributes:
-        forward_sigma: White noise along the optical axis [m].
-        left_sigma: White noise across it [m].
-        heading_sigma: White noise of a marker's heading [rad].
-        flip_probability: Share of sightings whose heading is the mirror solution of the planar pose problem.
-        gross_probability: Share of sightings that are outliers.
-        camera_yaw_sigma: Unknown turn of each camera on its robot [rad].
-        scale_sigma: Unknown scale of each camera's distances [1].
-        map_position_sigma: Error of every landmark's surveyed position, per axis [m].
-        map_heading_sigma: Error of its surveyed direction [rad].
-        face_position_sigma: Error of every on-robot marker's position, per axis [m].
-        exposure_early_s: Images are taken up to this long before their stamp, uniformly [s].
-        turn_slip: Share of every commanded turn that is lost.
-        wheel_noise: Variance of a wheel's path per metre rolled [m].
-        frame_loss: Share of images that never arrive.
-        described: The sensor model that the swarm description gives.
-    """
-
-    forward_sigma: float
-    left_sigma: float
-    heading_sigma: float
+    forward_sigma: float  # White noise along the optical axis [m]
+    left_sigma: float  # White noise across it [m]
+    heading_sigma: float  # White noise of a marker's heading [rad]
+    # Share of sightings whose heading is the mirror solution of the planar pose problem
     flip_probability: float = 0.0
-    gross_probability: float = 0.0
-    camera_yaw_sigma: float = 0.0
-    scale_sigma: float = 0.0
-    map_position_sigma: float = 0.0
-    map_heading_sigma: float = 0.0
-    face_position_sigma: float = 0.0
-    exposure_early_s: float = 0.0
-    turn_slip: float = 0.0
-    wheel_noise: float = 2e-5
-    frame_loss: float = 0.05
-    described: SensorModel = PRINTED_SENSOR
+    gross_probability: float = 0.0  # Share of sightings that are outliers
+    camera_yaw_sigma: float = 0.0  # Unknown turn of each camera on its robot [rad]
+    scale_sigma: float = 0.0  # Unknown scale of each camera's distances [1]
+    map_position_sigma: float = 0.0  # Error of every landmark's surveyed position, per axis [m]
+    map_heading_sigma: float = 0.0  # Error of its surveyed direction [rad]
+    face_position_sigma: float = 0.0  # Error of every on-robot marker's position, per axis [m]
+    exposure_early_s: float = 0.0  # Images are taken up to this long before their stamp, uniformly [s]
+    turn_slip: float = 0.0  # Share of every commanded turn that is lost
+    wheel_noise: float = 2e-5  # Variance of a wheel's path per metre rolled [m]
+    frame_loss: float = 0.05  # Share of images that never arrive
+    described: SensorModel = PRINTED_SENSOR  # The sensor model that the swarm description gives
 
 
 W0 = ErrorModel(PRINTED_SENSOR.forward_sigma, PRINTED_SENSOR.left_sigma, PRINTED_SENSOR.heading_sigma)
@@ -75,31 +58,21 @@ W2 = ErrorModel(
 )
 """Small white noise and systematic errors that together look like the paper's experiment."""
 
-W2_FAST = replace(W2, turn_slip=0.20)
-"""At 0.08 m/s the wheels slip more in the curves."""
+W2_FAST = replace(W2, turn_slip=0.20)  # At 0.08 m/s the wheels slip more in the curves
 
 WORLDS = {"w0": W0, "w2": W2, "w2fast": W2_FAST}
 
 
 @dataclass(frozen=True)
 class HiddenGeometry:
-    """Where cameras and markers truly are.
+    """Where cameras and markers truly are."""
 
-    Attributes:
-        mounts: (N, 3) camera poses in base_link.
-        scales: (N,) reported distance per true distance.
-        landmarks: (L, 3) in map.
-        faces: (K, 3) in their robot's base_link.
-        face_owner: (K,) robot index.
-        ids: (L + K,) marker ids.
-    """
-
-    mounts: FloatArray
-    scales: FloatArray
-    landmarks: FloatArray
-    faces: FloatArray
-    face_owner: NDArray[np.int64]
-    ids: NDArray[np.uint32]
+    mounts: FloatArray  # (N, 3) camera poses in base_link
+    scales: FloatArray  # (N,) reported distance per true distance
+    landmarks: FloatArray  # (L, 3) in map
+    faces: FloatArray  # (K, 3) in their robot's base_link
+    face_owner: NDArray[np.int64]  # (K,) robot index
+    ids: NDArray[np.uint32]  # (L + K,) marker ids
 
 
 def hidden_geometry(rng: np.random.Generator, swarm: Swarm, errors: ErrorModel) -> HiddenGeometry:

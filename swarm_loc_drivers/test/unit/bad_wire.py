@@ -6,8 +6,7 @@ import numpy as np
 
 from swarm_loc_drivers.sim.link_host import ConsoleFirmware
 
-_LOST = 0.7
-"""Share of the hurt bytes that are lost."""
+_LOST = 0.7  # Share of the hurt bytes that are lost
 
 
 class BadWire:

@@ -31,8 +31,7 @@ SQUARE = [leg for _ in range(4) for leg in ((0.1, 0.0, 0.06), (0.0, 3.0, 0.5 * m
 """Speed [m/s], turn rate [rad/s], and how far to go [m or rad]."""
 
 Item = TypeVar("Item")
-Wrap = Callable[[Any], Any]
-"""Puts something between a firmware and its link."""
+Wrap = Callable[[Any], Any]  # Puts something between a firmware and its link
 
 
 class Emulator:

@@ -11,8 +11,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.laser.calibration import RowBias
 from swarm_loc_vision.laser.fit import fit_hyperbola
 
-HALF_A_SECOND = 25
-"""Windows of the tracker."""
+HALF_A_SECOND = 25  # Windows of the tracker
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -38,8 +38,7 @@ from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 _LIVE_S = 180.0
 _SENSORS = ("odometry", "imu", "detections", "ranges")
-_SURVEYED = ("unknown_id", "uwb_unknown_address")
-"""Reasons for which the estimator drops what a survey needs."""
+_SURVEYED = ("unknown_id", "uwb_unknown_address")  # Reasons for which the estimator drops what a survey needs
 
 
 @exit_with_message

@@ -31,8 +31,7 @@ Parameters = TypeVar("Parameters")
 Number = TypeVar("Number", int, float)
 
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
-_INTERRUPTED = 130
-"""Exit status of a program that SIGINT has ended, as shells count."""
+_INTERRUPTED = 130  # Exit status of a program that SIGINT has ended, as shells count
 _REDRAW_S = 0.1
 _WIDTH = 30
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -47,12 +46,9 @@ class Program:
 
     A signal during the import ends the process with status 128 + n and without a traceback, a missing package
     of others with one sentence and status 1.
-
-    Attributes:
-        module: Full name of the module.
     """
 
-    module: str
+    module: str  # Full name of the module
 
     def __call__(self) -> int:
         """Run the program; returns its exit status."""

@@ -10,12 +10,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Any
 
-PATIENCE_S = 5.0
-"""Time without messages after which a topic is logged as silent [s]."""
-THROTTLE_S = 30.0
-"""The same warning is logged at most once in this time."""
-_MAX_LINES = 8
-"""Maximum number of new problems of a kind that are logged one by one."""
+PATIENCE_S = 5.0  # Time without messages after which a topic is logged as silent [s]
+THROTTLE_S = 30.0  # The same warning is logged at most once in this time
+_MAX_LINES = 8  # Maximum number of new problems of a kind that are logged one by one
 _MAX_NAMES = 8
 
 
@@ -29,21 +26,13 @@ class Level(IntEnum):
 
 @dataclass
 class Report:
-    """One status of /diagnostics.
+    """One status of /diagnostics."""
 
-    Attributes:
-        name: Name of the status.
-        message: One sentence.
-        level: How bad it is.
-        values: Figures; their names hold the units.
-        hardware_id: Address of the hardware that it is about, "" for none.
-    """
-
-    name: str
-    message: str
-    level: Level = Level.OK
-    values: dict[str, object] = field(default_factory=dict)
-    hardware_id: str = ""
+    name: str  # Name of the status
+    message: str  # One sentence
+    level: Level = Level.OK  # How bad it is
+    values: dict[str, object] = field(default_factory=dict)  # Figures; their names hold the units
+    hardware_id: str = ""  # Address of the hardware that it is about, "" for none
 
     @property
     def warning(self) -> bool:

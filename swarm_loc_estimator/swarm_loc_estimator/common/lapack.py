@@ -35,8 +35,7 @@ _dtrmm, _dsyrk = _external("blas", "dtrmm", 11), _external("blas", "dsyrk", 10)
 _LOWER = _LEFT = np.frombuffer(b"L", dtype=np.uint8)
 _RIGHT, _TRANSPOSED, _PLAIN = (np.frombuffer(letter, dtype=np.uint8) for letter in (b"R", b"T", b"N"))
 _PLUS, _MINUS = np.array([1.0]), np.array([-1.0])
-_LEAF = 40
-"""Maximum number of rows that are passed to LAPACK, which is slow with larger triangles."""
+_LEAF = 40  # Maximum number of rows that are passed to LAPACK, which is slow with larger triangles
 _WHOLE, _FIRST, _LAST = 0, 1, 2
 """Steps of a plan: a small part; what follows from the upper half of a part; from the lower one."""
 

@@ -23,8 +23,7 @@ from swarm_loc_estimator.common.yaml_tree import read_tree
 Options = TypeVar("Options")
 ParameterValue = bool | int | float | str | list[str]
 
-GRACE_S = 5.0
-"""Timeout of processes after SIGINT, and again after SIGTERM."""
+GRACE_S = 5.0  # Timeout of processes after SIGINT, and again after SIGTERM
 STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM}
 AWAITED_SIGNALS = STOP_SIGNALS | {signal.SIGCHLD}
 _ARGUMENTS = {"parameter_file": "params_file"}
@@ -45,50 +44,31 @@ class GraphError(UserError):
 
 @dataclass(frozen=True)
 class GraphOptions:
-    """Options of a swarm's graph.
+    """Options of a swarm's graph."""
 
-    Attributes:
-        swarm_file: Path of the swarm description.
-        bag: Path of a bag to play into the graph, which then runs on the bag's clock; None: live robots.
-        rate: Speed of that bag, 1 for real time.
-        use_sim_time: Whether the nodes take their time from /clock though no bag is played here.
-        parameter_file: Path of a ROS parameter file for all nodes, None for none.
-        watch: Whether a page shows the swarm to browsers of this machine.
-        watch_port: Port of that page, 0 for any free one.
-    """
-
-    swarm_file: str
+    swarm_file: str  # Path of the swarm description
+    # Path of a bag to play into the graph, which then runs on the bag's clock; None: live robots
     bag: str | None = None
-    rate: float = number(1.0, "1", 0.01, 1000.0, "speed of the bag")
-    use_sim_time: bool = False
-    parameter_file: str | None = None
-    watch: bool = False
-    watch_port: int = number(8420, "1", 0, 65535, "port of the page")
+    rate: float = number(1.0, "1", 0.01, 1000.0, "speed of the bag")  # Speed of that bag, 1 for real time
+    use_sim_time: bool = False  # Whether the nodes take their time from /clock though no bag is played here
+    parameter_file: str | None = None  # Path of a ROS parameter file for all nodes, None for none
+    watch: bool = False  # Whether a page shows the swarm to browsers of this machine
+    watch_port: int = number(8420, "1", 0, 65535, "port of the page")  # Port of that page, 0 for any free one
 
 
 @dataclass(frozen=True)
 class NodeSpec:
-    """One node of a graph.
+    """One node of a graph."""
 
-    Attributes:
-        package: Package of the executable.
-        executable: Name of the executable.
-        name: Name of the node.
-        namespace: Namespace of the node, "" for none.
-        parameters: Parameter -> value; they override the parameter file.
-        parameter_file: Path of a ROS parameter file, None for none.
-        remappings: Pairs of names, from and to.
-        required: Whether the graph ends when this node ends.
-    """
-
-    package: str
-    executable: str
-    name: str
-    namespace: str = ""
+    package: str  # Package of the executable
+    executable: str  # Name of the executable
+    name: str  # Name of the node
+    namespace: str = ""  # Namespace of the node, "" for none
+    # Parameter -> value; they override the parameter file
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
-    parameter_file: str | None = None
-    remappings: tuple[tuple[str, str], ...] = ()
-    required: bool = True
+    parameter_file: str | None = None  # Path of a ROS parameter file, None for none
+    remappings: tuple[tuple[str, str], ...] = ()  # Pairs of names, from and to
+    required: bool = True  # Whether the graph ends when this node ends
 
     @property
     def full_name(self) -> str:

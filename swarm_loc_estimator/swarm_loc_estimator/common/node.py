@@ -44,8 +44,7 @@ BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1
 _EACH_CHANGE = JumpThreshold(
     min_forward=Duration(nanoseconds=1), min_backward=Duration(nanoseconds=-1), on_clock_change=False
 )
-_WAKE_S = 0.2
-"""Maximum time until a signal is noticed while the node is idle [s]."""
+_WAKE_S = 0.2  # Maximum time until a signal is noticed while the node is idle [s]
 _LEAVE_S = 0.7
 """The process ends this long after a signal, even if it is busy. Destroying thousands of publishers takes DDS
 20 s, since for each of them it announces all remaining ones."""

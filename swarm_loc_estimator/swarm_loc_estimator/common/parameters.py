@@ -26,23 +26,14 @@ class ParameterError(UserError):
 
 @dataclass(frozen=True)
 class NumberSpec:
-    """Unit, range and documentation of a number.
+    """Unit, range and documentation of a number."""
 
-    Attributes:
-        unit: SI unit, "1" for none.
-        low: Smallest allowed value, itself allowed unless `above`.
-        high: Largest allowed value.
-        above: Whether `low` itself is refused.
-        doc: One line of documentation.
-        optional: Whether None is allowed and means unknown.
-    """
-
-    unit: str
-    low: float
-    high: float
-    above: bool
-    doc: str
-    optional: bool = False
+    unit: str  # SI unit, "1" for none
+    low: float  # Smallest allowed value, itself allowed unless `above`
+    high: float  # Largest allowed value
+    above: bool  # Whether `low` itself is refused
+    doc: str  # One line of documentation
+    optional: bool = False  # Whether None is allowed and means unknown
 
     def allows(self, value: float) -> bool:
         """Whether the value is finite and in range."""
@@ -73,23 +64,14 @@ def number_specs(cls: type) -> dict[str, NumberSpec]:
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """One parameter.
+    """One parameter."""
 
-    Attributes:
-        name: Its name.
-        default: Default value; its type is that of the parameter.
-        doc: One line of documentation.
-        number: Unit and range of a number; None for the other types.
-        required: Whether an empty text is refused.
-        choices: Allowed texts; empty: any.
-    """
-
-    name: str
-    default: Value
-    doc: str
-    number: NumberSpec | None = None
-    required: bool = False
-    choices: tuple[str, ...] = ()
+    name: str  # Its name
+    default: Value  # Default value; its type is that of the parameter
+    doc: str  # One line of documentation
+    number: NumberSpec | None = None  # Unit and range of a number; None for the other types
+    required: bool = False  # Whether an empty text is refused
+    choices: tuple[str, ...] = ()  # Allowed texts; empty: any
 
     @property
     def range_text(self) -> str:

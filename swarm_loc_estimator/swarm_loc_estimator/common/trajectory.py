@@ -10,8 +10,7 @@ import numpy.typing as npt
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 
-DEFAULT_GAP_NS = 500_000_000
-"""Ground truth is not interpolated over longer gaps than this."""
+DEFAULT_GAP_NS = 500_000_000  # Ground truth is not interpolated over longer gaps than this
 
 
 class TrajectoryError(ValueError):
@@ -22,16 +21,12 @@ class TrajectoryError(ValueError):
 class Trajectory:
     """Poses over time.
 
-    Attributes:
-        stamp_ns: (N,) not decreasing.
-        pose: (N, 3) x [m], y [m], theta [rad] in map.
-
     Raises:
         TrajectoryError: The lengths differ, or time goes back.
     """
 
-    stamp_ns: IntArray
-    pose: FloatArray
+    stamp_ns: IntArray  #: (N,) not decreasing
+    pose: FloatArray  #: (N, 3) x [m], y [m], theta [rad] in map
 
     def __post_init__(self) -> None:
         if self.pose.shape != (len(self.stamp_ns), 3):

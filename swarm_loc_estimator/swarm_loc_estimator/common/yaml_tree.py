@@ -20,8 +20,7 @@ from swarm_loc_estimator.common.parameters import UserError
 if TYPE_CHECKING:
     from pathlib import Path
 
-Tree = Any
-"""dict, list, str, int, float, bool or None."""
+Tree = Any  # dict, list, str, int, float, bool or None
 
 MAX_BYTES = 2_000_000
 """Larger files are refused [byte]; the file of a thousand robots has a quarter of this size."""

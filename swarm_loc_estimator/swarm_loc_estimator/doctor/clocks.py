@@ -12,10 +12,8 @@ from swarm_loc_estimator.sensors.ingest import CLOCKS_APART_S
 
 _HOUR_S = 3600.0
 _AHEAD_S = 0.05
-_LATE_S = 0.8
-"""Detections that are later than odometry by more are named [s]; a detector takes .15 to .3 s."""
-_BACK = 0.02
-"""Share of stamps that are older than the stamp of the message before, from which they are named."""
+_LATE_S = 0.8  # Detections that are later than odometry by more are named [s]; a detector takes .15 to .3 s
+_BACK = 0.02  # Share of stamps that are older than the stamp of the message before, from which they are named
 _SENSORS = ("odometry", "detections", "imu", "ranges", "brightness")
 _SET_CLOCK = "Synchronize it with the others (chrony)"
 

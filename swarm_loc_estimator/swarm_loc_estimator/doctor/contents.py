@@ -18,10 +18,8 @@ from swarm_loc_estimator.sensors.registry import SENSORS
 from swarm_loc_estimator.timeline.contradictions import Contradicted, Contradiction
 from swarm_loc_estimator.timeline.estimate import Status
 
-_MIN_SIGHTINGS = 5
-"""Fewer sightings of an unknown marker are misread ones."""
-_MIN_SHARE = 0.05
-"""Smaller shares of dropped readings are not named."""
+_MIN_SIGHTINGS = 5  # Fewer sightings of an unknown marker are misread ones
+_MIN_SHARE = 0.05  # Smaller shares of dropped readings are not named
 _MIN_ROWS = 20
 _AWAY_M, _TURNED, _AWAY_SIGMAS = 0.1, 0.35, 5.0
 """Least distance [m] and angle [rad] from a start that are named, and least multiple of its sigmas."""

@@ -25,8 +25,7 @@ _LOOKED_AT = (
     *(kind.message_type for kind in kinds().values()),
     *(TRANSFORMS, DIAGNOSTICS, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO),
 )
-MAX_IMAGES = 20
-"""Maximum number of images of a topic that are kept; what is wrong with one is wrong with all."""
+MAX_IMAGES = 20  # Maximum number of images of a topic that are kept; what is wrong with one is wrong with all
 
 
 def examine(evidence: Evidence) -> list[Finding]:

@@ -27,41 +27,27 @@ from swarm_loc_estimator.timeline.estimate import Status
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 
-SETTINGS = Settings()
-"""Of the estimator."""
+SETTINGS = Settings()  # Of the estimator
 _TICK_NS = 500_000_000
-_AT_ZERO = 0.05
-"""Odometry begins at zero if x and y [m] and the heading [rad] are smaller."""
+_AT_ZERO = 0.05  # Odometry begins at zero if x and y [m] and the heading [rad] are smaller
 _LASTING_TICKS, _LASTING_SHARE = 4, 0.2
 """Contradictions of fewer ticks, or of a smaller share of all, are not named."""
 
 
 class Finding(NamedTuple):
-    """Something that is wrong.
+    """Something that is wrong."""
 
-    Attributes:
-        about: A topic, robot, marker or node.
-        problem: What is wrong with it, the rest of a sentence.
-        remedy: What to do, a sentence without its full stop.
-    """
-
-    about: str
-    problem: str
-    remedy: str
+    about: str  # A topic, robot, marker or node
+    problem: str  # What is wrong with it, the rest of a sentence
+    remedy: str  # What to do, a sentence without its full stop
 
 
 class Publisher(NamedTuple):
-    """A publisher in the live graph.
+    """A publisher in the live graph."""
 
-    Attributes:
-        node: Full name of its node.
-        is_reliable: Whether it sends lost messages again.
-        is_latched: Whether late subscribers get its last messages.
-    """
-
-    node: str
-    is_reliable: bool = True
-    is_latched: bool = False
+    node: str  # Full name of its node
+    is_reliable: bool = True  # Whether it sends lost messages again
+    is_latched: bool = False  # Whether late subscribers get its last messages
 
 
 class Message(NamedTuple):
@@ -73,52 +59,31 @@ class Message(NamedTuple):
 
 @dataclass(frozen=True)
 class Heard:
-    """A topic that was found.
+    """A topic that was found."""
 
-    Attributes:
-        type: Of its messages.
-        messages: In order of arrival; of images only some.
-        publishers: In the live graph; of a bag they are not known.
-    """
-
-    type: str
-    messages: Sequence[Message] = ()
-    publishers: tuple[Publisher, ...] = ()
+    type: str  # Of its messages
+    messages: Sequence[Message] = ()  # In order of arrival; of images only some
+    publishers: tuple[Publisher, ...] = ()  # In the live graph; of a bag they are not known
 
 
 class Estimated(NamedTuple):
-    """What the estimator made of all readings.
+    """What the estimator made of all readings."""
 
-    Attributes:
-        status: (N,) of the robots at the end.
-        contradictions: Those that lasted, each as it was last.
-        begin_ns: (N,) when a robot was tracked first; -1: never.
-        begin_pose: (N, 3) its pose then.
-    """
-
-    status: IntArray
-    contradictions: list[Contradiction]
-    begin_ns: IntArray
-    begin_pose: FloatArray
+    status: IntArray  # (N,) of the robots at the end
+    contradictions: list[Contradiction]  # Those that lasted, each as it was last
+    begin_ns: IntArray  # (N,) when a robot was tracked first; -1: never
+    begin_pose: FloatArray  # (N, 3) its pose then
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """All that the checks look at.
+    """All that the checks look at."""
 
-    Attributes:
-        swarm: The description.
-        topics: By name, without a leading slash.
-        is_live: Whether it comes from the live graph.
-        remarks: What could not be read, one sentence each.
-        is_cut: Whether there was more in the bag.
-    """
-
-    swarm: Swarm
-    topics: Mapping[str, Heard]
-    is_live: bool = False
-    remarks: Sequence[str] = ()
-    is_cut: bool = False
+    swarm: Swarm  # The description
+    topics: Mapping[str, Heard]  # By name, without a leading slash
+    is_live: bool = False  # Whether it comes from the live graph
+    remarks: Sequence[str] = ()  # What could not be read, one sentence each
+    is_cut: bool = False  # Whether there was more in the bag
 
     @cached_property
     def inputs(self) -> tuple[InputTopic, ...]:

@@ -21,8 +21,7 @@ from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 _DEPTH = 1000
-_LOOK_S = 0.5
-"""Time between two looks at the topics of the graph [s]."""
+_LOOK_S = 0.5  # Time between two looks at the topics of the graph [s]
 _OWN = ("parameter_events", "rosout")
 
 

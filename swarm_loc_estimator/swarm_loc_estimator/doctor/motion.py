@@ -26,24 +26,20 @@ from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_BEARING
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot
 
-_WINDOW_NS = 6_000_000_000
-"""Odometry is trusted this long."""
+_WINDOW_NS = 6_000_000_000  # Odometry is trusted this long
 _MIN_ROWS, _MIN_MOTION_M = 30, 0.03
 """Least sightings of landmarks, and least spread of places around their means, for a verdict."""
 _MIN_WINDOWS = 3
 """Least windows for a verdict on scale and yaw: in a window, the drift of odometry is common to all."""
 _ROUNDS = 8
-_CLEARER = 0.5
-"""Residual of a mirrored track over that of the true one, below which the sign is wrong."""
+_CLEARER = 0.5  # Residual of a mirrored track over that of the true one, below which the sign is wrong
 _STANDS_M = 1e-4
 _SCALE, _YAW, _SIGNIFICANT = 0.15, math.radians(30.0), 5.0
 """Least errors of scale and yaw that are named, and least multiple of their sigma."""
 _TURN_NS, _MIN_TURN = 500_000_000, 2.0
 """Turns of gyroscopes are compared over this time, and if wheels turn by this much in all [rad]."""
-_DEGREES, _SLACK = 20.0, 0.3
-"""Ratios of gyroscope to wheels from which units, sign or silence are named."""
-_AHEAD = 0.4
-"""Least usual share of the optical z axis in the directions of markers."""
+_DEGREES, _SLACK = 20.0, 0.3  # Ratios of gyroscope to wheels from which units, sign or silence are named
+_AHEAD = 0.4  # Least usual share of the optical z axis in the directions of markers
 
 Change = Callable[[FloatArray], FloatArray]
 _WRONG: MappingProxyType[str, Change] = MappingProxyType(

@@ -21,8 +21,7 @@ _STARTS = MappingProxyType(
     }
 )
 """What to do without the messages of a sensor."""
-_SLOW_S = 0.35
-"""Longest usual time between two odometry messages [s]."""
+_SLOW_S = 0.35  # Longest usual time between two odometry messages [s]
 _PAUSE_S, _SILENT_S = 2.0, 10.0
 """Shortest pauses that are named: of odometry and gyroscopes, and at the end of detections [s]."""
 _PERIODIC = ("odometry", "imu", "detections")

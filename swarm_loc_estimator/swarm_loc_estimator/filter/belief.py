@@ -19,72 +19,42 @@ class IntegrityArrays(NamedTuple):
 
     A source is a measured object: robot i has index i, landmark l has index N + l. Measurements of models
     without a kernel have sources of their own, with indices that are larger by N + L.
-
-    Attributes:
-        source: (N, S) sources measured most recently by each robot; -1: none.
-        source_ns: (N, S) stamp of the last measurement of the pair.
-        counted_ns: (N, S) stamp of the last measurement counted as evidence.
-        outlier: (N, S) True if the last measurement was an outlier.
-        unexplained: (N, S) True if no parameter error could explain it.
-        trending: (N, S) True if the last innovations had a trend.
-        evidence: (N, S) evidence against the pair.
-        whitened: (N, S, 2) sum of whitened innovations since the last test for a trend.
-        squares: (N, S) sum of their squares.
-        looks: (N, S) number of these innovations.
-        fault_score: (N + L,) of each robot and landmark.
-        confirmations: (N,) number of sightings that agree with the robot's initial pose.
-        confirmed_ns: (N,) stamp of the last counted confirmation.
-        gated_in_a_row: (N,) counted gated measurements since the last accepted one; not quick repeats.
-        gated_source: (N,) source of the last gated measurement.
-        gated_ns: (N,) stamp of the last gated measurement.
-        gated_fixes: (N,) absolute fixes gated since the last accepted fix or landmark sighting.
-        gated_fix_ns: (N,) stamp of the last counted gated fix.
-        noise_inflation: (N,) level of noise inflation of each robot's measurements, see
-            `integrity/noise_inflation.py`.
-        drift_ns: (N, W) begin of each window in which the drift of odometry is observed, see
-            `integrity/motion_noise.py`.
-        drift_transform: (N, W, 3) T at that time.
-        drift_noise: (N, W, 3, 3) preintegrated covariance of the track at that time.
-        drift_covariance: (N, W, 3, 3) of the error of T at that time.
-        motion_likelihood: (N, scales) log-likelihood of each scale of the process noise.
-        motion_scale: (N,) scale of the process noise of each robot.
-        motion_explained: (N,) True if it stays 1, as scales of the robot's motion are described as estimated.
-        excess: (N, 3, 3) covariance of each robot's error beyond that of the filter, see
-            `integrity/repeated_errors.py`.
-        repeated: (N, S, 2, 3, 3) covariance of the errors of observer and target with the repeated error of
-            their pair.
-        repeated_at: (N, S, 2) place of the target, as the observer saw it last [m].
     """
 
-    source: IntArray
-    source_ns: IntArray
-    counted_ns: IntArray
-    outlier: BoolArray
-    unexplained: BoolArray
-    trending: BoolArray
-    evidence: FloatArray
-    whitened: FloatArray
-    squares: FloatArray
-    looks: IntArray
-    fault_score: FloatArray
-    confirmations: IntArray
-    confirmed_ns: IntArray
-    gated_in_a_row: IntArray
-    gated_source: IntArray
-    gated_ns: IntArray
-    gated_fixes: IntArray
-    gated_fix_ns: IntArray
+    source: IntArray  # (N, S) sources measured most recently by each robot; -1: none
+    source_ns: IntArray  # (N, S) stamp of the last measurement of the pair
+    counted_ns: IntArray  # (N, S) stamp of the last measurement counted as evidence
+    outlier: BoolArray  # (N, S) True if the last measurement was an outlier
+    unexplained: BoolArray  # (N, S) True if no parameter error could explain it
+    trending: BoolArray  # (N, S) True if the last innovations had a trend
+    evidence: FloatArray  # (N, S) evidence against the pair
+    whitened: FloatArray  # (N, S, 2) sum of whitened innovations since the last test for a trend
+    squares: FloatArray  # (N, S) sum of their squares
+    looks: IntArray  # (N, S) number of these innovations
+    fault_score: FloatArray  # (N + L,) of each robot and landmark
+    confirmations: IntArray  # (N,) number of sightings that agree with the robot's initial pose
+    confirmed_ns: IntArray  # (N,) stamp of the last counted confirmation
+    gated_in_a_row: IntArray  # (N,) counted gated measurements since the last accepted one; not quick repeats
+    gated_source: IntArray  # (N,) source of the last gated measurement
+    gated_ns: IntArray  # (N,) stamp of the last gated measurement
+    gated_fixes: IntArray  # (N,) absolute fixes gated since the last accepted fix or landmark sighting
+    gated_fix_ns: IntArray  # (N,) stamp of the last counted gated fix
+    # (N,) level of noise inflation of each robot's measurements, see `integrity/noise_inflation.py`
     noise_inflation: FloatArray
+    # (N, W) begin of each window in which the drift of odometry is observed, see `integrity/motion_noise.py`
     drift_ns: IntArray
-    drift_transform: FloatArray
-    drift_noise: FloatArray
-    drift_covariance: FloatArray
-    motion_likelihood: FloatArray
-    motion_scale: FloatArray
+    drift_transform: FloatArray  # (N, W, 3) T at that time
+    drift_noise: FloatArray  # (N, W, 3, 3) preintegrated covariance of the track at that time
+    drift_covariance: FloatArray  # (N, W, 3, 3) of the error of T at that time
+    motion_likelihood: FloatArray  # (N, scales) log-likelihood of each scale of the process noise
+    motion_scale: FloatArray  # (N,) scale of the process noise of each robot
+    # (N,) True if it stays 1, as scales of the robot's motion are described as estimated
     motion_explained: BoolArray
+    # (N, 3, 3) covariance of each robot's error beyond that of the filter, see `integrity/repeated_errors.py`
     excess: FloatArray
+    # (N, S, 2, 3, 3) covariance of the errors of observer and target with the repeated error of their pair
     repeated: FloatArray
-    repeated_at: FloatArray
+    repeated_at: FloatArray  # (N, S, 2) place of the target, as the observer saw it last [m]
 
 
 class BeliefArrays(NamedTuple):

@@ -52,19 +52,15 @@ from swarm_loc_estimator.filter.belief import BeliefArrays
 from swarm_loc_estimator.filter.measurement_model import MeasurementArray, MeasurementColumns
 from swarm_loc_estimator.odometry.look_up import OdometrySample
 
-PAIR_ROWS = 10
-"""Rows of three numbers stored per pair."""
+PAIR_ROWS = 10  # Rows of three numbers stored per pair
 _MEAN, _OBSERVER, _TARGET, _FUSED, _VARIANCE, _RANDOM, _SYSTEMATIC, _NOISE = 0, 1, 2, 3, 6, 7, 8, 9
 """The mean z; the poses of both robots on their tracks; the rows of L; the variances of their relative pose
 after the update; w; s; the accumulated variances of the two tracks, and an unused number."""
-_DECORRELATION_ANGLE = 0.5
-"""Turn after which errors have a correlation of exp(-1/2) with those before [rad]."""
-_INITIAL_INFLATION = 1.5
-"""Factor on the variances of a measurement that initializes a robot."""
+_DECORRELATION_ANGLE = 0.5  # Turn after which errors have a correlation of exp(-1/2) with those before [rad]
+_INITIAL_INFLATION = 1.5  # Factor on the variances of a measurement that initializes a robot
 _STATIONARY_SIGMA = 1e-4
 """Robots are stationary while their tracks accumulate a smaller standard deviation [m, rad]."""
-_NEGLIGIBLE = 1e-8
-"""Share of the information of a measurement that is neglected."""
+_NEGLIGIBLE = 1e-8  # Share of the information of a measurement that is neglected
 
 
 def at_initialization(measurement: MeasurementArray) -> MeasurementArray:

@@ -13,10 +13,8 @@ from swarm_loc_estimator.common.jit import inlined_njit
 from swarm_loc_estimator.common.small_matrix import factor_numbers
 
 _STUDENT_DOF = 4.0
-_MISREAD = 0.25 * np.pi
-"""Minimum error of the heading of a misread fiducial [rad]."""
-NO_HEADING = 1e4
-"""Variance of a heading that is not used [rad^2]."""
+_MISREAD = 0.25 * np.pi  # Minimum error of the heading of a misread fiducial [rad]
+NO_HEADING = 1e4  # Variance of a heading that is not used [rad^2]
 
 
 def gate_threshold(probability: ArrayLike, degrees_of_freedom: int = 2) -> FloatArray:

@@ -36,58 +36,36 @@ DEPENDS_ON = 8
 
 
 class Scratch(NamedTuple):
-    """Buffers for one evaluation, reused to avoid allocation.
+    """Buffers for one evaluation, reused to avoid allocation."""
 
-    Attributes:
-        predicted: (3,) value.
-        other: (3,) innovation of the alternative.
-        value_jacobian: (3, 5) Jacobian of the value, see `measurement_model.predict`.
-        relative_covariance: (3, 3) covariance of xi_target - xi_observer.
-        innovation_covariance: (3, 3) covariance of the innovation.
-        variances: (3,) of the predicted value.
-    """
-
-    predicted: FloatArray
-    other: FloatArray
-    value_jacobian: FloatArray
-    relative_covariance: FloatArray
-    innovation_covariance: FloatArray
-    variances: FloatArray
+    predicted: FloatArray  # (3,) value
+    other: FloatArray  # (3,) innovation of the alternative
+    value_jacobian: FloatArray  # (3, 5) Jacobian of the value, see `measurement_model.predict`
+    relative_covariance: FloatArray  # (3, 3) covariance of xi_target - xi_observer
+    innovation_covariance: FloatArray  # (3, 3) covariance of the innovation
+    variances: FloatArray  # (3,) of the predicted value
 
 
 class InnovationBatch(NamedTuple):
-    """Measurements (m,) evaluated at one belief.
+    """Measurements (m,) evaluated at one belief."""
 
-    Attributes:
-        pose: (m, 2, 3) observers and targets in `map` at the stamps; of a landmark, its pose correction.
-        motion: (m, 3) rate of change of xi_target - xi_observer by driving [1/s], see `relative_motion`.
-        cross_covariance: (m, 3, 5) of the observer's error with the target's, and of the target's with
-            yaw and scale of the observer's camera.
-        columns: (m, DEPENDS_ON) filter columns.
-        jacobian: (m, 3, DEPENDS_ON) Jacobian of the innovation.
-        innovation: (m, 3) measured minus predicted.
-        noise: (m, 3, 3) measurement covariances for the update.
-        pair: (m, PAIR_ROWS, 3) new mean of the pair, stored if used, see `correlated_noise`.
-        distance: (m,) squared Mahalanobis distance of the position, small errors left out.
-        whitened: (m, 2) position innovation over its standard deviation, without small errors.
-        cause: (m,) possible cause of the innovation, see `integrity.cause_of`.
-        accepted: (m,) True if the innovation passes the gate.
-        nis: (m,) normalized innovation squared.
-    """
-
+    # (m, 2, 3) observers and targets in `map` at the stamps; of a landmark, its pose correction
     pose: FloatArray
+    # (m, 3) rate of change of xi_target - xi_observer by driving [1/s], see `relative_motion`
     motion: FloatArray
+    # (m, 3, 5) of the observer's error with the target's, and of the target's with yaw and scale of the
+    # observer's camera
     cross_covariance: FloatArray
-    columns: IntArray
-    jacobian: FloatArray
-    innovation: FloatArray
-    noise: FloatArray
-    pair: FloatArray
-    distance: FloatArray
-    whitened: FloatArray
-    cause: IntArray
-    accepted: BoolArray
-    nis: FloatArray
+    columns: IntArray  # (m, DEPENDS_ON) filter columns
+    jacobian: FloatArray  # (m, 3, DEPENDS_ON) Jacobian of the innovation
+    innovation: FloatArray  # (m, 3) measured minus predicted
+    noise: FloatArray  # (m, 3, 3) measurement covariances for the update
+    pair: FloatArray  # (m, PAIR_ROWS, 3) new mean of the pair, stored if used, see `correlated_noise`
+    distance: FloatArray  # (m,) squared Mahalanobis distance of the position, small errors left out
+    whitened: FloatArray  # (m, 2) position innovation over its standard deviation, without small errors
+    cause: IntArray  # (m,) possible cause of the innovation, see `integrity.cause_of`
+    accepted: BoolArray  # (m,) True if the innovation passes the gate
+    nis: FloatArray  # (m,) normalized innovation squared
 
 
 @cached_njit

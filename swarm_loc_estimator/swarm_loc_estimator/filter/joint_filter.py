@@ -14,27 +14,17 @@ from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 
 
 class Robots(NamedTuple):
-    """Positions of robots, from which a sparse filter selects neighbours.
+    """Positions of robots, from which a sparse filter selects neighbours."""
 
-    Attributes:
-        places: (N, 2) positions in `map` [m].
-        active: (N,) True if the robot is part of the estimate; correlations of others are dropped.
-    """
-
-    places: FloatArray
-    active: BoolArray
+    places: FloatArray  # (N, 2) positions in `map` [m]
+    active: BoolArray  # (N,) True if the robot is part of the estimate; correlations of others are dropped
 
 
 class JointFilter(Protocol):
-    """Covariance of the errors of all bodies and parameters.
+    """Covariance of the errors of all bodies and parameters."""
 
-    Attributes:
-        covariance: (n, n) of all columns, (0, 0) for a sparse filter. Predictions write to it.
-        is_dense: True for a full covariance, which also supports sequential updates.
-    """
-
-    covariance: FloatArray
-    is_dense: bool
+    covariance: FloatArray  # (n, n) of all columns, (0, 0) for a sparse filter. Predictions write to it.
+    is_dense: bool  # True for a full covariance, which also supports sequential updates
 
     @property
     def marginal(self) -> FloatArray:

@@ -31,8 +31,7 @@ from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.se2_scalar import composed, wrap
 from swarm_loc_estimator.filter.gating import gate_threshold
 
-NOBODY = -1
-"""Robot index for the observer of an absolute fix and the target of a landmark sighting."""
+NOBODY = -1  # Robot index for the observer of an absolute fix and the target of a landmark sighting
 
 
 class Kind(IntEnum):
@@ -52,10 +51,8 @@ class Command(IntEnum):
     FORGET = 2  # deinitialize the target
 
 
-POLAR = int(Kind.POLAR)
-"""`Kind.POLAR` as a plain int, for compiled code."""
-NO_MODEL = -1
-"""The `kind` of a command."""
+POLAR = int(Kind.POLAR)  # `Kind.POLAR` as a plain int, for compiled code
+NO_MODEL = -1  # The `kind` of a command
 
 MEASUREMENT_DTYPE = np.dtype(
     [
@@ -148,17 +145,11 @@ def locates_alone(measurements: MeasurementColumns, k: int) -> bool:
 
 
 class Prediction(NamedTuple):
-    """Predicted value of a measurement with n components, n up to 3.
+    """Predicted value of a measurement with n components, n up to 3."""
 
-    Attributes:
-        value: (n,) predicted value.
-        observer_jacobian: (n, 3) by the observer's right-invariant error X = exp(xi) X_hat.
-        target_jacobian: (n, 3) by the target's right-invariant error.
-    """
-
-    value: FloatArray
-    observer_jacobian: FloatArray
-    target_jacobian: FloatArray
+    value: FloatArray  #: (n,) predicted value
+    observer_jacobian: FloatArray  #: (n, 3) by the observer's right-invariant error X = exp(xi) X_hat
+    target_jacobian: FloatArray  #: (n, 3) by the target's right-invariant error
 
 
 @dataclass(frozen=True)
@@ -166,26 +157,19 @@ class MeasurementModel:
     """Model of a kind of measurement as a function of the poses of its observer and its target.
 
     A model without a compiled kernel is evaluated by its record, see `filter/model_evaluation.py`.
-
-    Attributes:
-        name: Human-readable name.
-        number: Value of the field `kind` of its measurements.
-        degrees_of_freedom: Number of leading components that are gated.
-        predict: Predicts from a measurement (1,) and the poses (3,) in `map` of observer and target. For a
-            landmark, the pose of the target is the correction of its survey. The pose of a missing side is
-            undefined.
-        innovation: Returns measured minus predicted (n,), angles wrapped, for a measurement (1,) and a
-            predicted value (n,).
-        constraint: Converts a measurement (1,) to `Kind.CARTESIAN` or `Kind.POLAR`, to initialize a robot.
-            None: those of one degree of freedom initialize one together, see `initialization/window.py`, and
-            others do not.
     """
 
-    name: str
-    number: int
-    degrees_of_freedom: int
+    name: str  #: Human-readable name
+    number: int  #: Value of the field `kind` of its measurements
+    degrees_of_freedom: int  #: Number of leading components that are gated
+    #: Predicts from a measurement (1,) and the poses (3,) in `map` of observer and target. For a landmark,
+    #: the pose of the target is the correction of its survey. The pose of a missing side is undefined.
     predict: Callable[[MeasurementArray, FloatArray, FloatArray], Prediction]
+    #: Returns measured minus predicted (n,), angles wrapped, for a measurement (1,) and a predicted value
+    #: (n,)
     innovation: Callable[[MeasurementArray, FloatArray], FloatArray]
+    #: Converts a measurement (1,) to `Kind.CARTESIAN` or `Kind.POLAR`, to initialize a robot. None: those of
+    #: one degree of freedom initialize one together, see `initialization/window.py`, and others do not.
     constraint: Callable[[MeasurementArray], MeasurementArray] | None = None
 
     def gate(self, probability: ArrayLike) -> FloatArray:

@@ -33,21 +33,13 @@ from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, DRIVES, TUR
 
 
 class _Drift(NamedTuple):
-    """Drift of a robot's pose by its parameters, from the instant of the belief to another one.
+    """Drift of a robot's pose by its parameters, from the instant of the belief to another one."""
 
-    Attributes:
-        twist: (3,) T changes to exp(twist) T.
-        drive: (3, DRIVES) Jacobian of the final pose error by the initial errors of the parameters.
-        left: Remaining share of the turn bias.
-        gained: Process noise variance of the mean turn bias, in squared units of its column of `drive`.
-        shared: Process noise covariance of the mean and the final turn bias, in those units.
-    """
-
-    twist: FloatArray
-    drive: FloatArray
-    left: float
-    gained: float
-    shared: float
+    twist: FloatArray  # (3,) T changes to exp(twist) T
+    drive: FloatArray  # (3, DRIVES) Jacobian of the final pose error by the initial errors of the parameters
+    left: float  # Remaining share of the turn bias
+    gained: float  # Process noise variance of the mean turn bias, in squared units of its column of `drive`
+    shared: float  # Process noise covariance of the mean and the final turn bias, in those units
 
 
 @cached_njit

@@ -27,8 +27,7 @@ from swarm_loc_estimator.odometry.look_up import look_up, new_sample
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.track_arrays import TrackArrays
 
-OPEN, USED, GATED = 0, 1, 2
-"""Verdicts, see `fusion.Verdict`."""
+OPEN, USED, GATED = 0, 1, 2  # Verdicts, see `fusion.Verdict`
 
 FINISHED, LEFT_OUT, LOST, CONTRADICTED = 0, 1, 2, 3
 """Reasons to return from `update_in_order`: all fused; a command, a model without a kernel or a measurement

@@ -34,8 +34,7 @@ _ALONE: IntArray = np.zeros(0, dtype=np.int64)
 _NO_SHARES: FloatArray = np.zeros((0, 3, 3))
 
 
-IN_MAP = -1
-"""Origin of poses in `map`."""
+IN_MAP = -1  # Origin of poses in `map`
 
 
 class Meetings(NamedTuple):
@@ -49,36 +48,22 @@ class InitialPose(NamedTuple):
     """Pose of an odometry track, to initialize a robot.
 
     The error is the sum of an independent part and of mapped errors of other bodies.
-
-    Attributes:
-        transform: (3,) T, from `map` to the track's frame.
-        covariance: (3, 3) of the independent part of the right-invariant error.
-        columns: (s,) first filter columns of the other bodies.
-        shares: (s, 3, 3) Jacobians of the error with respect to theirs.
     """
 
-    transform: FloatArray
-    covariance: FloatArray
-    columns: IntArray = _ALONE
-    shares: FloatArray = _NO_SHARES
+    transform: FloatArray  # (3,) T, from `map` to the track's frame
+    covariance: FloatArray  # (3, 3) of the independent part of the right-invariant error
+    columns: IntArray = _ALONE  # (s,) first filter columns of the other bodies
+    shares: FloatArray = _NO_SHARES  # (s, 3, 3) Jacobians of the error with respect to theirs
 
 
 class Starts(NamedTuple):
-    """Initial poses of the tracks of robots (k,), with independent errors.
+    """Initial poses of the tracks of robots (k,), with independent errors."""
 
-    Attributes:
-        transform: (k, 3) T, from `map` to the tracks' frames.
-        covariance: (k, 3, 3) of the right-invariant errors.
-        stamp_ns: (k,) instants of initialization.
-        preintegrated_covariance: (k, 3, 3) of the tracks at these instants.
-        preintegrated_jacobian: (k, 3, 3) of the tracks at these instants.
-    """
-
-    transform: FloatArray
-    covariance: FloatArray
-    stamp_ns: IntArray
-    preintegrated_covariance: FloatArray
-    preintegrated_jacobian: FloatArray
+    transform: FloatArray  # (k, 3) T, from `map` to the tracks' frames
+    covariance: FloatArray  # (k, 3, 3) of the right-invariant errors
+    stamp_ns: IntArray  # (k,) instants of initialization
+    preintegrated_covariance: FloatArray  # (k, 3, 3) of the tracks at these instants
+    preintegrated_jacobian: FloatArray  # (k, 3, 3) of the tracks at these instants
 
 
 class SwarmState:

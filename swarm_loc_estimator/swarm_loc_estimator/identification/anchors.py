@@ -17,42 +17,27 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gathered_between
 from swarm_loc_estimator.identification.tracks import NO_TRACKS, Tracks, predicted, updated
 
-_CONCENTRATED = 8.0
-"""Concentration from which a von Mises heading is treated as Gaussian: 0.36 rad."""
+_CONCENTRATED = 8.0  # Concentration from which a von Mises heading is treated as Gaussian: 0.36 rad
 _ANY_DIRECTION = 3.0
 """Standard deviation of c along the circle before its direction is known; wide for a linear model."""
 
 
 class Scale(NamedTuple):
-    """Scale of an image.
+    """Scale of an image."""
 
-    Attributes:
-        mean: Units of the image per metre of the robot's own motion.
-        sigma: Standard deviation of the mean, in the same unit.
-    """
-
-    mean: float
-    sigma: float
+    mean: float  # Units of the image per metre of the robot's own motion
+    sigma: float  # Standard deviation of the mean, in the same unit
 
 
 class Anchors(NamedTuple):
-    """Detections (a,) of one image that are candidates for the robot.
+    """Detections (a,) of one image that are candidates for the robot."""
 
-    Attributes:
-        point: The robot's own track at that image.
-        stamp_ns: Of the image.
-        position: (a, 2) [m].
-        covariance: (a, 2, 2).
-        log_weight: (a,) up to the constant of the tracks.
-        place: (a,) which detection of the newest image each is; MISSED: of an earlier one.
-    """
-
-    point: TrackPoint
-    stamp_ns: int
-    position: FloatArray
-    covariance: FloatArray
-    log_weight: FloatArray
-    place: IntArray
+    point: TrackPoint  # The robot's own track at that image
+    stamp_ns: int  # Of the image
+    position: FloatArray  # (a, 2) [m]
+    covariance: FloatArray  # (a, 2, 2)
+    log_weight: FloatArray  # (a,) up to the constant of the tracks
+    place: IntArray  # (a,) which detection of the newest image each is; MISSED: of an earlier one
 
     def select(self, rows: IntArray) -> Anchors:
         """The anchors of the given rows."""
@@ -65,17 +50,11 @@ class Anchors(NamedTuple):
 
 
 class Circles(NamedTuple):
-    """Pairs (a, n) of an anchor and a detection of a later image.
+    """Pairs (a, n) of an anchor and a detection of a later image."""
 
-    Attributes:
-        log_density: (a, n) of the detection, if it is the robot that the anchor is [1/m^2].
-        log_alike: (a, n) the same if both are another robot, which moves about as far.
-        concentration: (a, n) of the heading that the pair shows.
-    """
-
-    log_density: FloatArray
-    log_alike: FloatArray
-    concentration: FloatArray
+    log_density: FloatArray  # (a, n) of the detection, if it is the robot that the anchor is [1/m^2]
+    log_alike: FloatArray  # (a, n) the same if both are another robot, which moves about as far
+    concentration: FloatArray  # (a, n) of the heading that the pair shows
 
 
 def own_way(anchors: Anchors, point: TrackPoint) -> complex:

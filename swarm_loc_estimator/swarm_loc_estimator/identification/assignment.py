@@ -14,25 +14,17 @@ import scipy
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.identification.picture import Picture
 
-UNSEEN = -1
-"""No detection passes the gate of a robot, or no robot that of a detection."""
-AMBIGUOUS = -2
-"""Candidates pass the gate, but none is clearly the right one."""
+UNSEEN = -1  #: No detection passes the gate of a robot, or no robot that of a detection
+AMBIGUOUS = -2  # Candidates pass the gate, but none is clearly the right one
 _FORBIDDEN = 1e9
 
 
 class Assignment(NamedTuple):
-    """Assignment of robots and detections.
+    """Assignment of robots and detections."""
 
-    Attributes:
-        place: (r,) the detection of each robot, or UNSEEN or AMBIGUOUS.
-        robot: (n,) the robot of each detection, as an index below r, or UNSEEN or AMBIGUOUS.
-        probability: (r,) that the assignment of a robot is right, beside the best one without it.
-    """
-
-    place: IntArray
-    robot: IntArray
-    probability: FloatArray
+    place: IntArray  # (r,) the detection of each robot, or UNSEEN or AMBIGUOUS
+    robot: IntArray  # (n,) the robot of each detection, as an index below r, or UNSEEN or AMBIGUOUS
+    probability: FloatArray  # (r,) that the assignment of a robot is right, beside the best one without it
 
 
 def log_ratios(

@@ -38,59 +38,38 @@ from swarm_loc_estimator.identification.tracks import (
     updated,
 )
 
-_NEGLIGIBLE = 12.0
-"""Chains whose log weight lies this far below the largest one are dropped."""
+_NEGLIGIBLE = 12.0  # Chains whose log weight lies this far below the largest one are dropped
 _MAX_TRACKS = 3000
 _MAX_ANCHORED_IMAGES = 6
 """Chains without heading end when their last detection is older than this number of images."""
-_LIKENESS = 0.5
-"""Relative standard deviation of distance and turn of another robot of the same kind."""
+_LIKENESS = 0.5  # Relative standard deviation of distance and turn of another robot of the same kind
 _LEAST_TURN_SPREAD = 0.1
-_OUTSIDE = 0.5
-"""Factor on the detection probability outside the area of all detections so far."""
+_OUTSIDE = 0.5  # Factor on the detection probability outside the area of all detections so far
 
 
-METRIC = Scale(1.0, 0.02)
-"""Scale of a calibrated camera: metres, with a standard deviation of 2 %."""
+METRIC = Scale(1.0, 0.02)  # Scale of a calibrated camera: metres, with a standard deviation of 2 %
 
 
 @dataclass(frozen=True)
 class ChainModel:
-    """Assumptions about images and robots.
+    """Assumptions about images and robots."""
 
-    Attributes:
-        detection_probability: Probability that a robot in the picture is detected.
-        absent: Probability that a robot is not in the first image.
-        entering: Probability that a robot not in the picture is in the next one.
-        false_detections: Mean number of false detections per image.
-        scale: Scale of the image and its standard deviation.
-        scale_drift: Relative random walk of the scale [1/s^0.5].
-    """
-
-    detection_probability: float = 0.95
-    absent: float = 0.05
-    entering: float = 0.05
-    false_detections: float = 0.2
-    scale: Scale = METRIC
-    scale_drift: float = 0.0
+    detection_probability: float = 0.95  # Probability that a robot in the picture is detected
+    absent: float = 0.05  # Probability that a robot is not in the first image
+    entering: float = 0.05  # Probability that a robot not in the picture is in the next one
+    false_detections: float = 0.2  # Mean number of false detections per image
+    scale: Scale = METRIC  # Scale of the image and its standard deviation
+    scale_drift: float = 0.0  # Relative random walk of the scale [1/s^0.5]
 
 
 class Identity(NamedTuple):
-    """The most probable detection of a robot.
+    """The most probable detection of a robot."""
 
-    Attributes:
-        place: Index of the detection in the newest image.
-        probability: Probability that it is the robot.
-        pose: (3,) x [m], y [m], heading [rad] there.
-        covariance: (3, 3) of it.
-        scale: Of the image.
-    """
-
-    place: int
-    probability: float
-    pose: FloatArray
-    covariance: FloatArray
-    scale: float
+    place: int  # Index of the detection in the newest image
+    probability: float  # Probability that it is the robot
+    pose: FloatArray  # (3,) x [m], y [m], heading [rad] there
+    covariance: FloatArray  # (3, 3) of it
+    scale: float  # Of the image
 
 
 class _Starts(NamedTuple):
@@ -102,33 +81,19 @@ class _Starts(NamedTuple):
 
 @dataclass(frozen=True)
 class Chains:
-    """All chains of one robot after some images.
+    """All chains of one robot after some images."""
 
-    Attributes:
-        model: Assumptions.
-        point: The robot's own track at the newest image; None before the first.
-        stamp_ns: Of that image.
-        images: Number of images so far.
-        detections: Number of detections in the newest image.
-        tracks: Chains with a heading.
-        anchors: Chains without, newest image last.
-        log_absent: Log probability that the robot is not in the picture.
-        low: Smallest x and y of all detections so far [m].
-        high: Largest x and y [m].
-        reach: Longest displacement of the robot between images [m].
-    """
-
-    model: ChainModel = ChainModel()
-    point: TrackPoint | None = None
-    stamp_ns: int = 0
-    images: int = 0
-    detections: int = 0
-    tracks: Tracks = NO_TRACKS
-    anchors: tuple[Anchors, ...] = ()
-    log_absent: float = 0.0
-    low: tuple[float, float] = (math.inf, math.inf)
-    high: tuple[float, float] = (-math.inf, -math.inf)
-    reach: float = 0.0
+    model: ChainModel = ChainModel()  # Assumptions
+    point: TrackPoint | None = None  # The robot's own track at the newest image; None before the first
+    stamp_ns: int = 0  # Of that image
+    images: int = 0  # Number of images so far
+    detections: int = 0  # Number of detections in the newest image
+    tracks: Tracks = NO_TRACKS  # Chains with a heading
+    anchors: tuple[Anchors, ...] = ()  # Chains without, newest image last
+    log_absent: float = 0.0  # Log probability that the robot is not in the picture
+    low: tuple[float, float] = (math.inf, math.inf)  # Smallest x and y of all detections so far [m]
+    high: tuple[float, float] = (-math.inf, -math.inf)  # Largest x and y [m]
+    reach: float = 0.0  # Longest displacement of the robot between images [m]
 
     def advanced(self, picture: Picture, point: TrackPoint, stamp_ns: int) -> Chains:
         """The chains after one more image, later than all before.

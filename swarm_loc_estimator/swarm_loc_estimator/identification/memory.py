@@ -28,17 +28,11 @@ class Outcome(IntEnum):
 
 
 class Identities(NamedTuple):
-    """Identities of the robots in an image.
+    """Identities of the robots in an image."""
 
-    Attributes:
-        stamp_ns: Of the image.
-        place: (N,) index of each robot's detection in the message; -1: unknown, or not detected.
-        probability: (N,) of the identity; where it is unknown, of the best candidate.
-    """
-
-    stamp_ns: int
-    place: IntArray
-    probability: FloatArray
+    stamp_ns: int  # Of the image
+    place: IntArray  # (N,) index of each robot's detection in the message; -1: unknown, or not detected
+    probability: FloatArray  # (N,) of the identity; where it is unknown, of the best candidate
 
 
 class IdentityMemory:

@@ -10,17 +10,11 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 
 
 class Picture(NamedTuple):
-    """Anonymous detections (n,) of one aerial image, in `map`.
+    """Anonymous detections (n,) of one aerial image, in `map`."""
 
-    Attributes:
-        pose: (n, 3) x [m], y [m], heading [rad], which is zero where it was not measured.
-        covariance: (n, 3, 3) of it.
-        has_heading: (n,) whether the heading was measured.
-    """
-
-    pose: FloatArray
-    covariance: FloatArray
-    has_heading: BoolArray
+    pose: FloatArray  # (n, 3) x [m], y [m], heading [rad], which is zero where it was not measured
+    covariance: FloatArray  # (n, 3, 3) of it
+    has_heading: BoolArray  # (n,) whether the heading was measured
 
     @property
     def variance(self) -> FloatArray:
@@ -29,15 +23,10 @@ class Picture(NamedTuple):
 
 
 class TrackPoint(NamedTuple):
-    """A robot's own track at the instant of an image.
+    """A robot's own track at the instant of an image."""
 
-    Attributes:
-        pose: (3,) on the track, in the track's frame; the heading is not wrapped.
-        covariance: (3, 3) of the right-invariant error accumulated since the start of the track.
-    """
-
-    pose: FloatArray
-    covariance: FloatArray
+    pose: FloatArray  # (3,) on the track, in the track's frame; the heading is not wrapped
+    covariance: FloatArray  # (3, 3) of the right-invariant error accumulated since the start of the track
 
 
 def gathered_between(before: TrackPoint, after: TrackPoint) -> FloatArray:

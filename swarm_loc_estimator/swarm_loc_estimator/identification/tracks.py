@@ -17,29 +17,19 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.identification.picture import Picture
 
-MISSED = -1
-"""Place of a chain without a detection in the newest image."""
-_FALSE_HEADING = 0.02
-"""Share of detected headings that are wrong and uniformly distributed."""
+MISSED = -1  # Place of a chain without a detection in the newest image
+_FALSE_HEADING = 0.02  # Share of detected headings that are wrong and uniformly distributed
 _LOG_TURN = float(np.log(2.0 * np.pi))
 
 
 class Tracks(NamedTuple):
-    """Chains (h,) of detections.
+    """Chains (h,) of detections."""
 
-    Attributes:
-        mean: (h, 4) p [m], c [1], real and imaginary parts.
-        covariance: (h, 4, 4).
-        log_weight: (h,) log probabilities, up to a common constant.
-        place: (h,) detection of the newest image at which each ends, or MISSED.
-        length: (h,) number of detections of each.
-    """
-
-    mean: FloatArray
-    covariance: FloatArray
-    log_weight: FloatArray
-    place: IntArray
-    length: IntArray
+    mean: FloatArray  # (h, 4) p [m], c [1], real and imaginary parts
+    covariance: FloatArray  # (h, 4, 4)
+    log_weight: FloatArray  # (h,) log probabilities, up to a common constant
+    place: IntArray  # (h,) detection of the newest image at which each ends, or MISSED
+    length: IntArray  # (h,) number of detections of each
 
     def select(self, rows: IntArray) -> Tracks:
         """The tracks of the given rows."""

@@ -55,8 +55,7 @@ def _at(platform: IrPlatform, poses: ArrayLike, gains: PairGains | None) -> tupl
     return readings * factor, slopes * factor[:, None]
 
 
-WAY_ROWS = 22
-"""Number of rows of the workspace of `predict_brightness`."""
+WAY_ROWS = 22  # Number of rows of the workspace of `predict_brightness`
 
 
 class _Ways(NamedTuple):

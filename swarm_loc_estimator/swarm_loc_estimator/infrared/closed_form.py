@@ -26,18 +26,13 @@ from swarm_loc_estimator.infrared.solution import DARKEST, IrOutcome, IrSolution
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
 _FOUND, _TOO_WEAK, _UNDETERMINED = int(IrOutcome.FOUND), int(IrOutcome.TOO_WEAK), int(IrOutcome.UNDETERMINED)
-_FAINTEST = 15.0
-"""Minimum of the brightest reading [sigma]; below it, noise makes far robots appear near."""
-_CLEAR = 0.05
-"""Minimum length of the mean direction of light; below it, the direction is undetermined."""
-_LEVELS, _SAMPLES = 32, 300
-"""Number of tabulated ranges, and of simulated poses at each."""
+_FAINTEST = 15.0  # Minimum of the brightest reading [sigma]; below it, noise makes far robots appear near
+_CLEAR = 0.05  # Minimum length of the mean direction of light; below it, the direction is undetermined
+_LEVELS, _SAMPLES = 32, 300  # Number of tabulated ranges, and of simulated poses at each
 _FEWEST, _CORE = 30, 0.99
 """Minimum number of simulated poses per tabulated range, and share of them that enters the covariance."""
-_SYSTEMATIC = 0.95
-"""Systematic share of the variance, from the approximation and from gains."""
-_SIGMA_STEP = 0.02
-"""Resolution of the standard deviation of log-gains for which errors are tabulated."""
+_SYSTEMATIC = 0.95  # Systematic share of the variance, from the approximation and from gains
+_SIGMA_STEP = 0.02  # Resolution of the standard deviation of log-gains for which errors are tabulated
 
 
 class ClosedForm:

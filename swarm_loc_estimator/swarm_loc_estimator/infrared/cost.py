@@ -23,19 +23,14 @@ _MOST = math.sqrt(2.0 * BELIEVED)
 
 
 class Costs(NamedTuple):
-    """The likelihood model of each of F readings.
+    """The likelihood model of each of F readings."""
 
-    Attributes:
-        per_sigma: (F,) inverse standard deviation of readings with a Gaussian likelihood, else 0.
-        most: (F,) maximum residual, expected minus read [sigma]; beyond it the reading counts as blocked.
-        others: (F,) indices of readings evaluated by `reading_cost`; the first `counts[1]` are valid.
-        counts: (2,) number of Gaussian readings and of `others`.
-    """
-
-    per_sigma: FloatArray
+    per_sigma: FloatArray  # (F,) inverse standard deviation of readings with a Gaussian likelihood, else 0
+    # (F,) maximum residual, expected minus read [sigma]; beyond it the reading counts as blocked
     most: FloatArray
+    # (F,) indices of readings evaluated by `reading_cost`; the first `counts[1]` are valid
     others: NDArray[np.int64]
-    counts: NDArray[np.int64]
+    counts: NDArray[np.int64]  # (2,) number of Gaussian readings and of `others`
 
 
 @cached_njit
@@ -45,77 +40,48 @@ def new_costs(readings: int) -> Costs:
 
 
 class Pair(NamedTuple):
-    """The readings of one pair of robots; F is modes * n * n, by mode, sensor, emitter.
+    """The readings of one pair of robots; F is modes * n * n, by mode, sensor, emitter."""
 
-    Attributes:
-        readings: (F,) [count].
-        cut: (F,) readings cut at saturation; 0 where MISSING.
-        stable: (F,) `cut` after the variance-stabilizing transform `stabilized` [sigma].
-        kinds: (F,) MISSING, MEASURED or SATURATED.
-        costs: Their likelihood model.
-        sensor: (n,) gains of the receiver's sensors.
-        emitter: (n,) gains of the transmitter's emitters.
-        prior: (2, 2) per side (sensors, emitters): w and c of the information matrix w (I - c 1 1^T) of the
-            prior on its log-gains; w = 0: gains are exact.
-        nearest: Minimum range of the search [m].
-        farthest: Maximum range of the search [m].
-    """
-
-    readings: FloatArray
-    cut: FloatArray
-    stable: FloatArray
-    kinds: NDArray[np.int8]
-    costs: Costs
-    sensor: FloatArray
-    emitter: FloatArray
+    readings: FloatArray  # (F,) [count]
+    cut: FloatArray  # (F,) readings cut at saturation; 0 where MISSING
+    stable: FloatArray  # (F,) `cut` after the variance-stabilizing transform `stabilized` [sigma]
+    kinds: NDArray[np.int8]  # (F,) MISSING, MEASURED or SATURATED
+    costs: Costs  # Their likelihood model
+    sensor: FloatArray  # (n,) gains of the receiver's sensors
+    emitter: FloatArray  # (n,) gains of the transmitter's emitters
+    # (2, 2) per side (sensors, emitters): w and c of the information matrix w (I - c 1 1^T) of the prior on
+    # its log-gains; w = 0: gains are exact
     prior: FloatArray
-    nearest: float
-    farthest: float
+    nearest: float  # Minimum range of the search [m]
+    farthest: float  # Maximum range of the search [m]
 
 
 class CostWorkspace(NamedTuple):
     """Memory of a search over P unknowns: the log-gains of sensors and emitters, if estimated, and the pose.
 
     The pose comes last, so that the last rows of the Hessian's factor are those of the pose alone.
-
-    Attributes:
-        ways: (WAY_ROWS, n * n) workspace of `predict_brightness`.
-        expected: (F,) expected readings for unit gains [count].
-        slopes: (3, F) derivatives of `expected` by range, bearing and heading.
-        pulls: (F,) first derivative of each reading's cost by `expected`.
-        weights: (F,) second derivative of each reading's cost by `expected`.
-        at: (P,) best estimate so far.
-        trial: (P,) next estimate to evaluate.
-        factors: (F,) products of a sensor's and an emitter's gain.
-        gradients: (2, P) gradients of the cost at `at` and at `trial`, in either order.
-        hessians: (2, P, P) Gauss-Newton Hessians at the same estimates; lower triangles.
-        factor: (P, P) Cholesky factor of the damped Hessian; lower triangle.
-        step: (P,) Gauss-Newton step.
-        tally: (3,) sum of squared residuals of priors and inlier readings, degrees of freedom of these
-            readings, and sum of squared residuals of all readings.
-        systematic: (3, 3) pose information from readings, weighted by the systematic share of their noise.
-        of_gains: (3,) share of the pose's variances that comes from unknown gains.
-        root: (3, 3) inverse of the pose block of `factor`; lower triangle.
-        first_root: (3, 3) `root` at a minimum.
     """
 
-    ways: FloatArray
-    expected: FloatArray
-    slopes: FloatArray
-    pulls: FloatArray
-    weights: FloatArray
-    at: FloatArray
-    trial: FloatArray
-    factors: FloatArray
-    gradients: FloatArray
-    hessians: FloatArray
-    factor: FloatArray
-    step: FloatArray
+    ways: FloatArray  # (WAY_ROWS, n * n) workspace of `predict_brightness`
+    expected: FloatArray  # (F,) expected readings for unit gains [count]
+    slopes: FloatArray  # (3, F) derivatives of `expected` by range, bearing and heading
+    pulls: FloatArray  # (F,) first derivative of each reading's cost by `expected`
+    weights: FloatArray  # (F,) second derivative of each reading's cost by `expected`
+    at: FloatArray  # (P,) best estimate so far
+    trial: FloatArray  # (P,) next estimate to evaluate
+    factors: FloatArray  # (F,) products of a sensor's and an emitter's gain
+    gradients: FloatArray  # (2, P) gradients of the cost at `at` and at `trial`, in either order
+    hessians: FloatArray  # (2, P, P) Gauss-Newton Hessians at the same estimates; lower triangles
+    factor: FloatArray  # (P, P) Cholesky factor of the damped Hessian; lower triangle
+    step: FloatArray  # (P,) Gauss-Newton step
+    # (3,) sum of squared residuals of priors and inlier readings, degrees of freedom of these readings, and
+    # sum of squared residuals of all readings
     tally: FloatArray
+    # (3, 3) pose information from readings, weighted by the systematic share of their noise
     systematic: FloatArray
-    of_gains: FloatArray
-    root: FloatArray
-    first_root: FloatArray
+    of_gains: FloatArray  # (3,) share of the pose's variances that comes from unknown gains
+    root: FloatArray  # (3, 3) inverse of the pose block of `factor`; lower triangle
+    first_root: FloatArray  # (3, 3) `root` at a minimum
 
 
 @cached_njit

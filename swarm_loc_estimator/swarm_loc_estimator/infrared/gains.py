@@ -26,43 +26,28 @@ from swarm_loc_estimator.swarm.ir_board import GAIN_RANGE, IrGains, IrPlatform, 
 Progress = Callable[[str], None]
 
 _ROUNDS = 8
-_STILL = 1e-3
-"""Maximum change of a log-gain at convergence."""
-POSE_SIGMA = (0.0005, 0.005, 0.005)
-"""Standard deviations of known poses: range [m], bearing, heading [rad]."""
-_BACKGROUND = 0.5
-"""Standard deviation of the residual ambient light of a sensor [sigma of a reading]."""
-_SEARCH_SIGMA = 0.02
-"""Standard deviation of log-gains in the search for poses."""
+_STILL = 1e-3  # Maximum change of a log-gain at convergence
+POSE_SIGMA = (0.0005, 0.005, 0.005)  # Standard deviations of known poses: range [m], bearing, heading [rad]
+_BACKGROUND = 0.5  # Standard deviation of the residual ambient light of a sensor [sigma of a reading]
+_SEARCH_SIGMA = 0.02  # Standard deviation of log-gains in the search for poses
 _MAX_ODDS = 0.05
 _MAX_MISFIT = 3.0
 """Maximum odds of the second-best pose and maximum misfit of exchanges that are used; where most exchanges
 fit worse with free gains, the curves are wrong."""
-_CLEAR_OF_SATURATION = 3.0
-"""Minimum distance of the expected reading from saturation [sigma]."""
-_WORST = 5.0
-"""Maximum mean squared residual of an exchange, relative to the median."""
+_CLEAR_OF_SATURATION = 3.0  # Minimum distance of the expected reading from saturation [sigma]
+_WORST = 5.0  # Maximum mean squared residual of an exchange, relative to the median
 _LONGEST_STEP = 0.3
-_MIN_SIGMA = 0.003
-"""Minimum reported standard deviation of gains."""
+_MIN_SIGMA = 0.003  # Minimum reported standard deviation of gains
 
 
 class Exchanges(NamedTuple):
-    """Readings of robots of each other.
+    """Readings of robots of each other."""
 
-    Attributes:
-        receiver: (k,) index of the robot that measured.
-        transmitter: (k,) index of the robot that lit its emitters.
-        readings: (k, modes, n, n) [count], [mode, sensor, emitter], NaN where not measured.
-        saturation: (k, modes) minimum of saturated readings [count].
-        poses: (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad]; NaN where
-            not known.
-    """
-
-    receiver: NDArray[np.int64]
-    transmitter: NDArray[np.int64]
-    readings: FloatArray
-    saturation: FloatArray
+    receiver: NDArray[np.int64]  # (k,) index of the robot that measured
+    transmitter: NDArray[np.int64]  # (k,) index of the robot that lit its emitters
+    readings: FloatArray  # (k, modes, n, n) [count], [mode, sensor, emitter], NaN where not measured
+    saturation: FloatArray  # (k, modes) minimum of saturated readings [count]
+    # (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad]; NaN where not known
     poses: FloatArray
 
     def select(self, rows: NDArray[np.bool_]) -> Exchanges:
@@ -72,20 +57,15 @@ class Exchanges(NamedTuple):
 
 @dataclass(frozen=True)
 class GainsFit:
-    """Gains of all robots, and the residuals without and with them.
+    """Gains of all robots, and the residuals without and with them."""
 
-    Attributes:
-        gains: One per robot; the uncalibrated default where contradictory exchanges would make the estimate
-            less certain than that.
-        used: (k,) which exchanges were used.
-        before: (k, modes, n, n) residuals with all gains 1, in sigmas; NaN where a reading was not used.
-        after: (k, modes, n, n) those residuals with the gains.
-    """
-
+    # One per robot; the uncalibrated default where contradictory exchanges would make the estimate less
+    # certain than that
     gains: tuple[IrGains, ...]
-    used: NDArray[np.bool_]
+    used: NDArray[np.bool_]  # (k,) which exchanges were used
+    # (k, modes, n, n) residuals with all gains 1, in sigmas; NaN where a reading was not used
     before: FloatArray
-    after: FloatArray
+    after: FloatArray  # (k, modes, n, n) those residuals with the gains
 
 
 class GainsError(ValueError):
@@ -207,19 +187,12 @@ def _without_worst(residuals: FloatArray, used: NDArray[np.bool_]) -> NDArray[np
 
 
 class _Linear(NamedTuple):
-    """Readings of the u exchanges used, linearized at the current estimate.
+    """Readings of the u exchanges used, linearized at the current estimate."""
 
-    Attributes:
-        weight: (u, modes, n, n) inverse variance, 0 where a reading is not used.
-        residual: (u, modes, n, n) reading minus expectation.
-        expected: (u, modes, n, n) expectation, equal to its derivative by a log-gain.
-        slopes: (u, modes, n, n, 3) derivatives by the pose.
-    """
-
-    weight: FloatArray
-    residual: FloatArray
-    expected: FloatArray
-    slopes: FloatArray
+    weight: FloatArray  # (u, modes, n, n) inverse variance, 0 where a reading is not used
+    residual: FloatArray  # (u, modes, n, n) reading minus expectation
+    expected: FloatArray  # (u, modes, n, n) expectation, equal to its derivative by a log-gain
+    slopes: FloatArray  # (u, modes, n, n, 3) derivatives by the pose
 
 
 def _linearized(

@@ -39,41 +39,29 @@ from swarm_loc_estimator.infrared.start_table import (
 )
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
-_WORSE = 2.0
-"""Maximum misfit of a start relative to that of the best start."""
+_WORSE = 2.0  # Maximum misfit of a start relative to that of the best start
 _LOOSE, _STILL = 0.1, 1e-4
 """Minimum predicted decrease of the cost per step, for the blurred and for the exact model."""
-_SAME = 0.02
-"""Maximum difference in cost of two searches that reached the same minimum."""
-_SUSPICIOUS = 1.3
-"""Threshold of the misfit above which a minimum may be wrong."""
+_SAME = 0.02  # Maximum difference in cost of two searches that reached the same minimum
+_SUSPICIOUS = 1.3  # Threshold of the misfit above which a minimum may be wrong
 _FEWEST = 9
-_FAINTEST = 6.0
-"""Minimum excess of the readings' sum of squares over noise [sigma]."""
+_FAINTEST = 6.0  # Minimum excess of the readings' sum of squares over noise [sigma]
 _FAINTEST_OF_OUTLIERS = 3.0
 """The same for platforms with bright outliers, where the posterior over all poses also rejects noise."""
-_EXPLAINED = 0.5
-"""Minimum share of the readings' sum of squares that a pose must explain."""
-_EXPLAINED_OF_OUTLIERS = 0.2
-"""The same where readings may be blocked or too bright."""
-_WIDEST = 1.0
-"""Maximum standard deviation of bearing and heading around the best minimum [rad]."""
-_WIDEST_OF_ALL = 0.9
-"""The same for the posterior over all poses."""
-_APART = 0.1
-"""Minimum distance of two distinct minima in bearing, heading [rad] or relative range."""
+_EXPLAINED = 0.5  # Minimum share of the readings' sum of squares that a pose must explain
+_EXPLAINED_OF_OUTLIERS = 0.2  # The same where readings may be blocked or too bright
+_WIDEST = 1.0  # Maximum standard deviation of bearing and heading around the best minimum [rad]
+_WIDEST_OF_ALL = 0.9  # The same for the posterior over all poses
+_APART = 0.1  # Minimum distance of two distinct minima in bearing, heading [rad] or relative range
 _AROUND = [(b, h) for b in (-0.2, 0.0, 0.2) for h in (-0.2, 0.0, 0.2) if b or h]
 _ASIDE = np.array([(0.0, 0.1, 0.3), (0.0, -0.1, -0.3), *((0.0, b, h) for b, h in _AROUND)])
 """Offsets (range [m], bearing, heading [rad]) of additional starts: two from the best minimum, near which the
 second-best often is, the others from the table's best start."""
-_OF_SECOND = 2
-"""Number of these offsets that start from the best minimum."""
+_OF_SECOND = 2  # Number of these offsets that start from the best minimum
 _MIN_ODDS = 1e-4
-_WORTH_WEIGHING = 8.0
-"""Maximum difference in cost of two minima compared by the probability around them."""
+_WORTH_WEIGHING = 8.0  # Maximum difference in cost of two minima compared by the probability around them
 _NO_MINIMUM = np.full(4, math.inf)
-_EXACT = 1e-4
-"""Standard deviation of each log-gain where only the common log-gain is uncertain."""
+_EXACT = 1e-4  # Standard deviation of each log-gain where only the common log-gain is uncertain
 _FOUND, _TOO_WEAK, _TOO_FEW, _UNDETERMINED, _MISFIT = (int(outcome) for outcome in IrOutcome)
 
 
@@ -98,17 +86,11 @@ class MaximumLikelihood:
 
 
 class Models(NamedTuple):
-    """The models of a platform.
+    """The models of a platform."""
 
-    Attributes:
-        exact: The platform's model.
-        blurred: The model with smoothed curves, which has fewer local minima.
-        table: Expected readings at coarse poses.
-    """
-
-    exact: IrModel
-    blurred: IrModel
-    table: StartTable
+    exact: IrModel  # The platform's model
+    blurred: IrModel  # The model with smoothed curves, which has fewer local minima
+    table: StartTable  # Expected readings at coarse poses
 
 
 @cached_njit

@@ -14,17 +14,12 @@ from swarm_loc_estimator.swarm.ir_board import ReadingErrors
 
 MISSING, MEASURED, SATURATED = 0, 1, 2
 
-_TAIL = -6.0
-"""Threshold below which the normal tail uses its asymptotic series [sigma]."""
-DARK = 4.0
-"""Maximum of blocked readings [sigma]."""
-BELIEVED = 2.0
-"""Maximum cost of an inlier."""
-_STRAY = 5.0
-"""Mean brightness of light that is not modelled [sigma]."""
+_TAIL = -6.0  # Threshold below which the normal tail uses its asymptotic series [sigma]
+DARK = 4.0  # Maximum of blocked readings [sigma]
+BELIEVED = 2.0  # Maximum cost of an inlier
+_STRAY = 5.0  # Mean brightness of light that is not modelled [sigma]
 _STRAY_DENSITY = math.log(_STRAY / math.sqrt(2.0 * math.pi))
-_SURELY = 6.0
-"""Minimum difference in cost at which the outlier hypothesis is ignored."""
+_SURELY = 6.0  # Minimum difference in cost at which the outlier hypothesis is ignored
 
 
 @cached_njit

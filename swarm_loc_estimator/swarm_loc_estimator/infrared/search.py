@@ -35,8 +35,7 @@ from swarm_loc_estimator.infrared.start_table import (
 )
 from swarm_loc_estimator.swarm.ir_board import IrModel
 
-TABLE_STARTS = 3
-"""Maximum number of starts from the table."""
+TABLE_STARTS = 3  # Maximum number of starts from the table
 
 
 class Workspace(NamedTuple):
@@ -151,14 +150,10 @@ def classify(model: IrModel, saturation: FloatArray, pair: Pair) -> tuple[int, i
 _ROUNDS = 40
 _FIRST_DAMPING = 1e-3
 _MAX_DAMPING = 1e8
-_LONGEST_TURN = 0.4
-"""Maximum change of bearing and heading per step [rad]."""
-_LONGEST_SHARE = 0.4
-"""Maximum relative change of range per step."""
-_BESIDE = 0.03
-"""Distance from a known minimum [rad, relative in range] within which a search ends early."""
-_AWAY = 2.5
-"""Distance from a minimum of the points over which its covariance is averaged [sigma]."""
+_LONGEST_TURN = 0.4  # Maximum change of bearing and heading per step [rad]
+_LONGEST_SHARE = 0.4  # Maximum relative change of range per step
+_BESIDE = 0.03  # Distance from a known minimum [rad, relative in range] within which a search ends early
+_AWAY = 2.5  # Distance from a minimum of the points over which its covariance is averaged [sigma]
 _CORNER = 3.0**-0.5
 _AROUND = (
     (_CORNER, _CORNER, _CORNER),

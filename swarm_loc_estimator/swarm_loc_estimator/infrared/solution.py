@@ -12,8 +12,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
 
-DARKEST = -6.0
-"""Minimum of a valid reading; lower ones count as missing [sigma]."""
+DARKEST = -6.0  # Minimum of a valid reading; lower ones count as missing [sigma]
 
 
 class IrOutcome(IntEnum):
@@ -27,25 +26,17 @@ class IrOutcome(IntEnum):
 
 
 class IrSolutions(NamedTuple):
-    """Relative poses of k pairs: range [m], bearing [rad], heading [rad]; NaN where there is none.
+    """Relative poses of k pairs: range [m], bearing [rad], heading [rad]; NaN where there is none."""
 
-    Attributes:
-        poses: (k, 3).
-        covariances: (k, 3, 3).
-        outcomes: (k,) of `IrOutcome`.
-        alternatives: (k, 3) the second-best pose where it is nearly as likely, else NaN.
-        odds: (k,) its likelihood relative to the best one's, in [0, 1].
-        systematic_share: (k, 3) share of each variance that is systematic, mostly from unknown gains.
-        misfits: (k,) sum of squared residuals per degree of freedom; about 1 where the platform's noise
-            matches the readings.
-    """
-
-    poses: FloatArray
-    covariances: FloatArray
-    outcomes: NDArray[np.int64]
-    alternatives: FloatArray
-    odds: FloatArray
+    poses: FloatArray  # (k, 3)
+    covariances: FloatArray  # (k, 3, 3)
+    outcomes: NDArray[np.int64]  # (k,) of `IrOutcome`
+    alternatives: FloatArray  # (k, 3) the second-best pose where it is nearly as likely, else NaN
+    odds: FloatArray  # (k,) its likelihood relative to the best one's, in [0, 1]
+    # (k, 3) share of each variance that is systematic, mostly from unknown gains
     systematic_share: FloatArray
+    # (k,) sum of squared residuals per degree of freedom; about 1 where the platform's noise matches the
+    # readings
     misfits: FloatArray
 
     @classmethod

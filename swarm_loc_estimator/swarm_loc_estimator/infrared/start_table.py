@@ -26,10 +26,8 @@ from swarm_loc_estimator.infrared.curves import curve_at, distance_at
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform
 from swarm_loc_estimator.swarm.ir_curves import AngleCurve, TabulatedCurve
 
-_NEGLIGIBLE = 16.0
-"""Maximum cost of a pose above the minimum; others are left out."""
-_BESIDE = 1.5
-"""Maximum distance of poses that belong to one minimum, in steps of the table."""
+_NEGLIGIBLE = 16.0  # Maximum cost of a pose above the minimum; others are left out
+_BESIDE = 1.5  # Maximum distance of poses that belong to one minimum, in steps of the table
 
 
 @cached_njit
@@ -79,58 +77,36 @@ def add_spread(table: StartTable, work: StartWorkspace, pose: FloatArray, covari
     return max(all_b, all_h) / total
 
 
-_DIRECTIONS = (16, 24)
-"""Minimum and maximum number of bearings, and of headings; in between, two per element."""
+_DIRECTIONS = (16, 24)  # Minimum and maximum number of bearings, and of headings; in between, two per element
 _LEVELS = 16
-_KNEE = 10.0
-"""Brightness above which compression is logarithmic instead of linear [sigma]."""
-_SHOWN = 2.0
-"""Brightness of an aligned pair at the maximum range of the table [sigma]."""
+_KNEE = 10.0  # Brightness above which compression is logarithmic instead of linear [sigma]
+_SHOWN = 2.0  # Brightness of an aligned pair at the maximum range of the table [sigma]
 
-_BLOCKED = np.float32(0.2)
-"""Maximum contribution of a blocked reading to the misfit."""
-_PER_SIGMA = np.float32(_KNEE)
-"""Inverse standard deviation of noise on the table's compressed scale."""
-_DARKEST = np.float32(3.0)
-"""Maximum cost of a possibly blocked reading where others may be too bright."""
-_BLUR = 0.1
-"""Standard deviation of the Gaussian by which `blurred` smooths the curves [rad]."""
-_BLUR_NOISE = 0.1
-"""Relative noise of the blurred model."""
+_BLOCKED = np.float32(0.2)  # Maximum contribution of a blocked reading to the misfit
+_PER_SIGMA = np.float32(_KNEE)  # Inverse standard deviation of noise on the table's compressed scale
+_DARKEST = np.float32(3.0)  # Maximum cost of a possibly blocked reading where others may be too bright
+_BLUR = 0.1  # Standard deviation of the Gaussian by which `blurred` smooths the curves [rad]
+_BLUR_NOISE = 0.1  # Relative noise of the blurred model
 
 Float32Array = NDArray[np.float32]
 
 
 class StartTable(NamedTuple):
-    """Expected readings at coarse poses, compressed so that bright readings do not dominate.
+    """Expected readings at coarse poses, compressed so that bright readings do not dominate."""
 
-    Attributes:
-        ranges: (L,) ascending [m].
-        angles: (D,) bearings, and headings [rad].
-        patterns: (D * D, L, modes * n * n) by bearing and heading, range, reading.
-        totals: (D * D, L) their sums, which fall with range.
-    """
-
-    ranges: FloatArray
-    angles: FloatArray
-    patterns: Float32Array
-    totals: Float32Array
+    ranges: FloatArray  # (L,) ascending [m]
+    angles: FloatArray  # (D,) bearings, and headings [rad]
+    patterns: Float32Array  # (D * D, L, modes * n * n) by bearing and heading, range, reading
+    totals: Float32Array  # (D * D, L) their sums, which fall with range
 
 
 class StartWorkspace(NamedTuple):
-    """Memory for the search for starts.
+    """Memory for the search for starts."""
 
-    Attributes:
-        misfit: (D * D,).
-        level: (D * D,) the range of each direction.
-        totals: (L,).
-        costs: (D * D, L) of every pose, where readings may be too bright.
-    """
-
-    misfit: Float32Array
-    level: NDArray[np.int64]
-    totals: Float32Array
-    costs: Float32Array
+    misfit: Float32Array  # (D * D,)
+    level: NDArray[np.int64]  # (D * D,) the range of each direction
+    totals: Float32Array  # (L,)
+    costs: Float32Array  # (D * D, L) of every pose, where readings may be too bright
 
 
 @cached_njit

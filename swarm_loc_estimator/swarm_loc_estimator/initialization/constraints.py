@@ -46,43 +46,28 @@ CONSTRAINT_DTYPE = np.dtype(
 )
 
 ConstraintArray = NDArray[np.void]
-Constraint = Any
-"""A row of a ConstraintArray inside compiled code, where the fields are attributes."""
+Constraint = Any  # A row of a ConstraintArray inside compiled code, where the fields are attributes
 
 NO_CONSTRAINTS: ConstraintArray = np.zeros(0, dtype=CONSTRAINT_DTYPE)
 _MAX_CONSTRAINTS = 20
 
 
 class Waiting(NamedTuple):
-    """A robot without a pose at the time of a sighting by or of it.
+    """A robot without a pose at the time of a sighting by or of it."""
 
-    Attributes:
-        robot: Its index.
-        pose: (3,) on its track.
-        covariance: (3, 3) preintegrated until then.
-    """
-
-    robot: int
-    pose: FloatArray
-    covariance: FloatArray
+    robot: int  # Its index
+    pose: FloatArray  # (3,) on its track
+    covariance: FloatArray  # (3, 3) preintegrated until then
 
 
 class OtherSide(NamedTuple):
-    """The other side of a sighting: a localized robot, a landmark, or the map itself.
+    """The other side of a sighting: a localized robot, a landmark, or the map itself."""
 
-    Attributes:
-        robot: Its index, or NOBODY.
-        landmark: Index of the landmark; -1: none.
-        pose: (3,) in `map` at the stamp; for a landmark, its displacement from the survey.
-        frame: (3,) frame of its error: T of a robot, the pose of a landmark.
-        noise: (3, 3) covariance of its track preintegrated until the stamp.
-    """
-
-    robot: int
-    landmark: int
-    pose: FloatArray
-    frame: FloatArray
-    noise: FloatArray
+    robot: int  # Its index, or NOBODY
+    landmark: int  # Index of the landmark; -1: none
+    pose: FloatArray  # (3,) in `map` at the stamp; for a landmark, its displacement from the survey
+    frame: FloatArray  # (3,) frame of its error: T of a robot, the pose of a landmark
+    noise: FloatArray  # (3, 3) covariance of its track preintegrated until the stamp
 
 
 THE_MAP = OtherSide(NOBODY, -1, np.zeros(3), np.zeros(3), np.zeros((3, 3)))

@@ -52,8 +52,7 @@ from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW
 
-_INDEPENDENT_NS = 100_000_000
-"""Sightings of one marker within this time are redundant."""
+_INDEPENDENT_NS = 100_000_000  # Sightings of one marker within this time are redundant
 _LONGEST_PAUSE_NS = 300_000_000
 _PAUSE_SHARE = 8
 """After a failed attempt the robot collects constraints for an eighth of the time that they span.

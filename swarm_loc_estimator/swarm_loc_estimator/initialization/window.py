@@ -34,26 +34,21 @@ WindowArray = NDArray[np.void]
 NO_WINDOW: WindowArray = np.zeros(0, dtype=WINDOW_DTYPE)
 
 _MAX_ROWS = 48
-_INDEPENDENT_NS = 100_000_000
-"""Measurements of one link within this time are redundant."""
+_INDEPENDENT_NS = 100_000_000  # Measurements of one link within this time are redundant
 _MIN_ROWS = 8
-_FIRST_ROWS = 16
-"""Number of rows from which the first fits are made."""
+_FIRST_ROWS = 16  # Number of rows from which the first fits are made
 _HEADINGS = 8
 _MAX_HYPOTHESES = 8
 _FIRST_STEPS, _STEPS = 10, 15
-_ROBUST = 2.0
-"""Residual in standard deviations from which measurements are down-weighted (Cauchy)."""
+_ROBUST = 2.0  # Residual in standard deviations from which measurements are down-weighted (Cauchy)
 _TRUNCATED = 9.0
 """Squared residual in units of its variance from which a measurement disagrees and costs no more."""
-_MIN_SHARE = 0.65
-"""Share of the measurements that must agree."""
+_MIN_SHARE = 0.65  # Share of the measurements that must agree
 _MIN_LINKS, _FEW_SHARE, _FEW_NS = 3, 0.85, 8_000_000_000
 """With fewer links, more must agree for longer: two too long ranges can agree with each other."""
 _MARGIN, _MARGIN_WITHOUT = 30.0, 6.0
 """Least difference of cost to any other hypothesis, of all measurements and of those without one link."""
-_MAX_EXCESS = 2.0
-"""Largest mean squared residual of the measurements that agree."""
+_MAX_EXCESS = 2.0  # Largest mean squared residual of the measurements that agree
 _POSITION_SIGMA = 0.15
 _APART_M, _APART_RAD = 0.1, 0.1
 _MIN_SPREAD_M = 1.0
@@ -97,19 +92,12 @@ def is_redundant(window: WindowArray, row: WindowArray) -> bool:
 
 
 class _Fit(NamedTuple):
-    """Rows (m,) linearized about a transform.
+    """Rows (m,) linearized about a transform."""
 
-    Attributes:
-        residual: (m,) measured minus predicted.
-        jacobian: (m, 3) of the prediction, by the right-invariant error of the transform.
-        other_jacobian: (m, 3) by that of the other side.
-        variance: (m,) of the residuals, all errors included.
-    """
-
-    residual: FloatArray
-    jacobian: FloatArray
-    other_jacobian: FloatArray
-    variance: FloatArray
+    residual: FloatArray  # (m,) measured minus predicted
+    jacobian: FloatArray  # (m, 3) of the prediction, by the right-invariant error of the transform
+    other_jacobian: FloatArray  # (m, 3) by that of the other side
+    variance: FloatArray  # (m,) of the residuals, all errors included
 
     @property
     def squared(self) -> FloatArray:
@@ -124,15 +112,10 @@ class _Fit(NamedTuple):
 
 
 class _Hypothesis(NamedTuple):
-    """A minimum.
+    """A minimum."""
 
-    Attributes:
-        transform: (3,) of the track.
-        fit: The rows there.
-    """
-
-    transform: FloatArray
-    fit: _Fit
+    transform: FloatArray  # (3,) of the track
+    fit: _Fit  # The rows there
 
     @property
     def cost(self) -> float:

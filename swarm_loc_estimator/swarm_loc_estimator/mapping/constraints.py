@@ -21,71 +21,41 @@ STOP_UNKNOWNS = 4
 
 
 class Linearised(NamedTuple):
-    """Constraints (m,) with e residuals each on c unknowns each.
+    """Constraints (m,) with e residuals each on c unknowns each."""
 
-    Attributes:
-        unknowns: (m, c) indices of the unknowns.
-        jacobian: (m, e, c).
-        residual: (m, e).
-        weight: (m, e) inverse variance.
-    """
-
-    unknowns: IntArray
-    jacobian: FloatArray
-    residual: FloatArray
-    weight: FloatArray
+    unknowns: IntArray  # (m, c) indices of the unknowns
+    jacobian: FloatArray  # (m, e, c)
+    residual: FloatArray  # (m, e)
+    weight: FloatArray  # (m, e) inverse variance
 
 
 class Departures(NamedTuple):
-    """Odometry from stop to stop (m,).
+    """Odometry from stop to stop (m,)."""
 
-    Attributes:
-        begin: (m,) stop of departure.
-        end: (m,) stop of arrival.
-        turn: (m,) turn by odometry at the stop of departure [rad].
-        motion: (m, 3) pose on arrival in the frame at departure, by odometry.
-        sigma: (m, 3) along the motion [m], across it [m], of the heading [rad].
-    """
-
-    begin: IntArray
-    end: IntArray
-    turn: FloatArray
-    motion: FloatArray
-    sigma: FloatArray
+    begin: IntArray  # (m,) stop of departure
+    end: IntArray  # (m,) stop of arrival
+    turn: FloatArray  # (m,) turn by odometry at the stop of departure [rad]
+    motion: FloatArray  # (m, 3) pose on arrival in the frame at departure, by odometry
+    sigma: FloatArray  # (m, 3) along the motion [m], across it [m], of the heading [rad]
 
 
 class Ties(NamedTuple):
-    """Relative poses (m,) of stops, from scan matching.
+    """Relative poses (m,) of stops, from scan matching."""
 
-    Attributes:
-        begin: (m,) reference stop.
-        end: (m,) stop whose pose in the frame of `begin` is given.
-        pose: (m, 3).
-        sigma: (m, 3) [m, m, rad].
-    """
-
-    begin: IntArray
-    end: IntArray
-    pose: FloatArray
-    sigma: FloatArray
+    begin: IntArray  # (m,) reference stop
+    end: IntArray  # (m,) stop whose pose in the frame of `begin` is given
+    pose: FloatArray  # (m, 3)
+    sigma: FloatArray  # (m, 3) [m, m, rad]
 
 
 class Bearings(NamedTuple):
-    """Bearings (m,) of lights of robots at other stops.
+    """Bearings (m,) of lights of robots at other stops."""
 
-    Attributes:
-        begin: (m,) stop from which the light was seen.
-        end: (m,) stop of the other robot.
-        turn: (m,) turn by odometry at which it was seen [rad].
-        bearing: (m,) of the light in the robot's frame then [rad].
-        sigma: (m,) [rad].
-    """
-
-    begin: IntArray
-    end: IntArray
-    turn: FloatArray
-    bearing: FloatArray
-    sigma: FloatArray
+    begin: IntArray  # (m,) stop from which the light was seen
+    end: IntArray  # (m,) stop of the other robot
+    turn: FloatArray  # (m,) turn by odometry at which it was seen [rad]
+    bearing: FloatArray  # (m,) of the light in the robot's frame then [rad]
+    sigma: FloatArray  # (m,) [rad]
 
 
 def odometry(states: FloatArray, given: Departures) -> Linearised:

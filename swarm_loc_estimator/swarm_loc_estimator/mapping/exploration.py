@@ -20,21 +20,13 @@ UNKNOWN, OPEN, WALL = 0, 1, 2
 
 
 class PlanningGrid(NamedTuple):
-    """Coarse occupancy grid for path planning.
+    """Coarse occupancy grid for path planning."""
 
-    Attributes:
-        corner: (2,) lower left corner in map [m].
-        cell: [m].
-        state: (nx, ny) `UNKNOWN`, `OPEN` or `WALL`.
-        evidence: (nx, ny) the largest log odds in each.
-        passable: (nx, ny) True where the centre of a robot may be.
-    """
-
-    corner: FloatArray
-    cell: float
-    state: NDArray[np.int8]
-    evidence: FloatArray
-    passable: BoolArray
+    corner: FloatArray  # (2,) lower left corner in map [m]
+    cell: float  # [m]
+    state: NDArray[np.int8]  # (nx, ny) `UNKNOWN`, `OPEN` or `WALL`
+    evidence: FloatArray  # (nx, ny) the largest log odds in each
+    passable: BoolArray  # (nx, ny) True where the centre of a robot may be
 
     def cell_of(self, point: FloatArray) -> tuple[int, int]:
         """The cell of a point (2,) in the grid [m]."""
@@ -102,8 +94,7 @@ def paths_from(passable: BoolArray, i: int, j: int) -> tuple[FloatArray, IntArra
 
 
 _RAYS = 60
-_SURE = 2.0
-"""Log odds above which a wall yields no information gain."""
+_SURE = 2.0  # Log odds above which a wall yields no information gain
 _WALL_GAIN = 0.5
 
 
@@ -139,21 +130,14 @@ def information_gain(
 
 @dataclass(frozen=True)
 class Goal:
-    """Goal of a robot for its next scan.
+    """Goal of a robot for its next scan."""
 
-    Attributes:
-        number: Counter of the goals of a robot, from 1 on.
-        position: (2,) in map [m].
-        odometry: (2,) the goal in the odom frame for a turn followed by a straight drive by odometry [m].
-        stamp_ns: Time of the decision.
-        pose: (3,) pose of the robot in map at that time.
-    """
-
-    number: int
-    position: FloatArray
+    number: int  #: Counter of the goals of a robot, from 1 on
+    position: FloatArray  #: (2,) in map [m]
+    #: (2,) the goal in the odom frame for a turn followed by a straight drive by odometry [m]
     odometry: FloatArray
-    stamp_ns: int
-    pose: FloatArray
+    stamp_ns: int  #: Time of the decision
+    pose: FloatArray  #: (3,) pose of the robot in map at that time
 
 
 def goal_by_odometry(
@@ -178,8 +162,7 @@ def goal_by_odometry(
 
 _LATTICE, _CANDIDATES = 0.2, 260
 _MIN_PATH = 0.3
-_REACH_SHARE = 0.72
-"""Share of the laser's range within which walls are measured accurately."""
+_REACH_SHARE = 0.72  # Share of the laser's range within which walls are measured accurately
 _MIN_WALL = 0.6
 """Length of the walls in sight of a place below which it is in the open; false echoes are shorter [m]."""
 _CROWD_RADIUS, _GOAL_RADIUS, _GOAL_WEIGHT = 0.45, 2.0, 0.8

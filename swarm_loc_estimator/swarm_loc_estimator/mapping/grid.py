@@ -13,12 +13,9 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.mapping.matching import Scans
 from swarm_loc_estimator.mapping.scans import BINS, LINE, POINT, UNKNOWN, Lines
 
-_FREE_STEP, _HIT_STEP = 0.25, 0.9
-"""Change of the log odds of a cell by one ray."""
-_POINT_HIT = 0.25
-"""Share of `_HIT_STEP` for a reflection without a fitted line."""
-_SHARP_M = 0.03
-"""Standard deviation of a wall above which the increase of the log odds is reduced."""
+_FREE_STEP, _HIT_STEP = 0.25, 0.9  # Change of the log odds of a cell by one ray
+_POINT_HIT = 0.25  # Share of `_HIT_STEP` for a reflection without a fitted line
+_SHARP_M = 0.03  # Standard deviation of a wall above which the increase of the log odds is reduced
 
 
 @cached_njit
@@ -74,26 +71,18 @@ def _draw_free(
         last_i, last_j = i, j
 
 
-CELL = 0.02
-"""Size of a cell as in the PushBot paper [m]."""
-LOG_ODDS_CAP = 5.0
-"""Maximum absolute log odds of a cell."""
+CELL = 0.02  # Size of a cell as in the PushBot paper [m]
+LOG_ODDS_CAP = 5.0  # Maximum absolute log odds of a cell
 _OCCUPIED, _FREE = 0.45, -0.2
 
 
 @dataclass(frozen=True)
 class OccupancyMap:
-    """A grid in the frame map.
+    """A grid in the frame map."""
 
-    Attributes:
-        corner: (2,) its lower left corner [m], a multiple of the cell.
-        cell: [m].
-        log_odds: (nx, ny) log odds of occupancy, 0: unknown, clipped to +-`LOG_ODDS_CAP`.
-    """
-
-    corner: FloatArray
-    cell: float
-    log_odds: FloatArray
+    corner: FloatArray  #: (2,) its lower left corner [m], a multiple of the cell
+    cell: float  #: [m]
+    log_odds: FloatArray  #: (nx, ny) log odds of occupancy, 0: unknown, clipped to +-`LOG_ODDS_CAP`
 
     @property
     def occupied(self) -> BoolArray:

@@ -246,28 +246,19 @@ def _unconnected(graph: PoseGraph, stop: int) -> list[int]:
 
 _MAX_PENDING = 20_000
 _MAX_VISITS = 50
-_LIGHT_OFFSET = 0.03
-"""Effective offset of a robot's lights from its centre, averaged over turns [m]."""
+_LIGHT_OFFSET = 0.03  # Effective offset of a robot's lights from its centre, averaged over turns [m]
 _LEAST_SIGMA = math.radians(1.0)
 
 
 @dataclass(frozen=True)
 class Visit:
-    """A robot's stay at a stop.
+    """A robot's stay at a stop."""
 
-    Attributes:
-        node: Number of its stop in the graph.
-        begin_ns: First reading.
-        end_ns: Last reading.
-        stop: Its readings.
-        turn_begin: Turn by odometry at which the node begins [rad].
-    """
-
-    node: int
-    begin_ns: int
-    end_ns: int
-    stop: ScanStop
-    turn_begin: float
+    node: int  # Number of its stop in the graph
+    begin_ns: int  # First reading
+    end_ns: int  # Last reading
+    stop: ScanStop  # Its readings
+    turn_begin: float  # Turn by odometry at which the node begins [rad]
 
 
 class LightBook:

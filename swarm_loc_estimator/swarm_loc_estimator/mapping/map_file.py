@@ -20,8 +20,7 @@ _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
 _MODES = ("trinary", "scale", "raw")
 _MAX_BYTES = 200_000_000
-_MAX_CELLS = 50_000_000
-"""Maximum number of cells: 400 MB, or 141 x 141 m with cells of 2 cm."""
+_MAX_CELLS = 50_000_000  # Maximum number of cells: 400 MB, or 141 x 141 m with cells of 2 cm
 _NUMBERS = {
     "resolution": NumberSpec("m", 1e-4, 10.0, False, "side of a pixel"),
     "occupied_thresh": NumberSpec("1", 0.0, 1.0, False, "cells above are occupied"),

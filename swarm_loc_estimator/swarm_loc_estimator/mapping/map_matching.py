@@ -27,30 +27,22 @@ from swarm_loc_estimator.mapping.map_file import MapFileError
 
 _WALL_M, _MIN_WINDOW = 0.12, 2
 """Half the side of the window in which the line of a wall is fitted [m], and at least this many cells."""
-_SURFACE = 1.5
-"""Depth in cells up to which occupied cells are the surface of a wall, and not its inside."""
+_SURFACE = 1.5  # Depth in cells up to which occupied cells are the surface of a wall, and not its inside
 _MAX_THICKNESS, _MIN_LENGTH = 1.1, 1.6
 """Maximum standard deviation across a line in cells, and minimum ratio of that along it to it."""
-REACH_M = 0.6
-"""Maximum distance from the end of a beam to its wall [m]."""
-_PIECE_M = 0.25
-"""Side of the squares that share the errors of a map [m]."""
+REACH_M = 0.6  # Maximum distance from the end of a beam to its wall [m]
+_PIECE_M = 0.25  # Side of the squares that share the errors of a map [m]
 _SHARED, _SHARED_TURN = 0.5, 0.1
 """Shares of the map's variance that remain in the position, and at the mean distance in the heading."""
-_CAUCHY = 6.0
-"""Square of the scale of the Cauchy loss, in variances."""
-_STEPS, _FINE_FROM = 12, 5
-"""Number of Gauss-Newton steps, and the one from which only near walls count."""
+_CAUCHY = 6.0  # Square of the scale of the Cauchy loss, in variances
+_STEPS, _FINE_FROM = 12, 5  # Number of Gauss-Newton steps, and the one from which only near walls count
 _NEAR_M, _NEAR_SIGMAS = 0.05, 3.0
 """Up to this distance, two cells and these standard deviations a beam fits a wall."""
-_IMITATED = 5.0
-"""Information over what errors of normals imitate, below which it is no information."""
-_MIN_INFORMATION = 4.0
-"""Information below which a direction is not determined [1/m^2]."""
+_IMITATED = 5.0  # Information over what errors of normals imitate, below which it is no information
+_MIN_INFORMATION = 4.0  # Information below which a direction is not determined [1/m^2]
 UNDETERMINED_SIGMA = 2.0
 """Standard deviation where walls tell nothing [m, or rad times the mean range]; robots are lost before."""
-_THROUGH_M = 0.25
-"""A beam that ends so far behind a wall has gone through it [m]."""
+_THROUGH_M = 0.25  # A beam that ends so far behind a wall has gone through it [m]
 _MIN_BEAMS, _MIN_FIT, _MAX_THROUGH = 20, 0.5, 0.1
 """Minimum number and share of beams that fit, and maximum share of beams that go through walls."""
 
@@ -63,45 +55,27 @@ end where the map is free, or too few are comparable."""
 
 
 class WallMap(NamedTuple):
-    """A map prepared for matching.
+    """A map prepared for matching."""
 
-    Attributes:
-        corner: (2,) its lower left corner [m].
-        cell: [m].
-        kind: (nx, ny) unknown, free or wall.
-        nearest: (nx, ny) number of the nearest wall cell; -1: none within `REACH_M`.
-        line: (w, 4) a point x, y [m] and the normal x, y of the wall at each wall cell; normal 0: no line.
-        normal_variance: (w,) of the direction of the normal [rad^2].
-        variance: Of the place of a wall; of `wall_map` that of cells alone [m^2].
-    """
-
-    corner: FloatArray
-    cell: float
-    kind: NDArray[np.int8]
-    nearest: NDArray[np.int32]
+    corner: FloatArray  # (2,) its lower left corner [m]
+    cell: float  # [m]
+    kind: NDArray[np.int8]  # (nx, ny) unknown, free or wall
+    nearest: NDArray[np.int32]  # (nx, ny) number of the nearest wall cell; -1: none within `REACH_M`
+    # (w, 4) a point x, y [m] and the normal x, y of the wall at each wall cell; normal 0: no line
     line: FloatArray
-    normal_variance: FloatArray
-    variance: float
+    normal_variance: FloatArray  # (w,) of the direction of the normal [rad^2]
+    variance: float  # Of the place of a wall; of `wall_map` that of cells alone [m^2]
 
 
 class Match(NamedTuple):
-    """A sweep matched to a map.
+    """A sweep matched to a map."""
 
-    Attributes:
-        outcome: `FITS`, `OFF_MAP` or `BLOCKED`.
-        pose: (3,) x [m], y [m], theta [rad].
-        covariance: (3, 3) of the pose, of `UNDETERMINED_SIGMA` where walls tell nothing.
-        determined: Number of directions that walls tell, of 3.
-        fitting: Share of the comparable beams that fit walls.
-        through: Share of those that go through walls.
-    """
-
-    outcome: int
-    pose: FloatArray
-    covariance: FloatArray
-    determined: int
-    fitting: float
-    through: float
+    outcome: int  # `FITS`, `OFF_MAP` or `BLOCKED`
+    pose: FloatArray  # (3,) x [m], y [m], theta [rad]
+    covariance: FloatArray  # (3, 3) of the pose, of `UNDETERMINED_SIGMA` where walls tell nothing
+    determined: int  # Number of directions that walls tell, of 3
+    fitting: float  # Share of the comparable beams that fit walls
+    through: float  # Share of those that go through walls
 
 
 def wall_map(occupancy: OccupancyMap, path: Path) -> WallMap:

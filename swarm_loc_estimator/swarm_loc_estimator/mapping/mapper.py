@@ -33,8 +33,7 @@ from swarm_loc_estimator.mapping.track import Located, Track
 
 START_TURN = 4.5 * math.pi
 """Turn by odometry of a complete first scan [rad]: a slow quarter that fixes the heading, then two turns."""
-SCAN_TURN = 2.14 * math.pi
-"""Turn by odometry at every later stop [rad]; enough for a full turn despite slip."""
+SCAN_TURN = 2.14 * math.pi  #: Turn by odometry at every later stop [rad]; enough for a full turn despite slip
 _SWEEP_STEP, _SWEEP_TURN = 0.3, math.radians(20.0)
 """Motion by odometry after which the next sweep of a lidar is used: path [m], turn [rad]."""
 _SWEEP_DISTANCE_NOISE = 0.2

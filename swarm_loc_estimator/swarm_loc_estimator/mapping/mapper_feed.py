@@ -23,8 +23,7 @@ from swarm_loc_estimator.swarm.swarm import Robot
 
 _LEAST_SIGMA = np.array([0.02, 0.02, 0.01])
 """Minimum standard deviations of a fix, for errors of the map that all fixes share [m, m, rad]."""
-_OPTIMISM = 2.5
-"""Factor on variances of the graph, which assumes rigid scans although wheels slip unevenly."""
+_OPTIMISM = 2.5  # Factor on variances of the graph, which assumes rigid scans although wheels slip unevenly
 
 
 def fix_covariance(covariance: FloatArray) -> FloatArray:

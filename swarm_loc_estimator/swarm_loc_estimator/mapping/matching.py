@@ -16,35 +16,25 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.mapping.scans import BINS, LINE, Beams, Lines
 
-CAUCHY = 6.0
-"""Square of the scale of the Cauchy loss, in variances."""
-MIN_MATCHED = 30
-"""Minimum number of matched beams of a pair of stops."""
+CAUCHY = 6.0  # Square of the scale of the Cauchy loss, in variances
+MIN_MATCHED = 30  # Minimum number of matched beams of a pair of stops
 _MIN_INCIDENCE = 0.15
 _MIN_DISTANCE = 0.05
-_ROUGHNESS = 0.004
-"""Standard deviation of walls from straight lines [m]."""
+_ROUGHNESS = 0.004  # Standard deviation of walls from straight lines [m]
 _GATE_VARIANCES = 16.0
 _RANGE_SIGMAS = 2.5
 _IMITATED = 5.0
 """Information along lines over what errors of their normals imitate, below which it is no information."""
 
-OFF, UNUSABLE, FIT = 0, 1, 2
-"""Result for a beam: off the line; not comparable; on the line."""
+OFF, UNUSABLE, FIT = 0, 1, 2  # Result for a beam: off the line; not comparable; on the line
 
 
 class Scans(NamedTuple):
-    """Stops as input of scan matching.
+    """Stops as input of scan matching."""
 
-    Attributes:
-        states: (k, 4) x [m], y [m], theta [rad] on arrival, true turn over turn by odometry.
-        beams: Their beams.
-        lines: Lines fitted to the beams.
-    """
-
-    states: FloatArray
-    beams: Beams
-    lines: Lines
+    states: FloatArray  # (k, 4) x [m], y [m], theta [rad] on arrival, true turn over turn by odometry
+    beams: Beams  # Their beams
+    lines: Lines  # Lines fitted to the beams
 
 
 @cached_njit
@@ -215,40 +205,25 @@ def _remove_direction(H: FloatArray, g: FloatArray, angle: float) -> None:
             H[r, first + 1] -= along * y
 
 
-_APART_M = 0.2
-"""Minimum distance of another place from the best one."""
-_BEAMS = 60
-"""Number of beams of a stop used by the search."""
+_APART_M = 0.2  # Minimum distance of another place from the best one
+_BEAMS = 60  # Number of beams of a stop used by the search
 
 
 class Lattice(NamedTuple):
-    """Lattice of offsets around a pose.
+    """Lattice of offsets around a pose."""
 
-    Attributes:
-        reach: Maximum offset along x and y of map [m].
-        step: Step along x and y [m].
-        turn_reach: Maximum offset of the heading [rad].
-        turn_step: Step of the heading [rad].
-    """
-
-    reach: float
-    step: float
-    turn_reach: float
-    turn_step: float
+    reach: float  # Maximum offset along x and y of map [m]
+    step: float  # Step along x and y [m]
+    turn_reach: float  # Maximum offset of the heading [rad]
+    turn_step: float  # Step of the heading [rad]
 
 
 class BestOffset(NamedTuple):
-    """The best offset.
+    """The best offset."""
 
-    Attributes:
-        offset: (3,) x [m], y [m], theta [rad] to add to the pose.
-        score: Share of beams that fit any of the other stops, minus their losses.
-        other: The best score of another place.
-    """
-
-    offset: FloatArray
-    score: float
-    other: float
+    offset: FloatArray  # (3,) x [m], y [m], theta [rad] to add to the pose
+    score: float  # Share of beams that fit any of the other stops, minus their losses
+    other: float  # The best score of another place
 
 
 def search_offsets(scans: Scans, parts: IntArray, against: IntArray, lattice: Lattice) -> BestOffset:

@@ -15,26 +15,17 @@ from swarm_loc_estimator.common.messages.definitions import LASER, LASER_SCAN, L
 from swarm_loc_estimator.common.messages.poses import planar_pose
 from swarm_loc_estimator.common.parameters import ParameterError
 
-MAX_CELLS = 4_000_000
-"""Maximum number of cells of a valid map."""
+MAX_CELLS = 4_000_000  # Maximum number of cells of a valid map
 
 
 class GridMessage(NamedTuple):
-    """A map.
+    """A map."""
 
-    Attributes:
-        stamp_ns: Time of the map.
-        frame_id: Frame of the origin.
-        resolution: Side of a cell [m].
-        origin: x [m], y [m], yaw [rad] of the outer corner of the first cell.
-        cells: (height, width), x along the rows: -1 unknown, else occupied by 0 to 100 %.
-    """
-
-    stamp_ns: int
-    frame_id: str
-    resolution: float
-    origin: tuple[float, float, float]
-    cells: NDArray[np.int8]
+    stamp_ns: int  # Time of the map
+    frame_id: str  # Frame of the origin
+    resolution: float  # Side of a cell [m]
+    origin: tuple[float, float, float]  # x [m], y [m], yaw [rad] of the outer corner of the first cell
+    cells: NDArray[np.int8]  # (height, width), x along the rows: -1 unknown, else occupied by 0 to 100 %
 
 
 def decode_occupancy_grid(data: bytes) -> GridMessage:

@@ -17,14 +17,10 @@ from swarm_loc_estimator.mapping.stops import ScanStop
 from swarm_loc_estimator.mapping.sweeps import LidarSweep, read_sweep
 from swarm_loc_estimator.swarm.error_models import LidarModel
 
-MAX_WAITING = 500
-"""Maximum numbers of queued odometry messages and distances; the oldest are dropped."""
-MAX_GAP_NS = 500_000_000
-"""Maximum gap over which odometry is interpolated."""
-_MAX_SWEEPS = 50
-"""Maximum number of queued scans."""
-_SIGMAS = 301
-"""Number of distances over which the median sigma is taken."""
+MAX_WAITING = 500  # Maximum numbers of queued odometry messages and distances; the oldest are dropped
+MAX_GAP_NS = 500_000_000  # Maximum gap over which odometry is interpolated
+_MAX_SWEEPS = 50  # Maximum number of queued scans
+_SIGMAS = 301  # Number of distances over which the median sigma is taken
 
 
 class OdometryQueue:

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 
-UNSEEN = 0.0
-"""Inverse distance of a beam without reflection."""
+UNSEEN = 0.0  #: Inverse distance of a beam without reflection
 
 
 class Readings(NamedTuple):
@@ -24,63 +23,39 @@ class Readings(NamedTuple):
 
     The inverse of a distance is what a camera beside a laser measures: it is linear in the pixel at which the
     reflection is seen, d = f b / (p - p_inf), so its noise does not depend on the distance.
-
-    Attributes:
-        stamp_ns: (n,).
-        odometry: (n, 3) pose by odometry at each stamp, in the robot's own odom frame.
-        inverse: (n,) inverse distance along x of the robot, from its centre [1/m]; `UNSEEN`: nothing.
-        sigma: Standard deviation of an inverse distance, sigma_px / (f b) [1/m]; NaN before
-            the first reflection.
     """
 
-    stamp_ns: IntArray
-    odometry: FloatArray
+    stamp_ns: IntArray  #: (n,)
+    odometry: FloatArray  #: (n, 3) pose by odometry at each stamp, in the robot's own odom frame
+    #: (n,) inverse distance along x of the robot, from its centre [1/m]; `UNSEEN`: nothing
     inverse: FloatArray
+    #: Standard deviation of an inverse distance, sigma_px / (f b) [1/m]; NaN before the first reflection
     sigma: float
 
 
 class LightSightings(NamedTuple):
-    """Sightings (m,) of lights of other robots by one robot.
+    """Sightings (m,) of lights of other robots by one robot."""
 
-    Attributes:
-        stamp_ns: (m,).
-        target: (m,) number of the robot whose light it is.
-        bearing: (m,) in the frame of the robot that saw it [rad].
-        sigma: (m,) its standard deviation [rad].
-    """
-
-    stamp_ns: IntArray
-    target: IntArray
-    bearing: FloatArray
-    sigma: FloatArray
+    stamp_ns: IntArray  #: (m,)
+    target: IntArray  #: (m,) number of the robot whose light it is
+    bearing: FloatArray  #: (m,) in the frame of the robot that saw it [rad]
+    sigma: FloatArray  #: (m,) its standard deviation [rad]
 
 
-MAX_BEAMS = 768
-"""Maximum number of beams per stop; if exceeded, every second one is dropped."""
+MAX_BEAMS = 768  # Maximum number of beams per stop; if exceeded, every second one is dropped
 
 
 class Beams(NamedTuple):
-    """Beams of stops (k,).
+    """Beams of stops (k,)."""
 
-    Attributes:
-        turn: (k, MAX_BEAMS) turn by odometry since arrival at the stop [rad].
-        inverse: (k, MAX_BEAMS) inverse distance [1/m], 0: no reflection.
-        bearing: (k, MAX_BEAMS) direction in the frame of the robot [rad]; 0 of a laser pointer.
-        weight: (k, MAX_BEAMS) variance sigma^2 over that of this beam; 1 of a laser pointer.
-        counts: (k,) number of beams.
-        sigma: (k,) standard deviation of an inverse distance [1/m]; of a lidar at its range.
-        reach: (k,) range of the laser [m].
-        free: (k,) distance that is free in a direction without reflection [m].
-    """
-
-    turn: FloatArray
-    inverse: FloatArray
-    bearing: FloatArray
-    weight: FloatArray
-    counts: IntArray
-    sigma: FloatArray
-    reach: FloatArray
-    free: FloatArray
+    turn: FloatArray  # (k, MAX_BEAMS) turn by odometry since arrival at the stop [rad]
+    inverse: FloatArray  # (k, MAX_BEAMS) inverse distance [1/m], 0: no reflection
+    bearing: FloatArray  # (k, MAX_BEAMS) direction in the frame of the robot [rad]; 0 of a laser pointer
+    weight: FloatArray  # (k, MAX_BEAMS) variance sigma^2 over that of this beam; 1 of a laser pointer
+    counts: IntArray  # (k,) number of beams
+    sigma: FloatArray  # (k,) standard deviation of an inverse distance [1/m]; of a lidar at its range
+    reach: FloatArray  # (k,) range of the laser [m]
+    free: FloatArray  # (k,) distance that is free in a direction without reflection [m]
 
 
 def no_beams(capacity: int) -> Beams:
@@ -121,34 +96,22 @@ _WINDOWS = (40, 28, 20, 14, 9, 6)
 _MIN_BEAMS, _MIN_SEEN_SHARE = 5, 0.85
 _MAX_THIRD_SIGMAS = 2.2
 """Maximum distance of the mean of a third of a window from the line; beyond it the wall has a step."""
-_MIN_INCIDENCE = 0.15
-"""Minimum cosine between beam and normal."""
+_MIN_INCIDENCE = 0.15  # Minimum cosine between beam and normal
 _MAX_NORMAL_SIGMA = 0.08
 _RANGE_SIGMAS = 2.5
 
 
 class Lines(NamedTuple):
-    """Lines of stops (k,), per degree of direction relative to the heading on arrival.
+    """Lines of stops (k,), per degree of direction relative to the heading on arrival."""
 
-    Attributes:
-        kind: (k, BINS) `UNKNOWN`, `FREE`, `POINT` or `LINE`.
-        a: (k, BINS) normal over distance, along x [1/m].
-        b: (k, BINS) normal over distance, along y [1/m].
-        distance: (k, BINS) along the direction [m].
-        variance: (k, BINS) of the line's inverse distance along the direction [1/m^2].
-        turn: (k, BINS) turn by odometry at which the direction was scanned [rad].
-        normal_variance: (k, BINS) of the direction of the normal [rad^2].
-        usable: (k, BINS) whether the normal is accurate enough for scan matching.
-    """
-
-    kind: NDArray[np.int8]
-    a: FloatArray
-    b: FloatArray
-    distance: FloatArray
-    variance: FloatArray
-    turn: FloatArray
-    normal_variance: FloatArray
-    usable: NDArray[np.bool_]
+    kind: NDArray[np.int8]  # (k, BINS) `UNKNOWN`, `FREE`, `POINT` or `LINE`
+    a: FloatArray  # (k, BINS) normal over distance, along x [1/m]
+    b: FloatArray  # (k, BINS) normal over distance, along y [1/m]
+    distance: FloatArray  # (k, BINS) along the direction [m]
+    variance: FloatArray  # (k, BINS) of the line's inverse distance along the direction [1/m^2]
+    turn: FloatArray  # (k, BINS) turn by odometry at which the direction was scanned [rad]
+    normal_variance: FloatArray  # (k, BINS) of the direction of the normal [rad^2]
+    usable: NDArray[np.bool_]  # (k, BINS) whether the normal is accurate enough for scan matching
 
 
 def no_lines(capacity: int) -> Lines:
@@ -291,8 +254,7 @@ def _is_free(total: FloatArray, m: int) -> bool:
     return bool(total[here + 3, _SEEN] - total[here - 2, _SEEN] <= 0.34 * around)
 
 
-MIN_OVERLAP = 50
-"""Minimum number of beams of the first turn with a neighbour in the second."""
+MIN_OVERLAP = 50  # Minimum number of beams of the first turn with a neighbour in the second
 _LOW, _HIGH, _STEP = 0.90, 1.02, 0.0005
 _OUTLIER = 9.0
 

@@ -14,16 +14,11 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.scans import Readings, Scan
 
-MIN_TURN = 0.5
-"""Minimum turn of a scan [rad]."""
-_STAND_SPEED = 0.02
-"""Maximum speed of a stopped robot [m/s]."""
-_DEPARTED = 0.01
-"""Maximum distance from the arrival position within a stop [m]."""
-_MAX_READINGS = 4096
-"""Maximum number of readings per stop; if exceeded, every second one is dropped."""
-_REST_NS, _REST_TURN = 1_000_000_000, 0.01
-"""A robot rests if it turns less than this [rad] within this time."""
+MIN_TURN = 0.5  # Minimum turn of a scan [rad]
+_STAND_SPEED = 0.02  # Maximum speed of a stopped robot [m/s]
+_DEPARTED = 0.01  # Maximum distance from the arrival position within a stop [m]
+_MAX_READINGS = 4096  # Maximum number of readings per stop; if exceeded, every second one is dropped
+_REST_NS, _REST_TURN = 1_000_000_000, 0.01  # A robot rests if it turns less than this [rad] within this time
 _DRIVES, _STANDS, _ARRIVES, _JUMPS = 0, 1, 2, 3
 _MAX_SPEED, _MAX_STEP, _MAX_RATE, _MAX_TURN = 3.0, 0.05, 20.0, 0.3
 """Limits beyond which odometry counts as restarted: rate and offset of position, and of heading."""
@@ -141,19 +136,12 @@ class ScanStop:
 
 
 class Run(NamedTuple):
-    """Consecutive readings with the same motion state.
+    """Consecutive readings with the same motion state."""
 
-    Attributes:
-        stands: Whether the robot is stopped.
-        arrives: Whether it has just arrived.
-        jumps: Whether odometry has restarted, so that the motion to this place is unknown.
-        readings: The readings.
-    """
-
-    stands: bool
-    arrives: bool
-    jumps: bool
-    readings: Readings
+    stands: bool  # Whether the robot is stopped
+    arrives: bool  # Whether it has just arrived
+    jumps: bool  # Whether odometry has restarted, so that the motion to this place is unknown
+    readings: Readings  # The readings
 
 
 class MotionTracker:

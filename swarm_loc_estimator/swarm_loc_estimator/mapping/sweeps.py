@@ -18,21 +18,13 @@ _MAX_SWEEP_S, _MAX_SWEEP_TURN = 2.0, 6.5
 
 
 class LidarSweep(NamedTuple):
-    """Beams (n,) of a scan that are used.
+    """Beams (n,) of a scan that are used."""
 
-    Attributes:
-        stamp_ns: Time of the first beam of the scan.
-        beam_ns: (n,) times of the beams.
-        angle: (n,) directions in the frame of the lidar [rad].
-        distance: (n,) [m]; infinite: nothing up to `reach`.
-        reach: Range of the lidar [m].
-    """
-
-    stamp_ns: int
-    beam_ns: IntArray
-    angle: FloatArray
-    distance: FloatArray
-    reach: float
+    stamp_ns: int  # Time of the first beam of the scan
+    beam_ns: IntArray  # (n,) times of the beams
+    angle: FloatArray  # (n,) directions in the frame of the lidar [rad]
+    distance: FloatArray  # (n,) [m]; infinite: nothing up to `reach`
+    reach: float  # Range of the lidar [m]
 
     @property
     def seen(self) -> BoolArray:

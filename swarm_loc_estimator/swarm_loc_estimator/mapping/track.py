@@ -21,36 +21,20 @@ class Located(NamedTuple):
 
 @dataclass
 class Track:
-    """State of one robot.
+    """State of one robot."""
 
-    Attributes:
-        prior: (3,) start pose.
-        prior_sigma: (3,) standard deviations of the start pose.
-        motion: Detects stops.
-        stop: The current stop.
-        node: Its newest stop in the graph.
-        is_known: Whether `stop` is in the graph, as `node`.
-        passes: Whether the next stop replaces `node` because the graph is full.
-        left: (3,) pose by odometry at departure from `node`.
-        last: (3,) newest pose by odometry.
-        path: Length driven since the departure [m].
-        target: (2,) final target position [m].
-        goal: Its next stop.
-        located: Where its newest scan says that it was.
-        home: (2,) old stop to which it returns to reduce its position uncertainty [m].
-    """
-
-    prior: FloatArray
-    prior_sigma: FloatArray
-    motion: MotionTracker = field(default_factory=MotionTracker)
-    stop: ScanStop | None = None
-    node: int | None = None
-    is_known: bool = False
-    passes: bool = False
+    prior: FloatArray  # (3,) start pose
+    prior_sigma: FloatArray  # (3,) standard deviations of the start pose
+    motion: MotionTracker = field(default_factory=MotionTracker)  # Detects stops
+    stop: ScanStop | None = None  # The current stop
+    node: int | None = None  # Its newest stop in the graph
+    is_known: bool = False  # Whether `stop` is in the graph, as `node`
+    passes: bool = False  # Whether the next stop replaces `node` because the graph is full
+    # (3,) pose by odometry at departure from `node`
     left: FloatArray = field(default_factory=lambda: np.zeros(3))
-    last: FloatArray | None = None
-    path: float = 0.0
-    target: FloatArray | None = None
-    goal: Goal | None = None
-    located: Located | None = None
-    home: FloatArray | None = None
+    last: FloatArray | None = None  # (3,) newest pose by odometry
+    path: float = 0.0  # Length driven since the departure [m]
+    target: FloatArray | None = None  # (2,) final target position [m]
+    goal: Goal | None = None  # Its next stop
+    located: Located | None = None  # Where its newest scan says that it was
+    home: FloatArray | None = None  # (2,) old stop to which it returns to reduce its position uncertainty [m]

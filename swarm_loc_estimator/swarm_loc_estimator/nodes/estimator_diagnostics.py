@@ -38,27 +38,18 @@ _CAUSES = {
     "odometry_absurd": "are odometry that is absurdly large",
 }
 """Why messages of a robot are dropped."""
-_PATIENCE_S, _PATIENCE_PERIODS = 10.0, 5.0
-"""Timeout of an expected input [s], and in its mean periods."""
+_PATIENCE_S, _PATIENCE_PERIODS = 10.0, 5.0  # Timeout of an expected input [s], and in its mean periods
 
 
 @dataclass
 class TickCost:
-    """Cost of the ticks since the last report.
+    """Cost of the ticks since the last report."""
 
-    Attributes:
-        count: Number of ticks.
-        sum_s: Total duration of the ticks [s].
-        max_s: Duration of the longest tick [s].
-        sightings: Number of measurements received.
-        shed: Number of measurements dropped under overload.
-    """
-
-    count: int = 0
-    sum_s: float = 0.0
-    max_s: float = 0.0
-    sightings: int = 0
-    shed: int = 0
+    count: int = 0  # Number of ticks
+    sum_s: float = 0.0  # Total duration of the ticks [s]
+    max_s: float = 0.0  # Duration of the longest tick [s]
+    sightings: int = 0  # Number of measurements received
+    shed: int = 0  # Number of measurements dropped under overload
 
     def note(self, seconds: float) -> None:
         """Count one tick."""

@@ -76,8 +76,7 @@ _ORDINARY_DROPS = frozenset(
 """Drops that are ordinary and not logged: late, duplicate or outlying data and infrared out of range.
 Drops under overload have a warning of their own."""
 
-INACTIVE = "Nothing was changed: the estimator is not active."
-"""Answer of the services while it is not."""
+INACTIVE = "Nothing was changed: the estimator is not active."  # Answer of the services while it is not
 
 CreateEstimator = Callable[[Swarm, Settings], Estimator]
 

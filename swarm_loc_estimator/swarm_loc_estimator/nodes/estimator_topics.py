@@ -31,12 +31,9 @@ from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.sightings import encode_sightings, newest_sightings
 from swarm_loc_msgs.msg import RobotIdentities, SwarmPoses, SwarmSightings
 
-DEPTH = 1000
-"""Queue length of a topic, which is emptied at each tick: enough for the horizon."""
-_SHARED_DEPTH = 500
-"""The same for a topic with the readings of many robots, whose messages are large."""
-_MAX_PER_TAKE = 5000
-"""Limit of messages per tick over all topics."""
+DEPTH = 1000  # Queue length of a topic, which is emptied at each tick: enough for the horizon
+_SHARED_DEPTH = 500  # The same for a topic with the readings of many robots, whose messages are large
+_MAX_PER_TAKE = 5000  # Limit of messages per tick over all topics
 _MIN_PER_TOPIC = 100
 """Least limit per topic: the messages of the usual horizon. With less, an estimator that has fallen behind
 would get ever older data, which cost more to fuse, and never catch up."""
@@ -44,11 +41,9 @@ would get ever older data, which cost more to fuse, and never catch up."""
 _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
 """Drop reason of messages that are missing in a publisher's sequence."""
 _TF_STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_MAX_FRAME_LENGTH = 64
-"""Longer names of foreign frames are cut."""
+_MAX_FRAME_LENGTH = 64  # Longer names of foreign frames are cut
 _RELIABLE = QoSProfile(depth=10)
-_SIGHTINGS_PERIOD_NS = 180_000_000
-"""Publishing period of swarm/sightings, which are for display only."""
+_SIGHTINGS_PERIOD_NS = 180_000_000  # Publishing period of swarm/sightings, which are for display only
 _TF = QoSProfile(depth=100)  # what tf2's own broadcaster offers
 
 

@@ -4,23 +4,16 @@ from __future__ import annotations
 
 MIN_SHARE = 0.01
 """Least share, however busy the node is: without any measurements, robots would be lost for good."""
-_WINDOW_S = 0.5
-"""Least time over which the load is measured, since fusing comes in bursts."""
-_BUSY = 0.9
-"""Load above which a node may not keep up."""
-_MAX_WAIT = 0.5
-"""Share of the horizon; data that wait longer to be fused would soon be too old."""
-_AT_EASE = 0.6
-"""Load below which the share grows. Between the two limits it stays."""
-_SMOOTHING = 0.2
-"""Smoothing factor of the time that fusing takes, an average over about five windows."""
+_WINDOW_S = 0.5  # Least time over which the load is measured, since fusing comes in bursts
+_BUSY = 0.9  # Load above which a node may not keep up
+_MAX_WAIT = 0.5  # Share of the horizon; data that wait longer to be fused would soon be too old
+_AT_EASE = 0.6  # Load below which the share grows. Between the two limits it stays.
+_SMOOTHING = 0.2  # Smoothing factor of the time that fusing takes, an average over about five windows
 _AIM = 0.75
-_MIN_CUT, _MAX_CUT = 0.5, 0.125
-"""Limits of the factor by which the share is cut per window."""
+_MIN_CUT, _MAX_CUT = 0.5, 0.125  # Limits of the factor by which the share is cut per window
 _GROWTH = 1.3
 """Growth of the share per window at low load; it is too small to lead from one load limit past the other."""
-_LONGEST_WAIT = 0.25
-"""Share of the horizon that data may wait to be fused."""
+_LONGEST_WAIT = 0.25  # Share of the horizon that data may wait to be fused
 
 
 class Shedding:

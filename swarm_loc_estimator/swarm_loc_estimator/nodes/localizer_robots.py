@@ -19,26 +19,17 @@ from swarm_loc_estimator.sensors.fix import HEADING_UNKNOWN, has_heading, is_unk
 
 _IN_TOPICS = re.compile(r"[A-Za-z0-9_/]+")
 _MAX_OFFSET_M = 10.0
-_MAX_STRANGERS = 100
-"""Maximum number of names of bodies that are kept only to name them."""
-_NO_HEADING = 1e3 * HEADING_UNKNOWN
-"""Variance of a heading that was not measured [rad^2]."""
+_MAX_STRANGERS = 100  # Maximum number of names of bodies that are kept only to name them
+_NO_HEADING = 1e3 * HEADING_UNKNOWN  # Variance of a heading that was not measured [rad^2]
 
 
 class RobotPose(NamedTuple):
-    """Pose of a robot in `map`.
+    """Pose of a robot in `map`."""
 
-    Attributes:
-        robot: Its name.
-        stamp_ns: Time of measurement.
-        pose: (3,) x [m], y [m], heading [rad]; 0 if it was not measured.
-        covariance: (3, 3) of the pose; the variance of a heading that was not measured is huge.
-    """
-
-    robot: str
-    stamp_ns: int
-    pose: FloatArray
-    covariance: FloatArray
+    robot: str  # Its name
+    stamp_ns: int  # Time of measurement
+    pose: FloatArray  # (3,) x [m], y [m], heading [rad]; 0 if it was not measured
+    covariance: FloatArray  # (3, 3) of the pose; the variance of a heading that was not measured is huge
 
 
 class _UnusableError(Exception):

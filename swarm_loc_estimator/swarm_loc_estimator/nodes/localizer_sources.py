@@ -22,44 +22,28 @@ from swarm_loc_estimator.common.messages.definitions import (
 )
 from swarm_loc_estimator.common.messages.poses import PLANE, yaw_of
 
-BODY = "<body>"
-"""Stands for the name of a body in a topic."""
+BODY = "<body>"  # Stands for the name of a body in a topic
 _UNKNOWN: FloatArray = np.zeros((3, 3))
 
 
 class BodyPose(NamedTuple):
-    """Pose of a body.
+    """Pose of a body."""
 
-    Attributes:
-        name: Its name in the message; "": the message is about the body of its topic.
-        frame_id: Frame of the pose.
-        stamp_ns: Stamp of the message.
-        pose: x [m], y [m] and yaw [rad], NaN if it was not measured.
-        tilt: Angle between the z axes of the body and of the frame [rad]; 0 without orientation.
-        covariance: (3, 3) of the pose; zeros: unknown.
-    """
-
-    name: str
-    frame_id: str
-    stamp_ns: int
-    pose: tuple[float, float, float]
-    tilt: float
-    covariance: FloatArray = _UNKNOWN
+    name: str  # Its name in the message; "": the message is about the body of its topic
+    frame_id: str  # Frame of the pose
+    stamp_ns: int  # Stamp of the message
+    pose: tuple[float, float, float]  # x [m], y [m] and yaw [rad], NaN if it was not measured
+    tilt: float  # Angle between the z axes of the body and of the frame [rad]; 0 without orientation
+    covariance: FloatArray = _UNKNOWN  # (3, 3) of the pose; zeros: unknown
 
 
 @dataclass(frozen=True)
 class LocalizerSource:
-    """Kind of messages of localisers.
+    """Kind of messages of localisers."""
 
-    Attributes:
-        message_type: Such as geometry_msgs/msg/PoseStamped.
-        topic: Default topic; contains `BODY` if each body has its own.
-        bodies: Reads the poses of a message.
-    """
-
-    message_type: str
-    topic: str
-    bodies: Callable[[Any], Iterable[BodyPose]]
+    message_type: str  # Such as geometry_msgs/msg/PoseStamped
+    topic: str  # Default topic; contains `BODY` if each body has its own
+    bodies: Callable[[Any], Iterable[BodyPose]]  # Reads the poses of a message
 
 
 def _body(name: str, header: Any, place: Any, turn: Any, covariance: FloatArray = _UNKNOWN) -> BodyPose:

@@ -15,12 +15,10 @@ from swarm_loc_estimator.mapping.matching import Lattice, search_offsets
 from swarm_loc_estimator.mapping.scans import Readings
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
-_ROOM = (1.7, 1.1)
-"""Distances of the walls from the centre of the room, east and west, north and south [m]."""
+_ROOM = (1.7, 1.1)  # Distances of the walls from the centre of the room, east and west, north and south [m]
 _PERIOD_NS, _TURN_RATE, _SPEED = 20_000_000, 1.0, 0.2
 _STOPS = 4
-_SIGMA = 0.016
-"""Noise of an inverse distance [1/m]."""
+_SIGMA = 0.016  # Noise of an inverse distance [1/m]
 
 
 def precompile() -> None:

@@ -32,8 +32,7 @@ from swarm_loc_estimator.nodes.playback import STEP_S, PlayedSoFar, play
 
 _CLOCK = "clock"
 _POLL_S = 0.05
-_SETTLED_S = 0.5
-"""Discovery of subscriptions counts as complete after this time without a new one."""
+_SETTLED_S = 0.5  # Discovery of subscriptions counts as complete after this time without a new one
 _SAY_EVERY_S = 5.0
 _LAST_WORDS_S = 30.0
 """Time to wait for acknowledgements. DDS removes a dead subscriber after 20 s; a live one acknowledges
@@ -41,10 +40,8 @@ earlier, even by a lossy radio, where lost packets are requested again only ever
 _AT_ONCE = Duration(nanoseconds=0)
 _RUN_ON_S = 0.25
 """Time for which /clock continues after the last message, so that timers of other nodes process it."""
-DEPTH = 1000
-"""History depth of the player's publishers, whatever the recorded depth; enough for any rate."""
-RELIABLE = QoSProfile(depth=DEPTH)
-"""Reliable, which matches reliable and best-effort subscribers."""
+DEPTH = 1000  # History depth of the player's publishers, whatever the recorded depth; enough for any rate
+RELIABLE = QoSProfile(depth=DEPTH)  # Reliable, which matches reliable and best-effort subscribers
 LATCHED = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _LATCHED_TOPICS = frozenset({"tf_static", "robot_description", "map"})
 

@@ -10,10 +10,8 @@ from typing import Protocol
 from swarm_loc_estimator.common.bags.bag_file import RawMessage
 
 _SECOND = 1_000_000_000
-STEP_S = 0.005
-"""Wall time of a playback step [s]; the messages of a step follow a /clock not behind them."""
-LONGEST_STEP_NS = 20_000_000
-"""Longest bag time of a step, at any rate and lag."""
+STEP_S = 0.005  # Wall time of a playback step [s]; the messages of a step follow a /clock not behind them
+LONGEST_STEP_NS = 20_000_000  # Longest bag time of a step, at any rate and lag
 
 
 def clock_step_ns(rate: float) -> int:
@@ -23,19 +21,12 @@ def clock_step_ns(rate: float) -> int:
 
 @dataclass
 class PlayedSoFar:
-    """Progress of the playback.
+    """Progress of the playback."""
 
-    Attributes:
-        messages: Number of messages published.
-        bag_ns: Elapsed bag time.
-        wall_s: Elapsed wall time.
-        latest_s: Maximum delay of a message, in wall time.
-    """
-
-    messages: int = 0
-    bag_ns: int = 0
-    wall_s: float = 0.0
-    latest_s: float = 0.0
+    messages: int = 0  # Number of messages published
+    bag_ns: int = 0  # Elapsed bag time
+    wall_s: float = 0.0  # Elapsed wall time
+    latest_s: float = 0.0  # Maximum delay of a message, in wall time
 
     def summary(self) -> str:
         """One line for people."""

@@ -15,23 +15,17 @@ from swarm_loc_estimator.odometry.track_arrays import BEFORE_ALL_NS, TrackArrays
 NO_FAULT, JUMP, RESET = 0, 1, 2
 """Faults of a step: none; beyond the speed limits; contradicts the twist, or a restart at the origin."""
 
-_TURN_SLACK = 0.2
-"""Tolerance of a turn beyond the maximum turn rate [rad], because stamps jitter."""
-_TWIST_TURN_SLACK = 0.03
-"""Tolerance of a turn outside the twists [rad]."""
-_TWIST_PATH_SLACK = 0.1
-"""Tolerance of a displacement outside the twists, in wheel separations."""
+_TURN_SLACK = 0.2  # Tolerance of a turn beyond the maximum turn rate [rad], because stamps jitter
+_TWIST_TURN_SLACK = 0.03  # Tolerance of a turn outside the twists [rad]
+_TWIST_PATH_SLACK = 0.1  # Tolerance of a displacement outside the twists, in wheel separations
 _LEAST_RATE = 0.05
 """Share of the maximum rates by which rates may vary in a step, until the robot has reported larger ones."""
 _AGREED_ENOUGH, _AGREED_MOST, _AGREED_LOSS = 20, 60, 30
 """Number of agreeing steps from which the twist is used, its maximum, and its loss at a contradiction."""
-_RESTART_GAP = 2.5
-"""Pause before a restart at the origin, in previous steps."""
+_RESTART_GAP = 2.5  # Pause before a restart at the origin, in previous steps
 _ROUNDING = 1e-9
-_UNMOVED_M, _UNMOVED_RAD = 0.02, 0.2
-"""Motion by the twist from which a constant pose is not believed."""
-_UNMOVED_ROWS = 3
-"""Minimum number of rows with that pose."""
+_UNMOVED_M, _UNMOVED_RAD = 0.02, 0.2  # Motion by the twist from which a constant pose is not believed
+_UNMOVED_ROWS = 3  # Minimum number of rows with that pose
 _UNMOVED_S = 10.0
 """Time constant with which this motion is forgotten, so that a small bias of the twist is no motion."""
 

@@ -10,8 +10,7 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.odometry.track_arrays import LATEST_NS, TrackArrays
 
-_STILL_SIGMAS = 4.0
-"""Turns within so many sigma of noise and bias are none while the wheels stand."""
+_STILL_SIGMAS = 4.0  # Turns within so many sigma of noise and bias are none while the wheels stand
 
 
 @cached_njit

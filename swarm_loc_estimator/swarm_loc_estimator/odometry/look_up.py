@@ -15,21 +15,13 @@ from swarm_loc_estimator.odometry.track_arrays import TrackArrays
 
 
 class OdometrySample(NamedTuple):
-    """Tracks looked up at some instants (m,).
+    """Tracks looked up at some instants (m,)."""
 
-    Attributes:
-        pose: (m, 3) calibrated odometry pose O, heading not wrapped.
-        raw: (m, 3) pose reported by the driver, interpolated in the same way.
-        covariance: (m, 3, 3) preintegrated covariance, see `Preintegrated`.
-        jacobian: (m, 3, 3) preintegrated Jacobian.
-        silence_s: (m,) time since the newest message of the robot [s]; 0 within the track.
-    """
-
-    pose: FloatArray
-    raw: FloatArray
-    covariance: FloatArray
-    jacobian: FloatArray
-    silence_s: FloatArray
+    pose: FloatArray  # (m, 3) calibrated odometry pose O, heading not wrapped
+    raw: FloatArray  # (m, 3) pose reported by the driver, interpolated in the same way
+    covariance: FloatArray  # (m, 3, 3) preintegrated covariance, see `Preintegrated`
+    jacobian: FloatArray  # (m, 3, 3) preintegrated Jacobian
+    silence_s: FloatArray  # (m,) time since the newest message of the robot [s]; 0 within the track
 
 
 @cached_njit

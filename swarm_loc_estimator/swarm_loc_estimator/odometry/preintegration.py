@@ -31,17 +31,11 @@ _CONTRADICTORY_NS = 1_000_000_000
 
 
 class Preintegrated(NamedTuple):
-    """Preintegrated odometry from the start of a track to an instant, in the track's frame.
+    """Preintegrated odometry from the start of a track to an instant, in the track's frame."""
 
-    Attributes:
-        stamp_ns: The instant.
-        covariance: (3, 3) covariance G of the right-invariant error.
-        jacobian: (3, 3) Jacobian D of the pose by the parameters of the motion.
-    """
-
-    stamp_ns: int
-    covariance: FloatArray
-    jacobian: FloatArray
+    stamp_ns: int  # The instant
+    covariance: FloatArray  # (3, 3) covariance G of the right-invariant error
+    jacobian: FloatArray  # (3, 3) Jacobian D of the pose by the parameters of the motion
 
     @classmethod
     def begin(cls, stamp_ns: int) -> Preintegrated:
@@ -50,21 +44,13 @@ class Preintegrated(NamedTuple):
 
 
 class NewRows(NamedTuple):
-    """Rows (k,) sorted by robot and stamp.
+    """Rows (k,) sorted by robot and stamp."""
 
-    Attributes:
-        robot: (k,) index of the robot.
-        stamp_ns: (k,) instants, calibrated for delay.
-        raw: (k, 3) poses as reported.
-        twist: (k, 3) twists as reported.
-        new: (k,) False for rows that are integrated again.
-    """
-
-    robot: IntArray
-    stamp_ns: IntArray
-    raw: FloatArray
-    twist: FloatArray
-    new: NDArray[np.bool_]
+    robot: IntArray  # (k,) index of the robot
+    stamp_ns: IntArray  # (k,) instants, calibrated for delay
+    raw: FloatArray  # (k, 3) poses as reported
+    twist: FloatArray  # (k, 3) twists as reported
+    new: NDArray[np.bool_]  # (k,) False for rows that are integrated again
 
 
 class Integrated(NamedTuple):

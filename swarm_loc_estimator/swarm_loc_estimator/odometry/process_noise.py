@@ -15,29 +15,18 @@ _MAX_TURNING_S = 100.0
 
 
 class OdometryStep(NamedTuple):
-    """One step of a robot along its track.
+    """One step of a robot along its track."""
 
-    Attributes:
-        forward: Displacement of the body [m], as is left.
-        turn: Change of heading [rad].
-        turn_rate_change: Absolute change of the turn rate [rad/s].
-        duration_s: Duration [s].
-        x: Position on the track in the middle of the step [m], as is y.
-        theta: Heading in the middle of the step [rad].
-        turn_variance: Variance of a turn that a gyroscope measured [rad^2]; NaN: of the wheels.
-        estimates_turn: Whether the estimated scale and bias of turns are those of the sensor of this turn.
-    """
-
-    forward: float
+    forward: float  # Displacement of the body [m], as is left
     left: float
-    turn: float
-    turn_rate_change: float
-    duration_s: float
-    x: float
+    turn: float  # Change of heading [rad]
+    turn_rate_change: float  # Absolute change of the turn rate [rad/s]
+    duration_s: float  # Duration [s]
+    x: float  # Position on the track in the middle of the step [m], as is y
     y: float
-    theta: float
-    turn_variance: float
-    estimates_turn: bool
+    theta: float  # Heading in the middle of the step [rad]
+    turn_variance: float  # Variance of a turn that a gyroscope measured [rad^2]; NaN: of the wheels
+    estimates_turn: bool  # Whether the estimated scale and bias of turns are those of the sensor of this turn
 
 
 @cached_njit

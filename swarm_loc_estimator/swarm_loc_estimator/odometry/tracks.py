@@ -60,21 +60,14 @@ _GYRO_ROWS = ("gyro_ns", "gyro_rate", "gyro_angle", "gyro_piece")
 
 @dataclass(frozen=True)
 class TrackChange:
-    """Result of `OdometryTracks.extend`.
+    """Result of `OdometryTracks.extend`."""
 
-    Attributes:
-        changed_from_ns: (N,) instant after which look-ups of each robot have changed, or UNCHANGED_NS.
-        duplicates: Number of dropped rows with the stamp of another row of the robot.
-        too_old: (k,) robots of dropped rows older than the oldest accepted stamp.
-        jumps: Number of new rows beyond the robot's maximum speed or turn rate.
-        resets: Number of new rows that contradict their twist, or restart at the origin. The steps to rows
-            with a jump or a reset are unknown motion.
-    """
-
-    changed_from_ns: IntArray
-    duplicates: int
-    too_old: IntArray
-    jumps: int
+    changed_from_ns: IntArray  # (N,) instant after which look-ups of each robot have changed, or UNCHANGED_NS
+    duplicates: int  # Number of dropped rows with the stamp of another row of the robot
+    too_old: IntArray  # (k,) robots of dropped rows older than the oldest accepted stamp
+    jumps: int  # Number of new rows beyond the robot's maximum speed or turn rate
+    # Number of new rows that contradict their twist, or restart at the origin. The steps to rows with a jump
+    # or a reset are unknown motion.
     resets: int
 
 

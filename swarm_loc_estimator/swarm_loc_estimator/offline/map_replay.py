@@ -76,27 +76,18 @@ def truth_of(bag: Path, swarm: Swarm) -> dict[str, Trajectory]:
     return truth.tracks()
 
 
-COVERED_M = 0.06
-"""A piece of wall is covered if a cell within this distance is occupied [m]."""
+COVERED_M = 0.06  # A piece of wall is covered if a cell within this distance is occupied [m]
 _SPACING_M = 0.01
 
 
 class MapFigures(NamedTuple):
-    """Quality of a map; NaN without ground truth or floor plan.
+    """Quality of a map; NaN without ground truth or floor plan."""
 
-    Attributes:
-        stops: Number of stops with ground truth.
-        position_m: RMS position error of these stops.
-        heading_rad: RMS heading error of these stops.
-        wall_m: Mean distance of occupied cells from the nearest wall.
-        coverage: Share of the walls with an occupied cell nearby.
-    """
-
-    stops: int
-    position_m: float
-    heading_rad: float
-    wall_m: float
-    coverage: float
+    stops: int  # Number of stops with ground truth
+    position_m: float  # RMS position error of these stops
+    heading_rad: float  # RMS heading error of these stops
+    wall_m: float  # Mean distance of occupied cells from the nearest wall
+    coverage: float  # Share of the walls with an occupied cell nearby
 
     def sentence(self) -> str:
         """The figures as a sentence."""

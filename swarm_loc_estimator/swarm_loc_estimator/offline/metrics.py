@@ -22,22 +22,15 @@ class MetricsError(ValueError):
 
 @dataclass(frozen=True)
 class Errors:
-    """Estimate minus truth of one robot, where both are known.
+    """Estimate minus truth of one robot, where both are known."""
 
-    Attributes:
-        stamp_ns: (N,).
-        error: (N, 3) x [m], y [m], heading [rad, wrapped] in map.
-        sigma: (N, 3) one standard deviation of x, y, theta as estimated; NaN where unknown.
-        nees: (N,) squared error normalised by the covariance, ideally 3 on average; infinite where the
-            covariance is not positive definite, NaN where there is none.
-        misleading: (N,) whether the position is wrong beyond its covariance, see `is_misleading`.
-    """
-
-    stamp_ns: IntArray
-    error: FloatArray
-    sigma: FloatArray
+    stamp_ns: IntArray  #: (N,)
+    error: FloatArray  #: (N, 3) x [m], y [m], heading [rad, wrapped] in map
+    sigma: FloatArray  #: (N, 3) one standard deviation of x, y, theta as estimated; NaN where unknown
+    #: (N,) squared error normalised by the covariance, ideally 3 on average; infinite where the covariance is
+    #: not positive definite, NaN where there is none
     nees: FloatArray
-    misleading: BoolArray
+    misleading: BoolArray  #: (N,) whether the position is wrong beyond its covariance, see `is_misleading`
 
     @property
     def position(self) -> FloatArray:
@@ -47,27 +40,20 @@ class Errors:
 
 @dataclass(frozen=True)
 class ErrorSummary:
-    """Statistics of errors; NaN without poses to compare.
+    """Statistics of errors; NaN without poses to compare."""
 
-    Attributes:
-        count: Number of compared poses.
-        position_rmse: [m]; mean, median, p95 (95 %) and max follow.
-        heading_rmse: [rad], of the absolute heading error; mean, median, p95 and max follow.
-        nees: Mean normalised squared error, ideally 3.
-    """
-
-    count: int
-    position_rmse: float
+    count: int  #: Number of compared poses
+    position_rmse: float  #: [m]; mean, median, p95 (95 %) and max follow
     position_mean: float
     position_median: float
     position_p95: float
     position_max: float
-    heading_rmse: float
+    heading_rmse: float  #: [rad], of the absolute heading error; mean, median, p95 and max follow
     heading_mean: float
     heading_median: float
     heading_p95: float
     heading_max: float
-    nees: float
+    nees: float  #: Mean normalised squared error, ideally 3
 
 
 def compare(

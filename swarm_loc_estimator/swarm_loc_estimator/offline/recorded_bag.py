@@ -89,25 +89,16 @@ class Network:
 
 @dataclass(frozen=True)
 class BagSummary:
-    """Contents of a bag other than the inputs of the estimator.
+    """Contents of a bag other than the inputs of the estimator."""
 
-    Attributes:
-        range_ns: First and last log time.
-        truth: Robot name -> ground truth; robots without are missing.
-        received: Messages for the estimator by kind of topic.
-        remarks: Unreadable or unused contents, one sentence each.
-        unusable: Why no message can be used, one sentence each; empty if some can or none is expected.
-        maps: Messages of `map`, thinned out to `MAX_MAP_BYTES`.
-        goals: Robot name -> its goals by their stamps.
-    """
-
-    range_ns: tuple[int, int]
-    truth: Mapping[str, Trajectory]
-    received: Mapping[str, int]
-    remarks: tuple[str, ...]
+    range_ns: tuple[int, int]  # First and last log time
+    truth: Mapping[str, Trajectory]  # Robot name -> ground truth; robots without are missing
+    received: Mapping[str, int]  # Messages for the estimator by kind of topic
+    remarks: tuple[str, ...]  # Unreadable or unused contents, one sentence each
+    # Why no message can be used, one sentence each; empty if some can or none is expected
     unusable: tuple[str, ...]
-    maps: tuple[RecordedMap, ...] = ()
-    goals: Mapping[str, Trajectory] = field(default_factory=dict)
+    maps: tuple[RecordedMap, ...] = ()  # Messages of `map`, thinned out to `MAX_MAP_BYTES`
+    goals: Mapping[str, Trajectory] = field(default_factory=dict)  # Robot name -> its goals by their stamps
 
 
 def read_bag(
@@ -272,10 +263,8 @@ def _listed(topics: Sequence[BagTopic]) -> str:
     return listed([f"{topic.name} ({topic.type or 'no type'})" for topic in topics])
 
 
-MAX_MAP_BYTES = 48_000_000
-"""Size from which maps are thinned out evenly over time."""
-MAX_GOALS = 20_000
-"""Maximum number of stored goals per robot."""
+MAX_MAP_BYTES = 48_000_000  # Size from which maps are thinned out evenly over time
+MAX_GOALS = 20_000  # Maximum number of stored goals per robot
 
 
 class MapReader:

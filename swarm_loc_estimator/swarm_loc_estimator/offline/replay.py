@@ -36,10 +36,8 @@ from swarm_loc_estimator.timeline.self_calibration import swapped_signs
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.sightings import Sightings, newest_sightings
 
-TICK_S = 0.1
-"""Default time between two outputs [s]."""
-TICKS_S = (1e-3, 3600.0)
-"""Range of it [s]."""
+TICK_S = 0.1  # Default time between two outputs [s]
+TICKS_S = (1e-3, 3600.0)  # Range of it [s]
 
 
 def replay(

@@ -32,62 +32,42 @@ class RecordedMap(NamedTuple):
 
 
 class AerialImage(NamedTuple):
-    """Detections of an aerial image.
+    """Detections of an aerial image."""
 
-    Attributes:
-        stamp_ns: Of the image.
-        position: (n, 2) of its detections in map [m].
-        robot: (n,) index of the most probable robot of each; -1: unknown.
-        probability: (n,) of these identities.
-    """
-
-    stamp_ns: int
-    position: FloatArray
-    robot: IntArray
-    probability: FloatArray
+    stamp_ns: int  # Of the image
+    position: FloatArray  # (n, 2) of its detections in map [m]
+    robot: IntArray  # (n,) index of the most probable robot of each; -1: unknown
+    probability: FloatArray  # (n,) of these identities
 
 
 @dataclass(frozen=True)
 class ReplayResult:
-    """Estimated poses of all robots over time, with ground truth and statistics of the run.
+    """Estimated poses of all robots over time, with ground truth and statistics of the run."""
 
-    Attributes:
-        title: Such as the name of the bag.
-        swarm: Robots and landmarks.
-        stamp_ns: (T,) times of the poses.
-        poses: (T, N, 3) x [m], y [m], theta [rad] in map; NaN while a robot is not located.
-        covariances: (T, N, 3, 3) of x, y, theta.
-        status: (T, N) of `Status`.
-        truth: Robot name -> ground truth; robots without are missing.
-        counters: Counts by name, such as dropped inputs by reason.
-        remarks: Sentences for the user, such as unreadable parts of the bag.
-        data_s: Duration of the data [s].
-        wall_s: Duration of the replay [s].
-        self_calibrated: The swarm with the estimated calibration parameters; None if none were estimated.
-        sightings: Time [ns] and sightings, every half second; empty: not kept.
-        images: Aerial images with the identities of their detections; empty: none, or not kept.
-        maps: Recorded messages of `map`.
-        goals: Robot name -> its recorded goals; robots without are missing.
-        is_local: (T,) True while poses are relative to a robot instead of in map, and have no errors; empty:
-            never.
-    """
-
-    title: str
-    swarm: Swarm
-    stamp_ns: npt.NDArray[np.int64]
+    title: str  #: Such as the name of the bag
+    swarm: Swarm  #: Robots and landmarks
+    stamp_ns: npt.NDArray[np.int64]  #: (T,) times of the poses
+    #: (T, N, 3) x [m], y [m], theta [rad] in map; NaN while a robot is not located
     poses: npt.NDArray[np.float64]
-    covariances: npt.NDArray[np.float64]
-    status: npt.NDArray[np.uint8]
+    covariances: npt.NDArray[np.float64]  #: (T, N, 3, 3) of x, y, theta
+    status: npt.NDArray[np.uint8]  #: (T, N) of `Status`
+    #: Robot name -> ground truth; robots without are missing
     truth: Mapping[str, Trajectory] = field(default_factory=dict)
+    #: Counts by name, such as dropped inputs by reason
     counters: Mapping[str, int] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
-    data_s: float = 0.0
-    wall_s: float = 0.0
+    remarks: tuple[str, ...] = ()  #: Sentences for the user, such as unreadable parts of the bag
+    data_s: float = 0.0  #: Duration of the data [s]
+    wall_s: float = 0.0  #: Duration of the replay [s]
+    #: The swarm with the estimated calibration parameters; None if none were estimated
     self_calibrated: Swarm | None = None
+    #: Time [ns] and sightings, every half second; empty: not kept
     sightings: tuple[tuple[int, Sightings], ...] = ()
+    #: Aerial images with the identities of their detections; empty: none, or not kept
     images: tuple[AerialImage, ...] = ()
-    maps: tuple[RecordedMap, ...] = ()
+    maps: tuple[RecordedMap, ...] = ()  #: Recorded messages of `map`
+    #: Robot name -> its recorded goals; robots without are missing
     goals: Mapping[str, Trajectory] = field(default_factory=dict)
+    #: (T,) True while poses are relative to a robot instead of in map, and have no errors; empty: never
     is_local: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     @property

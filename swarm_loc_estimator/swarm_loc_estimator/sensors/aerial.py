@@ -27,33 +27,21 @@ from swarm_loc_estimator.sensors.sensor import (
 )
 from swarm_loc_estimator.swarm.swarm import Swarm
 
-FOREIGN_FRAME = "aerial_frame"
-"""Reason to drop an aerial image that is not in the frame `map`."""
-TOO_MANY = "aerial_too_many"
-"""Reason to drop an aerial image with more detections than MAX_ANONYMOUS."""
+FOREIGN_FRAME = "aerial_frame"  # Reason to drop an aerial image that is not in the frame `map`
+TOO_MANY = "aerial_too_many"  # Reason to drop an aerial image with more detections than MAX_ANONYMOUS
 MAX_ANONYMOUS = 2000
-_UNKNOWN_VARIANCE = -1.0
-"""First element of an unknown covariance."""
+_UNKNOWN_VARIANCE = -1.0  # First element of an unknown covariance
 
 
 class AerialRows(NamedTuple):
-    """Anonymous detections of aerial images, a row per detection (d,).
+    """Anonymous detections of aerial images, a row per detection (d,)."""
 
-    Attributes:
-        robot: (d,) always -1, the whole swarm.
-        stamp_ns: (d,) exposure times.
-        number: (d,) index of the detection in its message.
-        pose: (d, 3) x [m], y [m], heading [rad] in `map`; heading NaN: not measured.
-        covariance: (d, 3, 3) of the pose; a first element of -1: unknown.
-        arrival_ns: (d,) arrival times.
-    """
-
-    robot: IntArray
-    stamp_ns: IntArray
-    number: IntArray
-    pose: FloatArray
-    covariance: FloatArray
-    arrival_ns: IntArray
+    robot: IntArray  # (d,) always -1, the whole swarm
+    stamp_ns: IntArray  # (d,) exposure times
+    number: IntArray  # (d,) index of the detection in its message
+    pose: FloatArray  # (d, 3) x [m], y [m], heading [rad] in `map`; heading NaN: not measured
+    covariance: FloatArray  # (d, 3, 3) of the pose; a first element of -1: unknown
+    arrival_ns: IntArray  # (d,) arrival times
 
 
 NO_AERIAL = AerialRows(NO_ROWS, NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros((0, 3, 3)), NO_ROWS)

@@ -13,8 +13,7 @@ from swarm_loc_estimator.filter.measurement_model import (
     register,
 )
 
-BEARING = 4
-"""Number of the model; the first component of a value is the bearing, positive to the left [rad]."""
+BEARING = 4  # Number of the model; the first component of a value is the bearing, positive to the left [rad]
 
 
 def _predict_bearing(one: MeasurementArray, observer: FloatArray, target: FloatArray) -> Prediction:

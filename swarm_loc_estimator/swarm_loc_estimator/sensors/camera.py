@@ -72,19 +72,12 @@ def _tilt(pitch: float, roll: float) -> FloatArray:
 
 
 class DetectionRows(NamedTuple):
-    """Detections of cameras, a row per detection (d,).
+    """Detections of cameras, a row per detection (d,)."""
 
-    Attributes:
-        robot: (d,) index of the robot or fixed camera into `Swarm.sources`.
-        stamp_ns: (d,) exposure times.
-        detection: (d,) structured, see `SightingConverter.convert`.
-        arrival_ns: (d,) arrival times.
-    """
-
-    robot: IntArray
-    stamp_ns: IntArray
-    detection: NDArray[np.void]
-    arrival_ns: IntArray
+    robot: IntArray  #: (d,) index of the robot or fixed camera into `Swarm.sources`
+    stamp_ns: IntArray  #: (d,) exposure times
+    detection: NDArray[np.void]  #: (d,) structured, see `SightingConverter.convert`
+    arrival_ns: IntArray  #: (d,) arrival times
 
 
 NO_DETECTIONS = DetectionRows(NO_ROWS, NO_ROWS, np.zeros(0, dtype=DETECTION_DTYPE), NO_ROWS)
@@ -92,16 +85,11 @@ NO_DETECTIONS = DetectionRows(NO_ROWS, NO_ROWS, np.zeros(0, dtype=DETECTION_DTYP
 
 @dataclass(frozen=True)
 class Conversion:
-    """Result of converting detections.
+    """Result of converting detections."""
 
-    Attributes:
-        measurements: (m,) of MEASUREMENT_DTYPE.
-        measured: (d,) True for detections that were converted.
-        dropped: Robots or fixed cameras (k,) of the dropped detections by reason, see `OUTCOMES`.
-    """
-
-    measurements: MeasurementArray
-    measured: NDArray[np.bool_]
+    measurements: MeasurementArray  # (m,) of MEASUREMENT_DTYPE
+    measured: NDArray[np.bool_]  # (d,) True for detections that were converted
+    # Robots or fixed cameras (k,) of the dropped detections by reason, see `OUTCOMES`
     dropped: dict[str, IntArray]
 
 

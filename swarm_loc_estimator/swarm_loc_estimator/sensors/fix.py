@@ -46,22 +46,15 @@ _GATE = float(MODELS[Kind.CARTESIAN].gate(0.9999))
 
 
 class FixRows(NamedTuple):
-    """Absolute fixes (f,).
+    """Absolute fixes (f,)."""
 
-    Attributes:
-        robot: (f,) index of the robot.
-        stamp_ns: (f,) time of measurement.
-        pose: (f, 3) x [m], y [m], heading [rad] in `map`; heading NaN: not measured.
-        covariance: (f, 3, 3) of the pose; the part of a heading not measured is ignored. With variances 0 of
-            x and y it is unknown, and that of the swarm description is used.
-        arrival_ns: (f,) arrival times.
-    """
-
-    robot: IntArray
-    stamp_ns: IntArray
-    pose: FloatArray
+    robot: IntArray  #: (f,) index of the robot
+    stamp_ns: IntArray  #: (f,) time of measurement
+    pose: FloatArray  #: (f, 3) x [m], y [m], heading [rad] in `map`; heading NaN: not measured
+    #: (f, 3, 3) of the pose; the part of a heading not measured is ignored. With variances 0 of x and y it is
+    #: unknown, and that of the swarm description is used.
     covariance: FloatArray
-    arrival_ns: IntArray
+    arrival_ns: IntArray  #: (f,) arrival times
 
 
 NO_FIXES = FixRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros((0, 3, 3)), NO_ROWS)
@@ -160,5 +153,4 @@ _OWN = InputKind(
 )
 _decode_shared = partial(decode_shared_numbers, widths=(3, 9))
 _SHARED = shared_kind(_OWN, "swarm/fixes", SWARM_FIXES, _decode_shared, _shared_rows, NO_FIXES)
-FIXES = Sensor("fixes", NO_FIXES, (_OWN, _SHARED), _create_converter)
-"""The sensor, see `registry.SENSORS`."""
+FIXES = Sensor("fixes", NO_FIXES, (_OWN, _SHARED), _create_converter)  # The sensor, see `registry.SENSORS`

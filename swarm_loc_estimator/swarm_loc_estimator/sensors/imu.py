@@ -29,26 +29,18 @@ from swarm_loc_estimator.sensors.sensor import (
 )
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
-_MAX_RATE = 200.0
-"""Larger turn rates are no measurements [rad/s]."""
+_MAX_RATE = 200.0  # Larger turn rates are no measurements [rad/s]
 
 
 class TurnRateRows(NamedTuple):
-    """Turn rates (k,).
+    """Turn rates (k,)."""
 
-    Attributes:
-        robot: (k,) index of the robot.
-        stamp_ns: (k,) acquisition stamps.
-        velocity: (k, 3) angular velocity in the frame of the IMU [rad/s].
-        rate: (k,) turn rate about the vertical, without calibration [rad/s]; NaN before the conversion.
-        arrival_ns: (k,) arrival times.
-    """
-
-    robot: IntArray
-    stamp_ns: IntArray
-    velocity: FloatArray
+    robot: IntArray  # (k,) index of the robot
+    stamp_ns: IntArray  # (k,) acquisition stamps
+    velocity: FloatArray  # (k, 3) angular velocity in the frame of the IMU [rad/s]
+    # (k,) turn rate about the vertical, without calibration [rad/s]; NaN before the conversion
     rate: FloatArray
-    arrival_ns: IntArray
+    arrival_ns: IntArray  # (k,) arrival times
 
 
 NO_TURN_RATES = TurnRateRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros(0), NO_ROWS)

@@ -44,48 +44,31 @@ _METHODS: dict[IrMethod, Callable[[IrPlatform], IrEstimator]] = {
 
 
 class BrightnessRows(NamedTuple):
-    """Brightness matrices (b,), as `swarm_loc_msgs/BrightnessMatrix` has them.
+    """Brightness matrices (b,), as `swarm_loc_msgs/BrightnessMatrix` has them."""
 
-    Attributes:
-        robot: (b,) index of the robot of the topic.
-        stamp_ns: (b,) middle of the exchange, equal for all its power modes.
-        receiver: (b,) id of the robot that measured.
-        transmitter: (b,) id of the robot that lit its emitters.
-        n: (b,) number of sensors, and of emitters.
-        power: (b,) index of the power mode.
-        saturation: (b,) reading at which a sensor saturates [count]; 0: that of the platform.
-        readings: (b,) of arrays (k,) [count], row-major [sensor, emitter]; k should be n * n.
-        arrival_ns: (b,) arrival times.
-    """
-
-    robot: IntArray
-    stamp_ns: IntArray
-    receiver: IntArray
-    transmitter: IntArray
-    n: IntArray
-    power: IntArray
-    saturation: IntArray
+    robot: IntArray  # (b,) index of the robot of the topic
+    stamp_ns: IntArray  # (b,) middle of the exchange, equal for all its power modes
+    receiver: IntArray  # (b,) id of the robot that measured
+    transmitter: IntArray  # (b,) id of the robot that lit its emitters
+    n: IntArray  # (b,) number of sensors, and of emitters
+    power: IntArray  # (b,) index of the power mode
+    saturation: IntArray  # (b,) reading at which a sensor saturates [count]; 0: that of the platform
+    # (b,) of arrays (k,) [count], row-major [sensor, emitter]; k should be n * n
     readings: NDArray[np.object_]
-    arrival_ns: IntArray
+    arrival_ns: IntArray  # (b,) arrival times
 
 
 NO_BRIGHTNESS = BrightnessRows(*(NO_ROWS,) * 7, np.zeros(0, dtype=object), NO_ROWS)
 
 
 class Matrix(NamedTuple):
-    """Readings at one power.
+    """Readings at one power."""
 
-    Attributes:
-        light: (n, n) [count], [sensor, emitter], dark readings subtracted.
-        saturation: Light at or above this is only a lower bound [count].
-    """
-
-    light: FloatArray
-    saturation: float
+    light: FloatArray  # (n, n) [count], [sensor, emitter], dark readings subtracted
+    saturation: float  # Light at or above this is only a lower bound [count]
 
 
-Readings = dict[int, Matrix]
-"""Matrices of an exchange by power."""
+Readings = dict[int, Matrix]  # Matrices of an exchange by power
 
 
 class ExchangeKey(NamedTuple):
@@ -169,17 +152,12 @@ class MatrixScreening:
 
 @dataclass
 class _Exchange:
-    """State of an exchange.
+    """State of an exchange."""
 
-    Attributes:
-        readings: Received matrices.
-        measurement: Current measurement (1,), or (0,) if there is none.
-        fault: Reason why there is none.
-    """
-
-    readings: Readings = field(default_factory=dict)
+    readings: Readings = field(default_factory=dict)  # Received matrices
+    # Current measurement (1,), or (0,) if there is none
     measurement: MeasurementArray = field(default_factory=NO_MEASUREMENTS.copy)
-    fault: str = ""
+    fault: str = ""  # Reason why there is none
 
 
 @lru_cache(maxsize=64)

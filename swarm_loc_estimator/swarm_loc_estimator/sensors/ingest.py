@@ -25,8 +25,7 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 MAX_PAUSE_NS = 3_600_000_000_000
 """Maximum time between arrivals; beyond it the clock was set, as on a robot without a hardware clock."""
 
-CLOCKS_APART_S = 0.2
-"""Difference between the clock of a robot and those of the others that is named [s]."""
+CLOCKS_APART_S = 0.2  # Difference between the clock of a robot and those of the others that is named [s]
 
 _STATISTICS_DTYPE = np.dtype(
     [
@@ -109,15 +108,10 @@ class InputStatistics:
 
 
 class WrongClock(NamedTuple):
-    """A robot's clock that is not that of the other robots.
+    """A robot's clock that is not that of the other robots."""
 
-    Attributes:
-        apart_s: Its time minus theirs [s], as its description corrects it.
-        offset_s: `clock.offset_s` of its description that corrects it.
-    """
-
-    apart_s: float
-    offset_s: float
+    apart_s: float  # Its time minus theirs [s], as its description corrects it
+    offset_s: float  # `clock.offset_s` of its description that corrects it
 
     @property
     def problem(self) -> str:

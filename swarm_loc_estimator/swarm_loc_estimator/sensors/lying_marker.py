@@ -19,8 +19,7 @@ from swarm_loc_estimator.filter.gating import gate_threshold
 CAST, FACE_DOWN, NOT_FLAT = range(3)
 """Results of `cast`: a pose in the plane; a marker that shows the floor; one that lies not as described."""
 _GATE = float(gate_threshold(1.0 - 1e-6, 3))
-_TILT_SIGMA = 0.05
-"""Standard deviation of the tilt of what lies, besides its measurement [rad]."""
+_TILT_SIGMA = 0.05  # Standard deviation of the tilt of what lies, besides its measurement [rad]
 _HEIGHT_SHARE, _HEIGHT_SIGMA = 0.02, 0.005
 """Standard deviation of a distance by the size of a marker: share of it, and [m]."""
 

@@ -32,21 +32,14 @@ _MAX_DISTANCE_M = 1e6
 
 
 class OdometryRows(NamedTuple):
-    """Odometry messages (k,).
+    """Odometry messages (k,)."""
 
-    Attributes:
-        robot: (k,) index of the robot.
-        stamp_ns: (k,) acquisition stamps.
-        pose: (k, 3) x [m], y [m], yaw [rad] in the robot's own odom frame.
-        twist: (k, 3) velocity forward and left [m/s] and turn rate [rad/s] of base_link; NaN: not known.
-        arrival_ns: (k,) arrival times.
-    """
-
-    robot: IntArray
-    stamp_ns: IntArray
-    pose: FloatArray
+    robot: IntArray  #: (k,) index of the robot
+    stamp_ns: IntArray  #: (k,) acquisition stamps
+    pose: FloatArray  #: (k, 3) x [m], y [m], yaw [rad] in the robot's own odom frame
+    #: (k, 3) velocity forward and left [m/s] and turn rate [rad/s] of base_link; NaN: not known
     twist: FloatArray
-    arrival_ns: IntArray
+    arrival_ns: IntArray  #: (k,) arrival times
 
     @classmethod
     def without_twist(

@@ -83,8 +83,7 @@ def _innovation(one: MeasurementArray, predicted: FloatArray) -> FloatArray:
     return innovation
 
 
-RANGE = MeasurementModel("range", 10, 1, _predict_range, _innovation)
-"""Distance of two antennas [m]."""
+RANGE = MeasurementModel("range", 10, 1, _predict_range, _innovation)  # Distance of two antennas [m]
 RANGE_DIFFERENCE = MeasurementModel("range difference", 11, 1, _predict_difference, _innovation)
 """Distance to one antenna minus that to the reference [m]."""
 register(RANGE)
@@ -92,25 +91,15 @@ register(RANGE_DIFFERENCE)
 
 
 class RangeRows(NamedTuple):
-    """Ranges and range differences (k,).
+    """Ranges and range differences (k,)."""
 
-    Attributes:
-        robot: (k,) index of the robot that measured.
-        stamp_ns: (k,) time of measurement.
-        device: (k,) uint64, address of the other device.
-        reference: (k,) uint64, address of the reference; 0: a range.
-        range: (k,) range, or difference [m].
-        variance: (k,) of `range` [m^2]; 0: that of the swarm description is used.
-        arrival_ns: (k,) arrival times.
-    """
-
-    robot: IntArray
-    stamp_ns: IntArray
-    device: NDArray[np.uint64]
-    reference: NDArray[np.uint64]
-    range: FloatArray
-    variance: FloatArray
-    arrival_ns: IntArray
+    robot: IntArray  # (k,) index of the robot that measured
+    stamp_ns: IntArray  # (k,) time of measurement
+    device: NDArray[np.uint64]  # (k,) uint64, address of the other device
+    reference: NDArray[np.uint64]  # (k,) uint64, address of the reference; 0: a range
+    range: FloatArray  # (k,) range, or difference [m]
+    variance: FloatArray  # (k,) of `range` [m^2]; 0: that of the swarm description is used
+    arrival_ns: IntArray  # (k,) arrival times
 
 
 _NO_ADDRESSES = np.zeros(0, dtype=np.uint64)
@@ -149,23 +138,14 @@ def _columns(
 
 
 class _Devices(NamedTuple):
-    """All radios by ascending address (d,), the first one is none.
+    """All radios by ascending address (d,), the first one is none."""
 
-    Attributes:
-        address: (d,) uint64.
-        robot: (d,) index of its robot; -1: an anchor.
-        landmark: (d,) field `landmark` of measurements; 0: a robot.
-        place: (d, 3) antenna x, y, z in base_link or in `map`.
-        bias: (d,) of its ranges [m].
-        variance: (d,) of x and of y of an anchor [m^2].
-    """
-
-    address: NDArray[np.uint64]
-    robot: IntArray
-    landmark: IntArray
-    place: FloatArray
-    bias: FloatArray
-    variance: FloatArray
+    address: NDArray[np.uint64]  # (d,) uint64
+    robot: IntArray  # (d,) index of its robot; -1: an anchor
+    landmark: IntArray  # (d,) field `landmark` of measurements; 0: a robot
+    place: FloatArray  # (d, 3) antenna x, y, z in base_link or in `map`
+    bias: FloatArray  # (d,) of its ranges [m]
+    variance: FloatArray  # (d,) of x and of y of an anchor [m^2]
 
     @classmethod
     def of(cls, swarm: Swarm) -> _Devices:
@@ -257,5 +237,4 @@ _OWN = InputKind(
     _has_radio,
     only_expected=True,
 )
-RANGES = Sensor("ranges", NO_RANGES, (_OWN,), _create_converter)
-"""The sensor, see `registry.SENSORS`."""
+RANGES = Sensor("ranges", NO_RANGES, (_OWN,), _create_converter)  # The sensor, see `registry.SENSORS`

@@ -27,8 +27,7 @@ SENSORS: dict[str, Sensor] = {
 }
 """All sensors by name. Simultaneous measurements are fused in this order."""
 
-THE_SWARM = -1
-"""Robot index of topics about the whole swarm."""
+THE_SWARM = -1  # Robot index of topics about the whole swarm
 
 
 def kinds() -> dict[str, InputKind]:
@@ -39,18 +38,12 @@ def kinds() -> dict[str, InputKind]:
 
 @dataclass(frozen=True)
 class InputTopic:
-    """Input topic.
+    """Input topic."""
 
-    Attributes:
-        name: Relative topic name, such as `<robot>/odom`.
-        kind: Kind of the topic.
-        robot: Index into `Swarm.sources`, or THE_SWARM.
-        expected: True if missing messages are an error; False for detections of a robot without camera.
-    """
-
-    name: str
-    kind: InputKind
-    robot: int
+    name: str  # Relative topic name, such as `<robot>/odom`
+    kind: InputKind  # Kind of the topic
+    robot: int  # Index into `Swarm.sources`, or THE_SWARM
+    # True if missing messages are an error; False for detections of a robot without camera
     expected: bool = True
 
 
@@ -99,19 +92,13 @@ def _is_sent(topic: InputTopic, swarm: Swarm, stood_for: Collection[str]) -> boo
 
 @dataclass(frozen=True)
 class Batch:
-    """Raw readings of an interval of monotonic arrival time.
+    """Raw readings of an interval of monotonic arrival time."""
 
-    Attributes:
-        begin_ns: Arrival of the first message.
-        end_ns: Arrival of the last message.
-        rows: Readings by sensor, in order of arrival; sensors without readings are omitted.
-        dropped: Number of unreadable readings by reason.
-    """
-
-    begin_ns: int
-    end_ns: int
+    begin_ns: int  #: Arrival of the first message
+    end_ns: int  #: Arrival of the last message
+    #: Readings by sensor, in order of arrival; sensors without readings are omitted
     rows: Mapping[str, Any] = field(default_factory=dict)
-    dropped: Mapping[str, int] = field(default_factory=dict)
+    dropped: Mapping[str, int] = field(default_factory=dict)  #: Number of unreadable readings by reason
 
     @classmethod
     def of(cls, begin_ns: int, end_ns: int, **rows: Any) -> Batch:
@@ -135,21 +122,13 @@ class Batch:
 
 @dataclass(frozen=True)
 class Measurements:
-    """Measurements of a batch, in order of arrival.
+    """Measurements of a batch, in order of arrival."""
 
-    Attributes:
-        begin_ns: Arrival of the first message.
-        end_ns: Arrival of the last message.
-        measurements: (m,) with finite values and valid covariances.
-        arrival_ns: (m,) arrival times.
-        rows: Valid unconverted readings by sensor: odometry and inputs of accumulators.
-    """
-
-    begin_ns: int
-    end_ns: int
-    measurements: MeasurementArray
-    arrival_ns: IntArray
-    rows: Mapping[str, Any]
+    begin_ns: int  # Arrival of the first message
+    end_ns: int  # Arrival of the last message
+    measurements: MeasurementArray  # (m,) with finite values and valid covariances
+    arrival_ns: IntArray  # (m,) arrival times
+    rows: Mapping[str, Any]  # Valid unconverted readings by sensor: odometry and inputs of accumulators
 
     def until_each(self, stamps_ns: IntArray) -> Iterator[Measurements]:
         """Split at instants (s,) into s + 1 parts by arrival time."""

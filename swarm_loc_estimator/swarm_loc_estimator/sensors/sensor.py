@@ -47,27 +47,17 @@ def in_order_of_arrival(parts: Sequence[Rows]) -> Rows:
 
 
 class Known(NamedTuple):
-    """Expected contents of messages.
+    """Expected contents of messages."""
 
-    Attributes:
-        map_frame: Name of the frame `map` in messages.
-        robots: Number of robots in the swarm.
-        swarm: Number that identifies the swarm in messages of many robots, see `swarm_key`.
-    """
-
-    map_frame: str
-    robots: int
-    swarm: int
+    map_frame: str  #: Name of the frame `map` in messages
+    robots: int  #: Number of robots in the swarm
+    swarm: int  #: Number that identifies the swarm in messages of many robots, see `swarm_key`
 
 
 class Reader(Protocol):
-    """Decodes the messages of all topics of one kind.
+    """Decodes the messages of all topics of one kind."""
 
-    Attributes:
-        frame_ids: Frame of the newest message of each topic, "" before the first.
-    """
-
-    frame_ids: list[str]
+    frame_ids: list[str]  #: Frame of the newest message of each topic, "" before the first
 
     def read(self, batch: MessageBatch) -> Any:
         """Decode messages (n,) in order of arrival.
@@ -148,36 +138,22 @@ class Guard:
 
 @dataclass(frozen=True)
 class InputKind:
-    """Kind of input topic.
+    """Kind of input topic."""
 
-    Attributes:
-        name: Name of the kind; equal to that of the sensor for topics of single robots.
-        topic: Name relative to the robot's namespace, or full name of a topic of the swarm.
-        message_type: Message type, such as nav_msgs/msg/Odometry.
-        create_reader: Creates a reader for a number of topics.
-        columns_of: Converts decoded messages (n,), the messages and the robots (n,) of their topics to
-            readings; also returns the number of unused valid readings by reason.
-        expected_of: True if a missing topic of the robot is an error.
-        of_each: True if each robot has its own topic.
-        only_expected: True if robots of which it is not expected have no such topic.
-        of_cameras: True if each fixed camera has such a topic, too.
-        in_map: True if readings must be in the frame `map`.
-        needs_map: True if there are such topics only for a swarm with a map.
-        stands_for: Name of the sensor whose topics of single robots it replaces; "" if none.
-    """
-
-    name: str
-    topic: str
-    message_type: str
-    create_reader: Callable[[int, Known], Reader]
+    name: str  #: Name of the kind; equal to that of the sensor for topics of single robots
+    topic: str  #: Name relative to the robot's namespace, or full name of a topic of the swarm
+    message_type: str  #: Message type, such as nav_msgs/msg/Odometry
+    create_reader: Callable[[int, Known], Reader]  #: Creates a reader for a number of topics
+    #: Converts decoded messages (n,), the messages and the robots (n,) of their topics to readings; also
+    #: returns the number of unused valid readings by reason
     columns_of: Callable[[Any, MessageBatch, IntArray, Known], tuple[Any, Mapping[str, int]]]
-    expected_of: Callable[[Robot], bool] = of_every
-    of_each: bool = True
-    only_expected: bool = False
-    of_cameras: bool = False
-    in_map: bool = False
-    needs_map: bool = False
-    stands_for: str = ""
+    expected_of: Callable[[Robot], bool] = of_every  #: True if a missing topic of the robot is an error
+    of_each: bool = True  #: True if each robot has its own topic
+    only_expected: bool = False  #: True if robots of which it is not expected have no such topic
+    of_cameras: bool = False  #: True if each fixed camera has such a topic, too
+    in_map: bool = False  #: True if readings must be in the frame `map`
+    needs_map: bool = False  #: True if there are such topics only for a swarm with a map
+    stands_for: str = ""  #: Name of the sensor whose topics of single robots it replaces; "" if none
 
     @property
     def rows(self) -> str:
@@ -195,27 +171,17 @@ class InputKind:
 
 
 class Measured(NamedTuple):
-    """Measurements of a sensor.
+    """Measurements of a sensor."""
 
-    Attributes:
-        measurements: (m,) of MEASUREMENT_DTYPE.
-        arrival_ns: (m,) arrival times.
-    """
-
-    measurements: MeasurementArray
-    arrival_ns: IntArray
+    measurements: MeasurementArray  #: (m,) of MEASUREMENT_DTYPE
+    arrival_ns: IntArray  #: (m,) arrival times
 
 
 class Change(NamedTuple):
-    """Change of a sensor's measurements by new readings.
+    """Change of a sensor's measurements by new readings."""
 
-    Attributes:
-        added: (m,) new measurements.
-        withdrawn: (w,) earlier measurements that are replaced.
-    """
-
-    added: MeasurementArray
-    withdrawn: MeasurementArray
+    added: MeasurementArray  #: (m,) new measurements
+    withdrawn: MeasurementArray  #: (w,) earlier measurements that are replaced
 
 
 class Accumulator(Protocol):
@@ -261,24 +227,17 @@ Converter = Callable[[Any], Any]
 
 @dataclass(frozen=True)
 class Sensor:
-    """Sensor on the robots or an overhead camera; `registry.SENSORS` lists all.
+    """Sensor on the robots or an overhead camera; `registry.SENSORS` lists all."""
 
-    Attributes:
-        name: Name of its readings in a batch.
-        nothing: Empty readings.
-        kinds: Kinds of its topics.
-        create_converter: Creates a converter for a swarm, which counts dropped readings by reason; if None,
-            readings are used unchanged.
-        create_accumulator: Creates an accumulator for a sensor that combines several readings into one
-            measurement; None for other sensors.
-        unit: Columns that group readings: a group is used or dropped as a whole. None: never dropped.
-        keeps_units: True if readings of one group may arrive in several batches.
-    """
-
-    name: str
-    nothing: tuple[NDArray[Any], ...]
-    kinds: tuple[InputKind, ...]
+    name: str  #: Name of its readings in a batch
+    nothing: tuple[NDArray[Any], ...]  #: Empty readings
+    kinds: tuple[InputKind, ...]  #: Kinds of its topics
+    #: Creates a converter for a swarm, which counts dropped readings by reason; if None, readings are used
+    #: unchanged
     create_converter: Callable[[Swarm, SensorSettings, DropCounts], Converter] | None = None
+    #: Creates an accumulator for a sensor that combines several readings into one measurement; None for other
+    #: sensors
     create_accumulator: Callable[[Swarm], Accumulator] | None = None
+    #: Columns that group readings: a group is used or dropped as a whole. None: never dropped.
     unit: tuple[str, ...] | None = ()
-    keeps_units: bool = False
+    keeps_units: bool = False  #: True if readings of one group may arrive in several batches

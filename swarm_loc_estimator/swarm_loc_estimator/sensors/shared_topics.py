@@ -17,37 +17,23 @@ from swarm_loc_estimator.common.messages.detections import SharedMessage
 from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.sensors.sensor import InputKind, Known, chosen, joined
 
-MAX_READINGS = 100_000
-"""Maximum number of readings per message; larger messages are dropped."""
-MAX_OF_ONE = 1_000
-"""Maximum number of readings of one robot per message, equal to the queue of its own topic."""
-TOO_MANY = "shared_too_many"
-"""Reason to drop messages beyond these limits."""
-OTHER_SWARM = "other_swarm"
-"""Reason to drop readings of a sender with another list of robots."""
-UNKNOWN_ROBOT = "unknown_robot"
-"""Reason to drop a reading with an invalid robot index."""
-BAD_STAMP = "bad_stamp"
-"""Reason to drop a reading with 10^9 or more nanoseconds in its stamp."""
+MAX_READINGS = 100_000  # Maximum number of readings per message; larger messages are dropped
+MAX_OF_ONE = 1_000  # Maximum number of readings of one robot per message, equal to the queue of its own topic
+TOO_MANY = "shared_too_many"  # Reason to drop messages beyond these limits
+OTHER_SWARM = "other_swarm"  # Reason to drop readings of a sender with another list of robots
+UNKNOWN_ROBOT = "unknown_robot"  # Reason to drop a reading with an invalid robot index
+BAD_STAMP = "bad_stamp"  # Reason to drop a reading with 10^9 or more nanoseconds in its stamp
 
-FOREIGN_FRAME = "fix_frame"
-"""Reason to drop a reading that is not in the frame `map`."""
+FOREIGN_FRAME = "fix_frame"  # Reason to drop a reading that is not in the frame `map`
 
 
 class SharedColumns(NamedTuple):
-    """Decoded messages (n,) with readings of many robots.
+    """Decoded messages (n,) with readings of many robots."""
 
-    Attributes:
-        stamp_ns: (n,) stamps of the messages.
-        valid: (n,) True if the message is complete and of the right type.
-        rows: The readings.
-        dropped: Number of unusable readings of valid messages by reason.
-    """
-
-    stamp_ns: IntArray
-    valid: NDArray[np.bool_]
-    rows: Any
-    dropped: Mapping[str, int]
+    stamp_ns: IntArray  # (n,) stamps of the messages
+    valid: NDArray[np.bool_]  # (n,) True if the message is complete and of the right type
+    rows: Any  # The readings
+    dropped: Mapping[str, int]  # Number of unusable readings of valid messages by reason
 
 
 class SharedReader:

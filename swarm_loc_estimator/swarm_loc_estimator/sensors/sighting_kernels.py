@@ -24,14 +24,10 @@ from swarm_loc_estimator.sensors.optical_frame import (
 )
 from swarm_loc_estimator.swarm.error_models import SensorModel
 
-CONTENT_POSITION = 1
-"""Detection content: position only (MarkerDetection.CONTENT_POSITION)."""
-CONTENT_POSE = 2
-"""Detection content: position and orientation."""
-CONTENT_POSE_TWO = 3
-"""Detection content: position and orientation, with a mirrored second solution."""
-CONTENT_BEARING = 4
-"""Detection content: only the direction of the position."""
+CONTENT_POSITION = 1  # Detection content: position only (MarkerDetection.CONTENT_POSITION)
+CONTENT_POSE = 2  #: Detection content: position and orientation
+CONTENT_POSE_TWO = 3  #: Detection content: position and orientation, with a mirrored second solution
+CONTENT_BEARING = 4  # Detection content: only the direction of the position
 
 OUTCOMES = (
     *("measured", "unknown_id", "own_marker", "no_camera", "bad_content", "non_finite", "absurd"),

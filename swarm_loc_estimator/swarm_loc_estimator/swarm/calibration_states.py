@@ -20,19 +20,13 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import error_covariance
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot
 
-TURN_BIAS = 0
-"""Bias of the turn rate while moving, or of the gyroscope [rad/s]; it changes slowly."""
-DISTANCE_SCALE = 1
-"""Relative error of the distance driven."""
-TURN_SCALE = 2
-"""Relative error of the turn."""
-CAMERA_YAW = 3
-"""Yaw offset of the camera, positive to the left [rad]; constant, or it changes slowly."""
-CAMERA_SCALE = 4
-"""Relative error of distances measured by the camera."""
+TURN_BIAS = 0  # Bias of the turn rate while moving, or of the gyroscope [rad/s]; it changes slowly
+DISTANCE_SCALE = 1  # Relative error of the distance driven
+TURN_SCALE = 2  # Relative error of the turn
+CAMERA_YAW = 3  # Yaw offset of the camera, positive to the left [rad]; constant, or it changes slowly
+CAMERA_SCALE = 4  # Relative error of distances measured by the camera
 
-DRIVES = 3
-"""Number of leading parameters that act through the motion."""
+DRIVES = 3  # Number of leading parameters that act through the motion
 PARAMETERS = 5
 BLOCKS = -(-PARAMETERS // DRIVES)
 """Number of blocks of three columns for a robot's parameters: one for motion, one for the camera."""
@@ -49,23 +43,15 @@ _MIN_SURVEY_SIGMA = 1e-4
 
 
 class ParameterTable(NamedTuple):
-    """Table of estimated parameters of robots and landmarks, for compiled code.
+    """Table of estimated parameters of robots and landmarks, for compiled code."""
 
-    Attributes:
-        column: (N, PARAMETERS) filter column; -1: not estimated, value 0.
-        sigma: (N, PARAMETERS) prior standard deviation; 0: never estimated.
-        time_s: (N, PARAMETERS) time constants of parameters that vary; infinite for constant ones.
-        survey_column: (L,) first of the three filter columns of each landmark; -1: not estimated.
-        survey: (L, 3, 3) prior covariance of its right-invariant error.
-        in_blocks: True if a robot's parameters have blocks of three columns, some of them unused.
-    """
-
-    column: NDArray[np.int64]
-    sigma: FloatArray
-    time_s: FloatArray
+    column: NDArray[np.int64]  # (N, PARAMETERS) filter column; -1: not estimated, value 0
+    sigma: FloatArray  # (N, PARAMETERS) prior standard deviation; 0: never estimated
+    time_s: FloatArray  # (N, PARAMETERS) time constants of parameters that vary; infinite for constant ones
+    # (L,) first of the three filter columns of each landmark; -1: not estimated
     survey_column: NDArray[np.int64]
-    survey: FloatArray
-    in_blocks: bool
+    survey: FloatArray  # (L, 3, 3) prior covariance of its right-invariant error
+    in_blocks: bool  # True if a robot's parameters have blocks of three columns, some of them unused
 
     @classmethod
     def of(

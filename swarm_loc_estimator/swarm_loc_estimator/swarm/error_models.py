@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from swarm_loc_estimator.common.parameters import number
 
-TURN = 6.2832
-"""Maximum absolute angle in descriptions: a full turn [rad]."""
+TURN = 6.2832  # Maximum absolute angle in descriptions: a full turn [rad]
 
 
 @dataclass(frozen=True)
@@ -152,8 +151,7 @@ class RandomWalk:
         return self.position > 0.0 or self.heading > 0.0
 
 
-MAX_OFFSET_S = 1e9
-"""Greatest offset of a clock [s]."""
+MAX_OFFSET_S = 1e9  # Greatest offset of a clock [s]
 
 
 @dataclass(frozen=True)

@@ -28,76 +28,48 @@ POWERS = ("far", "near")
 """Powers of the emitters in the order of BrightnessMatrix's POWER_* constants; the second is optional."""
 MAX_ELEMENTS = 32
 GAIN_RANGE = (0.05, 20.0)
-_TOGETHER = 1e-3
-"""Minimum angle between two elements [rad]."""
+_TOGETHER = 1e-3  # Minimum angle between two elements [rad]
 
 
 class ReadingErrors(NamedTuple):
-    """Error model of readings; a separate tuple, because passing a whole model per reading is slow.
+    """Error model of readings; a separate tuple, because passing a whole model per reading is slow."""
 
-    Attributes:
-        noise: Standard deviation of a reading [count].
-        relative: Additional standard deviation relative to the expected reading [1].
-        systematic: Share of the relative variance that is systematic.
-        blocked: Maximum cost of a reading that may be blocked; infinite: never blocked.
-        bright: Maximum cost of a reading that may be too bright.
-    """
-
-    noise: float
-    relative: float
-    systematic: float
-    blocked: float
-    bright: float
+    noise: float  # Standard deviation of a reading [count]
+    relative: float  # Additional standard deviation relative to the expected reading [1]
+    systematic: float  # Share of the relative variance that is systematic
+    blocked: float  # Maximum cost of a reading that may be blocked; infinite: never blocked
+    bright: float  # Maximum cost of a reading that may be too bright
 
 
 class IrModel(NamedTuple):
-    """A platform for compiled code.
+    """A platform for compiled code."""
 
-    Attributes:
-        radius: Distance from the centre to the elements [m].
-        angles: (n,) directions of the elements in base_link [rad].
-        units: (n, 2) their unit vectors.
-        sensor: The curve S.
-        emitter: The curve E.
-        amplitudes: (modes, 5) the fields of `Amplitude`.
-        saturation: Readings at or above are only lower bounds [count].
-        noise: Standard deviation of a reading [count].
-        errors: Error model of readings.
-        stray: Additional noise, relative to the brightest reading of an exchange.
-        scale: Factor on covariances.
-    """
-
-    radius: float
-    angles: FloatArray
-    units: FloatArray
-    sensor: CurveTable
-    emitter: CurveTable
-    amplitudes: FloatArray
-    saturation: float
-    noise: float
-    errors: ReadingErrors
-    stray: float
-    scale: float
+    radius: float  # Distance from the centre to the elements [m]
+    angles: FloatArray  # (n,) directions of the elements in base_link [rad]
+    units: FloatArray  # (n, 2) their unit vectors
+    sensor: CurveTable  # The curve S
+    emitter: CurveTable  # The curve E
+    amplitudes: FloatArray  # (modes, 5) the fields of `Amplitude`
+    saturation: float  # Readings at or above are only lower bounds [count]
+    noise: float  # Standard deviation of a reading [count]
+    errors: ReadingErrors  # Error model of readings
+    stray: float  # Additional noise, relative to the brightest reading of an exchange
+    scale: float  # Factor on covariances
 
 
 @dataclass(frozen=True)
 class IrPlatform:
     """An infrared board.
 
-    Attributes:
-        angles: (n,) directions of the elements in base_link [rad], counter-clockwise positive.
-        sensor: S, sensor reading over the angle of incidence.
-        emitter: E, emitted light over the angle to the emitter's axis.
-        amplitudes: A for each power of the emitters, in the order of `POWERS`.
-
     Raises:
         IrPlatformError: A number is out of range, elements coincide, or dark_level reaches saturation.
     """
 
+    # (n,) directions of the elements in base_link [rad], counter-clockwise positive
     angles: tuple[float, ...]
-    sensor: AngleCurve
-    emitter: AngleCurve
-    amplitudes: tuple[Amplitude, ...]
+    sensor: AngleCurve  # S, sensor reading over the angle of incidence
+    emitter: AngleCurve  # E, emitted light over the angle to the emitter's axis
+    amplitudes: tuple[Amplitude, ...]  # A for each power of the emitters, in the order of `POWERS`
     radius: float = number(0.022, "m", 0.0, 10.0, "from the centre to the elements", above=True)
     saturation: float = number(255.0, "count", 0.0, 1e9, "readings from here on are lower bounds", above=True)
     dark_level: float = number(0.0, "count", -1e6, 1e6, "mean reading without light")
@@ -193,22 +165,16 @@ class IrPlatform:
 class IrGains:
     """Gains of one robot's elements relative to its platform.
 
-    Attributes:
-        sensor: (n,) factors of the sensors [1].
-        emitter: (n,) factors of the emitters [1].
-        dead_sensors: Numbers of sensors to ignore.
-        dead_emitters: Numbers of emitters to ignore.
-
     Raises:
         IrPlatformError: A factor is not in [0.05, 20], sizes differ, or an element does not exist.
     """
 
-    sensor: tuple[float, ...]
-    emitter: tuple[float, ...]
+    sensor: tuple[float, ...]  # (n,) factors of the sensors [1]
+    emitter: tuple[float, ...]  # (n,) factors of the emitters [1]
     sigma: float = number(0.0, "1", 0.0, 1.0, "how unsure each factor still is, relative, by itself")
     common_sigma: float = number(0.0, "1", 0.0, 1.0, "how unsure all of a robot's factors are together")
-    dead_sensors: tuple[int, ...] = ()
-    dead_emitters: tuple[int, ...] = ()
+    dead_sensors: tuple[int, ...] = ()  # Numbers of sensors to ignore
+    dead_emitters: tuple[int, ...] = ()  # Numbers of emitters to ignore
 
     def __post_init__(self) -> None:
         if len(self.sensor) != len(self.emitter):
@@ -238,17 +204,11 @@ class IrGains:
 
 
 class PairGains(NamedTuple):
-    """Gains of k pairs of robots, for the models.
+    """Gains of k pairs of robots, for the models."""
 
-    Attributes:
-        sensor: (k, n) gains of each receiver's sensors; NaN: dead.
-        emitter: (k, n) gains of each transmitter's emitters; NaN: dead.
-        sigma: (k, 4) individual and common sigma of the receiver's sensors, then of the emitters.
-    """
-
-    sensor: FloatArray
-    emitter: FloatArray
-    sigma: FloatArray
+    sensor: FloatArray  # (k, n) gains of each receiver's sensors; NaN: dead
+    emitter: FloatArray  # (k, n) gains of each transmitter's emitters; NaN: dead
+    sigma: FloatArray  # (k, 4) individual and common sigma of the receiver's sensors, then of the emitters
 
     @classmethod
     def of(cls, receivers: list[IrGains], transmitters: list[IrGains]) -> PairGains:
@@ -277,25 +237,15 @@ class IrMethod(Enum):
 
 @dataclass(frozen=True)
 class RobotIr:
-    """The infrared board of one robot.
+    """The infrared board of one robot."""
 
-    Attributes:
-        id: Id in its exchanges, 1 to 65535, unique in the swarm.
-        platform: Model of the board.
-        source: Name of a packaged platform, or absolute path of its file.
-        estimator: Method to estimate poses.
-        gains: Calibrated gains of its elements; None: never calibrated.
-        dead_sensors: Numbers of sensors to ignore.
-        dead_emitters: Numbers of emitters to ignore.
-    """
-
-    id: int
-    platform: IrPlatform
-    source: str
-    estimator: IrMethod = IrMethod.LIKELIHOOD
-    gains: IrGains | None = None
-    dead_sensors: tuple[int, ...] = ()
-    dead_emitters: tuple[int, ...] = ()
+    id: int  #: Id in its exchanges, 1 to 65535, unique in the swarm
+    platform: IrPlatform  #: Model of the board
+    source: str  #: Name of a packaged platform, or absolute path of its file
+    estimator: IrMethod = IrMethod.LIKELIHOOD  #: Method to estimate poses
+    gains: IrGains | None = None  #: Calibrated gains of its elements; None: never calibrated
+    dead_sensors: tuple[int, ...] = ()  #: Numbers of sensors to ignore
+    dead_emitters: tuple[int, ...] = ()  #: Numbers of emitters to ignore
     gate_probability: float = number(
         0.9999, "1", 0.5, 1.0, "share of good measurements that must pass the gate; 1 passes all"
     )

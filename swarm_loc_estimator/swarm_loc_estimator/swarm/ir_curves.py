@@ -21,12 +21,9 @@ from swarm_loc_estimator.common.parameters import number, number_specs
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
-_CELLS = 128
-"""Number of cubics per piece; the error for the curves of the Droplet is 2e-6."""
-_TABLE_CELLS = 720
-"""Number of cubics of a tabulated curve, which has no kinks: half a degree each."""
-_JOINT = 0.01
-"""Maximum jump at a joint, relative to the curve's maximum; rounded printed joints have 1e-4."""
+_CELLS = 128  # Number of cubics per piece; the error for the curves of the Droplet is 2e-6
+_TABLE_CELLS = 720  # Number of cubics of a tabulated curve, which has no kinks: half a degree each
+_JOINT = 0.01  # Maximum jump at a joint, relative to the curve's maximum; rounded printed joints have 1e-4
 
 
 class IrPlatformError(ValueError):
@@ -46,17 +43,11 @@ def check_numbers(holder: DataclassInstance, prefix: str = "") -> None:
 
 
 class CurveTable(NamedTuple):
-    """A curve over [-pi, pi] in the form used by compiled code.
+    """A curve over [-pi, pi] in the form used by compiled code."""
 
-    Attributes:
-        edges: (P + 1,) boundaries of the pieces [rad].
-        per_radian: (P,) cells per radian of each piece.
-        cubics: (P, cells, 4) coefficients of powers of t in [0, 1] across the cell, constant first.
-    """
-
-    edges: FloatArray
-    per_radian: FloatArray
-    cubics: FloatArray
+    edges: FloatArray  # (P + 1,) boundaries of the pieces [rad]
+    per_radian: FloatArray  # (P,) cells per radian of each piece
+    cubics: FloatArray  # (P, cells, 4) coefficients of powers of t in [0, 1] across the cell, constant first
 
     @classmethod
     def of(cls, edges: FloatArray, cubics: FloatArray) -> CurveTable:
@@ -66,15 +57,10 @@ class CurveTable(NamedTuple):
 
 @dataclass(frozen=True)
 class PowerPiece:
-    """A sum of powers of the absolute angle, up to a maximum.
+    """A sum of powers of the absolute angle, up to a maximum."""
 
-    Attributes:
-        below: Start of the next piece [rad]; pi for the last.
-        terms: Pairs (coefficient, exponent) of coefficient * |angle|^exponent.
-    """
-
-    below: float
-    terms: tuple[tuple[float, float], ...]
+    below: float  # Start of the next piece [rad]; pi for the last
+    terms: tuple[tuple[float, float], ...]  # Pairs (coefficient, exponent) of coefficient * |angle|^exponent
 
 
 @dataclass(frozen=True)
@@ -121,16 +107,13 @@ class PowerCurve:
 class TabulatedCurve:
     """A curve given at angles, interpolated without overshoot; it need not be symmetric.
 
-    Attributes:
-        angles: (K,) ascending within [-pi, pi] [rad]; the curve is constant beyond the first and last.
-        values: (K,) non-negative values at these angles [1].
-
     Raises:
         IrPlatformError: Sizes do not fit, angles do not ascend, or values are not finite and positive.
     """
 
+    # (K,) ascending within [-pi, pi] [rad]; the curve is constant beyond the first and last
     angles: tuple[float, ...]
-    values: tuple[float, ...]
+    values: tuple[float, ...]  # (K,) non-negative values at these angles [1]
 
     def __post_init__(self) -> None:
         if len(self.angles) < 2 or len(self.angles) != len(self.values):

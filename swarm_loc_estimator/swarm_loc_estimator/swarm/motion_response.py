@@ -16,20 +16,14 @@ class MotionResponse:
 
     Shares are interpolated between the points of the grid and constant beyond its border.
 
-    Attributes:
-        speeds: (V,) reported speeds [m/s], ascending from 0.
-        turn_rates: (W,) absolute reported turn rates [rad/s], ascending from 0.
-        speed_share: (V, W) true speed per reported speed.
-        turn_share: (V, W) true turn rate per reported turn rate.
-
     Raises:
         MotionResponseError: Sizes differ, an axis does not ascend, or a share is not in [0, 10].
     """
 
-    speeds: tuple[float, ...]
-    turn_rates: tuple[float, ...]
-    speed_share: tuple[tuple[float, ...], ...]
-    turn_share: tuple[tuple[float, ...], ...]
+    speeds: tuple[float, ...]  #: (V,) reported speeds [m/s], ascending from 0
+    turn_rates: tuple[float, ...]  #: (W,) absolute reported turn rates [rad/s], ascending from 0
+    speed_share: tuple[tuple[float, ...], ...]  #: (V, W) true speed per reported speed
+    turn_share: tuple[tuple[float, ...], ...]  #: (V, W) true turn rate per reported turn rate
 
     def __post_init__(self) -> None:
         for name in ("speeds", "turn_rates"):

@@ -40,31 +40,18 @@ class PlanError(UserError):
 
 @dataclass(frozen=True)
 class SwarmPlan:
-    """What a new description is to hold; lengths are in m.
+    """What a new description is to hold; lengths are in m."""
 
-    Attributes:
-        type: Of `KNOWN_ROBOTS`.
-        robots: How many.
-        prefix: Names are this and a number from 1 on.
-        sensors: Of the sensors of the type.
-        wheel_separation: Distance of the wheels; None: that of the type.
-        family: Kind of the markers.
-        size: Side of the markers on robots; None: that of the type.
-        arena: Length along x and along y; the middle is the origin of map.
-        pitch: Distance of the landmarks along the walls.
-        landmark_size: Side of the landmarks.
-    """
-
-    type: str
-    robots: int
-    prefix: str
-    sensors: tuple[str, ...]
-    wheel_separation: float | None = None
-    family: str = "artoolkit_bch_thin"
-    size: float | None = None
-    arena: tuple[float, float] = (2.4, 1.6)
-    pitch: float = 0.4
-    landmark_size: float = 0.05
+    type: str  # Of `KNOWN_ROBOTS`
+    robots: int  # How many
+    prefix: str  # Names are this and a number from 1 on
+    sensors: tuple[str, ...]  # Of the sensors of the type
+    wheel_separation: float | None = None  # Distance of the wheels; None: that of the type
+    family: str = "artoolkit_bch_thin"  # Kind of the markers
+    size: float | None = None  # Side of the markers on robots; None: that of the type
+    arena: tuple[float, float] = (2.4, 1.6)  # Length along x and along y; the middle is the origin of map
+    pitch: float = 0.4  # Distance of the landmarks along the walls
+    landmark_size: float = 0.05  # Side of the landmarks
 
     @property
     def known(self) -> KnownRobot:

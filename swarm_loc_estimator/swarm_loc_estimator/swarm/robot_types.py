@@ -35,31 +35,19 @@ _SQUARE = MappingProxyType({"front": 0.0, "left": 90.0, "back": 180.0, "right": 
 
 @dataclass(frozen=True)
 class KnownRobot:
-    """One type of robot.
+    """One type of robot."""
 
-    Attributes:
-        title: What people call it.
-        sensors: Those of `SENSORS` that go with it.
-        odometry: Error model of its odometry; None: it has none.
-        camera: Usual place of a camera.
-        faces: Usual markers on its body, with id 0.
-        imu: Error model of its gyroscope.
-        random_walk: Random walk without odometry.
-        image: Namespace of its images below its own.
-        driver: Executable of swarm_loc_drivers and its arguments, of {robot} and {file}; "": others drive it.
-        sources: Where the numbers come from, and which are guesses; sentences.
-    """
-
-    title: str
-    sensors: tuple[str, ...]
-    odometry: OdometryModel | None = OdometryModel()
-    camera: CameraMount = CameraMount()
-    faces: tuple[Face, ...] = ()
-    imu: ImuModel = ImuModel()
-    random_walk: RandomWalk = RandomWalk()
-    image: str = ""
+    title: str  # What people call it
+    sensors: tuple[str, ...]  # Those of `SENSORS` that go with it
+    odometry: OdometryModel | None = OdometryModel()  # Error model of its odometry; None: it has none
+    camera: CameraMount = CameraMount()  # Usual place of a camera
+    faces: tuple[Face, ...] = ()  # Usual markers on its body, with id 0
+    imu: ImuModel = ImuModel()  # Error model of its gyroscope
+    random_walk: RandomWalk = RandomWalk()  # Random walk without odometry
+    image: str = ""  # Namespace of its images below its own
+    # Executable of swarm_loc_drivers and its arguments, of {robot} and {file}; "": others drive it
     driver: str = ""
-    sources: str = ""
+    sources: str = ""  # Where the numbers come from, and which are guesses; sentences
 
     @property
     def usual_sensors(self) -> tuple[str, ...]:

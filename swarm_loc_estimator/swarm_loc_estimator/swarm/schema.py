@@ -28,8 +28,7 @@ from swarm_loc_estimator.swarm.swarm_file import (
 from swarm_loc_estimator.swarm.tree_checks import hexadecimal
 from swarm_loc_estimator.swarm.uwb import MAX_ADDRESS, Anchor, UwbDevice
 
-SCHEMA_FILE = "swarm.schema.json"
-"""Name of the schema beside a description."""
+SCHEMA_FILE = "swarm.schema.json"  # Name of the schema beside a description
 SCHEMA_COMMENT = f"yaml-language-server: $schema={SCHEMA_FILE}"
 """First comment of a description, by which editors find the schema."""
 

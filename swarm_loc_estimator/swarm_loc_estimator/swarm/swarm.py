@@ -33,8 +33,7 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.swarm.motion_response import MotionResponse
     from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 
-Pose2 = tuple[float, float, float]
-"""x [m], y [m], heading [rad]."""
+Pose2 = tuple[float, float, float]  # x [m], y [m], heading [rad]
 
 
 @dataclass(frozen=True)
@@ -60,57 +59,42 @@ class CameraMount:
 
 @dataclass(frozen=True)
 class Face:
-    """A marker on a robot's body, in base_link.
+    """A marker on a robot's body, in base_link."""
 
-    Attributes:
-        name: Name of this side in the robot's type.
-        id: Marker id, unique in the swarm.
-        x: [m], forward.
-        y: [m], left.
-        z: [m], up.
-        yaw: Direction of the outward normal [rad]; None if the marker shows no heading.
-        size: Side of the marker, black border included [m].
-        position_sigma: Standard deviation of x and y, each [m].
-        lies: Whether it lies flat and looks up; its yaw is then the direction of its x axis, to the right.
-    """
-
-    name: str
-    id: int
-    x: float = number(0.0, "m", -10.0, 10.0, "forward of base_link")
-    y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")
-    z: float = number(0.0, "m", -10.0, 10.0, "above base_link")
+    name: str  #: Name of this side in the robot's type
+    id: int  #: Marker id, unique in the swarm
+    x: float = number(0.0, "m", -10.0, 10.0, "forward of base_link")  #: [m], forward
+    y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")  #: [m], left
+    z: float = number(0.0, "m", -10.0, 10.0, "above base_link")  #: [m], up
+    #: Direction of the outward normal [rad]; None if the marker shows no heading
     yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of the face; null: shows no heading")
+    #: Side of the marker, black border included [m]
     size: float = number(0.036, "m", 0.001, 10.0, "side of the marker, black border included")
+    #: Standard deviation of x and y, each [m]
     position_sigma: float = number(
         0.0, "m", 0.0, 10.0, "standard deviation of x and y; added to the noise of its sightings"
     )
+    #: Whether it lies flat and looks up; its yaw is then the direction of its x axis, to the right
     lies: bool = False
 
 
 @dataclass(frozen=True)
 class Landmark:
-    """A static marker in `map`.
+    """A static marker in `map`."""
 
-    Attributes:
-        id: Marker id, unique in the swarm.
-        x: [m].
-        y: [m].
-        z: [m].
-        yaw: Direction of the outward normal [rad]; None if the marker shows no heading.
-        size: Side of the marker, black border included [m].
-        position_sigma: Standard deviation of x and y, each [m].
-        yaw_sigma: Standard deviation of yaw [rad].
-    """
-
-    id: int
-    x: float = number(0.0, "m", -1e6, 1e6, "in map")
-    y: float = number(0.0, "m", -1e6, 1e6, "in map")
-    z: float = number(0.0, "m", -1e4, 1e4, "in map")
+    id: int  #: Marker id, unique in the swarm
+    x: float = number(0.0, "m", -1e6, 1e6, "in map")  #: [m]
+    y: float = number(0.0, "m", -1e6, 1e6, "in map")  #: [m]
+    z: float = number(0.0, "m", -1e4, 1e4, "in map")  #: [m]
+    #: Direction of the outward normal [rad]; None if the marker shows no heading
     yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of its face; null: shows no heading")
+    #: Side of the marker, black border included [m]
     size: float = number(0.05, "m", 0.001, 10.0, "side of the marker, black border included")
+    #: Standard deviation of x and y, each [m]
     position_sigma: float = number(
         0.0, "m", 0.0, 100.0, "standard deviation of x and y; 0: exact, else estimated with the poses"
     )
+    #: Standard deviation of yaw [rad]
     yaw_sigma: float = number(0.0, "rad", 0.0, 10.0, "standard deviation of yaw; 0: exact, else estimated")
 
     @property
@@ -130,45 +114,25 @@ class StartSigma:
 
 @dataclass(frozen=True)
 class Robot:
-    """One robot.
+    """One robot."""
 
-    Attributes:
-        name: Namespace of its topics and prefix of its frames.
-        type: Name of its type; "" if it has none.
-        odometry: Error model of its odometry.
-        imu: Error model of its IMU.
-        lidar: Its lidar, for mapping and for localization in a map.
-        response: True share of the reported motion; None: all of it.
-        camera: Pose of its camera; None if it has none.
-        sensor: Error model of its sightings.
-        faces: Markers on its body.
-        start: Start pose in `map`; None: unknown, to be initialized by sightings or fixes.
-        start_sigma: Standard deviations of the start pose.
-        stands: True if it has no odometry; it moves only by `random_walk`.
-        random_walk: Random walk without odometry.
-        fix: Error model of its absolute fixes.
-        clock: Its clock.
-        ir: Infrared board; None if it has none.
-        uwb: UWB radio; None if it has none.
-    """
-
-    name: str
-    type: str = ""
-    odometry: OdometryModel = OdometryModel()
-    imu: ImuModel = ImuModel()
-    lidar: LidarModel = LidarModel()
-    response: MotionResponse | None = None
-    camera: CameraMount | None = CameraMount()
-    sensor: SensorModel = SensorModel()
-    faces: tuple[Face, ...] = ()
-    start: Pose2 | None = None
-    start_sigma: StartSigma = StartSigma()
-    stands: bool = False
-    random_walk: RandomWalk = RandomWalk()
-    fix: FixModel = FixModel()
-    clock: ClockModel = ClockModel()
-    ir: RobotIr | None = None
-    uwb: UwbDevice | None = None
+    name: str  #: Namespace of its topics and prefix of its frames
+    type: str = ""  #: Name of its type; "" if it has none
+    odometry: OdometryModel = OdometryModel()  #: Error model of its odometry
+    imu: ImuModel = ImuModel()  #: Error model of its IMU
+    lidar: LidarModel = LidarModel()  #: Its lidar, for mapping and for localization in a map
+    response: MotionResponse | None = None  #: True share of the reported motion; None: all of it
+    camera: CameraMount | None = CameraMount()  #: Pose of its camera; None if it has none
+    sensor: SensorModel = SensorModel()  #: Error model of its sightings
+    faces: tuple[Face, ...] = ()  #: Markers on its body
+    start: Pose2 | None = None  #: Start pose in `map`; None: unknown, to be initialized by sightings or fixes
+    start_sigma: StartSigma = StartSigma()  #: Standard deviations of the start pose
+    stands: bool = False  #: True if it has no odometry; it moves only by `random_walk`
+    random_walk: RandomWalk = RandomWalk()  #: Random walk without odometry
+    fix: FixModel = FixModel()  #: Error model of its absolute fixes
+    clock: ClockModel = ClockModel()  #: Its clock
+    ir: RobotIr | None = None  #: Infrared board; None if it has none
+    uwb: UwbDevice | None = None  #: UWB radio; None if it has none
 
     @property
     def turn_sensor(self) -> OdometryModel | ImuModel:
@@ -202,17 +166,11 @@ class FixedCamera:
 
 @dataclass(frozen=True)
 class MarkerOwner:
-    """Owner of a marker id.
+    """Owner of a marker id."""
 
-    Attributes:
-        robot_index: Index into `Swarm.robots`; -1 for a landmark.
-        landmark_index: Index into `Swarm.landmarks`; -1 for a robot's face.
-        marker: The face (in base_link) or the landmark (in map).
-    """
-
-    robot_index: int
-    landmark_index: int
-    marker: Face | Landmark
+    robot_index: int  #: Index into `Swarm.robots`; -1 for a landmark
+    landmark_index: int  #: Index into `Swarm.landmarks`; -1 for a robot's face
+    marker: Face | Landmark  #: The face (in base_link) or the landmark (in map)
 
 
 class SwarmError(ValueError):

@@ -114,8 +114,7 @@ LANDMARK_DEFAULTS = {name: number_specs(Landmark)[name] for name in ("size", "po
 RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
 MAX_ID = 2**32 - 1
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-MAX_NAME = 64
-"""Maximum length of a robot name; DDS limits the length of topic names."""
+MAX_NAME = 64  # Maximum length of a robot name; DDS limits the length of topic names
 RESERVED_NAMES = frozenset(
     [
         "aerial",
@@ -136,8 +135,7 @@ RESERVED_NAMES = frozenset(
     ]
 )
 """Names of topics, nodes and frames that a robot's namespace must not collide with."""
-MAX_ROBOTS = 5000
-"""Maximum number of robots; larger swarms have not been tested."""
+MAX_ROBOTS = 5000  # Maximum number of robots; larger swarms have not been tested
 MAX_PARAMETERS = 10_000
 """Maximum number of states beside the poses; the dense filter's covariance then has 800 MB per checkpoint."""
 
@@ -170,19 +168,12 @@ def parse_swarm(tree: Tree, path: Path) -> Swarm:
 
 @dataclass
 class _Layer:
-    """Settings of one layer: defaults, type or robot; keys that the layer omits are omitted here.
+    """Settings of one layer: defaults, type or robot; keys that the layer omits are omitted here."""
 
-    Attributes:
-        sections: Values by section; None: null in the file.
-        response: Motion response of the layer.
-        says_response: True if the layer has the key `response`.
-        faces: Face by name; None: removed.
-    """
-
-    sections: dict[str, Values | None]
-    response: MotionResponse | None
-    says_response: bool
-    faces: dict[str, Numbers | None]
+    sections: dict[str, Values | None]  # Values by section; None: null in the file
+    response: MotionResponse | None  # Motion response of the layer
+    says_response: bool  # True if the layer has the key `response`
+    faces: dict[str, Numbers | None]  # Face by name; None: removed
 
 
 class _Loader(TreeChecks):

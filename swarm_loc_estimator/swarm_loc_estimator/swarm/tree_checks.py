@@ -14,8 +14,7 @@ from swarm_loc_estimator.common.yaml_tree import Tree, shown
 
 Numbers = dict[str, "float | None"]
 
-WHOLE_FILE = "the file"
-"""The key of the outermost mapping."""
+WHOLE_FILE = "the file"  # The key of the outermost mapping
 
 
 class TreeChecks:

@@ -15,12 +15,9 @@ class UwbDevice:
     """Radio on a robot: its antenna in base_link, and the error model of what it measures.
 
     A measured range is range_scale times the true one, plus the range_bias of both devices.
-
-    Attributes:
-        address: Number by which messages name it, unique among robots and anchors.
     """
 
-    address: int
+    address: int  #: Number by which messages name it, unique among robots and anchors
     x: float = number(0.0, "m", -10.0, 10.0, "antenna forward of base_link")
     y: float = number(0.0, "m", -10.0, 10.0, "antenna left of base_link")
     z: float = number(0.0, "m", -10.0, 10.0, "antenna above the ground")
@@ -39,13 +36,9 @@ class UwbDevice:
 
 @dataclass(frozen=True)
 class Anchor:
-    """Radio at a fixed place in `map`.
+    """Radio at a fixed place in `map`."""
 
-    Attributes:
-        address: Number by which messages name it, unique among robots and anchors.
-    """
-
-    address: int
+    address: int  #: Number by which messages name it, unique among robots and anchors
     x: float = number(0.0, "m", -1e6, 1e6, "in map")
     y: float = number(0.0, "m", -1e6, 1e6, "in map")
     z: float = number(0.0, "m", -1e4, 1e4, "above the ground")

@@ -36,18 +36,13 @@ from swarm_loc_estimator.timeline.estimate import TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.settings import Settings
 
 _GATE = float(gate_threshold(0.9999))
-_MAX_FREE = 200
-"""Maximum number of unassigned detections among which robots are searched."""
-_MOVED = 6.0
-"""Minimum motion of a robot to be searched, in standard deviations; half of it for a turn."""
+_MAX_FREE = 200  # Maximum number of unassigned detections among which robots are searched
+_MOVED = 6.0  # Minimum motion of a robot to be searched, in standard deviations; half of it for a turn
 _MAX_DRIFT_M, _MAX_DRIFT_RAD = 0.3, 0.5
 """Maximum drift of a robot's track between two images; beyond it the search restarts."""
-_DOUBT_SHARE = 0.1
-"""Factor on the allowed error probability for a robot that is localized at another place."""
-_MAX_FAULT_SCORE = 9.0
-"""Maximum fault score from missed detections of a robot that may have left the view."""
-_HEADING_SIGMA = 0.2
-"""Maximum standard deviation of the heading of an identified robot [rad]."""
+_DOUBT_SHARE = 0.1  # Factor on the allowed error probability for a robot that is localized at another place
+_MAX_FAULT_SCORE = 9.0  # Maximum fault score from missed detections of a robot that may have left the view
+_HEADING_SIGMA = 0.2  # Maximum standard deviation of the heading of an identified robot [rad]
 
 
 class PictureFusion:

@@ -53,15 +53,10 @@ _Columns = tuple[IntArray, IntArray, NDArray[np.uint8], FloatArray]
 
 
 class Merged(NamedTuple):
-    """Result of `MeasurementBuffer.merge`.
+    """Result of `MeasurementBuffer.merge`."""
 
-    Attributes:
-        first_ns: Stamp of the first new measurement; None if there is none.
-        duplicates: Number of duplicates.
-    """
-
-    first_ns: int | None
-    duplicates: int
+    first_ns: int | None  # Stamp of the first new measurement; None if there is none
+    duplicates: int  # Number of duplicates
 
 
 class MeasurementBuffer:

@@ -29,17 +29,11 @@ class Contradicted(Enum):
 
 
 class Contradiction(NamedTuple):
-    """A fault of a robot or landmark.
+    """A fault of a robot or landmark."""
 
-    Attributes:
-        about: Name of the robot, or a landmark such as "landmark 7".
-        kind: Contradicted property.
-        text: Message for users, one sentence.
-    """
-
-    about: str
-    kind: Contradicted
-    text: str
+    about: str  # Name of the robot, or a landmark such as "landmark 7"
+    kind: Contradicted  # Contradicted property
+    text: str  # Message for users, one sentence
 
 
 def contradictions(

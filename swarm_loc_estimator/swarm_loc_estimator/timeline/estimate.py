@@ -41,17 +41,11 @@ _UNCERTAIN = int(Status.UNCERTAIN)
 
 
 class TrackedLimits(NamedTuple):
-    """Limits beyond which a localized robot is not reported as tracked.
+    """Limits beyond which a localized robot is not reported as tracked."""
 
-    Attributes:
-        timeout_s: (N,) age of the newest odometry [s].
-        position_sigma: Standard deviation of x and of y [m].
-        heading_sigma: Standard deviation of the heading [rad].
-    """
-
-    timeout_s: FloatArray
-    position_sigma: float
-    heading_sigma: float
+    timeout_s: FloatArray  # (N,) age of the newest odometry [s]
+    position_sigma: float  # Standard deviation of x and of y [m]
+    heading_sigma: float  # Standard deviation of the heading [rad]
 
     @classmethod
     def of(cls, swarm: Swarm, settings: Settings) -> TrackedLimits:
@@ -61,23 +55,14 @@ class TrackedLimits(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Poses of all robots at one instant.
+    """Poses of all robots at one instant."""
 
-    Attributes:
-        stamp_ns: The instant.
-        poses: (N, 3) x [m], y [m], theta [rad] in `map`; NaN for robots that are not localized.
-        covariances: (N, 3, 3) of x, y, theta; NaN where `poses` are.
-        map_to_odom: (N, 3) transform from `map` to the robot's odom frame; NaN where `poses` are.
-        status: (N,) of `Status`.
-        fix_age_s: (N,) age of the newest accepted landmark sighting or absolute fix [s]; -1: none.
-    """
-
-    stamp_ns: int
-    poses: FloatArray
-    covariances: FloatArray
-    map_to_odom: FloatArray
-    status: NDArray[np.uint8]
-    fix_age_s: FloatArray
+    stamp_ns: int  #: The instant
+    poses: FloatArray  #: (N, 3) x [m], y [m], theta [rad] in `map`; NaN for robots that are not localized
+    covariances: FloatArray  #: (N, 3, 3) of x, y, theta; NaN where `poses` are
+    map_to_odom: FloatArray  #: (N, 3) transform from `map` to the robot's odom frame; NaN where `poses` are
+    status: NDArray[np.uint8]  #: (N,) of `Status`
+    fix_age_s: FloatArray  #: (N,) age of the newest accepted landmark sighting or absolute fix [s]; -1: none
 
 
 def estimate_at(state: SwarmState, tracks: TrackArrays, limits: TrackedLimits, now_ns: int) -> Estimate:

@@ -32,8 +32,7 @@ _MAX_MISSED, _MAX_AT_START = 10.0, 3.0
 _ALL, _SURE_FIT = 3, 0.65
 """Number of directions and share of fitting beams with which a scan confirms a start: elsewhere, walls like
 those at home are seen now and then."""
-Sweeps = Mapping[tuple[int, int], LidarSweep]
-"""Sweeps by robot and stamp of the first beam [ns]."""
+Sweeps = Mapping[tuple[int, int], LidarSweep]  # Sweeps by robot and stamp of the first beam [ns]
 
 
 def walls_of(swarm: Swarm) -> WallMap | None:

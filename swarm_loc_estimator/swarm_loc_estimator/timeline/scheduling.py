@@ -21,24 +21,19 @@ Stamps = TypeVar("Stamps", int, IntArray)
 
 @dataclass(frozen=True)
 class Policy:
-    """Sizes at which the estimator changes its strategy; users set only `Settings.sparse_from`.
+    """Sizes at which the estimator changes its strategy; users set only `Settings.sparse_from`."""
 
-    Attributes:
-        large_from: Minimum number of robots for batch updates; a smaller swarm has few measurements.
-        batch_from: Minimum number of measurements per fusion period for a batch update; sequential updates
-            of fewer measurements are faster.
-        delay_from: Minimum number of robots to fuse a period only `fusion_delay_s` after its end; a smaller
-            swarm fuses late data again at little cost.
-        reopen_all_up_to: Maximum number of robots for which all parameters are re-estimated when several
-            robots or landmarks are contradicted; a larger swarm re-estimates only the contradicted ones.
-        fusion_periods_s: Default fusion period [s] by the minimum number of robots with calibrated odometry,
-            largest number first.
-    """
-
-    large_from: int = 16
+    large_from: int = 16  # Minimum number of robots for batch updates; a smaller swarm has few measurements
+    # Minimum number of measurements per fusion period for a batch update; sequential updates of fewer
+    # measurements are faster
     batch_from: int = 64
+    # Minimum number of robots to fuse a period only `fusion_delay_s` after its end; a smaller swarm fuses
+    # late data again at little cost
     delay_from: int = 64
+    # Maximum number of robots for which all parameters are re-estimated when several robots or landmarks are
+    # contradicted; a larger swarm re-estimates only the contradicted ones
     reopen_all_up_to: int = 30
+    # Default fusion period [s] by the minimum number of robots with calibrated odometry, largest number first
     fusion_periods_s: tuple[tuple[int, float], ...] = ((600, 0.5), (250, 0.4), (0, 0.2))
 
     def fusion_period_s(self, calibrated: int) -> float:

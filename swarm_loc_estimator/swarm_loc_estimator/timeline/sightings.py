@@ -12,40 +12,25 @@ from swarm_loc_estimator.common.messages.definitions import SWARM_SIGHTINGS
 from swarm_loc_estimator.filter.measurement_model import Command, MeasurementArray
 from swarm_loc_estimator.timeline.verdicts import Verdict
 
-RECENT_NS = 2_000_000_000
-"""Maximum age of reported measurements."""
+RECENT_NS = 2_000_000_000  # Maximum age of reported measurements
 
 
 class Recent(NamedTuple):
-    """Recent measurements with their verdicts.
+    """Recent measurements with their verdicts."""
 
-    Attributes:
-        measurements: (m,) sorted by stamp.
-        verdicts: (m,) of `Verdict`.
-        nis: (m,) normalized innovation squared.
-    """
-
-    measurements: MeasurementArray
-    verdicts: NDArray[np.uint8]
-    nis: NDArray[np.float64]
+    measurements: MeasurementArray  # (m,) sorted by stamp
+    verdicts: NDArray[np.uint8]  # (m,) of `Verdict`
+    nis: NDArray[np.float64]  # (m,) normalized innovation squared
 
 
 class Sightings(NamedTuple):
-    """One row per pair (M,), sorted by observer and target.
+    """One row per pair (M,), sorted by observer and target."""
 
-    Attributes:
-        observer: Index of the observing robot; -1: absolute fix.
-        target: Index of the observed robot; below 0: landmark -1 - target.
-        verdict: Of `Verdict`.
-        nis: Normalized innovation squared; NaN if not evaluated.
-        age_s: Time since the measurement [s].
-    """
-
-    observer: NDArray[np.int32]
-    target: NDArray[np.int32]
-    verdict: NDArray[np.uint8]
-    nis: NDArray[np.float32]
-    age_s: NDArray[np.float32]
+    observer: NDArray[np.int32]  # Index of the observing robot; -1: absolute fix
+    target: NDArray[np.int32]  # Index of the observed robot; below 0: landmark -1 - target
+    verdict: NDArray[np.uint8]  # Of `Verdict`
+    nis: NDArray[np.float32]  # Normalized innovation squared; NaN if not evaluated
+    age_s: NDArray[np.float32]  # Time since the measurement [s]
 
 
 def newest_sightings(recent: Recent, now_ns: int) -> Sightings:

@@ -25,8 +25,7 @@ from swarm_loc_estimator.sensors.registry import SENSORS, Batch
 from swarm_loc_estimator.sensors.sensor import Sensor, chosen
 from swarm_loc_estimator.timeline.scheduling import end_of_period
 
-_GOLDEN = np.uint64(0x9E3779B97F4A7C15)
-"""Fractional part of the golden ratio in units of 2^-64."""
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # Fractional part of the golden ratio in units of 2^-64
 _SILVER = np.uint64(0x6A09E667F3BCC909)
 """Fractional part of the square root of two: offset between sources, so that their drops alternate."""
 
@@ -37,17 +36,11 @@ SHED_REASONS = frozenset(f"shed_{sensor.name}" for sensor in SENSORS.values() if
 
 
 class Thinned(NamedTuple):
-    """Result of thinning.
+    """Result of thinning."""
 
-    Attributes:
-        messages: The remaining readings; `dropped` includes the readings dropped here.
-        measurements: Number of measurements before: detections, fixes, infrared exchanges, aerial images.
-        shed: Number of dropped measurements.
-    """
-
-    messages: Batch
-    measurements: int
-    shed: int
+    messages: Batch  # The remaining readings; `dropped` includes the readings dropped here
+    measurements: int  # Number of measurements before: detections, fixes, infrared exchanges, aerial images
+    shed: int  # Number of dropped measurements
 
 
 class Thinning:
@@ -130,19 +123,12 @@ def water_level(count: IntArray, total: float) -> float:
 
 
 class _Units(NamedTuple):
-    """Groups (u,) of readings that are used or dropped as a whole.
+    """Groups (u,) of readings that are used or dropped as a whole."""
 
-    Attributes:
-        robot: (u,) robot index.
-        stamp_ns: (u,) time of measurement.
-        of_row: (k,) group of each row.
-        exchange: Robot, stamp and transmitter of each group; infrared only.
-    """
-
-    robot: IntArray
-    stamp_ns: IntArray
-    of_row: IntArray
-    exchange: Sequence[tuple[int, ...]] = ()
+    robot: IntArray  # (u,) robot index
+    stamp_ns: IntArray  # (u,) time of measurement
+    of_row: IntArray  # (k,) group of each row
+    exchange: Sequence[tuple[int, ...]] = ()  # Robot, stamp and transmitter of each group; infrared only
 
 
 def _units(sensor: Sensor, rows: Any) -> _Units:

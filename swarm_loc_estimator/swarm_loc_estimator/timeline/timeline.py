@@ -23,8 +23,7 @@ from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.verdicts import Verdict
 
 Step = Callable[[SwarmState, MeasurementArray, NDArray[np.uint8], FloatArray], None]
-HasBudget = Callable[[], bool]
-"""Returns True if there is time for another step."""
+HasBudget = Callable[[], bool]  # Returns True if there is time for another step
 
 _CHECKPOINTS = 40
 _FORGOTTEN_AT_ONCE = 4

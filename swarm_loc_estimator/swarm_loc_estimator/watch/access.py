@@ -57,15 +57,10 @@ class WrongTokens:
 
 
 class _Slot(NamedTuple):
-    """State of the clients of one slot.
+    """State of the clients of one slot."""
 
-    Attributes:
-        clear_s: Time at which their wrong tokens expire [s, monotonic].
-        guess: Hash of the last wrong token.
-    """
-
-    clear_s: float
-    guess: int
+    clear_s: float  # Time at which their wrong tokens expire [s, monotonic]
+    guess: int  # Hash of the last wrong token
 
 
 @dataclass(frozen=True)

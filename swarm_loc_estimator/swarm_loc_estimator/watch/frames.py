@@ -29,17 +29,11 @@ _ELSE_NS = 500_000_000
 
 
 class Frame(NamedTuple):
-    """A binary message to the page.
+    """A binary message to the page."""
 
-    Attributes:
-        kind: Its content: "poses", "sightings", "truth", "aerial", "goals" or "map".
-        stamp_ns: Time of the content [ns].
-        data: The bytes for the page.
-    """
-
-    kind: str
-    stamp_ns: int
-    data: bytes
+    kind: str  # Its content: "poses", "sightings", "truth", "aerial", "goals" or "map"
+    stamp_ns: int  # Time of the content [ns]
+    data: bytes  # The bytes for the page
 
 
 def pack(kind: str, stamp_ns: int, columns: Mapping[str, npt.NDArray[Any]], **extra: object) -> Frame:

@@ -33,13 +33,11 @@ _COLOURS = np.array(
 _USED, _GATED, _KEPT = [0.0, 0.62, 0.45, 0.7], [0.84, 0.37, 0.0, 0.9], [0.9, 0.62, 0.0, 0.9]
 _VERDICT_COLOURS = np.array([_KEPT, _USED, _GATED, _KEPT, _KEPT])
 _INK = (0.2, 0.25, 0.3, 1.0)
-_CHI2_95 = 5.991
-"""95 % bound of the chi-square distribution with two degrees of freedom."""
+_CHI2_95 = 5.991  # 95 % bound of the chi-square distribution with two degrees of freedom
 _CORNERS = 24
 _MAX_LABELS = 100
 _HEIGHT = 0.01
-_BODY_PER_WHEELS = 1.32
-"""Ratio of body diameter to wheel separation, as of an e-puck."""
+_BODY_PER_WHEELS = 1.32  # Ratio of body diameter to wheel separation, as of an e-puck
 
 
 class _Marker(NamedTuple):

@@ -28,8 +28,7 @@ _SCRIPTS = (
     "actions.js",
 )
 _ALIGNMENT = 8
-_BODY_PER_WHEELS = 0.66
-"""Ratio of body radius to wheel separation, as of an e-puck."""
+_BODY_PER_WHEELS = 0.66  # Ratio of body radius to wheel separation, as of an e-puck
 
 
 @lru_cache(maxsize=1)

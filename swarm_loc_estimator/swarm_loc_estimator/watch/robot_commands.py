@@ -17,8 +17,7 @@ from swarm_loc_estimator.watch.server import Answer, Command
 from swarm_loc_msgs.srv import SetRobotPose
 
 _MAX_WAITING = 64
-_DRIVEN_NS = 400_000_000
-"""Time without a command after which a driven robot is stopped."""
+_DRIVEN_NS = 400_000_000  # Time without a command after which a driven robot is stopped
 
 
 class RobotCommands:

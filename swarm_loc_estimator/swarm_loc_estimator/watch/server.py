@@ -26,15 +26,12 @@ _MAX_COMMAND_BYTES = 4096
 _SEND_BUFFER_BYTES = 262144
 _HEARTBEAT_S = 10.0
 _START_PATIENCE_S = 10.0
-REQUEST_PATIENCE_S = 10.0
-"""Timeout after which a connection that is not a page's WebSocket is closed."""
+REQUEST_PATIENCE_S = 10.0  # Timeout after which a connection that is not a page's WebSocket is closed
 _SWEEP_PERIOD_S = 1.0
 
 Command = Mapping[str, Any]
-MAX_NOTES = 64
-"""Maximum number of texts queued for a slow page; the oldest are dropped first."""
-RECEIVED = "+"
-"""Acknowledgement of a frame by a page."""
+MAX_NOTES = 64  # Maximum number of texts queued for a slow page; the oldest are dropped first
+RECEIVED = "+"  # Acknowledgement of a frame by a page
 _MAX_ON_THE_WAY = 4
 """Maximum number of unacknowledged frames; more would only age in the buffers of a busy page."""
 
@@ -47,8 +44,7 @@ class Answer(Protocol):
 
 
 Connection = web.RequestHandler
-OnCommand = Callable[[Command, Answer], None]
-"""Receives a page's command; called in the server's thread."""
+OnCommand = Callable[[Command, Answer], None]  # Receives a page's command; called in the server's thread
 
 
 class ServerError(UserError):
@@ -56,21 +52,13 @@ class ServerError(UserError):
 
 
 class ServerLoad(NamedTuple):
-    """Load of the server.
+    """Load of the server."""
 
-    Attributes:
-        pages: Number of open pages.
-        slow: Number of these for which frames were dropped since the last report.
-        left_out: Total number of frames dropped because pages were busy with older ones.
-        texts_left_out: Total number of texts dropped for the same reason.
-        refused: Total number of refused requests.
-    """
-
-    pages: int
-    slow: int
-    left_out: int
-    texts_left_out: int
-    refused: int
+    pages: int  # Number of open pages
+    slow: int  # Number of these for which frames were dropped since the last report
+    left_out: int  # Total number of frames dropped because pages were busy with older ones
+    texts_left_out: int  # Total number of texts dropped for the same reason
+    refused: int  # Total number of refused requests
 
 
 class WatchServer:
@@ -314,15 +302,10 @@ def _own_name() -> str:
 
 
 class LeftOut(NamedTuple):
-    """Numbers of messages dropped for a page.
+    """Numbers of messages dropped for a page."""
 
-    Attributes:
-        frames: Frames replaced by newer ones while the page was busy.
-        texts: Texts dropped from the full queue.
-    """
-
-    frames: int
-    texts: int
+    frames: int  # Frames replaced by newer ones while the page was busy
+    texts: int  # Texts dropped from the full queue
 
 
 class Viewer:

@@ -23,8 +23,7 @@ import numpy as np
 
 _TUNSETIFF, _IFF_TUN, _IFF_NO_PI = 0x400454CA, 0x0001, 0x1000
 _LARGEST = 65536
-_MAX_WAITING = 10_000
-"""Packets; what is more is lost, as in any radio's queue."""
+_MAX_WAITING = 10_000  # Packets; what is more is lost, as in any radio's queue
 
 
 def _opened(device: str) -> int:

@@ -16,23 +16,16 @@ from pathlib import Path
 
 PORT = 11811
 LOSSY_LINK = Path(__file__).with_name("lossy_link.py")
-_Ends = tuple[tuple[str, str], tuple[str, str]]
-"""Machine and device at either end of a link."""
+_Ends = tuple[tuple[str, str], tuple[str, str]]  # Machine and device at either end of a link
 
 
 @dataclass(frozen=True)
 class Radio:
-    """How the robots are linked to the router, if by radio.
+    """How the robots are linked to the router, if by radio."""
 
-    Attributes:
-        delay_s: At least [s].
-        jitter_s: Up to so much more [s]; packets overtake each other.
-        loss: Share of packets, each way.
-    """
-
-    delay_s: float
-    jitter_s: float
-    loss: float
+    delay_s: float  # At least [s]
+    jitter_s: float  # Up to so much more [s]; packets overtake each other
+    loss: float  # Share of packets, each way
 
 
 class Machines:

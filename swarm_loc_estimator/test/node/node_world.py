@@ -56,8 +56,7 @@ landmarks:
 LANDMARKS = {100: (2.0, 0.0, math.pi), 101: (2.0, 1.0, math.pi)}
 TRUE_POSES = {"alpha": (0.0, 0.0, 0.0), "beta": (0.0, 1.0, 0.0)}
 UNKNOWN_ID = 999
-SETTINGS = {"fusion_load": 1.0}
-"""Every tick fuses, however fast the test lets time pass."""
+SETTINGS = {"fusion_load": 1.0}  # Every tick fuses, however fast the test lets time pass
 
 _RELIABLE = QoSProfile(depth=100)
 

@@ -32,8 +32,7 @@ robots:
   beta: {type: droplet, ir: {id: 2}}
   gamma: {type: droplet, ir: null}
 """
-BETA = (0.1, 0.5, -1.0)
-"""Range, bearing and heading of beta, from alpha at the origin."""
+BETA = (0.1, 0.5, -1.0)  # Range, bearing and heading of beta, from alpha at the origin
 GAMMA = (0.3, 0.2, 1.5)
 KINDS = {"odom": Odometry, "brightness": BrightnessMatrix, "fix": PoseWithCovarianceStamped}
 

@@ -31,10 +31,8 @@ from swarm_loc_estimator.timeline.settings import Settings
 DEMO = Path(__file__).parents[3] / "bags" / "eight_five_robots"
 SWARM_FILE = DEMO / "swarm.yaml"
 PATIENCE_S = 60.0
-INPUTS = 400
-"""Of all robots in three seconds of the bag."""
-POSES = 40
-"""Of two seconds."""
+INPUTS = 400  # Of all robots in three seconds of the bag
+POSES = 40  # Of two seconds
 
 
 @pytest.fixture(scope="module")

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import pytest
 
-PACKETS = 400
-"""More than fit between both ends at once."""
+PACKETS = 400  # More than fit between both ends at once
 END = "import socket, sys; from lossy_link import forward; "
 END += "forward(int(sys.argv[1]), socket.socket(fileno=int(sys.argv[2])), (0.5, 0.0), 0.0, 1)"
 

@@ -21,8 +21,7 @@ from bench.shared.bags import copy_part
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, node_command
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_five_robots"
-INPUTS = 10
-"""Odometry and detections of five robots."""
+INPUTS = 10  # Odometry and detections of five robots
 PATIENCE_S = 120.0
 SERVER = "fast-discovery-server"
 

@@ -18,36 +18,22 @@ _STEP_NS = 50_000_000
 
 @dataclass(frozen=True)
 class View:
-    """What the overhead camera shows.
+    """What the overhead camera shows."""
 
-    Attributes:
-        period_s: Time between images.
-        detected: Share of the robots detected.
-        false: Mean number of false detections of an image.
-        headings: Whether the pattern shows the heading.
-        half: Half the width of the square in view [m].
-        noise: Scale of all noise.
-    """
-
-    period_s: float = 0.5
-    detected: float = 1.0
-    false: float = 0.0
-    headings: bool = False
-    half: float = 5.0
-    noise: float = 1.0
+    period_s: float = 0.5  # Time between images
+    detected: float = 1.0  # Share of the robots detected
+    false: float = 0.0  # Mean number of false detections of an image
+    headings: bool = False  # Whether the pattern shows the heading
+    half: float = 5.0  # Half the width of the square in view [m]
+    noise: float = 1.0  # Scale of all noise
 
 
 @dataclass(frozen=True)
 class AerialWorld:
-    """A world with its images.
+    """A world with its images."""
 
-    Attributes:
-        world: With the events of the images.
-        robot: Stamp of an image -> which robot each of its detections is; -1: none.
-    """
-
-    world: World
-    robot: dict[int, IntArray]
+    world: World  # With the events of the images
+    robot: dict[int, IntArray]  # Stamp of an image -> which robot each of its detections is; -1: none
 
 
 def seen_from_above(plan: Plan, view: View, seed: int) -> AerialWorld:

@@ -29,25 +29,15 @@ _FIRST_MARK = 100
 
 @dataclass(frozen=True)
 class World:
-    """How the recording errs.
+    """How the recording errs."""
 
-    Attributes:
-        robots: As they truly are; all of one type.
-        seed: Of commands and noise.
-        duration_s: [s].
-        range_sigma: Relative.
-        bearing_sigma: [rad].
-        posed: Whether sightings have a heading.
-        turn_sigma: Of the true turn beside what the model says [rad/sqrt(s)].
-    """
-
-    robots: tuple[Robot, ...]
-    seed: int
-    duration_s: float = 300.0
-    range_sigma: float = 0.005
-    bearing_sigma: float = 0.005
-    posed: bool = False
-    turn_sigma: float = 0.0
+    robots: tuple[Robot, ...]  # As they truly are; all of one type
+    seed: int  # Of commands and noise
+    duration_s: float = 300.0  # [s]
+    range_sigma: float = 0.005  # Relative
+    bearing_sigma: float = 0.005  # [rad]
+    posed: bool = False  # Whether sightings have a heading
+    turn_sigma: float = 0.0  # Of the true turn beside what the model says [rad/sqrt(s)]
 
 
 def described(robots: tuple[Robot, ...]) -> Swarm:

@@ -18,19 +18,12 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, 
 
 @dataclass(frozen=True)
 class World:
-    """A simulated run.
+    """A simulated run."""
 
-    Attributes:
-        swarm: Its description.
-        stamp_ns: (T,) instants of the truth.
-        truth: (T, N, 3).
-        events: In order of their stamps.
-    """
-
-    swarm: Swarm
-    stamp_ns: NDArray[np.int64]
-    truth: FloatArray
-    events: tuple[Event, ...]
+    swarm: Swarm  # Its description
+    stamp_ns: NDArray[np.int64]  # (T,) instants of the truth
+    truth: FloatArray  # (T, N, 3)
+    events: tuple[Event, ...]  # In order of their stamps
 
     def at(self, stamp_ns: int) -> FloatArray:
         """The true poses (N, 3) at an instant of the truth."""
@@ -40,48 +33,29 @@ class World:
 
 @dataclass(frozen=True)
 class Plan:
-    """What to simulate.
+    """What to simulate."""
 
-    Attributes:
-        robots: N.
-        duration_s: [s].
-        speed: Of every robot [m/s].
-        turn_rate: Largest [rad/s]; each robot changes its own every second.
-        arena: Half the width of the square in which the landmarks stand [m].
-        landmarks: How many, on a circle.
-        start_known: Per robot, or one for all.
-        content: Of the detections.
-        noise: Scale of all noise; 0: none.
-        flips: Share of pose sightings whose first solution is the mirrored one.
-        outliers: Share of sightings that are off by a metre.
-        reach: How far cameras see [m].
-        camera_hz: Pictures per second.
-        standing: Robots that do not move.
-        carried: Robots that are put elsewhere, with their backs to where they looked, at half time.
-        lasting: Scale of the errors that last, of the motion and of the camera; 0: neither are there any,
-            nor are they estimated.
-        survey: Scale of the errors of the landmarks' places, likewise.
-        watching: Whether every robot begins with its camera on the landmark farthest from it.
-    """
-
-    robots: int = 3
-    duration_s: float = 6.0
-    speed: float = 0.1
-    turn_rate: float = 0.8
-    arena: float = 1.2
-    landmarks: int = 8
-    start_known: Sequence[bool] = (True,)
-    content: int = POSE
-    noise: float = 1.0
-    flips: float = 0.0
-    outliers: float = 0.0
-    reach: float = 2.5
-    camera_hz: float = 5.0
-    standing: Sequence[int] = ()
+    robots: int = 3  # N
+    duration_s: float = 6.0  # [s]
+    speed: float = 0.1  # Of every robot [m/s]
+    turn_rate: float = 0.8  # Largest [rad/s]; each robot changes its own every second
+    arena: float = 1.2  # Half the width of the square in which the landmarks stand [m]
+    landmarks: int = 8  # How many, on a circle
+    start_known: Sequence[bool] = (True,)  # Per robot, or one for all
+    content: int = POSE  # Of the detections
+    noise: float = 1.0  # Scale of all noise; 0: none
+    flips: float = 0.0  # Share of pose sightings whose first solution is the mirrored one
+    outliers: float = 0.0  # Share of sightings that are off by a metre
+    reach: float = 2.5  # How far cameras see [m]
+    camera_hz: float = 5.0  # Pictures per second
+    standing: Sequence[int] = ()  # Robots that do not move
+    # Robots that are put elsewhere, with their backs to where they looked, at half time
     carried: Sequence[int] = ()
+    # Scale of the errors that last, of the motion and of the camera; 0: neither are there any, nor are they
+    # estimated
     lasting: float = 0.0
-    survey: float = 0.0
-    watching: bool = False
+    survey: float = 0.0  # Scale of the errors of the landmarks' places, likewise
+    watching: bool = False  # Whether every robot begins with its camera on the landmark farthest from it
 
 
 ODOMETRY = OdometryModel(wheel_separation=0.053, wheel_noise=2e-5)

@@ -32,8 +32,7 @@ SECOND = 10**9
 T0 = 1_000 * SECOND
 DROPLET = load_ir_platform("droplet")
 REACH_M = 0.28
-SLOT_NS = 2 * SECOND // 5
-"""One robot after the other lights its emitters; both powers take so long."""
+SLOT_NS = 2 * SECOND // 5  # One robot after the other lights its emitters; both powers take so long
 FIX_SIGMA = np.array([0.002, 0.002, 0.02])
 WALK = OdometryModel(
     wheel_noise=0.0,
@@ -84,27 +83,16 @@ Event = Light | Move | Place
 
 @dataclass(frozen=True)
 class Plan:
-    """What happens.
+    """What happens."""
 
-    Attributes:
-        columns: Robots stand in a square of so many by so many.
-        pitch: Between them [m].
-        seconds: How long.
-        fixed: Robots that get an absolute fix once a second.
-        known: Robots whose start is known.
-        walking: Whether they walk, now in one of six directions, now turning; the others stand.
-        noise: Scale of the sensors' noise.
-        differ: By how much elements differ, unknown to all.
-    """
-
-    columns: int = 3
-    pitch: float = 0.09
-    seconds: float = 24.0
-    fixed: Sequence[int] = ()
-    known: Sequence[int] = ()
-    walking: bool = False
-    noise: float = 1.0
-    differ: float = 0.0
+    columns: int = 3  # Robots stand in a square of so many by so many
+    pitch: float = 0.09  # Between them [m]
+    seconds: float = 24.0  # How long
+    fixed: Sequence[int] = ()  # Robots that get an absolute fix once a second
+    known: Sequence[int] = ()  # Robots whose start is known
+    walking: bool = False  # Whether they walk, now in one of six directions, now turning; the others stand
+    noise: float = 1.0  # Scale of the sensors' noise
+    differ: float = 0.0  # By how much elements differ, unknown to all
 
 
 @dataclass

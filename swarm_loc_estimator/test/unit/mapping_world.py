@@ -19,10 +19,8 @@ from swarm_loc_estimator.swarm.error_models import LidarModel
 
 PERIOD_NS = 20_000_000
 MAX_RANGE = 2.5
-SIGMA = 0.1 / 6.3
-"""A tenth of a pixel [1/m]."""
-ROOM = (0.0, 0.0, 3.4, 2.6)
-"""Left, lower, right, upper [m]."""
+SIGMA = 0.1 / 6.3  # A tenth of a pixel [1/m]
+ROOM = (0.0, 0.0, 3.4, 2.6)  # Left, lower, right, upper [m]
 NICHE = (1.2, 2.6, 2.0, 3.1)
 _SPEED, _TURN_RATE = 0.2, 1.0
 

@@ -18,8 +18,7 @@ from test_bags import START, expected, read, record_of, some_messages, write_bag
 from swarm_loc_estimator.common.bags.bag_file import MAX_LOG_NS
 from swarm_loc_estimator.common.bags.reader import BagError, BagReader
 
-CHUNK_HEAD = 9 + 8 + 8 + 8 + 4 + 4 + 8
-"""Bytes of a chunk's record before its messages, without compression."""
+CHUNK_HEAD = 9 + 8 + 8 + 8 + 4 + 4 + 8  # Bytes of a chunk's record before its messages, without compression
 UNTIMED = "messages whose log time cannot be were skipped"
 
 

@@ -41,8 +41,7 @@ ANGLE = st.floats(-3.1, 3.1)
 NAMES = st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"]), max_size=17)
 STAMPS = st.integers(-(2**31) * 10**9, (2**31 - 1) * 10**9 + 999_999_999)
 TYPES = typestore().types
-MAX_CUTS = 200
-"""Lengths at which a message is cut off; a message has up to 10 000 bytes, and 100 are drawn."""
+MAX_CUTS = 200  # Lengths at which a message is cut off; a message has up to 10 000 bytes, and 100 are drawn
 
 
 def encode(message: Any, message_type: str) -> bytes:

@@ -113,17 +113,11 @@ def drive(rng: np.random.Generator, robots: int, images: int) -> tuple[FloatArra
 
 
 class Found(NamedTuple):
-    """What chains have made of five images of four robots, of which they look for the first.
+    """What chains have made of five images of four robots, of which they look for the first."""
 
-    Attributes:
-        chains: After the newest image.
-        order: (4,) which robot each detection of it is.
-        pose: (3,) of the robot there, by the image's scale.
-    """
-
-    chains: Chains
-    order: IntArray
-    pose: FloatArray
+    chains: Chains  # After the newest image
+    order: IntArray  # (4,) which robot each detection of it is
+    pose: FloatArray  # (3,) of the robot there, by the image's scale
 
 
 def found(seed: int, *, headings: bool) -> Found:

@@ -20,8 +20,7 @@ from swarm_loc_estimator.swarm.ir_board import IrMethod, IrPlatform, PairGains, 
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 POSES = np.array([[0.0, 0.0, 0.3], [0.14, 0.08, -1.2], [-0.05, 0.1, 2.0]])
-CLOSE = POSES * [0.55, 0.55, 1.0]
-"""Near enough for the reduced power."""
+CLOSE = POSES * [0.55, 0.55, 1.0]  # Near enough for the reduced power
 OTHER_BOARD = replace(DROPLET, radius=0.03)
 ONE_POWER = replace(DROPLET, amplitudes=DROPLET.amplitudes[:1])
 

@@ -41,8 +41,7 @@ SIGMA, TURN_SIGMA = 0.01, 0.05
 NO_NOISE = np.zeros((3, 3))
 EXACT = np.zeros(2)
 LONG_NS = 3600 * SECOND
-ORIGIN = OtherSide(1, -1, np.zeros(3), np.zeros(3), NO_NOISE)
-"""Robot 1 at the origin."""
+ORIGIN = OtherSide(1, -1, np.zeros(3), np.zeros(3), NO_NOISE)  # Robot 1 at the origin
 
 
 def any_pose(rng: np.random.Generator) -> FloatArray:

@@ -18,8 +18,7 @@ SWARM = Swarm((Robot("walker", camera=None, stands=True, random_walk=WALK),))
 EXACT = Settings(fusion_period_s=0.0)
 FIX_SIGMA = np.array([0.02, 0.02, 0.05])
 FIXES, FIX_S = 15, 2
-HIDDEN = 0.03
-"""What the estimator adds where few measurements have confirmed a pose [m]."""
+HIDDEN = 0.03  # What the estimator adds where few measurements have confirmed a pose [m]
 
 
 def walked(seed: int) -> tuple[FloatArray, FloatArray]:

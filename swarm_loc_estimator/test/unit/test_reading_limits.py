@@ -20,10 +20,8 @@ from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
 
 ROBOTS, N = 3, 6
-NEVER = 1e8
-"""A saturation that nothing reaches [count]."""
-ROUNDED = 1.0 / np.sqrt(12.0)
-"""Noise of whole counts [count]."""
+NEVER = 1e8  # A saturation that nothing reaches [count]
+ROUNDED = 1.0 / np.sqrt(12.0)  # Noise of whole counts [count]
 
 
 def board(name: str) -> IrPlatform:
@@ -34,21 +32,13 @@ def board(name: str) -> IrPlatform:
 
 @dataclass(frozen=True)
 class Course:
-    """What happens.
+    """What happens."""
 
-    Attributes:
-        count: How many exchanges.
-        stay: So many in a row in each geometry of a pair.
-        nearest: Least range [m].
-        farthest: Largest range [m].
-        walk: How far robots move between exchanges of one geometry, one standard deviation [m].
-    """
-
-    count: int = 400
-    stay: int = 4
-    nearest: float = 0.05
-    farthest: float = 0.2
-    walk: float = 0.0
+    count: int = 400  # How many exchanges
+    stay: int = 4  # So many in a row in each geometry of a pair
+    nearest: float = 0.05  # Least range [m]
+    farthest: float = 0.2  # Largest range [m]
+    walk: float = 0.0  # How far robots move between exchanges of one geometry, one standard deviation [m]
 
 
 def exchanged(

@@ -22,8 +22,7 @@ from swarm_loc_estimator.timeline.settings import Settings
 SPARSE = Settings(sparse_from=2, fusion_period_s=0.2)
 DENSE = replace(SPARSE, sparse_from=1000)
 
-world_of = lru_cache(maxsize=16)(simulate)
-"""For tests that change nothing in it."""
+world_of = lru_cache(maxsize=16)(simulate)  # For tests that change nothing in it
 
 
 def run(world: World, settings: Settings = SPARSE, period_s: float = 0.2) -> tuple[Estimator, list[Estimate]]:

@@ -38,8 +38,7 @@ COMMANDS = {
     *("replay", "replay_map", "schema", "survey", "sweep"),
 }
 NODES = {"estimator_node", "localizer_bridge", "mapper_node", "markers_node", "play", "watch_node"}
-STARTERS = {"demo", "graph", "watch"}
-"""Commands that start nodes."""
+STARTERS = {"demo", "graph", "watch"}  # Commands that start nodes
 
 
 def python(

@@ -16,10 +16,8 @@ from swarm_loc_vision.aerial.rectification import Brightness, Plain, logarithm
 
 _RADII = np.array([0.82, 0.91, 1.0, 1.09, 1.18])
 _MAX_EDGES = 400_000
-_EDGE_SHARE = 0.15
-"""Least slope of an edge per pixel, over the least contrast."""
-_BLUR_SHARE, _APART_SHARE = 0.08, 0.3
-"""Smoothing of votes and least distance of candidates, in diameters."""
+_EDGE_SHARE = 0.15  # Least slope of an edge per pixel, over the least contrast
+_BLUR_SHARE, _APART_SHARE = 0.08, 0.3  # Smoothing of votes and least distance of candidates, in diameters
 
 
 class Edges:
@@ -80,25 +78,18 @@ def _shrunk(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 RAYS = 64
-_WIDEST = 0.3
-"""Largest relative difference of a rim from the expected radius."""
-_OFF = 0.12
-"""Largest distance of an edge from its circle, in radii."""
-_BLOCK = 30_000
-"""OpenCV's images have fewer than 2^15 rows."""
+_WIDEST = 0.3  # Largest relative difference of a rim from the expected radius
+_OFF = 0.12  # Largest distance of an edge from its circle, in radii
+_BLOCK = 30_000  # OpenCV's images have fewer than 2^15 rows
 _ROUNDS = 3
 _EVERY, _LIKELY = 4, 0.4
 """Candidates are first tested on every fourth ray; this share of them must meet an edge."""
 _MIN_RAYS = 12
-_NOISES = 0.5
-"""Least step of an edge over the noise of one pixel: its two sides are means over many pixels."""
-_TOGETHER = 3.0
-"""Neighbouring rays that share pixels, and so one error."""
-_MIN_PAIRS = 8
-"""Least opposite rays with edges that show the errors which move a centre."""
+_NOISES = 0.5  # Least step of an edge over the noise of one pixel: its two sides are means over many pixels
+_TOGETHER = 3.0  # Neighbouring rays that share pixels, and so one error
+_MIN_PAIRS = 8  # Least opposite rays with edges that show the errors which move a centre
 
-_OVAL_RIDGE = 1.0
-"""Prior information on the oval, in edges: half a rim says little of it."""
+_OVAL_RIDGE = 1.0  # Prior information on the oval, in edges: half a rim says little of it
 
 _ANGLES = 2.0 * np.pi * np.arange(RAYS) / RAYS
 DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
@@ -106,29 +97,17 @@ _OVALS = np.stack([np.cos(2.0 * _ANGLES), np.sin(2.0 * _ANGLES)], axis=1)
 
 
 class Circles(NamedTuple):
-    """Measured candidates, one row each.
+    """Measured candidates, one row each."""
 
-    Attributes:
-        centre: (C, 2) column and row [px].
-        radius: (C,) [px].
-        coverage: (C,) share of the rays that meet an edge of the outline.
-        contrast: (C,) median step of these edges, of the logarithm of brightness.
-        spread: (C,) root mean square distance of these edges from the outline [px].
-        oval: (C, 2) cosine and sine of the second harmonic of the outline, as left by motion [px].
-        covariance: (C, 2, 2) of the centre [px^2].
-        kind: (C,) `TOP`, `SIDES` or `PARTLY`: what the outline is.
-        soft: (C,) whether the edges are taken for blurred ones.
-    """
-
-    centre: FloatArray
-    radius: FloatArray
-    coverage: FloatArray
-    contrast: FloatArray
-    spread: FloatArray
-    oval: FloatArray
-    covariance: FloatArray
-    kind: NDArray[np.int64]
-    soft: NDArray[np.bool_]
+    centre: FloatArray  # (C, 2) column and row [px]
+    radius: FloatArray  # (C,) [px]
+    coverage: FloatArray  # (C,) share of the rays that meet an edge of the outline
+    contrast: FloatArray  # (C,) median step of these edges, of the logarithm of brightness
+    spread: FloatArray  # (C,) root mean square distance of these edges from the outline [px]
+    oval: FloatArray  # (C, 2) cosine and sine of the second harmonic of the outline, as left by motion [px]
+    covariance: FloatArray  # (C, 2, 2) of the centre [px^2]
+    kind: NDArray[np.int64]  # (C,) `TOP`, `SIDES` or `PARTLY`: what the outline is
+    soft: NDArray[np.bool_]  # (C,) whether the edges are taken for blurred ones
 
     def chosen(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Circles:
         """Some of the rows."""
@@ -151,14 +130,10 @@ class Sides(NamedTuple):
     """Sides of upright cylinders of one height, seen on the rectified plane of their tops.
 
     A cylinder hides the hull of its top and of its base, which is a smaller circle nearer to the foot.
-
-    Attributes:
-        foot: (2,) column and row below the camera.
-        share: Height of the cylinders over that of the camera.
     """
 
-    foot: FloatArray
-    share: float
+    foot: FloatArray  # (2,) column and row below the camera
+    share: float  # Height of the cylinders over that of the camera
 
     def outline(
         self, centre: FloatArray, radius: FloatArray, kind: NDArray[np.int64]
@@ -206,19 +181,12 @@ Light = Callable[[FloatArray], FloatArray]
 
 @dataclass(frozen=True)
 class Rims:
-    """Measures rims of discs.
+    """Measures rims of discs."""
 
-    Attributes:
-        image: The image.
-        polarity: Polarity of the discs.
-        min_contrast: Least step of an edge in the logarithm of brightness.
-        sides: The discs' sides; a share of 0: they are flat.
-    """
-
-    image: Brightness
-    polarity: float
-    min_contrast: float
-    sides: Sides
+    image: Brightness  # The image
+    polarity: float  # Polarity of the discs
+    min_contrast: float  # Least step of an edge in the logarithm of brightness
+    sides: Sides  # The discs' sides; a share of 0: they are flat
 
     def measure(
         self,

@@ -22,12 +22,10 @@ from swarm_loc_vision.common.camera import Camera
 
 MIN_POINTS = 4
 MAX_POINTS = 1000
-_MIN_SPREAD = 0.02
-"""Least ratio of the extents of points; below it they count as on one line."""
+_MIN_SPREAD = 0.02  # Least ratio of the extents of points; below it they count as on one line
 _GUESS_PX = 1.0
 _STEPS = 200
-_FAR = 1e4
-"""Residual of a point that a pose does not see [sigma]."""
+_FAR = 1e4  # Residual of a point that a pose does not see [sigma]
 
 
 class ControlPointError(ValueError):
@@ -36,17 +34,11 @@ class ControlPointError(ValueError):
 
 @dataclass(frozen=True)
 class ControlPoints:
-    """Places and their pixels, one row each.
+    """Places and their pixels, one row each."""
 
-    Attributes:
-        names: (N,) for messages.
-        places: (N, 3) in map [m].
-        pixels: (N, 2) in the raw image [px].
-    """
-
-    names: Sequence[str]
-    places: FloatArray
-    pixels: FloatArray
+    names: Sequence[str]  # (N,) for messages
+    places: FloatArray  # (N, 3) in map [m]
+    pixels: FloatArray  # (N, 2) in the raw image [px]
 
     def __len__(self) -> int:
         return len(self.names)
@@ -65,19 +57,12 @@ NO_POINTS = ControlPoints((), np.zeros((0, 3)), np.zeros((0, 2)))
 
 @dataclass(frozen=True)
 class PoseFit:
-    """Pose of a camera from control points.
+    """Pose of a camera from control points."""
 
-    Attributes:
-        ground: The camera with its pose.
-        residuals: (N,) reprojection errors [px].
-        deviations: (N,) reprojection errors over their standard deviations.
-        names: (N,) names of the points.
-    """
-
-    ground: GroundCamera
-    residuals: FloatArray
-    deviations: FloatArray
-    names: Sequence[str]
+    ground: GroundCamera  # The camera with its pose
+    residuals: FloatArray  # (N,) reprojection errors [px]
+    deviations: FloatArray  # (N,) reprojection errors over their standard deviations
+    names: Sequence[str]  # (N,) names of the points
 
     @property
     def rms_px(self) -> float:

@@ -34,65 +34,46 @@ from swarm_loc_vision.aerial.rectification import (
 )
 from swarm_loc_vision.common.images import Gray
 
-_SIZES_PX = 16.0, 32.0
-"""Least and largest diameter of robots in the rectified image."""
+_SIZES_PX = 16.0, 32.0  # Least and largest diameter of robots in the rectified image
 _ROUGH_PX = 14.0
-_MAX_SHARE = 0.25
-"""Largest robot that is searched for, over the shorter side of the image."""
+_MAX_SHARE = 0.25  # Largest robot that is searched for, over the shorter side of the image
 _SPARE, _SPARE_SHARE = 60, 4
-_APART = 0.75
-"""Least distance of two robots, in diameters."""
+_APART = 0.75  # Least distance of two robots, in diameters
 _MAX_SPREAD, _MAX_SPREAD_PX = 0.03, 0.2
 """Largest rms distance of a disc's rim from a circle: a share of the radius, plus pixels."""
-_MAX_OVAL = 0.15
-"""Largest second harmonic of a disc's outline, over its radius: what motion leaves."""
+_MAX_OVAL = 0.15  # Largest second harmonic of a disc's outline, over its radius: what motion leaves
 _MAX_SHIFT, _MAX_GROWTH = 0.2, 3.0
 """Largest distance of a refined centre from the first one, in radii, and largest ratio of their sigmas."""
-_SHIFT_SHARE = 0.03
-"""Share of the square of that distance that is a variance of the refined centre."""
-_UNREFINED = 0.03
-"""Error of a centre that cannot be refined, one standard deviation in radii."""
+_SHIFT_SHARE = 0.03  # Share of the square of that distance that is a variance of the refined centre
+_UNREFINED = 0.03  # Error of a centre that cannot be refined, one standard deviation in radii
 _PARALLAX_SHARE = 0.05
 """Error of a centre by sides that its outline leaves out, over the distance of top and base in the image."""
-_MOTION_SHARE = 0.1
-"""Variance of the place along the motion, in squares of the second harmonic."""
+_MOTION_SHARE = 0.1  # Variance of the place along the motion, in squares of the second harmonic
 _FLAT = ((TOP, True, 0.6),)
 _TALL = ((SIDES, False, 1.0), (PARTLY, False, 0.6), (TOP, True, 0.6), (SIDES, True, 0.6), (PARTLY, True, 0.4))
 """Outlines that are tried where the quality is below their weight: kind, if edges are blurred, weight."""
 _PART, _SURE = 0.3, 0.2
 """Least coverage of discs for which other outlines are tried, and least weighted quality of these."""
-_SAME_SIZE = 0.2
-"""Largest relative difference of a disc's radius from the others in the image."""
-_SAME_CONTRAST = 0.45
-"""Least contrast of a disc over that of the others: shadows have less."""
+_SAME_SIZE = 0.2  # Largest relative difference of a disc's radius from the others in the image
+_SAME_CONTRAST = 0.45  # Least contrast of a disc over that of the others: shadows have less
 _TOUCHING, _USUAL = 1.3, 0.65
 """Largest distance of touching discs, in diameters; least share of the usual coverage of any other disc."""
 _MARK_ROUNDS = 2
-_MOST, _CLEAR = 0.6, 0.85
-"""If this share of discs shows a mark, discs without one need this coverage."""
+_MOST, _CLEAR = 0.6, 0.85  # If this share of discs shows a mark, discs without one need this coverage
 
 
 @dataclass(frozen=True)
 class AerialDetections:
-    """The robots in an image, one row each, in no order.
+    """The robots in an image, one row each, in no order."""
 
-    Attributes:
-        place: (N, 2) of their centres in map [m].
-        theta: (N,) headings in map [rad]; NaN: unknown.
-        covariance: (N, 3, 3) of x, y and theta; an unknown heading has that of a uniform distribution.
-        pixel: (N, 2) centres in the raw image.
-        diameter: (N,) [m].
-        coverage: (N,) share of the rim that shows an edge.
-        dropped: Number of discs left out, by reason.
-    """
-
-    place: FloatArray
-    theta: FloatArray
+    place: FloatArray  # (N, 2) of their centres in map [m]
+    theta: FloatArray  # (N,) headings in map [rad]; NaN: unknown
+    # (N, 3, 3) of x, y and theta; an unknown heading has that of a uniform distribution
     covariance: FloatArray
-    pixel: FloatArray
-    diameter: FloatArray
-    coverage: FloatArray
-    dropped: Mapping[str, int]
+    pixel: FloatArray  # (N, 2) centres in the raw image
+    diameter: FloatArray  # (N,) [m]
+    coverage: FloatArray  # (N,) share of the rim that shows an edge
+    dropped: Mapping[str, int]  # Number of discs left out, by reason
 
     def __len__(self) -> int:
         return len(self.place)

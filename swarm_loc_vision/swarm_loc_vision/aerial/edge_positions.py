@@ -12,30 +12,20 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray
 
 _NEAREST, _FARTHEST, _SAMPLES = 0.45, 1.6, 47
-SHARES = np.linspace(_NEAREST, _FARTHEST, _SAMPLES)
-"""Samples on a ray, over the length to the expected edge."""
-_SIDE = 5
-"""Number of samples compared on each side of an edge: an eighth of the diameter."""
-_RAMP = 16
-"""Samples on each side of a blurred edge that show its ends: 0.4 of the radius."""
-_AWAY = 6
-"""Largest distance of the steepest counts from the steepest logarithm [samples]."""
+SHARES = np.linspace(_NEAREST, _FARTHEST, _SAMPLES)  # Samples on a ray, over the length to the expected edge
+_SIDE = 5  # Number of samples compared on each side of an edge: an eighth of the diameter
+_RAMP = 16  # Samples on each side of a blurred edge that show its ends: 0.4 of the radius
+_AWAY = 6  # Largest distance of the steepest counts from the steepest logarithm [samples]
 _NEIGHBOURS, _WEAK = 12, 0.8
 """Rays on each side whose median step an edge is compared with, and its least share of that."""
 
 
 class EdgesOnRays(NamedTuple):
-    """Edges on rays.
+    """Edges on rays."""
 
-    Attributes:
-        where: (C, R) distance from the centre [px].
-        step: (C, R) step of the logarithm of brightness.
-        is_edge: (C, R) whether there is an edge.
-    """
-
-    where: FloatArray
-    step: FloatArray
-    is_edge: NDArray[np.bool_]
+    where: FloatArray  # (C, R) distance from the centre [px]
+    step: FloatArray  # (C, R) step of the logarithm of brightness
+    is_edge: NDArray[np.bool_]  # (C, R) whether there is an edge
 
 
 def strongest(

@@ -13,27 +13,20 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.common.camera import Camera
 
 POSE_SIZE = 6
-_GRID = 48
-"""Samples along a side of the image for the reach of the lens."""
+_GRID = 48  # Samples along a side of the image for the reach of the lens
 _PLACE_STEP = 1e-4
 _POSE_STEPS = np.array([1e-6] * 3 + [1e-6] * 3)
-_MIN_DEPTH = 1e-3
-"""Least depth of a projected place [m]."""
+_MIN_DEPTH = 1e-3  # Least depth of a projected place [m]
 
 
 @dataclass(frozen=True)
 class GroundCamera:
-    """A camera with a known pose in map; the plane z = 0 of map is the floor.
+    """A camera with a known pose in map; the plane z = 0 of map is the floor."""
 
-    Attributes:
-        camera: Its intrinsics.
-        pose: (6,) from map to the optical frame (x right, y down, z forward): rotation vector, shift [m].
-        covariance: (6, 6) covariance of the pose.
-    """
-
-    camera: Camera
+    camera: Camera  # Its intrinsics
+    # (6,) from map to the optical frame (x right, y down, z forward): rotation vector, shift [m]
     pose: FloatArray
-    covariance: FloatArray
+    covariance: FloatArray  # (6, 6) covariance of the pose
 
     def pixels(self, places: FloatArray) -> FloatArray:
         """(..., 2) raw pixels of places (..., 3) in map; NaN behind the camera and beyond its lens."""

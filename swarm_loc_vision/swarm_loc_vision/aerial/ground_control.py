@@ -101,19 +101,13 @@ _MOVED = 3.0
 
 @dataclass(frozen=True)
 class Ground:
-    """Known references on the floor.
+    """Known references on the floor."""
 
-    Attributes:
-        points: Control points.
-        markers: Floor markers.
-        family: Family of the floor markers.
-        camera: Intrinsics; None: those of camera_info.
-    """
-
-    points: ControlPoints = NO_POINTS
-    markers: tuple[FloorMarker, ...] = ()
+    points: ControlPoints = NO_POINTS  # Control points
+    markers: tuple[FloorMarker, ...] = ()  # Floor markers
+    # Family of the floor markers
     family: Family = field(default_factory=lambda: family_named("aruco_mip_36h12"))
-    camera: Camera | None = None
+    camera: Camera | None = None  # Intrinsics; None: those of camera_info
 
     @property
     def is_empty(self) -> bool:

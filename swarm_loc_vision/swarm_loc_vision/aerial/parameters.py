@@ -10,8 +10,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import autostart, choice, number, text
 from swarm_loc_vision.common.images import TRANSPORTS
 
-BRIGHT, DARK = 1.0, -1.0
-"""Polarities of discs: brighter or darker than the floor."""
+BRIGHT, DARK = 1.0, -1.0  # Polarities of discs: brighter or darker than the floor
 POLARITIES = {"auto": (BRIGHT, DARK), "bright": (BRIGHT,), "dark": (DARK,)}
 """The polarities that are tried, by the value of the parameter."""
 

@@ -15,10 +15,8 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.aerial.circles import DIRECTIONS, sampled
 from swarm_loc_vision.aerial.rectification import Plain
 
-MARK_RADIUS = 0.58
-"""Radius of the white half-disc, in radii of the black disc."""
-MARGIN = 0.2
-"""Width of the white margin, in radii of the black disc."""
+MARK_RADIUS = 0.58  # Radius of the white half-disc, in radii of the black disc
+MARGIN = 0.2  # Width of the white margin, in radii of the black disc
 
 
 def inside_mark(places: FloatArray) -> FloatArray:
@@ -28,34 +26,22 @@ def inside_mark(places: FloatArray) -> FloatArray:
 
 _TURNS = 48
 _RINGS, _SPOKES, _OUTERMOST = 7, 48, 0.82
-_SOFTNESSES = (0.07, 0.14, 0.28)
-"""Candidates for the blur of the mark's edges, in radii of the disc."""
-_MIN_EXPLAINED = 0.7
-"""Least share of the residuals of a plane of light that the mark must explain."""
-_MIN_MARK = 0.3
-"""Least step of the mark over that of the disc's rim."""
-_RIM = 0.85, 1.25
-"""Radii of the samples inside and outside of the rim, over the radius."""
+_SOFTNESSES = (0.07, 0.14, 0.28)  # Candidates for the blur of the mark's edges, in radii of the disc
+_MIN_EXPLAINED = 0.7  # Least share of the residuals of a plane of light that the mark must explain
+_MIN_MARK = 0.3  # Least step of the mark over that of the disc's rim
+_RIM = 0.85, 1.25  # Radii of the samples inside and outside of the rim, over the radius
 _NEWTON_ROUNDS = 4
 _TURN_STEP = 1e-3
-_MIN_SIGMA = 0.004
-"""Error of a heading by print and mounting [rad]."""
+_MIN_SIGMA = 0.004  # Error of a heading by print and mounting [rad]
 
 
 class Marks(NamedTuple):
-    """Marks of discs, one row each.
+    """Marks of discs, one row each."""
 
-    Attributes:
-        theta: (C,) headings in the axes of the grid [rad]; NaN where there is no mark.
-        variance: (C,) variance of the headings [rad^2].
-        step: (C,) brightness of the mark minus that of the disc [counts]; 0 where there is no mark.
-        softness: (C,) blur of the edges, in radii of the disc.
-    """
-
-    theta: FloatArray
-    variance: FloatArray
-    step: FloatArray
-    softness: FloatArray
+    theta: FloatArray  # (C,) headings in the axes of the grid [rad]; NaN where there is no mark
+    variance: FloatArray  # (C,) variance of the headings [rad^2]
+    step: FloatArray  # (C,) brightness of the mark minus that of the disc [counts]; 0 where there is no mark
+    softness: FloatArray  # (C,) blur of the edges, in radii of the disc
 
     def light(self, places: FloatArray) -> FloatArray:
         """(C, R, S) light of the marks at places (C, R, S, 2) in radii of their discs [counts]."""

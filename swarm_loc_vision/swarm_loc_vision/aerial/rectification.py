@@ -16,10 +16,8 @@ from swarm_loc_vision.common.images import Gray
 
 Plain = NDArray[np.float32]
 
-_CELL_PX = 16
-"""Distance of the raw pixels at which the extent of a plane is sampled."""
-_MAX_AREA = 12_000_000
-"""Bound on the pixels of a rectified image."""
+_CELL_PX = 16  # Distance of the raw pixels at which the extent of a plane is sampled
+_MAX_AREA = 12_000_000  # Bound on the pixels of a rectified image
 
 
 class RectificationError(ValueError):
@@ -28,23 +26,14 @@ class RectificationError(ValueError):
 
 @dataclass(frozen=True)
 class Rectification:
-    """A grid over a level plane, and the raw pixels that show it.
+    """A grid over a level plane, and the raw pixels that show it."""
 
-    Attributes:
-        origin: (2,) x, y of the middle of the first pixel, which has the least x and y [m].
-        metres_per_px: Size of a pixel.
-        height: Height of the plane [m].
-        maps: (2, rows, columns) raw pixels u and v, columns along x, rows along y; -1 outside the image.
-        seen: (rows, columns) whether the raw image shows the pixel.
-        blur_px: Blur of the raw image before sampling, where the grid is coarser than the image.
-    """
-
-    origin: FloatArray
-    metres_per_px: float
-    height: float
-    maps: Plain
-    seen: NDArray[np.bool_]
-    blur_px: float
+    origin: FloatArray  # (2,) x, y of the middle of the first pixel, which has the least x and y [m]
+    metres_per_px: float  # Size of a pixel
+    height: float  # Height of the plane [m]
+    maps: Plain  # (2, rows, columns) raw pixels u and v, columns along x, rows along y; -1 outside the image
+    seen: NDArray[np.bool_]  # (rows, columns) whether the raw image shows the pixel
+    blur_px: float  # Blur of the raw image before sampling, where the grid is coarser than the image
 
     def apply(self, image: Gray) -> Plain:
         """The rectified image (rows, columns)."""
@@ -119,29 +108,21 @@ def _visible(ground: GroundCamera, height: float) -> tuple[FloatArray, FloatArra
     return flat[good], scale[good]
 
 
-_DARK = 10.0
-"""Counts added to brightness: without them the logarithm of dark pixels is mostly noise."""
+_DARK = 10.0  # Counts added to brightness: without them the logarithm of dark pixels is mostly noise
 _SMOOTHING_SHARE, _MIN_SMOOTHING_PX = 0.035, 0.6
 _KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])
 _KERNEL_NORM = 6.0
 _MEDIAN_OF_NORMAL = 0.6745
-_LEAST_NOISE = 0.3
-"""Noise of quantization alone [counts]."""
+_LEAST_NOISE = 0.3  # Noise of quantization alone [counts]
 
 
 @dataclass(frozen=True)
 class Brightness:
-    """A rectified image.
+    """A rectified image."""
 
-    Attributes:
-        plain: (rows, columns) counts, slightly smoothed.
-        log: (rows, columns) their logarithm, in which uneven light and shadows change edges little.
-        noise: Standard deviation of the noise of the raw image [counts].
-    """
-
-    plain: Plain
-    log: Plain
-    noise: float
+    plain: Plain  # (rows, columns) counts, slightly smoothed
+    log: Plain  # (rows, columns) their logarithm, in which uneven light and shadows change edges little
+    noise: float  # Standard deviation of the noise of the raw image [counts]
 
     def log_noise(self, log: FloatArray) -> FloatArray:
         """Standard deviation of values of the logarithm."""

@@ -74,8 +74,7 @@ _OPENCV = (0, 4, 5, 8, 12, 14)
 _MODELS = {"": (0,), "plumb_bob": _OPENCV, "rational_polynomial": _OPENCV, "equidistant": (0, 4)}
 """Distortion models of sensor_msgs/CameraInfo, and their numbers of coefficients; only zeros may follow."""
 
-_MOST_PX, _STRONGEST = 1e6, 1e4
-"""Bounds on intrinsics and on coefficients of the distortion."""
+_MOST_PX, _STRONGEST = 1e6, 1e4  # Bounds on intrinsics and on coefficients of the distortion
 _MAX_OFF_AXIS = math.tan(math.radians(80.0))
 """Further off the axis a flat image is stretched too much to detect straight sides."""
 _ROUNDS, _EXACT_PX = 50, 1e-4
@@ -91,28 +90,18 @@ class CameraError(ValueError):
 class Camera:
     """Intrinsics of a camera.
 
-    Attributes:
-        width: Columns of the image.
-        height: Rows of the image.
-        fx: Horizontal focal length [px].
-        fy: Vertical focal length [px].
-        cx: Column of the principal point [px].
-        cy: Row of the principal point [px].
-        distortion: Coefficients in the order of OpenCV; all that are given count.
-        model: Distortion model by its name in sensor_msgs/CameraInfo.
-
     Raises:
         CameraError: The camera is not calibrated, or a number is out of its range.
     """
 
-    width: int
-    height: int
-    fx: float
-    fy: float
-    cx: float
-    cy: float
-    distortion: tuple[float, ...] = ()
-    model: str = "plumb_bob"
+    width: int  # Columns of the image
+    height: int  # Rows of the image
+    fx: float  # Horizontal focal length [px]
+    fy: float  # Vertical focal length [px]
+    cx: float  # Column of the principal point [px]
+    cy: float  # Row of the principal point [px]
+    distortion: tuple[float, ...] = ()  # Coefficients in the order of OpenCV; all that are given count
+    model: str = "plumb_bob"  # Distortion model by its name in sensor_msgs/CameraInfo
 
     def __post_init__(self) -> None:
         if self.width <= 0 or self.height <= 0:

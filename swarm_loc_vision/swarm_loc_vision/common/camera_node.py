@@ -24,17 +24,11 @@ _THROTTLE_S = 30.0
 
 
 class Input(NamedTuple):
-    """A topic with a camera's images, or with what was found in them.
+    """A topic with a camera's images, or with what was found in them."""
 
-    Attributes:
-        message_class: Class of its messages.
-        topic: Its name, with its namespace.
-        qos: Of the subscription.
-    """
-
-    message_class: type
-    topic: str
-    qos: QoSProfile
+    message_class: type  # Class of its messages
+    topic: str  # Its name, with its namespace
+    qos: QoSProfile  # Of the subscription
 
 
 class CameraNode(ManagedNode[Parameters]):

@@ -29,19 +29,12 @@ class ImageError(ValueError):
 
 @dataclass(frozen=True)
 class _Encoding:
-    """Layout of pixels in memory, and their conversion to gray.
+    """Layout of pixels in memory, and their conversion to gray."""
 
-    Attributes:
-        channels: Of a pixel.
-        to_gray: Converts (height, width, channels).
-        bytes_per_channel: 1 or 2.
-        planes: Rows in memory per row of the image; those below the image hold colours.
-    """
-
-    channels: int
-    to_gray: Callable[[Pixels], NDArray[Any]]
-    bytes_per_channel: int = 1
-    planes: float = 1.0
+    channels: int  # Of a pixel
+    to_gray: Callable[[Pixels], NDArray[Any]]  # Converts (height, width, channels)
+    bytes_per_channel: int = 1  # 1 or 2
+    planes: float = 1.0  # Rows in memory per row of the image; those below the image hold colours
 
 
 def _highest_bits(pixels: NDArray[Any]) -> NDArray[np.uint8]:
@@ -85,19 +78,12 @@ _ENCODINGS = {
 
 @dataclass(frozen=True)
 class _Compression:
-    """Markers in the bytes of a compressed image.
+    """Markers in the bytes of a compressed image."""
 
-    Attributes:
-        name: Its name in error messages.
-        begin: First bytes.
-        data: Mark before pixel data; `end` must follow its last occurrence.
-        end: Mark behind all pixel data.
-    """
-
-    name: str
-    begin: bytes
-    data: bytes
-    end: bytes
+    name: str  # Its name in error messages
+    begin: bytes  # First bytes
+    data: bytes  # Mark before pixel data; `end` must follow its last occurrence
+    end: bytes  # Mark behind all pixel data
 
     def is_whole(self, data: bytes) -> bool:
         """Whether bytes are a whole image; cameras may append bytes."""
@@ -107,8 +93,7 @@ class _Compression:
 _JPEG = _Compression("jpeg", b"\xff\xd8\xff", b"\xff\xda", b"\xff\xd9")
 _PNG = _Compression("png", b"\x89PNG\r\n\x1a\n", b"IDAT", b"IEND")
 _COMPRESSIONS = {"jpeg": _JPEG, "jpg": _JPEG, "png": _PNG}
-_COMPRESSED_DEPTH = "compressedDepth"
-"""The format of image_transport whose bytes are no plain image."""
+_COMPRESSED_DEPTH = "compressedDepth"  # The format of image_transport whose bytes are no plain image
 
 
 def gray_image(message: Any) -> Gray:
@@ -178,17 +163,11 @@ def _decoded(raw: NDArray[np.uint8]) -> NDArray[Any] | None:
 
 @dataclass(frozen=True)
 class Transport:
-    """A transport of images, as in image_transport.
+    """A transport of images, as in image_transport."""
 
-    Attributes:
-        suffix: Suffix of the topic `image_raw`.
-        message_type: Type of its messages.
-        gray_of: Reads a message.
-    """
-
-    suffix: str
-    message_type: str
-    gray_of: Callable[[Any], Gray]
+    suffix: str  # Suffix of the topic `image_raw`
+    message_type: str  # Type of its messages
+    gray_of: Callable[[Any], Gray]  # Reads a message
 
 
 TRANSPORTS = {

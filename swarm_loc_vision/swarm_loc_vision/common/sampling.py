@@ -20,8 +20,7 @@ _MIN_REACH_PX, _MAX_REACH_PX = 1.5, 6.0
 _STEP_PX = 0.5
 _MIN_SHARED_CELL_PX = 2.0
 _SPREAD = 0.4
-_MIN_CLEAR_CELL_PX = 4.5
-"""Narrower cells do not all reach the brightness of ink and paper."""
+_MIN_CLEAR_CELL_PX = 4.5  # Narrower cells do not all reach the brightness of ink and paper
 
 
 @cached_njit

@@ -40,8 +40,7 @@ EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 _OUTPUT_QOS = QoSProfile(depth=50)
 _LASER_PATIENCE_S, _SEEN_PATIENCE_S = 15.0, 60.0
 """For the laser, before it was first seen and afterwards: in large halls often nothing is within range."""
-_MAX_PIXELS = 1 << 21
-"""Bound on the pixels of a sensor: the tracker stores the last bursts of each."""
+_MAX_PIXELS = 1 << 21  # Bound on the pixels of a sensor: the tracker stores the last bursts of each
 
 
 class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):

@@ -8,22 +8,17 @@ from pathlib import Path
 from swarm_loc_estimator.common.parameters import ParameterError, number, text, texts
 from swarm_loc_vision.laser.calibration import LaserCalibration, load_laser
 
-MAX_SOURCES = 32
-"""Bound on the lights that are looked for at once."""
+MAX_SOURCES = 32  # Bound on the lights that are looked for at once
 _MIN_HZ, _MAX_HZ = 10.0, 5000.0
 
 
 @dataclass(frozen=True)
 class LightSource:
-    """A light that blinks.
+    """A light that blinks."""
 
-    Attributes:
-        frequency: [Hz].
-        is_above: Whether it is in the upper half of the image, as LEDs of other robots, or in the lower half,
-            as the spot of the robot's own laser.
-    """
-
-    frequency: float
+    frequency: float  # [Hz]
+    # Whether it is in the upper half of the image, as LEDs of other robots, or in the lower half, as the spot
+    # of the robot's own laser
     is_above: bool
 
     @property

@@ -24,76 +24,46 @@ from swarm_loc_vision.events.parameters import MAX_SOURCES, LightSource, Tracker
 _LONG_AGO_NS = -(1 << 62)
 _ITERATIONS = 8
 _MAX_SHIFT_PX, _SETTLED_PX = 3.0, 1e-3
-_PIXEL_VARIANCE = 1.0 / 12.0
-"""Variance of a place within its pixel [px^2]."""
+_PIXEL_VARIANCE = 1.0 / 12.0  # Variance of a place within its pixel [px^2]
 _MOMENTS = 8
 _COUNT, _BURSTS, _U, _V, _UU, _UV, _VV, _TIME = range(_MOMENTS)
 
 
 class Sighting(NamedTuple):
-    """A light in one window.
+    """A light in one window."""
 
-    Attributes:
-        source: Index of the light.
-        stamp_ns: Mean time of its events [ns].
-        u: Column of its centre [px].
-        v: Row [px].
-        covariance: (2, 2) over u, v [px^2].
-        locking: Part of each variance that is the bias within pixels, the same at each return [px^2].
-        events: Number of events that the place was computed from.
-    """
-
-    source: int
-    stamp_ns: int
-    u: float
-    v: float
-    covariance: FloatArray
-    locking: float
-    events: int
+    source: int  # Index of the light
+    stamp_ns: int  # Mean time of its events [ns]
+    u: float  # Column of its centre [px]
+    v: float  # Row [px]
+    covariance: FloatArray  # (2, 2) over u, v [px^2]
+    locking: float  # Part of each variance that is the bias within pixels, the same at each return [px^2]
+    events: int  # Number of events that the place was computed from
 
 
 class WindowReport(NamedTuple):
-    """The lights in one window.
+    """The lights in one window."""
 
-    Attributes:
-        stamp_ns: Middle of the window [ns].
-        sightings: At most one for each light, by source.
-    """
-
-    stamp_ns: int
-    sightings: tuple[Sighting, ...]
+    stamp_ns: int  # Middle of the window [ns]
+    sightings: tuple[Sighting, ...]  # At most one for each light, by source
 
 
 class _Hits(NamedTuple):
-    """Events in time with a light, in order of time, one row each.
+    """Events in time with a light, in order of time, one row each."""
 
-    Attributes:
-        source: (H,) index of the light.
-        x: (H,) column [px].
-        y: (H,) row [px].
-        time_ns: (H,) [ns].
-        begins: (H,) whether the event is the first of its burst.
-    """
-
-    source: NDArray[np.int32]
-    x: NDArray[np.int32]
-    y: NDArray[np.int32]
-    time_ns: IntArray
-    begins: BoolArray
+    source: NDArray[np.int32]  # (H,) index of the light
+    x: NDArray[np.int32]  # (H,) column [px]
+    y: NDArray[np.int32]  # (H,) row [px]
+    time_ns: IntArray  # (H,) [ns]
+    begins: BoolArray  # (H,) whether the event is the first of its burst
 
 
 class _Bursts(NamedTuple):
-    """The last burst of each pixel and polarity.
+    """The last burst of each pixel and polarity."""
 
-    Attributes:
-        event_ns: (P,) time of its last event [ns].
-        begin_ns: (P,) time of its first event [ns].
-        source: (P,) the light that it belongs to; -1: none.
-    """
-
-    event_ns: IntArray
-    begin_ns: IntArray
-    source: NDArray[np.int32]
+    event_ns: IntArray  # (P,) time of its last event [ns]
+    begin_ns: IntArray  # (P,) time of its first event [ns]
+    source: NDArray[np.int32]  # (P,) the light that it belongs to; -1: none
 
 
 class LightTracker:

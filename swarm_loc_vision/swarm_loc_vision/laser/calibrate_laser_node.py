@@ -37,8 +37,7 @@ _QOS = QoSProfile(depth=10)
 _COMMAND_S = 0.05
 _WAKE_S = 0.1
 _PATIENCE_S = 10.0
-_SETTLE_S = 0.5
-"""Time for messages that are under way when the robot stops [s]."""
+_SETTLE_S = 0.5  # Time for messages that are under way when the robot stops [s]
 
 
 @dataclass(frozen=True)

@@ -19,21 +19,16 @@ from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number,
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
 from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 
-STEP_PX = 0.2
-"""Distance of two knots: the bias has a period of one pixel, with harmonics."""
+STEP_PX = 0.2  # Distance of two knots: the bias has a period of one pixel, with harmonics
 
 
 @dataclass(frozen=True)
 class RowBias:
-    """Tracked row minus true row, linear between knots.
-
-    Attributes:
-        offsets: (K,) bias at each knot [px]; empty: unknown.
-    """
+    """Tracked row minus true row, linear between knots."""
 
     first_row: float = number(0.0, "px", -1000.0, 10_000.0, "row of the first knot")
     step: float = number(STEP_PX, "px", 0.0, 10.0, "from knot to knot", above=True)
-    offsets: tuple[float, ...] = ()
+    offsets: tuple[float, ...] = ()  # (K,) bias at each knot [px]; empty: unknown
 
     def reaches(self, row: float) -> bool:
         """Whether a tracked row [px] lies between knots."""

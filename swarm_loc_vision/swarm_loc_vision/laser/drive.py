@@ -16,23 +16,16 @@ from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_vision.laser.fit import CalibrationError, Drive
 
 _MAX_SAMPLES = 100_000
-_MAX_OFF_COURSE = 0.1
-"""A robot that turns by more does not drive straight at a wall [rad]."""
+_MAX_OFF_COURSE = 0.1  # A robot that turns by more does not drive straight at a wall [rad]
 
 
 @dataclass
 class WallDrive:
-    """Collects rows of the laser's spot with the path driven since the start.
+    """Collects rows of the laser's spot with the path driven since the start."""
 
-    Attributes:
-        start_distance: From base_link to the wall at the start [m].
-        stop_distance: From base_link to the wall at the end [m].
-        driven: Path so far [m].
-    """
-
-    start_distance: float
-    stop_distance: float
-    driven: float = 0.0
+    start_distance: float  # From base_link to the wall at the start [m]
+    stop_distance: float  # From base_link to the wall at the end [m]
+    driven: float = 0.0  # Path so far [m]
     _begin: tuple[float, float, float] | None = None
     _odometry: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=1000))
     _waiting: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=1000))

@@ -22,10 +22,8 @@ _MIN_SPREAD = 2.0
 """Least ratio of the largest to the smallest depth; with less, f b and p_inf cannot be separated."""
 _MAX_RESIDUAL_PX = 1.0
 _START_PX = 0.1
-_BEND_PX = 0.05
-"""Prior standard deviation of a knot off the line between its neighbours [px]."""
-_SIZE_PX = 0.3
-"""Prior standard deviation of a knot [px]."""
+_BEND_PX = 0.05  # Prior standard deviation of a knot off the line between its neighbours [px]
+_SIZE_PX = 0.3  # Prior standard deviation of a knot [px]
 _LEAST_SAMPLES = 4
 """Least number of samples between two knots. Near the wall rows change fast, samples are few and matter
 least."""
@@ -42,21 +40,13 @@ class CalibrationError(UserError):
 
 @dataclass(frozen=True)
 class Drive:
-    """A drive straight at a wall.
+    """A drive straight at a wall."""
 
-    Attributes:
-        start_distance: From base_link to the wall at the start, measured by hand [m].
-        start_sigma: Its standard deviation [m].
-        driven: (N,) path since the start, by odometry [m].
-        rows: (N,) rows of the laser's spot at the same instants [px].
-        camera_x: Position of the camera ahead of base_link [m].
-    """
-
-    start_distance: float
-    start_sigma: float
-    driven: FloatArray
-    rows: FloatArray
-    camera_x: float
+    start_distance: float  # From base_link to the wall at the start, measured by hand [m]
+    start_sigma: float  # Its standard deviation [m]
+    driven: FloatArray  # (N,) path since the start, by odometry [m]
+    rows: FloatArray  # (N,) rows of the laser's spot at the same instants [px]
+    camera_x: float  # Position of the camera ahead of base_link [m]
 
     @property
     def depths(self) -> FloatArray:

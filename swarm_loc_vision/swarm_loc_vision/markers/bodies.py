@@ -18,32 +18,23 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Robot
 from swarm_loc_vision.markers.pose import Poses, Upright, body_pose, square
 
-_MIN_SIGMA = 0.0005
-"""Minimum of `position_sigma` [m]."""
+_MIN_SIGMA = 0.0005  # Minimum of `position_sigma` [m]
 _MAX_CHI2 = 25.0
 """Maximum chi square per degree of freedom; above it the faces contradict the description and stay single."""
 
-_MAX_LEFT_OUT = 0.99
-"""Maximum share of a position's variance that is subtracted."""
+_MAX_LEFT_OUT = 0.99  # Maximum share of a position's variance that is subtracted
 
 
 @dataclass(frozen=True)
 class Placement:
-    """Pose of a marker on a body.
+    """Pose of a marker on a body."""
 
-    Attributes:
-        rotation: (3, 3) from the marker's frame to the body's.
-        position: (3,) in the body's frame [m].
-        sigma: Standard deviation of the position along each axis [m].
-    """
-
-    rotation: FloatArray
-    position: FloatArray
-    sigma: float
+    rotation: FloatArray  # (3, 3) from the marker's frame to the body's
+    position: FloatArray  # (3,) in the body's frame [m]
+    sigma: float  # Standard deviation of the position along each axis [m]
 
 
-Body = Mapping[int, Placement]
-"""Marker id -> its pose on the body."""
+Body = Mapping[int, Placement]  # Marker id -> its pose on the body
 
 
 def robot_body(robot: Robot) -> Body:
@@ -68,21 +59,13 @@ def up_of(mount: CameraMount | FixedCamera) -> FloatArray:
 
 @dataclass(frozen=True)
 class Seen:
-    """Markers in an image, one row each.
+    """Markers in an image, one row each."""
 
-    Attributes:
-        id: (N,).
-        corners: (N, 4, 2) [ideal px].
-        covariance: (N, 8, 8) of the corners [px^2].
-        lengths: (N,) sides [m].
-        poses: Pose of each marker alone; those on bodies are replaced.
-    """
-
-    id: IntArray
-    corners: FloatArray
-    covariance: FloatArray
-    lengths: FloatArray
-    poses: Poses
+    id: IntArray  # (N,)
+    corners: FloatArray  # (N, 4, 2) [ideal px]
+    covariance: FloatArray  # (N, 8, 8) of the corners [px^2]
+    lengths: FloatArray  # (N,) sides [m]
+    poses: Poses  # Pose of each marker alone; those on bodies are replaced
 
 
 def solve_bodies(seen: Seen, bodies: Iterable[Body], intrinsics: FloatArray, upright: Upright | None) -> None:

@@ -24,12 +24,10 @@ from swarm_loc_vision.markers.layouts import Layout, Words
 FALSE_READINGS = 1e-5
 """Maximum false positive rate for random squares, with whole bits and one threshold. Weighted bits and the
 second threshold increase it: with all 4096 ids to one or two of 100 000 random squares."""
-_SHARPENING = 0.2
-"""Share of the difference to each of its four neighbours that is added to a cell."""
+_SHARPENING = 0.2  # Share of the difference to each of its four neighbours that is added to a cell
 _MAX_DARK_ERRORS = 3.0
 """Maximum number of light cells among those of the border's inner ring, which are 16 or more."""
-_MAX_SLOPE = 0.5
-"""Maximum difference of the border's brightness between its sides, relative to the contrast."""
+_MAX_SLOPE = 0.5  # Maximum difference of the border's brightness between its sides, relative to the contrast
 _MIDDLE, _LOW = 0.5, 0.28
 """Thresholds between ink and paper: the default, and one for a marker half in shadow."""
 _MIN_CORRELATION = 0.4
@@ -40,26 +38,17 @@ _CLEAR = 0.3
 Sharpening brightens light cells that have dark neighbours; compared with these, light cells among light ones
 have a clearness of 0.4 at most."""
 _FAR = 1e9
-_WEIGHED = 4
-"""Maximum excess of different bits over the nearest word for words compared by weighted bits."""
+_WEIGHED = 4  # Maximum excess of different bits over the nearest word for words compared by weighted bits
 
 
 class Readings(NamedTuple):
-    """Decoded candidates, one row each.
+    """Decoded candidates, one row each."""
 
-    Attributes:
-        word: Index of the nearest word, -1: none accepted.
-        quarters: Counter-clockwise quarter turns of the marker in the image.
-        errors: Distance from the word in weighted bits.
-        margin: Weighted bits that could flip before another reading would be nearer.
-        contrast: Light minus dark cells [counts].
-    """
-
-    word: NDArray[np.int64]
-    quarters: NDArray[np.int64]
-    errors: FloatArray
-    margin: FloatArray
-    contrast: FloatArray
+    word: NDArray[np.int64]  # Index of the nearest word, -1: none accepted
+    quarters: NDArray[np.int64]  # Counter-clockwise quarter turns of the marker in the image
+    errors: FloatArray  # Distance from the word in weighted bits
+    margin: FloatArray  # Weighted bits that could flip before another reading would be nearer
+    contrast: FloatArray  # Light minus dark cells [counts]
 
 
 class _Places(NamedTuple):

@@ -35,43 +35,27 @@ class DetectorSettings(PoseSettings):
     min_contrast: float = number(4.0, "1", 1.0, 100.0, "least brightness of paper minus that of ink [counts]")
 
 
-_ROUGH_PX = 3.0
-"""Distance of the profiles across the sides of candidates [px]."""
+_ROUGH_PX = 3.0  # Distance of the profiles across the sides of candidates [px]
 _MIN_EDGE = 2.0
 """Minimum contrast of a candidate's sides over `min_contrast`, which is relative to the local mean."""
-_MAX_CANDIDATES = 8192
-"""Maximum number of candidates per image; the smallest are dropped."""
-_BLOCK = 256
-"""Number of candidates decoded at once, to limit memory."""
-_SAME = 0.3
-"""Maximum distance of duplicate readings, relative to a marker's diagonal."""
+_MAX_CANDIDATES = 8192  # Maximum number of candidates per image; the smallest are dropped
+_BLOCK = 256  # Number of candidates decoded at once, to limit memory
+_SAME = 0.3  # Maximum distance of duplicate readings, relative to a marker's diagonal
 
 
 @dataclass(frozen=True)
 class Detections:
-    """The markers in an image, one row each.
+    """The markers in an image, one row each."""
 
-    Attributes:
-        family: (N,) codes of families.
-        id: (N,) ids.
-        margin: (N,) weighted bits that could flip before another reading would be nearer.
-        errors: (N,) weighted bits by which the cells differ from the word of the id.
-        contrast: (N,) light minus dark cells [counts].
-        corners: (N, 4, 2) clockwise from the marker's own upper left [raw px].
-        poses: Poses and mirrored poses; None without a camera.
-        misfits: Number of markers whose corners do not fit a square: the calibration may be wrong.
-        dropped: Number of candidates that could not be read, by reason.
-    """
-
-    family: IntArray
-    id: IntArray
-    margin: FloatArray
-    errors: FloatArray
-    contrast: FloatArray
-    corners: FloatArray
-    poses: Poses | None
-    misfits: int
-    dropped: Mapping[str, int]
+    family: IntArray  # (N,) codes of families
+    id: IntArray  # (N,) ids
+    margin: FloatArray  # (N,) weighted bits that could flip before another reading would be nearer
+    errors: FloatArray  # (N,) weighted bits by which the cells differ from the word of the id
+    contrast: FloatArray  # (N,) light minus dark cells [counts]
+    corners: FloatArray  # (N, 4, 2) clockwise from the marker's own upper left [raw px]
+    poses: Poses | None  # Poses and mirrored poses; None without a camera
+    misfits: int  # Number of markers whose corners do not fit a square: the calibration may be wrong
+    dropped: Mapping[str, int]  # Number of candidates that could not be read, by reason
 
     def __len__(self) -> int:
         return len(self.id)

@@ -19,27 +19,19 @@ from swarm_loc_vision.markers.side_pixels import side_pixels
 from swarm_loc_vision.markers.sides import fit_sides
 
 _MIN_CROSSINGS = 3
-_MIN_SINE = 0.1
-"""Minimum sine of the angle between neighbouring sides."""
-_MIN_SIGMA_PX = 0.004
-"""Standard deviation of a line without noise, from print, lens and pixels."""
+_MIN_SINE = 0.1  # Minimum sine of the angle between neighbouring sides
+_MIN_SIGMA_PX = 0.004  # Standard deviation of a line without noise, from print, lens and pixels
 _NEIGHBOUR_PX3 = 0.25
 """Bias by neighbouring edges that blur into the side, times the square of a cell's width [px]."""
-_SHARE_FRESH = 0.5
-"""Share of independent information of crossings, which share pixels."""
+_SHARE_FRESH = 0.5  # Share of independent information of crossings, which share pixels
 
 
 class Corners(NamedTuple):
-    """Refined quadrangles.
+    """Refined quadrangles."""
 
-    Attributes:
-        corners: (N, 4, 2) [ideal px].
-        covariance: (N, 8, 8) of u0 v0 u1 v1 ... [px^2]; neighbours share a side.
-        contrast: (N,) light minus dark across the weakest side [counts]; 0 where a side was not found.
-    """
-
-    corners: FloatArray
-    covariance: FloatArray
+    corners: FloatArray  # (N, 4, 2) [ideal px]
+    covariance: FloatArray  # (N, 8, 8) of u0 v0 u1 v1 ... [px^2]; neighbours share a side.
+    # (N,) light minus dark across the weakest side [counts]; 0 where a side was not found
     contrast: FloatArray
 
 

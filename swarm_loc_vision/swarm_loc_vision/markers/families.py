@@ -13,8 +13,7 @@ from swarm_loc_vision.markers.layouts import Cells, Layout, Words
 
 _BCH_IDS = 4096
 
-_BCH_GENERATOR = 0x1DB2777
-"""The generator polynomial, degree 24, lowest power in bit 0."""
+_BCH_GENERATOR = 0x1DB2777  # The generator polynomial, degree 24, lowest power in bit 0
 _BCH_PARITY_BITS = 24
 _BCH_MASK = 0x8F80B8750
 
@@ -43,21 +42,13 @@ CODE_OTHER = 255
 
 @dataclass(frozen=True, eq=False)
 class Family:
-    """One kind of marker.
+    """One kind of marker."""
 
-    Attributes:
-        name: Name in parameters.
-        code: FAMILY_* of swarm_loc_msgs/MarkerDetection.
-        layout: Places of the cells.
-        words: (N,) words of the ids.
-        touching: Whether the corners touch those of other dark squares, as in Kalibr's grids.
-    """
-
-    name: str
-    code: int
-    layout: Layout
-    words: Words
-    touching: bool = False
+    name: str  # Name in parameters
+    code: int  # FAMILY_* of swarm_loc_msgs/MarkerDetection
+    layout: Layout  # Places of the cells
+    words: Words  # (N,) words of the ids
+    touching: bool = False  # Whether the corners touch those of other dark squares, as in Kalibr's grids
 
     @property
     def side(self) -> int:

@@ -36,41 +36,27 @@ _APRILTAG_NAMES = {
     "apriltag_standard_41h12": "tagStandard41h12",
 }
 """Families that AprilTag's detector finds, with the names that it gives them."""
-_UPSIDE_DOWN = ("apriltag_16h5", "apriltag_25h9", "apriltag_36h11")
-"""Families that OpenCV reads upside down."""
+_UPSIDE_DOWN = ("apriltag_16h5", "apriltag_25h9", "apriltag_36h11")  # Families that OpenCV reads upside down
 _OPENCV = (*_UPSIDE_DOWN, *(name for name in families() if name.startswith("aruco_")))
 """Families that OpenCV finds."""
 
 
 class ForeignMarker(NamedTuple):
-    """A marker that another detector has found.
+    """A marker that another detector has found."""
 
-    Attributes:
-        id: Its id.
-        family: Name of its family in the message; "": the message does not say.
-        corners: (4, 2) clockwise from its own upper left in an image without distortion [px].
-    """
-
-    id: int
-    family: str
-    corners: FloatArray
+    id: int  # Its id
+    family: str  # Name of its family in the message; "": the message does not say
+    corners: FloatArray  # (4, 2) clockwise from its own upper left in an image without distortion [px]
 
 
 @dataclass(frozen=True)
 class ForeignKind:
-    """Kind of messages of another detector.
+    """Kind of messages of another detector."""
 
-    Attributes:
-        message_type: Such as apriltag_msgs/msg/AprilTagDetectionArray.
-        topic: Its topic.
-        families: Families that the detector finds.
-        markers: Reads a message.
-    """
-
-    message_type: str
-    topic: str
-    families: Sequence[str]
-    markers: Callable[[Any, Camera, ForeignParameters], Iterator[ForeignMarker]]
+    message_type: str  # Such as apriltag_msgs/msg/AprilTagDetectionArray
+    topic: str  # Its topic
+    families: Sequence[str]  # Families that the detector finds
+    markers: Callable[[Any, Camera, ForeignParameters], Iterator[ForeignMarker]]  # Reads a message
 
 
 def _of_apriltag(message: Any, camera: Camera, _parameters: ForeignParameters) -> Iterator[ForeignMarker]:

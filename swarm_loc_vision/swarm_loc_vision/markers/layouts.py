@@ -23,16 +23,11 @@ class Layout:
 
     A marker is a black border around cells of data. In a surrounded one, as of AprilTag's Standard families,
     the border is white, lies in a black ring, and a ring of further data cells surrounds that.
-
-    Attributes:
-        cells: Cells along a side inside the border.
-        border: Width of the border [cells].
-        surrounded: Whether data surround the border; the detector sees such a marker with light and dark
-            swapped.
     """
 
-    cells: int
-    border: int
+    cells: int  # Cells along a side inside the border
+    border: int  # Width of the border [cells]
+    # Whether data surround the border; the detector sees such a marker with light and dark swapped
     surrounded: bool = False
 
     @property

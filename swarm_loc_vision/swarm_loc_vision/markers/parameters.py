@@ -56,23 +56,14 @@ class DetectorParameters(MarkersInUse):
 
 
 class KnownMarkers(NamedTuple):
-    """What a description says of markers: `MarkersInUse` with the contents of its files.
+    """What a description says of markers: `MarkersInUse` with the contents of its files."""
 
-    Attributes:
-        family: The family.
-        ids: (N,) ids in use, ascending; None: all.
-        lengths: Sides by id [m].
-        up: (3,) up in the camera frame.
-        lying: Ids of markers that lie flat.
-        bodies: Faces of the other robots.
-    """
-
-    family: Family
-    ids: IntArray | None
-    lengths: Mapping[int, float]
-    up: FloatArray
-    lying: Sequence[int]
-    bodies: Sequence[Body]
+    family: Family  # The family
+    ids: IntArray | None  # (N,) ids in use, ascending; None: all
+    lengths: Mapping[int, float]  # Sides by id [m]
+    up: FloatArray  # (3,) up in the camera frame
+    lying: Sequence[int]  # Ids of markers that lie flat
+    bodies: Sequence[Body]  # Faces of the other robots
 
 
 def known_markers(parameters: MarkersInUse) -> KnownMarkers:

@@ -20,8 +20,7 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.markers.ippe import two_starts
 
 _ROUNDS = 12
-_STILL = 1e-6
-"""Threshold of the weighted squared step at convergence."""
+_STILL = 1e-6  # Threshold of the weighted squared step at convergence
 _NOWHERE = 1e12
 _TRUST = 6.0
 """Prior degrees of freedom of the corners' covariance. The pose covariance is inflated where residuals are
@@ -35,53 +34,31 @@ of two rotations is 1 + 2 cos of the angle between them."""
 
 
 class Upright(NamedTuple):
-    """Prior that a body stands upright.
+    """Prior that a body stands upright."""
 
-    Attributes:
-        up: (3,) unit vector in the camera frame.
-        tilt_sigma: Standard deviation of the tilt about either horizontal axis [rad].
-    """
-
-    up: FloatArray
-    tilt_sigma: float
+    up: FloatArray  # (3,) unit vector in the camera frame
+    tilt_sigma: float  # Standard deviation of the tilt about either horizontal axis [rad]
 
 
 class Poses(NamedTuple):
-    """Two solutions for each of N markers or bodies, the better one first.
+    """Two solutions for each of N markers or bodies, the better one first."""
 
-    Attributes:
-        rotation: (N, 2, 3, 3) to the camera frame.
-        position: (N, 2, 3) in the camera frame [m].
-        covariance: (N, 2, 6, 6) of position and rotation [m^2, rad^2].
-        chi2: (N, 2) weighted squares of the corners' residuals; infinite: no solution.
-    """
-
-    rotation: FloatArray
-    position: FloatArray
-    covariance: FloatArray
-    chi2: FloatArray
+    rotation: FloatArray  # (N, 2, 3, 3) to the camera frame
+    position: FloatArray  # (N, 2, 3) in the camera frame [m]
+    covariance: FloatArray  # (N, 2, 6, 6) of position and rotation [m^2, rad^2]
+    chi2: FloatArray  # (N, 2) weighted squares of the corners' residuals; infinite: no solution
 
 
 class _Sight(NamedTuple):
-    """Measurements of one marker, or of a body with M markers.
+    """Measurements of one marker, or of a body with M markers."""
 
-    Attributes:
-        points: (4 M, 3) corners in the body's frame.
-        pixels: (4 M, 2) their pixels.
-        weights: (M, 8, 8) inverse covariance of the corners of each marker.
-        intrinsics: fx, fy, cx, cy.
-        axis: (3,) axis of the body that points up.
-        up: (3,) in the camera frame.
-        tilt_weight: Inverse variance of the tilt; 0: no prior.
-    """
-
-    points: FloatArray
-    pixels: FloatArray
-    weights: FloatArray
-    intrinsics: FloatArray
-    axis: FloatArray
-    up: FloatArray
-    tilt_weight: float
+    points: FloatArray  # (4 M, 3) corners in the body's frame
+    pixels: FloatArray  # (4 M, 2) their pixels
+    weights: FloatArray  # (M, 8, 8) inverse covariance of the corners of each marker
+    intrinsics: FloatArray  # fx, fy, cx, cy
+    axis: FloatArray  # (3,) axis of the body that points up
+    up: FloatArray  # (3,) in the camera frame
+    tilt_weight: float  # Inverse variance of the tilt; 0: no prior
 
 
 def square(length: float) -> FloatArray:

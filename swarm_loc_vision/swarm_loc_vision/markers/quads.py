@@ -22,35 +22,26 @@ from swarm_loc_vision.common.images import Gray
 
 IntArray = NDArray[np.int32]
 
-_MIN_SIDE_PX = 3
-"""Minimum size of an image with inner pixels."""
+_MIN_SIDE_PX = 3  # Minimum size of an image with inner pixels
 _DARK = 255
-_FOLLOWED = 1
-"""Value of a dark pixel on a followed outline whose left neighbour is light."""
-_SAME = 0.15
-"""Maximum distance of duplicate quadrangles, relative to their size."""
+_FOLLOWED = 1  # Value of a dark pixel on a followed outline whose left neighbour is light
+_SAME = 0.15  # Maximum distance of duplicate quadrangles, relative to their size
 _NOISE_SIGMAS = 1.25
 """Minimum ratio of contrast to noise; below it, specks of noise would dominate the run time."""
 _SMOOTHING_PX = 0.5
 """Standard deviation of the blur that keeps outlines connected; more would close narrow cells."""
-_NOISE_ROWS = 16
-"""The noise is measured in every 16th row."""
-_DEVIATION = 0.75
-"""Standard deviation of noise, blurred as above, over the median of its second differences."""
-_MIN_AREA = 0.6
-"""Minimum area of a quadrangle over the square of the minimum side."""
+_NOISE_ROWS = 16  # The noise is measured in every 16th row
+_DEVIATION = 0.75  # Standard deviation of noise, blurred as above, over the median of its second differences
+_MIN_AREA = 0.6  # Minimum area of a quadrangle over the square of the minimum side
 _MIN_COMPACTNESS = 0.008
 """Minimum area of a quadrangle over the square of its outline. A square seen at 75 degrees has 0.04, and a
 fourth of that if the outline leads through a gap and around the inside."""
 _SLACK_PX, _SLACK = 1.0, 0.05
 """Maximum distance of an outline from its side: pixels, and a share of its length. Points farther away, as at
 a gap or an obstacle on the border, are ignored."""
-_MIN_SEEN = 0.5
-"""Minimum share of a side that the outline covers."""
-_LEFT = 4
-"""Index of the direction to the left; the eight directions count counter-clockwise from the right."""
-_LONGEST_OUTLINE = 4
-"""Maximum number of points of an outline, relative to height plus width of the image."""
+_MIN_SEEN = 0.5  # Minimum share of a side that the outline covers
+_LEFT = 4  # Index of the direction to the left; the eight directions count counter-clockwise from the right
+_LONGEST_OUTLINE = 4  # Maximum number of points of an outline, relative to height plus width of the image
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
 WINDOWS = ((7, 25), (35,))
 """Sides of the neighbourhoods of the local mean [px], in full and in half resolution."""

@@ -20,8 +20,7 @@ from swarm_loc_vision.common.sampling import homographies
 
 REACH_PX, INNER_REACH_PX = 7.0, 3.5
 """Maximum distance of pixels from a side, and from the inner edge of its border."""
-_MAX_ROWS = 32
-"""Maximum number of rows or columns of pixels across a side; spread evenly over longer sides."""
+_MAX_ROWS = 32  # Maximum number of rows or columns of pixels across a side; spread evenly over longer sides
 _ROOM = 4 * (_MAX_ROWS + 1) * (2 * math.ceil(math.sqrt(2.0) * (REACH_PX + INNER_REACH_PX)) + 4)
 _NODES = 6
 """Points at a side whose shift is computed: start, middle and end on it, and one pixel outside of these."""
@@ -30,28 +29,20 @@ INNER = 4
 
 
 class SidePixels(NamedTuple):
-    """Pixels near the four sides of N quadrangles.
+    """Pixels near the four sides of N quadrangles."""
 
-    Attributes:
-        frames: (N, 4, 8) of each side: start, direction, length, width of the border at both ends [px], and
-            shear, the shift of cells along the side per distance inwards.
-        boundaries: (N, 4, cells + 1) distance along a side of the boundaries of cells behind the border [px].
-        counts: (N,) number of pixels of each quadrangle; M is the bound on it.
-        side: (N, M) index of the side; INNER is added for pixels at the inner edge of its border.
-        along: (N, M) distance along the side [px].
-        outside: (N, M) distance outside of the side [px].
-        place: (N, M, 2) position from the first corner, over the size of the quadrangle.
-        value: (N, M) brightness.
-    """
-
+    # (N, 4, 8) of each side: start, direction, length, width of the border at both ends [px], and shear, the
+    # shift of cells along the side per distance inwards
     frames: FloatArray
+    # (N, 4, cells + 1) distance along a side of the boundaries of cells behind the border [px]
     boundaries: FloatArray
-    counts: NDArray[np.int64]
+    counts: NDArray[np.int64]  # (N,) number of pixels of each quadrangle; M is the bound on it
+    # (N, M) index of the side; INNER is added for pixels at the inner edge of its border
     side: NDArray[np.int64]
-    along: FloatArray
-    outside: FloatArray
-    place: FloatArray
-    value: FloatArray
+    along: FloatArray  # (N, M) distance along the side [px]
+    outside: FloatArray  # (N, M) distance outside of the side [px]
+    place: FloatArray  # (N, M, 2) position from the first corner, over the size of the quadrangle
+    value: FloatArray  # (N, M) brightness
 
 
 def side_pixels(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, border: int) -> SidePixels:

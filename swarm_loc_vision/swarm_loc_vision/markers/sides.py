@@ -40,30 +40,22 @@ _PARAMETERS = _ENDS + 7
 _OF_SIDE = 2 + _PARAMETERS - _ENDS
 """Parameters of a pixel: the two ends of its side, and those that all sides share."""
 _ROUNDS = 5
-_STILL = 0.2
-"""Maximum motion of an end at convergence, in standard deviations."""
-_FIRST_BLUR, _MIN_BLUR, _MAX_BLUR = 0.45, 0.08, 12.0
-"""Variance of the blur [px^2]."""
-_BLUR_FREEDOM = 4.0
-"""Prior standard deviation of that variance [px^2]."""
-_LIGHT_FREEDOM = 0.2
-"""Prior standard deviation of the relative difference of light over a marker."""
+_STILL = 0.2  # Maximum motion of an end at convergence, in standard deviations
+_FIRST_BLUR, _MIN_BLUR, _MAX_BLUR = 0.45, 0.08, 12.0  # Variance of the blur [px^2]
+_BLUR_FREEDOM = 4.0  # Prior standard deviation of that variance [px^2]
+_LIGHT_FREEDOM = 0.2  # Prior standard deviation of the relative difference of light over a marker
 _REACH, _MORE_REACH_PX, _MIN_REACH_PX = 2.5, 0.6, 0.75
 """Half width of the window around a line: a multiple of the blur, plus pixels, and a lower bound [px]."""
 _CLEAR = 1.6
 """Distance of the window from unknown areas: beyond the margin, behind the first row of cells [blurs]."""
 _CLEAR_OF_CORNERS = 1.8
-_MAX_SHIFT_PX = 1.5
-"""Maximum motion of a corner in the fit."""
-_OUTLIER = 4.0
-"""Residual above which the weight of a pixel decreases, in standard deviations."""
-_MIN_NOISE = 0.5
-"""Minimum standard deviation of a pixel [counts]."""
+_MAX_SHIFT_PX = 1.5  # Maximum motion of a corner in the fit
+_OUTLIER = 4.0  # Residual above which the weight of a pixel decreases, in standard deviations
+_MIN_NOISE = 0.5  # Minimum standard deviation of a pixel [counts]
 _MIN_SIGMA_PX = 0.01
 """Error of an end without noise. Blur is not exactly Gaussian: that of a shutter or of a defocused lens
 shifts edges by about 0.01 px, depending on their place in the pixels."""
-_NEIGHBOURS = 0.7
-"""Times blur^3 / cell^2: shift of a side by light from beyond the next cells."""
+_NEIGHBOURS = 0.7  # Times blur^3 / cell^2: shift of a side by light from beyond the next cells
 _TABLE_END, _TABLE_STEPS = 5.0, 256.0
 _NORMAL = ndtr(np.arange(-_TABLE_END, _TABLE_END, 1.0 / _TABLE_STEPS))
 _BY_CHANCE, _CLEARLY_WHITE = 3.0, 0.7

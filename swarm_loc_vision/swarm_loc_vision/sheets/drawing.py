@@ -22,8 +22,7 @@ _POINTS_PER_MM = 72.0 / MM_PER_INCH
 _FAINT = "0.6"
 _LINE_PT = 0.4
 _TEXT_MM = 2.6
-_WIDTH_OF_LETTER = 0.62
-"""Of its height, at most."""
+_WIDTH_OF_LETTER = 0.62  # Of its height, at most
 
 
 def save_pdf(pages: list[Page], family: Family, paper: str, path: Path) -> None:

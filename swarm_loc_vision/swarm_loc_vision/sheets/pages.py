@@ -12,14 +12,10 @@ from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
 from swarm_loc_vision.aerial.ground_control import FloorMarker
 from swarm_loc_vision.markers.families import Family
 
-PAPERS = {"a4": (210.0, 297.0), "letter": (215.9, 279.4), "a3": (297.0, 420.0)}
-"""Width and height [mm]."""
-EDGE_MM = 10.0
-"""Width of the paper's edge, on which printers cannot print."""
-FOOT_MM = 14.0
-"""Height of the ruler and its text."""
-STRIP_MM = 5.0
-"""Height of the label below a marker."""
+PAPERS = {"a4": (210.0, 297.0), "letter": (215.9, 279.4), "a3": (297.0, 420.0)}  # Width and height [mm]
+EDGE_MM = 10.0  # Width of the paper's edge, on which printers cannot print
+FOOT_MM = 14.0  # Height of the ruler and its text
+STRIP_MM = 5.0  # Height of the label below a marker
 _LEAST_MARGIN_MM = 3.0
 _PITCH_STEP_MM = 5.0
 
@@ -30,34 +26,21 @@ class SheetError(UserError):
 
 @dataclass(frozen=True)
 class Sticker:
-    """A marker to print.
+    """A marker to print."""
 
-    Attributes:
-        id: Marker id.
-        side: Side of its black square [mm].
-        label: What it is for.
-    """
-
-    id: int
-    side: float
-    label: str
+    id: int  # Marker id
+    side: float  # Side of its black square [mm]
+    label: str  # What it is for
 
 
 @dataclass(frozen=True)
 class Piece:
-    """A sticker on a sheet.
+    """A sticker on a sheet."""
 
-    Attributes:
-        sticker: The marker.
-        x: Left of its black square [mm].
-        y: Bottom of its black square [mm].
-        margin: White margin around it, and above its label [mm].
-    """
-
-    sticker: Sticker
-    x: float
-    y: float
-    margin: float
+    sticker: Sticker  # The marker
+    x: float  # Left of its black square [mm]
+    y: float  # Bottom of its black square [mm]
+    margin: float  # White margin around it, and above its label [mm]
 
     @property
     def frame(self) -> tuple[float, float, float, float]:
@@ -69,17 +52,11 @@ class Piece:
 
 @dataclass(frozen=True)
 class Page:
-    """One sheet.
+    """One sheet."""
 
-    Attributes:
-        title: What is on it.
-        pieces: Its markers.
-        is_cut: Whether its markers are cut out.
-    """
-
-    title: str
-    pieces: Sequence[Piece]
-    is_cut: bool = True
+    title: str  # What is on it
+    pieces: Sequence[Piece]  # Its markers
+    is_cut: bool = True  # Whether its markers are cut out
 
 
 def stickers_of(swarm: Swarm) -> list[Sticker]:

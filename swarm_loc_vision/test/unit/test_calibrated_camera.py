@@ -58,8 +58,7 @@ def detections(roi: tuple[int, int, int, int], binning: tuple[int, int]) -> Dete
 
 
 WHOLE = (0, 0, 0, 0)
-PART = (303, 93, 951, 801)
-"""With odd numbers, so that binning leaves a column and a row over."""
+PART = (303, 93, 951, 801)  # With odd numbers, so that binning leaves a column and a row over
 
 
 @pytest.mark.parametrize("roi", [WHOLE, PART])

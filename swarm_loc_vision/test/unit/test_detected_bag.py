@@ -26,8 +26,7 @@ DESCRIPTION = BAG / "self_calibrating.yaml"
 SWARM = load_swarm(DESCRIPTION)
 BEGINNING_S = 2.5
 GAP_NS = 200_000_000
-TO_EDGE = 0.47
-"""Of the image, in focal lengths, less what hidden errors of the world may shift a marker by."""
+TO_EDGE = 0.47  # Of the image, in focal lengths, less what hidden errors of the world may shift a marker by
 MAX_OBLIQUE, ROBOT_M = math.radians(60.0), 0.08
 CAMERA_INFO, IMAGE = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/CompressedImage"
 Messages = list[tuple[str, str, int, bytes]]

@@ -30,8 +30,7 @@ from swarm_loc_estimator.common.messages.poses import planar_covariance
 from swarm_loc_estimator.common.node import run_node
 
 _FIX_QOS = QoSProfile(depth=10)
-_CLOCK_STEPS = 2
-"""Droplets are slow; many drivers hear the clock."""
+_CLOCK_STEPS = 2  # Droplets are slow; many drivers hear the clock
 
 
 class DropletWorldNode(WorldNode[DropletWorldParameters]):

@@ -64,8 +64,7 @@ class DropletBody(Protocol):
 
 
 _BUFFER = 64
-_RECEIVE_QUEUE = 2
-"""Characters that the serial port keeps while nobody fetches them."""
+_RECEIVE_QUEUE = 2  # Characters that the serial port keeps while nobody fetches them
 _BUSY_SENDING = 2
 _BUSY_EXCHANGING = 4
 _PROCESSING = 1 << 6

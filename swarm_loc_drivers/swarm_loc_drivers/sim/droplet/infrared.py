@@ -18,29 +18,18 @@ from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
 
 
 class InfraredCommand(NamedTuple):
-    """A command received by infrared.
+    """A command received by infrared."""
 
-    Attributes:
-        line: The command.
-        end_ns: Arrival time of its last byte.
-    """
-
-    line: str
-    end_ns: int
+    line: str  # The command
+    end_ns: int  # Arrival time of its last byte
 
 
 class ExchangeReadings(NamedTuple):
-    """An exchange in which this robot measured.
+    """An exchange in which this robot measured."""
 
-    Attributes:
-        emitter: Id of the robot that emitted.
-        readings: (n, n) emitters by sensors, baseline taken off [count].
-        end_ns: End of the exchange.
-    """
-
-    emitter: int
-    readings: NDArray[np.int64]
-    end_ns: int
+    emitter: int  # Id of the robot that emitted
+    readings: NDArray[np.int64]  # (n, n) emitters by sensors, baseline taken off [count]
+    end_ns: int  # End of the exchange
 
 
 def overlap(one: InfraredMessage | Exchange, other: InfraredMessage | Exchange) -> bool:
@@ -50,23 +39,14 @@ def overlap(one: InfraredMessage | Exchange, other: InfraredMessage | Exchange) 
 
 @dataclass
 class InfraredMessage:
-    """An infrared message in transit.
+    """An infrared message in transit."""
 
-    Attributes:
-        sender: Index of the robot.
-        begin_ns: Start of the transmission.
-        end_ns: End of the transmission.
-        hearers: Indices of the robots in range at its start.
-        line: The command; "" for the call that starts an exchange.
-        target: Id of the receiver; 0: all.
-    """
-
-    sender: int
-    begin_ns: int
-    end_ns: int
-    hearers: NDArray[np.int64]
-    line: str = ""
-    target: int = 0
+    sender: int  # Index of the robot
+    begin_ns: int  # Start of the transmission
+    end_ns: int  # End of the transmission
+    hearers: NDArray[np.int64]  # Indices of the robots in range at its start
+    line: str = ""  # The command; "" for the call that starts an exchange
+    target: int = 0  # Id of the receiver; 0: all
     done: bool = False
 
     def reaches(self, robot: int) -> bool:
@@ -76,25 +56,17 @@ class InfraredMessage:
 
 @dataclass
 class Exchange:
-    """An exchange.
+    """An exchange."""
 
-    Attributes:
-        emitter: Index of the robot.
-        begin_ns: Start of the call.
-        power: Power of the emitters.
-        receivers: (k,) indices of the robots that received the call.
-        readings: (k, n, n) emitters by sensors, measured so far.
-        flashes: Number of flashes.
-        done: Whether its readings have been delivered.
-    """
-
-    emitter: int
-    begin_ns: int
-    power: int
+    emitter: int  # Index of the robot
+    begin_ns: int  # Start of the call
+    power: int  # Power of the emitters
+    # (k,) indices of the robots that received the call
     receivers: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    # (k, n, n) emitters by sensors, measured so far
     readings: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0, 0), dtype=np.int64))
-    flashes: int = 0
-    done: bool = False
+    flashes: int = 0  # Number of flashes
+    done: bool = False  # Whether its readings have been delivered
 
     @property
     def end_ns(self) -> int:
@@ -188,19 +160,12 @@ _RECEIVING, _TRANSMITTING, _TIMED, _BLOCKED = 1, 2, 4, 8
 
 @dataclass(frozen=True)
 class InfraredSettings:
-    """Losses and ambient light of infrared; messages do not disturb measurements.
+    """Losses and ambient light of infrared; messages do not disturb measurements."""
 
-    Attributes:
-        reach: Maximum range of messages [m].
-        loss: Probability that a robot in range loses a message, independent per robot.
-        ambient: Maximum ambient light [count].
-        ambient_walk: Standard deviation of the change of ambient light in one second [count].
-    """
-
-    reach: float
-    loss: float
-    ambient: float
-    ambient_walk: float
+    reach: float  # Maximum range of messages [m]
+    loss: float  # Probability that a robot in range loses a message, independent per robot
+    ambient: float  # Maximum ambient light [count]
+    ambient_walk: float  # Standard deviation of the change of ambient light in one second [count]
 
 
 class DropletInfrared:

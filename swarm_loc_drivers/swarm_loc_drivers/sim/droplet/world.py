@@ -32,17 +32,11 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 @dataclass(frozen=True)
 class Fix:
-    """A pose measured by the tracker.
+    """A pose measured by the tracker."""
 
-    Attributes:
-        robot: Its index.
-        stamp_ns: When.
-        pose: (3,) in map, with noise.
-    """
-
-    robot: int
-    stamp_ns: int
-    pose: FloatArray
+    robot: int  # Its index
+    stamp_ns: int  # When
+    pose: FloatArray  # (3,) in map, with noise
 
 
 class Tracker:
@@ -77,41 +71,27 @@ class Tracker:
 
 
 STEP_NS = 5_000_000
-NEAR_POWER = 40
-"""Of the emitters, at which the board's near model holds."""
+NEAR_POWER = 40  # Of the emitters, at which the board's near model holds
 _WALK_TRIMS, _TURN_TRIMS = (0, 5, -5), (5, 5, 5)
-_WALK_MM, _TURN_DEG = 300, 1200
-"""Per 1000 steps: 2.4 mm/s and 6.4 deg/s, as real Droplets were logged."""
-_MOTION, _GAINS, _INFRARED = range(3)
-"""Streams of random numbers."""
+_WALK_MM, _TURN_DEG = 300, 1200  # Per 1000 steps: 2.4 mm/s and 6.4 deg/s, as real Droplets were logged
+_MOTION, _GAINS, _INFRARED = range(3)  # Streams of random numbers
 
 
 @dataclass(frozen=True)
 class DropletErrors:
-    """Errors of Droplets; all sigmas are one standard deviation.
+    """Errors of Droplets; all sigmas are one standard deviation."""
 
-    Attributes:
-        scale_sigma: Of each robot's and each direction's steps, relative.
-        veer_sigma: Of each robot's and each direction's turn per metre walked [rad/m].
-        walk_noise: Variance along and across of a walk per metre [m^2/m].
-        veer_noise: Variance of the heading per metre walked [rad^2/m].
-        turn_noise: Variance of a turn per radian [rad^2/rad].
-        gain_sigma: Of each sensor and each emitter, relative.
-        infrared: Losses and ambient light of infrared.
-    """
-
-    scale_sigma: float
-    veer_sigma: float
-    walk_noise: float
-    veer_noise: float
-    turn_noise: float
-    gain_sigma: float
-    infrared: InfraredSettings
+    scale_sigma: float  # Of each robot's and each direction's steps, relative
+    veer_sigma: float  # Of each robot's and each direction's turn per metre walked [rad/m]
+    walk_noise: float  # Variance along and across of a walk per metre [m^2/m]
+    veer_noise: float  # Variance of the heading per metre walked [rad^2/m]
+    turn_noise: float  # Variance of a turn per radian [rad^2/rad]
+    gain_sigma: float  # Of each sensor and each emitter, relative
+    infrared: InfraredSettings  # Losses and ambient light of infrared
 
 
 _LINK = InfraredSettings(reach=0.30, loss=0.05, ambient=6.0, ambient_walk=0.1)
-D0 = DropletErrors(0.0, 0.0, 1e-4, 0.02, 1e-3, 0.0, _LINK)
-"""White noise only."""
+D0 = DropletErrors(0.0, 0.0, 1e-4, 0.02, 1e-3, 0.0, _LINK)  # White noise only
 D1 = DropletErrors(0.08, 0.5, 1e-4, 0.02, 1e-3, 0.1, _LINK)
 """Robots that are not calibrated: steps of their own length, a drift to one side, elements of their own."""
 DROPLET_WORLDS = {"d0": D0, "d1": D1}
@@ -119,21 +99,13 @@ DROPLET_WORLDS = {"d0": D0, "d1": D1}
 
 @dataclass(frozen=True)
 class DropletWorldSettings:
-    """Settings of a world.
+    """Settings of a world."""
 
-    Attributes:
-        seed: Seed of systematic errors and noise.
-        errors: Error model.
-        platform: The infrared board of all robots.
-        start_ns: Start time.
-        boards: Seed of the gains of the elements, instead of `seed`.
-    """
-
-    seed: int
-    errors: DropletErrors
-    platform: IrPlatform
-    start_ns: int
-    boards: int | None = None
+    seed: int  # Seed of systematic errors and noise
+    errors: DropletErrors  # Error model
+    platform: IrPlatform  # The infrared board of all robots
+    start_ns: int  # Start time
+    boards: int | None = None  # Seed of the gains of the elements, instead of `seed`
 
 
 class DropletWorld:

@@ -44,8 +44,7 @@ from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import AnonymousDetectionArray, MarkerDetectionArray
 
-_CAMERA_QOS = QoSProfile(depth=5)
-"""Reliable, so that subscribers can choose: each image, or best effort."""
+_CAMERA_QOS = QoSProfile(depth=5)  # Reliable, so that subscribers can choose: each image, or best effort
 
 
 class CameraOutput:
@@ -85,8 +84,7 @@ class CameraOutput:
         return True
 
 
-_AERIAL = "aerial"
-"""Namespace of the overhead camera."""
+_AERIAL = "aerial"  # Namespace of the overhead camera
 _ANSWER_QOS = QoSProfile(depth=100)
 _ANSWER_PATIENCE_S = 10.0
 _THROTTLE_S = 30.0

@@ -54,8 +54,7 @@ class EpuckBody(Protocol):
 
 CAMERA_WIDTH, CAMERA_HEIGHT = 640, 480
 
-GRAVITY_EPUCK2 = 768
-"""One g in its raw accelerations."""
+GRAVITY_EPUCK2 = 768  # One g in its raw accelerations
 _AMBIENT = 3600
 _TOF_MM = 2000
 _BATTERY = 3200

@@ -13,10 +13,8 @@ from swarm_loc_drivers.epuck import wifi_protocol as wifi
 from swarm_loc_drivers.epuck.hardware import EPUCK2, as_counter, encode_rgb565
 from swarm_loc_drivers.sim.epuck.parts import EpuckBody, Motors, camera_image, sensor_values
 
-DELAY_NS = 10_000_000
-"""After reading a command, and after sending a message."""
-IMAGE_NS = 70_000_000
-"""Fetching an image from the other chip, and sending it."""
+DELAY_NS = 10_000_000  # After reading a command, and after sending a message
+IMAGE_NS = 70_000_000  # Fetching an image from the other chip, and sending it
 FAILED_EXCHANGE_NS = 1_071_000_000
 """How long an exchange between the two chips that fails takes, with the pause after it."""
 

@@ -37,56 +37,36 @@ GrayImage = NDArray[np.uint8]
 STEP_NS = 5_000_000
 OVERHEAD = -1
 """In place of a robot: the overhead camera, which stamps its images with the middle of the exposure."""
-_SLIP_S = 0.05
-"""How long a slip of a wheel lasts: 3 mm of its way at 0.06 m/s."""
-_KEPT_NS = 400_000_000
-"""An image can be drawn for this time after its camera has taken the next one."""
+_SLIP_S = 0.05  # How long a slip of a wheel lasts: 3 mm of its way at 0.06 m/s
+_KEPT_NS = 400_000_000  # An image can be drawn for this time after its camera has taken the next one
 _PHASES, _EXPOSURES, _SENSOR, _PROXIMITY, _OVERHEAD_SENSOR = range(5)
 """Streams of random numbers, each a function of the seed, the stream, and what it is for."""
 
 
 @dataclass(frozen=True)
 class EpuckWorldSettings:
-    """Settings of a world.
+    """Settings of a world."""
 
-    Attributes:
-        seed: Fixes its systematic errors and its noise.
-        errors: Which errors there are; those of sightings themselves (noise, flips) are up to the images.
-        arena: Arena around the robots.
-        camera: Of all robots, as calibrated.
-        wheels: Of all robots.
-        camera_rate_hz: [1/s].
-        start_ns: First moment.
-        overhead: A camera above all, and the light.
-        floor_markers: Fiducials on the floor, which that camera sees.
-    """
-
-    seed: int
+    seed: int  # Fixes its systematic errors and its noise
+    # Which errors there are; those of sightings themselves (noise, flips) are up to the images
     errors: ErrorModel
-    arena: Arena
-    camera: CameraModel
-    wheels: WheelGeometry
-    camera_rate_hz: float
-    start_ns: int
-    overhead: OverheadSettings = field(default_factory=OverheadSettings)
-    floor_markers: tuple[FloorMarker, ...] = ()
+    arena: Arena  # Arena around the robots
+    camera: CameraModel  # Of all robots, as calibrated
+    wheels: WheelGeometry  # Of all robots
+    camera_rate_hz: float  # [1/s]
+    start_ns: int  # First moment
+    overhead: OverheadSettings = field(default_factory=OverheadSettings)  # A camera above all, and the light
+    floor_markers: tuple[FloorMarker, ...] = ()  # Fiducials on the floor, which that camera sees
 
 
 @dataclass(frozen=True)
 class Exposure:
-    """An image that a camera has taken.
+    """An image that a camera has taken."""
 
-    Attributes:
-        robot: Index of the robot, or OVERHEAD.
-        number: Counts the robot's images.
-        stamp_ns: When its camera says it was taken.
-        middle_ns: When it was taken: the middle of the exposure.
-    """
-
-    robot: int
-    number: int
-    stamp_ns: int
-    middle_ns: int
+    robot: int  # Index of the robot, or OVERHEAD
+    number: int  # Counts the robot's images
+    stamp_ns: int  # When its camera says it was taken
+    middle_ns: int  # When it was taken: the middle of the exposure
 
 
 class EpuckWorld:

@@ -62,8 +62,7 @@ BIAS_SETS = (
     (1067, 12316, 16777215, 5579731, 60, 427594, 0, 16777215, 567391, 19187, 39, 4),
 )
 """Bias currents of the camera by their numbers, in the sets of `!BD`; a board starts with the last one."""
-RELEASED = 2014, 10, 9, 16, 49, 39
-"""When version 0.7.1 was built, where its calendar clock begins."""
+RELEASED = 2014, 10, 9, 16, 49, 39  # When version 0.7.1 was built, where its calendar clock begins
 
 
 class Board:

@@ -11,8 +11,7 @@ from swarm_loc_drivers.sim.pushbot.motor import int32
 
 _MAX_LINE = 128
 _ALL_SENSORS = 0xFFFFFFFF
-_DATE_LENGTH = 22
-"""Of a command that sets the date: one character more than the date takes."""
+_DATE_LENGTH = 22  # Of a command that sets the date: one character more than the date takes
 _MAX_ANALOG = 1023
 
 

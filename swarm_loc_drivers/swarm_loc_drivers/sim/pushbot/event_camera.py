@@ -20,24 +20,17 @@ from swarm_loc_estimator.common.parameters import number
 
 
 class Blinking(NamedTuple):
-    """A light that is lit in the first part of each period; with a period of 0 it is dark.
+    """A light that is lit in the first part of each period; with a period of 0 it is dark."""
 
-    Attributes:
-        period_us: [us].
-        lit_us: [us].
-    """
-
-    period_us: int = 0
-    lit_us: int = 0
+    period_us: int = 0  # [us]
+    lit_us: int = 0  # [us]
 
 
-_REACH_PX = 4
-"""Half width of the window in which a spot is computed [px]."""
+_REACH_PX = 4  # Half width of the window in which a spot is computed [px]
 _WINDOW = np.arange(-_REACH_PX, _REACH_PX + 1)
 _MAX_BURST = 6
 _LATENCY_US = 20.0
-_DIM_LATENCY_US = 60.0
-"""Of a pixel that is as bright as its surroundings; brighter ones are faster."""
+_DIM_LATENCY_US = 60.0  # Of a pixel that is as bright as its surroundings; brighter ones are faster
 _US = 1e-6
 
 _Raw = tuple[IntArray, IntArray, IntArray, FloatArray]
@@ -61,19 +54,12 @@ class CameraNoise:
 
 
 class Spot(NamedTuple):
-    """The image of a light during a step.
+    """The image of a light during a step."""
 
-    Attributes:
-        begin: Column and row at the begin of the step [px].
-        end: Column and row at the end of the step [px].
-        amplitude: Its brightness in the middle over that of the surroundings [1].
-        blinking: How it blinks; periods begin at whole multiples since the world's time zero.
-    """
-
-    begin: tuple[float, float]
-    end: tuple[float, float]
-    amplitude: float
-    blinking: Blinking
+    begin: tuple[float, float]  # Column and row at the begin of the step [px]
+    end: tuple[float, float]  # Column and row at the end of the step [px]
+    amplitude: float  # Its brightness in the middle over that of the surroundings [1]
+    blinking: Blinking  # How it blinks; periods begin at whole multiples since the world's time zero
 
 
 class CameraEvents(NamedTuple):

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-RING = 4092
-"""Events that wait; with four places left the oldest is dropped."""
+RING = 4092  # Events that wait; with four places left the oldest is dropped
 _DELTA_LIMITS = (0x7F, 0x3FFF, 0x1FFFFF)
 
 

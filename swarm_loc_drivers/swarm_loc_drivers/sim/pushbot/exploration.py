@@ -20,16 +20,12 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
 
-PERIOD_S = 0.02
-"""Between two reports of the event tracker."""
-TURN_RATE, SPEED = 1.0, 0.2
-"""[rad/s], [m/s]."""
+PERIOD_S = 0.02  # Between two reports of the event tracker
+TURN_RATE, SPEED = 1.0, 0.2  # [rad/s], [m/s]
 BODY_RADIUS = 0.06
-FOCAL_BASELINE = 90.0 * 0.07
-"""Focal length times distance of laser and lens [px m]."""
+FOCAL_BASELINE = 90.0 * 0.07  # Focal length times distance of laser and lens [px m]
 _MAX_PX = 40.0
-_NEAREST, _FARTHEST = 0.10, 2.5
-"""Minimum and maximum distance of a reflection [m]."""
+_NEAREST, _FARTHEST = 0.10, 2.5  # Minimum and maximum distance of a reflection [m]
 _LED_RADIUS = 0.045
 _LED_RANGE = 3.0
 _HALF_FIELD = math.radians(35.0)
@@ -37,27 +33,16 @@ _HALF_FIELD = math.radians(35.0)
 
 @dataclass(frozen=True)
 class PushBotNoise:
-    """Imperfections; standard deviations.
+    """Imperfections; standard deviations."""
 
-    Attributes:
-        slip: Share of every turn that is lost.
-        turn: Of a turn, per square root of a full turn [rad].
-        distance: Of a drive, per path.
-        heading: While driving, per square root of a metre [rad].
-        pixel: Of the tracked row of the laser spot [px].
-        dropout: Share of readings without reflection.
-        outlier: Share of readings that are outliers.
-        bearing: Of the bearing of a light [rad].
-    """
-
-    slip: float = 0.0
-    turn: float = math.radians(0.64)
-    distance: float = 0.015
-    heading: float = math.radians(0.3)
-    pixel: float = 0.1
-    dropout: float = 0.01
-    outlier: float = 0.003
-    bearing: float = math.radians(1.0)
+    slip: float = 0.0  # Share of every turn that is lost
+    turn: float = math.radians(0.64)  # Of a turn, per square root of a full turn [rad]
+    distance: float = 0.015  # Of a drive, per path
+    heading: float = math.radians(0.3)  # While driving, per square root of a metre [rad]
+    pixel: float = 0.1  # Of the tracked row of the laser spot [px]
+    dropout: float = 0.01  # Share of readings without reflection
+    outlier: float = 0.003  # Share of readings that are outliers
+    bearing: float = math.radians(1.0)  # Of the bearing of a light [rad]
 
 
 class KinematicPushBot:
@@ -274,49 +259,31 @@ class Mapper(Protocol):
 
 @dataclass(frozen=True)
 class Arrival:
-    """One stop of a robot.
+    """One stop of a robot."""
 
-    Attributes:
-        robot: Its number.
-        time_s: End of its scan [s].
-        truth: (3,) true pose then.
-        online: (3,) the mapper's estimate then.
-        count: Number of earlier arrivals of all robots.
-    """
-
-    robot: int
-    time_s: float
-    truth: FloatArray
-    online: FloatArray
-    count: int
+    robot: int  # Its number
+    time_s: float  # End of its scan [s]
+    truth: FloatArray  # (3,) true pose then
+    online: FloatArray  # (3,) the mapper's estimate then
+    count: int  # Number of earlier arrivals of all robots
 
 
 @dataclass
 class Exploration:
-    """Robots that explore a floor plan with one mapper.
+    """Robots that explore a floor plan with one mapper."""
 
-    Attributes:
-        plan: The hall.
-        mapper: Makes the map.
-        rng: Source of all noise.
-        use_lights: Whether the mapper gets sightings of lights.
-        robots: Those that have joined, by number.
-        arrivals: All stops so far.
-        cpu_s: CPU time of the mapper [s].
-        starts: By robot, the start pose (3,) that the mapper was given.
-        on_readings: Called with the number and readings of a robot.
-        on_lights: Called with the number and light sightings of a robot.
-    """
-
-    plan: FloorPlan
-    mapper: Mapper
-    rng: np.random.Generator
-    use_lights: bool = True
-    robots: dict[int, KinematicPushBot] = field(default_factory=dict)
-    arrivals: list[Arrival] = field(default_factory=list)
-    cpu_s: float = 0.0
+    plan: FloorPlan  # The hall
+    mapper: Mapper  # Makes the map
+    rng: np.random.Generator  # Source of all noise
+    use_lights: bool = True  # Whether the mapper gets sightings of lights
+    robots: dict[int, KinematicPushBot] = field(default_factory=dict)  # Those that have joined, by number
+    arrivals: list[Arrival] = field(default_factory=list)  # All stops so far
+    cpu_s: float = 0.0  # CPU time of the mapper [s]
+    # By robot, the start pose (3,) that the mapper was given
     starts: dict[int, FloatArray] = field(default_factory=dict)
+    # Called with the number and readings of a robot
     on_readings: Callable[[int, Readings], None] | None = None
+    # Called with the number and light sightings of a robot
     on_lights: Callable[[int, LightSightings], None] | None = None
     _odometry: dict[int, FloatArray] = field(default_factory=dict)
     _unlooked_ns: dict[int, IntArray] = field(default_factory=dict)

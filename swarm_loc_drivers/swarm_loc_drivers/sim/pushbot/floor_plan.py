@@ -21,15 +21,13 @@ from swarm_loc_estimator.common.parameters import NumberSpec, UserError
 from swarm_loc_estimator.common.yaml_tree import Tree, read_file, read_tree
 from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 
-Rectangle = tuple[float, float, float, float]
-"""Left, lower, right and upper edge [m]."""
+Rectangle = tuple[float, float, float, float]  # Left, lower, right and upper edge [m]
 _SUFFIXES = (".yaml", ".yml", ".json")
 _KEYS = ("about", "free", "solid", "polygons", "columns", "segments", "starts")
 _RESOLUTION = NumberSpec("m", 0.001, 10.0, False, "side of a pixel")
 _THRESHOLD = NumberSpec("1", 0.0, 1.0, False, "darker pixels are occupied")
 _MAX_IMAGE_BYTES = 50_000_000
-_MAX_WALLS, _MAX_RECTANGLES = 2000, 200
-"""Each step of a world compares every corner with every wall."""
+_MAX_WALLS, _MAX_RECTANGLES = 2000, 200  # Each step of a world compares every corner with every wall
 
 
 class FloorPlanError(UserError):
@@ -38,17 +36,11 @@ class FloorPlanError(UserError):
 
 @dataclass(frozen=True)
 class FloorPlan:
-    """A hall seen from above.
+    """A hall seen from above."""
 
-    Attributes:
-        name: Of the plan.
-        walls: (S, 4) segments x0, y0, x1, y1 [m].
-        starts: (R, 2) where the first robots may start [m].
-    """
-
-    name: str
-    walls: FloatArray
-    starts: FloatArray
+    name: str  # Of the plan
+    walls: FloatArray  # (S, 4) segments x0, y0, x1, y1 [m]
+    starts: FloatArray  # (R, 2) where the first robots may start [m]
 
 
 def outline(free: Sequence[Rectangle], solid: Sequence[Rectangle]) -> FloatArray:

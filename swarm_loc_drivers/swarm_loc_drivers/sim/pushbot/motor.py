@@ -9,8 +9,7 @@ from enum import Enum
 
 from swarm_loc_drivers.pushbot.hardware import MAX_VELOCITY
 
-COUNTS_PER_US = 192
-"""The motors' timer runs at 192 MHz."""
+COUNTS_PER_US = 192  # The motors' timer runs at 192 MHz
 _BOOT_PERIOD = 50 * COUNTS_PER_US
 _BOOT_GAINS = 80, 0, 0
 _BOOT_WINDUP = _BOOT_PERIOD // _BOOT_GAINS[0] * 20

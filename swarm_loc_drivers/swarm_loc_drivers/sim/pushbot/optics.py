@@ -18,40 +18,29 @@ from swarm_loc_drivers.sim.pushbot.floor_plan import is_visible, ray_distance
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 
-FOCAL_PX = 90.0
-"""3.6 mm over pixels of 40 um: 70.8 degrees."""
+FOCAL_PX = 90.0  # 3.6 mm over pixels of 40 um: 70.8 degrees
 CENTRE_PX = 63.5
-CAMERA_X_M = 0.04
-"""The camera before base_link."""
+CAMERA_X_M = 0.04  # The camera before base_link
 _LED_X_M = 0.04
 _LED_ABOVE_CAMERA_M = 0.03
-_BASE_ROW_M, _BASE_COLUMN_M = 0.07, 0.02
-"""From the laser pointer to the camera."""
+_BASE_ROW_M, _BASE_COLUMN_M = 0.07, 0.02  # From the laser pointer to the camera
 _LED_FIELD = math.radians(80.0)
 _HALF_FIELD = math.radians(37.0)
-_SPOT_BRIGHTNESS, _LED_BRIGHTNESS = 12.0, 20.0
-"""At a metre, over that of the surroundings."""
+_SPOT_BRIGHTNESS, _LED_BRIGHTNESS = 12.0, 20.0  # At a metre, over that of the surroundings
 _MAX_BRIGHTNESS = 60.0
 _LASER_PERIODS_US = (2430, 2330, 2230, 2130, 1880, 1820, 1760, 1700, 2500, 1640)
 _LED_PERIODS_US = (1000, 900, 1100, 800, 1200, 1300, 700, 1400, 1500, 1600)
 """Each robot of a hall has its own; trackers tell apart LEDs whose periods differ by a tenth of a ms."""
-MAX_ROBOTS = len(_LED_PERIODS_US)
-"""Of one hall."""
+MAX_ROBOTS = len(_LED_PERIODS_US)  # Of one hall
 
 
 @dataclass(frozen=True)
 class LaserOptics:
-    """The laser and camera of one robot as assembled.
+    """The laser and camera of one robot as assembled."""
 
-    Attributes:
-        row: p_inf [px] and f b [px m] of the spot's row.
-        column: The same of its column.
-        sensor: Seed of what the pixels of its event camera are like.
-    """
-
-    row: tuple[float, float]
-    column: tuple[float, float]
-    sensor: int
+    row: tuple[float, float]  # p_inf [px] and f b [px m] of the spot's row
+    column: tuple[float, float]  # The same of its column
+    sensor: int  # Seed of what the pixels of its event camera are like
 
     def spot(self, distance: float) -> tuple[float, float]:
         """Column and row [px] of the spot on what is so far from the camera [m]."""
@@ -133,15 +122,12 @@ def led_pixel(observer: FloatArray, pose: FloatArray, *, front: bool) -> tuple[f
 
 
 BODY_RADIUS_M = 0.07
-_MAX_SPOT_M = 5.0
-"""The laser is invisible beyond this distance."""
+_MAX_SPOT_M = 5.0  # The laser is invisible beyond this distance
 _BEFORE_WALL = 1e-3
 """Corners are part of walls: visibility is tested at a point moved by this share towards the camera."""
-_CONTRAST = 0.6
-"""Share of the pixels along an upright edge that notice it."""
+_CONTRAST = 0.6  # Share of the pixels along an upright edge that notice it
 
-Lights = tuple[Blinking, Blinking, Blinking]
-"""Laser, rear and front LED of a robot."""
+Lights = tuple[Blinking, Blinking, Blinking]  # Laser, rear and front LED of a robot
 
 
 class HallSight:

@@ -29,23 +29,14 @@ _START_SIGMA = 0.005
 
 @dataclass(frozen=True)
 class WallDriveSettings:
-    """A drive towards a wall, and its errors.
+    """A drive towards a wall, and its errors."""
 
-    Attributes:
-        start: From base_link to the wall at the begin [m].
-        stop: From base_link to the wall at the end [m].
-        speed: [m/s].
-        start_sigma: Of the tape at the start [m].
-        wheel_noise: Variance of the path per metre [m^2/m].
-        noise_rate: Noise events of a pixel [1/s].
-    """
-
-    start: float = 2.55
-    stop: float = 0.15
-    speed: float = 0.1
-    start_sigma: float = 0.003
-    wheel_noise: float = 1e-6
-    noise_rate: float = 5.0
+    start: float = 2.55  # From base_link to the wall at the begin [m]
+    stop: float = 0.15  # From base_link to the wall at the end [m]
+    speed: float = 0.1  # [m/s]
+    start_sigma: float = 0.003  # Of the tape at the start [m]
+    wheel_noise: float = 1e-6  # Variance of the path per metre [m^2/m]
+    noise_rate: float = 5.0  # Noise events of a pixel [1/s]
 
 
 def drive_at_wall(

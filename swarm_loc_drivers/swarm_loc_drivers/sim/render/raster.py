@@ -20,22 +20,15 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.common.camera import CX, CY, FX, FY, LENS_KIND, LENS_SIZE, STRAIGHT, distorted
 
 Image = NDArray[np.float32]
-Changes = NDArray[np.float32]
-"""(height, width + 2): changes along each row of an image (height, width)."""
+Changes = NDArray[np.float32]  # (height, width + 2): changes along each row of an image (height, width)
 
 
 class Layer(NamedTuple):
-    """Changes of brightness and opacity of an object.
+    """Changes of brightness and opacity of an object."""
 
-    Attributes:
-        changes: Changes of the brightness.
-        covers: Changes of the opacity.
-        box: (4,) left, top, right and bottom [px] of it.
-    """
-
-    changes: Changes
-    covers: Changes
-    box: FloatArray
+    changes: Changes  # Changes of the brightness
+    covers: Changes  # Changes of the opacity
+    box: FloatArray  # (4,) left, top, right and bottom [px] of it
 
 
 def empty_box() -> FloatArray:
@@ -195,8 +188,7 @@ def ball_in_view(centre: FloatArray, radius: float, reach: float) -> bool:
     return True
 
 
-REACH = LENS_SIZE
-"""Behind the constants of a lens, the radius at distance 1 up to which they hold."""
+REACH = LENS_SIZE  # Behind the constants of a lens, the radius at distance 1 up to which they hold
 
 _CHORD_PX = 4.0  # in 1280 columns, 60 degrees and a distortion of -0.3 it leaves its arc by 0.004 px at most
 
@@ -205,25 +197,15 @@ Motion = tuple[FloatArray, FloatArray]
 
 
 class Patches(NamedTuple):
-    """Flat patches, grouped into surfaces that are seen from one side only.
+    """Flat patches, grouped into surfaces that are seen from one side only."""
 
-    Attributes:
-        corners: (Q, 4, 3) [m], clockwise as seen from the front.
-        change: (Q,) brightness minus that of the patch it lies on [1].
-        cover: (Q,) 1 where it hides what is behind, 0 where the patch it lies on does so already.
-        first: (S + 1,) surface s has the patches first[s] to first[s + 1].
-        centre: (S, 3) of each surface [m].
-        radius: (S,) around it [m].
-        normal: (S, 3) unit vector out of its front.
-    """
-
-    corners: FloatArray
-    change: FloatArray
-    cover: FloatArray
-    first: IntArray
-    centre: FloatArray
-    radius: FloatArray
-    normal: FloatArray
+    corners: FloatArray  # (Q, 4, 3) [m], clockwise as seen from the front
+    change: FloatArray  # (Q,) brightness minus that of the patch it lies on [1]
+    cover: FloatArray  # (Q,) 1 where it hides what is behind, 0 where the patch it lies on does so already
+    first: IntArray  # (S + 1,) surface s has the patches first[s] to first[s + 1]
+    centre: FloatArray  # (S, 3) of each surface [m]
+    radius: FloatArray  # (S,) around it [m]
+    normal: FloatArray  # (S, 3) unit vector out of its front
 
 
 @cached_njit

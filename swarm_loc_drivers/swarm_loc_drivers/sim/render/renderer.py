@@ -39,8 +39,7 @@ _CLOSEST = 0.03
 _ONE_WAY = ((0.0, 1.0),)
 _NARROW_WAYS = ((-0.5, 0.25), (0.0, 0.5), (0.5, 0.25))
 """Shift to the right and down [px], and share of the light, for a blur that is narrow against pixels."""
-_NARROW_VARIANCE, _WIDE_VARIANCE = 0.125, 0.64
-"""Of these ways, and from which pixels are fine enough [px^2]."""
+_NARROW_VARIANCE, _WIDE_VARIANCE = 0.125, 0.64  # Of these ways, and from which pixels are fine enough [px^2]
 _NOISE_LENGTH = 1 << 20
 
 
@@ -50,38 +49,24 @@ PosesAt = Callable[[NDArray[np.int64]], FloatArray]
 
 @dataclass(frozen=True)
 class Scene:
-    """Everything that cameras see.
+    """Everything that cameras see."""
 
-    Attributes:
-        backdrop: Behind everything, in map.
-        boards: Free-standing boards, in map.
-        robots: Of each robot its parts in its base_link, such that no part hides a later one.
-        flat: Number of first robots that are flat on the floor, as shadows are, and hide nothing.
-    """
-
-    backdrop: Patches
-    boards: Sequence[Patches]
+    backdrop: Patches  # Behind everything, in map
+    boards: Sequence[Patches]  # Free-standing boards, in map
+    # Of each robot its parts in its base_link, such that no part hides a later one
     robots: Sequence[Sequence[Patches]]
-    flat: int = 0
+    flat: int = 0  # Number of first robots that are flat on the floor, as shadows are, and hide nothing
 
 
 @dataclass
 class RobotCamera:
-    """One robot's camera as it truly is.
+    """One robot's camera as it truly is."""
 
-    Attributes:
-        robot: Index of its robot, whose own body is not seen.
-        model: As calibrated.
-        mount: In base_link.
-        focal_scale: True focal length per calibrated one.
-        lens: Constants of `raster.project`.
-    """
-
-    robot: int
-    model: CameraModel
-    mount: CameraMount
-    focal_scale: float = 1.0
-    lens: FloatArray = field(init=False)
+    robot: int  # Index of its robot, whose own body is not seen
+    model: CameraModel  # As calibrated
+    mount: CameraMount  # In base_link
+    focal_scale: float = 1.0  # True focal length per calibrated one
+    lens: FloatArray = field(init=False)  # Constants of `raster.project`
 
     def __post_init__(self) -> None:
         self.lens = self.model.lens(self.focal_scale)

@@ -24,15 +24,10 @@ from swarm_loc_vision.markers.families import Family
 
 @dataclass(frozen=True)
 class Arena:
-    """Arena around the robots.
+    """Arena around the robots."""
 
-    Attributes:
-        size: Size along x and y, around map's origin [m].
-        family: Kind of the markers.
-    """
-
-    size: tuple[float, float]
-    family: Family
+    size: tuple[float, float]  # Size along x and y, around map's origin [m]
+    family: Family  # Kind of the markers
 
 
 class CameraRig:
@@ -146,13 +141,9 @@ class OverheadSettings:
 
 @dataclass(frozen=True)
 class OverheadModel(CameraModel):
-    """A camera with uneven light in its image.
+    """A camera with uneven light in its image."""
 
-    Attributes:
-        light: At the right rim over that at the left.
-    """
-
-    light: float = 1.0
+    light: float = 1.0  # At the right rim over that at the left
 
     def electrons(self) -> NDArray[np.float32]:
         """What white leaves in each pixel (height, width) during the exposure."""

@@ -17,16 +17,14 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.aerial.pattern import MARK_RADIUS
 
 BLACK, WHITE = 0.05, 0.85
-ROOM = 0.30
-"""Brightness above the walls."""
+ROOM = 0.30  # Brightness above the walls
 
 _FLOOR, _TILE, _TILE_SPREAD = 0.45, 0.2, 0.02
 _WALLS, _WALL_HEIGHT = (0.58, 0.66, 0.62, 0.70), 0.30
 _CLUTTER_PER_M, _CLUTTER_ABOVE = 4.0, 0.16
 _BODY, _BODY_TOP, _BAND, _TOWER, _TOWER_TOP = 0.28, 0.35, 0.12, 0.20, 0.24
 _BODY_RADIUS, _BODY_HEIGHT, _BODY_SIDES, _BAND_HEIGHTS = 0.035, 0.055, 10, (0.024, 0.030)
-TOP_RADIUS, TOP_HEIGHT = 0.035, 0.105
-"""Of the pattern on a robot's top [m]."""
+TOP_RADIUS, TOP_HEIGHT = 0.035, 0.105  # Of the pattern on a robot's top [m]
 _DISC_SIDES = 32
 _PENUMBRA = (-0.004, 0.0, 0.004)
 _TOWER_RADIUS, _TOWER_HEIGHT, _TOWER_SIDES = 0.036, TOP_HEIGHT, 5

@@ -44,13 +44,10 @@ from swarm_loc_estimator.common.messages.poses import (
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
-FAMILY = 0
-"""MarkerDetection.FAMILY_ARTOOLKIT_BCH."""
+FAMILY = 0  # MarkerDetection.FAMILY_ARTOOLKIT_BCH
 TRUTH_PERIOD_NS = 100_000_000
-SATURATION = 240
-"""As the drivers report it: full scale less the largest ambient light [count]."""
-LOSS = 0.05
-"""Share of brightness matrices and fixes that never arrive."""
+SATURATION = 240  # As the drivers report it: full scale less the largest ambient light [count]
+LOSS = 0.05  # Share of brightness matrices and fixes that never arrive
 COMPRESSED_IMAGE = "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 JPEG_QUALITY = 85

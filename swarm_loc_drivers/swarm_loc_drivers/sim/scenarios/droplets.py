@@ -51,31 +51,20 @@ _FIRST_ID = 0x1001
 _WANDER_RADIUS = 0.03
 _ARRIVED, _TURNED = 0.004, 0.1
 _PATIENCE_NS = 30_000_000_000
-_FAST, _FAST_TURN = 0.02, 0.5
-"""Faster than any Droplet: the direction counts."""
+_FAST, _FAST_TURN = 0.02, 0.5  # Faster than any Droplet: the direction counts
 
 
 @dataclass(frozen=True)
 class DropletRunSettings:
-    """Settings of a run.
+    """Settings of a run."""
 
-    Attributes:
-        seed: Two runs with the same settings are identical.
-        duration_s: [s].
-        robots: How many, on a grid of which no row is much longer than a column.
-        world: Their errors, of `DROPLET_WORLDS`.
-        calibrated: Whether the description has the gains of the elements, to 2 %.
-        start_known: Whether it has the start poses.
-        boards: Seed of the gains of the elements; None: that of the run.
-    """
-
-    seed: int = 1
-    duration_s: float = 90.0
-    robots: int = 20
-    world: str = "d1"
-    calibrated: bool = False
-    start_known: bool = False
-    boards: int | None = None
+    seed: int = 1  # Two runs with the same settings are identical
+    duration_s: float = 90.0  # [s]
+    robots: int = 20  # How many, on a grid of which no row is much longer than a column
+    world: str = "d1"  # Their errors, of `DROPLET_WORLDS`
+    calibrated: bool = False  # Whether the description has the gains of the elements, to 2 %
+    start_known: bool = False  # Whether it has the start poses
+    boards: int | None = None  # Seed of the gains of the elements; None: that of the run
 
 
 def starts(settings: DropletRunSettings) -> FloatArray:
@@ -168,8 +157,7 @@ class Wander:
 
 
 TURN_S = 0.9
-FIXED = (0, -1)
-"""The robots in two opposite corners."""
+FIXED = (0, -1)  # The robots in two opposite corners
 FIX_SIGMA, FIX_HEADING_SIGMA = 0.003, 0.02
 FIX_RATE_HZ = 1.0
 ODOMETRY_NS, CONTROL_NS = 200_000_000, 100_000_000
@@ -180,32 +168,20 @@ _GAINS, _LATENESS = range(2)
 
 @dataclass(frozen=True)
 class PublishedBrightness:
-    """A brightness matrix as it was published.
+    """A brightness matrix as it was published."""
 
-    Attributes:
-        receiver: Index of the robot.
-        published_ns: When.
-        brightness: What.
-    """
-
-    receiver: int
-    published_ns: int
-    brightness: Brightness
+    receiver: int  # Index of the robot
+    published_ns: int  # When
+    brightness: Brightness  # What
 
 
 @dataclass(frozen=True)
 class DropletRun(LivedRun):
-    """A simulated swarm with infrared boards from start to end.
+    """A simulated swarm with infrared boards from start to end."""
 
-    Attributes:
-        matrices: In order of publication.
-        fixes: In order of their stamps.
-        counts: Events of all sessions together.
-    """
-
-    matrices: tuple[PublishedBrightness, ...]
-    fixes: tuple[Fix, ...]
-    counts: Counter[str]
+    matrices: tuple[PublishedBrightness, ...]  # In order of publication
+    fixes: tuple[Fix, ...]  # In order of their stamps
+    counts: Counter[str]  # Events of all sessions together
 
 
 @dataclass

@@ -73,25 +73,16 @@ _CATCH_UP_GAIN = 0.5
 
 @dataclass(frozen=True)
 class EightSettings:
-    """Settings of a run.
+    """Settings of a run."""
 
-    Attributes:
-        seed: Two runs with the same settings are identical.
-        duration_s: [s].
-        robots: How many, evenly spread over the eight; 5 or another odd number never meet in its middle.
-        speed: [m/s].
-        errors: The imperfections.
-        odometry_rate_hz: 20, 25, 40 or 50 are multiples of the simulation's step.
-        start_known: Whether the description has the start poses.
-    """
-
-    seed: int = 1
-    duration_s: float = 54.0
+    seed: int = 1  # Two runs with the same settings are identical
+    duration_s: float = 54.0  # [s]
+    # How many, evenly spread over the eight; 5 or another odd number never meet in its middle
     robots: int = 5
-    speed: float = 0.06
-    errors: ErrorModel = W0
-    odometry_rate_hz: float = 20.0
-    start_known: bool = True
+    speed: float = 0.06  # [m/s]
+    errors: ErrorModel = W0  # The imperfections
+    odometry_rate_hz: float = 20.0  # 20, 25, 40 or 50 are multiples of the simulation's step
+    start_known: bool = True  # Whether the description has the start poses
 
 
 def simulate_eight(settings: EightSettings) -> SimulatedRun:

@@ -22,19 +22,13 @@ FAMILY = "artoolkit_bch_thin"
 
 @dataclass(frozen=True)
 class ImageRun:
-    """A simulated run whose cameras deliver images.
+    """A simulated run whose cameras deliver images."""
 
-    Attributes:
-        run: Swarm, truth and odometry; its frames say which images arrive when, and have no sightings.
-        settings: Settings of the run.
-        camera: Of all robots, as calibrated.
-        hidden: Where cameras and markers truly are.
-    """
-
+    # Swarm, truth and odometry; its frames say which images arrive when, and have no sightings
     run: SimulatedRun
-    settings: EightSettings
-    camera: CameraModel
-    hidden: HiddenGeometry
+    settings: EightSettings  # Settings of the run
+    camera: CameraModel  # Of all robots, as calibrated
+    hidden: HiddenGeometry  # Where cameras and markers truly are
 
     def images(self) -> Iterator[NDArray[np.uint8]]:
         """The images (height, width) in the order of `run.frames`, drawn one by one."""

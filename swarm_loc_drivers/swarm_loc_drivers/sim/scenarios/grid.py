@@ -138,25 +138,17 @@ START_SIGMA = StartSigma(x=0.01, y=0.01, theta=0.02)
 STEP_NS = 10_000_000
 
 _FIRST_LANDMARK_ID = 1_000_000
-_NEAR_FOR_NS = 250_000_000
-"""So long the robots near a wandering one are those at the middle of that time."""
+_NEAR_FOR_NS = 250_000_000  # So long the robots near a wandering one are those at the middle of that time
 
 
 @dataclass(frozen=True)
 class GridSettings:
-    """Settings of a run.
+    """Settings of a run."""
 
-    Attributes:
-        robots: N.
-        seed: Two runs with the same settings are identical.
-        duration_s: [s].
-        shape: Layout and motion.
-    """
-
-    robots: int = 100
-    seed: int = 1
-    duration_s: float = 20.0
-    shape: Shape = Shape.BORDER
+    robots: int = 100  # N
+    seed: int = 1  # Two runs with the same settings are identical
+    duration_s: float = 20.0  # [s]
+    shape: Shape = Shape.BORDER  # Layout and motion
 
 
 def simulate_grid(settings: GridSettings) -> SimulatedRun:

@@ -60,11 +60,9 @@ from swarm_loc_estimator.common.messages.poses import (
 from swarm_loc_estimator.swarm.error_models import FixModel, OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
 
-EVENT_STEP_US = 5_000
-"""Time of an event packet, as the driver makes them."""
+EVENT_STEP_US = 5_000  # Time of an event packet, as the driver makes them
 BEGIN_NS = 1_700_000_000_000_000_000
-_MAP_PERIOD_NS = 30_000_000_000
-"""Between recorded maps."""
+_MAP_PERIOD_NS = 30_000_000_000  # Between recorded maps
 _TRUTH_EVERY = 5
 _ODOMETRY = OdometryModel(
     wheel_separation=0.085,
@@ -79,23 +77,14 @@ _ODOMETRY = OdometryModel(
 
 @dataclass(frozen=True)
 class PushbotBagSettings:
-    """Settings of a run.
+    """Settings of a run."""
 
-    Attributes:
-        seed: Of all noise.
-        duration_s: How long [s].
-        robots: How many.
-        plan: The floor plan, see `floor_plan`.
-        slip: Share of turns that wheels lose.
-        events_s: Events of so long at the begin [s].
-    """
-
-    seed: int
-    duration_s: float
-    robots: int
-    plan: str
-    slip: float
-    events_s: float = 0.0
+    seed: int  # Of all noise
+    duration_s: float  # How long [s]
+    robots: int  # How many
+    plan: str  # The floor plan, see `floor_plan`
+    slip: float  # Share of turns that wheels lose
+    events_s: float = 0.0  # Events of so long at the begin [s]
 
 
 def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) -> int:

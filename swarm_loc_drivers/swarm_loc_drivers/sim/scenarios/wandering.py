@@ -23,8 +23,7 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 PERIOD_NS = 500_000_000
 _SIGMA = 0.008
 _DETECTED = 0.95
-_FALSE = 0.1
-"""Mean number of false detections of an image."""
+_FALSE = 0.1  # Mean number of false detections of an image
 _SPEEDS, _TURN_RATE = (0.03, 0.10), 0.8
 _CHANGES_S = (0.5, 3.0)
 _EDGE, _NEAR = 0.2, 0.13
@@ -33,17 +32,11 @@ _HOMING_GAIN = 3.0
 
 @dataclass(frozen=True)
 class AerialRun(LivedRun):
-    """A simulated swarm with an overhead camera that cannot tell robots apart.
+    """A simulated swarm with an overhead camera that cannot tell robots apart."""
 
-    Attributes:
-        stamp_ns: (k,) exposure of each image, in order of arrival.
-        arrival_ns: (k,).
-        images: (k) of each the detections (n,) of ANONYMOUS_DTYPE.
-    """
-
-    stamp_ns: IntArray
-    arrival_ns: IntArray
-    images: tuple[np.typing.NDArray[np.void], ...]
+    stamp_ns: IntArray  # (k,) exposure of each image, in order of arrival
+    arrival_ns: IntArray  # (k,)
+    images: tuple[np.typing.NDArray[np.void], ...]  # (k) of each the detections (n,) of ANONYMOUS_DTYPE
 
 
 def simulate_wandering(settings: EightSettings) -> AerialRun:

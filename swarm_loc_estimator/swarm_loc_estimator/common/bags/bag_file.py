@@ -11,8 +11,7 @@ if TYPE_CHECKING:
 
     from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 
-RawMessage = tuple[str, str, int, bytes]
-"""Topic, type, log time [ns], serialized message."""
+RawMessage = tuple[str, str, int, bytes]  # Topic, type, log time [ns], serialized message
 
 MAX_LOG_NS = 2**62
 """Log times lie between 0 and here [ns], in the year 2116, so that the difference of any two is a number."""
@@ -23,17 +22,11 @@ class BagError(UserError):
 
 
 class BagTopic(NamedTuple):
-    """A topic of a bag.
+    """A topic of a bag."""
 
-    Attributes:
-        name: Such as robot1/odom.
-        type: Such as nav_msgs/msg/Odometry.
-        encoding: How its messages are serialized: cdr in ROS 2; "" if nothing is said.
-    """
-
-    name: str
-    type: str
-    encoding: str = "cdr"
+    name: str  # Such as robot1/odom
+    type: str  # Such as nav_msgs/msg/Odometry
+    encoding: str = "cdr"  # How its messages are serialized: cdr in ROS 2; "" if nothing is said
 
 
 class ReadErrors(list[str]):

@@ -20,16 +20,12 @@ from swarm_loc_estimator.common.bags.bag_file import MAX_LOG_NS
 from swarm_loc_estimator.common.jit import cached_njit
 
 MAGIC = b"\x89MCAP0\r\n"
-RECORD = struct.Struct("<BQ")
-"""Opcode and length."""
-MESSAGE_HEAD = 22
-"""Bytes of channel, sequence, log time and publish time."""
+RECORD = struct.Struct("<BQ")  # Opcode and length
+MESSAGE_HEAD = 22  # Bytes of channel, sequence, log time and publish time
 OPCODES = frozenset({*map(int, Opcode), *range(0x80, 0x100)})
 """Of records; the last ones are applications' own, to be skipped."""
-UNWANTED, UNKNOWN = -1, -2
-"""In place of the number of a topic: it is not asked for, or the channel has none."""
-MAX_CHUNK = 1 << 30
-"""Unpacked chunks are at most so large [byte]; writers close them at a megabyte or so."""
+UNWANTED, UNKNOWN = -1, -2  # In place of the number of a topic: it is not asked for, or the channel has none
+MAX_CHUNK = 1 << 30  # Unpacked chunks are at most so large [byte]; writers close them at a megabyte or so
 
 _HEAD = struct.Struct("<QQQII")  # first and last time, size, checksum, length of the compression's name
 _LENGTH = struct.Struct("<Q")
@@ -40,49 +36,28 @@ _STEP = 1 << 20
 
 @dataclass
 class Chunk:
-    """Where a run of messages lies, and how to unpack it.
+    """Where a run of messages lies, and how to unpack it."""
 
-    Attributes:
-        record: Where its record begins.
-        offset: Where its content begins.
-        stored: How long that is.
-        first_ns: Log time of its first message.
-        last_ns: Log time of its last message.
-        compression: "", "zstd" or "lz4".
-        size: Length of the content unpacked.
-        checksum: CRC32 of the content unpacked; 0: none.
-        whole: Whether nothing of it was cut off.
-        is_run: Whether its messages lie in no chunk, but one behind the other in the file.
-    """
-
-    record: int
-    offset: int
-    stored: int
-    first_ns: int
-    last_ns: int
-    compression: str = ""
-    size: int = 0
-    checksum: int = 0
-    whole: bool = True
-    is_run: bool = False
+    record: int  # Where its record begins
+    offset: int  # Where its content begins
+    stored: int  # How long that is
+    first_ns: int  # Log time of its first message
+    last_ns: int  # Log time of its last message
+    compression: str = ""  # "", "zstd" or "lz4"
+    size: int = 0  # Length of the content unpacked
+    checksum: int = 0  # CRC32 of the content unpacked; 0: none
+    whole: bool = True  # Whether nothing of it was cut off
+    is_run: bool = False  # Whether its messages lie in no chunk, but one behind the other in the file
 
 
 class MessageScan(NamedTuple):
-    """How far the messages of a chunk were read.
+    """How far the messages of a chunk were read."""
 
-    Attributes:
-        wanted: Messages of the topics that are asked for, those before included.
-        others: Messages of other topics.
-        unknown: Messages of channels without a topic.
-        untimed: Messages whose log time cannot be.
-        offset: Behind the last message.
-    """
-
-    wanted: int
-    others: int
-    unknown: int
-    untimed: int
-    offset: int
+    wanted: int  # Messages of the topics that are asked for, those before included
+    others: int  # Messages of other topics
+    unknown: int  # Messages of channels without a topic
+    untimed: int  # Messages whose log time cannot be
+    offset: int  # Behind the last message
 
 
 def parse_chunk(head: bytes, begin: int, length: int, *, whole: bool) -> Chunk | None:

@@ -17,10 +17,8 @@ from swarm_loc_estimator.common.messages.message_batch import MessageBatch, Seri
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-PACKED = (".zstd", ".zst", ".lz4")
-"""Suffixes of compressed files, as in bag_0.db3.zstd."""
-MAX_MESSAGE = 1 << 28
-"""Unpacked messages are at most so large [byte]."""
+PACKED = (".zstd", ".zst", ".lz4")  # Suffixes of compressed files, as in bag_0.db3.zstd
+MAX_MESSAGE = 1 << 28  # Unpacked messages are at most so large [byte]
 
 _STEP = 1 << 20
 _MAX_BATCH = 1 << 26

@@ -20,10 +20,8 @@ from swarm_loc_estimator.common.messages.definitions import SEQUENCE, Field, fie
 
 Rows = NDArray[np.void]
 
-ENCAPSULATION = 4
-"""Bytes before the payload; alignment counts from behind them."""
-MAX_PADDING = 7
-"""Bytes that may come behind a message."""
+ENCAPSULATION = 4  # Bytes before the payload; alignment counts from behind them
+MAX_PADDING = 7  # Bytes that may come behind a message
 SECOND_NS = 1_000_000_000
 TIME = "builtin_interfaces/msg/Time"
 

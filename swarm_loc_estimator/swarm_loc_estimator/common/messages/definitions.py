@@ -114,23 +114,15 @@ class DefinitionsNotFoundError(UserError):
 
 
 class Field(NamedTuple):
-    """A field of a message.
+    """A field of a message."""
 
-    Attributes:
-        name: Its name.
-        type: "string", a letter of `NUMBERS`, or a message type such as std_msgs/msg/Header.
-        size: 1 for a value, the length of an array, or `SEQUENCE`.
-        is_array: Whether it is an array or a sequence.
-    """
-
-    name: str
-    type: str
-    size: int
-    is_array: bool
+    name: str  # Its name
+    type: str  # "string", a letter of `NUMBERS`, or a message type such as std_msgs/msg/Header
+    size: int  # 1 for a value, the length of an array, or `SEQUENCE`
+    is_array: bool  # Whether it is an array or a sequence
 
 
-SEQUENCE = -1
-"""In place of a length: it varies and stands before the elements."""
+SEQUENCE = -1  # In place of a length: it varies and stands before the elements
 
 
 @lru_cache(maxsize=1)

@@ -89,23 +89,15 @@ class BrightnessMessage(NamedTuple):
 
 
 class SharedMessage(NamedTuple):
-    """Readings (n,) of many robots.
+    """Readings (n,) of many robots."""
 
-    Attributes:
-        stamp_ns: When the message was sent.
-        frame_id: Frame of all readings.
-        swarm: Which swarm's indices these are, see `swarm_key`.
-        robot: (n,) indices as sent.
-        reading_ns: (n,) when each was acquired; -1 where the stamp has a second and more of nanoseconds.
-        columns: (n, k) numbers of each, or (n,) detections.
-    """
-
-    stamp_ns: int
-    frame_id: str
-    swarm: int
-    robot: IntArray
+    stamp_ns: int  # When the message was sent
+    frame_id: str  # Frame of all readings
+    swarm: int  # Which swarm's indices these are, see `swarm_key`
+    robot: IntArray  # (n,) indices as sent
+    # (n,) when each was acquired; -1 where the stamp has a second and more of nanoseconds
     reading_ns: IntArray
-    columns: tuple[NDArray[Any], ...]
+    columns: tuple[NDArray[Any], ...]  # (n, k) numbers of each, or (n,) detections
 
 
 class SharedHead(NamedTuple):

@@ -23,31 +23,20 @@ from swarm_loc_estimator.common.messages.poses import (
     stamp_bytes,
 )
 
-_DOUBLES = 3 + 9 + 1
-"""Numbers of a robot in swarm/poses: pose, covariance and age of the fix."""
+_DOUBLES = 3 + 9 + 1  # Numbers of a robot in swarm/poses: pose, covariance and age of the fix
 _STAMP = slice(ENCAPSULATION, ENCAPSULATION + STAMP_SIZE)
 
 
 class EstimateMessage(NamedTuple):
-    """One swarm/poses.
+    """One swarm/poses."""
 
-    Attributes:
-        stamp_ns: The instant.
-        frame_id: Frame of the poses.
-        names: N robots.
-        pose: (N, 3) x [m], y [m], theta [rad]; NaN: not located.
-        covariance: (N, 3, 3); NaN: not located.
-        fix_age_s: (N,) [s]; -1: never.
-        status: (N,) of `Status`.
-    """
-
-    stamp_ns: int
-    frame_id: str
-    names: tuple[str, ...]
-    pose: FloatArray
-    covariance: FloatArray
-    fix_age_s: FloatArray
-    status: NDArray[np.uint8]
+    stamp_ns: int  # The instant
+    frame_id: str  # Frame of the poses
+    names: tuple[str, ...]  # N robots
+    pose: FloatArray  # (N, 3) x [m], y [m], theta [rad]; NaN: not located
+    covariance: FloatArray  # (N, 3, 3); NaN: not located
+    fix_age_s: FloatArray  # (N,) [s]; -1: never
+    status: NDArray[np.uint8]  # (N,) of `Status`
 
 
 def _bytes_from(offsets: Sequence[int], size: int) -> NDArray[np.intp]:

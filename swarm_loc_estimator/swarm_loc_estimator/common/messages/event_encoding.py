@@ -14,8 +14,7 @@ from swarm_loc_estimator.common.arrays import BoolArray, IntArray
 
 ENCODING = "mono"
 EVENT_BYTES = 8
-MAX_SPAN_NS = (1 << 32) - 1
-"""A packet may not last longer."""
+MAX_SPAN_NS = (1 << 32) - 1  # A packet may not last longer
 
 
 class EventError(ValueError):
@@ -23,19 +22,12 @@ class EventError(ValueError):
 
 
 class Events(NamedTuple):
-    """Events in the order of their time.
+    """Events in the order of their time."""
 
-    Attributes:
-        x: (N,) columns [px].
-        y: (N,) rows [px].
-        is_on: (N,) whether the pixel became brighter.
-        time_ns: (N,) after the packet's stamp [ns].
-    """
-
-    x: NDArray[np.uint16]
-    y: NDArray[np.uint16]
-    is_on: BoolArray
-    time_ns: IntArray
+    x: NDArray[np.uint16]  # (N,) columns [px]
+    y: NDArray[np.uint16]  # (N,) rows [px]
+    is_on: BoolArray  # (N,) whether the pixel became brighter
+    time_ns: IntArray  # (N,) after the packet's stamp [ns]
 
 
 def encode_events(events: Events) -> bytes:

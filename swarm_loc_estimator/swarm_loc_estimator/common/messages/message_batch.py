@@ -22,21 +22,13 @@ class SerializedMessage(NamedTuple):
 
 
 class MessageBatch(NamedTuple):
-    """Messages (n,) of several topics.
+    """Messages (n,) of several topics."""
 
-    Attributes:
-        data: (b,) bytes, read-only.
-        topic: (n,) number of the topic of each.
-        log_ns: (n,) when each was recorded or arrived.
-        offset: (n,) where each begins in `data`.
-        length: (n,) of each in bytes.
-    """
-
-    data: npt.NDArray[np.uint8]
-    topic: IntArray
-    log_ns: IntArray
-    offset: IntArray
-    length: IntArray
+    data: npt.NDArray[np.uint8]  # (b,) bytes, read-only
+    topic: IntArray  # (n,) number of the topic of each
+    log_ns: IntArray  # (n,) when each was recorded or arrived
+    offset: IntArray  # (n,) where each begins in `data`
+    length: IntArray  # (n,) of each in bytes
 
     @classmethod
     def of(cls, messages: Sequence[SerializedMessage]) -> MessageBatch:

@@ -13,10 +13,8 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.cdr import ENCAPSULATION, decode, encode, nanoseconds, stamp_rows
 from swarm_loc_estimator.common.messages.definitions import ODOMETRY, POSE_STAMPED, POSE_WITH_COVARIANCE
 
-POSE_DOUBLES = 7
-"""Numbers of a geometry_msgs/Pose: position and quaternion."""
-PLANE = np.ix_((0, 1, 5), (0, 1, 5))
-"""Where x, y and yaw stand in a 6x6 covariance."""
+POSE_DOUBLES = 7  # Numbers of a geometry_msgs/Pose: position and quaternion
+PLANE = np.ix_((0, 1, 5), (0, 1, 5))  # Where x, y and yaw stand in a 6x6 covariance
 UNKNOWN_COVARIANCE = np.diag([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 """6x6; a negative first element says that the sender does not know (the convention of sensor_msgs)."""
 STAMP_SIZE = 8
@@ -25,23 +23,14 @@ _COVARIANCE = POSE_DOUBLES + np.arange(36).reshape(6, 6)[PLANE].ravel()
 
 
 class OdometryMessage(NamedTuple):
-    """The part of nav_msgs/Odometry that the estimator uses.
+    """The part of nav_msgs/Odometry that the estimator uses."""
 
-    Attributes:
-        stamp_ns: Acquisition time.
-        frame_id: Frame of the pose.
-        child_frame_id: Frame of the twist.
-        pose: (x [m], y [m], yaw [rad]); yaw is NaN when the quaternion is zero.
-        twist: (vx [m/s], vy [m/s], yaw rate [rad/s]).
-        covariance: 3x3, of x, y, yaw, as published.
-    """
-
-    stamp_ns: int
-    frame_id: str
-    child_frame_id: str
-    pose: tuple[float, float, float]
-    twist: tuple[float, float, float]
-    covariance: FloatArray
+    stamp_ns: int  # Acquisition time
+    frame_id: str  # Frame of the pose
+    child_frame_id: str  # Frame of the twist
+    pose: tuple[float, float, float]  # (x [m], y [m], yaw [rad]); yaw is NaN when the quaternion is zero
+    twist: tuple[float, float, float]  # (vx [m/s], vy [m/s], yaw rate [rad/s])
+    covariance: FloatArray  # 3x3, of x, y, yaw, as published
 
 
 class PoseMessage(NamedTuple):
@@ -53,19 +42,12 @@ class PoseMessage(NamedTuple):
 
 
 class FixMessage(NamedTuple):
-    """A geometry_msgs/PoseWithCovarianceStamped in the plane.
+    """A geometry_msgs/PoseWithCovarianceStamped in the plane."""
 
-    Attributes:
-        stamp_ns: When the robot was there.
-        frame_id: Frame of the pose.
-        pose: (x [m], y [m], yaw [rad]); yaw is NaN when the quaternion is zero.
-        covariance: 3x3, of x, y, yaw, as published.
-    """
-
-    stamp_ns: int
-    frame_id: str
-    pose: tuple[float, float, float]
-    covariance: FloatArray
+    stamp_ns: int  # When the robot was there
+    frame_id: str  # Frame of the pose
+    pose: tuple[float, float, float]  # (x [m], y [m], yaw [rad]); yaw is NaN when the quaternion is zero
+    covariance: FloatArray  # 3x3, of x, y, yaw, as published
 
 
 @cached_njit

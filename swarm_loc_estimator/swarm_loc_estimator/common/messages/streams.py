@@ -52,8 +52,7 @@ class StampedMessage(Protocol):
 Message = TypeVar("Message", bound=StampedMessage)
 
 _LITTLE_ENDIAN = b"\x00\x01"
-_NAMES = ENCAPSULATION + 8
-"""Offset of the first frame name's length, behind the stamp."""
+_NAMES = ENCAPSULATION + 8  # Offset of the first frame name's length, behind the stamp
 _DETECTION_SIZE = DETECTION_DTYPE.itemsize
 _TWIST = tuple(8 * (POSE_DOUBLES + 36 + component) for component in (0, 1, 5))
 """Offsets of x, y and yaw of the twist behind the start of the numbers of nav_msgs/Odometry."""
@@ -62,19 +61,12 @@ _ODOMETRY_NUMBERS = 8 * (POSE_DOUBLES + 36 + 6 + 36)
 
 
 class _Models(NamedTuple):
-    """Per topic what its messages have in common that only differ in stamp and numbers.
+    """Per topic what its messages have in common that only differ in stamp and numbers."""
 
-    Attributes:
-        names: (t, w) bytes from `_NAMES` to `end`.
-        end: (t,) offset behind the frame names; 0 where no message was read yet.
-        start: (t,) offset of the numbers.
-        size: (t,) length of the message, where it does not vary.
-    """
-
-    names: BytesArray
-    end: IntArray
-    start: IntArray
-    size: IntArray
+    names: BytesArray  # (t, w) bytes from `_NAMES` to `end`
+    end: IntArray  # (t,) offset behind the frame names; 0 where no message was read yet
+    start: IntArray  # (t,) offset of the numbers
+    size: IntArray  # (t,) length of the message, where it does not vary
 
 
 def _no_models(topics: int) -> _Models:
@@ -94,19 +86,13 @@ def _with_model(models: _Models, topic: int, data: bytes, end: int, start: int) 
 
 @dataclass(frozen=True)
 class PoseColumns:
-    """Stamped poses (n,), one per message.
+    """Stamped poses (n,), one per message."""
 
-    Attributes:
-        stamp_ns: (n,).
-        pose: (n, 3) x [m], y [m], yaw [rad]; yaw is NaN when the quaternion is zero.
-        twist: (n, 3) forward and left [m/s] and turn rate [rad/s] of nav_msgs/Odometry; NaN for other types.
-        valid: (n,) whether the bytes were a whole message of the type.
-    """
-
-    stamp_ns: IntArray
-    pose: FloatArray
+    stamp_ns: IntArray  # (n,)
+    pose: FloatArray  # (n, 3) x [m], y [m], yaw [rad]; yaw is NaN when the quaternion is zero
+    # (n, 3) forward and left [m/s] and turn rate [rad/s] of nav_msgs/Odometry; NaN for other types
     twist: FloatArray
-    valid: NDArray[np.bool_]
+    valid: NDArray[np.bool_]  # (n,) whether the bytes were a whole message of the type
 
 
 class PoseReader:
@@ -162,19 +148,12 @@ class PoseReader:
 
 @dataclass(frozen=True)
 class DetectionColumns:
-    """Detections of all messages (n,), one after the other (d,).
+    """Detections of all messages (n,), one after the other (d,)."""
 
-    Attributes:
-        stamp_ns: (n,).
-        count: (n,) detections per message.
-        detection: (d,) of `DETECTION_DTYPE`.
-        valid: (n,) whether the bytes were a whole message of the type.
-    """
-
-    stamp_ns: IntArray
-    count: IntArray
-    detection: NDArray[np.void]
-    valid: NDArray[np.bool_]
+    stamp_ns: IntArray  # (n,)
+    count: IntArray  # (n,) detections per message
+    detection: NDArray[np.void]  # (d,) of `DETECTION_DTYPE`
+    valid: NDArray[np.bool_]  # (n,) whether the bytes were a whole message of the type
 
 
 class DetectionReader:
@@ -226,17 +205,11 @@ class DetectionReader:
 
 @dataclass(frozen=True)
 class MessageColumns(Generic[Message]):
-    """Messages (n,) read whole.
+    """Messages (n,) read whole."""
 
-    Attributes:
-        stamp_ns: (n,).
-        valid: (n,) whether the bytes were a whole message of the type.
-        messages: The valid ones.
-    """
-
-    stamp_ns: IntArray
-    valid: NDArray[np.bool_]
-    messages: list[Message]
+    stamp_ns: IntArray  # (n,)
+    valid: NDArray[np.bool_]  # (n,) whether the bytes were a whole message of the type
+    messages: list[Message]  # The valid ones
 
 
 class EachReader(Generic[Message]):

@@ -10,8 +10,7 @@ from swarm_loc_estimator.filter.belief import BeliefArrays, IntegrityArrays, cov
 from swarm_loc_estimator.filter.integrity.pairs import source_of
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns
 
-CONFIRMED = 2
-"""Number of agreeing sightings after which an assumed pose counts as known."""
+CONFIRMED = 2  # Number of agreeing sightings after which an assumed pose counts as known
 WELL_CONFIRMED = 12
 _SUSPECT = 2.0
 _SUSPECT_SIGMA = (0.03, 0.03, 0.06)
@@ -26,19 +25,12 @@ _CONFIRMED_AGAIN_NS = 150_000_000
 
 
 class LossLimits(NamedTuple):
-    """Limits beyond which a robot is lost.
+    """Limits beyond which a robot is lost."""
 
-    Attributes:
-        position_sigma: Standard deviation of its position [m].
-        heading_sigma: Of its heading [rad].
-        gated_in_a_row: Gated measurements since the last accepted one.
-        max_fault_score: Fault score from which a robot or landmark is contradicted.
-    """
-
-    position_sigma: float
-    heading_sigma: float
-    gated_in_a_row: int
-    max_fault_score: float
+    position_sigma: float  # Standard deviation of its position [m]
+    heading_sigma: float  # Of its heading [rad]
+    gated_in_a_row: int  # Gated measurements since the last accepted one
+    max_fault_score: float  # Fault score from which a robot or landmark is contradicted
 
 
 @inlined_njit

@@ -34,8 +34,7 @@ from swarm_loc_estimator.filter.integrity.pairs import (
 from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementColumns
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW
 
-_SUSPECT = 7.5
-"""Fault score from which a robot is not reported as tracked."""
+_SUSPECT = 7.5  # Fault score from which a robot is not reported as tracked
 
 _SOURCES = 16
 _OUTLIER = 6.0
@@ -48,17 +47,14 @@ _EXPLAINED_M, _EXPLAINED_SHARE = 0.1, 0.35
 """Error that a wrong description can explain: a constant, and a share of the distance."""
 _SMALL_M, _SMALL_SHARE = 0.003, 0.005
 """Errors up to this constant and share of the distance are inliers whatever the noise is."""
-_SINGLE_WEIGHT = 0.3
-"""Weight of an outlier whose observer has no other one."""
+_SINGLE_WEIGHT = 0.3  # Weight of an outlier whose observer has no other one
 _MAX_SINGLE_DOUBT = 5.0
 """A single source raises the fault score of an observer up to here, which does not contradict it."""
-_SHARED_WEIGHT = 0.2
-"""Weight for the source where observer and source are equally likely to be wrong."""
+_SHARED_WEIGHT = 0.2  # Weight for the source where observer and source are equally likely to be wrong
 _INLIER_WEIGHT = 0.25
 _ONE_IMAGE_NS = 20_000_000
 _REPORTED_NS = 3_000_000_000
-_INDEPENDENT_NS = 100_000_000
-"""Measurements of a pair that follow each other faster share their errors."""
+_INDEPENDENT_NS = 100_000_000  # Measurements of a pair that follow each other faster share their errors
 
 
 def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:

@@ -27,21 +27,17 @@ from swarm_loc_estimator.filter.measurement_model import MeasurementColumns
 
 WINDOWS = 2
 _WINDOW_NS = (2_000_000_000, 8_000_000_000)
-_LONGEST = 4.0
-"""A window that no measurement has ended after this many of its lengths says nothing."""
+_LONGEST = 4.0  # A window that no measurement has ended after this many of its lengths says nothing
 LOG_SCALES = math.log(2.0) * np.arange(-1.0, 7.5, 0.5)
 """Logarithms of the scales of the process noise, from one half to 128.
 
 Those below 1 take up what chance adds: without them, the mean of a robot as described would exceed 1.
 """
-_PRIOR = 3.0
-"""Decrease of the log-likelihood per factor of e from scale 1."""
-_MEMORY_S = 30.0
-"""Time constant with which likelihoods are forgotten."""
+_PRIOR = 3.0  # Decrease of the log-likelihood per factor of e from scale 1
+_MEMORY_S = 30.0  # Time constant with which likelihoods are forgotten
 _POSE_SHARE = 0.25
 """Share of the variance of the pose by which corrections scatter beyond a consistent filter's."""
-_STATIONARY_M2 = 1e-8
-"""Position noise of a window below which the robot has not moved [m^2]."""
+_STATIONARY_M2 = 1e-8  # Position noise of a window below which the robot has not moved [m^2]
 
 
 @cached_njit

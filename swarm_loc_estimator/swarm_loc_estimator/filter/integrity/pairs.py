@@ -13,14 +13,11 @@ from swarm_loc_estimator.common.jit import inlined_njit
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel
 
-EXCLUDED, MAX_EVIDENCE = 10.0, 15.0
-"""Evidence from which a pair is excluded, and its maximum."""
+EXCLUDED, MAX_EVIDENCE = 10.0, 15.0  # Evidence from which a pair is excluded, and its maximum
 RECENT_NS = 400_000_000
-AGAIN_NS = 90_000_000
-"""A measurement sooner after the last one of its pair is no new evidence."""
+AGAIN_NS = 90_000_000  # A measurement sooner after the last one of its pair is no new evidence
 _TREND_LOOKS = 8
-TREND = 3.0
-"""Limit of the squared sum of whitened innovations over their sum of squares; 1 without a trend."""
+TREND = 3.0  # Limit of the squared sum of whitened innovations over their sum of squares; 1 without a trend
 _MIN_TREND = 0.6
 """Smallest mean of whitened innovations that counts: trends of calibrated sensors lie below their noise."""
 _TREND_WEIGHT = 4.0

@@ -32,10 +32,8 @@ from swarm_loc_estimator.filter.belief import BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.filter.integrity.pairs import find_pair
 from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementColumns
 
-_SHARE = 0.5
-"""Share s of the variance of a sighting that repeats at the same place."""
-_LENGTH_M = 0.03
-"""Distance over which the repeated part fades to 1/e."""
+_SHARE = 0.5  # Share s of the variance of a sighting that repeats at the same place
+_LENGTH_M = 0.03  # Distance over which the repeated part fades to 1/e
 _ROUNDING = 1e-12
 
 

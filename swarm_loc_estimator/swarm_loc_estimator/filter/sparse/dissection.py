@@ -17,27 +17,19 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.filter.sparse.neighbours import Adjacency
 
-_LEAF = 24
-"""Sets of at most this size are not split."""
+_LEAF = 24  # Sets of at most this size are not split
 _CUTS = (0.5, 0.42, 0.58)
-_FEW = 60
-"""Sets of at most this size are split in the middle only."""
-_UNEQUAL = 1.15
-"""Factor by which the separator of an uneven split must be smaller."""
+_FEW = 60  # Sets of at most this size are split in the middle only
+_UNEQUAL = 1.15  # Factor by which the separator of an uneven split must be smaller
 _DIRECTIONS = 4
 _BELOW, _ABOVE, _SEPARATOR, _OUTSIDE = 0, 1, 2, -1
 
 
 class Order(NamedTuple):
-    """Groups of bodies in the order of their elimination.
+    """Groups of bodies in the order of their elimination."""
 
-    Attributes:
-        body: (n,) bodies, group by group.
-        begin: (F + 1,) start of each group.
-    """
-
-    body: IntArray
-    begin: IntArray
+    body: IntArray  # (n,) bodies, group by group
+    begin: IntArray  # (F + 1,) start of each group
 
 
 @cached_njit

@@ -19,20 +19,14 @@ from swarm_loc_estimator.filter.sparse.translation_adjoint import Information
 
 _LOOSER = (0.0, 1e-10, 1e-8, 1e-6, 1e-4)
 """Relative increases of the variances, tried in turn where rounding has made a covariance indefinite."""
-_PANEL = 24
-"""Rows solved at once."""
+_PANEL = 24  # Rows solved at once
 
 
 class Prior(NamedTuple):
-    """Covariances before the measurements, on a pattern.
+    """Covariances before the measurements, on a pattern."""
 
-    Attributes:
-        covariance: (s, s, 3, 3) by the bodies' numbers there.
-        place: (n,) numbers of the pattern's bodies in `covariance`.
-    """
-
-    covariance: FloatArray
-    place: IntArray
+    covariance: FloatArray  # (s, s, 3, 3) by the bodies' numbers there
+    place: IntArray  # (n,) numbers of the pattern's bodies in `covariance`
 
 
 def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> Factor:

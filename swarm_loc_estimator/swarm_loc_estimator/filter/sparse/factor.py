@@ -15,40 +15,25 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.sparse.symbolic import Pattern
 
-_FEW = 2
-"""Up to this number of pivots, products with many columns are faster as loops than by BLAS."""
+_FEW = 2  # Up to this number of pivots, products with many columns are faster as loops than by BLAS
 
 
 class Derived(NamedTuple):
-    """A body appended to a factor, whose error is a function of those of others.
+    """A body appended to a factor, whose error is a function of those of others."""
 
-    Attributes:
-        others: (s,) bodies of the factor, or appended before; empty: independent.
-        gain: (3 s, 3) A.
-        spread: (3, 3) D.
-    """
-
-    others: IntArray
-    gain: FloatArray
-    spread: FloatArray
+    others: IntArray  # (s,) bodies of the factor, or appended before; empty: independent
+    gain: FloatArray  # (3 s, 3) A
+    spread: FloatArray  # (3, 3) D
 
 
 class Factor(NamedTuple):
-    """A Gaussian over bodies.
+    """A Gaussian over bodies."""
 
-    Attributes:
-        pattern: Its fronts.
-        gain: A (3 b, 3 j) of all fronts, concatenated.
-        gain_begin: (F + 1,) start of each front's A.
-        spread: D (3 j, 3 j) of all fronts, concatenated.
-        spread_begin: (F + 1,)
-    """
-
-    pattern: Pattern
-    gain: FloatArray
-    gain_begin: IntArray
-    spread: FloatArray
-    spread_begin: IntArray
+    pattern: Pattern  # Its fronts
+    gain: FloatArray  # A (3 b, 3 j) of all fronts, concatenated
+    gain_begin: IntArray  # (F + 1,) start of each front's A
+    spread: FloatArray  # D (3 j, 3 j) of all fronts, concatenated
+    spread_begin: IntArray  # (F + 1,)
 
 
 _NONE: IntArray = np.zeros(0, dtype=np.int64)

@@ -14,15 +14,10 @@ _NEAREST = 8
 
 
 class Adjacency(NamedTuple):
-    """Neighbours of each of n bodies.
+    """Neighbours of each of n bodies."""
 
-    Attributes:
-        begin: (n + 1,) start of the neighbours of each body.
-        neighbour: (k,) bodies.
-    """
-
-    begin: IntArray
-    neighbour: IntArray
+    begin: IntArray  # (n + 1,) start of the neighbours of each body
+    neighbour: IntArray  # (k,) bodies
 
 
 def adjacency(count: int, pairs: IntArray) -> Adjacency:

@@ -20,23 +20,16 @@ from swarm_loc_estimator.filter.sparse.symbolic import Pattern, pattern_of
 _ORDERED_AGAIN = 3
 _GROWN = 1.2
 """An order is replaced after this number of updates, or when its largest front has grown by this factor."""
-_NEAR_AGAIN = 9
-"""Number of updates after which near pairs are computed again."""
+_NEAR_AGAIN = 9  # Number of updates after which near pairs are computed again
 
 
 class Situation(NamedTuple):
-    """The bodies and pairs of an update.
+    """The bodies and pairs of an update."""
 
-    Attributes:
-        bodies: Active bodies, ascending.
-        blocks: Blocks of parameters, which are eliminated before all bodies.
-        places: (n, 2) of all bodies.
-        pairs: (k, 2) bodies of which one has measured the other recently, and pairs that follow from blocks.
-    """
-
-    bodies: IntArray
-    blocks: Order
-    places: FloatArray
+    bodies: IntArray  # Active bodies, ascending
+    blocks: Order  # Blocks of parameters, which are eliminated before all bodies
+    places: FloatArray  # (n, 2) of all bodies
+    # (k, 2) bodies of which one has measured the other recently, and pairs that follow from blocks
     pairs: IntArray
 
     def near(self) -> IntArray:
@@ -76,23 +69,14 @@ class NearPairs(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Ordering:
-    """An order of elimination and the pattern of one update.
+    """An order of elimination and the pattern of one update."""
 
-    Attributes:
-        situation: Bodies and pairs of the update.
-        pattern: Contains all pairs of the situation.
-        order: Of all active bodies and blocks.
-        updates: Number of updates that have used the order.
-        width: Size of its largest front at first use.
-        near: Near pairs.
-    """
-
-    situation: Situation
-    pattern: Pattern
-    order: Order
-    updates: int
-    width: int
-    near: NearPairs
+    situation: Situation  # Bodies and pairs of the update
+    pattern: Pattern  # Contains all pairs of the situation
+    order: Order  # Of all active bodies and blocks
+    updates: int  # Number of updates that have used the order
+    width: int  # Size of its largest front at first use
+    near: NearPairs  # Near pairs
 
     @cached_property
     def next_near(self) -> NearPairs:

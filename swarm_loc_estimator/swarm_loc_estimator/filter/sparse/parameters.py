@@ -22,17 +22,11 @@ from swarm_loc_estimator.swarm.calibration_states import BLOCKS, DRIVES, Paramet
 
 
 class Groups(NamedTuple):
-    """The robots, bodies and blocks that belong together, for n bodies and blocks.
+    """The robots, bodies and blocks that belong together, for n bodies and blocks."""
 
-    Attributes:
-        member: (N, 1 + BLOCKS) each robot's body and its blocks; -1: none.
-        owner: (n,) the robot of each block; a body is its own owner.
-        part: (n,) 0 for a body, else the number of the block within its robot.
-    """
-
-    member: IntArray
-    owner: IntArray
-    part: IntArray
+    member: IntArray  # (N, 1 + BLOCKS) each robot's body and its blocks; -1: none
+    owner: IntArray  # (n,) the robot of each block; a body is its own owner
+    part: IntArray  # (n,) 0 for a body, else the number of the block within its robot
 
     @classmethod
     def of(cls, table: ParameterTable) -> Groups:
@@ -53,17 +47,11 @@ class Groups(NamedTuple):
 
 
 class Moves(NamedTuple):
-    """Transition of the errors of n bodies and blocks.
+    """Transition of the errors of n bodies and blocks."""
 
-    Attributes:
-        beside: (n,) the block whose error changes each body's; -1: none.
-        gain: (n, 3, 3) A.
-        left: (n, 3) L.
-    """
-
-    beside: IntArray
-    gain: FloatArray
-    left: FloatArray
+    beside: IntArray  # (n,) the block whose error changes each body's; -1: none
+    gain: FloatArray  # (n, 3, 3) A
+    left: FloatArray  # (n, 3) L
 
     def any(self) -> bool:
         """Whether the transition is not the identity."""

@@ -41,14 +41,12 @@ from swarm_loc_estimator.filter.sparse.translation_adjoint import (
 from swarm_loc_estimator.swarm.calibration_states import BLOCKS, ParameterTable
 
 _COPIES = 64
-_COPIED_SHARE = 4
-"""At most one of this number of bodies is copied."""
+_COPIED_SHARE = 4  # At most one of this number of bodies is copied
 _COPIED_AGAIN = 100
 """Updates after which other bodies are copied: copies become stale, but each change loses correlations."""
 _PAIRS_KEPT, _PAIRS_KEPT_WITH_BLOCKS = 3, 2
 """Updates whose pairs count as neighbours, without and with blocks of parameters."""
-_FAR_M = 20.0
-"""Distance from its reference point beyond which the error of a body gets a new reference point."""
+_FAR_M = 20.0  # Distance from its reference point beyond which the error of a body gets a new reference point
 _NOBODY: IntArray = np.zeros(0, dtype=np.int64)
 
 

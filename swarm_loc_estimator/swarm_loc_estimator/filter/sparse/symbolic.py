@@ -17,21 +17,13 @@ from swarm_loc_estimator.filter.sparse.neighbours import Adjacency
 
 
 class Pattern(NamedTuple):
-    """Fronts in the order of their elimination.
+    """Fronts in the order of their elimination."""
 
-    Attributes:
-        pivot: Pivots, front by front.
-        pivot_begin: (F + 1,) start of each front's pivots.
-        border: Borders, front by front.
-        border_begin: (F + 1,) start of each front's border.
-        front: (n,) the front of which each body is a pivot; -1: none.
-    """
-
-    pivot: IntArray
-    pivot_begin: IntArray
-    border: IntArray
-    border_begin: IntArray
-    front: IntArray
+    pivot: IntArray  # Pivots, front by front
+    pivot_begin: IntArray  # (F + 1,) start of each front's pivots
+    border: IntArray  # Borders, front by front
+    border_begin: IntArray  # (F + 1,) start of each front's border
+    front: IntArray  # (n,) the front of which each body is a pivot; -1: none
 
     @property
     def fronts(self) -> int:

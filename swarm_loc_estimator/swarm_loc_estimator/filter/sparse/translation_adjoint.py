@@ -16,19 +16,12 @@ from swarm_loc_estimator.common.small_matrix import cholesky3, solve3
 
 
 class Information(NamedTuple):
-    """Information of measurements: H^T R^-1 H in blocks, and H^T R^-1 y.
+    """Information of measurements: H^T R^-1 H in blocks, and H^T R^-1 y."""
 
-    Attributes:
-        first: (k,) bodies; a block of two bodies is given once.
-        second: (k,)
-        block: (k, 3, 3)
-        gradient: (n, 3)
-    """
-
-    first: IntArray
-    second: IntArray
-    block: FloatArray
-    gradient: FloatArray
+    first: IntArray  # (k,) bodies; a block of two bodies is given once
+    second: IntArray  # (k,)
+    block: FloatArray  # (k, 3, 3)
+    gradient: FloatArray  # (n, 3)
 
 
 def translation_adjoints(places: FloatArray) -> FloatArray:

@@ -28,37 +28,24 @@ from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm
 
-DENSE_GAP_NS = 200_000_000
-"""Longest gap of ground truth that is interpolated."""
-OFFSET_REACH_NS = 250_000_000
-"""Largest time offset of a camera."""
+DENSE_GAP_NS = 200_000_000  # Longest gap of ground truth that is interpolated
+OFFSET_REACH_NS = 250_000_000  # Largest time offset of a camera
 
 _SAME_NS = 3_000_000
-_SAME_VIEW_NS = 4_000_000_000
-"""Errors of sightings of one marker are correlated for about this long."""
+_SAME_VIEW_NS = 4_000_000_000  # Errors of sightings of one marker are correlated for about this long
 _MAX_SIGHTINGS = 2000
 
 
 class CameraSightings(NamedTuple):
-    """Uncalibrated sightings of one robot's camera where the ground truth is known.
+    """Uncalibrated sightings of one robot's camera where the ground truth is known."""
 
-    Attributes:
-        stamp_ns: (m,).
-        polar: (m,) whether values are range and bearing, else forward, left and heading.
-        value: (m, 3) in the frame of a camera at the origin of base_link.
-        marker_id: (m,).
-        marker: (m, 3) pose of the marker in `map`, or in the base_link of the target robot.
-        target: (m,) index of the target robot; -1 for a landmark.
-        lone: (m, 3) true pose of the observer where it is known at the stamp only, else NaN.
-    """
-
-    stamp_ns: IntArray
-    polar: BoolArray
-    value: FloatArray
-    marker_id: IntArray
-    marker: FloatArray
-    target: IntArray
-    lone: FloatArray
+    stamp_ns: IntArray  # (m,)
+    polar: BoolArray  # (m,) whether values are range and bearing, else forward, left and heading
+    value: FloatArray  # (m, 3) in the frame of a camera at the origin of base_link
+    marker_id: IntArray  # (m,)
+    marker: FloatArray  # (m, 3) pose of the marker in `map`, or in the base_link of the target robot
+    target: IntArray  # (m,) index of the target robot; -1 for a landmark
+    lone: FloatArray  # (m, 3) true pose of the observer where it is known at the stamp only, else NaN
 
     @property
     def independent_share(self) -> float:
@@ -173,8 +160,7 @@ def _dense_around(truth: Trajectory, stamp_ns: IntArray) -> BoolArray:
     return known
 
 
-MIN_SIGHTINGS = 100
-"""Sightings with ground truth needed to calibrate a camera."""
+MIN_SIGHTINGS = 100  # Sightings with ground truth needed to calibrate a camera
 
 _OF_CAMERA = ("x", "y", "yaw")
 _WIDE = {
@@ -201,21 +187,14 @@ _ROUNDS = 2
 
 @dataclass(frozen=True)
 class CameraFit:
-    """Calibration of one robot's camera.
+    """Calibration of one robot's camera."""
 
-    Attributes:
-        robot: Calibrated.
-        count: Sightings used; 0 if there were too few.
-        before: (m, 3) measured minus true: range [m] and bearing [rad], or forward, left [m], heading [rad].
-        after: (m, 3) the same errors, calibrated.
-        sightings: All that were used.
-    """
-
-    robot: Robot
-    count: int
+    robot: Robot  # Calibrated
+    count: int  # Sightings used; 0 if there were too few
+    # (m, 3) measured minus true: range [m] and bearing [rad], or forward, left [m], heading [rad]
     before: FloatArray
-    after: FloatArray
-    sightings: CameraSightings
+    after: FloatArray  # (m, 3) the same errors, calibrated
+    sightings: CameraSightings  # All that were used
 
 
 class _Camera:

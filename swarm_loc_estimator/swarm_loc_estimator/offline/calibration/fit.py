@@ -46,12 +46,10 @@ from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
-EVALUATIONS = 80
-"""Runs of the estimator to fit the noise."""
+EVALUATIONS = 80  # Runs of the estimator to fit the noise
 
 _MIN_WINDOWS = 50
-_CORRELATION = 2.7
-"""Initial ratio of the white noise that represents correlated errors to their scatter."""
+_CORRELATION = 2.7  # Initial ratio of the white noise that represents correlated errors to their scatter
 _TICK_S = 0.5
 _FLOORS = {"wheel_noise": 0.0, "distance_drift": 1e-5, "range_sigma": 1e-3}
 """Not fitted, since they duplicate fitted terms; they keep the covariance of a slow robot positive."""
@@ -65,75 +63,46 @@ turns on the spot and sees few markers is soon too sure of its place.
 
 @dataclass(frozen=True)
 class Options:
-    """What is fitted.
+    """What is fitted."""
 
-    Attributes:
-        plain: Whether only noise is fitted.
-        response: Whether a table of scale factors may be fitted, else one of speed and one of turn rate.
-        evaluations: Limit of runs of the estimator to fit the noise.
-    """
-
-    plain: bool = False
+    plain: bool = False  # Whether only noise is fitted
+    # Whether a table of scale factors may be fitted, else one of speed and one of turn rate
     response: bool = True
-    evaluations: int = EVALUATIONS
+    evaluations: int = EVALUATIONS  # Limit of runs of the estimator to fit the noise
 
 
 @dataclass(frozen=True)
 class DriveFit:
-    """Calibrated motion of a type of robot.
+    """Calibrated motion of a type of robot."""
 
-    Attributes:
-        members: Indices of its robots.
-        drives: Motion of the robots with dense ground truth.
-        late: Delay and lag.
-        response: Scale factors; None if only noise is fitted.
-        before: (m, 2) errors of path [m] and turn [rad] of 5 s windows as reported.
-        after: (m, 2) the same errors, calibrated.
-    """
-
-    members: tuple[int, ...]
-    drives: tuple[Drive, ...]
-    late: Lateness
-    response: MotionResponse | None
-    before: FloatArray
-    after: FloatArray
+    members: tuple[int, ...]  # Indices of its robots
+    drives: tuple[Drive, ...]  # Motion of the robots with dense ground truth
+    late: Lateness  # Delay and lag
+    response: MotionResponse | None  # Scale factors; None if only noise is fitted
+    before: FloatArray  # (m, 2) errors of path [m] and turn [rad] of 5 s windows as reported
+    after: FloatArray  # (m, 2) the same errors, calibrated
 
 
 @dataclass(frozen=True)
 class FittedModels:
-    """Calibrated models, without noise.
+    """Calibrated models, without noise."""
 
-    Attributes:
-        swarm: Calibrated.
-        cameras: Of all robots, ordered by type.
-        motion: One per type.
-        remarks: Parameters that could not be fitted, one sentence each.
-    """
-
-    swarm: Swarm
-    cameras: tuple[CameraFit, ...]
-    motion: tuple[DriveFit, ...]
-    remarks: tuple[str, ...]
+    swarm: Swarm  # Calibrated
+    cameras: tuple[CameraFit, ...]  # Of all robots, ordered by type
+    motion: tuple[DriveFit, ...]  # One per type
+    remarks: tuple[str, ...]  # Parameters that could not be fitted, one sentence each
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """Result of a calibration.
+    """Result of a calibration."""
 
-    Attributes:
-        swarm: Calibrated, with unchanged starts.
-        models: The fits behind it.
-        noise: Fitted noise parameters by name.
-        before: Score of the estimator on the recording, started at the true poses.
-        after: The same, calibrated.
-        warning: One sentence if the models do not help in a part that they were not fitted to; else "".
-    """
-
-    swarm: Swarm
-    models: FittedModels
-    noise: dict[str, float] = field(default_factory=dict)
-    before: Score | None = None
-    after: Score | None = None
+    swarm: Swarm  # Calibrated, with unchanged starts
+    models: FittedModels  # The fits behind it
+    noise: dict[str, float] = field(default_factory=dict)  # Fitted noise parameters by name
+    before: Score | None = None  # Score of the estimator on the recording, started at the true poses
+    after: Score | None = None  # The same, calibrated
+    # One sentence if the models do not help in a part that they were not fitted to; else ""
     warning: str = ""
 
 

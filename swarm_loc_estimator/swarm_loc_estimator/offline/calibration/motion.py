@@ -28,19 +28,15 @@ from swarm_loc_estimator.swarm.motion_response import MotionResponse
 LONGEST_DELAY_S = 0.5
 LONGEST_LAG_S = 1.0
 
-WINDOW_S = 5.0
-"""Length of the windows in which motion is compared."""
+WINDOW_S = 5.0  # Length of the windows in which motion is compared
 
 _SHORT_WINDOW_S = 0.5
-_NODES = (0, 2, 5)
-"""Numbers of points above 0 that are tried for the table; 0: one scale factor."""
+_NODES = (0, 2, 5)  # Numbers of points above 0 that are tried for the table; 0: one scale factor
 _BLOCKS = 5
 _CLEAR_SIGMAS = 2.0
 _NEAR_ZERO = 0.05
-_CLEARLY = 0.85
-"""Delay and lag are used if they reduce the errors of short windows to this share."""
-_MOVING = 1e-3
-"""Speeds below which a robot counts as stationary [m/s, rad/s]."""
+_CLEARLY = 0.85  # Delay and lag are used if they reduce the errors of short windows to this share
+_MOVING = 1e-3  # Speeds below which a robot counts as stationary [m/s, rad/s]
 _SMOOTHNESS, _TO_ONE = 0.02, 0.001
 """Weights of the priors that neighbouring scale factors are equal, and that they are 1."""
 _FIRST_LATENESS = (0.05, 0.1)
@@ -50,38 +46,23 @@ _SETTLING_S = 5.0
 
 @dataclass(frozen=True)
 class Steps:
-    """Speeds between consecutive odometry messages.
+    """Speeds between consecutive odometry messages."""
 
-    Attributes:
-        stamp_ns: (n + 1,) of the messages.
-        speed: (n,) reported [m/s].
-        turn_rate: (n,) reported [rad/s].
-        duration_s: (n,).
-    """
-
-    stamp_ns: IntArray
-    speed: FloatArray
-    turn_rate: FloatArray
-    duration_s: FloatArray
+    stamp_ns: IntArray  # (n + 1,) of the messages
+    speed: FloatArray  # (n,) reported [m/s]
+    turn_rate: FloatArray  # (n,) reported [rad/s]
+    duration_s: FloatArray  # (n,)
 
 
 @dataclass(frozen=True)
 class TrueMotion:
-    """A robot's true motion, accumulated on a regular grid of time.
+    """A robot's true motion, accumulated on a regular grid of time."""
 
-    Attributes:
-        time_s: (g,) since the first odometry.
-        path: (g,) [m], forwards.
-        lateral: (g,) [m], to the left.
-        turn: (g,) heading, unwrapped [rad].
-        known: (g,) whether the ground truth is dense there.
-    """
-
-    time_s: FloatArray
-    path: FloatArray
-    lateral: FloatArray
-    turn: FloatArray
-    known: npt.NDArray[np.bool_]
+    time_s: FloatArray  # (g,) since the first odometry
+    path: FloatArray  # (g,) [m], forwards
+    lateral: FloatArray  # (g,) [m], to the left
+    turn: FloatArray  # (g,) heading, unwrapped [rad]
+    known: npt.NDArray[np.bool_]  # (g,) whether the ground truth is dense there
 
 
 @dataclass(frozen=True)
@@ -94,15 +75,10 @@ class Drive:
 
 @dataclass(frozen=True)
 class Lateness:
-    """Delay of the true motion after the reported one.
+    """Delay of the true motion after the reported one."""
 
-    Attributes:
-        delay_s: Dead time.
-        lag_s: Time constant of a first-order lag.
-    """
-
-    delay_s: float
-    lag_s: float
+    delay_s: float  # Dead time
+    lag_s: float  # Time constant of a first-order lag
 
 
 def steps_of(track: Trajectory, model: OdometryModel) -> Steps:
@@ -271,19 +247,12 @@ def hats(values: FloatArray, nodes: FloatArray) -> FloatArray:
 
 
 class _Regression(NamedTuple):
-    """Linear regression of the true motion in windows by scale factors.
+    """Linear regression of the true motion in windows by scale factors."""
 
-    Attributes:
-        basis: (m, V W) reported motion by grid point.
-        wanted: (m,) true path [m] or turn [rad].
-        block: (m,) block of time in which a window begins.
-        last_block: (m,) block in which it ends.
-    """
-
-    basis: FloatArray
-    wanted: FloatArray
-    block: IntArray
-    last_block: IntArray
+    basis: FloatArray  # (m, V W) reported motion by grid point
+    wanted: FloatArray  # (m,) true path [m] or turn [rad]
+    block: IntArray  # (m,) block of time in which a window begins
+    last_block: IntArray  # (m,) block in which it ends
 
 
 def _regression(

@@ -26,58 +26,40 @@ from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
 from swarm_loc_estimator.swarm.swarm import Swarm
 
-TICK_S = 1.0
-"""Interval at which errors are computed."""
-NEES_AIM = 1.7
-"""Target of the NEES, below 3 since errors in other recordings are larger."""
+TICK_S = 1.0  # Interval at which errors are computed
+NEES_AIM = 1.7  # Target of the NEES, below 3 since errors in other recordings are larger
 _HEADING_WEIGHT = 0.2
 """A heading error larger by a factor costs as much as a position error larger by its power of this."""
 _OF_SENSOR = frozenset({"range_sigma_per_m", "bearing_sigma", "forward_sigma", "left_sigma", "heading_sigma"})
 """Noise in which robots differ."""
 
 _SPACING_NS = 50_000_000
-_INCONSISTENCY = 0.2
-"""A NEES of half or twice its aim costs as much as 10 % more error."""
-_LOSS = 5.0
-"""A hundredth of the poses missing costs as much as 5 % more error."""
+_INCONSISTENCY = 0.2  # A NEES of half or twice its aim costs as much as 10 % more error
+_LOSS = 5.0  # A hundredth of the poses missing costs as much as 5 % more error
 _FORGETTING = 0.005
 """Weight of the prior that parameters stay near their initial values, per squared factor of e."""
 _FIRST_STEP, _LAST_STEP = 0.7, 0.07
 _WORST = 1e3
-_BAD = 0.3
-"""Costs are capped this far above the initial one: when robots get lost, a score means nothing."""
+_BAD = 0.3  # Costs are capped this far above the initial one: when robots get lost, a score means nothing
 
 
 @dataclass(frozen=True)
 class Fold:
-    """A part of a recording, and the swarm as calibrated without it.
+    """A part of a recording, and the swarm as calibrated without it."""
 
-    Attributes:
-        recording: Input of the estimator.
-        swarm: With the true starts.
-        is_held_out: Whether the swarm was calibrated without this part.
-    """
-
-    recording: Recording
-    swarm: Swarm
-    is_held_out: bool = True
+    recording: Recording  # Input of the estimator
+    swarm: Swarm  # With the true starts
+    is_held_out: bool = True  # Whether the swarm was calibrated without this part
 
 
 @dataclass(frozen=True)
 class Score:
-    """Quality of an estimate.
+    """Quality of an estimate."""
 
-    Attributes:
-        position_rmse: [m].
-        heading_rmse: [rad].
-        nees: Ideally 3.
-        given: Share of the poses with ground truth that were estimated.
-    """
-
-    position_rmse: float
-    heading_rmse: float
-    nees: float
-    given: float
+    position_rmse: float  # [m]
+    heading_rmse: float  # [rad]
+    nees: float  # Ideally 3
+    given: float  # Share of the poses with ground truth that were estimated
 
     @property
     def cost(self) -> float:

@@ -21,10 +21,8 @@ from swarm_loc_estimator.offline.calibration.robust import (
 from swarm_loc_estimator.swarm.calibration_states import TURN_BIAS
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
-_WIDE = np.array([0.05, 0.05])
-"""Standard deviations of the prior of course offset [rad] and axle offset [m]."""
-_WIDE_BIAS = np.array([0.01])
-"""Standard deviation of the prior of the turn bias [rad/s]."""
+_WIDE = np.array([0.05, 0.05])  # Standard deviations of the prior of course offset [rad] and axle offset [m]
+_WIDE_BIAS = np.array([0.01])  # Standard deviation of the prior of the turn bias [rad/s]
 _WINDOW_NS = 2_000_000_000
 _STRIDE_NS = 500_000_000
 _SHORTEST_NS, _LONGEST_NS = 1_000_000_000, 20_000_000_000
@@ -33,17 +31,12 @@ _MIN_WINDOWS = 20
 
 @dataclass(frozen=True)
 class _OffsetRegression:
-    """Linear regression of a robot's motion in windows by offsets (p,).
+    """Linear regression of a robot's motion in windows by offsets (p,)."""
 
-    Attributes:
-        wanted: (m,) motion to the left [m] or turn [rad] that odometry misses, per square root of a second.
-        basis: (m, p) its derivatives by the offsets.
-        independent_share: Share of independent windows.
-    """
-
+    # (m,) motion to the left [m] or turn [rad] that odometry misses, per square root of a second
     wanted: FloatArray
-    basis: FloatArray
-    independent_share: float
+    basis: FloatArray  # (m, p) its derivatives by the offsets
+    independent_share: float  # Share of independent windows
 
     def fit(self, mean: FloatArray, sigma: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Offsets (p,) and their standard deviations (p,)."""
@@ -99,21 +92,13 @@ def _of_type(
 
 @dataclass(frozen=True)
 class _Motion:
-    """Motion of a robot in windows (m,): calibrated odometry without course and axle offset, and the truth.
+    """Motion of a robot in windows (m,): calibrated odometry without course and axle offset, and truth."""
 
-    Attributes:
-        reported: (m, 3) x, y and theta in the frame of the beginning.
-        true: (m, 3) the same for the truth.
-        moving_s: (m,) time in motion.
-        length_s: (m,) of the windows.
-        independent_share: Share of independent windows.
-    """
-
-    reported: FloatArray
-    true: FloatArray
-    moving_s: FloatArray
-    length_s: FloatArray
-    independent_share: float
+    reported: FloatArray  # (m, 3) x, y and theta in the frame of the beginning
+    true: FloatArray  # (m, 3) the same for the truth
+    moving_s: FloatArray  # (m,) time in motion
+    length_s: FloatArray  # (m,) of the windows
+    independent_share: float  # Share of independent windows
 
 
 def _motion(recording: Recording, robot: Robot, track: Trajectory) -> _Motion | None:

@@ -38,31 +38,18 @@ class CalibrationError(UserError):
 
 @dataclass(frozen=True)
 class Recording:
-    """Inputs and ground truth of a bag.
+    """Inputs and ground truth of a bag."""
 
-    Attributes:
-        name: Of the bag.
-        odometry: Of all robots.
-        detections: Of all cameras.
-        truth: Robot name -> ground truth; robots without are missing.
-        brightness: Of all infrared boards.
-        fixes: Of all robots.
-        turn_rates: Of all IMUs.
-        ranges: Of all UWB radios, as they arrived.
-        dropped: Number of dropped inputs by reason.
-        remarks: Unreadable contents, one sentence each.
-    """
-
-    name: str
-    odometry: OdometryRows
-    detections: DetectionRows
-    truth: Mapping[str, Trajectory]
-    brightness: BrightnessRows = NO_BRIGHTNESS
-    fixes: FixRows = NO_FIXES
-    turn_rates: TurnRateRows = NO_TURN_RATES
-    ranges: RangeRows = NO_RANGES
-    dropped: Mapping[str, int] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
+    name: str  # Of the bag
+    odometry: OdometryRows  # Of all robots
+    detections: DetectionRows  # Of all cameras
+    truth: Mapping[str, Trajectory]  # Robot name -> ground truth; robots without are missing
+    brightness: BrightnessRows = NO_BRIGHTNESS  # Of all infrared boards
+    fixes: FixRows = NO_FIXES  # Of all robots
+    turn_rates: TurnRateRows = NO_TURN_RATES  # Of all IMUs
+    ranges: RangeRows = NO_RANGES  # Of all UWB radios, as they arrived
+    dropped: Mapping[str, int] = field(default_factory=dict)  # Number of dropped inputs by reason
+    remarks: tuple[str, ...] = ()  # Unreadable contents, one sentence each
 
     def sentences(self, expected: Collection[str] = ()) -> list[str]:
         """The remarks, and what was dropped for other reasons than the expected ones."""

@@ -9,10 +9,8 @@ from scipy.optimize import least_squares
 
 from swarm_loc_estimator.common.arrays import FloatArray
 
-_BEND = 3.0
-"""Residuals beyond this many sigmas have linear cost."""
-_NORMAL = 1.4826
-"""Standard deviation per median absolute deviation, for normal errors."""
+_BEND = 3.0  # Residuals beyond this many sigmas have linear cost
+_NORMAL = 1.4826  # Standard deviation per median absolute deviation, for normal errors
 
 
 def spread(residuals: FloatArray) -> float:

@@ -19,17 +19,12 @@ from swarm_loc_estimator.offline.calibration.camera import CameraFit
 from swarm_loc_estimator.offline.calibration.robust import spread
 from swarm_loc_estimator.swarm.swarm import Robot
 
-_EDGES_S = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0])
-"""Bins of the time between two sightings."""
+_EDGES_S = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0])  # Bins of the time between two sightings
 _MIN_PAIRS = 30
-_MAX_STEPS = 60
-"""Sightings after each one that are compared with it."""
-_CUT = 4.0
-"""Errors are cut at this many spreads, so that outliers have no weight."""
-_MIN_SHARE = 0.05
-"""Smallest share of the variance of bearings that counts as sway."""
-_TIMES_S = (1.0, 60.0)
-"""Smallest and largest time constant."""
+_MAX_STEPS = 60  # Sightings after each one that are compared with it
+_CUT = 4.0  # Errors are cut at this many spreads, so that outliers have no weight
+_MIN_SHARE = 0.05  # Smallest share of the variance of bearings that counts as sway
+_TIMES_S = (1.0, 60.0)  # Smallest and largest time constant
 _MIN_SIGHTINGS = 100
 
 

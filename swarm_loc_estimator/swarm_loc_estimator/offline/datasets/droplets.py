@@ -38,38 +38,23 @@ class DropletRecordingError(UserError):
 
 @dataclass(frozen=True)
 class Sighting:
-    """A fiducial in the camera's image.
+    """A fiducial in the camera's image."""
 
-    Attributes:
-        id: As read by the camera.
-        x: [px], to the right.
-        y: [px], downwards.
-        orientation: Counter-clockwise as seen in the image [rad].
-    """
-
-    id: int
-    x: float
-    y: float
-    orientation: float
+    id: int  # As read by the camera
+    x: float  # [px], to the right
+    y: float  # [px], downwards
+    orientation: float  # Counter-clockwise as seen in the image [rad]
 
 
 @dataclass(frozen=True)
 class Exchange:
-    """Readings of one robot while another lit its emitters, and the camera's detections at that time.
+    """Readings of one robot while another lit its emitters, and the camera's detections at that time."""
 
-    Attributes:
-        transmitter: Id of the robot that lit its emitters.
-        receiver: Id of the robot that measured.
-        readings: (n, n) [count], [sensor, emitter].
-        time_s: Of the camera.
-        sightings: Of the camera.
-    """
-
-    transmitter: int
-    receiver: int
-    readings: FloatArray
-    time_s: float
-    sightings: tuple[Sighting, ...]
+    transmitter: int  # Id of the robot that lit its emitters
+    receiver: int  # Id of the robot that measured
+    readings: FloatArray  # (n, n) [count], [sensor, emitter]
+    time_s: float  # Of the camera
+    sightings: tuple[Sighting, ...]  # Of the camera
 
 
 def read_exchanges(path: Path) -> tuple[list[Exchange], Counter[str]]:
@@ -124,26 +109,19 @@ def parse_line(line: str) -> Exchange | str:
     return Exchange(transmitter, receiver, np.array(rows, dtype=float).T, float(match[4]), sightings)
 
 
-SAME_PLACE_PX = 3.5
-"""A standing robot moves less than this between two sightings."""
+SAME_PLACE_PX = 3.5  # A standing robot moves less than this between two sightings
 SAME_TURN = math.radians(8.0)
-MAX_GAP_S = 30.0
-"""A robot unseen for longer may have moved."""
+MAX_GAP_S = 30.0  # A robot unseen for longer may have moved
 _QUARTER = 0.5 * math.pi
 
 
 @dataclass
 class Place:
-    """A robot that stands, or moves very slowly.
+    """A robot that stands, or moves very slowly."""
 
-    Attributes:
-        moments: Indices of the exchanges at which it was seen.
-        seen: Its sightings, one per moment.
-        turned: One per moment: the orientation up to quarter turns, continuous [rad].
-    """
-
-    moments: list[int] = field(default_factory=list)
-    seen: list[Sighting] = field(default_factory=list)
+    moments: list[int] = field(default_factory=list)  # Indices of the exchanges at which it was seen
+    seen: list[Sighting] = field(default_factory=list)  # Its sightings, one per moment
+    # One per moment: the orientation up to quarter turns, continuous [rad]
     turned: list[float] = field(default_factory=list)
 
     @property
@@ -183,32 +161,20 @@ class Place:
 
 @dataclass(frozen=True)
 class CameraPose:
-    """Pose of a standing robot in the image.
+    """Pose of a standing robot in the image."""
 
-    Attributes:
-        x: [px], to the right.
-        y: [px], downwards.
-        orientation: As in `Sighting` [rad].
-        stand: Number of the place at which the robot stands; poses of one place have the same quarter turn.
-    """
-
-    x: float
-    y: float
-    orientation: float
-    stand: int
+    x: float  # [px], to the right
+    y: float  # [px], downwards
+    orientation: float  # As in `Sighting` [rad]
+    stand: int  # Number of the place at which the robot stands; poses of one place have the same quarter turn
 
 
 @dataclass
 class CleanTruth:
-    """Poses of all standing robots.
+    """Poses of all standing robots."""
 
-    Attributes:
-        poses: One mapping per exchange: robot -> its pose, if known.
-        remarks: Kind of correction or drop -> count.
-    """
-
-    poses: list[dict[int, CameraPose]]
-    remarks: Counter[str]
+    poses: list[dict[int, CameraPose]]  # One mapping per exchange: robot -> its pose, if known
+    remarks: Counter[str]  # Kind of correction or drop -> count
 
 
 def clean(exchanges: Sequence[Exchange]) -> CleanTruth:

@@ -41,20 +41,15 @@ from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 ROBOT_TYPE = "droplet"
 DIAMETER_M = 0.044
-METRES_PER_PIXEL = DIAMETER_M / 42.0
-"""Robots that touch are 42 pixels apart in the recordings of 2016."""
-FIX_SIGMA = (0.001, 0.001, 0.05)
-"""Standard deviations of fixes by the camera: x, y [m], heading [rad]."""
-WALK = RandomWalk(position=5e-6, heading=3e-2)
-"""The robots turn often and move some centimetres per minute."""
+METRES_PER_PIXEL = DIAMETER_M / 42.0  # Robots that touch are 42 pixels apart in the recordings of 2016
+FIX_SIGMA = (0.001, 0.001, 0.05)  # Standard deviations of fixes by the camera: x, y [m], heading [rad]
+WALK = RandomWalk(position=5e-6, heading=3e-2)  # The robots turn often and move some centimetres per minute
 _NS = 1_000_000_000
 _BRIGHTNESS, _FIXES = kinds()["brightness"], kinds()["fixes"]
 
 _QUARTER = 0.5 * math.pi
-_CLEAR = 8.0
-"""Matrices whose brightest reading is not this far above the noise are not used [sigma]."""
-_ONE_WAY = 0.5
-"""If the mean vector of all directions is shorter, matrices and camera contradict each other."""
+_CLEAR = 8.0  # Matrices whose brightest reading is not this far above the noise are not used [sigma]
+_ONE_WAY = 0.5  # If the mean vector of all directions is shorter, matrices and camera contradict each other
 _VOTES, _AGREED, _NEAR_QUARTER = 5, 0.7, math.radians(30.0)
 """A fiducial was misread at a stand if at least this number of directions have a mean vector of at least this
 length within this angle of another quarter turn. Dark elements turn directions by up to 60 degrees."""
@@ -62,17 +57,12 @@ length within this angle of another quarter turn. Dark elements turn directions 
 
 @dataclass(frozen=True)
 class Fiducials:
-    """Orientation of all fiducials.
+    """Orientation of all fiducials."""
 
-    Attributes:
-        handedness: 1 if x and y of the image are those of map, -1 if y points the other way.
-        turn_of: Robot -> from the orientation of its fiducial to its own [rad], a multiple of a quarter turn.
-        misread: `CameraPose.stand` -> additional turn where the fiducial was misread [rad].
-    """
-
-    handedness: int
+    handedness: int  # 1 if x and y of the image are those of map, -1 if y points the other way
+    # Robot -> from the orientation of its fiducial to its own [rad], a multiple of a quarter turn
     turn_of: Mapping[int, float]
-    misread: Mapping[int, float]
+    misread: Mapping[int, float]  # `CameraPose.stand` -> additional turn where the fiducial was misread [rad]
 
     def pose(self, robot: int, seen: CameraPose, metres_per_pixel: float) -> Pose2:
         """The robot's pose x, y [m], heading [rad] in map."""
@@ -174,32 +164,20 @@ def _noise(exchanges: Sequence[Exchange]) -> float:
 
 @dataclass(frozen=True)
 class ImportSettings:
-    """Settings of an import that the files do not contain.
+    """Settings of an import that the files do not contain."""
 
-    Attributes:
-        platform: Packaged name or path of the board of all robots.
-        metres_per_pixel: Of the camera's image.
-    """
-
-    platform: str = "droplet_2016"
-    metres_per_pixel: float = METRES_PER_PIXEL
+    platform: str = "droplet_2016"  # Packaged name or path of the board of all robots
+    metres_per_pixel: float = METRES_PER_PIXEL  # Of the camera's image
 
 
 @dataclass(frozen=True)
 class DropletImport:
-    """Result of an import.
+    """Result of an import."""
 
-    Attributes:
-        exchanges: Their number.
-        with_truth: Number of those with both robots' poses known.
-        fiducials: Their orientation.
-        remarks: Corrections and drops, one sentence each.
-    """
-
-    exchanges: int
-    with_truth: int
-    fiducials: Fiducials
-    remarks: tuple[str, ...]
+    exchanges: int  # Their number
+    with_truth: int  # Number of those with both robots' poses known
+    fiducials: Fiducials  # Their orientation
+    remarks: tuple[str, ...]  # Corrections and drops, one sentence each
 
 
 def import_recording(

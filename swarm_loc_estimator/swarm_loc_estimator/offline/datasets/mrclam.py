@@ -26,8 +26,7 @@ from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 MAX_TRUTH_GAP_NS = 500_000_000
 
 _ODOMETRY = re.compile(r"Robot(\d+)_Odometry\.dat")
-_MISFIT = 0.5
-"""A barcode whose median sighting is further than this from its landmark is wrong [m]."""
+_MISFIT = 0.5  # A barcode whose median sighting is further than this from its landmark is wrong [m]
 _SIGHTINGS_TO_JUDGE = 10
 
 
@@ -37,42 +36,26 @@ class MrclamError(UserError):
 
 @dataclass(frozen=True)
 class RobotLog:
-    """One robot's files.
+    """One robot's files."""
 
-    Attributes:
-        subject: Its number.
-        odometry: Poses of its own frame, starting at the origin; the command of a row holds until the next.
-        twist: (N, 2) commanded forward speed [m/s] and turn rate [rad/s].
-        sighting_ns: (M,) stamps, not decreasing.
-        sighting: (M, 2) range [m] and bearing [rad, positive to the left].
-        barcode: (M,) of each sighting.
-        truth: Ground truth in map; None when there is none.
-    """
-
-    subject: int
+    subject: int  # Its number
+    # Poses of its own frame, starting at the origin; the command of a row holds until the next
     odometry: Trajectory
-    twist: FloatArray
-    sighting_ns: IntArray
-    sighting: FloatArray
-    barcode: npt.NDArray[np.int64]
-    truth: Trajectory | None
+    twist: FloatArray  # (N, 2) commanded forward speed [m/s] and turn rate [rad/s]
+    sighting_ns: IntArray  # (M,) stamps, not decreasing
+    sighting: FloatArray  # (M, 2) range [m] and bearing [rad, positive to the left]
+    barcode: npt.NDArray[np.int64]  # (M,) of each sighting
+    truth: Trajectory | None  # Ground truth in map; None when there is none
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """One set.
+    """One set."""
 
-    Attributes:
-        robots: In the order of their subjects.
-        barcode_of: Subject -> barcode.
-        landmarks: Subject -> x [m], y [m].
-        remarks: Missing files and corrected barcodes, one sentence each.
-    """
-
-    robots: tuple[RobotLog, ...]
-    barcode_of: Mapping[int, int]
-    landmarks: Mapping[int, tuple[float, float]]
-    remarks: tuple[str, ...]
+    robots: tuple[RobotLog, ...]  # In the order of their subjects
+    barcode_of: Mapping[int, int]  # Subject -> barcode
+    landmarks: Mapping[int, tuple[float, float]]  # Subject -> x [m], y [m]
+    remarks: tuple[str, ...]  # Missing files and corrected barcodes, one sentence each
 
 
 def read_dataset(folder: Path) -> Dataset:

@@ -22,15 +22,13 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Pose2, 
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 
 ROBOT_TYPE = "create"
-WHEEL_SEPARATION = 0.258
-"""Wheel separation of the iRobot Create [m]."""
+WHEEL_SEPARATION = 0.258  # Wheel separation of the iRobot Create [m]
 TIMEOUT_S = 2.0
 """The logs pause for just over a second about every two minutes, while the robots keep driving."""
 
 _FAMILY_OTHER = 255
 _REPORT_EVERY = 5000
-_SERIALIZING = 0.3
-"""Share of the progress before writing."""
+_SERIALIZING = 0.3  # Share of the progress before writing
 
 _MAX_CUT_NS = 120_000_000_000
 _MARGIN_NS = 1_000_000_000
@@ -38,30 +36,19 @@ _MARGIN_NS = 1_000_000_000
 
 @dataclass(frozen=True)
 class Delay:
-    """Delay of detections, uniform between two limits.
+    """Delay of detections, uniform between two limits."""
 
-    Attributes:
-        low_ns: Least delay.
-        high_ns: Largest delay.
-        seed: Of the random numbers.
-    """
-
-    low_ns: int = 0
-    high_ns: int = 0
-    seed: int = 0
+    low_ns: int = 0  # Least delay
+    high_ns: int = 0  # Largest delay
+    seed: int = 0  # Of the random numbers
 
 
 @dataclass(frozen=True)
 class MrclamImport:
-    """Result of an import.
+    """Result of an import."""
 
-    Attributes:
-        message_count: Number of messages written.
-        remarks: Missing data, corrected barcodes and late starts, one sentence each.
-    """
-
-    message_count: int
-    remarks: tuple[str, ...]
+    message_count: int  # Number of messages written
+    remarks: tuple[str, ...]  # Missing data, corrected barcodes and late starts, one sentence each
 
 
 @dataclass(frozen=True)

@@ -37,8 +37,7 @@ from swarm_loc_estimator.sensors.registry import kinds
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_msgs.msg import SwarmPoses
 
-START_PATIENCE_S = 600.0
-"""Compiling the estimator takes three minutes, more on a busy machine."""
+START_PATIENCE_S = 600.0  # Compiling the estimator takes three minutes, more on a busy machine
 _ALONE = {"ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST", "ROS_STATIC_PEERS": ""}
 _WAKE_S = 0.05
 
@@ -54,14 +53,11 @@ class LiveGraph:
         nodes: The estimator first; the others start when this process has discovered its poses.
         log: File for the output of the nodes.
 
-    Attributes:
-        recorder: Records poses and diagnostics.
-
     Raises:
         LiveError: The estimator does not start.
     """
 
-    recorder: Recorder
+    recorder: Recorder  # Records poses and diagnostics
 
     def __init__(self, nodes: Sequence[NodeSpec], log: Path) -> None:
         self._nodes = {node.full_name: node for node in nodes}
@@ -202,19 +198,12 @@ _RECEIVED = {f"{kind.topic} received": kind for kind in kinds().values()}
 
 
 class Poses(NamedTuple):
-    """One message of swarm/poses.
+    """One message of swarm/poses."""
 
-    Attributes:
-        stamp_ns: Time of the poses.
-        pose: (N, 3) x [m], y [m], theta [rad] in map.
-        covariance: (N, 3, 3).
-        status: (N,) of `SwarmPose.status`.
-    """
-
-    stamp_ns: int
-    pose: FloatArray
-    covariance: FloatArray
-    status: NDArray[np.uint8]
+    stamp_ns: int  # Time of the poses
+    pose: FloatArray  # (N, 3) x [m], y [m], theta [rad] in map
+    covariance: FloatArray  # (N, 3, 3)
+    status: NDArray[np.uint8]  # (N,) of `SwarmPose.status`
 
 
 class Recorder(Node):

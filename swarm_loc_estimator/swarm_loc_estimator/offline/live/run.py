@@ -40,31 +40,23 @@ _END_PATIENCE_S = 10.0
 
 @dataclass(frozen=True)
 class LiveRun:
-    """Results of a run of the live graph.
+    """Results of a run of the live graph."""
 
-    Attributes:
-        result: Poses as received, ground truth of the bag, counts of dropped inputs.
-        arrival_ns: Topic of the estimator's inputs -> (M,) increasing log times of its messages in the bag,
-            all of which were published.
-        taken: Stamp of poses -> topic -> messages that the estimator had received by then; of some poses.
-        rate: Speed of the player.
-        received: Messages that the estimator received.
-        estimator_core: CPU time of the estimator per second while the bag played.
-        age_s: (A,) time of reception minus stamp of poses in the bag's time, once /clock was received here.
-        start_up_s: From the start of the estimator to its first poses, which come when all topics of the bag
-            are discovered and the player has begun.
-        memory_mb: Of the estimator at the end.
-    """
-
-    result: ReplayResult
+    result: ReplayResult  # Poses as received, ground truth of the bag, counts of dropped inputs
+    # Topic of the estimator's inputs -> (M,) increasing log times of its messages in the bag, all of which
+    # were published
     arrival_ns: Mapping[str, NDArray[np.int64]]
+    # Stamp of poses -> topic -> messages that the estimator had received by then; of some poses
     taken: Mapping[int, Mapping[str, int]]
-    rate: float
-    received: int
-    estimator_core: float
+    rate: float  # Speed of the player
+    received: int  # Messages that the estimator received
+    estimator_core: float  # CPU time of the estimator per second while the bag played
+    # (A,) time of reception minus stamp of poses in the bag's time, once /clock was received here
     age_s: FloatArray
+    # From the start of the estimator to its first poses, which come when all topics of the bag are discovered
+    # and the player has begun
     start_up_s: float
-    memory_mb: float
+    memory_mb: float  # Of the estimator at the end
 
     @property
     def sent(self) -> int:
@@ -79,21 +71,14 @@ class LiveRun:
 
 @dataclass(frozen=True)
 class BagContent:
-    """Contents of a bag, read before it is played.
+    """Contents of a bag, read before it is played."""
 
-    Attributes:
-        begin_ns: First log time.
-        end_ns: Last one.
-        arrival_ns: Topic of the estimator's inputs -> (M,) increasing log times of its messages.
-        truth: Robot name -> ground truth.
-        remarks: What could not be read, one sentence each.
-    """
-
-    begin_ns: int
-    end_ns: int
+    begin_ns: int  # First log time
+    end_ns: int  # Last one
+    # Topic of the estimator's inputs -> (M,) increasing log times of its messages
     arrival_ns: Mapping[str, NDArray[np.int64]]
-    truth: Mapping[str, Trajectory]
-    remarks: tuple[str, ...]
+    truth: Mapping[str, Trajectory]  # Robot name -> ground truth
+    remarks: tuple[str, ...]  # What could not be read, one sentence each
 
 
 Watch = Callable[[Recorder, BagContent], None]
@@ -230,17 +215,12 @@ class Agreement:
     The live estimator lacks inputs that are still in transport when it gives a pose: those of up to a step of
     the player's clock, and more on a busy machine. Only at settled stamps both have the same inputs; there
     the poses must be equal.
-
-    Attributes:
-        replayed: The replay.
-        distance_m: (T, N) between the positions; NaN if neither is located, infinite if one is not.
-        turn_rad: (T, N) absolute difference of the headings; NaN and infinite as above.
-        settled: (T,) whether the estimator had received exactly what had arrived by then in the bag.
     """
 
-    replayed: ReplayResult
-    distance_m: FloatArray
-    turn_rad: FloatArray
+    replayed: ReplayResult  # The replay
+    distance_m: FloatArray  # (T, N) between the positions; NaN if neither is located, infinite if one is not
+    turn_rad: FloatArray  # (T, N) absolute difference of the headings; NaN and infinite as above
+    # (T,) whether the estimator had received exactly what had arrived by then in the bag
     settled: NDArray[np.bool_]
 
     @property

@@ -35,20 +35,17 @@ from swarm_loc_estimator.offline.report.style import (
 from swarm_loc_estimator.offline.result import ReplayResult
 
 _MAP_IN, _ERRORS_IN = 6.6, 4.4
-_ROOM_IN = 0.6
-"""Height of title, legend and axes."""
+_ROOM_IN = 0.6  # Height of title, legend and axes
 _AROUND_MAP = Margins(left=0.65, right=0.15, bottom=0.9, top=0.7, across=0.5, down=0.6)
 _AROUND_PATHS = Margins(left=0.65, right=0.15, bottom=0.5, top=0.35, across=0.2, down=0.5)
 _AROUND_ERRORS = Margins(left=0.7, right=0.15, bottom=0.5, top=0.7, across=0.5, down=0.2)
 _TAIL_NS = 6_000_000_000
 _SIGMAS = 3.0
 _ENLARGED = 20.0
-_SEEN = 0.05
-"""Ellipses are enlarged if the largest is smaller than this share of the map's width."""
+_SEEN = 0.05  # Ellipses are enlarged if the largest is smaller than this share of the map's width
 _MAX_NAMES = 12
 _STRETCHES = 120
-_NAME_PT = np.array([42.0, 22.0])
-"""Distance of a name from its robot, horizontally and vertically."""
+_NAME_PT = np.array([42.0, 22.0])  # Distance of a name from its robot, horizontally and vertically
 
 
 def plot_overview(result: ReplayResult, path: Path) -> None:
@@ -204,8 +201,7 @@ _PANEL_IN = 3.7
 _MAX_PANELS = 9
 _MAX_ROWS = 6
 _MAX_POINTS = 1500
-_NEES_95 = (0.216, 9.348)
-"""95 % bounds of the normalized squared error of three dimensions."""
+_NEES_95 = (0.216, 9.348)  # 95 % bounds of the normalized squared error of three dimensions
 
 
 def plot_paths(result: ReplayResult, path: Path) -> bool:

@@ -41,21 +41,13 @@ from swarm_loc_estimator.watch.page import about, page, recording
 
 @dataclass(frozen=True)
 class ReportFiles:
-    """Files of a report.
+    """Files of a report."""
 
-    Attributes:
-        text: The table as text.
-        page: The self-contained page.
-        overview: Plot of the swarm on its map, and of its errors over time.
-        paths: Plot of each robot's path; None for one robot or more than nine.
-        errors: Plot of each robot's errors over time; None without ground truth.
-    """
-
-    text: Path
-    page: Path
-    overview: Path
-    paths: Path | None
-    errors: Path | None
+    text: Path  # The table as text
+    page: Path  # The self-contained page
+    overview: Path  # Plot of the swarm on its map, and of its errors over time
+    paths: Path | None  # Plot of each robot's path; None for one robot or more than nine
+    errors: Path | None  # Plot of each robot's errors over time; None without ground truth
 
 
 def write_report(result: ReplayResult, folder: Path | str) -> ReportFiles:

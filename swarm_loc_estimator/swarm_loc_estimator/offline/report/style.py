@@ -23,8 +23,7 @@ INK, SOFT, TRUTH = "#22303c", "#6b7a86", "#9aa5b1"
 _COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
 _DPI = 120
 _PAD_IN = 0.08
-_PALETTE = 256
-"""Fewer colours halve the size of the file."""
+_PALETTE = 256  # Fewer colours halve the size of the file
 _MILLIMETRES_BELOW_M = 0.1
 _MIN_GAP_NS = 2_000_000_000
 
@@ -115,8 +114,7 @@ def _place(figure: Figure, margins: Margins) -> None:
 
 _MAX_POINTS = 8000
 _MAX_IDS = 40
-_MARGIN = 0.05
-"""Margin around the world, as a share of its size."""
+_MARGIN = 0.05  # Margin around the world, as a share of its size
 
 
 class WorldMap:

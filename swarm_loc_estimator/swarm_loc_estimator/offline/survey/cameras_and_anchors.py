@@ -26,37 +26,26 @@ from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_BEARING
 from swarm_loc_estimator.swarm.swarm import FixedCamera, Swarm
 from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 
-MIN_MEASUREMENTS = 30
-"""Minimum number of sightings or ranges that place a camera or an anchor."""
-_SPELLS = 8
-"""Spells of time of the jackknife."""
-_DRAWS, _DRAWN = 60, 6
-"""Starts of an anchor: number of draws, and ranges of each."""
-_OUTLIER = 5.0
-"""Residuals of more standard deviations contradict the others."""
+MIN_MEASUREMENTS = 30  # Minimum number of sightings or ranges that place a camera or an anchor
+_SPELLS = 8  # Spells of time of the jackknife
+_DRAWS, _DRAWN = 60, 6  # Starts of an anchor: number of draws, and ranges of each
+_OUTLIER = 5.0  # Residuals of more standard deviations contradict the others
 _LEAST_SIGMA = 1e-4
-_MOST_SIGMA, _MOST_YAW_SIGMA = 1.0, 0.5
-"""Standard deviations [m], [rad] from which nothing is placed."""
-_TURNS = 16
-"""Other places are sought in so many directions about the line of all robots."""
+_MOST_SIGMA, _MOST_YAW_SIGMA = 1.0, 0.5  # Standard deviations [m], [rad] from which nothing is placed
+_TURNS = 16  # Other places are sought in so many directions about the line of all robots
 _AS_WELL, _ELSEWHERE, _ELSEWHERE_M = 1.2, 0.5, 0.3
 """Another place fits as well if its residuals are larger by no more than this factor. It is farther away than
 this share of the distance from the line, and this length."""
-_DEPTH = 0.05
-"""Least depth of a marker in front of a camera, of which its direction is computed [m]."""
+_DEPTH = 0.05  # Least depth of a marker in front of a camera, of which its direction is computed [m]
 
 
 @dataclass(frozen=True)
 class Paths:
-    """Paths of the robots.
+    """Paths of the robots."""
 
-    Attributes:
-        at: Poses (k, 3) in map of robots (k,) at instants (k,) [ns]; NaN: not known.
-        frame: (3, 3) covariance of the right-invariant error that is common to all.
-    """
-
+    # Poses (k, 3) in map of robots (k,) at instants (k,) [ns]; NaN: not known
     at: Callable[[IntArray, IntArray], FloatArray]
-    frame: FloatArray
+    frame: FloatArray  # (3, 3) covariance of the right-invariant error that is common to all
 
     def variances(self, place: FloatArray) -> FloatArray:
         """Variances (3,) of x, y and directions at a place (2,) by the frame."""
@@ -66,19 +55,12 @@ class Paths:
 
 @dataclass(frozen=True)
 class Placed:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        cameras: All cameras, those that were placed with their poses and sigmas.
-        anchors: The described anchors, then those that were found.
-        lines: A table.
-        remarks: What is badly determined, one sentence each.
-    """
-
-    cameras: tuple[FixedCamera, ...]
-    anchors: tuple[Anchor, ...]
-    lines: list[str]
-    remarks: list[str]
+    cameras: tuple[FixedCamera, ...]  # All cameras, those that were placed with their poses and sigmas
+    anchors: tuple[Anchor, ...]  # The described anchors, then those that were found
+    lines: list[str]  # A table
+    remarks: list[str]  # What is badly determined, one sentence each
 
 
 def place_fixed(recording: Recording, swarm: Swarm, paths: Paths, *, cameras: bool) -> Placed:

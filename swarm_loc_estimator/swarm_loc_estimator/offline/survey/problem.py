@@ -21,28 +21,20 @@ from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSE, CONTENT_POSE_TWO
 from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
 
-STEP_NS = 100_000_000
-"""Shortest time between two instants at which the transform of a track is estimated."""
+STEP_NS = 100_000_000  # Shortest time between two instants at which the transform of a track is estimated
 MAX_KNOTS = 12_000
 """Maximum number of these instants, of all robots; those of long recordings are farther apart."""
 _WITH_POSE = (CONTENT_POSE, CONTENT_POSE_TWO)
-MIN_SIGHTINGS = 5
-"""Minimum number of sightings of a marker that is to be a landmark."""
+MIN_SIGHTINGS = 5  # Minimum number of sightings of a marker that is to be a landmark
 
 
 @dataclass(frozen=True)
 class Knots:
-    """Instants at which transforms of tracks are estimated (k,), by robot and stamp.
+    """Instants at which transforms of tracks are estimated (k,), by robot and stamp."""
 
-    Attributes:
-        robot: (k,) index of the robot.
-        stamp_ns: (k,) the instants.
-        sample: (k,) the tracks there.
-    """
-
-    robot: IntArray
-    stamp_ns: IntArray
-    sample: OdometrySample
+    robot: IntArray  # (k,) index of the robot
+    stamp_ns: IntArray  # (k,) the instants
+    sample: OdometrySample  # (k,) the tracks there
 
     def nearest(self, robots: IntArray, stamps_ns: IntArray) -> IntArray:
         """The nearest knots (m,) of robots at instants (m,); -1 for a robot without any, or none (-1)."""
@@ -58,30 +50,20 @@ class Knots:
 
 @dataclass(frozen=True)
 class SurveyProblem:
-    """What is to be solved.
+    """What is to be solved."""
 
-    Attributes:
-        swarm: The description with a landmark for each marker that belongs to nobody, at the origin where its
-            place is not known.
-        is_known: (L,) whether the place of a landmark is described.
-        knots: Instants at which transforms are estimated.
-        sightings: (m,) measurements of cameras; markers of landmarks are in the landmark's own frame.
-        sides: (m, 2) knots of observer and target; -1: a landmark.
-        tracks: (2, m, 3) poses of observer and target on their tracks.
-        odometry: The tracks.
-        slip: (2, m, 3, 3) covariance of their slip since the knot, in the frame of the track.
-        rare: Number of sightings by id, of markers that were seen too rarely.
-    """
-
+    # The description with a landmark for each marker that belongs to nobody, at the origin where its place is
+    # not known
     swarm: Swarm
-    is_known: BoolArray
-    knots: Knots
+    is_known: BoolArray  # (L,) whether the place of a landmark is described
+    knots: Knots  # Instants at which transforms are estimated
+    # (m,) measurements of cameras; markers of landmarks are in the landmark's own frame
     sightings: MeasurementArray
-    sides: IntArray
-    tracks: FloatArray
-    slip: FloatArray
-    odometry: OdometryTracks
-    rare: dict[int, int]
+    sides: IntArray  # (m, 2) knots of observer and target; -1: a landmark
+    tracks: FloatArray  # (2, m, 3) poses of observer and target on their tracks
+    slip: FloatArray  # (2, m, 3, 3) covariance of their slip since the knot, in the frame of the track
+    odometry: OdometryTracks  # The tracks
+    rare: dict[int, int]  # Number of sightings by id, of markers that were seen too rarely
 
     @property
     def is_polar(self) -> BoolArray:

@@ -30,11 +30,9 @@ _SCALES = (50.0, 20.0, 10.0, 5.0)
 _ITERATIONS, _CONVERGED, _NEARLY = 15, 1e-2, 1e-3
 """Most steps of each scale, and the decrease of the cost that ends them: of the last scale and, as a share of
 the cost, of the others."""
-_RISES = 2
-"""Most steps in a row that may raise the cost."""
+_RISES = 2  # Most steps in a row that may raise the cost
 _ORIGIN_SIGMA = 1e-5
-_YAW_SIGMA = 1.0
-"""Of the heading of a landmark without one, which nothing determines [rad]."""
+_YAW_SIGMA = 1.0  # Of the heading of a landmark without one, which nothing determines [rad]
 _DAMPING = (1e-14, 1e-2)
 _LEAST_VARIANCE = 1e-10
 """Added to the variances of a step, so that the covariance of a standing robot is regular [m^2, rad^2]."""
@@ -44,29 +42,17 @@ Progress = Callable[[float, str], None]
 
 @dataclass
 class Solution:
-    """Estimates with the covariance of their right-invariant errors.
+    """Estimates with the covariance of their right-invariant errors."""
 
-    Attributes:
-        knot: (k, 3) transforms of the tracks at the knots.
-        landmark: (L, 3) poses.
-        parameter: (N, 5) errors of turn bias, path scale, turn scale, camera yaw and camera scale.
-        parameter_sigma: (N, 5) their standard deviations.
-        landmark_covariance: (L, 3, 3) of x, y, yaw.
-        frame_covariance: (3, 3) of a knot in the middle: what is common to all is as uncertain.
-        weight: (m,) of the sightings, from 0 for wrong ones to 1.
-        used: (m,) whether both sides of the sighting are connected with the origin.
-        variance_ratio: Mean squared residual of sightings by the described noise; 1 is ideal.
-    """
-
-    knot: FloatArray
-    landmark: FloatArray
-    parameter: FloatArray
-    parameter_sigma: FloatArray
-    landmark_covariance: FloatArray
-    frame_covariance: FloatArray
-    weight: FloatArray
-    used: BoolArray
-    variance_ratio: float
+    knot: FloatArray  # (k, 3) transforms of the tracks at the knots
+    landmark: FloatArray  # (L, 3) poses
+    parameter: FloatArray  # (N, 5) errors of turn bias, path scale, turn scale, camera yaw and camera scale
+    parameter_sigma: FloatArray  # (N, 5) their standard deviations
+    landmark_covariance: FloatArray  # (L, 3, 3) of x, y, yaw
+    frame_covariance: FloatArray  # (3, 3) of a knot in the middle: what is common to all is as uncertain
+    weight: FloatArray  # (m,) of the sightings, from 0 for wrong ones to 1
+    used: BoolArray  # (m,) whether both sides of the sighting are connected with the origin
+    variance_ratio: float  # Mean squared residual of sightings by the described noise; 1 is ideal
 
 
 class Solver:

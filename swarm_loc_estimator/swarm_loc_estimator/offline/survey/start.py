@@ -16,15 +16,10 @@ _AGREES_M = 0.15
 
 @dataclass
 class Start:
-    """Where all begin.
+    """Where all begin."""
 
-    Attributes:
-        transform: (N, 3) from the common frame to the track of each robot; NaN: not connected.
-        landmark: (L, 3) poses; NaN: not connected.
-    """
-
-    transform: FloatArray
-    landmark: FloatArray
+    transform: FloatArray  # (N, 3) from the common frame to the track of each robot; NaN: not connected
+    landmark: FloatArray  # (L, 3) poses; NaN: not connected
 
 
 def start_of(problem: SurveyProblem) -> Start:

@@ -19,35 +19,24 @@ from swarm_loc_estimator.offline.survey.solve import Solution, Solver
 from swarm_loc_estimator.offline.survey.start import start_of
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 
-_ONE_SIDE = math.radians(45.0)
-"""Landmarks seen from directions within less than this were seen from one side."""
-_WRONG = 0.3
-"""Share of sightings that contradict a landmark from which it is named."""
+_ONE_SIDE = math.radians(45.0)  # Landmarks seen from directions within less than this were seen from one side
+_WRONG = 0.3  # Share of sightings that contradict a landmark from which it is named
 _VAGUE_M, _VAGUE = 0.01, 3.0
 """A landmark is named if its sigma exceeds this [m] and this multiple of the median sigma."""
 _WORSE = 1.5
 """One that was seen from one side is named if its sigma exceeds this multiple of the median sigma."""
-_SIGNIFICANT = 3.0
-"""Parameters are written if they exceed this many of their standard deviations."""
+_SIGNIFICANT = 3.0  # Parameters are written if they exceed this many of their standard deviations
 
 
 @dataclass(frozen=True)
 class Surveyed:
-    """What was found.
+    """What was found."""
 
-    Attributes:
-        swarm: The description with all connected landmarks and corrected parameters.
-        problem: What was solved.
-        solution: How.
-        path: (k, 3) poses in map of the robots at the knots; NaN: not connected.
-        text: Table of the landmarks, corrected parameters, and what is badly determined.
-    """
-
-    swarm: Swarm
-    problem: SurveyProblem
-    solution: Solution
-    path: FloatArray
-    text: str
+    swarm: Swarm  # The description with all connected landmarks and corrected parameters
+    problem: SurveyProblem  # What was solved
+    solution: Solution  # How
+    path: FloatArray  # (k, 3) poses in map of the robots at the knots; NaN: not connected
+    text: str  # Table of the landmarks, corrected parameters, and what is badly determined
 
 
 def survey(

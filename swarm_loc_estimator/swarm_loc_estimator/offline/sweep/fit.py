@@ -22,33 +22,21 @@ _AT_ONCE = 8
 
 
 class Best(NamedTuple):
-    """The best trial of a fit.
+    """The best trial of a fit."""
 
-    Attributes:
-        values: Setting -> value.
-        minimized: The column that it minimizes.
-        mean: Of this column.
-        mean_before: The same with the defaults; None: they are not in the ranges, or have no figure.
-    """
-
-    values: Mapping[str, Value]
-    minimized: str
-    mean: float
+    values: Mapping[str, Value]  # Setting -> value
+    minimized: str  # The column that it minimizes
+    mean: float  # Of this column
+    # The same with the defaults; None: they are not in the ranges, or have no figure
     mean_before: float | None
 
 
 class Fitted(NamedTuple):
-    """A finished fit.
+    """A finished fit."""
 
-    Attributes:
-        sweep: With the replays of all trials.
-        finished: Key of a job -> its line.
-        best: None if each trial had a replay without the figure.
-    """
-
-    sweep: Sweep
-    finished: Mapping[str, Line]
-    best: Best | None
+    sweep: Sweep  # With the replays of all trials
+    finished: Mapping[str, Line]  # Key of a job -> its line
+    best: Best | None  # None if each trial had a replay without the figure
 
 
 def run_fit(sweep: Sweep, fit: Fit, path: Path, backend: Backend, progress: Progress) -> Fitted:

@@ -51,23 +51,15 @@ class SweepFileError(UserError):
 
 @dataclass(frozen=True)
 class Job:
-    """One replay.
+    """One replay."""
 
-    Attributes:
-        bag: Path of the bag.
-        swarm: Its robots and landmarks.
-        settings: Of the estimator.
-        loss: Messages that are lost.
-        key: Hash of all that determines the result: contents of bag, swarm and map, settings, loss, program.
-        cells: Its values by column of the table; None: no seed where nothing is lost.
-    """
-
-    bag: Path
-    swarm: Swarm
-    settings: Settings
-    loss: Loss
+    bag: Path  # Path of the bag
+    swarm: Swarm  # Its robots and landmarks
+    settings: Settings  # Of the estimator
+    loss: Loss  # Messages that are lost
+    # Hash of all that determines the result: contents of bag, swarm and map, settings, loss, program
     key: str
-    cells: dict[str, Value | None]
+    cells: dict[str, Value | None]  # Its values by column of the table; None: no seed where nothing is lost
 
     def having(self, values: Mapping[str, Value]) -> Job:
         """The same replay with other values of settings."""
@@ -80,34 +72,22 @@ class Job:
 
 @dataclass(frozen=True)
 class Fit:
-    """A search for the values of settings with the least mean of a column over all replays.
+    """A search for the values of settings with the least mean of a column over all replays."""
 
-    Attributes:
-        minimize: The column.
-        trials: Number of sets of values that are tried.
-        ranges: Setting -> least and greatest value; whole numbers for those that are.
-    """
-
-    minimize: str
-    trials: int
+    minimize: str  # The column
+    trials: int  # Number of sets of values that are tried
+    # Setting -> least and greatest value; whole numbers for those that are
     ranges: Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """All replays of a sweep, in the order of the table.
+    """All replays of a sweep, in the order of the table."""
 
-    Attributes:
-        jobs: The replays.
-        varied: Columns with more than one value, but for bag and seed.
-        workers: Number of replays at a time; -1: one for each processor.
-        fit: Makes the replays of each trial from these; None: there is no fit.
-    """
-
-    jobs: tuple[Job, ...]
-    varied: tuple[str, ...]
-    workers: int
-    fit: Fit | None = None
+    jobs: tuple[Job, ...]  # The replays
+    varied: tuple[str, ...]  # Columns with more than one value, but for bag and seed
+    workers: int  # Number of replays at a time; -1: one for each processor
+    fit: Fit | None = None  # Makes the replays of each trial from these; None: there is no fit
 
 
 def read_sweep(path: Path) -> Sweep:

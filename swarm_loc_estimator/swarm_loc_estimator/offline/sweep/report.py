@@ -21,14 +21,11 @@ from swarm_loc_estimator.offline.sweep.grid import Sweep
 from swarm_loc_estimator.offline.sweep.jobs import FIGURES, Line
 from swarm_loc_estimator.timeline.settings import Settings
 
-Row = Mapping[str, Any]
-"""Column -> value; None where there is none."""
+Row = Mapping[str, Any]  # Column -> value; None where there is none
 
 _FAILURE = "failure"
-_LOG_FROM = 10.0
-"""Ratio of the greatest to the least value from which their axis is logarithmic."""
-_TICKS = 8
-"""Maximum number of values that are labelled, and joined by lines."""
+_LOG_FROM = 10.0  # Ratio of the greatest to the least value from which their axis is logarithmic
+_TICKS = 8  # Maximum number of values that are labelled, and joined by lines
 _UNITS = {name: spec.unit for name, spec in number_specs(Settings).items()}
 _UNITS["lost"] = "share of the messages"
 _WITHOUT_TRUTH = "No ground truth to compare with: the plots show what the estimator itself reports."

@@ -23,15 +23,10 @@ class BackendError(UserError):
 
 
 class Backend(NamedTuple):
-    """What runs the workers.
+    """What runs the workers."""
 
-    Attributes:
-        name: loky for processes of this machine.
-        address: Of a running cluster; None: Ray or Dask is started on this machine.
-    """
-
-    name: Name = "loky"
-    address: str | None = None
+    name: Name = "loky"  # loky for processes of this machine
+    address: str | None = None  # Of a running cluster; None: Ray or Dask is started on this machine
 
 
 @contextmanager

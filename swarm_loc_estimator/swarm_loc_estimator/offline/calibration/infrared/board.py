@@ -28,8 +28,7 @@ from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import Swarm
 
-MAX_RANGE = 0.3
-"""Maximum distance of exchanges that are used [m]; farther readings are mostly noise."""
+MAX_RANGE = 0.3  # Maximum distance of exchanges that are used [m]; farther readings are mostly noise
 _BODIES = 2.0
 """Maximum distance of an occluding robot from the line of sight between two others [robot radii]."""
 _TRUTH_GAP_NS = 200_000_000
@@ -37,19 +36,12 @@ _TRUTH_GAP_NS = 200_000_000
 
 @dataclass(frozen=True)
 class BoardRecording:
-    """Exchanges of a recording with one kind of board.
+    """Exchanges of a recording with one kind of board."""
 
-    Attributes:
-        platform: The initial model of the board.
-        robots: Their indices in the swarm, in ascending order.
-        data: All exchanges with ground truth; robots by place in `robots`.
-        clear: (k,) True where no other robot is known to occlude the line of sight.
-    """
-
-    platform: IrPlatform
-    robots: tuple[int, ...]
-    data: BoardReadings
-    clear: BoolArray
+    platform: IrPlatform  # The initial model of the board
+    robots: tuple[int, ...]  # Their indices in the swarm, in ascending order
+    data: BoardReadings  # All exchanges with ground truth; robots by place in `robots`
+    clear: BoolArray  # (k,) True where no other robot is known to occlude the line of sight
 
     @property
     def to_fit(self) -> BoardReadings:
@@ -144,11 +136,9 @@ GAIN_SIGMA = 0.05
 Set by hand: a jackknife over blocks of time gives .03 to .17 on the recordings of 2016, where some sensors
 are sometimes dark, and yields worse results on other recordings: 10.6 instead of 10.4 deg of heading.
 """
-MIN_EXCHANGES = 100
-"""Minimum number of exchanges with ground truth."""
+MIN_EXCHANGES = 100  # Minimum number of exchanges with ground truth
 BLOCKS = 3
-_STRAY = (0.0, 0.01, 0.02, 0.03, 0.04, 0.06)
-"""Candidate values of stray light."""
+_STRAY = (0.0, 0.01, 0.02, 0.03, 0.04, 0.06)  # Candidate values of stray light
 _MISFIT = 3.0
 """Maximum RMS residual of the initial platform; beyond it its curves are considered wrong [sigma]."""
 _TAIL_SHARE, _TAIL_BOUND = 0.97, 11.345
@@ -158,17 +148,11 @@ _MAX_SCALE = 30.0
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Errors in blocks of time held out of the fit.
+    """Errors in blocks of time held out of the fit."""
 
-    Attributes:
-        errors: (s, 3) range [m], bearing, heading [rad] of the solved exchanges.
-        nees: (s,) normalised estimation errors squared.
-        asked: Number of exchanges.
-    """
-
-    errors: FloatArray
-    nees: FloatArray
-    asked: int
+    errors: FloatArray  # (s, 3) range [m], bearing, heading [rad] of the solved exchanges
+    nees: FloatArray  # (s,) normalised estimation errors squared
+    asked: int  # Number of exchanges
 
     @property
     def solved_share(self) -> float:
@@ -191,23 +175,14 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class BoardCalibration:
-    """A calibrated board.
+    """A calibrated board."""
 
-    Attributes:
-        model: Model fitted to all exchanges.
-        stock_sigma: RMS residual of the initial platform at the true poses [sigma].
-        held_out: Errors in blocks held out of the fit (cross-validation).
-        with_gains: Whether sensor gains reduced these errors and are kept.
-        elements: Dead or shaded elements, according to the fitted board.
-        saturation: (n,) maximum count of each sensor.
-    """
-
-    model: BoardModel
-    stock_sigma: float
-    held_out: HeldOut
-    with_gains: bool
-    elements: ElementVerdicts
-    saturation: FloatArray
+    model: BoardModel  # Model fitted to all exchanges
+    stock_sigma: float  # RMS residual of the initial platform at the true poses [sigma]
+    held_out: HeldOut  # Errors in blocks held out of the fit (cross-validation)
+    with_gains: bool  # Whether sensor gains reduced these errors and are kept
+    elements: ElementVerdicts  # Dead or shaded elements, according to the fitted board
+    saturation: FloatArray  # (n,) maximum count of each sensor
 
     @property
     def curves_wrong(self) -> bool:

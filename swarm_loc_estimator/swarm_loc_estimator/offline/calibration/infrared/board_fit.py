@@ -22,8 +22,7 @@ from swarm_loc_estimator.swarm.ir_curves import Amplitude, TabulatedCurve
 
 _KNOTS = np.radians([0, 15, 30, 40, 50, 60, 70, 80, 90, 110, 135, 180])
 _TABLE = np.radians(np.arange(0, 181, 10))
-_FALLS_FROM = 5
-"""Index of the first knot from which curves must decrease."""
+_FALLS_FROM = 5  # Index of the first knot from which curves must decrease
 _STEEPNESS, _BEND = 5.0, 0.8
 """Weights of an increase beyond that knot, and of second differences of the log curves."""
 _YAW_SIGMA = np.radians(4.0)
@@ -31,38 +30,26 @@ _OFFSET, _OFFSET_SIGMA, _EXPONENT, _EXPONENT_SIGMA = 0.05, 0.05, 2.5, 1.0
 _PRIOR = 3.0
 _STEP = 1e-5
 _GAIN_SIGMA, _MIN_SPREAD = 0.25, 0.01
-_MIN_MEASURED = 100
-"""Minimum number of exchanges of a receiver for sensor gains."""
-_LIMIT = 2.0
-"""Maximum residual after the robust loss [sigma]."""
+_MIN_MEASURED = 100  # Minimum number of exchanges of a receiver for sensor gains
+_LIMIT = 2.0  # Maximum residual after the robust loss [sigma]
 _DIM = 3.0
 """Maximum distance from the median of readings that determine the noise [sigma]; most show no light."""
-_LIT = 8.0
-"""Minimum expectation of readings that determine the error of the curves [sigma]."""
+_LIT = 8.0  # Minimum expectation of readings that determine the error of the curves [sigma]
 _OUTLIER = 3.0
 _MIN_SHARE, _MAX_SHARE = 0.02, 0.3
 _ROUNDS = 2
 _MAX_EVALUATIONS = 10
-_TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution per median absolute deviation."""
+_TO_SIGMA = 1.4826  # Standard deviation of a normal distribution per median absolute deviation
 
 
 class BoardReadings(NamedTuple):
-    """Exchanges of robots with one kind of board at full power.
+    """Exchanges of robots with one kind of board at full power."""
 
-    Attributes:
-        receiver: (k,) index of the robot that measured.
-        transmitter: (k,) index of the robot that lit its emitters.
-        readings: (k, n, n) [count], [sensor, emitter], NaN where not measured or dead.
-        poses: (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad].
-        stamp_ns: (k,).
-    """
-
-    receiver: NDArray[np.int64]
-    transmitter: NDArray[np.int64]
-    readings: FloatArray
-    poses: FloatArray
-    stamp_ns: NDArray[np.int64]
+    receiver: NDArray[np.int64]  # (k,) index of the robot that measured
+    transmitter: NDArray[np.int64]  # (k,) index of the robot that lit its emitters
+    readings: FloatArray  # (k, n, n) [count], [sensor, emitter], NaN where not measured or dead
+    poses: FloatArray  # (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad]
+    stamp_ns: NDArray[np.int64]  # (k,)
 
     def select(self, rows: NDArray[np.bool_]) -> BoardReadings:
         """The exchanges where `rows` (k,) is True."""
@@ -71,23 +58,15 @@ class BoardReadings(NamedTuple):
 
 @dataclass(frozen=True)
 class BoardModel:
-    """A fitted board.
+    """A fitted board."""
 
-    Attributes:
-        platform: The board.
-        sensor_gains: (robots, n) gains of the receivers' sensors; 1 where not estimated.
-        gains_sought: (robots,) True where estimated; their spread is the platform's `element_sigma`.
-        truth_yaw: (robots,) heading of each robot minus that of its ground truth [rad].
-        scatter: (k, n, n) residuals of the fitted readings [sigma].
-        angles: (2, k, n, n) angles of the paths at sensors and emitters [rad].
-    """
-
-    platform: IrPlatform
-    sensor_gains: FloatArray
+    platform: IrPlatform  # The board
+    sensor_gains: FloatArray  # (robots, n) gains of the receivers' sensors; 1 where not estimated
+    # (robots,) True where estimated; their spread is the platform's `element_sigma`
     gains_sought: NDArray[np.bool_]
-    truth_yaw: FloatArray
-    scatter: FloatArray
-    angles: FloatArray
+    truth_yaw: FloatArray  # (robots,) heading of each robot minus that of its ground truth [rad]
+    scatter: FloatArray  # (k, n, n) residuals of the fitted readings [sigma]
+    angles: FloatArray  # (2, k, n, n) angles of the paths at sensors and emitters [rad]
 
 
 def fit_board(start: IrPlatform, data: BoardReadings, robots: int, *, gains: bool = True) -> BoardModel:

@@ -29,34 +29,24 @@ from swarm_loc_estimator.offline.calibration.infrared.element_likelihood import 
 )
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
-FALSE_ALARM = 0.01
-"""Probability of a false alarm for any element."""
+FALSE_ALARM = 0.01  # Probability of a false alarm for any element
 _LOST, _WHOLE_SHARES = slice(0, 3), slice(3, None)
 """Relative gains (of `SHARES`) under the hypotheses dead or shaded, and working."""
-_SAME_GEOMETRY = 1.5
-"""Maximum difference of directions within one geometry, in steps of the grid."""
+_SAME_GEOMETRY = 1.5  # Maximum difference of directions within one geometry, in steps of the grid
 _BRIGHT = 10.0
 """Minimum of the brightest reading of a usable exchange [sigma]; below, robots are out of range or sight."""
-_MIN_BLOCKED = 0.05
-"""Minimum assumed share of geometries with an obstacle on the line of sight."""
+_MIN_BLOCKED = 0.05  # Minimum assumed share of geometries with an obstacle on the line of sight
 
-_MIN_SIGMA = 0.05
-"""Minimum relative standard deviation of the gains of working elements."""
+_MIN_SIGMA = 0.05  # Minimum relative standard deviation of the gains of working elements
 
 
 @dataclass(frozen=True)
 class ElementVerdicts:
-    """The verdict on each element.
+    """The verdict on each element."""
 
-    Attributes:
-        dead: (2, robots, n) sensors and emitters that are dead or shaded.
-        works: (2, robots, n) sensors and emitters that certainly work.
-        share: (2, robots, n) most likely relative gain.
-    """
-
-    dead: BoolArray
-    works: BoolArray
-    share: FloatArray
+    dead: BoolArray  # (2, robots, n) sensors and emitters that are dead or shaded
+    works: BoolArray  # (2, robots, n) sensors and emitters that certainly work
+    share: FloatArray  # (2, robots, n) most likely relative gain
 
     @property
     def undecided(self) -> BoolArray:

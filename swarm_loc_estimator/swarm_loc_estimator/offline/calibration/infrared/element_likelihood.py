@@ -24,39 +24,27 @@ from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 SHARES: FloatArray = np.array([0.0, 0.15, 0.35, 0.7, 1.0, 1.4])
 """Relative gains of an element that are compared; the first is zero."""
-WHOLE = 4
-"""Index of the relative gain one."""
-_PER_ELEMENT, _MAX_DIRECTIONS = 4, 24
-"""Number of bearings, and of headings, of the grid."""
-_SHOWN = 10.0
-"""Minimum of readings that determine the discretization error of the grid [sigma]."""
-_NOISE_RATIO = 1.2
-"""Maximum relative difference in noise of exchanges that share a table."""
-_NEGLIGIBLE = 8.0
-"""Maximum log-likelihood ratio to the best pose; less likely poses are skipped."""
-BRIGHT_SPAN = 20.0
-"""Width of the uniform distribution of readings that are too bright [sigma]."""
-MIN_SHARE = 1e-3
-"""Minimum assumed share of outliers."""
+WHOLE = 4  # Index of the relative gain one
+_PER_ELEMENT, _MAX_DIRECTIONS = 4, 24  # Number of bearings, and of headings, of the grid
+_SHOWN = 10.0  # Minimum of readings that determine the discretization error of the grid [sigma]
+_NOISE_RATIO = 1.2  # Maximum relative difference in noise of exchanges that share a table
+_NEGLIGIBLE = 8.0  # Maximum log-likelihood ratio to the best pose; less likely poses are skipped
+BRIGHT_SPAN = 20.0  # Width of the uniform distribution of readings that are too bright [sigma]
+MIN_SHARE = 1e-3  # Minimum assumed share of outliers
 PEAK = 1.0 / math.sqrt(2.0 * math.pi)
 LOWEST = 1e-300
-_FAR_OFF = 8.0
-"""Maximum residual with a non-negligible likelihood [sigma]."""
+_FAR_OFF = 8.0  # Maximum residual with a non-negligible likelihood [sigma]
 
 Float32Array = NDArray[np.float32]
 
 
 class ElementLikelihoods(NamedTuple):
-    """Likelihoods of the elements of exchanges.
+    """Likelihoods of the elements of exchanges."""
 
-    Attributes:
-        log: (k, 2, n, S) log likelihood for each relative gain of `SHARES`, of the receiver's sensors and
-            the transmitter's emitters.
-        directions: (k, 2) bearing and heading [rad] of the most likely pose.
-    """
-
+    # (k, 2, n, S) log likelihood for each relative gain of `SHARES`, of the receiver's sensors and the
+    # transmitter's emitters
     log: FloatArray
-    directions: FloatArray
+    directions: FloatArray  # (k, 2) bearing and heading [rad] of the most likely pose
 
 
 def element_likelihoods(

@@ -35,14 +35,12 @@ from swarm_loc_estimator.offline.calibration.infrared.element_likelihood import 
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
 
 BLOCKS = 4
-_EVIDENCE = math.log(100.0)
-"""Minimum increase of the log likelihood of all exchanges."""
+_EVIDENCE = math.log(100.0)  # Minimum increase of the log likelihood of all exchanges
 GAINS, ALIKE, UNKNOWN = range(3)
 """Hypotheses on a robot's gains: the estimate; unit gains with the same uncertainty; unknown gains with the
 board's `element_sigma`."""
 HYPOTHESES = 3
-_POINTS = 48
-"""Number of poses sampled around each solution."""
+_POINTS = 48  # Number of poses sampled around each solution
 _SEED = 1
 
 

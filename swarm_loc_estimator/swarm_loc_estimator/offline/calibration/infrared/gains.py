@@ -26,46 +26,30 @@ from swarm_loc_estimator.sensors.infrared import ExchangeKey, MatrixScreening, R
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
-MIN_EXCHANGES = 20
-"""Minimum number of exchanges between robots with one kind of board."""
+MIN_EXCHANGES = 20  # Minimum number of exchanges between robots with one kind of board
 _MAX_EXCHANGES = 10_000
 _DECIMALS = 5
 
 
 @dataclass(frozen=True)
 class BoardGroup:
-    """The robots with one kind of board, and their exchanges.
+    """The robots with one kind of board, and their exchanges."""
 
-    Attributes:
-        source: Name or path of the platform.
-        platform: Model of the board.
-        robots: Their indices in the swarm.
-        exchanges: Exchanges in order of time; robots by place in `robots`.
-    """
-
-    source: str
-    platform: IrPlatform
-    robots: tuple[int, ...]
-    exchanges: Exchanges
+    source: str  # Name or path of the platform
+    platform: IrPlatform  # Model of the board
+    robots: tuple[int, ...]  # Their indices in the swarm
+    exchanges: Exchanges  # Exchanges in order of time; robots by place in `robots`
 
 
 @dataclass(frozen=True)
 class BoardFit:
-    """The calibration of one kind of board.
+    """The calibration of one kind of board."""
 
-    Attributes:
-        group: Robots and exchanges.
-        fit: Gains, by place in the group's `robots`.
-        elements: Dead or shaded elements, by place; they are not used.
-        limits: Saturation and noise of sensors, by place.
-        helps: (robots,) True where a robot's gains pass the cross-validation over blocks of time.
-    """
-
-    group: BoardGroup
-    fit: GainsFit
-    elements: ElementVerdicts
-    limits: ReadingLimits
-    helps: BoolArray
+    group: BoardGroup  # Robots and exchanges
+    fit: GainsFit  # Gains, by place in the group's `robots`
+    elements: ElementVerdicts  # Dead or shaded elements, by place; they are not used
+    limits: ReadingLimits  # Saturation and noise of sensors, by place
+    helps: BoolArray  # (robots,) True where a robot's gains pass the cross-validation over blocks of time
 
     def of_robot(self, place: int) -> tuple[int, float, float]:
         """Number of exchanges of a robot used, and its RMS residuals before and after [sigma]."""
@@ -76,17 +60,11 @@ class BoardFit:
 
 @dataclass(frozen=True)
 class InfraredCalibration:
-    """Result of a calibration of infrared boards.
+    """Result of a calibration of infrared boards."""
 
-    Attributes:
-        swarm: The swarm with calibrated gains and dead elements.
-        boards: The fit of each kind of board.
-        remarks: What could not be used or calibrated, one sentence each.
-    """
-
-    swarm: Swarm
-    boards: tuple[BoardFit, ...]
-    remarks: tuple[str, ...]
+    swarm: Swarm  # The swarm with calibrated gains and dead elements
+    boards: tuple[BoardFit, ...]  # The fit of each kind of board
+    remarks: tuple[str, ...]  # What could not be used or calibrated, one sentence each
 
 
 def calibrate_infrared(

@@ -27,36 +27,28 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.infrared.gains import Exchanges
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
-FALSE_ALARM = 0.01
-"""Probability of any false detection of saturation."""
+FALSE_ALARM = 0.01  # Probability of any false detection of saturation
 _SPAN, _WIDTHS = 0.3, (0.0, 0.005, 0.01, 0.02, 0.04)
 """Span below the highest reading, and widths of the windows at the top, relative to it."""
 _MIN_EMITTERS = 3
 """Minimum number of emitters at the top: a single one may face the sensor at a constant distance."""
-_SAME = 0.2
-"""Maximum change of a reading within one geometry, relative to the brightest."""
-_CLEAR_OF_TOP = 0.9
-"""Maximum reading used for noise, relative to saturation."""
-_BRIGHT = 10.0
-"""Minimum of the brightest reading of pairs tested for motion [sigma of a change]."""
-_MAX_CHANGE = 0.3
-"""Maximum change of a stationary pair beyond noise: relative root sum of squares."""
+_SAME = 0.2  # Maximum change of a reading within one geometry, relative to the brightest
+_CLEAR_OF_TOP = 0.9  # Maximum reading used for noise, relative to saturation
+_BRIGHT = 10.0  # Minimum of the brightest reading of pairs tested for motion [sigma of a change]
+_MAX_CHANGE = 0.3  # Maximum change of a stationary pair beyond noise: relative root sum of squares
 _MOTIONS, _MOVED = 3, 0.05
 """Number of motion directions (range, bearing, heading); false alarm probability of the F test for motion."""
 _MIN_STANDING = 0.2
 """Minimum share of stationary pairs; fewer may pass the test by chance while all robots move."""
-_MIN_READINGS = 60
-"""Minimum number of differences for the noise of a sensor."""
-_MIN_FREE = 0.2
-"""Minimum share of a change that motion cannot explain, for its use in the noise estimate."""
+_MIN_READINGS = 60  # Minimum number of differences for the noise of a sensor
+_MIN_FREE = 0.2  # Minimum share of a change that motion cannot explain, for its use in the noise estimate
 _TRIM, _TRIMMED = 3.0, 0.9733
 """Outlier threshold of differences [sigma], and the relative variance of a normal truncated there."""
 _MAX_UNSURE = 0.03
 """Relative noise is reported if this value were detectable, or if it exceeds twice its standard deviation."""
 _ROUNDS, _FIT_ROUNDS = 4, 30
 _TINY = 1e-300
-_FIRST_RELATIVE, _LEAST_NOISE = 0.03, 0.3
-"""Initial noise: relative, and minimum [count]."""
+_FIRST_RELATIVE, _LEAST_NOISE = 0.03, 0.3  # Initial noise: relative, and minimum [count]
 _LOWER, _FACTOR = 0.97, 1.5
 """Thresholds of a contradiction: saturation relative to the described one, and factor between noises."""
 _LEAST_RELATIVE = 0.05
@@ -65,17 +57,11 @@ _LEAST_RELATIVE = 0.05
 
 @dataclass(frozen=True)
 class ReadingLimits:
-    """Saturation and noise of sensors; NaN where exchanges do not determine them.
+    """Saturation and noise of sensors; NaN where exchanges do not determine them."""
 
-    Attributes:
-        saturation: (robots, n) saturation above the dark level [count].
-        noise: (robots, n) standard deviation of a dark reading [count].
-        relative_noise: (robots, n) additional noise relative to the reading.
-    """
-
-    saturation: FloatArray
-    noise: FloatArray
-    relative_noise: FloatArray
+    saturation: FloatArray  # (robots, n) saturation above the dark level [count]
+    noise: FloatArray  # (robots, n) standard deviation of a dark reading [count]
+    relative_noise: FloatArray  # (robots, n) additional noise relative to the reading
 
     @property
     def typical_noise(self) -> tuple[float, float]:
@@ -84,19 +70,12 @@ class ReadingLimits:
 
 
 class _Repeats(NamedTuple):
-    """Pairs of consecutive exchanges of one receiver with one transmitter.
+    """Pairs of consecutive exchanges of one receiver with one transmitter."""
 
-    Attributes:
-        receiver: (p,) index of the receiver.
-        change: (p, n, n) change of readings [count]; 0 where one of the two is unusable.
-        level: (p, n, n) mean of both readings.
-        known: (p, n, n) True where both are usable.
-    """
-
-    receiver: NDArray[np.int64]
-    change: FloatArray
-    level: FloatArray
-    known: BoolArray
+    receiver: NDArray[np.int64]  # (p,) index of the receiver
+    change: FloatArray  # (p, n, n) change of readings [count]; 0 where one of the two is unusable
+    level: FloatArray  # (p, n, n) mean of both readings
+    known: BoolArray  # (p, n, n) True where both are usable
 
 
 def find_reading_limits(platform: IrPlatform, robots: int, exchanges: Exchanges) -> ReadingLimits:
