@@ -16,8 +16,7 @@ from sensor_msgs.msg import Image
 from bench.shared.bags import read_truth
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.worlds import ErrorModel
-from swarm_loc_estimator.common.messages.cdr import nanoseconds
-from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY, POSE_STAMPED
+from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY, POSE_STAMPED, nanoseconds
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveError, LiveGraph

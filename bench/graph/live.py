@@ -20,8 +20,7 @@ import numpy as np
 from bench.shared.bags import copy_part
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.common.launch import GraphOptions
-from swarm_loc_estimator.offline.datasets.mrclam import read_dataset
-from swarm_loc_estimator.offline.datasets.mrclam_bag import Delay, convert
+from swarm_loc_estimator.offline.datasets.mrclam import Delay, convert, read_dataset
 from swarm_loc_estimator.offline.live.run import Agreement, LiveRun, compare_with_replay, play_live
 
 ROOT = OUT.parent

@@ -12,15 +12,13 @@ import numpy as np
 from swarm_loc_drivers.sim.run import CAMERA_LATENESS, START_NS, arrival_ns
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.common.messages.cdr import encode
-from swarm_loc_estimator.common.messages.definitions import RANGES
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.cdr import RANGES, encode
 from swarm_loc_estimator.common.messages.poses import encode_odometry
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.sensor import chosen, joined
 from swarm_loc_estimator.swarm.error_models import OdometryModel
-from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
-from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
+from swarm_loc_estimator.swarm.swarm import Anchor, Robot, StartSigma, Swarm, UwbDevice
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 
 STEP_NS = 50_000_000

@@ -14,8 +14,7 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import BoolArray
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
-from swarm_loc_estimator.offline.datasets.mrclam import read_dataset
-from swarm_loc_estimator.offline.datasets.mrclam_bag import Delay, convert
+from swarm_loc_estimator.offline.datasets.mrclam import Delay, convert, read_dataset
 from swarm_loc_estimator.sensors.camera import NO_DETECTIONS
 from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel

@@ -24,8 +24,7 @@ from bench.shared.bags import copy_part
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.cdr import nanoseconds
-from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY, nanoseconds
 from swarm_loc_estimator.common.messages.poses import decode_odometry, yaw_of
 from swarm_loc_estimator.common.messages.streams import DetectionReader, PoseReader
 

@@ -11,8 +11,7 @@ from bench.shared.common import Cell, new_plot, rms, save_plot, table
 from swarm_loc_drivers.sim.pushbot.optics import assembled
 from swarm_loc_drivers.sim.pushbot.wall_drive import WallDriveSettings, drive_at_wall
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.laser.calibration import LaserCalibration
-from swarm_loc_vision.laser.fit import Drive, fit_hyperbola
+from swarm_loc_vision.laser.calibration import Drive, LaserCalibration, fit_hyperbola
 
 DEPTHS_M = np.linspace(0.1, 2.5, 241)
 _MAX_ROW = 125.0

@@ -19,8 +19,7 @@ from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, clearance, is_vi
 from swarm_loc_drivers.sim.scenarios.bags import message_header
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.messages.cdr import encode
-from swarm_loc_estimator.common.messages.definitions import LASER_SCAN
+from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, encode
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.se2 import compose, wrap_angle
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper

@@ -9,15 +9,17 @@ from typing import Any
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader, BagTopic
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.cdr import Rows, encode, stamp_rows
-from swarm_loc_estimator.common.messages.definitions import (
+from swarm_loc_estimator.common.messages.cdr import (
     POSE_STAMPED,
     SWARM_DETECTIONS,
     SWARM_FIXES,
     SWARM_ODOMETRY,
+    Rows,
+    encode,
+    stamp_rows,
 )
 from swarm_loc_estimator.common.messages.detections import SharedHead
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.ground_truth import TruthReader
 from swarm_loc_estimator.swarm.swarm import Swarm

@@ -9,7 +9,7 @@ import pytest
 
 from bench.peers import reading
 from bench.shared.bags import copy_part
-from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from playwright.sync_api import Browser, CDPSession
 
 from bench.watch.browser import WatchedPage
 from bench.watch.watched_swarm import WatchedSwarm
-from swarm_loc_estimator.watch.access import Access
+from swarm_loc_estimator.watch.server import Access
 
 Place = tuple[float, float]
 PATIENCE_S = 15.0

@@ -14,8 +14,7 @@ from playwright.sync_api import Browser
 from bench.watch.browser import WatchedPage
 from bench.watch.watched_swarm import MAP_CORNER, SWARM, WatchedSwarm, surroundings, swarm_frames
 from swarm_loc_estimator.mapping.messages import GridMessage
-from swarm_loc_estimator.watch.frames import map_frame
-from swarm_loc_estimator.watch.page import about, recording
+from swarm_loc_estimator.watch.page import about, map_frame, recording
 from swarm_loc_estimator.watch.page import page as page_of
 
 LEAST_PIXELS = {

@@ -45,7 +45,7 @@ from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph, 
 from swarm_loc_estimator.offline.live.run import ESTIMATOR, PLAYER
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.watch.access import free_port
+from swarm_loc_estimator.watch.server import free_port
 
 SIZES = (5, 300, 1000)
 BARS_MS = {5: 100.0, 300: 150.0, 1000: 250.0}

@@ -7,13 +7,12 @@ import numpy as np
 from bench.pushbot.runs import RunSettings
 from swarm_loc_drivers.sim.pushbot.exploration import Arrival, Exploration, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
-from swarm_loc_estimator.common.messages.estimates import EstimateMessage
+from swarm_loc_estimator.common.messages.poses import EstimateMessage
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.messages import GridMessage
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
-from swarm_loc_estimator.watch.frames import Frame, map_frame, places_frame, poses_frame
-from swarm_loc_estimator.watch.page import about, recording
+from swarm_loc_estimator.watch.page import Frame, about, map_frame, places_frame, poses_frame, recording
 
 _MAP_EVERY_S = 20.0
 

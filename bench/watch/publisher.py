@@ -18,7 +18,7 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.estimates import SwarmPosesEncoder
+from swarm_loc_estimator.common.messages.poses import SwarmPosesEncoder
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.sightings import Sightings, encode_sightings
 from swarm_loc_msgs.msg import SwarmPoses, SwarmSightings

@@ -16,8 +16,7 @@ from nav_msgs.msg import Odometry
 from rclpy.qos import QoSProfile
 
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.messages.cdr import ENCAPSULATION, SECOND_NS
-from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ENCAPSULATION, ODOMETRY, SECOND_NS
 from swarm_loc_estimator.common.messages.poses import STAMP_SIZE, stamp_bytes
 from swarm_loc_msgs.msg import MarkerDetectionArray
 

@@ -10,21 +10,20 @@ from typing import Any
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.estimates import EstimateMessage
+from swarm_loc_estimator.common.messages.poses import EstimateMessage
 from swarm_loc_estimator.mapping.messages import GridMessage
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.sightings import Sightings
-from swarm_loc_estimator.watch.access import Access
-from swarm_loc_estimator.watch.frames import (
+from swarm_loc_estimator.watch.page import (
     Frame,
+    about,
     aerial_frame,
     map_frame,
     places_frame,
     poses_frame,
     sightings_frame,
 )
-from swarm_loc_estimator.watch.page import about
-from swarm_loc_estimator.watch.server import Answer, Command, WatchServer
+from swarm_loc_estimator.watch.server import Access, Answer, Command, WatchServer
 
 SWARM = Swarm(
     robots=(Robot("alpha"), Robot("beta"), Robot("gamma")),

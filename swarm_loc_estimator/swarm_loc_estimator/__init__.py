@@ -23,19 +23,19 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.mapping.scans import UNSEEN as UNSEEN
     from swarm_loc_estimator.mapping.scans import LightSightings as LightSightings
     from swarm_loc_estimator.mapping.scans import Readings as Readings
+    from swarm_loc_estimator.offline.export import read_truth as read_truth
     from swarm_loc_estimator.offline.metrics import Errors as Errors
     from swarm_loc_estimator.offline.metrics import ErrorSummary as ErrorSummary
     from swarm_loc_estimator.offline.recorded_bag import Loss as Loss
     from swarm_loc_estimator.offline.replay import replay as replay
     from swarm_loc_estimator.offline.report.report import write_report as write_report
     from swarm_loc_estimator.offline.result import ReplayResult as ReplayResult
-    from swarm_loc_estimator.offline.tum import read_truth as read_truth
+    from swarm_loc_estimator.sensors.camera import CONTENT_POSE as CONTENT_POSE
+    from swarm_loc_estimator.sensors.camera import CONTENT_POSE_TWO as CONTENT_POSE_TWO
     from swarm_loc_estimator.sensors.camera import DetectionRows as DetectionRows
     from swarm_loc_estimator.sensors.fix import FixRows as FixRows
     from swarm_loc_estimator.sensors.odometry import OdometryRows as OdometryRows
     from swarm_loc_estimator.sensors.registry import Batch as Batch
-    from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSE as CONTENT_POSE
-    from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSE_TWO as CONTENT_POSE_TWO
     from swarm_loc_estimator.swarm.swarm import Landmark as Landmark
     from swarm_loc_estimator.swarm.swarm import Robot as Robot
     from swarm_loc_estimator.swarm.swarm import Swarm as Swarm
@@ -59,9 +59,8 @@ _MODULES = {
     "swarm_loc_estimator.offline.replay": ("replay",),
     "swarm_loc_estimator.offline.report.report": ("write_report",),
     "swarm_loc_estimator.offline.result": ("ReplayResult",),
-    "swarm_loc_estimator.offline.tum": ("read_truth",),
-    "swarm_loc_estimator.sensors.camera": ("DetectionRows",),
-    "swarm_loc_estimator.sensors.sighting_kernels": ("CONTENT_POSE", "CONTENT_POSE_TWO"),
+    "swarm_loc_estimator.offline.export": ("read_truth",),
+    "swarm_loc_estimator.sensors.camera": ("CONTENT_POSE", "CONTENT_POSE_TWO", "DetectionRows"),
     "swarm_loc_estimator.sensors.fix": ("FixRows",),
     "swarm_loc_estimator.sensors.odometry": ("OdometryRows",),
     "swarm_loc_estimator.sensors.registry": ("Batch",),

@@ -17,17 +17,17 @@ from swarm_loc_estimator.common.messages.detections import (
     encode_brightness,
     encode_detections,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS, record_pair
-from swarm_loc_estimator.filter.integrity.fault_detection import is_kidnapped
+from swarm_loc_estimator.filter.integrity import is_kidnapped
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.sensors.camera import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import OdometryModel
@@ -35,8 +35,7 @@ from swarm_loc_estimator.swarm.ir_board import IrMethod, RobotIr
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.fusion import Fusion
-from swarm_loc_estimator.timeline.scheduling import Policy
-from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.settings import Policy, Settings
 
 _SECOND = 1_000_000_000
 _FIRST_LANDMARK = 10

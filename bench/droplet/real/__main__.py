@@ -29,15 +29,16 @@ from swarm_loc_estimator.common.command_line import exit_with_message
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.infrared.closed_form import ClosedForm
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.solution import IrEstimator
+from swarm_loc_estimator.infrared.search import IrEstimator
 from swarm_loc_estimator.offline.calibration.infrared.board import (
     MAX_RANGE,
     BoardCalibration,
+    BoardReadings,
     calibrate_board,
     pair_gains,
+    turned,
     without_dead,
 )
-from swarm_loc_estimator.offline.calibration.infrared.board_fit import BoardReadings, turned
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 

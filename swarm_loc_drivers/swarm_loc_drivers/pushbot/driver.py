@@ -1,20 +1,86 @@
-"""Driver of one PushBot: link, wheel commands and odometry, without ROS."""
+"""Driver of one PushBot: link, wheel commands and odometry, without ROS.
+
+Wheel odometry of a PushBot from its ticks.
+"""
 
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from swarm_loc_drivers.common.link import Link, open_link
-from swarm_loc_drivers.common.odometry import OdometryState
+from swarm_loc_drivers.common.odometry import DeadReckoning, OdometryState, WheelGeometry
 from swarm_loc_drivers.common.robot_driver import RobotDriver
 from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
 from swarm_loc_drivers.pushbot.event_packets import EventPacket
-from swarm_loc_drivers.pushbot.hardware import wheel_velocities
-from swarm_loc_drivers.pushbot.odometry import PushbotOdometry
+from swarm_loc_drivers.pushbot.hardware import MAX_TICK_RATE, tick_difference, wheel_velocities
 from swarm_loc_drivers.pushbot.parameters import PushbotParameters
-from swarm_loc_drivers.pushbot.session import NO_STOP, PushbotSession
+from swarm_loc_drivers.pushbot.session import NO_STOP, PushbotSession, WheelTicks
+
+_MAX_RATE = 2.0 * MAX_TICK_RATE  # Largest rate of a wheel, also while its controller catches up [ticks/s]
+_SLACK_S = 0.15  # Largest error of a stamp [s]
+_MAX_CORRECTION_S = 0.5
+"""Stamps step back by at most so much when a smaller delay is found, or events arrive after ticks [s]."""
+
+
+class PushbotOdometry:
+    """Integrates ticks to a pose.
+
+    The wheels may also be turned by hand, so only readings that no motor can cause are rejected.
+
+    Args:
+        geometry: Geometry of the wheels.
+        wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
+        counts: Counts `implausible_counters`, `counter_restarts`, `time_jumps` and `corrected_times`.
+    """
+
+    def __init__(self, geometry: WheelGeometry, wheel_noise: float, counts: Counter[str]) -> None:
+        self._metres_per_tick = geometry.metres_per_step
+        self._reckoning = DeadReckoning(geometry, wheel_noise)
+        self._counts = counts
+        self._last: WheelTicks | None = None
+        self._doubtful = False
+
+    def restart(self) -> None:
+        """The board is reset and its ticks are zero; the robot has not moved in between."""
+        self._last = None
+
+    def update(self, ticks: WheelTicks) -> OdometryState | None:
+        """Take a reading; the state, or None if the reading is not newer or is impossible."""
+        last = self._last
+        if last is None:
+            self._last = ticks
+            return self._reckoning.state(ticks.stamp_ns, 0.0, 0.0, 0.0)
+        if ticks.stamp_ns == last.stamp_ns:
+            return None
+        elapsed_s = (ticks.stamp_ns - last.stamp_ns) * 1e-9
+        if -_MAX_CORRECTION_S < elapsed_s < 0.0:
+            self._counts["corrected_times"] += 1  # its motion is part of the next reading
+            return None
+        if elapsed_s < 0.0:
+            self._counts["time_jumps"] += 1
+            elapsed_s = 0.0
+        done = tick_difference(last.left, ticks.left), tick_difference(last.right, ticks.right)
+        if max(map(abs, done)) > _MAX_RATE * (elapsed_s + _SLACK_S):
+            return self._distrust(ticks, elapsed_s)
+        self._last, self._doubtful = ticks, False
+        left, right = (self._metres_per_tick * one for one in done)
+        self._reckoning.advance(left, right)
+        return self._reckoning.state(ticks.stamp_ns, left, right, elapsed_s)
+
+    def _distrust(self, ticks: WheelTicks, elapsed_s: float) -> OdometryState | None:
+        """A single reading may have lost bytes; a second one shows that the counters have changed."""
+        if not self._doubtful:
+            self._counts["implausible_counters"] += 1
+            self._doubtful = True
+            return None
+        self._counts["counter_restarts"] += 1
+        self._reckoning.forget_motion(_MAX_RATE * self._metres_per_tick * elapsed_s)
+        self._last, self._doubtful = ticks, False
+        return self._reckoning.state(ticks.stamp_ns, 0.0, 0.0, 0.0)
+
 
 _READ_S = 0.02
 _BATCH_S = 0.002  # Shortest time between two reads [s]; each read has a fixed cost

@@ -22,7 +22,7 @@ from swarm_loc_drivers.pushbot.event_packets import EventPacket
 from swarm_loc_drivers.pushbot.event_parser import precompile
 from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
 from swarm_loc_drivers.pushbot.parameters import PushbotParameters
-from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS
+from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS
 from swarm_loc_estimator.common.messages.event_encoding import ENCODING
 from swarm_loc_estimator.common.node import message_class, run_node
 

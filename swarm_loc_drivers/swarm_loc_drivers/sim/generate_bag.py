@@ -35,8 +35,7 @@ from swarm_loc_drivers.sim.scenarios.bags import (
     write_image_bag,
 )
 from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, simulate_droplets
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
-from swarm_loc_drivers.sim.scenarios.eight_images import simulate_eight_images
+from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight, simulate_eight_images
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.pushbot_bag import PushbotBagSettings, write_pushbot_bag
 from swarm_loc_drivers.sim.scenarios.wandering import simulate_wandering

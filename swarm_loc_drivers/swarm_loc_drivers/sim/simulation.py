@@ -20,8 +20,7 @@ from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
 from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings
 from swarm_loc_drivers.sim.scenarios.droplets import starts as droplet_starts
-from swarm_loc_drivers.sim.scenarios.eight import ARENA, eight_starts, rounded
-from swarm_loc_drivers.sim.scenarios.eight_images import eight_floor
+from swarm_loc_drivers.sim.scenarios.eight import ARENA, eight_floor, eight_starts, rounded
 from swarm_loc_drivers.sim.worlds import WorldError
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, check_parameter_file

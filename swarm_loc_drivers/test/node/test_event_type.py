@@ -12,7 +12,7 @@ from node_world import Ros, overrides
 from std_msgs.msg import String
 
 from swarm_loc_drivers.pushbot.pushbot_driver_node import PushbotDriverNode
-from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS
+from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS
 from swarm_loc_estimator.common.node import message_class
 from swarm_loc_msgs.msg import EventPacket
 from swarm_loc_vision.events.event_tracker_node import EventTrackerNode

@@ -26,7 +26,7 @@ from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import FOCAL_PX
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldParameters
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
-from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS
+from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS
 from swarm_loc_estimator.common.node import message_class
 from swarm_loc_msgs.msg import LaserDistance, LightBearingArray, SwarmPose, SwarmPoses
 from swarm_loc_vision.laser.calibrate_laser_node import CalibrateLaserParameters

@@ -14,14 +14,15 @@ from swarm_loc_drivers.droplet.session import SessionSettings
 from swarm_loc_drivers.droplet.tdma import TdmaSettings
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.infrared import InfraredSettings
-from swarm_loc_drivers.sim.droplet.lockstep import Cable, run
 from swarm_loc_drivers.sim.droplet.world import (
     NEAR_POWER,
     STEP_NS,
+    Cable,
     DropletErrors,
     DropletWorld,
     DropletWorldSettings,
     SimulatedDroplet,
+    run,
 )
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.board_file import load_ir_platform

@@ -17,8 +17,8 @@ from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
-from swarm_loc_vision.aerial.fixed_camera import fixed_camera
 from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, located
+from swarm_loc_vision.aerial.locate_camera import fixed_camera
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.markers.bodies import robot_body
 from swarm_loc_vision.markers.camera_detector import detection_rows

@@ -10,7 +10,7 @@ from epuck_body import PROXIMITY, DrivenBody
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_drivers.epuck import serial_protocol as epuck_serial
+from swarm_loc_drivers.epuck import serial_session
 from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
 from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2, EpuckModel, decode_rgb565
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
@@ -62,7 +62,7 @@ def test_answers_come_at_the_end_of_a_chain_in_the_order_of_the_requests(
     model: EpuckModel, body: DrivenBody
 ) -> None:
     firmware = SerialFirmware(body, model)
-    request = epuck_serial.readings_request(300, -20, is_new=True)
+    request = serial_session.readings_request(300, -20, is_new=True)
     assert firmware.receive(request.data[:-1]) == b""
     reply = firmware.receive(request.data[-1:])
     assert reply == request.mark + struct.pack("<2h8H", 0, 0, *PROXIMITY) + request.mark
@@ -177,7 +177,7 @@ def test_only_the_first_generation_resets(body: DrivenBody, clock: Clock) -> Non
 
 def test_a_lone_end_of_line_swallows_binary_commands(body: DrivenBody) -> None:
     firmware = SerialFirmware(body, EPUCK1)
-    assert firmware.receive(b"\r" + epuck_serial.readings_request(1, 1, is_new=True).data) == b""
+    assert firmware.receive(b"\r" + serial_session.readings_request(1, 1, is_new=True).data) == b""
     assert firmware.receive(b"\r").startswith(b"z,")
 
 
@@ -186,10 +186,10 @@ def test_a_lone_end_of_line_swallows_binary_commands(body: DrivenBody) -> None:
 def test_from_any_state_the_resynchronisation_leads_to_an_answer(model: EpuckModel, noise: bytes) -> None:
     firmware = SerialFirmware(DrivenBody(lambda: SECOND), model)
     firmware.receive(noise)
-    reply = firmware.receive(epuck_serial.resync(5, -6))
-    assert epuck_serial.speed_reply(5, -6).search(reply)
-    request = epuck_serial.readings_request(3, 4, is_new=True)
-    assert epuck_serial.ReplyParser(request).feed(firmware.receive(request.data)) is not None
+    reply = firmware.receive(serial_session.resync(5, -6))
+    assert serial_session.speed_reply(5, -6).search(reply)
+    request = serial_session.readings_request(3, 4, is_new=True)
+    assert serial_session.ReplyParser(request).feed(firmware.receive(request.data)) is not None
 
 
 def test_a_picture_is_the_middle_of_the_frame(body: DrivenBody) -> None:
@@ -199,10 +199,10 @@ def test_a_picture_is_the_middle_of_the_frame(body: DrivenBody) -> None:
     body.frame = (frame, 5)
     firmware = SerialFirmware(body, EPUCK1)
     firmware.receive(b"J,1,40,20,8\r")
-    request = epuck_serial.image_request(0, 0, 40, 20)
-    parsed = epuck_serial.ReplyParser(request).feed(firmware.receive(request.data))
+    request = serial_session.image_request(0, 0, 40, 20)
+    parsed = serial_session.ReplyParser(request).feed(firmware.receive(request.data))
     assert parsed is not None
-    pixels = epuck_serial.decode_image(parsed, 40, 20)
+    pixels = serial_session.decode_image(parsed, 40, 20)
     assert pixels is not None
     picture = decode_rgb565(pixels, 40, 20)
     assert (picture[:, :20] == (255, 0, 0)).all()
@@ -225,13 +225,13 @@ def test_an_image_that_fits_without_the_speeds_around_it_overruns_the_memory(
 ) -> None:
     largest = SerialFirmware(body, model)
     largest.receive(f"J,1,{width},{height},4\r".encode())
-    request = epuck_serial.image_request(0, 0, width, height)
+    request = serial_session.image_request(0, 0, width, height)
     assert len(largest.receive(request.data)) == 2 * width * height + 11 <= model.answer_buffer
     assert model.largest_image == model.answer_buffer - 11
     beyond = SerialFirmware(body, model)
     beyond.receive(b"J,1,48,36,4\r" if model is EPUCK1 else b"J,1,47,44,4\r")
     assert beyond.receive(request.data) == b""
-    assert beyond.receive(epuck_serial.resync(0, 0)) == b""
+    assert beyond.receive(serial_session.resync(0, 0)) == b""
 
 
 def command(left: int, right: int, *, camera: bool = False, sensors: bool = True) -> bytes:

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.epuck import serial_protocol as epuck_serial
+from swarm_loc_drivers.epuck import serial_session
 from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
 from swarm_loc_drivers.epuck.hardware import (
     EPUCK1,
@@ -108,21 +108,22 @@ def test_pixels_survive_decoding(data: bytes) -> None:
 
 
 def test_a_request_sets_the_speeds_and_is_framed_by_them() -> None:
-    request = epuck_serial.readings_request(200, -200, is_new=True)
+    request = serial_session.readings_request(200, -200, is_new=True)
     assert request.data.hex(" ").upper() == "BC C8 00 38 FF BB AF B2 BB 00"
     assert request.mark == struct.pack("<2h", 200, -200)
-    assert epuck_serial.image_request(0, 0, 40, 40).data.hex(" ").upper() == "BB B7 BB 00"
+    assert serial_session.image_request(0, 0, 40, 40).data.hex(" ").upper() == "BB B7 BB 00"
 
 
 def test_readings_are_little_endian() -> None:
-    readings = epuck_serial.decode_readings(bytes.fromhex("FF7F0080") + struct.pack("<8H", *range(100, 108)))
+    data = bytes.fromhex("FF7F0080") + struct.pack("<8H", *range(100, 108))
+    readings = serial_session.decode_readings(data)
     assert readings == (32767, -32768, tuple(range(100, 108)))
 
 
 def test_a_picture_of_another_size_or_mode_is_refused() -> None:
-    assert epuck_serial.decode_image(bytes([1, 2, 1]) + b"abcd", 2, 1) == b"abcd"
-    assert epuck_serial.decode_image(bytes([0, 2, 1]) + b"abcd", 2, 1) is None
-    assert epuck_serial.decode_image(bytes([1, 40, 40]) + b"abcd", 2, 1) is None
+    assert serial_session.decode_image(bytes([1, 2, 1]) + b"abcd", 2, 1) == b"abcd"
+    assert serial_session.decode_image(bytes([0, 2, 1]) + b"abcd", 2, 1) is None
+    assert serial_session.decode_image(bytes([1, 40, 40]) + b"abcd", 2, 1) is None
 
 
 def cut(data: bytes, places: Iterable[int]) -> list[bytes]:
@@ -136,8 +137,8 @@ CUTS = st.lists(st.integers(0, 10**6), max_size=12)
 
 @given(left=SPEED, right=SPEED, body=st.binary(min_size=20, max_size=20), cuts=CUTS)
 def test_a_reply_is_found_in_any_pieces(left: int, right: int, body: bytes, cuts: list[int]) -> None:
-    request = epuck_serial.readings_request(left, right, is_new=True)
-    parser = epuck_serial.ReplyParser(request)
+    request = serial_session.readings_request(left, right, is_new=True)
+    parser = serial_session.ReplyParser(request)
     found = [parser.feed(piece) for piece in cut(request.mark + body + request.mark, cuts)]
 
     assert found[-1] == body
@@ -155,11 +156,11 @@ def test_a_reply_is_found_in_any_pieces(left: int, right: int, body: bytes, cuts
 def test_a_reply_is_found_behind_garbage(
     left: int, right: int, body: bytes, garbage: bytes, cuts: list[int]
 ) -> None:
-    request = epuck_serial.readings_request(left, right, is_new=True)
+    request = serial_session.readings_request(left, right, is_new=True)
     frame = request.mark + body + request.mark
     if (garbage + frame).find(request.mark) != len(garbage):
         return  # the garbage itself looks like a mark
-    parser = epuck_serial.ReplyParser(request)
+    parser = serial_session.ReplyParser(request)
     found = [parser.feed(piece) for piece in cut(garbage + frame, cuts)]
 
     assert found[-1] == body
@@ -170,9 +171,9 @@ def test_a_reply_is_found_behind_garbage(
     left=SPEED.filter(bool), right=SPEED, body=st.binary(min_size=20, max_size=20), lost=st.integers(0, 27)
 )
 def test_a_reply_that_lost_a_byte_is_none(left: int, right: int, body: bytes, lost: int) -> None:
-    request = epuck_serial.readings_request(left, right, is_new=True)
+    request = serial_session.readings_request(left, right, is_new=True)
     frame = request.mark + body + request.mark
-    assert epuck_serial.ReplyParser(request).feed(frame[:lost] + frame[lost + 1 :]) is None
+    assert serial_session.ReplyParser(request).feed(frame[:lost] + frame[lost + 1 :]) is None
 
 
 def test_the_wifi_command_is_as_documented() -> None:

@@ -16,7 +16,7 @@ from epuck_wire import MS, SECOND, Wire
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.session import SessionError
-from swarm_loc_drivers.epuck import serial_protocol as protocol
+from swarm_loc_drivers.epuck import serial_session
 from swarm_loc_drivers.epuck.hardware import EPUCK1
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.session import CameraImage, Reading
@@ -247,6 +247,6 @@ def test_speeds_are_commanded_when_they_change_and_no_more() -> None:
     wire.run(2.0)
     wire.speeds = (200, 190)
     wire.run(2.0)
-    told = bytes([protocol.code("D")])
+    told = bytes([serial_session.code("D")])
     assert wire.sent.count(told) == 2
     assert all(wire.sent.count(told + struct.pack("<2h", 200, right)) == 1 for right in (200, 190))

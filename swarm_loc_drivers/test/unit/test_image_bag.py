@@ -12,8 +12,7 @@ from swarm_loc_drivers.sim.generate_bag import main
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.renderer import RobotCamera
 from swarm_loc_drivers.sim.scenarios.bags import CAMERA_INFO, COMPRESSED_IMAGE
-from swarm_loc_drivers.sim.scenarios.eight import CAMERA, EightSettings
-from swarm_loc_drivers.sim.scenarios.eight_images import FAMILY, simulate_eight_images
+from swarm_loc_drivers.sim.scenarios.eight import CAMERA, FAMILY, EightSettings, simulate_eight_images
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader

@@ -8,8 +8,7 @@ import pytest
 from swarm_loc_drivers.sim.pushbot.optics import assembled
 from swarm_loc_drivers.sim.pushbot.wall_drive import WallDriveSettings, drive_at_wall
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.laser.calibration import RowBias
-from swarm_loc_vision.laser.fit import fit_hyperbola
+from swarm_loc_vision.laser.calibration import RowBias, fit_hyperbola
 
 HALF_A_SECOND = 25  # Windows of the tracker
 

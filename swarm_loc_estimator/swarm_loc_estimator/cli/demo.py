@@ -42,7 +42,7 @@ from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Status
-from swarm_loc_estimator.watch.access import free_port
+from swarm_loc_estimator.watch.server import free_port
 
 BAG = Path("bags/eight_five_robots")
 RATE = 3.0

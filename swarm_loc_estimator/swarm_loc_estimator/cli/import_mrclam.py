@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swarm_loc_estimator.common.command_line import ProgressLine, command_parser, exit_with_message
-from swarm_loc_estimator.offline.datasets.mrclam import read_dataset
-from swarm_loc_estimator.offline.datasets.mrclam_bag import Delay, convert
+from swarm_loc_estimator.offline.datasets.mrclam import Delay, convert, read_dataset
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

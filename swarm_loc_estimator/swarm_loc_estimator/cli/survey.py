@@ -30,8 +30,7 @@ from swarm_loc_estimator.common.command_line import (
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.doctor.evidence import Evidence, same_type
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
-from swarm_loc_estimator.offline.survey.plots import draw
-from swarm_loc_estimator.offline.survey.survey import survey
+from swarm_loc_estimator.offline.survey.survey import draw, survey
 from swarm_loc_estimator.sensors.registry import kinds
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm

@@ -17,7 +17,7 @@ from swarm_loc_estimator.cli.graph import check_graph
 from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in, swarm_beside
 from swarm_loc_estimator.common.launch import GraphOptions, NodeSpec, ParameterValue, graph_nodes, run_graph
 from swarm_loc_estimator.nodes.parameters import WatchParameters
-from swarm_loc_estimator.watch.access import Access
+from swarm_loc_estimator.watch.server import Access
 
 _DEFAULT = WatchParameters()
 _DESCRIPTIONS = (".yaml", ".yml")

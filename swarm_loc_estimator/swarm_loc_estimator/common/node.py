@@ -33,7 +33,7 @@ from rclpy.time_source import TimeSource
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from swarm_loc_estimator.common.health import Health, Report
-from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS
+from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.ros_parameters import declare_parameters, read_parameters
 

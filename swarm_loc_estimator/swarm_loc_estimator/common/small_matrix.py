@@ -1,12 +1,25 @@
-"""Matrices of three rows inside compiled code: copies, Cholesky factors, solutions."""
+"""Matrices of three rows inside compiled code: copies, Cholesky factors, solutions.
+
+LAPACK and BLAS inside compiled code, in place on parts of matrices.
+
+SciPy's Python functions copy every part that is not contiguous. These are the same routines, by its Cython
+interface; matrices are in Fortran order, given by all their numbers and the offset of a part.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import cache
+from typing import cast
 
+import llvmlite.binding  # type: ignore[import-untyped]
 import numpy as np
+from numba import types
+from numba.extending import get_cython_function_address
+from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 
 
@@ -64,3 +77,122 @@ def solve3(factor: FloatArray, right: FloatArray, out: FloatArray) -> None:
     b = (b - factor[2, 1] * c) / factor[1, 1]
     out[0] = (a - factor[1, 0] * b - factor[2, 0] * c) / factor[0, 0]
     out[1], out[2] = b, c
+
+
+def _external(library: str, name: str, arguments: int) -> Callable[..., None]:
+    """A routine, by a symbol that compiled code finds also when it comes from the cache."""
+    symbol = f"swarm_loc_{name}"
+    llvmlite.binding.add_symbol(symbol, get_cython_function_address(f"scipy.linalg.cython_{library}", name))
+    routine = types.ExternalFunction(symbol, types.void(*[types.voidptr] * arguments))
+    return cast("Callable[..., None]", routine)
+
+
+_dpotrf, _dtrtri = _external("lapack", "dpotrf", 5), _external("lapack", "dtrtri", 6)
+_dlauum = _external("lapack", "dlauum", 5)
+_dtrmm, _dsyrk = _external("blas", "dtrmm", 11), _external("blas", "dsyrk", 10)
+
+_LOWER = _LEFT = np.frombuffer(b"L", dtype=np.uint8)
+_RIGHT, _TRANSPOSED, _PLAIN = (np.frombuffer(letter, dtype=np.uint8) for letter in (b"R", b"T", b"N"))
+_PLUS, _MINUS = np.array([1.0]), np.array([-1.0])
+_LEAF = 40  # Maximum number of rows that are passed to LAPACK, which is slow with larger triangles
+_WHOLE, _FIRST, _LAST = 0, 1, 2
+"""Steps of a plan: a small part; what follows from the upper half of a part; from the lower one."""
+
+
+def invert_positive(numbers: FloatArray, size: int) -> bool:
+    """Invert a symmetric positive definite matrix (size, size) in place; only its lower triangle is used.
+
+    Args:
+        numbers: (size * size,) column by column.
+        size: Number of rows.
+
+    Returns:
+        Whether it is positive definite; if not, the content of the matrix is undefined.
+    """
+    return _invert(numbers, size, _plan(size))
+
+
+def invert_factor(numbers: FloatArray, size: int) -> bool:
+    """Replace a symmetric positive definite matrix (size, size) by the inverse of its Cholesky factor.
+
+    Only its lower triangle is read and written; for arguments and result see `invert_positive`.
+    """
+    return _invert_factor(numbers, size, _plan(size))
+
+
+@cache
+def _plan(size: int) -> IntArray:
+    """The steps (s, 3) that invert the factor of a matrix: which, the first row, number of rows."""
+    steps: IntArray = np.array(_steps(0, size), dtype=np.int64).reshape(-1, 3)
+    return steps
+
+
+def _steps(begin: int, rows: int) -> list[tuple[int, int, int]]:
+    """Those of a part on the diagonal."""
+    if rows <= _LEAF:
+        return [(_WHOLE, begin, rows)]
+    half = rows // 2
+    upper, lower = _steps(begin, half), _steps(begin + half, rows - half)
+    return [*upper, (_FIRST, begin, rows), *lower, (_LAST, begin, rows)]
+
+
+@cached_njit
+def _invert(numbers: FloatArray, size: int, plan: IntArray) -> bool:
+    """Invert a matrix."""
+    if not _invert_factor(numbers, size, plan):
+        return False
+    sizes = np.empty(2, dtype=np.int32)
+    sizes[0] = size
+    _dlauum(_LOWER.ctypes, sizes.ctypes, numbers.ctypes, sizes.ctypes, sizes[1:].ctypes)
+    return True
+
+
+@cached_njit
+def _invert_factor(numbers: FloatArray, size: int, plan: IntArray) -> bool:
+    """Invert the factor in steps; not by recursion, which numba's cache does not support."""
+    sizes = np.empty(3, dtype=np.int32)
+    for k in range(plan.shape[0]):
+        step, begin, rows = plan[k, 0], plan[k, 1] * (size + 1), plan[k, 2]
+        if step == _WHOLE:
+            if not _invert_part(numbers, begin, rows, size, sizes):
+                return False
+        else:
+            _join_halves(numbers, begin, rows, size, sizes, step == _FIRST)
+    return True
+
+
+@cached_njit
+def _invert_part(numbers: FloatArray, begin: int, rows: int, size: int, sizes: NDArray[np.int32]) -> bool:
+    """Replace a small part on the diagonal by the inverse of its factor; return whether it has one."""
+    sizes[0], sizes[1], sizes[2] = rows, size, 0
+    part, n, stride, info = numbers[begin:].ctypes, sizes.ctypes, sizes[1:].ctypes, sizes[2:].ctypes
+    _dpotrf(_LOWER.ctypes, n, part, stride, info)
+    for i in range(rows):  # LAPACK may let NaN pass
+        if sizes[2] != 0 or not np.isfinite(numbers[begin + i * (size + 1)]):
+            return False
+    _dtrtri(_LOWER.ctypes, _PLAIN.ctypes, n, part, stride, info)
+    return True
+
+
+@cached_njit
+def _join_halves(
+    numbers: FloatArray, begin: int, rows: int, size: int, sizes: NDArray[np.int32], is_first: bool
+) -> None:
+    """Go on from half of a part on the diagonal.
+
+    [A .; B D] has the factor [L 0; M N] with M = B L^-T and N N^T = D - M M^T, and that the inverse
+    [L^-1 0; -N^-1 M L^-1 N^-1]: products take nearly all of the time, where LAPACK would solve.
+    """
+    half = rows // 2
+    last = begin + half * (size + 1)
+    sizes[0], sizes[1], sizes[2] = rows - half, half, size
+    m, n, stride = sizes.ctypes, sizes[1:].ctypes, sizes[2:].ctypes
+    upper, lower, below = numbers[begin:].ctypes, numbers[last:].ctypes, numbers[begin + half :].ctypes
+    right, left, is_lower = _RIGHT.ctypes, _LEFT.ctypes, _LOWER.ctypes
+    plain, transposed, plus, minus = _PLAIN.ctypes, _TRANSPOSED.ctypes, _PLUS.ctypes, _MINUS.ctypes
+    if is_first:
+        _dtrmm(right, is_lower, transposed, plain, m, n, plus, upper, stride, below, stride)
+        _dsyrk(is_lower, plain, m, n, minus, below, stride, plus, lower, stride)
+    else:
+        _dtrmm(left, is_lower, plain, plain, m, n, minus, lower, stride, below, stride)
+        _dtrmm(right, is_lower, plain, plain, m, n, plus, upper, stride, below, stride)

@@ -8,14 +8,18 @@ from types import MappingProxyType
 
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.health import listed
-from swarm_loc_estimator.common.messages.definitions import TRANSFORMS
-from swarm_loc_estimator.doctor.clocks import check_clocks
-from swarm_loc_estimator.doctor.contents import check_contents, check_estimate
+from swarm_loc_estimator.common.messages.cdr import TRANSFORMS
+from swarm_loc_estimator.doctor.contents import (
+    CAMERA_INFO,
+    COMPRESSED_IMAGE,
+    IMAGE,
+    check_contents,
+    check_estimate,
+    check_pictures,
+)
 from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, Message, same_type
-from swarm_loc_estimator.doctor.frames import check_frames
 from swarm_loc_estimator.doctor.motion import check_motion
-from swarm_loc_estimator.doctor.pictures import CAMERA_INFO, COMPRESSED_IMAGE, IMAGE, check_pictures
-from swarm_loc_estimator.doctor.topics import DIAGNOSTICS, check_topics
+from swarm_loc_estimator.doctor.topics import DIAGNOSTICS, check_clocks, check_frames, check_topics
 from swarm_loc_estimator.offline.recorded_bag import Progress, renamed_topics
 from swarm_loc_estimator.sensors.registry import input_topics, kinds
 from swarm_loc_estimator.swarm.swarm import Swarm

@@ -14,12 +14,18 @@ from rosbags.serde import SerdeError
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
-from swarm_loc_estimator.sensors.conversion import InputConverter
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
-from swarm_loc_estimator.sensors.registry import SENSORS, Batch, InputTopic, Measurements, live_topics
+from swarm_loc_estimator.sensors.registry import (
+    SENSORS,
+    Batch,
+    InputConverter,
+    InputTopic,
+    Measurements,
+    live_topics,
+)
 from swarm_loc_estimator.sensors.sensor import DropCounts, joined
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradicted, Contradiction

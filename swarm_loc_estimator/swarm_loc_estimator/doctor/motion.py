@@ -20,10 +20,9 @@ from scipy.spatial.transform import Rotation
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.doctor.evidence import Evidence, Finding
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.sensors.camera import FROM_OPTICAL
+from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
 from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.sensors.sensor import chosen
-from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_BEARING
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot
 
 _WINDOW_NS = 6_000_000_000  # Odometry is trusted this long

@@ -16,18 +16,18 @@ from swarm_loc_estimator.filter.innovation import (
     new_scratch,
     relative_motion,
 )
-from swarm_loc_estimator.filter.integrity.divergence import (
+from swarm_loc_estimator.filter.integrity import (
     LossLimits,
+    assess,
+    assess_link,
     confirm,
     count_gated,
+    is_excluded,
     is_uncertain,
 )
-from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_excluded
-from swarm_loc_estimator.filter.integrity.pairs import assess_link
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel
-from swarm_loc_estimator.odometry.look_up import look_up, look_up_pose, new_sample
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.odometry.track_arrays import TrackArrays
+from swarm_loc_estimator.odometry.track_arrays import TrackArrays, look_up, look_up_pose, new_sample
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW
 
 

@@ -15,7 +15,7 @@ NEVER_NS = np.iinfo(np.int64).min
 
 
 class IntegrityArrays(NamedTuple):
-    """Statistics of recent innovations for fault detection; see `integrity/`.
+    """Statistics of recent innovations for fault detection; see `integrity.py`.
 
     A source is a measured object: robot i has index i, landmark l has index N + l. Measurements of models
     without a kernel have sources of their own, with indices that are larger by N + L.
@@ -39,9 +39,9 @@ class IntegrityArrays(NamedTuple):
     gated_ns: IntArray  # (N,) stamp of the last gated measurement
     gated_fixes: IntArray  # (N,) absolute fixes gated since the last accepted fix or landmark sighting
     gated_fix_ns: IntArray  # (N,) stamp of the last counted gated fix
-    # (N,) level of noise inflation of each robot's measurements, see `integrity/noise_inflation.py`
+    # (N,) level of noise inflation of each robot's measurements, see `filter/integrity.py`
     noise_inflation: FloatArray
-    # (N, W) begin of each window in which the drift of odometry is observed, see `integrity/motion_noise.py`
+    # (N, W) begin of each window in which the drift of odometry is observed, see `filter/prediction.py`
     drift_ns: IntArray
     drift_transform: FloatArray  # (N, W, 3) T at that time
     drift_noise: FloatArray  # (N, W, 3, 3) preintegrated covariance of the track at that time
@@ -50,7 +50,7 @@ class IntegrityArrays(NamedTuple):
     motion_scale: FloatArray  # (N,) scale of the process noise of each robot
     # (N,) True if it stays 1, as scales of the robot's motion are described as estimated
     motion_explained: BoolArray
-    # (N, 3, 3) covariance of each robot's error beyond that of the filter, see `integrity/repeated_errors.py`
+    # (N, 3, 3) covariance of each robot's error beyond that of the filter, see `filter/correlated_noise.py`
     excess: FloatArray
     # (N, S, 2, 3, 3) covariance of the errors of observer and target with the repeated error of their pair
     repeated: FloatArray

@@ -20,15 +20,15 @@ from swarm_loc_estimator.filter.gating import (
     soften_heading,
     squared_distance,
 )
-from swarm_loc_estimator.filter.integrity.fault_detection import (
+from swarm_loc_estimator.filter.integrity import (
+    add_noise_inflation,
     cause_of,
     noise_of_frequent_looks,
     small_variances,
+    stamp_variance,
 )
-from swarm_loc_estimator.filter.integrity.noise_inflation import add_noise_inflation, stamp_variance
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, predict_one, write_innovation
-from swarm_loc_estimator.odometry.look_up import rate_at
-from swarm_loc_estimator.odometry.track_arrays import TrackArrays
+from swarm_loc_estimator.odometry.track_arrays import TrackArrays, rate_at
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW
 
 DEPENDS_ON = 8

@@ -3,14 +3,24 @@
 A filter operates on columns and Jacobians, not on robots or sensors. It does not hold the mean: an update
 returns the correction, which the caller applies on the manifold. Columns 3i..3i+2 are the error twist of
 body i; columns of parameters follow those of the robots.
+
+Inverses of covariance and information matrices.
+
+Joint filter with a full covariance matrix.
+
+Implements `JointFilter` of `joint_filter.py`.
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.swarm.calibration_states import ParameterTable
+from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.small_matrix import assign_matrix, cholesky3, invert_positive, solve3
+from swarm_loc_estimator.swarm.calibration_states import BLOCKS, DRIVES, ParameterTable
 
 
 class Robots(NamedTuple):
@@ -89,3 +99,207 @@ class JointFilter(Protocol):
             innovation: (m, 3) measured minus predicted.
             noise: (m, 3, 3) covariance of the measurement.
         """
+
+
+def inverse(matrix: FloatArray) -> FloatArray:
+    """Inverse (n, n) of a symmetric positive definite matrix; exactly symmetric.
+
+    Raises:
+        LinAlgError: The matrix is not positive definite.
+    """
+    inverted: FloatArray = matrix.copy()
+    invert(inverted)
+    return inverted
+
+
+def invert(matrix: FloatArray) -> None:
+    """Invert a matrix (n, n) in place; see `inverse`."""
+    if not invert_positive(matrix.reshape(-1), matrix.shape[0]):
+        raise np.linalg.LinAlgError("the covariance is not positive definite")
+    _mirror(matrix)
+
+
+@cached_njit
+def _mirror(matrix: FloatArray) -> None:
+    """Copy the upper triangle, the lower one in Fortran order, to the other triangle."""
+    for i in range(matrix.shape[0]):
+        for j in range(i):
+            matrix[i, j] = matrix[j, i]
+
+
+class DenseFilter:
+    """Full covariance matrix; every update keeps it symmetric positive definite.
+
+    Args:
+        size: Number of columns; the prior is the identity.
+    """
+
+    is_dense = True
+
+    def __init__(self, size: int) -> None:
+        self.covariance: FloatArray = np.eye(size)
+        self.marginal: FloatArray = np.zeros((0, 3, 3))
+        self.transition: FloatArray = np.zeros((0, 3 + BLOCKS, DRIVES))
+
+    def copy(self) -> DenseFilter:
+        """An independent copy."""
+        other = DenseFilter.__new__(DenseFilter)
+        other.covariance, other.marginal = self.covariance.copy(), self.marginal
+        other.transition = self.transition
+        return other
+
+    def set_prior(self, columns: IntArray, covariance: FloatArray) -> None:
+        """Set the covariance (k, k) of columns (k,), independent of all others."""
+        self.covariance[columns, :] = 0.0
+        self.covariance[:, columns] = 0.0
+        self.covariance[columns[:, None], columns[None, :]] = covariance
+
+    def set_body_priors(self, bodies: IntArray, covariances: FloatArray) -> None:
+        """Set covariances (k, 3, 3) of bodies (k,), each independent of all others."""
+        for body, covariance in zip(bodies.tolist(), covariances, strict=True):
+            self.set_prior(3 * body + np.arange(3), covariance)
+
+    def add(self, columns: IntArray, covariance: FloatArray) -> None:
+        """Add a covariance (k, k) to that of columns (k,)."""
+        self.covariance[columns[:, None], columns[None, :]] += covariance
+
+    def append_columns(self, table: ParameterTable) -> None:
+        """Append the new columns of a table with zero variance; `set_prior` must follow."""
+        size = self.covariance.shape[0]
+        grown = np.zeros((table.filter_size, table.filter_size))
+        grown[:size, :size] = self.covariance
+        self.covariance = grown
+
+    def correlate(self, columns: IntArray, others: IntArray, mapping: FloatArray) -> None:
+        """Add the errors of other columns (m,), mapped by (k, m), to independent columns (k,)."""
+        common = mapping @ self.covariance[others]
+        added = common[:, others] @ mapping.T
+        self.covariance[columns, :] += common
+        self.covariance[:, columns] += common.T
+        self.covariance[np.ix_(columns, columns)] += 0.5 * (added + added.T)
+
+    def block(self, columns: IntArray) -> FloatArray:
+        """Covariance (k, k) of columns (k,)."""
+        covariance: FloatArray = self.covariance[np.ix_(columns, columns)]
+        return covariance
+
+    def prepare_update(self, columns: IntArray, robots: Robots, cross_covariance: FloatArray) -> None:
+        """Do nothing: `covariance` contains all cross-covariances."""
+
+    def update(
+        self, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
+    ) -> FloatArray:
+        """Fuse measurements with independent errors as one batch; return the correction (n,).
+
+        Eqs. (11)-(14) of the e-puck paper in information form, P = (P^-1 + H^T R^-1 H)^-1: two inversions,
+        whose cost does not grow with the number of measurements.
+
+        Args:
+            columns: (m, c) filter columns of each measurement; may contain duplicates.
+            jacobian: (m, r, c) Jacobians; a zero row for a component that was not measured.
+            innovation: (m, r) measured minus predicted.
+            noise: (m, r, r) covariance of the measurement.
+        """
+        gradient = np.zeros(self.covariance.shape[0])
+        information = inverse(self.covariance)
+        _gather(information, gradient, columns, jacobian, innovation, noise)
+        invert(information)
+        self.covariance = information
+        correction: FloatArray = self.covariance @ gradient
+        return correction
+
+
+@cached_njit
+def _gather(
+    information: FloatArray,
+    gradient: FloatArray,
+    columns: IntArray,
+    jacobian: FloatArray,
+    innovation: FloatArray,
+    noise: FloatArray,
+) -> None:
+    """Add H^T R^-1 H to the information (n, n) and H^T R^-1 y to the gradient (n,)."""
+    weighted = np.empty((columns.shape[1], 3))
+    for k in range(columns.shape[0]):
+        factor = cholesky3(noise[k])
+        for a in range(columns.shape[1]):
+            solve3(factor, jacobian[k, :, a], weighted[a])  # R^-1 H
+        for a in range(columns.shape[1]):
+            w0, w1, w2 = weighted[a, 0], weighted[a, 1], weighted[a, 2]
+            gradient[columns[k, a]] += w0 * innovation[k, 0] + w1 * innovation[k, 1] + w2 * innovation[k, 2]
+            for b in range(columns.shape[1]):
+                h0, h1, h2 = jacobian[k, 0, b], jacobian[k, 1, b], jacobian[k, 2, b]
+                information[columns[k, a], columns[k, b]] += w0 * h0 + w1 * h1 + w2 * h2
+
+
+@cached_njit
+def update_one(
+    covariance: FloatArray,
+    columns: IntArray,
+    jacobian: FloatArray,
+    innovation: FloatArray,
+    noise: FloatArray,
+) -> tuple[FloatArray, FloatArray]:
+    """Fuse one measurement: update the covariance (n, n) in place, return correction (n,) and gain (3, n).
+
+    Eqs. (11), (13), (14), and (12) in Joseph's form, which keeps the covariance positive definite, expanded
+    to P - K H P - (P H^T - K S) K^T, where the last term is the rounding error, and made symmetric.
+
+    Args:
+        covariance: (n, n) of all states.
+        columns: (c,) filter columns of the measurement; may contain duplicates.
+        jacobian: (3, c).
+        innovation: (3,) measured minus predicted.
+        noise: (3, 3) covariance of the measurement.
+    """
+    size = covariance.shape[0]
+    ph = _projected(covariance, columns, jacobian)
+    s = innovation_covariance(ph, columns, jacobian, noise)
+    factor = cholesky3(s)
+    gain, one = np.empty((3, size)), np.empty(3)
+    change, correction = np.empty((3, size)), np.zeros(size)
+    for i in range(size):
+        solve3(factor, ph[i], one)
+        for r in range(3):
+            gain[r, i] = one[r]
+            correction[i] += one[r] * innovation[r]
+            rest = ph[i, r] - one[0] * s[0, r] - one[1] * s[1, r] - one[2] * s[2, r]
+            change[r, i] = 0.5 * (ph[i, r] + rest)
+    for i in range(size):
+        k0, k1, k2 = gain[0, i], gain[1, i], gain[2, i]
+        c0, c1, c2 = change[0, i], change[1, i], change[2, i]
+        for j in range(size):  # each pair of terms is the same for (i, j) and (j, i): exactly symmetric
+            value = k0 * change[0, j] + c0 * gain[0, j]
+            value += k1 * change[1, j] + c1 * gain[1, j]
+            value += k2 * change[2, j] + c2 * gain[2, j]
+            covariance[i, j] -= value
+    return correction, gain
+
+
+@cached_njit
+def _projected(covariance: FloatArray, columns: IntArray, jacobian: FloatArray) -> FloatArray:
+    """P H^T (n, 3)."""
+    size = covariance.shape[0]
+    ph = np.zeros((size, 3))
+    for c in range(columns.size):
+        column = columns[c]
+        for r in range(3):
+            factor = jacobian[r, c]
+            if factor != 0.0:
+                for i in range(size):
+                    ph[i, r] += covariance[column, i] * factor
+    return ph
+
+
+@cached_njit
+def innovation_covariance(
+    projected: FloatArray, columns: IntArray, jacobian: FloatArray, noise: FloatArray
+) -> FloatArray:
+    """S = H P H^T + R (3, 3) from P H^T (n, 3); eq. (13)."""
+    s = np.empty((3, 3))
+    assign_matrix(s, noise)
+    for c in range(columns.size):
+        for i in range(3):
+            for j in range(3):
+                s[i, j] += jacobian[i, c] * projected[columns[c], j]
+    return s

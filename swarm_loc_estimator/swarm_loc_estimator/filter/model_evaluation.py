@@ -1,9 +1,9 @@
 """Evaluation of measurements whose models have no compiled kernel.
 
 Such a measurement is gated with the degrees of freedom of its model. When accepted it confirms the poses of
-its robots; when gated it counts towards their loss (`integrity/divergence.py`), but does not refute a
+its robots; when gated it counts towards their loss (`filter/integrity.py`), but does not refute a
 configured start. A contradiction is evidence against its pair of observer and source, never against one of
-them (`integrity/pairs.py`). It takes no part in the noise inflation of robots or in the mean of
+them (`filter/integrity.py`). It takes no part in the noise inflation of robots or in the mean of
 repeated measurements (`correlated_noise.py`): these need positions and headings.
 """
 
@@ -16,8 +16,7 @@ from swarm_loc_estimator.filter.belief import BeliefArrays
 from swarm_loc_estimator.filter.innovation import InnovationBatch
 from swarm_loc_estimator.filter.joint_filter import JointFilter
 from swarm_loc_estimator.filter.measurement_model import MODELS, POLAR, MeasurementArray
-from swarm_loc_estimator.odometry.look_up import rate_at
-from swarm_loc_estimator.odometry.track_arrays import TrackArrays
+from swarm_loc_estimator.odometry.track_arrays import TrackArrays, rate_at
 
 _BODY: IntArray = np.arange(3)
 

@@ -10,22 +10,21 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.small_matrix import assign
 from swarm_loc_estimator.filter import prediction
 from swarm_loc_estimator.filter.belief import BeliefArrays, correct, to_map
-from swarm_loc_estimator.filter.correlated_noise import record_pair
-from swarm_loc_estimator.filter.dense_filter import update_one
+from swarm_loc_estimator.filter.correlated_noise import count_repeated, record_pair
 from swarm_loc_estimator.filter.innovation import evaluate, new_batch, new_scratch, relative_motion
-from swarm_loc_estimator.filter.integrity.divergence import (
+from swarm_loc_estimator.filter.integrity import (
     LossLimits,
+    assess,
     confirm,
     count_gated,
+    is_excluded,
     is_uncertain,
 )
-from swarm_loc_estimator.filter.integrity.fault_detection import assess, is_excluded
-from swarm_loc_estimator.filter.integrity.motion_noise import learn
-from swarm_loc_estimator.filter.integrity.repeated_errors import count_repeated
+from swarm_loc_estimator.filter.joint_filter import update_one
 from swarm_loc_estimator.filter.measurement_model import MeasurementColumns, has_kernel, locates_alone
-from swarm_loc_estimator.odometry.look_up import look_up, new_sample
+from swarm_loc_estimator.filter.prediction import learn
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.odometry.track_arrays import TrackArrays
+from swarm_loc_estimator.odometry.track_arrays import TrackArrays, look_up, new_sample
 
 OPEN, USED, GATED = 0, 1, 2  # Verdicts, see `fusion.Verdict`
 

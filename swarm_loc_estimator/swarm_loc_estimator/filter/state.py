@@ -12,10 +12,8 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import error_covariance
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS
-from swarm_loc_estimator.filter.dense_filter import DenseFilter
-from swarm_loc_estimator.filter.integrity.fault_detection import new_integrity
-from swarm_loc_estimator.filter.integrity.noise_inflation import inflate_all_noise
-from swarm_loc_estimator.filter.joint_filter import JointFilter
+from swarm_loc_estimator.filter.integrity import inflate_all_noise, new_integrity
+from swarm_loc_estimator.filter.joint_filter import DenseFilter, JointFilter
 from swarm_loc_estimator.filter.measurement_model import NOBODY
 from swarm_loc_estimator.identification.memory import IdentityMemory
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
@@ -96,7 +94,7 @@ class SwarmState:
         windows: Stored measurements of one degree of freedom per such robot (see `window.py`).
         next_window_ns: (N,) earliest instant of the next attempt with them.
         images: Memory of aerial images.
-        origin: Robot whose pose was the origin when a local frame began, see `local_frame.py`; IN_MAP: none.
+        origin: Robot whose pose was the origin when a local frame began, see `initializer.py`; IN_MAP: none.
         frame_moves: How often all poses have moved from a local frame to `map`.
         meetings: Robots that have met while nobody was located.
     """

@@ -20,9 +20,8 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.se2_scalar import wrap
-from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.infrared.curves import curve_at, distance_at
-from swarm_loc_estimator.infrared.solution import DARKEST, IrOutcome, IrSolutions, checked
+from swarm_loc_estimator.infrared.brightness import curve_at, distance_at, expected_brightness
+from swarm_loc_estimator.infrared.search import DARKEST, IrOutcome, IrSolutions, checked
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
 _FOUND, _TOO_WEAK, _UNDETERMINED = int(IrOutcome.FOUND), int(IrOutcome.TOO_WEAK), int(IrOutcome.UNDETERMINED)

@@ -20,7 +20,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.infrared.brightness import expected_with_slopes
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.solution import DARKEST, IrOutcome
+from swarm_loc_estimator.infrared.search import DARKEST, IrOutcome
 from swarm_loc_estimator.swarm.ir_board import GAIN_RANGE, IrGains, IrPlatform, PairGains
 
 Progress = Callable[[str], None]

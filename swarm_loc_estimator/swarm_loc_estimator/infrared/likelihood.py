@@ -17,18 +17,20 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit
 from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
-from swarm_loc_estimator.infrared.cost import Pair, with_stray_light, write_costs
-from swarm_loc_estimator.infrared.reading_cost import DARK, MEASURED
+from swarm_loc_estimator.infrared.cost import DARK, MEASURED, Pair, with_stray_light, write_costs
 from swarm_loc_estimator.infrared.search import (
     TABLE_STARTS,
+    IrOutcome,
+    IrSolutions,
     Workspace,
+    checked,
     classify,
     compress_readings,
     new_workspace,
+    no_solutions,
     pose_covariance,
     search,
 )
-from swarm_loc_estimator.infrared.solution import IrOutcome, IrSolutions, checked, no_solutions
 from swarm_loc_estimator.infrared.start_table import (
     StartTable,
     add_spread,

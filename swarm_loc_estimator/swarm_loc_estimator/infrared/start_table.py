@@ -21,10 +21,8 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit, reassociated_njit
 from swarm_loc_estimator.common.se2_scalar import wrap
-from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.infrared.curves import curve_at, distance_at
-from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform
-from swarm_loc_estimator.swarm.ir_curves import AngleCurve, TabulatedCurve
+from swarm_loc_estimator.infrared.brightness import curve_at, distance_at, expected_brightness
+from swarm_loc_estimator.swarm.ir_board import AngleCurve, IrModel, IrPlatform, TabulatedCurve
 
 _NEGLIGIBLE = 16.0  # Maximum cost of a pose above the minimum; others are left out
 _BESIDE = 1.5  # Maximum distance of poses that belong to one minimum, in steps of the table

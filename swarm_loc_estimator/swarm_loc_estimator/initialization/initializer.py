@@ -7,37 +7,47 @@ it has a mirrored solution. The transform on which most constraints agree is ref
 accepted when its covariance is small enough and no other transform explains the constraints about as well.
 A whole pose by a mapper locates a robot alone: it is an estimate, which its next poses would not confirm.
 Measurements of one degree of freedom are collected apart, see `window.py`.
+
+Initialization of robots at the start poses of the swarm description.
+
+A frame without a map: that of the best connected robot, until something absolute is measured.
+
+Robots that only see each other can be located relative to one of them. It becomes the origin when nobody has
+a start and nothing absolute has been measured for a while: no landmark, no fix, no aerial image. Others are
+initialized by sightings, as with a map; parts of the swarm that have not met yet wait. Absolute measurements
+are collected as for a robot without a pose. When they determine the pose of a robot in `map`, all poses move
+there with it, as one rigid body.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.filter.integrity import CONFIRMED, WELL_CONFIRMED
 from swarm_loc_estimator.filter.measurement_model import (
     NOBODY,
     POLAR,
+    Command,
     MeasurementArray,
     MeasurementColumns,
     locates_alone,
 )
 from swarm_loc_estimator.filter.prediction import new_scratch, predict
-from swarm_loc_estimator.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.filter.state import IN_MAP, InitialPose, Meetings, Starts, SwarmState
 from swarm_loc_estimator.initialization.alignment import (
     HEADING_SIGMA,
     MIN_CONSTRAINTS,
-    POSITION_SIGMA,
-    align,
-)
-from swarm_loc_estimator.initialization.constraints import (
     NO_CONSTRAINTS,
+    POSITION_SIGMA,
     THE_MAP,
     OtherSide,
     Waiting,
+    align,
     refreshed,
     with_constraint,
 )
@@ -51,6 +61,7 @@ from swarm_loc_estimator.initialization.window import (
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW
+from swarm_loc_estimator.swarm.swarm import Swarm
 
 _INDEPENDENT_NS = 100_000_000  # Sightings of one marker within this time are redundant
 _LONGEST_PAUSE_NS = 300_000_000
@@ -197,3 +208,202 @@ def _fixed(one: MeasurementArray, on_track: FloatArray) -> InitialPose:
     carry = se2.adjoint(sensor)  # from errors seen by the sensor to errors in map
     covariance = carry @ se2.error_covariance(value, one["covariance"][0]) @ carry.T
     return InitialPose(se2.compose(pose, se2.inverse(on_track)), covariance)
+
+
+class ConfiguredStarts:
+    """Initializes robots at their configured starts.
+
+    Args:
+        swarm: Robots with their starts.
+        tracks: Odometry of the robots.
+    """
+
+    def __init__(self, swarm: Swarm, tracks: OdometryTracks) -> None:
+        self._tracks = tracks
+        self._has_start = np.array([r.start is not None for r in swarm.robots], dtype=bool)
+        self._start: FloatArray = np.array([r.start or (0.0, 0.0, 0.0) for r in swarm.robots]).reshape(-1, 3)
+        sigma = [(r.start_sigma.x, r.start_sigma.y, r.start_sigma.theta) for r in swarm.robots]
+        self._start_variance: FloatArray = np.square(sigma).reshape(-1, 3)
+
+    def with_starts(self, state: SwarmState, stamp_ns: int) -> SwarmState:
+        """State in which robots without any measurement are initialized at their starts.
+
+        Robots that are random walks are excluded, because the start of their motion is unknown.
+        """
+        robots = np.flatnonzero(state.start_pending)
+        ready = robots[~self._tracks.is_random_walk(robots) & self._may_start(state, robots, stamp_ns)]
+        if ready.size:
+            state = state.copy()
+            self._initialize(state, ready, np.full(ready.size, stamp_ns))
+        return state
+
+    def initialize_pending(self, state: SwarmState, stamp_ns: int) -> None:
+        """Initialize all pending robots with odometry before an instant."""
+        robots = np.flatnonzero(state.start_pending)
+        ready = robots[self._may_start(state, robots, stamp_ns)]
+        if ready.size:
+            self._initialize(state, ready, np.full(ready.size, stamp_ns))
+
+    def _may_start(self, state: SwarmState, robots: IntArray, stamps_ns: IntArray | int) -> BoolArray:
+        """Whether robots (k,) are pending and have odometry before instants (k,)."""
+        pending: BoolArray = state.start_pending[robots] & self._has_start[robots]
+        return pending & self._tracks.has_started(robots, stamps_ns)
+
+    def _initialize(self, state: SwarmState, robots: IntArray, stamps_ns: IntArray) -> None:
+        """Initialize robots (k,) at the start of their tracks, random walks at `stamps_ns`."""
+        tracks, start, walks = self._tracks.arrays, self._start[robots], self._tracks.is_random_walk(robots)
+        transform = se2.compose(start, se2.inverse(tracks.begin_pose[robots]))
+        error = se2.error_covariance(start, self._start_variance[robots][:, :, None] * np.eye(3))
+        begun_ns = np.where(walks, stamps_ns, tracks.begin_ns[robots])
+        covariance, jacobian = self._tracks.at(robots, stamps_ns)[2:4]
+        covariance[~walks], jacobian[~walks] = 0.0, 0.0  # nothing is preintegrated at the start of a track
+        state.start(robots, Starts(transform, error, begun_ns, covariance, jacobian))
+
+    def initialize_measured(self, state: SwarmState, measurements: MeasurementArray) -> bool:
+        """Initialize pending robots of measurements (m,) at their starts; return whether there were any.
+
+        Not earlier: when the first odometry of a robot arrives late, only its measurements are fused again.
+        """
+        initialized = False
+        for side in ("observer", "target"):
+            new = np.append(state.start_pending, False)[measurements[side]]  # NOBODY (-1) is the last element
+            robots, stamps_ns = measurements[side][new], measurements["stamp_ns"][new]
+            ready = self._may_start(state, robots, stamps_ns)
+            chosen_robots, first = np.unique(robots[ready], return_index=True)
+            if chosen_robots.size:
+                self._initialize(state, chosen_robots, stamps_ns[ready][first])
+                initialized = True
+        return initialized
+
+
+_ORIGIN_SIGMA = 1e-4
+"""Standard deviation of the pose of the origin [m, rad]; not zero, so that its covariance is invertible."""
+
+
+def is_absolute(measurements: MeasurementArray) -> BoolArray:
+    """Whether measurements (m,) tie a robot to `map`: fixes, landmarks, and poses set by a user."""
+    command, landmark = measurements["command"], measurements["landmark"] > 0
+    alone = (measurements["observer"] == NOBODY) | (measurements["target"] == NOBODY)
+    return np.asarray((alone | landmark) & (command != Command.FORGET))
+
+
+class LocalFrame:
+    """Begins a local frame, and moves its robots to `map`.
+
+    Args:
+        swarm: Robots; where one has a start, there is never a local frame.
+        tracks: Odometry of the robots.
+        initializer: Locates robots in `map`.
+        after_s: Time of sightings between robots after which a local frame begins [s]; 0: never.
+    """
+
+    def __init__(
+        self, swarm: Swarm, tracks: OdometryTracks, initializer: Initializer, after_s: float
+    ) -> None:
+        self._is_wanted = after_s > 0.0 and all(robot.start is None for robot in swarm.robots)
+        self._after_ns = round(after_s * 1e9)
+        self._tracks, self._initializer = tracks, initializer
+
+    def parts(self, state: SwarmState, measurements: MeasurementArray) -> Iterator[tuple[slice, bool]]:
+        """Split measurements (m,) by what may be done with them, as the state changes in between.
+
+        Yields:
+            Parts in order, and whether a part is one absolute measurement of a swarm in a local frame. All
+            others are to be fused in the frame of the poses.
+        """
+        if state.origin == IN_MAP and not self._may_begin(state):
+            yield slice(None), False
+            return
+        begin, absolute = 0, is_absolute(measurements)
+        while begin < measurements.size:
+            end = measurements.size
+            if state.origin != IN_MAP:
+                other = np.flatnonzero(absolute[begin:])
+                end = begin + 1 if absolute[begin] else begin + int(other[0]) if other.size else end
+                yield slice(begin, end), bool(absolute[begin])
+                if not state.tracked.any():
+                    self.leave(state)
+            else:
+                end = begin + self._first_local(state, measurements[begin:], absolute[begin:])
+                if end > begin:
+                    yield slice(begin, end), False
+                if end < measurements.size and not state.tracked.any():
+                    self._begin(state, int(measurements["stamp_ns"][end]))
+            begin = end
+
+    def _may_begin(self, state: SwarmState) -> bool:
+        return self._is_wanted and not state.tracked.any()
+
+    def _first_local(self, state: SwarmState, measurements: MeasurementArray, absolute: BoolArray) -> int:
+        """Index of the first measurement (of m) that a local frame may use; m if none.
+
+        Notes which robots have met.
+        """
+        if not self._may_begin(state):
+            return measurements.size
+        for k, one in enumerate(measurements):
+            stamp_ns = int(one["stamp_ns"])
+            if absolute[k]:
+                state.meetings = Meetings()
+                continue
+            pair = (int(one["observer"]), int(one["target"]))
+            if one["command"] != Command.NONE or not self._tracks.has_started(np.array(pair), stamp_ns).all():
+                continue
+            first_ns = state.meetings.first_ns if state.meetings.pairs else stamp_ns
+            if pair not in state.meetings.pairs:
+                state.meetings = Meetings(first_ns, state.meetings.pairs | {pair})
+            if stamp_ns - first_ns >= self._after_ns:
+                return k
+        return measurements.size
+
+    def _begin(self, state: SwarmState, stamp_ns: int) -> None:
+        """Initialize the best connected robot at the origin."""
+        partners = {frozenset(pair) for pair in state.meetings.pairs}
+        count = Counter(robot for pair in sorted(map(sorted, partners)) for robot in pair)
+        robot = max(sorted(count), key=lambda one: count[one])
+        track = self._tracks.at(np.array([robot]), np.array([stamp_ns]))
+        initial = InitialPose(se2.inverse(track.pose[0]), _ORIGIN_SIGMA**2 * np.eye(3))
+        at = Preintegrated(stamp_ns, track.covariance[0], track.jacobian[0])
+        state.initialize(robot, initial, at, WELL_CONFIRMED)
+        state.origin, state.meetings = robot, Meetings()
+
+    def collect(self, state: SwarmState, one: MeasurementArray) -> bool:
+        """Keep an absolute measurement (1,) of a swarm in a local frame; enough of them move it to `map`.
+
+        Returns:
+            Whether the measurement does so.
+        """
+        sides = int(one["observer"][0]), int(one["target"][0])
+        robot = max(sides)
+        if not self._tracks.has_started(robot, int(one["stamp_ns"][0])):
+            return False
+        return self._initializer.constrain(state, robot, NOBODY, one, self.move_to_map)
+
+    def move_to_map(
+        self,
+        state: SwarmState,
+        robot: int,
+        initial: InitialPose,
+        at: Preintegrated,
+        confirmations: int = CONFIRMED,
+    ) -> None:
+        """Move all robots to `map` with a robot whose pose there is known.
+
+        Where it is not among the located ones, or the filter is sparse, the others are deinitialized.
+        """
+        state.origin, state.frame_moves = IN_MAP, state.frame_moves + 1
+        if state.tracked[robot] and state.filter.is_dense:
+            predict(state.arrays(), robot, at, new_scratch())
+            state.move(robot, initial)
+        else:
+            self.leave(state)
+            state.initialize(robot, initial, at, confirmations)
+
+    @staticmethod
+    def leave(state: SwarmState) -> None:
+        """Deinitialize all robots of a local frame."""
+        state.origin = IN_MAP
+        for other in np.flatnonzero(state.tracked).tolist():
+            state.deinitialize(other)
+        state.constraints.clear()
+        state.windows.clear()

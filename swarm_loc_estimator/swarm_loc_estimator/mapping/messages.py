@@ -10,8 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.cdr import CdrError, decode, nanoseconds
-from swarm_loc_estimator.common.messages.definitions import LASER, LASER_SCAN, LIGHTS, OCCUPANCY_GRID
+from swarm_loc_estimator.common.messages.cdr import (
+    LASER,
+    LASER_SCAN,
+    LIGHTS,
+    OCCUPANCY_GRID,
+    CdrError,
+    decode,
+    nanoseconds,
+)
 from swarm_loc_estimator.common.messages.poses import planar_pose
 from swarm_loc_estimator.common.parameters import ParameterError
 

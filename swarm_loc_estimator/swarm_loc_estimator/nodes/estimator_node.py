@@ -25,7 +25,7 @@ from std_srvs.srv import Trigger
 from swarm_loc_estimator.common.health import PATIENCE_S, Level, Report
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.lifecycle import ManagedNode
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.streams import MessageBatch
 from swarm_loc_estimator.common.node import BACKWARDS, Ticks, run_node
 from swarm_loc_estimator.nodes.estimator_diagnostics import (
     Diagnostics,
@@ -38,14 +38,15 @@ from swarm_loc_estimator.nodes.estimator_diagnostics import (
     shedding_report,
 )
 from swarm_loc_estimator.nodes.estimator_topics import (
+    NO_CLOCK,
     EstimateOutputs,
     EstimatorInputs,
+    PoseCommands,
     StaticTransforms,
     newest_time_ns,
 )
-from swarm_loc_estimator.nodes.load import FusionPace, Shedding
+from swarm_loc_estimator.nodes.load import SHED_REASONS, FusionPace, Shedding, Thinning
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
-from swarm_loc_estimator.nodes.set_pose import NO_CLOCK, PoseCommands
 from swarm_loc_estimator.precompile import precompile, size_of
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import live_topics
@@ -54,7 +55,6 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.map_scans import walls_of
 from swarm_loc_estimator.timeline.settings import Settings
-from swarm_loc_estimator.timeline.thinning import SHED_REASONS, Thinning
 from swarm_loc_msgs.srv import SetRobotPose
 
 _ORDINARY_DROPS = frozenset(

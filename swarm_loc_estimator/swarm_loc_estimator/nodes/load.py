@@ -1,6 +1,148 @@
-"""Limit the load of a live estimator: fuse less often, then drop a share of the measurements. No ROS here."""
+"""Limit the load of a live estimator: fuse less often, then drop a share of the measurements. No ROS here.
+
+Under overload, drop measurements uniformly over all robots and pairs.
+
+Each source (a robot's camera, infrared board or fixes, an overhead camera) has the same maximum number of
+used measurements, so those that send most lose measurements first (max-min fairness; D. Bertsekas, R.
+Gallager: Data Networks, 6.5.2). Measurement k of a source is used if the fractional part of k times the
+golden ratio is below the share. This sequence is uniform over any interval and over every n-th number (H.
+Weyl: Ueber die Gleichverteilung von Zahlen mod. Eins, 1916), so a robot that sends its detections always in
+the same order does not lose the same neighbour each time.
+
+A large swarm fuses the measurements of a fusion period as one batch, whose cost hardly depends on their
+number. So whole periods are used or dropped: period k by the same rule.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.sensors.registry import SENSORS, Batch
+from swarm_loc_estimator.sensors.sensor import Sensor, chosen
+from swarm_loc_estimator.timeline.settings import end_of_period
+
+_GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # Fractional part of the golden ratio in units of 2^-64
+_SILVER = np.uint64(0x6A09E667F3BCC909)
+"""Fractional part of the square root of two: offset between sources, so that their drops alternate."""
+
+_WHOLE = 2.0**64
+
+SHED_REASONS = frozenset(f"shed_{sensor.name}" for sensor in SENSORS.values() if sensor.unit is not None)
+"""Reasons in `drops` for readings dropped by thinning, one per sensor."""
+
+
+class Thinned(NamedTuple):
+    """Result of thinning."""
+
+    messages: Batch  # The remaining readings; `dropped` includes the readings dropped here
+    measurements: int  # Number of measurements before: detections, fixes, infrared exchanges, aerial images
+    shed: int  # Number of dropped measurements
+
+
+class Thinning:
+    """Thins out measurements, but never odometry, which all predictions need.
+
+    The result is deterministic. All matrices of an infrared exchange are used or none, and all detections of
+    an aerial image or none: a partial image would imply missing robots.
+
+    Args:
+        robots: Number of robots.
+        period_ns: Fusion period of a large swarm, to drop whole periods [ns]; 0: drop per source.
+    """
+
+    def __init__(self, robots: int, period_ns: int = 0) -> None:
+        self._period_ns = period_ns
+        self._sources_of_kind = robots + 1  # the last one is the swarm, index -1
+        self._sensors = [sensor for sensor in SENSORS.values() if sensor.unit is not None]
+        self._number = np.zeros(len(self._sensors) * self._sources_of_kind, dtype=np.uint64)
+        self._exchanges: dict[tuple[int, ...], bool] = {}
+
+    def thin(self, messages: Batch, share: float) -> Thinned:
+        """Keep a share of all measurements, in (0, 1]."""
+        units = [_units(sensor, messages[sensor.name]) for sensor in self._sensors]
+        sources = [
+            k * self._sources_of_kind + one.robot % self._sources_of_kind for k, one in enumerate(units)
+        ]
+        if self._period_ns:
+            used = self._in_periods(np.concatenate([one.stamp_ns for one in units]), share)
+        else:
+            used = self._used(np.concatenate(sources), share)
+        rows = dict(messages.rows)
+        shed: dict[str, int] = {}
+        for sensor, one, mine in zip(
+            self._sensors, units, np.split(used, np.cumsum([s.size for s in sources[:-1]])), strict=True
+        ):
+            self._decide_as_before(one.exchange, mine)
+            if not mine.all():
+                rows[sensor.name] = chosen(messages[sensor.name], mine[one.of_row])
+                shed[f"shed_{sensor.name}"] = int(np.sum(~mine))
+        left = replace(messages, rows=rows, dropped={**messages.dropped, **shed})
+        return Thinned(left, used.size, sum(shed.values()))
+
+    def _in_periods(self, stamp_ns: IntArray, share: float) -> NDArray[np.bool_]:
+        """Select measurements (u,) by the periods of their stamps (u,) [ns]."""
+        number = (end_of_period(stamp_ns, self._period_ns) // self._period_ns).astype(np.uint64)
+        fraction = (number * _GOLDEN).astype(np.float64) / _WHOLE
+        return np.asarray((fraction < share) | (share >= 1.0))
+
+    def _used(self, source: IntArray, share: float) -> NDArray[np.bool_]:
+        """Select measurements (u,) by their sources (u,)."""
+        count = np.bincount(source, minlength=self._number.size)
+        order = np.argsort(source, kind="stable")
+        first = np.cumsum(count) - count
+        number = np.empty(source.size, dtype=np.uint64)
+        number[order] = np.arange(source.size) - first[source[order]]
+        number += self._number[source]
+        self._number += count.astype(np.uint64)
+        if share >= 1.0:
+            return np.ones(source.size, dtype=np.bool_)
+        share_of = np.minimum(1.0, water_level(count, share * source.size) / np.maximum(count, 1))
+        fraction = (number * _GOLDEN + source.astype(np.uint64) * _SILVER).astype(np.float64) / _WHOLE
+        return np.asarray(fraction < share_of[source])
+
+    def _decide_as_before(self, exchanges: Sequence[tuple[int, ...]], used: NDArray[np.bool_]) -> None:
+        """Repeat the decisions of the previous call for exchanges that continue."""
+        if not exchanges:
+            return
+        for k, exchange in enumerate(exchanges):
+            used[k] = self._exchanges.get(exchange, used[k])
+        self._exchanges = dict(zip(exchanges, used.tolist(), strict=True))
+
+
+def water_level(count: IntArray, total: float) -> float:
+    """Maximum number per source such that all sources together use `total` of counts (s,)."""
+    ascending = np.sort(count)
+    left = total - (np.cumsum(ascending) - ascending)  # total left for this source and all larger ones
+    level = left / np.arange(count.size, 0, -1)
+    above = np.flatnonzero(ascending >= level)
+    return float(level[above[0]]) if above.size else float(np.inf)
+
+
+class _Units(NamedTuple):
+    """Groups (u,) of readings that are used or dropped as a whole."""
+
+    robot: IntArray  # (u,) robot index
+    stamp_ns: IntArray  # (u,) time of measurement
+    of_row: IntArray  # (k,) group of each row
+    exchange: Sequence[tuple[int, ...]] = ()  # Robot, stamp and transmitter of each group; infrared only
+
+
+def _units(sensor: Sensor, rows: Any) -> _Units:
+    """Group a sensor's readings by the columns `unit`; without these, each row is a group."""
+    if not sensor.unit:
+        return _Units(rows.robot, rows.stamp_ns, np.arange(rows.robot.size))
+    keys = np.column_stack([getattr(rows, name) for name in sensor.unit])
+    found, of_row = np.unique(keys, axis=0, return_inverse=True)
+    exchanges = [tuple(key) for key in found.tolist()] if sensor.keeps_units else []
+    robot, stamp_ns = (found[:, sensor.unit.index(name)] for name in ("robot", "stamp_ns"))
+    return _Units(robot, stamp_ns, of_row.reshape(-1), exchanges)
+
 
 MIN_SHARE = 0.01
 """Least share, however busy the node is: without any measurements, robots would be lost for good."""

@@ -13,12 +13,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.cdr import nanoseconds
-from swarm_loc_estimator.common.messages.definitions import (
+from swarm_loc_estimator.common.messages.cdr import (
     ODOMETRY,
     POSE_STAMPED,
     POSE_WITH_COVARIANCE,
     TRANSFORMS,
+    nanoseconds,
 )
 from swarm_loc_estimator.common.messages.poses import PLANE, yaw_of
 

@@ -1,7 +1,13 @@
-"""Rows and models of odometry tracks, as arrays for compiled code."""
+"""Rows and models of odometry tracks, as arrays for compiled code.
+
+Process noise of odometry steps and gaps.
+
+Interpolation and extrapolation of odometry tracks.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields
 from typing import NamedTuple
 
@@ -9,7 +15,126 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
+from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
+from swarm_loc_estimator.swarm.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
 from swarm_loc_estimator.swarm.error_models import ImuModel, OdometryModel
+
+_MAX_DISTANCE_M = 1e3
+_MAX_TURNING_S = 100.0
+
+
+class OdometryStep(NamedTuple):
+    """One step of a robot along its track."""
+
+    forward: float  # Displacement of the body [m], as is left
+    left: float
+    turn: float  # Change of heading [rad]
+    turn_rate_change: float  # Absolute change of the turn rate [rad/s]
+    duration_s: float  # Duration [s]
+    x: float  # Position on the track in the middle of the step [m], as is y
+    y: float
+    theta: float  # Heading in the middle of the step [rad]
+    turn_variance: float  # Variance of a turn that a gyroscope measured [rad^2]; NaN: of the wheels
+    estimates_turn: bool  # Whether the estimated scale and bias of turns are those of the sensor of this turn
+
+
+@cached_njit
+def add_step_noise(model: OdometryModel, step: OdometryStep, covariance: FloatArray) -> None:
+    """Add a step's noise to a covariance (3, 3) in the track's frame.
+
+    Wheels: covar(ds_r, ds_l) = diag(k |ds_r|, k |ds_l|) (Siegwart and Nourbakhsh), the U Q U^T of the e-puck
+    paper's eq. (9), whose Q is not printed. The noise along, across and in heading is relative to the
+    direction of motion, so a sideways step has the noise of a forward step of that length.
+    """
+    turn, duration_s = step.turn, step.duration_s
+    separation, wheel, path = model.wheel_separation, model.wheel_noise, math.hypot(step.forward, step.left)
+    right_wheel, left_wheel = abs(path + 0.5 * separation * turn), abs(path - 0.5 * separation * turn)
+    along = 0.25 * wheel * (right_wheel + left_wheel) + model.distance_noise * path
+    along += model.distance_turn_noise * abs(turn)
+    across = model.lateral_noise * path
+    heading = wheel * (right_wheel + left_wheel) / separation**2 + model.turn_noise * abs(turn)
+    heading += model.turn_change_noise * step.turn_rate_change
+    if right_wheel + left_wheel > 0.0:
+        along += model.distance_drift * duration_s
+        across += model.lateral_drift * duration_s
+        heading += model.turn_drift * duration_s
+    cross = 0.5 * wheel * (right_wheel - left_wheel) / separation
+    if not math.isnan(step.turn_variance):
+        heading, cross = step.turn_variance, 0.0
+    course = step.theta + math.atan2(step.left, step.forward)
+    add_in_track_frame((step.x, step.y, course), (along, across, heading, cross), covariance)
+
+
+@cached_njit
+def add_step_jacobian(model: OdometryModel, step: OdometryStep, jacobian: FloatArray) -> None:
+    """Add the Jacobian of a step's motion by the parameters: Ad(O) times their body directions.
+
+    Args:
+        model: Gives the position of the axle.
+        step: The step.
+        jacobian: (3, 3) sum to add to.
+    """
+    forward, left, turn = step.forward, step.left, step.turn
+    if forward == 0.0 and left == 0.0 and turn == 0.0:
+        return
+    cos, sin = math.cos(step.theta + model.course_offset), math.sin(step.theta + model.course_offset)
+    jacobian[0, DISTANCE_SCALE] += cos * forward - sin * left
+    jacobian[1, DISTANCE_SCALE] += sin * forward + cos * left
+    if not step.estimates_turn:
+        return
+    # when the axle turns, base_link ahead of it also moves sideways
+    turned_x = step.y - math.sin(step.theta) * model.axle_offset
+    turned_y = -step.x + math.cos(step.theta) * model.axle_offset
+    for parameter, angle in ((TURN_BIAS, step.duration_s), (TURN_SCALE, turn)):
+        jacobian[0, parameter] += turned_x * angle
+        jacobian[1, parameter] += turned_y * angle
+        jacobian[2, parameter] += angle
+
+
+@cached_njit
+def add_dropout_noise(
+    model: OdometryModel,
+    silence_s: float,
+    unknown: bool,
+    pose: FloatArray,
+    rate: FloatArray,
+    covariance: FloatArray,
+) -> None:
+    """Add the noise of an odometry dropout that started at `pose` (3,) on the track with `rate` (3,).
+
+    Speed and turn rate are random walks at first; if the motion is `unknown`, any feasible motion is covered.
+    Both noises act about the last known pose, so the covariance never decreases with time.
+    """
+    # bounded, so that rounding does not lose the noise of later steps
+    reach = min(model.max_speed * silence_s, _MAX_DISTANCE_M) ** 2 / 3.0
+    turned = min(model.max_turn_rate * silence_s, math.pi) ** 2 / 3.0  # pi: any heading
+    if model.max_turn_rate * silence_s > math.pi:  # the noise grows further while the robot may turn
+        turned += min(silence_s - math.pi / model.max_turn_rate, _MAX_TURNING_S) * math.pi**2 / 3.0
+    along, across, heading = reach, reach, turned
+    if not unknown:
+        walked = silence_s**3 / 3.0
+        along, across = min(along, model.speed_change**2 * walked), 0.0
+        heading = min(heading, model.turn_rate_change**2 * walked)
+    course = pose[2] + math.atan2(rate[1], rate[0])
+    add_in_track_frame((pose[0], pose[1], course), (along, across, heading, 0.0), covariance)
+
+
+@cached_njit
+def add_in_track_frame(
+    pose: tuple[float, float, float], body: tuple[float, float, float, float], covariance: FloatArray
+) -> None:
+    """Add Ad(pose) Q Ad(pose)^T for body variances along, across, heading and cov(along, heading)."""
+    x, y, theta = pose
+    along, across, heading, cross = body
+    cos, sin = math.cos(theta), math.sin(theta)
+    forward, left, turning = (cos, sin, 0.0), (-sin, cos, 0.0), (y, -x, 1.0)
+    for i in range(3):
+        for j in range(3):
+            covariance[i, j] += along * forward[i] * forward[j] + across * left[i] * left[j]
+            covariance[i, j] += heading * turning[i] * turning[j]
+            covariance[i, j] += cross * (forward[i] * turning[j] + turning[i] * forward[j])
+
 
 BEFORE_ALL_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
@@ -59,3 +184,149 @@ class TrackArrays(NamedTuple):
     gyro_angle: FloatArray  # (N, G) their integral [rad]
     gyro_piece: IntArray  # (N, G) number of the pause before, beyond which nothing is integrated
     walk: FloatArray  # (N, 2) its variances per second of position [m^2/s] and heading [rad^2/s]
+
+
+class OdometrySample(NamedTuple):
+    """Tracks looked up at some instants (m,)."""
+
+    pose: FloatArray  # (m, 3) calibrated odometry pose O, heading not wrapped
+    raw: FloatArray  # (m, 3) pose reported by the driver, interpolated in the same way
+    covariance: FloatArray  # (m, 3, 3) preintegrated covariance, see `Preintegrated`
+    jacobian: FloatArray  # (m, 3, 3) preintegrated Jacobian
+    silence_s: FloatArray  # (m,) time since the newest message of the robot [s]; 0 within the track
+
+
+@cached_njit
+def new_sample(count: int) -> OdometrySample:
+    """Allocate a sample of `count` look-ups."""
+    return OdometrySample(
+        np.zeros((count, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros(count),
+    )
+
+
+@inlined_njit
+def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample, k: int) -> None:
+    """Look a robot's track up at an instant, and write row k of a sample.
+
+    Within a step the twist is constant. Past the newest row the last twist is extrapolated with growing
+    covariance; after `timeout_s` the motion since that row is unknown. Before the first row the robot is
+    stationary. A robot without odometry is stationary or a random walk in its body frame.
+    """
+    count = tracks.filled[robot]
+    out.silence_s[k] = 0.0
+    if count == 0:
+        out.pose[k].fill(0.0)
+        out.raw[k].fill(0.0)
+        out.covariance[k].fill(0.0)
+        out.jacobian[k].fill(0.0)
+        out.silence_s[k] = 0.0 if tracks.is_stationary[robot] else math.inf
+        for i in range(3):  # for a random walk, only differences between instants matter
+            out.covariance[k, i, i] = tracks.walk[robot, i // 2] * (1e-9 * stamp_ns)
+        return
+    row, fraction = _find_step(tracks, robot, stamp_ns)
+    if fraction < 0.0:
+        assign(out.pose[k], tracks.pose[robot, row])
+        assign(out.raw[k], tracks.raw[robot, row])
+        assign_matrix(out.covariance[k], tracks.covariance[robot, row])
+        assign_matrix(out.jacobian[k], tracks.jacobian[robot, row])
+    else:
+        _along_step(tracks, robot, row, fraction, out, k)
+        if fraction < 1.0:
+            return
+        row += 1
+    model, pose, rate = tracks.model[robot], tracks.pose[robot, row], tracks.rate[robot, row]
+    silence_ns = max(0, stamp_ns - tracks.stamp_ns[robot, row])
+    unknown = silence_ns > model.timeout_s * 1e9
+    out.silence_s[k] = silence_s = silence_ns * 1e-9
+    add_dropout_noise(model, silence_s, unknown, pose, rate, out.covariance[k])
+
+
+@inlined_njit
+def look_up_pose(tracks: TrackArrays, robot: int, stamp_ns: int, out: FloatArray) -> None:
+    """Write only the pose (3,) of `look_up`."""
+    if tracks.filled[robot] == 0:
+        out.fill(0.0)
+        return
+    row, fraction = _find_step(tracks, robot, stamp_ns)
+    if fraction < 0.0:
+        assign(out, tracks.pose[robot, row])
+    else:
+        _interpolate(tracks.pose[robot, row], tracks.pose[robot, row + 1], fraction, out)
+
+
+@inlined_njit
+def _find_step(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[int, float]:
+    """Row before an instant on a track that is not empty, and the fraction of the step to the next row.
+
+    A fraction of 1 or more extrapolates past the newest row; below 0, the robot is stationary at the row.
+    """
+    count = tracks.filled[robot]
+    stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
+    row = max(0, np.searchsorted(stamps, stamp_ns, side="right") - 1)
+    if row + 1 < count and stamps[row + 1] - stamps[row] <= timeout_ns:
+        return row, max(0, stamp_ns - stamps[row]) / (stamps[row + 1] - stamps[row])
+    silence_ns = max(0, stamp_ns - stamps[row])
+    if row > 0 and silence_ns <= timeout_ns and stamps[row] - stamps[row - 1] <= timeout_ns:
+        return row - 1, 1.0 + silence_ns / (stamps[row] - stamps[row - 1])
+    return row, -1.0
+
+
+@inlined_njit
+def rate_at(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[float, float, float]:
+    """Velocity forward and left [m/s] and turn rate [rad/s] of base_link at an instant.
+
+    At a row, the rate is that of the step before, so that later rows do not change it. It is zero up to the
+    first row and where the motion is unknown.
+    """
+    count = tracks.filled[robot]
+    stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
+    row = min(np.searchsorted(stamps, stamp_ns), count - 1)
+    if row < 1:
+        return 0.0, 0.0, 0.0
+    if max(stamps[row], stamp_ns) - stamps[row - 1] > timeout_ns:
+        return 0.0, 0.0, 0.0
+    before, after = tracks.pose[robot, row - 1], tracks.pose[robot, row]
+    duration_s = (stamps[row] - stamps[row - 1]) * 1e-9
+    turn = after[2] - before[2]
+    cos, sin = math.cos(before[2] + 0.5 * turn), math.sin(before[2] + 0.5 * turn)
+    dx, dy = after[0] - before[0], after[1] - before[1]
+    return (cos * dx + sin * dy) / duration_s, (cos * dy - sin * dx) / duration_s, turn / duration_s
+
+
+@inlined_njit
+def _along_step(
+    tracks: TrackArrays, robot: int, row: int, fraction: float, out: OdometrySample, k: int
+) -> None:
+    """Write row k of `look_up` at a fraction of the step from a row to the next; may exceed 1."""
+    _interpolate(tracks.pose[robot, row], tracks.pose[robot, row + 1], fraction, out.pose[k])
+    _interpolate(tracks.raw[robot, row], tracks.raw[robot, row + 1], fraction, out.raw[k])
+    for i in range(3):
+        for j in range(3):
+            for table, target in ((tracks.covariance, out.covariance), (tracks.jacobian, out.jacobian)):
+                before, after = table[robot, row, i, j], table[robot, row + 1, i, j]
+                target[k, i, j] = before + fraction * (after - before)
+
+
+@cached_njit
+def look_up_all(tracks: TrackArrays, robots: IntArray, stamps_ns: IntArray) -> OdometrySample:
+    """Look up m robots at m instants; see `look_up`."""
+    out = new_sample(robots.size)
+    for k in range(robots.size):
+        look_up(tracks, robots[k], stamps_ns[k], out, k)
+    return out
+
+
+@inlined_njit
+def _interpolate(start: FloatArray, end: FloatArray, fraction: float, out: FloatArray) -> None:
+    """Interpolate from `start` to `end` with constant twist; a `fraction` above 1 extrapolates."""
+    turn = end[2] - start[2]
+    back = -0.5 * (1.0 - fraction) * turn
+    cos, sin = math.cos(back), math.sin(back)
+    dx, dy = end[0] - start[0], end[1] - start[1]
+    out[0] = start[0] + fraction * (cos * dx - sin * dy)
+    out[1] = start[1] + fraction * (sin * dx + cos * dy)
+    out[2] = start[2] + fraction * turn

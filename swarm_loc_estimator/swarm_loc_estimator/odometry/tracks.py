@@ -18,12 +18,11 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.odometry.gyro import insert_rates
-from swarm_loc_estimator.odometry.look_up import OdometrySample, look_up_all
 from swarm_loc_estimator.odometry.preintegration import (
     UNCHANGED_NS,
     NewRows,
     continue_tracks,
+    insert_rates,
     integrate,
     integrate_again,
 )
@@ -32,9 +31,11 @@ from swarm_loc_estimator.odometry.track_arrays import (
     IMU_DTYPE,
     LATEST_NS,
     MODEL_DTYPE,
+    OdometrySample,
     TrackArrays,
+    look_up_all,
 )
-from swarm_loc_estimator.swarm.motion_response import MotionResponse
+from swarm_loc_estimator.swarm.error_models import MotionResponse
 from swarm_loc_estimator.swarm.swarm import Robot
 
 _IDEAL = MotionResponse(speeds=(0.0,), turn_rates=(0.0,), speed_share=((1.0,),), turn_share=((1.0,),))

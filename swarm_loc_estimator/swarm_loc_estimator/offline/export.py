@@ -1,32 +1,138 @@
-"""Write a run as MCAP for viewers."""
+"""Write a run as MCAP for viewers.
+
+Trajectories as text in the format of TUM, as evo uses it: `seconds x y z qx qy qz qw` per line.
+"""
 
 from __future__ import annotations
 
+import math
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import BoolArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.definitions import (
+from swarm_loc_estimator.common.messages.cdr import (
     MARKERS,
     OCCUPANCY_GRID,
     POSE_STAMPED,
     SWARM_POSES,
     TRANSFORMS,
 )
-from swarm_loc_estimator.common.messages.estimates import (
+from swarm_loc_estimator.common.messages.poses import (
     EstimateMessage,
     SwarmPosesEncoder,
     TransformsEncoder,
+    encode_pose_stamped,
+    yaw_of,
 )
-from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
-from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
+from swarm_loc_estimator.common.yaml_tree import read_file
 from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.watch.markers import MarkersEncoder
+
+_TRUTH = ".truth.tum"
+_MAX_BYTES = 1_000_000_000
+_MAX_S = 9_000_000_000
+
+
+class TumError(UserError):
+    """Files of trajectories that cannot be used; the message is one sentence."""
+
+
+def write_tum(result: ReplayResult, folder: Path) -> None:
+    """Write the trajectories of a run, in `map`.
+
+    `<robot>.tum` has the estimated poses, `<robot>.truth.tum` the ground truth at the same instants, as far
+    as it is known there. So evo, which pairs the nearest stamps, finds the errors of the report.
+
+    Args:
+        result: The run.
+        folder: Created if missing; files of the same names are replaced.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    for index, robot in enumerate(result.swarm.robots):
+        pose = result.poses[:, index]
+        _write(folder / f"{robot.name}.tum", result.stamp_ns, pose)
+        if robot.name in result.truth:
+            truth, known = interpolate(result.truth[robot.name], result.stamp_ns, DEFAULT_GAP_NS)
+            truth[~known] = np.nan
+            _write(folder / f"{robot.name}{_TRUTH}", result.stamp_ns, truth + 0.0 * pose)
+
+
+def _write(path: Path, stamp_ns: IntArray, pose: FloatArray) -> None:
+    """Write the finite ones of poses (T, 3)."""
+    with path.open("w", encoding="utf-8") as file:
+        for at_ns, (x, y, theta) in zip(stamp_ns.tolist(), pose.tolist(), strict=True):
+            if math.isfinite(x + y + theta):
+                seconds, rest = divmod(at_ns, 10**9)
+                z, w = math.sin(0.5 * theta), math.cos(0.5 * theta)
+                file.write(f"{seconds}.{rest:09d} {x:.12g} {y:.12g} 0 0 0 {z:.12g} {w:.12g}\n")
+
+
+def read_truth(folder: Path | None, swarm: Swarm) -> dict[str, Trajectory]:
+    """Robot name -> its ground truth in `map`, of the files `<robot>.truth.tum` in a folder; None has none.
+
+    Raises:
+        TumError: There is none, or a line is no pose.
+        YamlTreeError: A file cannot be read.
+    """
+    if folder is None:
+        return {}
+    names = [f"{robot.name}{_TRUTH}" for robot in swarm.robots]
+    truth = {
+        robot.name: read_tum(folder / name)
+        for robot, name in zip(swarm.robots, names, strict=True)
+        if (folder / name).exists()
+    }
+    if not truth:
+        raise TumError(f"'{folder}' has no ground truth of a robot, such as {names[0]}.")
+    return truth
+
+
+def read_tum(path: Path) -> Trajectory:
+    """The poses of a file by their stamps; lines that begin with # are comments.
+
+    Raises:
+        TumError: A line is no pose, or there is none.
+        YamlTreeError: The file cannot be read.
+    """
+    stamps_ns, poses = [], []
+    for number, line in enumerate(read_file(path, _MAX_BYTES).decode("utf-8", "replace").splitlines(), 1):
+        if not line.strip() or line.startswith("#"):
+            continue
+        try:
+            at_s, *numbers = line.split()
+            x, y, z, *turn = map(float, numbers)
+            yaw, stamp_ns = yaw_of(*turn), _nanoseconds(at_s)
+        except (ValueError, TypeError, InvalidOperation) as error:
+            raise TumError(f"'{path}', line {number}: '{line[:60]}' is no pose: {_FORMAT}.") from error
+        if not math.isfinite(x + y + z + yaw):
+            raise TumError(f"'{path}', line {number}: '{line[:60]}' is not finite, or has no heading.")
+        stamps_ns.append(stamp_ns)
+        poses.append((x, y, yaw))
+    if not poses:
+        raise TumError(f"'{path}' has no pose; one line each: {_FORMAT}.")
+    stamp_ns_of, order = np.array(stamps_ns), np.argsort(stamps_ns, kind="stable")
+    return Trajectory(stamp_ns_of[order], np.array(poses)[order])
+
+
+_FORMAT = "seconds x y z qx qy qz qw"
+
+
+def _nanoseconds(text: str) -> int:
+    """A time in seconds, which a float would round to some hundred nanoseconds."""
+    seconds = Decimal(text)
+    if not 0 <= seconds <= _MAX_S:
+        raise ValueError(text)
+    return round(seconds * 10**9)
+
 
 _MAP = "map"
 

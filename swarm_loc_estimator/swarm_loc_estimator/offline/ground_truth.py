@@ -9,14 +9,14 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.bag_file import BagTopic
-from swarm_loc_estimator.common.messages.cdr import decode, nanoseconds
-from swarm_loc_estimator.common.messages.definitions import (
+from swarm_loc_estimator.common.messages.cdr import (
     ODOMETRY,
     POSE_STAMPED,
     POSE_WITH_COVARIANCE,
     TRANSFORM_STAMPED,
+    decode,
+    nanoseconds,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.poses import (
     FixMessage,
     OdometryMessage,
@@ -26,9 +26,9 @@ from swarm_loc_estimator.common.messages.poses import (
     decode_pose_stamped,
     yaw_of,
 )
-from swarm_loc_estimator.common.messages.streams import PoseReader
+from swarm_loc_estimator.common.messages.streams import MessageBatch, PoseReader
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.offline.spool import Spool
+from swarm_loc_estimator.offline.result import Spool
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from swarm_loc_estimator.common.bags.reader import BagError, BagReader, BagTopic
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
+from swarm_loc_estimator.common.messages.streams import MessageBatch
 from swarm_loc_estimator.common.parameters import UserError, number, number_specs
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid

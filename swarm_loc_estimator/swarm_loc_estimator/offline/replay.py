@@ -23,8 +23,7 @@ from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.offline.recorded_bag import NOTHING_LOST, Loss, Progress, read_bag, unwatched
-from swarm_loc_estimator.offline.result import AerialImage, ReplayResult
-from swarm_loc_estimator.offline.spool import Spool
+from swarm_loc_estimator.offline.result import AerialImage, ReplayResult, Spool
 from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.sensors.ingest import MAX_PAUSE_NS
 from swarm_loc_estimator.sensors.registry import Batch

@@ -8,10 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.definitions import ANONYMOUS_DETECTIONS
+from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DETECTIONS
 from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, AnonymousMessage, decode_anonymous
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.streams import EachReader, MessageColumns
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
 from swarm_loc_estimator.filter.measurement_model import NOBODY, Kind
 from swarm_loc_estimator.sensors.fix import about_robots, take_out_headings
 from swarm_loc_estimator.sensors.sensor import (

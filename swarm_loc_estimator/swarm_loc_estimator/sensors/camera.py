@@ -4,37 +4,57 @@ A detection is a marker's pose in the camera's optical frame (x right, y down, z
 a measurement in the planar sensor frame: at the camera's position on the robot or, of a fixed camera, in
 `map`, rotated by its yaw, with the mount's pitch and roll removed. A fixed camera has no observer, and the
 error of its pose is the systematic share of its measurements.
+
+Measurement model of the direction of a marker; it is evaluated by its record.
+
+Vectors and orientations in the optical frame of a camera, for compiled code.
+
+Pose in the plane of a marker that lies flat, by casting its corners onto the plane of its height.
+
+The tilt and the distance of a small marker in an image are uncertain, and the error of one is that of the
+other. But a marker that lies flat has neither: its corners, projected by its measured pose into the image and
+from there onto the plane in which it lies, tell its position and the direction of its x axis. These depend on
+the pixels only, whichever of the two mirrored poses was measured.
+
+Kernels that convert camera detections to measurements, see `camera`.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.definitions import DETECTIONS as MESSAGE_TYPE
-from swarm_loc_estimator.common.messages.definitions import SWARM_DETECTIONS
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
+from swarm_loc_estimator.common.messages.cdr import DETECTIONS as MESSAGE_TYPE
+from swarm_loc_estimator.common.messages.cdr import SWARM_DETECTIONS
 from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,
     SharedMessage,
     decode_shared_detections,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.streams import DetectionColumns, DetectionReader
+from swarm_loc_estimator.common.messages.streams import DetectionColumns, DetectionReader, MessageBatch
+from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.common.small_matrix import assign
+from swarm_loc_estimator.filter.gating import gate_threshold
 from swarm_loc_estimator.filter.measurement_model import (
     MEASUREMENT_DTYPE,
     MODELS,
     NOBODY,
+    POLAR,
     Kind,
     MeasurementArray,
     MeasurementColumns,
+    MeasurementModel,
+    Prediction,
+    predict,
+    register,
 )
-from swarm_loc_estimator.sensors.bearing import BEARING
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Converter,
@@ -44,18 +64,453 @@ from swarm_loc_estimator.sensors.sensor import (
     Measured,
     Sensor,
     SensorSettings,
+    shared_kind,
 )
-from swarm_loc_estimator.sensors.shared_topics import shared_kind
-from swarm_loc_estimator.sensors.sighting_kernels import (
-    MEASURED,
-    OUTCOMES,
-    SENSOR_DTYPE,
-    Cameras,
-    Detections,
-    Markers,
-    convert_all,
-)
+from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Robot, Swarm
+
+BEARING = 4  # Number of the model; the first component of a value is the bearing, positive to the left [rad]
+
+
+def _predict_bearing(one: MeasurementArray, observer: FloatArray, target: FloatArray) -> Prediction:
+    polar = one.copy()
+    polar["kind"] = POLAR
+    value, jacobian = predict(polar, observer[None], target[None])
+    row = jacobian[0, 1:2, :3]
+    return Prediction(value[0, 1:2], -row, row)
+
+
+def _bearing_innovation(one: MeasurementArray, predicted: FloatArray) -> FloatArray:
+    return wrap_angle(one["value"][0, :1] - predicted)
+
+
+register(MeasurementModel("bearing", BEARING, 1, _predict_bearing, _bearing_innovation))
+
+
+@cached_njit
+def is_rotation(quaternion: FloatArray) -> bool:
+    """Whether a quaternion (4,) is finite and not zero."""
+    norm = 0.0
+    for i in range(4):
+        norm += quaternion[i] * quaternion[i]
+    return math.isfinite(norm) and norm > 1e-12
+
+
+@cached_njit
+def to_level_frame(level: FloatArray, optical: FloatArray, out: FloatArray) -> None:
+    """Rotate a vector (3,) from the optical frame to the camera's level axes forward, left, up."""
+    for i in range(3):
+        out[i] = level[i, 0] * optical[0] + level[i, 1] * optical[1] + level[i, 2] * optical[2]
+
+
+@cached_njit
+def scale(vector: FloatArray, factor: float) -> None:
+    """Multiply a vector (3,), in place."""
+    for i in range(3):
+        vector[i] *= factor
+
+
+@cached_njit
+def write_rotation(quaternion: FloatArray, out: FloatArray) -> None:
+    """Write the rotation matrix (3, 3) of a quaternion xyzw (4,) of any length."""
+    x, y, z, w = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    out[0, 0], out[1, 1], out[2, 2] = (
+        w * w + x * x - y * y - z * z,
+        w * w - x * x + y * y - z * z,
+        w * w - x * x - y * y + z * z,
+    )
+    out[0, 1], out[0, 2], out[1, 2] = 2.0 * (x * y - w * z), 2.0 * (x * z + w * y), 2.0 * (y * z - w * x)
+    out[1, 0], out[2, 0], out[2, 1] = 2.0 * (x * y + w * z), 2.0 * (x * z - w * y), 2.0 * (y * z + w * x)
+    out /= x * x + y * y + z * z + w * w
+
+
+@cached_njit
+def face_heading(level: FloatArray, quaternion: FloatArray) -> float:
+    """Heading in the sensor plane of the z axis of an orientation xyzw (4,), the normal of a face."""
+    rotation, axes = np.empty((3, 3)), np.empty(3)
+    write_rotation(quaternion, rotation)
+    to_level_frame(level, rotation[:, 2], axes)
+    return math.atan2(axes[1], axes[0])
+
+
+CAST, FACE_DOWN, NOT_FLAT = range(3)
+"""Results of `cast`: a pose in the plane; a marker that shows the floor; one that lies not as described."""
+_GATE = float(gate_threshold(1.0 - 1e-6, 3))
+_TILT_SIGMA = 0.05  # Standard deviation of the tilt of what lies, besides its measurement [rad]
+_HEIGHT_SHARE, _HEIGHT_SIGMA = 0.02, 0.005
+"""Standard deviation of a distance by the size of a marker: share of it, and [m]."""
+
+
+@cached_njit
+def cast(
+    level: FloatArray,
+    position: FloatArray,
+    rotation: FloatArray,
+    spread: FloatArray,
+    size: float,
+    height: float,
+    value: FloatArray,
+    noise: FloatArray,
+) -> int:
+    """Write the pose of a lying marker in the level frame of a camera.
+
+    Args:
+        level: (3, 3) from the optical frame to the level frame: forward, left, up.
+        position: (3,) of the marker in the optical frame [m].
+        rotation: (3, 3) from the marker's frame to the optical frame.
+        spread: (6, 6) covariance of position and rotation about the axes of the optical frame.
+        size: Side of the marker [m].
+        height: Of the marker above the camera, negative below it [m].
+        value: (3,) written: forward, left [m], direction of the marker's x axis [rad].
+        noise: (3, 3) written: covariance of `value`.
+
+    Returns:
+        CAST; or FACE_DOWN or NOT_FLAT, and nothing is written.
+    """
+    middle, axes = np.dot(level, position), np.dot(level, rotation)
+    if not axes[2, 2] > 0.0:
+        return FACE_DOWN
+    if not _lies(level, middle, axes, spread, height):
+        return NOT_FLAT
+    ahead, aside, slopes = 0.0, 0.0, np.zeros((3, 6))
+    along, across = np.zeros(6), np.zeros(6)
+    value[0], value[1] = 0.0, 0.0
+    for corner in range(4):
+        a = 0.5 * size if corner in (1, 2) else -0.5 * size
+        b = 0.5 * size if corner < 2 else -0.5 * size
+        arm = rotation[:, 0] * a + rotation[:, 1] * b
+        place = middle + axes[:, 0] * a + axes[:, 1] * b
+        stretch = height / place[2]
+        if not stretch > 0.0:
+            return NOT_FLAT
+        x, y = stretch * place[0], stretch * place[1]
+        value[0] += 0.25 * x
+        value[1] += 0.25 * y
+        ahead += a * x + b * y
+        aside += a * y - b * x
+        for j in range(6):
+            moved = level[:, j] if j < 3 else _turned(level, arm, j - 3)
+            dx = stretch * moved[0] - x / place[2] * moved[2]
+            dy = stretch * moved[1] - y / place[2] * moved[2]
+            slopes[0, j] += 0.25 * dx
+            slopes[1, j] += 0.25 * dy
+            along[j] += a * dx + b * dy
+            across[j] += a * dy - b * dx
+    value[2] = math.atan2(aside, ahead)
+    slopes[2] = (ahead * across - aside * along) / (ahead * ahead + aside * aside)
+    noise[:] = np.dot(slopes, np.dot(spread, slopes.T))
+    return CAST
+
+
+@cached_njit
+def _lies(level: FloatArray, middle: FloatArray, axes: FloatArray, spread: FloatArray, height: float) -> bool:
+    """Whether a measured pose agrees with a level marker at a height, by its tilt and its distance."""
+    slopes, rest, noise = np.zeros((3, 6)), np.empty(3), np.zeros((3, 3))
+    slopes[0, 3:], slopes[1, 3:], slopes[2, :3] = level[1], -level[0], level[2]
+    rest[0], rest[1], rest[2] = axes[0, 2], axes[1, 2], middle[2] - height
+    noise[0, 0] = noise[1, 1] = _TILT_SIGMA * _TILT_SIGMA
+    noise[2, 2] = (_HEIGHT_SHARE * height) ** 2 + _HEIGHT_SIGMA**2
+    noise += np.dot(slopes, np.dot(spread, slopes.T))
+    for i in range(3):
+        if not noise[i, i] > 0.0:
+            return False
+    distance: float = np.dot(rest, np.linalg.solve(noise, rest))
+    return 0.0 <= distance <= _GATE
+
+
+@cached_njit
+def _turned(level: FloatArray, arm: FloatArray, axis: int) -> FloatArray:
+    """Motion (3,) in the level frame of the end of an arm (3,) turned about an axis of the optical frame."""
+    j, k = (axis + 1) % 3, (axis + 2) % 3
+    moved: FloatArray = level[:, k] * arm[j] - level[:, j] * arm[k]
+    return moved
+
+
+CONTENT_POSITION = 1  # Detection content: position only (MarkerDetection.CONTENT_POSITION)
+CONTENT_POSE = 2  #: Detection content: position and orientation
+CONTENT_POSE_TWO = 3  #: Detection content: position and orientation, with a mirrored second solution
+CONTENT_BEARING = 4  # Detection content: only the direction of the position
+
+OUTCOMES = (
+    *("measured", "unknown_id", "own_marker", "no_camera", "bad_content", "non_finite", "absurd"),
+    *("fixed_on_fixed", "face_down", "not_flat"),
+)
+MEASURED, _UNKNOWN_ID, _OWN_MARKER, _NO_CAMERA, _BAD_CONTENT, _NON_FINITE, _ABSURD = range(7)
+_FIXED_ON_FIXED, _FACE_DOWN, _NOT_FLAT = range(7, len(OUTCOMES))
+_MAX_DISTANCE_M = 1e3
+SENSOR_DTYPE = np.dtype([(f.name, np.float64) for f in fields(SensorModel)])
+
+
+class Cameras(NamedTuple):
+    """Cameras of robots (N), then fixed ones: has one, S (., 3), optical to level rotation (., 3, 3), errors.
+
+    `height` is z of the mount, `variance` (., 3) that of a fixed camera's pose: x, y, yaw.
+    """
+
+    robots: int
+    present: NDArray[np.bool_]
+    mount: FloatArray
+    height: FloatArray
+    level: FloatArray
+    sensor: NDArray[np.void]
+    gate: FloatArray
+    bearing_gate: FloatArray
+    variance: FloatArray
+
+
+class Markers(NamedTuple):
+    """All markers by ascending id (k,): robot, landmark, M (k, 3) with heading NaN if there is none.
+
+    `variance` (k,) is that of a face's position on its robot; the filter adds that of a landmark.
+    """
+
+    id: IntArray
+    owner: IntArray
+    landmark: IntArray
+    pose: FloatArray
+    height: FloatArray
+    size: FloatArray
+    lies: NDArray[np.bool_]
+    variance: FloatArray
+
+
+class Detections(NamedTuple):
+    """The used fields of detections (d,)."""
+
+    id: NDArray[np.uint32]
+    content: NDArray[np.uint8]
+    position: FloatArray
+    orientation: FloatArray
+    covariance: FloatArray
+    alternative_position: FloatArray
+    alternative_orientation: FloatArray
+
+
+@cached_njit
+def convert_all(
+    detections: Detections,
+    cameras: Cameras,
+    markers: Markers,
+    out: MeasurementColumns,
+    marker_id: IntArray,
+    outcomes: IntArray,
+) -> None:
+    """Fill the measurements (d,) except stamps and observers, and write their outcomes (d,)."""
+    for k in range(outcomes.size):
+        camera = out.observer[k]
+        place = min(np.searchsorted(markers.id, detections.id[k]), markers.id.size - 1)
+        outcomes[k] = _outcome(detections, k, cameras, markers, camera, place)
+        if outcomes[k] != MEASURED:
+            continue
+        marker_id[k] = markers.id[place]
+        out.stamp_ns[k] += round(cameras.sensor[camera].time_offset_s * 1e9)
+        out.target[k], out.landmark[k] = markers.owner[place], markers.landmark[place]
+        assign(out.sensor[k], cameras.mount[camera])
+        out.gate[k] = cameras.gate[camera]
+        assign(out.marker[k], markers.pose[place])
+        with_heading = detections.content[k] in (CONTENT_POSE, CONTENT_POSE_TWO)
+        out.has_heading[k] = with_heading and not math.isnan(out.marker[k, 2])
+        if detections.content[k] == CONTENT_BEARING:
+            _measure_bearing(detections.position[k], k, cameras, out)
+            continue
+        if markers.lies[place]:
+            outcomes[k] = _measure_lying(detections, k, cameras, markers, place, out)
+        else:
+            _measure_upright(detections, k, cameras, out)
+        _add_common_noise(cameras.variance[camera], markers.variance[place], k, out)
+
+
+@cached_njit
+def _measure_bearing(optical: FloatArray, k: int, cameras: Cameras, out: MeasurementColumns) -> None:
+    """Write value and covariance of measurement k of a direction (3,) in the optical frame."""
+    camera, position = out.observer[k], np.empty(3)
+    sensor = cameras.sensor[camera]
+    to_level_frame(cameras.level[camera], optical, position)
+    out.kind[k], out.gate[k], out.marker[k, 2] = BEARING, cameras.bearing_gate[camera], 0.0
+    out.value[k, 0] = _calibrated_bearing(sensor, position)
+    out.covariance[k, 0, 0] = sensor.bearing_sigma**2 + cameras.variance[camera, 2]
+    out.covariance[k, 1, 1] = out.covariance[k, 2, 2] = 1.0
+
+
+@cached_njit
+def _measure_upright(detections: Detections, k: int, cameras: Cameras, out: MeasurementColumns) -> None:
+    """Write value and covariance of measurement k of an upright marker."""
+    sensor, level = cameras.sensor[out.observer[k]], cameras.level[out.observer[k]]
+    position = np.empty(3)
+    to_level_frame(level, detections.position[k], position)
+    scale(position, 1.0 / sensor.distance_scale)
+    if not out.has_heading[k]:
+        out.kind[k], out.marker[k, 2] = POLAR, 0.0
+        _calibrate(sensor, position, out.target[k], out.value[k], out.covariance[k])
+        return
+    out.value[k, 0], out.value[k, 1] = position[0], position[1]
+    out.value[k, 2] = face_heading(level, detections.orientation[k])
+    if detections.content[k] == CONTENT_POSE_TWO:
+        out.has_alternative[k] = 1
+        to_level_frame(level, detections.alternative_position[k], position)
+        scale(position, 1.0 / sensor.distance_scale)
+        out.alternative[k, 0], out.alternative[k, 1] = position[0], position[1]
+        out.alternative[k, 2] = face_heading(level, detections.alternative_orientation[k])
+    _pose_noise(sensor, level, detections.covariance[k], out.covariance[k])
+
+
+@cached_njit
+def _measure_lying(
+    detections: Detections,
+    k: int,
+    cameras: Cameras,
+    markers: Markers,
+    place: int,
+    out: MeasurementColumns,
+) -> int:
+    """Write value and covariance of measurement k of a lying marker; return its outcome."""
+    camera = out.observer[k]
+    sensor, level = cameras.sensor[camera], cameras.level[camera]
+    spread, position, rotation = np.zeros((6, 6)), np.empty(3), np.empty((3, 3))
+    _write_spread(sensor, detections.content[k], detections.covariance[k], spread)
+    height, result = markers.height[place] - cameras.height[camera], CAST
+    for solution in range(2 if detections.content[k] == CONTENT_POSE_TWO else 1):
+        assign(position, detections.alternative_position[k] if solution else detections.position[k])
+        if detections.content[k] == CONTENT_POSITION:
+            rotation[:] = level.T  # as a marker that lies
+        else:
+            quaternion = detections.alternative_orientation[k] if solution else detections.orientation[k]
+            write_rotation(quaternion, rotation)
+        result = cast(
+            level, position, rotation, spread, markers.size[place], height, out.value[k], out.covariance[k]
+        )
+        if result == CAST:
+            break
+    if result != CAST:
+        return _FACE_DOWN if result == FACE_DOWN else _NOT_FLAT
+    _add_residual(sensor, out.covariance[k])
+    if not out.has_heading[k]:
+        out.value[k, 2] = out.marker[k, 2] = 0.0
+        out.covariance[k, 2, :] = out.covariance[k, :, 2] = 0.0
+        out.covariance[k, 2, 2] = 1.0
+    return MEASURED
+
+
+@cached_njit
+def _add_common_noise(of_camera: FloatArray, of_face: float, k: int, out: MeasurementColumns) -> None:
+    """Add the variances of a fixed camera's pose (3,) and of a face's position to measurement k."""
+    noise, distance2 = out.covariance[k], 1.0
+    if out.kind[k] == POLAR:
+        distance2 = max(out.value[k, 0] ** 2, 1e-6)
+    noise[0, 0] += of_face + of_camera[0]
+    noise[1, 1] += (of_face + of_camera[1]) / distance2
+    if out.has_heading[k]:
+        noise[2, 2] += of_camera[2]
+    if out.kind[k] == POLAR:
+        noise[1, 1] += of_camera[2]
+    if of_camera[0] > 0.0:
+        out.systematic_share[k, 0] = of_camera[0] / noise[0, 0]
+        out.systematic_share[k, 1] = of_camera[1] / distance2 / noise[1, 1]
+        out.systematic_share[k, 2] = of_camera[2] / noise[2, 2] if out.has_heading[k] else 0.0
+
+
+@inlined_njit
+def _outcome(
+    detections: Detections, k: int, cameras: Cameras, markers: Markers, camera: int, place: int
+) -> int:
+    """Outcome of detection k with the marker at index `place`: valid, or a reason to drop it."""
+    if place < 0 or markers.id[place] != detections.id[k]:
+        return _UNKNOWN_ID
+    if markers.owner[place] == camera:
+        return _OWN_MARKER
+    if not cameras.present[camera]:
+        return _NO_CAMERA
+    if camera >= cameras.robots and markers.owner[place] == NOBODY:
+        return _FIXED_ON_FIXED
+    content = detections.content[k]
+    if not CONTENT_POSITION <= content <= CONTENT_BEARING or (
+        content == CONTENT_BEARING and markers.lies[place]
+    ):
+        return _BAD_CONTENT
+    position, valid = detections.position[k], True
+    for i in range(3):
+        valid = valid and math.isfinite(position[i])
+    if content == CONTENT_BEARING:
+        valid = valid and (position[0] != 0.0 or position[1] != 0.0 or position[2] != 0.0)
+    if content in (CONTENT_POSE, CONTENT_POSE_TWO):
+        valid = valid and is_rotation(detections.orientation[k])
+        for i in range(6):
+            for j in range(6):
+                valid = valid and math.isfinite(detections.covariance[k, i, j])
+    if detections.content[k] == CONTENT_POSE_TWO:
+        valid = valid and is_rotation(detections.alternative_orientation[k])
+        for i in range(3):
+            valid = valid and math.isfinite(detections.alternative_position[k, i])
+    if not valid:
+        return _NON_FINITE
+    farthest = max(abs(position[0]), abs(position[1]), abs(position[2]))
+    if farthest > _MAX_DISTANCE_M and content != CONTENT_BEARING:
+        return _ABSURD
+    return MEASURED
+
+
+@cached_njit
+def _calibrated_bearing(sensor: SensorModel, position: FloatArray) -> float:
+    """Calibrated bearing of a position (3,); see `SensorModel`."""
+    logged = math.atan2(position[1], position[0])
+    return (sensor.bearing_scale + sensor.bearing_curve * logged) * logged + sensor.bearing_offset
+
+
+@cached_njit
+def _calibrate(
+    sensor: SensorModel, position: FloatArray, target: int, value: FloatArray, noise: FloatArray
+) -> None:
+    """Write calibrated range and bearing (3,) and their covariance (3, 3); see `SensorModel`."""
+    logged = math.atan2(position[1], position[0])
+    curve = sensor.range_log_scale + sensor.range_skew * logged + sensor.range_curve * logged * logged
+    distance = math.hypot(position[0], position[1]) * math.exp(curve) + sensor.range_offset
+    if target != NOBODY:
+        distance += sensor.robot_range_offset
+    value[0] = distance
+    value[1] = _calibrated_bearing(sensor, position)
+    noise[0, 0] = (sensor.range_sigma + sensor.range_sigma_per_m * abs(distance)) ** 2
+    noise[1, 1] = sensor.bearing_sigma**2
+    noise[2, 2] = 1.0
+
+
+@cached_njit
+def _pose_noise(sensor: SensorModel, level: FloatArray, published: FloatArray, noise: FloatArray) -> None:
+    """Write the covariance (3, 3) of forward, left, heading; from the sensor model if unknown (-1)."""
+    if published[0, 0] < 0.0:
+        noise[0, 0], noise[1, 1] = sensor.forward_sigma**2, sensor.left_sigma**2
+        noise[2, 2] = sensor.heading_sigma**2
+        return
+    to_plane = np.zeros((3, 6))
+    for i in range(3):
+        to_plane[0, i], to_plane[1, i] = level[0, i], level[1, i]
+        to_plane[2, 3 + i] = level[2, i]  # the rotation about the vertical
+    for i in range(3):
+        for j in range(3):
+            for a in range(6):
+                for b in range(6):
+                    noise[i, j] += to_plane[i, a] * published[a, b] * to_plane[j, b]
+    _add_residual(sensor, noise)
+
+
+@cached_njit
+def _add_residual(sensor: SensorModel, noise: FloatArray) -> None:
+    """Add the residual errors of a camera to the covariance (3, 3) of forward, left, heading."""
+    noise[0, 0] += sensor.residual_position_sigma**2
+    noise[1, 1] += sensor.residual_position_sigma**2
+    noise[2, 2] += sensor.residual_heading_sigma**2
+
+
+@cached_njit
+def _write_spread(sensor: SensorModel, content: int, published: FloatArray, spread: FloatArray) -> None:
+    """Write the covariance (6, 6) of a pose in the optical frame; from the sensor model if unknown (-1)."""
+    if content != CONTENT_POSITION and published[0, 0] >= 0.0:
+        spread[:] = published
+        return
+    spread[0, 0] = spread[1, 1] = sensor.left_sigma**2
+    spread[2, 2] = sensor.forward_sigma**2
+    for i in range(3, 6):
+        spread[i, i] = sensor.heading_sigma**2
+
 
 FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation from the optical frame to x forward, y left, z up."""

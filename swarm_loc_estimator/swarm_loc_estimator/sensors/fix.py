@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.definitions import POSE_WITH_COVARIANCE, SWARM_FIXES
+from swarm_loc_estimator.common.messages.cdr import POSE_WITH_COVARIANCE, SWARM_FIXES
 from swarm_loc_estimator.common.messages.detections import SharedMessage, decode_shared_numbers
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.poses import FixMessage, decode_fix
-from swarm_loc_estimator.common.messages.streams import EachReader, MessageColumns
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
 from swarm_loc_estimator.filter.measurement_model import (
     MEASUREMENT_DTYPE,
     MODELS,
@@ -24,6 +23,7 @@ from swarm_loc_estimator.filter.measurement_model import (
     MeasurementArray,
 )
 from swarm_loc_estimator.sensors.sensor import (
+    FOREIGN_FRAME,
     NO_ROWS,
     Converter,
     DropCounts,
@@ -34,8 +34,8 @@ from swarm_loc_estimator.sensors.sensor import (
     SensorSettings,
     chosen,
     of_none,
+    shared_kind,
 )
-from swarm_loc_estimator.sensors.shared_topics import FOREIGN_FRAME, shared_kind
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 HEADING_UNKNOWN = math.pi**2

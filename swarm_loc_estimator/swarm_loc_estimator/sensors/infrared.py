@@ -17,23 +17,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.definitions import BRIGHTNESS as MESSAGE_TYPE
+from swarm_loc_estimator.common.messages.cdr import BRIGHTNESS as MESSAGE_TYPE
 from swarm_loc_estimator.common.messages.detections import BrightnessMessage, decode_brightness
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.streams import EachReader, MessageColumns
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MODELS, Kind, MeasurementArray
 from swarm_loc_estimator.infrared.closed_form import ClosedForm
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.solution import IrEstimator, IrOutcome, IrSolutions
+from swarm_loc_estimator.infrared.search import IrEstimator, IrOutcome, IrSolutions
 from swarm_loc_estimator.sensors.sensor import (
     NO_MEASUREMENTS,
     NO_ROWS,
+    REJECT_REASONS,
     Change,
     InputKind,
     Known,
     Sensor,
+    reject_reasons,
 )
-from swarm_loc_estimator.sensors.validation import REJECT_REASONS, reject_reasons
 from swarm_loc_estimator.swarm.ir_board import IrMethod, IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 

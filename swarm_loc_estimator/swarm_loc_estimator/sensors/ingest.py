@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.detections import swarm_key
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+from swarm_loc_estimator.common.messages.streams import MessageBatch
 from swarm_loc_estimator.sensors.registry import Batch, InputTopic, input_topics, kinds
 from swarm_loc_estimator.sensors.sensor import Guard, Known, in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import MAX_OFFSET_S

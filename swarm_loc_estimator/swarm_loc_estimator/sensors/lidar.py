@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.common.messages.definitions import LASER_SCAN
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.streams import EachReader, MessageColumns
+from swarm_loc_estimator.common.messages.cdr import LASER_SCAN
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
 from swarm_loc_estimator.filter.measurement_model import Kind
 from swarm_loc_estimator.mapping.messages import ScanMessage, decode_scan
 from swarm_loc_estimator.mapping.sweeps import LidarSweep, read_sweep

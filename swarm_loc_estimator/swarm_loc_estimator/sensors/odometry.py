@@ -9,12 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.definitions import ODOMETRY as MESSAGE_TYPE
-from swarm_loc_estimator.common.messages.definitions import SWARM_ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import ODOMETRY as MESSAGE_TYPE
+from swarm_loc_estimator.common.messages.cdr import SWARM_ODOMETRY
 from swarm_loc_estimator.common.messages.detections import SharedMessage, decode_shared_numbers
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
 from swarm_loc_estimator.common.messages.poses import decode_odometry
-from swarm_loc_estimator.common.messages.streams import PoseColumns, PoseReader
+from swarm_loc_estimator.common.messages.streams import MessageBatch, PoseColumns, PoseReader
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Converter,
@@ -24,8 +23,8 @@ from swarm_loc_estimator.sensors.sensor import (
     Sensor,
     SensorSettings,
     chosen,
+    shared_kind,
 )
-from swarm_loc_estimator.sensors.shared_topics import shared_kind
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 _MAX_DISTANCE_M = 1e6

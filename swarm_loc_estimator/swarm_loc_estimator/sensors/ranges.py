@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.messages.cdr import RANGES as MESSAGE_TYPE
 from swarm_loc_estimator.common.messages.cdr import Rows, decode, nanoseconds
-from swarm_loc_estimator.common.messages.definitions import RANGES as MESSAGE_TYPE
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.common.messages.streams import EachReader, MessageColumns
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
 from swarm_loc_estimator.filter.measurement_model import (
     MEASUREMENT_DTYPE,
     MeasurementArray,
@@ -37,8 +36,7 @@ from swarm_loc_estimator.sensors.sensor import (
     SensorSettings,
     chosen,
 )
-from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.swarm.uwb import UwbDevice
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm, UwbDevice
 
 
 def _predict_range(one: MeasurementArray, observer: FloatArray, target: FloatArray) -> Prediction:

@@ -2,22 +2,32 @@
 
 Readings of a sensor are a NamedTuple of columns of equal length, sorted by arrival. The first column is
 `robot`, the last `arrival_ns`; one is `stamp_ns`.
+
+Validation of measurements: finite values of plausible size, valid covariances.
+
+Decoding of messages with readings of many robots; an invalid reading does not affect the others.
 """
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import BoolArray, IntArray
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.messages.cdr import CdrError
+from swarm_loc_estimator.common.messages.detections import SharedMessage
+from swarm_loc_estimator.common.messages.streams import MessageBatch
+from swarm_loc_estimator.common.small_matrix import cholesky3
+from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MODELS, NOBODY, MeasurementArray
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 Rows = TypeVar("Rows", bound="tuple[NDArray[Any], ...]")
@@ -241,3 +251,198 @@ class Sensor:
     #: Columns that group readings: a group is used or dropped as a whole. None: never dropped.
     unit: tuple[str, ...] | None = ()
     keeps_units: bool = False  #: True if readings of one group may arrive in several batches
+
+
+VALID = 0
+REJECT_REASONS = ("", "non_finite", "absurd", "bad_covariance", "bad_measurement")
+"""Reasons to reject a measurement, indexed by the result of `reject_reasons`."""
+BAD_MEASUREMENT = REJECT_REASONS.index("bad_measurement")
+
+_MAX_DISTANCE_M = 1e6
+_MIN_VARIANCE, _MAX_VARIANCE = 1e-14, 1e14
+_ASYMMETRY, _ROUNDING = 1e-6, 1e-9
+
+
+def reject_reasons(measurements: MeasurementArray) -> IntArray:
+    """Reasons (m,) to reject measurements (m,), as indices of `REJECT_REASONS`; `VALID` if none."""
+    value = measurements["value"]
+    reasons = np.full(measurements.size, VALID)
+    _check_covariances(measurements["covariance"], reasons)
+    reasons[np.abs(value).max(axis=1) > _MAX_DISTANCE_M] = REJECT_REASONS.index("absurd")
+    reasons[~np.isfinite(value).all(axis=1)] = REJECT_REASONS.index("non_finite")
+    return reasons
+
+
+def is_about_swarm(measurements: MeasurementArray, robots: int, landmarks: int) -> BoolArray:
+    """Whether measurements (m,) have a registered model, valid indices, and finite parameters."""
+    valid = np.empty(measurements.size, dtype=np.bool_)
+    _check_parameters(measurements, np.array(list(MODELS)), robots, landmarks, valid)
+    return valid
+
+
+@cached_njit
+def _check_parameters(
+    measurements: MeasurementArray, models: IntArray, robots: int, landmarks: int, valid: BoolArray
+) -> None:
+    for k in range(valid.size):
+        one = measurements[k]
+        good = NOBODY <= one.observer < robots and NOBODY <= one.target < robots
+        good = good and 0 <= one.landmark <= landmarks
+        good = good and (one.observer != one.target or one.observer == NOBODY)
+        good = good and math.isfinite(one.stamp_variance) and one.stamp_variance >= 0.0
+        good = good and not math.isnan(one.gate)
+        for i in range(3):
+            good = good and math.isfinite(one.sensor[i]) and math.isfinite(one.marker[i])
+        known = False
+        for number in models:
+            known = known or one.kind == number
+        valid[k] = good and known
+
+
+_BAD_COVARIANCE = REJECT_REASONS.index("bad_covariance")
+
+
+@cached_njit
+def _check_covariances(matrices: FloatArray, reasons: IntArray) -> None:
+    """Mark matrices that are not symmetric positive definite or of implausible magnitude."""
+    scaled = np.empty((3, 3))
+    for k in range(reasons.size):
+        good = True
+        for i in range(3):
+            good = good and _MIN_VARIANCE <= matrices[k, i, i] <= _MAX_VARIANCE
+        if good:
+            for i in range(3):
+                for j in range(3):
+                    scaled[i, j] = matrices[k, i, j] / math.sqrt(matrices[k, i, i] * matrices[k, j, j])
+            for i in range(3):
+                for j in range(3):
+                    good = good and abs(scaled[i, j] - scaled[j, i]) < _ASYMMETRY
+                scaled[i, i] -= _ROUNDING
+            factor = cholesky3(scaled)  # NaN if not positive definite
+            good = good and math.isfinite(factor[0, 0] + factor[1, 1] + factor[2, 2])
+        if not good:
+            reasons[k] = _BAD_COVARIANCE
+
+
+MAX_READINGS = 100_000  # Maximum number of readings per message; larger messages are dropped
+MAX_OF_ONE = 1_000  # Maximum number of readings of one robot per message, equal to the queue of its own topic
+TOO_MANY = "shared_too_many"  # Reason to drop messages beyond these limits
+OTHER_SWARM = "other_swarm"  # Reason to drop readings of a sender with another list of robots
+UNKNOWN_ROBOT = "unknown_robot"  # Reason to drop a reading with an invalid robot index
+BAD_STAMP = "bad_stamp"  # Reason to drop a reading with 10^9 or more nanoseconds in its stamp
+
+FOREIGN_FRAME = "fix_frame"  # Reason to drop a reading that is not in the frame `map`
+
+
+class SharedColumns(NamedTuple):
+    """Decoded messages (n,) with readings of many robots."""
+
+    stamp_ns: IntArray  # (n,) stamps of the messages
+    valid: NDArray[np.bool_]  # (n,) True if the message is complete and of the right type
+    rows: Any  # The readings
+    dropped: Mapping[str, int]  # Number of unusable readings of valid messages by reason
+
+
+class SharedReader:
+    """Decodes messages with readings of many robots each.
+
+    Args:
+        topics: Number of topics.
+        known: Expected contents.
+        decode: Decodes a message.
+        rows_of: Converts a message and arrivals (n,) to readings.
+        nothing: Empty readings.
+        in_map: True if readings must be in the frame `map`.
+    """
+
+    def __init__(
+        self,
+        topics: int,
+        known: Known,
+        *,
+        decode: Callable[[bytes], SharedMessage],
+        rows_of: Callable[[SharedMessage, IntArray], Any],
+        nothing: Any,
+        in_map: bool = False,
+    ) -> None:
+        self._known = known
+        self._decode = decode
+        self._rows_of = rows_of
+        self._nothing = nothing
+        self._in_map = in_map
+        self.frame_ids = [""] * topics
+
+    def read(self, batch: MessageBatch) -> SharedColumns:
+        """Decode messages (n,) in order of arrival."""
+        stamp_ns, valid = np.zeros(batch.size, dtype=np.int64), np.ones(batch.size, dtype=bool)
+        parts = [self._nothing]
+        dropped: Counter[str] = Counter()
+        for k, (topic, arrival_ns, data) in enumerate(batch.messages()):
+            try:
+                message = self._decode(data)
+            except CdrError:
+                valid[k] = False
+                continue
+            stamp_ns[k], self.frame_ids[topic] = message.stamp_ns, message.frame_id
+            if fault := self._fault(message):
+                dropped[fault] += message.robot.size
+            else:
+                rows = self._rows_of(message, np.full(message.robot.size, arrival_ns))
+                parts.append(self._sound(rows, dropped))
+        return SharedColumns(stamp_ns, valid, joined(parts), +dropped)
+
+    def _fault(self, message: SharedMessage) -> str:
+        """Reason to drop all readings of a message; "" if there is none."""
+        if message.swarm != self._known.swarm:
+            return OTHER_SWARM
+        robot = message.robot[message.robot < self._known.robots]
+        if message.robot.size > MAX_READINGS or np.bincount(robot).max(initial=0) > MAX_OF_ONE:
+            return TOO_MANY
+        return FOREIGN_FRAME if self._in_map and message.frame_id != self._known.map_frame else ""
+
+    def _sound(self, rows: Any, dropped: Counter[str]) -> Any:
+        """Select readings of known robots with valid stamps; count the others in `dropped`."""
+        unknown, unstamped = rows.robot >= self._known.robots, rows.stamp_ns < 0
+        dropped[UNKNOWN_ROBOT] += int(np.sum(unknown))
+        dropped[BAD_STAMP] += int(np.sum(unstamped & ~unknown))
+        return chosen(rows, ~(unknown | unstamped))
+
+
+def _shared_columns(
+    found: SharedColumns, _batch: MessageBatch, _robot: IntArray, _known: Known
+) -> tuple[Any, Mapping[str, int]]:
+    """Readings and drop counts of a `SharedReader`."""
+    return found.rows, found.dropped
+
+
+def shared_kind(
+    own: InputKind,
+    topic: str,
+    message_type: str,
+    decode: Callable[[bytes], SharedMessage],
+    rows_of: Callable[[SharedMessage, IntArray], Any],
+    nothing: Any,
+) -> InputKind:
+    """Create the kind of a topic with readings of many robots, which replaces their own topics.
+
+    Args:
+        own: Kind of the replaced topics.
+        topic: Full name of the topic.
+        message_type: Message type.
+        decode: Decodes a message.
+        rows_of: Converts a message and arrivals (n,) to readings.
+        nothing: Empty readings.
+    """
+    return replace(
+        own,
+        name=f"swarm_{own.name}",
+        topic=topic,
+        message_type=message_type,
+        create_reader=partial(
+            SharedReader, decode=decode, rows_of=rows_of, nothing=nothing, in_map=own.in_map
+        ),
+        columns_of=_shared_columns,
+        of_each=False,
+        of_cameras=False,
+        stands_for=own.name,
+    )

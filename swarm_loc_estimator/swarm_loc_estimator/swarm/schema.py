@@ -7,10 +7,9 @@ from dataclasses import fields
 from typing import Any
 
 from swarm_loc_estimator.common.parameters import NumberSpec, number_specs
-from swarm_loc_estimator.swarm.board_file import packaged_platforms
+from swarm_loc_estimator.swarm.board_file import MAX_BOARD_ID, packaged_platforms
 from swarm_loc_estimator.swarm.ir_board import GAIN_RANGE, IrGains, IrMethod, RobotIr
-from swarm_loc_estimator.swarm.ir_section import MAX_BOARD_ID
-from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Landmark
+from swarm_loc_estimator.swarm.swarm import MAX_ADDRESS, Anchor, Face, FixedCamera, Landmark, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import (
     FILE_VERSION,
     LANDMARK_DEFAULTS,
@@ -26,7 +25,6 @@ from swarm_loc_estimator.swarm.swarm_file import (
     START,
 )
 from swarm_loc_estimator.swarm.tree_checks import hexadecimal
-from swarm_loc_estimator.swarm.uwb import MAX_ADDRESS, Anchor, UwbDevice
 
 SCHEMA_FILE = "swarm.schema.json"  # Name of the schema beside a description
 SCHEMA_COMMENT = f"yaml-language-server: $schema={SCHEMA_FILE}"

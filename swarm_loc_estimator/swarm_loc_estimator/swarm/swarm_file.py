@@ -55,18 +55,19 @@ from typing import TYPE_CHECKING, Any
 
 from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
+from swarm_loc_estimator.swarm.board_file import IrSection, Values
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import (
     ClockModel,
     FixModel,
     ImuModel,
     LidarModel,
+    MotionResponse,
+    MotionResponseError,
     OdometryModel,
     RandomWalk,
     SensorModel,
 )
-from swarm_loc_estimator.swarm.ir_section import IrSection, Values
-from swarm_loc_estimator.swarm.motion_response import MotionResponse, MotionResponseError
 from swarm_loc_estimator.swarm.swarm import (
     CameraMount,
     Face,
@@ -77,9 +78,11 @@ from swarm_loc_estimator.swarm.swarm import (
     StartSigma,
     Swarm,
     SwarmError,
+    read_anchors,
+    uwb_device,
+    uwb_layer,
 )
 from swarm_loc_estimator.swarm.tree_checks import Numbers, TreeChecks, nearest
-from swarm_loc_estimator.swarm.uwb import read_anchors, uwb_device, uwb_layer
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping

@@ -10,18 +10,19 @@ from typing import TYPE_CHECKING, Any
 
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.common.yaml_tree import tree_text
-from swarm_loc_estimator.swarm.ir_section import ir_tree
-from swarm_loc_estimator.swarm.motion_response import MotionResponse
+from swarm_loc_estimator.swarm.board_file import ir_tree
+from swarm_loc_estimator.swarm.error_models import MotionResponse
 from swarm_loc_estimator.swarm.schema import SCHEMA_COMMENT, SCHEMA_FILE
 from swarm_loc_estimator.swarm.swarm import (
+    Anchor,
     Face,
     FixedCamera,
     Landmark,
     Robot,
     Swarm,
+    UwbDevice,
 )
 from swarm_loc_estimator.swarm.swarm_file import FILE_VERSION, LANDMARK_DEFAULTS, MODELS, parse_swarm
-from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

@@ -14,8 +14,7 @@ import numpy as np
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.filter.gating import gate_threshold
-from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED, count_missed, count_seen
-from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
+from swarm_loc_estimator.filter.integrity import CONFIRMED, count_missed, count_seen, is_contradicted
 from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.identification.anchors import Scale

@@ -13,13 +13,11 @@ from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.se2_scalar import composed, wrap
 from swarm_loc_estimator.common.small_matrix import add_scaled
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
-from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED, inflate_suspect_covariance
-from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
+from swarm_loc_estimator.filter.integrity import CONFIRMED, inflate_suspect_covariance, is_contradicted
 from swarm_loc_estimator.filter.prediction import new_scratch, write_predicted
 from swarm_loc_estimator.filter.state import SwarmState
-from swarm_loc_estimator.odometry.look_up import look_up, new_sample
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.odometry.track_arrays import TrackArrays
+from swarm_loc_estimator.odometry.track_arrays import TrackArrays, look_up, new_sample
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 

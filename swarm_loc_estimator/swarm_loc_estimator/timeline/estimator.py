@@ -14,17 +14,14 @@ from swarm_loc_estimator.filter.measurement_model import NO_MODEL, Command
 from swarm_loc_estimator.filter.state import IN_MAP
 from swarm_loc_estimator.identification.memory import Identities, Outcome
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.sensors.conversion import InputConverter
 from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.sensors.imu import TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.lidar import SCANS, SweepStore
 from swarm_loc_estimator.sensors.odometry import ODOMETRY, OdometryRows
-from swarm_loc_estimator.sensors.registry import Batch, Measurements
-from swarm_loc_estimator.sensors.sensor import joined
-from swarm_loc_estimator.sensors.validation import REJECT_REASONS, reject_reasons
+from swarm_loc_estimator.sensors.registry import Batch, InputConverter, Measurements
+from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, joined, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline.constant_odometry import ConstantOdometry
-from swarm_loc_estimator.timeline.contradictions import Contradiction, contradictions
+from swarm_loc_estimator.timeline.contradictions import ConstantOdometry, Contradiction, contradictions
 from swarm_loc_estimator.timeline.estimate import Estimate, Status, TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.fusion import Fusion
 from swarm_loc_estimator.timeline.self_calibration import learned, learns

@@ -25,12 +25,9 @@ from swarm_loc_estimator.filter.correlated_noise import (
     record_pair,
     without_repeats,
 )
-from swarm_loc_estimator.filter.dense_filter import update_one
 from swarm_loc_estimator.filter.innovation import InnovationBatch, new_batch
-from swarm_loc_estimator.filter.integrity.divergence import WELL_CONFIRMED, LossLimits
-from swarm_loc_estimator.filter.integrity.fault_detection import is_kidnapped
-from swarm_loc_estimator.filter.integrity.motion_noise import learn_all
-from swarm_loc_estimator.filter.joint_filter import JointFilter, Robots
+from swarm_loc_estimator.filter.integrity import WELL_CONFIRMED, LossLimits, is_kidnapped
+from swarm_loc_estimator.filter.joint_filter import JointFilter, Robots, update_one
 from swarm_loc_estimator.filter.measurement_model import (
     MODELS,
     POLAR,
@@ -41,22 +38,20 @@ from swarm_loc_estimator.filter.measurement_model import (
     locates_alone,
 )
 from swarm_loc_estimator.filter.model_evaluation import evaluate_by_records
+from swarm_loc_estimator.filter.prediction import learn_all
 from swarm_loc_estimator.filter.sequential_update import update_in_order
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.filter.state import IN_MAP, InitialPose, Meetings, SwarmState
 from swarm_loc_estimator.identification.assignment import AMBIGUOUS
-from swarm_loc_estimator.initialization.initializer import Initializer, Keep
-from swarm_loc_estimator.initialization.local_frame import LocalFrame
+from swarm_loc_estimator.initialization.initializer import ConfiguredStarts, Initializer, Keep, LocalFrame
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.aerial_images import PictureFusion, as_fixes, relieve_seen
-from swarm_loc_estimator.timeline.configured_starts import ConfiguredStarts
 from swarm_loc_estimator.timeline.map_scans import MapScans, Sweeps
-from swarm_loc_estimator.timeline.scheduling import middle_of_period, parts_by_way
-from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.settings import Settings, middle_of_period, parts_by_way
 from swarm_loc_estimator.timeline.verdicts import Verdict
 
 _SURER_AT_FIRST = 1.5

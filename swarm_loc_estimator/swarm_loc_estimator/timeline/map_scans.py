@@ -12,7 +12,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import between
-from swarm_loc_estimator.filter.integrity.divergence import CONFIRMED, count_missed, count_seen
+from swarm_loc_estimator.filter.integrity import CONFIRMED, count_missed, count_seen
 from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.filter.state import IN_MAP, SwarmState
 from swarm_loc_estimator.mapping.map_file import load_map

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.filter.integrity.noise_inflation import with_noise_inflation
+from swarm_loc_estimator.filter.integrity import with_noise_inflation
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.calibration_states import (
     CAMERA_SCALE,

@@ -7,8 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.messages.cdr import CdrError, decode, encode, nanoseconds
-from swarm_loc_estimator.common.messages.definitions import SWARM_SIGHTINGS
+from swarm_loc_estimator.common.messages.cdr import SWARM_SIGHTINGS, CdrError, decode, encode, nanoseconds
 from swarm_loc_estimator.filter.measurement_model import Command, MeasurementArray
 from swarm_loc_estimator.timeline.verdicts import Verdict
 

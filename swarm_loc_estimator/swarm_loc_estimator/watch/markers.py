@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.common.messages.cdr import encode
-from swarm_loc_estimator.common.messages.definitions import MARKERS
-from swarm_loc_estimator.common.messages.estimates import EstimateMessage
+from swarm_loc_estimator.common.messages.cdr import MARKERS, encode
+from swarm_loc_estimator.common.messages.poses import EstimateMessage
 from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
 from swarm_loc_estimator.timeline.sightings import Sightings
 

@@ -19,10 +19,11 @@ from rclpy.subscription import Subscription
 from visualization_msgs.msg import MarkerArray
 
 from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.estimates import EstimateMessage, SwarmPosesReader
 from swarm_loc_estimator.common.messages.poses import (
     PLANE,
     UNKNOWN_COVARIANCE,
+    EstimateMessage,
+    SwarmPosesReader,
     decode_odometry,
     encode_odometry,
     planar_covariance,

@@ -1,4 +1,11 @@
-"""The page as one text, its initial data, and a recorded run inside it."""
+"""The page as one text, its initial data, and a recorded run inside it.
+
+Frames, the binary messages to the page: a kind, an instant and columns of numbers; and their history.
+
+    uint32 length of the header | header as JSON, blanks up to a multiple of 8 | columns, each padded as well
+
+The header names kind and stamp [ms] and lists the columns as name, type and length; all is little-endian.
+"""
 
 from __future__ import annotations
 
@@ -7,13 +14,183 @@ import gzip
 import hashlib
 import json
 import struct
-from collections.abc import Iterable
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
+
+from swarm_loc_estimator.common.messages.poses import EstimateMessage
+from swarm_loc_estimator.mapping.messages import GridMessage
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.watch.frames import Frame
+from swarm_loc_estimator.timeline.sightings import Sightings
+
+_TYPES = {"float64": "f8", "float32": "f4", "int32": "i4", "uint8": "u1", "int8": "i1"}
+_COLUMN_ALIGNMENT = 8
+SPAN_NS = 180_000_000_000
+MAX_BYTES = 24_000_000
+_SPACING_NS = {"poses": 200_000_000, "truth": 200_000_000, "map": 5_000_000_000}
+_ELSE_NS = 500_000_000
+
+
+class Frame(NamedTuple):
+    """A binary message to the page."""
+
+    kind: str  # Its content: "poses", "sightings", "truth", "aerial", "goals" or "map"
+    stamp_ns: int  # Time of the content [ns]
+    data: bytes  # The bytes for the page
+
+
+def pack(kind: str, stamp_ns: int, columns: Mapping[str, npt.NDArray[Any]], **extra: object) -> Frame:
+    """A frame of columns (float64, float32, int32, uint8 or int8).
+
+    Args:
+        kind: See `Frame`.
+        stamp_ns: Time of the content [ns].
+        columns: By name; each is flattened.
+        extra: Further entries of the header.
+    """
+    flat = {name: np.ascontiguousarray(column).reshape(-1) for name, column in columns.items()}
+    listed = [[name, _TYPES[str(column.dtype)], column.size] for name, column in flat.items()]
+    header = json.dumps({"kind": kind, "stamp": stamp_ns * 1e-6, "columns": listed, **extra}).encode()
+    header += b" " * (-(4 + len(header)) % _COLUMN_ALIGNMENT)
+    parts = [struct.pack("<I", len(header)), header]
+    for column in flat.values():
+        data = column.tobytes()
+        parts += [data, bytes(-len(data) % _COLUMN_ALIGNMENT)]
+    return Frame(kind, stamp_ns, b"".join(parts))
+
+
+def unpack(data: bytes) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+    """Header and columns of a frame's bytes, as the page reads them."""
+    size = struct.unpack_from("<I", data)[0]
+    header: dict[str, Any] = json.loads(data[4 : 4 + size])
+    at, columns = 4 + size, {}
+    for name, kind, length in header["columns"]:
+        columns[name] = np.frombuffer(data, f"<{kind}", length, at)
+        at += -(-columns[name].nbytes // _COLUMN_ALIGNMENT) * _COLUMN_ALIGNMENT
+    return header, columns
+
+
+def poses_frame(estimate: EstimateMessage) -> Frame:
+    """Estimated poses of all robots; those of unlocated robots are NaN."""
+    pose, covariance = estimate.pose, estimate.covariance
+    single = {
+        "theta": pose[:, 2],
+        "sxx": covariance[:, 0, 0],
+        "sxy": covariance[:, 0, 1],
+        "syy": covariance[:, 1, 1],
+        "stt": covariance[:, 2, 2],
+        "age": estimate.fix_age_s,
+    }
+    columns: dict[str, npt.NDArray[Any]] = {"x": pose[:, 0], "y": pose[:, 1]}
+    columns |= {name: column.astype(np.float32) for name, column in single.items()}
+    return pack("poses", estimate.stamp_ns, {**columns, "status": estimate.status})
+
+
+def sightings_frame(stamp_ns: int, sightings: Sightings) -> Frame:
+    """The robots' measurements and their outcomes."""
+    return pack("sightings", stamp_ns, sightings._asdict())
+
+
+def places_frame(
+    kind: str, stamp_ns: int, robot: Sequence[int], pose: npt.NDArray[np.float64], **extra: object
+) -> Frame:
+    """Poses (n, 3) in map of robots, -1 for an unknown robot: ground truth, goals, aerial detections."""
+    columns: dict[str, npt.NDArray[Any]] = {
+        "robot": np.array(robot, dtype=np.int32),
+        "x": pose[:, 0],
+        "y": pose[:, 1],
+        "theta": pose[:, 2].astype(np.float32),
+    }
+    return pack(kind, stamp_ns, columns, **extra)
+
+
+def aerial_frame(
+    stamp_ns: int,
+    position: npt.NDArray[np.float64],
+    robot: npt.NDArray[np.integer],
+    probability: npt.NDArray[np.float64],
+) -> Frame:
+    """Detections of an aerial image.
+
+    Args:
+        stamp_ns: Of the image.
+        position: (n, 2) of its detections in map [m].
+        robot: (n,) index of the robot that each is; -1: unknown.
+        probability: (n,) of these identities.
+    """
+    columns: dict[str, npt.NDArray[Any]] = {
+        "robot": robot.astype(np.int32),
+        "x": position[:, 0],
+        "y": position[:, 1],
+        "probability": probability.astype(np.float32),
+    }
+    return pack("aerial", stamp_ns, columns)
+
+
+def map_frame(stamp_ns: int, grid: GridMessage) -> Frame:
+    """The map at an instant."""
+    height, width = grid.cells.shape
+    shape = {"width": width, "height": height, "resolution": grid.resolution, "origin": grid.origin}
+    return pack("map", stamp_ns, {"cells": grid.cells}, **shape)
+
+
+class History:
+    """A ring of frames.
+
+    Args:
+        span_ns: Maximum age of a frame.
+        max_bytes: Maximum size; the oldest frames are dropped first.
+    """
+
+    def __init__(self, span_ns: int = SPAN_NS, max_bytes: int = MAX_BYTES) -> None:
+        self._span_ns = span_ns
+        self._max_bytes = max_bytes
+        self._frames: deque[Frame] = deque()
+        self._bytes = 0
+        self._newest_of: dict[str, Frame] = {}
+        self._kept_ns: dict[str, int] = {}
+
+    def add(self, frame: Frame) -> bool:
+        """Add a frame; returns whether the clock has jumped back, at which the history is cleared."""
+        before = self._newest_of.get(frame.kind)
+        jumped = before is not None and frame.kind == "poses" and frame.stamp_ns < before.stamp_ns
+        if jumped:
+            self.clear()
+        self._newest_of[frame.kind] = frame
+        spacing_ns = _SPACING_NS.get(frame.kind, _ELSE_NS)
+        if frame.stamp_ns < self._kept_ns.get(frame.kind, -spacing_ns) + spacing_ns:
+            return jumped
+        self._kept_ns[frame.kind] = frame.stamp_ns
+        self._frames.append(frame)
+        self._bytes += len(frame.data)
+        first_ns = frame.stamp_ns - self._span_ns
+        while self._frames and (self._bytes > self._max_bytes or self._frames[0].stamp_ns < first_ns):
+            self._bytes -= len(self._frames.popleft().data)
+        return jumped
+
+    def clear(self) -> None:
+        """Clear the history."""
+        self._frames.clear()
+        self._newest_of.clear()
+        self._kept_ns.clear()
+        self._bytes = 0
+
+    def frames(self) -> list[Frame]:
+        """All stored frames, and the newest of each kind, in the order of arrival."""
+        kept = list(self._frames)
+        known = set(map(id, kept))
+        return kept + [frame for frame in self._newest_of.values() if id(frame) not in known]
+
+    @property
+    def size(self) -> int:
+        """Bytes held in the ring."""
+        return self._bytes
+
 
 _FOLDER = Path(__file__).parent / "page"
 _SCRIPTS = (

@@ -11,7 +11,7 @@ from rclpy.subscription import Subscription
 
 from swarm_loc_estimator.common.messages.cdr import CdrError, nanoseconds
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
-from swarm_loc_estimator.watch.frames import Frame, aerial_frame, places_frame
+from swarm_loc_estimator.watch.page import Frame, aerial_frame, places_frame
 from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities, RobotIdentity
 
 _OLD_NS = 500_000_000

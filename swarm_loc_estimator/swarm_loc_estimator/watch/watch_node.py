@@ -25,20 +25,17 @@ from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
-from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.definitions import SWARM_POSES
-from swarm_loc_estimator.common.messages.estimates import SwarmPosesReader
+from swarm_loc_estimator.common.messages.cdr import SWARM_POSES, CdrError
+from swarm_loc_estimator.common.messages.poses import SwarmPosesReader
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.nodes.parameters import WatchParameters
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.sightings import decode_sightings
-from swarm_loc_estimator.watch.access import Access
-from swarm_loc_estimator.watch.frames import Frame, map_frame, poses_frame, sightings_frame
-from swarm_loc_estimator.watch.page import about
+from swarm_loc_estimator.watch.page import Frame, about, map_frame, poses_frame, sightings_frame
 from swarm_loc_estimator.watch.robot_commands import RobotCommands
 from swarm_loc_estimator.watch.robot_places import AerialNames, NewestMessages, Places
-from swarm_loc_estimator.watch.server import WatchServer
+from swarm_loc_estimator.watch.server import Access, WatchServer
 from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities, SwarmPoses, SwarmSightings
 
 _FLEETING = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)

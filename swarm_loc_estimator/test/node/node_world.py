@@ -34,7 +34,7 @@ from swarm_loc_estimator.common.launch import executable_path
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
 from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.common.node import end_at_task_errors
-from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSE
+from swarm_loc_estimator.sensors.camera import CONTENT_POSE
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses
 
 SECOND = 1_000_000_000

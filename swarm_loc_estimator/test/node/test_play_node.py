@@ -13,7 +13,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
 COUNT = 200

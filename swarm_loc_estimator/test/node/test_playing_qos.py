@@ -11,7 +11,7 @@ from rosbags.interfaces import QosDurability, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer
 
 from swarm_loc_estimator.common.bags.writer import RELIABLE, typestore
-from swarm_loc_estimator.common.messages.definitions import ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import ODOMETRY
 
 BEST_EFFORT = RELIABLE._replace(reliability=QosReliability.BEST_EFFORT, deadline=QosTime(0, 500_000_000))
 LATCHED = RELIABLE._replace(durability=QosDurability.TRANSIENT_LOCAL, depth=1)

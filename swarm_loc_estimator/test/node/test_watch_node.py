@@ -22,8 +22,8 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
 from visualization_msgs.msg import MarkerArray
 
-from swarm_loc_estimator.watch.frames import unpack
 from swarm_loc_estimator.watch.markers_node import MarkersNode
+from swarm_loc_estimator.watch.page import unpack
 from swarm_loc_estimator.watch.robot_places import AerialNames
 from swarm_loc_estimator.watch.watch_node import WatchNode
 from swarm_loc_msgs.msg import (

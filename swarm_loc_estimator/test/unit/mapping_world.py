@@ -9,8 +9,7 @@ import scipy
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.cdr import encode
-from swarm_loc_estimator.common.messages.definitions import LASER_SCAN
+from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, encode
 from swarm_loc_estimator.common.se2 import compose, exp, wrap_angle
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.messages import ScanMessage

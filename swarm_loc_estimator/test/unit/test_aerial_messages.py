@@ -11,15 +11,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.definitions import ANONYMOUS_DETECTIONS, ROBOT_IDENTITIES
+from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DETECTIONS, ROBOT_IDENTITIES, CdrError
 from swarm_loc_estimator.common.messages.detections import (
     ANONYMOUS_DTYPE,
     decode_anonymous,
     encode_anonymous,
     encode_identities,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.sensors.aerial import MAX_ANONYMOUS
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import Batch

@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
-from swarm_loc_estimator.timeline.scheduling import Policy
-from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.settings import Policy, Settings
 
 Arrival = tuple[int, Event]
 EXACT = Settings(fusion_period_s=0.0)

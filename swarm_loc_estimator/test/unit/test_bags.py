@@ -18,8 +18,8 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from swarm_loc_estimator.common.bags.reader import BagError, BagReader, BagTopic, RawMessage
 from swarm_loc_estimator.common.bags.writer import RELIABLE, BagWriter, typestore
-from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage, merge_streams
+from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage, merge_streams
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,8 +13,7 @@ from scipy.stats import chi2
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MODELS
-from swarm_loc_estimator.sensors.bearing import BEARING
-from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_BEARING
+from swarm_loc_estimator.sensors.camera import BEARING, CONTENT_BEARING
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 

@@ -9,14 +9,14 @@ import pytest
 from ir_world import random_poses
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.infrared.curves import curve_at
-from swarm_loc_estimator.offline.calibration.infrared.board import errors_of, without_dead
-from swarm_loc_estimator.offline.calibration.infrared.board_fit import (
+from swarm_loc_estimator.infrared.brightness import curve_at, expected_brightness
+from swarm_loc_estimator.offline.calibration.infrared.board import (
     BoardReadings,
     _Problem,
+    errors_of,
     fit_board,
     turned,
+    without_dead,
 )
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import PairGains

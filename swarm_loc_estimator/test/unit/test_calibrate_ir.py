@@ -16,7 +16,7 @@ from swarm_loc_estimator.cli import calibrate_ir
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.definitions import BRIGHTNESS, POSE_STAMPED
+from swarm_loc_estimator.common.messages.cdr import BRIGHTNESS, POSE_STAMPED
 from swarm_loc_estimator.common.messages.detections import encode_brightness
 from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
 from swarm_loc_estimator.offline.calibration.infrared.gains import MIN_EXCHANGES

@@ -20,6 +20,7 @@ from swarm_loc_estimator.offline.calibration.fit import Options, calibrate, fit_
 from swarm_loc_estimator.offline.calibration.motion import (
     Drive,
     Lateness,
+    fit_offsets,
     fit_response,
     nodes_of,
     steps_of,
@@ -33,7 +34,6 @@ from swarm_loc_estimator.offline.calibration.noise import (
     thinned,
     with_noise,
 )
-from swarm_loc_estimator.offline.calibration.offsets import fit_offsets
 from swarm_loc_estimator.offline.calibration.recording import (
     CalibrationError,
     read_recording,
@@ -41,9 +41,8 @@ from swarm_loc_estimator.offline.calibration.recording import (
     started_at_truth,
 )
 from swarm_loc_estimator.offline.calibration.robust import population, ridge, softened
-from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSE
-from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
-from swarm_loc_estimator.swarm.motion_response import MotionResponse
+from swarm_loc_estimator.sensors.camera import CONTENT_POSE
+from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel, SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.settings import Settings

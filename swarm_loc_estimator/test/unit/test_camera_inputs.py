@@ -13,9 +13,7 @@ from scipy.spatial.transform import Rotation
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.filter.measurement_model import NOBODY, Kind, MeasurementArray
-from swarm_loc_estimator.sensors.bearing import BEARING
-from swarm_loc_estimator.sensors.camera import SightingConverter
-from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_BEARING
+from swarm_loc_estimator.sensors.camera import BEARING, CONTENT_BEARING, SightingConverter
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, Swarm
 

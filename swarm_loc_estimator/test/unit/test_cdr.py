@@ -13,9 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.cdr import CdrError, decode
-from swarm_loc_estimator.common.messages.cdr import encode as our_encode
-from swarm_loc_estimator.common.messages.definitions import (
+from swarm_loc_estimator.common.messages.cdr import (
     DETECTION,
     DETECTIONS,
     MESSAGE_PACKAGE,
@@ -24,10 +22,13 @@ from swarm_loc_estimator.common.messages.definitions import (
     POSE_STAMPED,
     SEQUENCE,
     STANDARD,
+    CdrError,
     DefinitionsNotFoundError,
+    decode,
     fields_of,
     message_folder,
 )
+from swarm_loc_estimator.common.messages.cdr import encode as our_encode
 from swarm_loc_estimator.common.messages.detections import decode_detections, encode_detections
 from swarm_loc_estimator.common.messages.poses import (
     decode_odometry,

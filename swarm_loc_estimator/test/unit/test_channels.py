@@ -12,14 +12,12 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.definitions import BRIGHTNESS, POSE_WITH_COVARIANCE
+from swarm_loc_estimator.common.messages.cdr import BRIGHTNESS, POSE_WITH_COVARIANCE, CdrError
 from swarm_loc_estimator.common.messages.detections import decode_brightness, encode_brightness
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import decode_fix, encode_fix, encode_odometry
-from swarm_loc_estimator.sensors.conversion import InputConverter
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import Batch
+from swarm_loc_estimator.sensors.registry import Batch, InputConverter
 from swarm_loc_estimator.swarm.error_models import FixModel, OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator, Status

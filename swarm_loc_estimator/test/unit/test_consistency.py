@@ -15,8 +15,7 @@ from scipy.stats import chi2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
-from swarm_loc_estimator.timeline.scheduling import Policy
-from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.settings import Policy, Settings
 
 SEEDS = range(6)
 

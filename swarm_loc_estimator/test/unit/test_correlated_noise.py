@@ -25,7 +25,7 @@ from swarm_loc_estimator.filter.measurement_model import (
     MeasurementColumns,
 )
 from swarm_loc_estimator.filter.state import SwarmState
-from swarm_loc_estimator.odometry.look_up import new_sample
+from swarm_loc_estimator.odometry.track_arrays import new_sample
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.ir_board import RobotIr

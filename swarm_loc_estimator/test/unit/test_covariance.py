@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.small_matrix import cholesky3, solve3
-from swarm_loc_estimator.filter.dense_filter import DenseFilter, update_one
+from swarm_loc_estimator.filter.joint_filter import DenseFilter, update_one
 
 
 def covariance(rng: np.random.Generator, size: int) -> FloatArray:

@@ -24,9 +24,8 @@ from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.offline.sweep.grid import KEYS, MINIMIZED, read_sweep
 from swarm_loc_estimator.offline.sweep.jobs import FIGURES
 from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS, SENSORS
-from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Landmark
+from swarm_loc_estimator.swarm.swarm import Anchor, Face, FixedCamera, Landmark, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import MODELS, load_swarm
-from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 
 DOC = Path(__file__).parents[2] / "doc"
 SWARM_DESCRIPTION = (DOC / "swarm_description.md").read_text(encoding="utf-8")

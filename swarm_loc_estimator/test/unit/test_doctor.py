@@ -12,10 +12,10 @@ from wrong_setups import BAGS, BOTH, ROBOT, WRONG, Change, good, shifted, with_g
 from swarm_loc_estimator.cli import doctor as command
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.definitions import TRANSFORMS
+from swarm_loc_estimator.common.messages.cdr import TRANSFORMS
+from swarm_loc_estimator.doctor.contents import IMAGE
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag, examine, lines_of
 from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message
-from swarm_loc_estimator.doctor.pictures import IMAGE
 from swarm_loc_estimator.offline.recorded_bag import unwatched
 from swarm_loc_estimator.swarm.error_models import ClockModel
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

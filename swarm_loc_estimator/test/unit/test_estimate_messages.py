@@ -14,9 +14,8 @@ from ruamel.yaml import YAML
 
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.definitions import MARKERS, MESSAGE_PACKAGE
-from swarm_loc_estimator.common.messages.estimates import EstimateMessage, SwarmPosesEncoder, SwarmPosesReader
+from swarm_loc_estimator.common.messages.cdr import MARKERS, MESSAGE_PACKAGE, CdrError
+from swarm_loc_estimator.common.messages.poses import EstimateMessage, SwarmPosesEncoder, SwarmPosesReader
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, Kind
 from swarm_loc_estimator.offline.export import write_mcap
 from swarm_loc_estimator.offline.result import ReplayResult

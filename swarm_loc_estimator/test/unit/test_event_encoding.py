@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS, SEQUENCE, fields_of
+from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS, SEQUENCE, fields_of
 from swarm_loc_estimator.common.messages.event_encoding import (
     ENCODING,
     MAX_SPAN_NS,

@@ -9,7 +9,7 @@ from ir_world import droplet, random_poses
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import Exchanges
-from swarm_loc_estimator.offline.calibration.infrared.gain_validation import (
+from swarm_loc_estimator.offline.calibration.infrared.gains import (
     ALIKE,
     GAINS,
     UNKNOWN,

@@ -8,8 +8,7 @@ from core_geometry import wrapped
 from core_messages import SECOND, T0, give_fix
 from ir_swarm import DROPLET, Event, Place, exchange, messages
 
-from swarm_loc_estimator.filter.integrity.divergence import LossLimits, count_gated
-from swarm_loc_estimator.filter.integrity.fault_detection import is_contradicted
+from swarm_loc_estimator.filter.integrity import LossLimits, count_gated, is_contradicted
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, NOBODY, MeasurementColumns
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable

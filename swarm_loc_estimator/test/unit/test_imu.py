@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.cdr import CdrError, encode
-from swarm_loc_estimator.common.messages.definitions import IMU
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
-from swarm_loc_estimator.odometry.look_up import OdometrySample
+from swarm_loc_estimator.common.messages.cdr import IMU, CdrError, encode
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
+from swarm_loc_estimator.odometry.track_arrays import OdometrySample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.imu import TURN_RATES, TurnRateRows, decode_imu
 from swarm_loc_estimator.sensors.ingest import Ingest

@@ -12,7 +12,7 @@ from ir_swarm import DROPLET, T0, Light, brightness_rows, calibrated, exchange
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
-from swarm_loc_estimator.infrared.solution import IrOutcome, IrSolutions
+from swarm_loc_estimator.infrared.search import IrOutcome, IrSolutions
 from swarm_loc_estimator.sensors import infrared as brightness_sightings
 from swarm_loc_estimator.sensors.infrared import BrightnessConverter, BrightnessRows
 from swarm_loc_estimator.sensors.sensor import chosen

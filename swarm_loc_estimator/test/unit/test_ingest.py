@@ -10,13 +10,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.definitions import DETECTIONS, ODOMETRY, POSE_STAMPED
+from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,
     decode_detections,
     encode_detections,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import (
     decode_odometry,
     decode_pose_stamped,
@@ -24,7 +23,12 @@ from swarm_loc_estimator.common.messages.poses import (
     encode_odometry,
     encode_pose_stamped,
 )
-from swarm_loc_estimator.common.messages.streams import DetectionReader, PoseReader
+from swarm_loc_estimator.common.messages.streams import (
+    DetectionReader,
+    MessageBatch,
+    PoseReader,
+    SerializedMessage,
+)
 from swarm_loc_estimator.sensors.ingest import Ingest, WrongClock
 from swarm_loc_estimator.swarm.error_models import ClockModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm

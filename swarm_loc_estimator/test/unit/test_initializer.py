@@ -21,7 +21,7 @@ from swarm_loc_estimator.filter.measurement_model import (
 )
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.initialization import alignment, initializer
-from swarm_loc_estimator.initialization.constraints import (
+from swarm_loc_estimator.initialization.alignment import (
     CONSTRAINT_DTYPE,
     NO_CONSTRAINTS,
     THE_MAP,

@@ -8,7 +8,7 @@ from ir_world import ANGLES, RHO, droplet, emitter_20, random_poses, readings_of
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.closed_form import ClosedForm
-from swarm_loc_estimator.infrared.solution import IrEstimator, IrOutcome
+from swarm_loc_estimator.infrared.search import IrEstimator, IrOutcome
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrGains, PairGains
 

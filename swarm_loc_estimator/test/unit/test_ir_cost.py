@@ -11,8 +11,16 @@ from ir_world import droplet, pair_of, random_poses, readings_of
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_with_slopes
-from swarm_loc_estimator.infrared.cost import CostWorkspace, Pair, cost_of, new_cost_workspace
-from swarm_loc_estimator.infrared.reading_cost import MEASURED, MISSING, SATURATED, reading_cost
+from swarm_loc_estimator.infrared.cost import (
+    MEASURED,
+    MISSING,
+    SATURATED,
+    CostWorkspace,
+    Pair,
+    cost_of,
+    new_cost_workspace,
+    reading_cost,
+)
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrModel
 

@@ -9,7 +9,7 @@ from ir_world import nees, pair_of, pose_errors, random_poses, readings_of
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.cost import cost_of, new_cost_workspace
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.solution import IrOutcome
+from swarm_loc_estimator.infrared.search import IrOutcome
 from swarm_loc_estimator.infrared.start_table import add_spread, new_start_workspace
 from swarm_loc_estimator.swarm.board_file import load_ir_platform
 

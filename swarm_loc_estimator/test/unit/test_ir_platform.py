@@ -11,16 +11,23 @@ import pytest
 from ir_world import ANGLES, droplet, emitter_20, far_21, sensor_19
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.curves import amplitude_at, amplitudes_at, curve_at, curves_at, distance_at
+from swarm_loc_estimator.infrared.brightness import (
+    amplitude_at,
+    amplitudes_at,
+    curve_at,
+    curves_at,
+    distance_at,
+)
 from swarm_loc_estimator.swarm.board_file import (
     IrPlatformFileError,
     load_ir_platform,
     packaged_platforms,
 )
-from swarm_loc_estimator.swarm.ir_board import IrGains, PairGains
-from swarm_loc_estimator.swarm.ir_curves import (
+from swarm_loc_estimator.swarm.ir_board import (
     Amplitude,
+    IrGains,
     IrPlatformError,
+    PairGains,
     PowerCurve,
     PowerPiece,
     TabulatedCurve,

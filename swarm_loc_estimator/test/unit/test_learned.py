@@ -16,10 +16,9 @@ from swarm_loc_estimator.cli.replay import main
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.cdr import decode, encode
-from swarm_loc_estimator.common.messages.definitions import ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import ODOMETRY, decode, encode
 from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.offline.report.table import SELF_CALIBRATED
+from swarm_loc_estimator.offline.report.report import SELF_CALIBRATED
 from swarm_loc_estimator.sensors.camera import SightingConverter
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm

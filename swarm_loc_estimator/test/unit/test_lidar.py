@@ -13,14 +13,13 @@ from mapping_world import BEAMS, LIDAR, ROOM, SWEEP_NS, LidarRobot, scan_bytes
 from swarm_loc_estimator.cli.replay_map import main
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
-from swarm_loc_estimator.common.messages.definitions import LASER_SCAN, ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, ODOMETRY
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.se2 import between, compose, transform_points
 from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
+from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput, SweepPairer
 from swarm_loc_estimator.mapping.messages import ScanMessage, decode_scan
-from swarm_loc_estimator.mapping.pairing import SweepPairer
 from swarm_loc_estimator.mapping.stops import ScanStop
 from swarm_loc_estimator.swarm.error_models import LidarModel
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm

@@ -12,9 +12,9 @@ from mapping_world import LIDAR, SWEEP_NS, LidarRobot, room_map, scan_bytes
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.definitions import LASER_SCAN, ODOMETRY
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, ODOMETRY
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.offline.replay import replay

@@ -11,7 +11,7 @@ import pytest
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.health import Health
-from swarm_loc_estimator.common.messages import definitions
+from swarm_loc_estimator.common.messages import cdr
 from swarm_loc_estimator.common.messages.cdr import decode, encode
 from swarm_loc_estimator.common.messages.poses import planar_covariance
 from swarm_loc_estimator.common.parameters import ParameterError
@@ -38,10 +38,10 @@ mocap4r2_msgs/RigidBodies: Header header, uint32 frame_number, mocap4r2_msgs/Rig
 @pytest.fixture
 def _foreign_types(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """Let the tables of CDR know messages of packages that are not installed."""
-    monkeypatch.setattr(definitions, "STANDARD", definitions.STANDARD + FOREIGN_TYPES)
-    definitions.fields_of.cache_clear()
+    monkeypatch.setattr(cdr, "STANDARD", cdr.STANDARD + FOREIGN_TYPES)
+    cdr.fields_of.cache_clear()
     yield
-    definitions.fields_of.cache_clear()
+    cdr.fields_of.cache_clear()
 
 
 def turn(yaw: float, roll: float = 0.0) -> dict[str, float]:

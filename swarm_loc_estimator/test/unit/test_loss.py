@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench.shared.bags import copy_part
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.offline.recorded_bag import Loss, LossError, Network
 from swarm_loc_estimator.offline.replay import replay
 

@@ -10,7 +10,7 @@ import pytest
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.definitions import LASER
+from swarm_loc_estimator.common.messages.cdr import LASER
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput

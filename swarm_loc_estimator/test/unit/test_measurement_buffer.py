@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE
-from swarm_loc_estimator.timeline.buffer import MeasurementBuffer
+from swarm_loc_estimator.timeline.timeline import MeasurementBuffer
 
 Row = tuple[int, int, int, float]
 ROW = st.tuples(

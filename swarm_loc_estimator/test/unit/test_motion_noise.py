@@ -12,10 +12,9 @@ from core_run import on_time, play, ticks
 from core_world import ODOMETRY, Plan, World, simulate
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.integrity.motion_noise import LOG_SCALES
+from swarm_loc_estimator.filter.prediction import LOG_SCALES
 from swarm_loc_estimator.timeline.estimator import Estimator
-from swarm_loc_estimator.timeline.scheduling import Policy
-from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.settings import Policy, Settings
 
 PLAN = Plan(3, 40.0, speed=0.2, landmarks=6)
 

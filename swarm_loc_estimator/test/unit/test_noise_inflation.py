@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.filter.integrity.noise_inflation import (
+from swarm_loc_estimator.filter.integrity import (
     MAX_UNITS,
     add_noise_inflation,
     inflate_all_noise,

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.odometry.look_up import OdometrySample, look_up_pose
+from swarm_loc_estimator.odometry.track_arrays import OdometrySample, look_up_pose
 from swarm_loc_estimator.odometry.tracks import OdometryTracks, TrackChange
 from swarm_loc_estimator.swarm.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
 from swarm_loc_estimator.swarm.error_models import OdometryModel, RandomWalk

@@ -8,7 +8,7 @@ import sys
 
 RECKON = """
 import os
-import swarm_loc_estimator.filter.dense_filter
+import swarm_loc_estimator.filter.joint_filter
 import numpy as np
 square = np.ones((500, 500))
 square @ square

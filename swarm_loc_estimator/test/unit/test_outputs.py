@@ -9,8 +9,7 @@ import pytest
 from rosbags.typesys import get_types_from_msg
 
 from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.estimates import SwarmPosesEncoder, TransformsEncoder
-from swarm_loc_estimator.common.messages.poses import encode_poses
+from swarm_loc_estimator.common.messages.poses import SwarmPosesEncoder, TransformsEncoder, encode_poses
 
 STAMP_NS = 1_234_567_890_123_456_789
 NAMES = ["a", "robot17", "x" * 40]

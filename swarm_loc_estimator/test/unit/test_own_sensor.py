@@ -17,8 +17,12 @@ from scipy.stats import chi2
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
-from swarm_loc_estimator.common.messages.streams import EachReader, MessageColumns
+from swarm_loc_estimator.common.messages.streams import (
+    EachReader,
+    MessageBatch,
+    MessageColumns,
+    SerializedMessage,
+)
 from swarm_loc_estimator.filter.measurement_model import (
     MEASUREMENT_DTYPE,
     MODELS,
@@ -44,8 +48,7 @@ from swarm_loc_estimator.sensors.sensor import (
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
-from swarm_loc_estimator.timeline.scheduling import Policy
-from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.settings import Policy, Settings
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_one_robot_slow"
 SIGMA_M = 0.03

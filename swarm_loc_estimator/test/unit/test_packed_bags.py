@@ -17,12 +17,11 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from test_bags import START, TOPICS, expected, read, some_messages, write_bag, write_mcap, write_sqlite
 
-from swarm_loc_estimator.common.bags import packed
+from swarm_loc_estimator.common.bags import reader
 from swarm_loc_estimator.common.bags.bag_file import ReadErrors
-from swarm_loc_estimator.common.bags.packed import unpack_messages
-from swarm_loc_estimator.common.bags.reader import BagError, BagReader
+from swarm_loc_estimator.common.bags.reader import BagError, BagReader, unpack_messages
 from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 
 PACK = {".zst": zstandard.compress, ".zstd": zstandard.compress, ".lz4": lz4.frame.compress}
 
@@ -114,7 +113,7 @@ def test_a_file_that_would_fill_the_disk_is_refused(
 
 
 def test_messages_that_cannot_be_unpacked_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(packed, "MAX_MESSAGE", 1000)
+    monkeypatch.setattr(reader, "MAX_MESSAGE", 1000)
     good, plain = zstandard.compress(bytes(1000)), b"\0\1\0\0 as it is"
     contents = [plain, good, good[:4] + b"damage", zstandard.compress(bytes(1001)), b"", plain]
     batch = MessageBatch.of([SerializedMessage(k, data, k) for k, data in enumerate(contents)])
@@ -125,7 +124,7 @@ def test_messages_that_cannot_be_unpacked_are_counted(monkeypatch: pytest.Monkey
 
 
 def test_batches_are_split_where_messages_unpack_to_much(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(packed, "_MAX_BATCH", 2500)
+    monkeypatch.setattr(reader, "_MAX_BATCH", 2500)
     message = zstandard.compress(bytes(1000))
     batch = MessageBatch.of([SerializedMessage(0, message, k) for k in range(8)])
     sizes = [part.size for part in unpack_messages(iter([batch]), ReadErrors("x"))]

@@ -20,7 +20,8 @@ from swarm_loc_estimator.common.messages.detections import (
     SharedHead,
     swarm_key,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
+from swarm_loc_estimator.nodes.load import Thinning
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.precompile import Size, precompile, size_of
 from swarm_loc_estimator.sensors.ingest import Ingest
@@ -28,9 +29,7 @@ from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
-from swarm_loc_estimator.timeline.scheduling import Policy
-from swarm_loc_estimator.timeline.settings import Settings
-from swarm_loc_estimator.timeline.thinning import Thinning
+from swarm_loc_estimator.timeline.settings import Policy, Settings
 
 BAGS = Path(__file__).parents[3] / "bags"
 SECOND = 1_000_000_000

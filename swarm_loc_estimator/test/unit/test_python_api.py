@@ -16,8 +16,8 @@ import pytest
 
 import swarm_loc_estimator
 from swarm_loc_estimator import Batch, Estimator, OdometryRows, ReplayResult, Robot, Swarm, replay
-from swarm_loc_estimator.offline.report.table import text_report
-from swarm_loc_estimator.offline.tum import write_tum
+from swarm_loc_estimator.offline.export import write_tum
+from swarm_loc_estimator.offline.report.report import text_report
 
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "swarm_loc_estimator" / "doc" / "python_api.md"

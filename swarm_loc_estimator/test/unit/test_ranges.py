@@ -18,18 +18,16 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.cdr import RANGES as MESSAGE_TYPE
 from swarm_loc_estimator.common.messages.cdr import encode
-from swarm_loc_estimator.common.messages.definitions import RANGES as MESSAGE_TYPE
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MODELS, MeasurementArray
 from swarm_loc_estimator.precompile import size_of
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.ranges import RANGE, RANGE_DIFFERENCE
-from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
+from swarm_loc_estimator.swarm.swarm import Anchor, Robot, Swarm, UwbDevice
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
-from swarm_loc_estimator.timeline.scheduling import Policy
-from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.settings import Policy, Settings
 from swarm_loc_estimator.timeline.verdicts import Verdict
 
 DOC = Path(__file__).parents[2] / "doc" / "uwb.md"

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.mapping.pairing import MAX_GAP_NS, MAX_WAITING, ReadingPairer
+from swarm_loc_estimator.mapping.mapper_feed import MAX_GAP_NS, MAX_WAITING, ReadingPairer
 
 STEP_NS = 50_000_000
 

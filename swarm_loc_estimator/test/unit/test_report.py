@@ -14,8 +14,7 @@ import pytest
 
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.report.plots import plot_overview
-from swarm_loc_estimator.offline.report.report import write_report
-from swarm_loc_estimator.offline.report.table import text_report
+from swarm_loc_estimator.offline.report.report import text_report, write_report
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from bench.shared.bags import encode_shared_detections, encode_shared_numbers
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.definitions import SWARM_DETECTIONS, SWARM_FIXES, SWARM_ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import SWARM_DETECTIONS, SWARM_FIXES, SWARM_ODOMETRY, CdrError
 from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,
     SharedHead,
@@ -23,8 +22,8 @@ from swarm_loc_estimator.common.messages.detections import (
     encode_detections,
     swarm_key,
 )
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import Batch, live_topics
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm

@@ -7,8 +7,7 @@ import pytest
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import error_covariance
-from swarm_loc_estimator.filter.dense_filter import DenseFilter
-from swarm_loc_estimator.filter.joint_filter import Robots
+from swarm_loc_estimator.filter.joint_filter import DenseFilter, Robots
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated

@@ -11,14 +11,21 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.filter.sparse import ordering
-from swarm_loc_estimator.filter.sparse.dissection import Order, dissect
 from swarm_loc_estimator.filter.sparse.factor import Factor, new_factor, solve, write_fronts, write_rows
-from swarm_loc_estimator.filter.sparse.neighbours import adjacency
-from swarm_loc_estimator.filter.sparse.ordering import Situation, ordered
-from swarm_loc_estimator.filter.sparse.parameters import Groups, active_blocks
-from swarm_loc_estimator.filter.sparse.symbolic import Pattern, pattern_of, wanted_rows
-from swarm_loc_estimator.filter.sparse.translation_adjoint import (
+from swarm_loc_estimator.filter.sparse.ordering import (
+    Order,
+    Pattern,
+    Situation,
+    adjacency,
+    dissect,
+    ordered,
+    pattern_of,
+    wanted_rows,
+)
+from swarm_loc_estimator.filter.sparse.parameters import (
+    Groups,
     Information,
+    active_blocks,
     carried_pairs,
     summed,
     translation_adjoints,

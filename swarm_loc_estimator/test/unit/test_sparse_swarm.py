@@ -16,8 +16,7 @@ from scipy.stats import chi2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
-from swarm_loc_estimator.timeline.scheduling import Policy
-from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.settings import Policy, Settings
 
 SPARSE = Settings(sparse_from=2, fusion_period_s=0.2)
 DENSE = replace(SPARSE, sparse_from=1000)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarm_loc_estimator.offline.spool import Spool
+from swarm_loc_estimator.offline.result import Spool
 
 
 def test_rows_come_back_by_key_in_their_order() -> None:

@@ -22,8 +22,7 @@ from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
-from swarm_loc_estimator.timeline.scheduling import Policy
-from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.settings import Policy, Settings
 
 TIME_SIGMA_S = 0.04
 SEER = Robot("seer", camera=CameraMount(x=0.04))

@@ -16,10 +16,9 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
-from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.definitions import OCCUPANCY_GRID, ODOMETRY, POSE_STAMPED
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.cdr import OCCUPANCY_GRID, ODOMETRY, POSE_STAMPED, CdrError
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry, encode_pose_stamped
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.mapping.messages import MAX_CELLS, decode_occupancy_grid
 from swarm_loc_estimator.offline.export import write_mcap
@@ -28,7 +27,7 @@ from swarm_loc_estimator.offline.replay import AerialImages, replay
 from swarm_loc_estimator.offline.report.report import recorded
 from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.watch.frames import unpack
+from swarm_loc_estimator.watch.page import unpack
 
 SECOND = 1_000_000_000
 SWARM = Swarm(robots=(Robot("a", start=(0.0, 0.0, 0.0)), Robot("b", start=(1.0, 0.0, 0.0))))

@@ -17,9 +17,8 @@ from swarm_loc_estimator.cli import survey as command
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
-from swarm_loc_estimator.offline.survey.problem import problem_of
+from swarm_loc_estimator.offline.survey.problem import problem_of, start_of
 from swarm_loc_estimator.offline.survey.solve import Solver
-from swarm_loc_estimator.offline.survey.start import start_of
 from swarm_loc_estimator.offline.survey.survey import survey
 from swarm_loc_estimator.sensors.camera import FROM_OPTICAL, NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
@@ -27,9 +26,8 @@ from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.ranges import RangeRows
 from swarm_loc_estimator.sensors.sensor import chosen, in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import ImuModel
-from swarm_loc_estimator.swarm.swarm import FixedCamera, Landmark, StartSigma, Swarm
+from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, StartSigma, Swarm, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 
 PLAN = Plan(robots=3, duration_s=25.0, arena=0.8, landmarks=8, start_known=(False,))
 BAGS = Path(__file__).parents[3] / "bags"

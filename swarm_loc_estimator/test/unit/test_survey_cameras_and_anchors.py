@@ -13,8 +13,7 @@ from swarm_loc_estimator.offline.survey.cameras_and_anchors import Paths, Placed
 from swarm_loc_estimator.sensors.camera import FROM_OPTICAL, DetectionRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY
 from swarm_loc_estimator.sensors.ranges import RangeRows
-from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Robot, Swarm
-from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
+from swarm_loc_estimator.swarm.swarm import Anchor, Face, FixedCamera, Robot, Swarm, UwbDevice
 
 COUNT = 400
 CEILING = FixedCamera("ceiling", 0.2, -0.1, 2.5, yaw=0.7, pitch=1.4, roll=0.1)

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from swarm_loc_estimator.swarm.error_models import OdometryModel
-from swarm_loc_estimator.swarm.motion_response import MotionResponse
+from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, StartSigma, Swarm, SwarmError
 from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm
 

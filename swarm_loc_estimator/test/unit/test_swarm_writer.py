@@ -14,12 +14,12 @@ from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.error_models import (
     ClockModel,
     FixModel,
+    MotionResponse,
     OdometryModel,
     RandomWalk,
     SensorModel,
 )
 from swarm_loc_estimator.swarm.ir_board import IrGains, IrMethod, RobotIr
-from swarm_loc_estimator.swarm.motion_response import MotionResponse
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, StartSigma, Swarm
 from swarm_loc_estimator.swarm.swarm_file import RESERVED_NAMES, load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm

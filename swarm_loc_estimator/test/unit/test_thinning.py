@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.nodes.load import Thinning, water_level
 from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.sensors.fix import FixRows
@@ -17,8 +18,7 @@ from swarm_loc_estimator.sensors.infrared import BrightnessRows
 from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.sensors.sensor import joined
-from swarm_loc_estimator.timeline.scheduling import end_of_period
-from swarm_loc_estimator.timeline.thinning import Thinning, water_level
+from swarm_loc_estimator.timeline.settings import end_of_period
 
 ROBOTS = 20
 SEEN = 4

@@ -14,10 +14,10 @@ from swarm_loc_estimator.cli.calibrate import main as calibrate
 from swarm_loc_estimator.cli.replay import main
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.calibration.recording import read_recording
+from swarm_loc_estimator.offline.export import TumError, read_truth, read_tum, write_tum
 from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.offline.report.table import text_report
+from swarm_loc_estimator.offline.report.report import text_report
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.offline.tum import TumError, read_truth, read_tum, write_tum
 
 BAG = Path(__file__).resolve().parents[3] / "bags" / "eight_one_robot_slow"
 LINE = "12.5 1 2 0 0 0 0 1"

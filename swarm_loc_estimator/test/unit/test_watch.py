@@ -17,11 +17,17 @@ from processor_wait import THIS_THREAD, waited_s
 
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
-from swarm_loc_estimator.watch.access import Access, AccessError
-from swarm_loc_estimator.watch.frames import Frame, History, pack, unpack
 from swarm_loc_estimator.watch.markers import _COLOURS
-from swarm_loc_estimator.watch.page import about, content_security_policy, page
-from swarm_loc_estimator.watch.server import Answer, Command, ServerError, ServerLoad, WatchServer
+from swarm_loc_estimator.watch.page import Frame, History, about, content_security_policy, pack, page, unpack
+from swarm_loc_estimator.watch.server import (
+    Access,
+    AccessError,
+    Answer,
+    Command,
+    ServerError,
+    ServerLoad,
+    WatchServer,
+)
 
 SECOND = 1_000_000_000
 MEGABYTE = 1 << 20

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from swarm_loc_estimator.common.bags.writer import typestore
-from swarm_loc_estimator.common.messages.definitions import IMU, ODOMETRY, POSE_WITH_COVARIANCE, TRANSFORMS
+from swarm_loc_estimator.common.messages.cdr import IMU, ODOMETRY, POSE_WITH_COVARIANCE, TRANSFORMS
+from swarm_loc_estimator.doctor.contents import CAMERA_INFO, IMAGE
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag
 from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message, Publisher
-from swarm_loc_estimator.doctor.pictures import CAMERA_INFO, IMAGE
 from swarm_loc_estimator.offline.recorded_bag import unwatched
 from swarm_loc_estimator.swarm.error_models import ImuModel
 from swarm_loc_estimator.swarm.swarm import Swarm

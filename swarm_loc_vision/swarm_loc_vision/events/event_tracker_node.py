@@ -21,8 +21,7 @@ from rclpy.time import Time
 from std_msgs.msg import Header
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
-from swarm_loc_estimator.common.messages.cdr import nanoseconds
-from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS
+from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS, nanoseconds
 from swarm_loc_estimator.common.messages.event_encoding import EventError, decode_events
 from swarm_loc_estimator.common.node import ConfiguredNode, message_class, run_node
 from swarm_loc_msgs.msg import LaserDistance, LightBearing, LightBearingArray

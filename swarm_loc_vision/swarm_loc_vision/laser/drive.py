@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from swarm_loc_estimator import decode_laser
-from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.definitions import LASER, ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import LASER, ODOMETRY, CdrError
 from swarm_loc_estimator.common.messages.poses import decode_odometry
-from swarm_loc_vision.laser.fit import CalibrationError, Drive
+from swarm_loc_vision.laser.calibration import CalibrationError, Drive
 
 _MAX_SAMPLES = 100_000
 _MAX_OFF_COURSE = 0.1  # A robot that turns by more does not drive straight at a wall [rad]

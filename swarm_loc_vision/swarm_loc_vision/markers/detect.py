@@ -31,8 +31,7 @@ from swarm_loc_estimator.common.command_line import (
     parameters_of,
     swarm_beside,
 )
-from swarm_loc_estimator.common.messages.cdr import CdrError, decode
-from swarm_loc_estimator.common.messages.definitions import DETECTIONS
+from swarm_loc_estimator.common.messages.cdr import DETECTIONS, CdrError, decode
 from swarm_loc_estimator.common.parameters import Value
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.camera import CameraError

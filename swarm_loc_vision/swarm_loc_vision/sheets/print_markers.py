@@ -26,13 +26,13 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.aerial.ground_control import Ground
 from swarm_loc_vision.aerial.ground_file import save_ground
 from swarm_loc_vision.markers.families import families, family_named
-from swarm_loc_vision.sheets.drawing import save_pdf
 from swarm_loc_vision.sheets.pages import (
     PAPERS,
     SheetError,
     board_page,
     floor_markers,
     pages_of,
+    save_pdf,
     stickers_of,
 )
 

@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 from bench.vision.negatives import black_squares
 from bench.vision.peers import own_detector
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
-from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_POSE, CONTENT_POSE_TWO
+from swarm_loc_estimator.sensors.camera import CONTENT_POSE, CONTENT_POSE_TWO
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.camera_detector import detection_rows
 from swarm_loc_vision.markers.detector import Detections, DetectorSettings, MarkerDetector

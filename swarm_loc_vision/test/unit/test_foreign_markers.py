@@ -18,8 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from bench.shared.parameter_table import markdown_table
 from bench.vision.scenes import CAMERA, Look, Truth, random_scene
-from swarm_loc_estimator.common.messages.cdr import decode
-from swarm_loc_estimator.common.messages.definitions import DETECTIONS
+from swarm_loc_estimator.common.messages.cdr import DETECTIONS, decode
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_vision.common.images import ImageError

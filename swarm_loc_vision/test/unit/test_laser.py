@@ -13,22 +13,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
-from swarm_loc_estimator.common.messages.definitions import LASER, ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import LASER, ODOMETRY
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_vision.laser.calibration import (
+    CalibrationError,
+    Drive,
     LaserCalibration,
     LaserFileError,
     RowBias,
+    fit_hyperbola,
+    fit_row_bias,
     load_laser,
     save_laser,
 )
 from swarm_loc_vision.laser.drive import WallDrive, recorded_drive
-from swarm_loc_vision.laser.fit import (
-    CalibrationError,
-    Drive,
-    fit_hyperbola,
-    fit_row_bias,
-)
 
 DEPTHS = np.linspace(0.1, 2.5, 200)
 

@@ -17,8 +17,8 @@ from swarm_loc_estimator.filter.measurement_model import predict
 from swarm_loc_estimator.sensors.camera import SightingConverter
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Robot, Swarm
 from swarm_loc_vision.aerial.control_points import solve_pose
-from swarm_loc_vision.aerial.fixed_camera import fixed_camera
 from swarm_loc_vision.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.aerial.locate_camera import fixed_camera
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.bodies import Seen, robot_body, solve_bodies

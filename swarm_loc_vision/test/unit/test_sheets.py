@@ -20,8 +20,18 @@ from swarm_loc_vision.aerial.ground_file import load_ground
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import families, family_named
-from swarm_loc_vision.sheets.drawing import MM_PER_INCH, outline, save_pdf, sheet_figure
-from swarm_loc_vision.sheets.pages import PAPERS, Page, board_page, floor_markers, pages_of, stickers_of
+from swarm_loc_vision.sheets.pages import (
+    MM_PER_INCH,
+    PAPERS,
+    Page,
+    board_page,
+    floor_markers,
+    outline,
+    pages_of,
+    save_pdf,
+    sheet_figure,
+    stickers_of,
+)
 from swarm_loc_vision.sheets.print_markers import main
 
 ROBOTS = tuple(

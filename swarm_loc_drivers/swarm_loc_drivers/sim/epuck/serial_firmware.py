@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.epuck.hardware import EPUCK1, EpuckModel, encode_rgb565
-from swarm_loc_drivers.epuck.serial_protocol import RGB565_MODE, code
+from swarm_loc_drivers.epuck.serial_session import RGB565_MODE, code
 from swarm_loc_drivers.sim.epuck.parts import GRAVITY_EPUCK2, EpuckBody, Motors, camera_image, sensor_values
 
 GREY_MODE = 0

@@ -20,8 +20,7 @@ from swarm_loc_drivers.sim.epuck.parts import proximity_values
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena, CameraRig, OverheadRig, OverheadSettings
 from swarm_loc_drivers.sim.run import START_NS, Trajectories
-from swarm_loc_drivers.sim.scenarios.eight import ARENA, CAMERA_RATE_HZ
-from swarm_loc_drivers.sim.scenarios.eight_images import FAMILY
+from swarm_loc_drivers.sim.scenarios.eight import ARENA, CAMERA_RATE_HZ, FAMILY
 from swarm_loc_drivers.sim.worlds import WORLDS, ErrorModel, WorldError, hidden_geometry, start_of
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text

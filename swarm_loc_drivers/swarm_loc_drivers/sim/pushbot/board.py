@@ -2,6 +2,12 @@
 
 Source: uart.c, pwm.c, sensors.c, DVS128Chip.c and main.c of the board's firmware EDVSBoardOS (eDVS4337),
 version 0.7.1.
+
+The ring of events that an emulated PushBot has still to send, and their bytes.
+
+Sensors of an emulated PushBot: their numbers, what they report at rest, and when they are due.
+
+Source: sensors.c, mpu9150.c and uart.c of the board's firmware EDVSBoardOS (eDVS4337), version 0.7.1.
 """
 
 from __future__ import annotations
@@ -18,9 +24,198 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.pushbot.hardware import TIMESTAMPS, FirmwareGeneration
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking
-from swarm_loc_drivers.sim.pushbot.event_ring import EventRing
 from swarm_loc_drivers.sim.pushbot.motor import COUNTS_PER_US, Motor, int32
-from swarm_loc_drivers.sim.pushbot.sensor_lines import Sensors
+
+RING = 4092  # Events that wait; with four places left the oldest is dropped
+_DELTA_LIMITS = (0x7F, 0x3FFF, 0x1FFFFF)
+
+
+class EventRing:
+    """Ring buffer of events to be sent.
+
+    Attributes:
+        dropped: Events that were overwritten, unnoticed by the board.
+    """
+
+    def __init__(self) -> None:
+        self.dropped = 0
+        self._words = np.zeros(0, np.uint16)
+        self._times = np.zeros(0, np.int64)
+        self._last = 0
+
+    def __len__(self) -> int:
+        return len(self._words)
+
+    def put(self, words: NDArray[np.uint16], times_us: NDArray[np.int64], room: int) -> None:
+        """Take events `0yyyyyyy pxxxxxxx`, in order, with their board's time.
+
+        Args:
+            words: (N,).
+            times_us: (N,) [us].
+            room: Events that are sent while these come, which leave their places.
+        """
+        self._words = np.concatenate([self._words, words])
+        self._times = np.concatenate([self._times, times_us])
+        self._forget(RING + room)
+
+    def _forget(self, kept: int) -> None:
+        extra = len(self._words) - kept
+        if extra > 0:
+            self.dropped += extra
+            self._words, self._times = self._words[extra:], self._times[extra:]
+
+    def clear(self) -> None:
+        """Drop all events, as when nothing is streamed."""
+        self._words, self._times = self._words[:0], self._times[:0]
+
+    def take(self, until_us: int, max_bytes: int, stamp_bytes: int) -> bytes:
+        """The bytes of events up to a time, as many as fit; stamp_bytes of -1: differences."""
+        due = int(np.searchsorted(self._times, until_us, side="right"))
+        if stamp_bytes >= 0:
+            count = min(due, max_bytes // (2 + stamp_bytes))
+            data = _fixed(self._words[:count], self._times[:count], stamp_bytes)
+        else:
+            deltas = np.diff(self._times[:due], prepend=self._last) & 0xFFFFFFFF
+            sizes = 3 + np.searchsorted(_DELTA_LIMITS, deltas, side="right")
+            count = int(np.searchsorted(np.cumsum(sizes), max_bytes, side="right"))
+            data = _differences(self._words[:count], deltas[:count], sizes[:count])
+            self._last = int(self._times[count - 1]) if count else self._last
+        self._words, self._times = self._words[count:], self._times[count:]
+        self._forget(RING)
+        return data
+
+
+def _fixed(words: NDArray[np.uint16], times: NDArray[np.int64], stamp_bytes: int) -> bytes:
+    """Events with timestamps of one length, the most significant byte first."""
+    table = np.empty((len(words), 2 + stamp_bytes), np.uint8)
+    table[:, 0] = words >> 8 | 0x80
+    table[:, 1] = words & 0xFF
+    for k in range(stamp_bytes):
+        table[:, 2 + k] = times >> 8 * (stamp_bytes - 1 - k) & 0xFF
+    return table.tobytes()
+
+
+def _differences(words: NDArray[np.uint16], deltas: NDArray[np.int64], sizes: NDArray[np.int64]) -> bytes:
+    """Events with the time since the last one, seven bits a byte, the last byte marked."""
+    ends = np.cumsum(sizes)
+    data = np.zeros(int(ends[-1]) if len(ends) else 0, np.uint8)
+    data[ends - sizes] = words >> 8 | 0x80
+    data[ends - sizes + 1] = words & 0xFF
+    for k in range(4):
+        has = sizes >= 3 + k
+        data[ends[has] - 1 - k] = (deltas[has] >> 7 * k & 0x7F) | (0x80 if k == 0 else 0)
+    return data.tobytes()
+
+
+_NAMES = (
+    *("BATTERY", *(f"ADC CHANNEL{channel}" for channel in range(6))),
+    *("RAW GYRO", "RAW ACCEL", "RAW COMPASS", "CAL GYRO", "CAL ACCEL", "CAL COMPASS", "QUARTERNION"),
+    *("EULER ANGLES", "ROTATION MATRIX", "HEADING", "LINEAR ACCEL", "IMU STATUS"),
+    *("PWM SIGNALS", "MOTOR CURRENTS", "EVENTS RATE"),
+)
+"""Sensors of the second firmware by their numbers from 0; the wheels' number is apart."""
+_WHEELS = "MOTOR SENSORS"
+_UNIT, _G = "40000000", 16384
+"""1 in Q30, and the acceleration of gravity of the raw sensor, which measures up to 2 g in 16 bits."""
+_AT_REST = {
+    "BATTERY": "7399",
+    "RAW GYRO": "0 0 0",
+    "RAW ACCEL": f"0 0 {_G}",
+    "RAW COMPASS": "0 67 147",
+    "CAL GYRO": "0 0 0 {ms}",
+    "CAL ACCEL": "0 0 10000",
+    "CAL COMPASS": "140000 0 FFD40000",
+    "QUARTERNION": f"{_UNIT} 0 0 0",
+    "EULER ANGLES": "0 0 0 0",
+    "ROTATION MATRIX": f"{_UNIT} 0 0 0 {_UNIT} 0 0 0 {_UNIT}",
+    "LINEAR ACCEL": "0 0 0",
+    "IMU STATUS": "250 {ms}",
+    "MOTOR CURRENTS": "0 0",
+}
+"""Values of a robot that stands level and looks north in a field of 20 uT ahead and 44 uT down; others are 0.
+
+Calibrated values are hexadecimal: Q16 of deg/s, g and uT, Q30 of quaternion and matrix. The temperature has
+one decimal and no point.
+"""
+_FIRST_NAMES = {0: "BATTERY", 14: "EVENTS RATE"}
+
+
+class Sensors:
+    """Which sensors a board has, and which of them are due.
+
+    Args:
+        generation: Which firmware it is.
+    """
+
+    def __init__(self, generation: FirmwareGeneration) -> None:
+        self._is_first = not generation.has_decay
+        names = _FIRST_NAMES if self._is_first else dict(enumerate(_NAMES))
+        self._names = {**names, generation.tick_bit: _WHEELS}
+        self._reloads: dict[int, int] = {}
+        self._counters: dict[int, int] = {}
+        self._places: dict[int, int] = {}
+        self._queue: list[int] = []
+        self._due: set[int] = set()
+
+    def start(self, mask: int, period_ms: int) -> None:
+        """Report sensors periodically; with a period of 0 ms a counter wraps before it reports."""
+        for bit in self.bits(mask):
+            self._reloads[bit] = period_ms
+            if bit not in self._places:
+                self._counters[bit], self._places[bit] = period_ms, len(self._queue)
+                self._queue.append(bit)
+
+    def stop(self, mask: int) -> None:
+        """Stop reports.
+
+        As on the board, the others keep their old places in the queue, by which they are taken away later:
+        after that one can go on in place of another.
+        """
+        for bit in self.bits(mask):
+            if (place := self._places.pop(bit, None)) is not None:
+                del self._queue[min(place, len(self._queue) - 1)]
+                self._due.discard(bit)
+
+    def tick(self) -> None:
+        """A millisecond has passed."""
+        for bit in self._queue:
+            self._counters[bit] = (self._counters[bit] - 1) % 2**32
+            if self._counters[bit] == 0:
+                self._counters[bit] = self._reloads[bit]
+                self._due.add(bit)
+
+    def take_due(self) -> list[int]:
+        """Numbers of the sensors that have become due since the last call."""
+        due = [bit for bit in dict.fromkeys(self._queue) if bit in self._due]
+        self._due.difference_update(due)
+        return due
+
+    def bits(self, mask: int) -> list[int]:
+        """The numbers in a mask of sensors that the board has."""
+        return [bit for bit in self._names if mask >> bit & 1]
+
+    def name(self, bit: int) -> str:
+        """Name of a sensor, which the second firmware also lists."""
+        return self._names[bit]
+
+    def at_rest(self, bit: int, time_ms: int) -> str:
+        """Values of a sensor of a robot at rest; the time [ms] is that of the last sample."""
+        return _AT_REST.get(self._names[bit], "0").format(ms=time_ms)
+
+    def listing(self) -> str:
+        """Answer to `??S`; the second firmware adds a description to each row."""
+        if self._is_first:
+            rows = (f" {bit} {name.replace(' ', '_')} {self._size(bit)}" for bit, name in self._names.items())
+            return "\n".join([" Bit Name Values", *rows, "", ""])
+        rows = (f" {bit:<3} {1 << bit:<9} {name:<15} {self._size(bit)}" for bit, name in self._names.items())
+        title = " Bit Dec-Value Name     # Values"
+        return "\n".join(["Bitlist for available sensors:", title, *rows, "", ""])
+
+    def _size(self, bit: int) -> int:
+        """How many values a sensor has."""
+        sizes = {_WHEELS: 2, "PWM SIGNALS": 4, "EVENTS RATE": 1 if self._is_first else 3, "CAL GYRO": 3}
+        name = self._names[bit]
+        return sizes.get(name, len(_AT_REST.get(name, "0").split()))
 
 
 class PushbotBody(Protocol):

@@ -19,8 +19,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.event_encoding import Events
 from swarm_loc_vision.events.parameters import LightSource, TrackerSettings
 from swarm_loc_vision.events.tracker import LightTracker
-from swarm_loc_vision.laser.calibration import save_laser
-from swarm_loc_vision.laser.fit import Drive, fit_hyperbola
+from swarm_loc_vision.laser.calibration import Drive, fit_hyperbola, save_laser
 
 _STEP_US = 5_000
 _BLINKING, _LASER = Blinking(2222, 1111), LightSource(450.0, is_above=False)

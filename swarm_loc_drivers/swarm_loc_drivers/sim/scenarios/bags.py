@@ -14,20 +14,20 @@ from scipy.spatial.transform import Rotation
 from swarm_loc_drivers.common.calibration_file import CameraCalibration
 from swarm_loc_drivers.sim.run import CAMERA_LATENESS, LivedRun, Records, SimulatedRun, arrival_ns, survivors
 from swarm_loc_drivers.sim.scenarios.droplets import FIX_HEADING_SIGMA, FIX_SIGMA, DropletRun
-from swarm_loc_drivers.sim.scenarios.eight_images import ImageRun
+from swarm_loc_drivers.sim.scenarios.eight import ImageRun
 from swarm_loc_drivers.sim.scenarios.wandering import AerialRun
 from swarm_loc_estimator import CONTENT_POSE
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.cdr import encode
-from swarm_loc_estimator.common.messages.definitions import (
+from swarm_loc_estimator.common.messages.cdr import (
     ANONYMOUS_DETECTIONS,
     BRIGHTNESS,
     DETECTIONS,
     ODOMETRY,
     POSE_STAMPED,
     POSE_WITH_COVARIANCE,
+    encode,
 )
 from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,

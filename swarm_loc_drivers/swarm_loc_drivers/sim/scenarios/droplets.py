@@ -1,6 +1,6 @@
 """A swarm of Droplets on a table that take turns to emit, half of them wandering.
 
-Robots, consoles and conversations are those of the live graph (see `droplet/lockstep.py`). A tracker above
+Robots, consoles and conversations are those of the live graph (see `droplet/world.py`). A tracker above
 the table sees two robots, all others are to be located by infrared alone.
 """
 
@@ -18,15 +18,16 @@ from swarm_loc_drivers.droplet.hardware import DROPLET, ELEMENTS, FULL_POWER
 from swarm_loc_drivers.droplet.odometry import MotionNoise
 from swarm_loc_drivers.droplet.session import SessionSettings
 from swarm_loc_drivers.droplet.tdma import TdmaSettings
-from swarm_loc_drivers.sim.droplet.lockstep import Cable, run
 from swarm_loc_drivers.sim.droplet.world import (
     DROPLET_WORLDS,
     NEAR_POWER,
     STEP_NS,
+    Cable,
     DropletWorld,
     DropletWorldSettings,
     Fix,
     Tracker,
+    run,
 )
 from swarm_loc_drivers.sim.run import (
     ODOMETRY_DTYPE,

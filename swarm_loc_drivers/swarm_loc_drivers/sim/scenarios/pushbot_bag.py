@@ -40,8 +40,7 @@ from swarm_loc_estimator import (
 )
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.cdr import encode
-from swarm_loc_estimator.common.messages.definitions import (
+from swarm_loc_estimator.common.messages.cdr import (
     EVENT_PACKETS,
     LASER,
     LIGHTS,
@@ -49,6 +48,7 @@ from swarm_loc_estimator.common.messages.definitions import (
     ODOMETRY,
     POSE_STAMPED,
     POSE_WITH_COVARIANCE,
+    encode,
 )
 from swarm_loc_estimator.common.messages.event_encoding import ENCODING, Events, encode_events
 from swarm_loc_estimator.common.messages.poses import (

@@ -9,7 +9,7 @@ from swarm_loc_estimator.common.parameters import UserError
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
 
-    from swarm_loc_estimator.common.messages.message_batch import MessageBatch
+    from swarm_loc_estimator.common.messages.streams import MessageBatch
 
 RawMessage = tuple[str, str, int, bytes]  # Topic, type, log time [ns], serialized message
 

@@ -27,7 +27,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from typing_extensions import Self
 
 from swarm_loc_estimator.common.bags.bag_file import BagError
-from swarm_loc_estimator.common.messages.definitions import EVENT_PACKETS, MESSAGE_PACKAGE, message_folder
+from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS, MESSAGE_PACKAGE, message_folder
 
 if TYPE_CHECKING:
     from pathlib import Path

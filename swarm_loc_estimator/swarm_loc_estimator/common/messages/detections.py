@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import (
+    ANONYMOUS_DETECTION,
+    ANONYMOUS_DETECTIONS,
+    BRIGHTNESS,
+    DETECTION,
+    DETECTIONS,
+    ROBOT_IDENTITIES,
     SECOND_NS,
+    SWARM_DETECTIONS,
+    SWARM_FIXES,
+    SWARM_ODOMETRY,
     CdrError,
     Rows,
     decode,
@@ -19,17 +28,6 @@ from swarm_loc_estimator.common.messages.cdr import (
     nanoseconds,
     renamed,
     row_dtype,
-)
-from swarm_loc_estimator.common.messages.definitions import (
-    ANONYMOUS_DETECTION,
-    ANONYMOUS_DETECTIONS,
-    BRIGHTNESS,
-    DETECTION,
-    DETECTIONS,
-    ROBOT_IDENTITIES,
-    SWARM_DETECTIONS,
-    SWARM_FIXES,
-    SWARM_ODOMETRY,
 )
 
 DETECTION_DTYPE = renamed(

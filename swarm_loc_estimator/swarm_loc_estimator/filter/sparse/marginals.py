@@ -9,8 +9,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.filter.sparse.factor import Derived
-from swarm_loc_estimator.filter.sparse.parameters import Groups, Moves
-from swarm_loc_estimator.filter.sparse.translation_adjoint import translation_adjoints
+from swarm_loc_estimator.filter.sparse.parameters import Groups, Moves, translation_adjoints
 from swarm_loc_estimator.swarm.calibration_states import BLOCKS, DRIVES
 
 _DRIVEN = slice(3, 3 + DRIVES)

@@ -1,4 +1,13 @@
-"""The sparse filter: errors of bodies and parameters, a Gaussian on the chordal pattern of recent pairs."""
+"""The sparse filter: errors of bodies and parameters, a Gaussian on the chordal pattern of recent pairs.
+
+Low-rank correction: errors that far bodies share, through copies of the errors of some bodies.
+
+    x_i = G_i a + y_i,
+
+where a are independent combinations, of unit variance, of the errors of the copies, and y is independent of a
+and represented by the factor. Measurements of x have information T about y, T G about both, and G^T T G about
+a: y is eliminated with T G on the right-hand side, and a is one dense block at the end.
+"""
 
 from __future__ import annotations
 
@@ -6,39 +15,194 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.jit import cached_njit, reassociated_njit
+from swarm_loc_estimator.common.small_matrix import invert_factor
 from swarm_loc_estimator.filter.joint_filter import Robots
-from swarm_loc_estimator.filter.sparse import low_rank_correction as copies
-from swarm_loc_estimator.filter.sparse.elimination import Prior, eliminate
 from swarm_loc_estimator.filter.sparse.factor import (
     EMPTY,
     Derived,
     Factor,
+    Prior,
+    add_rows,
+    eliminate,
+    solve,
     with_derived,
     write_fronts,
     write_rows,
 )
 from swarm_loc_estimator.filter.sparse.marginals import Marginals, derived_by
-from swarm_loc_estimator.filter.sparse.neighbours import spread
-from swarm_loc_estimator.filter.sparse.ordering import Ordering, Situation, ordered
+from swarm_loc_estimator.filter.sparse.ordering import (
+    Ordering,
+    Pattern,
+    Situation,
+    ordered,
+    spread,
+    wanted_rows,
+)
 from swarm_loc_estimator.filter.sparse.parameters import (
     Groups,
+    Information,
     active_blocks,
     block_pairs,
-    move,
-    moved_shares,
-)
-from swarm_loc_estimator.filter.sparse.symbolic import Pattern, wanted_rows
-from swarm_loc_estimator.filter.sparse.translation_adjoint import (
     carried,
     carried_pairs,
     centres,
     information_of,
+    move,
+    moved_shares,
     summed,
     translation_adjoints,
 )
 from swarm_loc_estimator.swarm.calibration_states import BLOCKS, ParameterTable
+
+_COPY_SPREAD = np.diag(np.square([3e-5, 3e-5, 3e-4]))
+"""Variance of a copy given its body [m^2], [m^2], [rad^2]."""
+_PANELS = 4
+
+
+def with_derived_shares(shares: FloatArray, derived: tuple[Derived, ...]) -> FloatArray:
+    """G (n, 3, k) with the shares of more bodies appended."""
+    if not derived:
+        return shares
+    out = np.concatenate([shares, np.zeros((len(derived), *shares.shape[1:]))])
+    for k, one in enumerate(derived):
+        others = out[one.others].reshape(3 * one.others.size, shares.shape[2])
+        out[len(shares) + k] = one.gain.T @ others
+    return out
+
+
+def renewed(factor: Factor, shares: FloatArray, copied: IntArray) -> FloatArray:
+    """G (n, 3, k) of new copies of bodies (m,), which replace the old copies.
+
+    k is 3 m: with fewer combinations, covariances of robots with a single landmark are too small.
+    """
+    count, size = factor.pattern.front.size, 3 * copied.size
+    columns = (3 * copied[:, None] + np.arange(3)).reshape(-1)
+    across = np.zeros((3 * count, size))
+    across[columns, np.arange(size)] = 1.0
+    solve(factor, across)
+    before = shares.reshape(3 * count, -1)
+    across += before @ before[columns].T
+    covariance = across[columns] + np.kron(np.eye(copied.size), _COPY_SPREAD)
+    _whiten(across, covariance)
+    return across.reshape(count, 3, size)
+
+
+def updated(factor: Factor, shares: FloatArray, measured: Information) -> tuple[FloatArray, FloatArray]:
+    """G after measurements, and their correction (n, 3).
+
+    Args:
+        factor: Of y, after the measurements.
+        shares: (n, 3, k) G before them.
+        measured: Information of the measurements.
+    """
+    count, _, size = shares.shape
+    before, gradient = shares.reshape(3 * count, size), measured.gradient.reshape(-1)
+    right = np.empty((3 * count, size + 1))
+    right[:, size] = gradient
+    _weigh(measured, before, right)
+    weighted = right[:, :size].copy()
+    solve(factor, right)
+    after, correction = before - right[:, :size], right[:, size]
+    if size:
+        _whiten(after, np.eye(size) + _lower_product(weighted, after))
+        correction = correction + after @ (after.T @ gradient)
+    return after.reshape(count, 3, size), correction.reshape(count, 3)
+
+
+def _lower_product(left: FloatArray, right: FloatArray) -> FloatArray:
+    """The lower triangle of left^T right for columns (n, k), in panels that skip part of the upper one."""
+    size = left.shape[1]
+    out = np.zeros((size, size))
+    for panel in np.array_split(np.arange(size), min(_PANELS, size)):
+        begin, end = panel[0], panel[-1] + 1
+        np.matmul(left[:, begin:].T, right[:, begin:end], out=out[begin:, begin:end])
+    return out
+
+
+def _whiten(columns: FloatArray, matrix: FloatArray) -> None:
+    """Multiply columns (n, k) by K^-T, in place, where K K^T is a matrix (k, k) by its lower triangle.
+
+    Uses the inverse of K: the product takes half the time of solving with this many columns.
+
+    Raises:
+        LinAlgError: The matrix is not positive definite.
+    """
+    if matrix.size:
+        inverse = np.array(matrix, order="F")
+        if not invert_factor(inverse.reshape(-1, order="F"), len(inverse)):
+            raise np.linalg.LinAlgError("the covariance of the copies is not positive definite")
+        scipy.linalg.blas.dtrmm(1.0, inverse, columns.T, lower=1, overwrite_b=1)
+
+
+@cached_njit
+def _weigh(measured: Information, shares: FloatArray, out: FloatArray) -> None:
+    """Write T G to the first columns of `out` (3 n, k + 1) for G (3 n, k)."""
+    size = shares.shape[1]
+    out[:, :size] = 0.0
+    for k in range(measured.first.size):
+        row, column, block = 3 * measured.first[k], 3 * measured.second[k], measured.block[k]
+        for i in range(3):
+            add_rows(shares[column : column + 3], block[i, 0], block[i, 1], block[i, 2], out[row + i, :size])
+            if row != column:
+                other = out[column + i, :size]
+                add_rows(shares[row : row + 3], block[0, i], block[1, i], block[2, i], other)
+
+
+@reassociated_njit
+def shared(shares: FloatArray, first: IntArray, second: IntArray) -> FloatArray:
+    """Covariances (m, 3, 3) of pairs of bodies (m,) through the copies."""
+    out = np.zeros((first.size, 3, 3))
+    for k in range(first.size):
+        for i in range(3):
+            for j in range(3):
+                total = 0.0
+                for c in range(shares.shape[2]):
+                    total += shares[first[k], i, c] * shares[second[k], j, c]
+                out[k, i, j] = total
+    return out
+
+
+@cached_njit
+def change_shared(
+    covariance: FloatArray, pattern: Pattern, place: IntArray, old: FloatArray, new: FloatArray
+) -> None:
+    """Change the covariances of y from old to new copies, for all pairs of a pattern.
+
+    Args:
+        covariance: (n, n, 3, 3) of y, changed.
+        pattern: Pairs to change.
+        place: Numbers of the pattern's bodies in `covariance`.
+        old: (n, 3, k) G of the old copies.
+        new: (n, 3, k) G of the new copies.
+    """
+    for f in range(pattern.pivot_begin.size - 1):
+        pivots = place[pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]]
+        border = place[pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]]
+        bodies = np.concatenate((border, pivots))
+        change = np.dot(_rows(old, bodies), _rows(old, pivots).T)
+        change -= np.dot(_rows(new, bodies), _rows(new, pivots).T)
+        for r in range(bodies.size):
+            for c in range(pivots.size):
+                for i in range(3):
+                    for j in range(3):
+                        value = covariance[bodies[r], pivots[c], i, j] + change[3 * r + i, 3 * c + j]
+                        covariance[bodies[r], pivots[c], i, j] = value
+                        if r < border.size:
+                            covariance[pivots[c], bodies[r], j, i] = value
+
+
+@cached_njit
+def _rows(shares: FloatArray, bodies: IntArray) -> FloatArray:
+    """The shares (3 m, k) of some bodies (m,)."""
+    out = np.empty((3 * bodies.size, shares.shape[2]))
+    for r in range(bodies.size):
+        out[3 * r : 3 * r + 3] = shares[bodies[r]]
+    return out
+
 
 _COPIES = 64
 _COPIED_SHARE = 4  # At most one of this number of bodies is copied
@@ -61,7 +225,7 @@ class _Prepared(NamedTuple):
     def covariance_of(self, first: IntArray, second: IntArray) -> FloatArray:
         """Covariances (k, 3, 3) of pairs of the pattern."""
         places, covariance = self.prior.place, self.prior.covariance
-        return covariance[places[first], places[second]] + copies.shared(self.shares, first, second)
+        return covariance[places[first], places[second]] + shared(self.shares, first, second)
 
 
 class SparseFilter:
@@ -236,7 +400,7 @@ class SparseFilter:
         active = np.flatnonzero(np.concatenate([robots.active, self._number[count:] >= 0]))
         bodies = active[self._groups.part[active] == 0]
         self._move_far(bodies, places)
-        factor, shares = with_derived(self._factor, self._new), copies.with_derived(self._shares, self._new)
+        factor, shares = with_derived(self._factor, self._new), with_derived_shares(self._shares, self._new)
         pattern = self._pattern(pairs, active, places)
         noise, moves = self._marginals.since(bodies, self._place)
         rows = wanted_rows(factor.pattern, pattern, self._number, len(self._new), moves.beside)
@@ -246,13 +410,13 @@ class SparseFilter:
         others = None
         if self._updates % _COPIED_AGAIN == 0:
             copied = bodies[spread(places[bodies], min(_COPIES, bodies.size // _COPIED_SHARE))]
-            others = copies.renewed(factor, shares, self._number[copied])
+            others = renewed(factor, shares, self._number[copied])
         if moves.any():
             move(covariance, pattern, self._number, moves)
             shares = moved_shares(shares, self._number, moves)
             others = None if others is None else moved_shares(others, self._number, moves)
         if others is not None:
-            copies.change_shared(covariance, pattern, self._number, shares, others)
+            change_shared(covariance, pattern, self._number, shares, others)
             shares = others
         self._updates += 1
         self._add_noise(covariance, bodies, noise)
@@ -321,7 +485,7 @@ class SparseFilter:
         (pattern, prior, shares, active), self._prepared = self._prepared, None
         measured = summed(information_of(columns, jacobian, innovation, noise, self._place))
         self._factor = eliminate(pattern, prior, measured)
-        self._shares, correction = copies.updated(self._factor, shares, measured)
+        self._shares, correction = updated(self._factor, shares, measured)
         count = self._number.size
         self._number = np.full(count, -1)
         self._number[active] = active
@@ -337,7 +501,7 @@ class SparseFilter:
         covariance = self._workspace.with_fronts(self._factor)
         bodies = active[self._groups.part[active] == 0]
         for (row, column), of, first, second in self._marginals.within(bodies):
-            own = covariance[first, second] + copies.shared(self._shares, first, second)
+            own = covariance[first, second] + shared(self._shares, first, second)
             own = carried_pairs(-self._place[first], own, -self._place[second])
             self.marginal[bodies[of], row, column] = own
         self._marginals.settle(bodies)

@@ -16,7 +16,7 @@ from swarm_loc_estimator.offline.calibration.fit import Calibration
 from swarm_loc_estimator.offline.calibration.noise import Score
 from swarm_loc_estimator.offline.calibration.robust import spread
 from swarm_loc_estimator.offline.report.style import INK, SOFT, TRUTH, colour_of, save, style
-from swarm_loc_estimator.swarm.motion_response import MotionResponse
+from swarm_loc_estimator.swarm.error_models import MotionResponse
 
 _BINS = 60
 _COLUMNS = 3

@@ -21,10 +21,8 @@ from scipy.spatial.transform import Rotation
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.offline.calibration.recording import Recording
-from swarm_loc_estimator.sensors.camera import FROM_OPTICAL
-from swarm_loc_estimator.sensors.sighting_kernels import CONTENT_BEARING
-from swarm_loc_estimator.swarm.swarm import FixedCamera, Swarm
-from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
+from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
+from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Swarm, UwbDevice
 
 MIN_MEASUREMENTS = 30  # Minimum number of sightings or ranges that place a camera or an anchor
 _SPELLS = 8  # Spells of time of the jackknife

@@ -19,8 +19,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.filter.measurement_model import predict
 from swarm_loc_estimator.mapping.constraints import NormalFactor
-from swarm_loc_estimator.offline.survey.problem import SurveyProblem
-from swarm_loc_estimator.offline.survey.start import Start
+from swarm_loc_estimator.offline.survey.problem import Start, SurveyProblem
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 PRIORS: FloatArray = np.array([0.01, 0.03, 0.05, 0.05, 0.02])

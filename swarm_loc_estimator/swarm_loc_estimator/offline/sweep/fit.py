@@ -13,8 +13,7 @@ import numpy as np
 from swarm_loc_estimator.common.parameters import Value
 from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.offline.sweep.grid import Fit, Job, Sweep
-from swarm_loc_estimator.offline.sweep.jobs import Line, run_sweep
-from swarm_loc_estimator.offline.sweep.workers import Backend, loaded
+from swarm_loc_estimator.offline.sweep.jobs import Backend, Line, loaded, run_sweep
 from swarm_loc_estimator.timeline.settings import Settings
 
 _AT_ONCE = 8

@@ -1,12 +1,22 @@
-"""Calibration of an infrared board from a recording with ground truth."""
+"""Calibration of an infrared board from a recording with ground truth.
+
+Fit the model of an infrared board to exchanges of robots with known relative poses.
+
+The unknowns are the amplitude law, the symmetric curves of sensors and emitters as tables, and the offset of
+each robot's heading in ground truth. Residuals are computed after a variance-stabilizing transform, with a
+robust loss. Second differences of the log curves are regularized.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+from scipy.optimize import least_squares
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
@@ -14,19 +24,315 @@ from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import Exchanges
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.solution import IrOutcome
-from swarm_loc_estimator.offline.calibration.infrared.board_fit import (
-    BoardModel,
-    BoardReadings,
-    fit_board,
-    turned,
+from swarm_loc_estimator.infrared.search import IrOutcome
+from swarm_loc_estimator.offline.calibration.infrared.element_likelihood import (
+    ElementVerdicts,
+    find_dead_elements,
 )
-from swarm_loc_estimator.offline.calibration.infrared.dead_elements import ElementVerdicts, find_dead_elements
 from swarm_loc_estimator.offline.calibration.infrared.gains import exchanges_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, RobotIr
+from swarm_loc_estimator.swarm.ir_board import (
+    Amplitude,
+    IrGains,
+    IrPlatform,
+    PairGains,
+    RobotIr,
+    TabulatedCurve,
+)
 from swarm_loc_estimator.swarm.swarm import Swarm
+
+_KNOTS = np.radians([0, 15, 30, 40, 50, 60, 70, 80, 90, 110, 135, 180])
+_TABLE = np.radians(np.arange(0, 181, 10))
+_FALLS_FROM = 5  # Index of the first knot from which curves must decrease
+_STEEPNESS, _BEND = 5.0, 0.8
+"""Weights of an increase beyond that knot, and of second differences of the log curves."""
+_YAW_SIGMA = np.radians(4.0)
+_OFFSET, _OFFSET_SIGMA, _EXPONENT, _EXPONENT_SIGMA = 0.05, 0.05, 2.5, 1.0
+_PRIOR = 3.0
+_STEP = 1e-5
+_GAIN_SIGMA, _MIN_SPREAD = 0.25, 0.01
+_MIN_MEASURED = 100  # Minimum number of exchanges of a receiver for sensor gains
+_LIMIT = 2.0  # Maximum residual after the robust loss [sigma]
+_DIM = 3.0
+"""Maximum distance from the median of readings that determine the noise [sigma]; most show no light."""
+_LIT = 8.0  # Minimum expectation of readings that determine the error of the curves [sigma]
+_OUTLIER = 3.0
+_MIN_SHARE, _MAX_SHARE = 0.02, 0.3
+_ROUNDS = 2
+_MAX_EVALUATIONS = 10
+_TO_SIGMA = 1.4826  # Standard deviation of a normal distribution per median absolute deviation
+
+
+class BoardReadings(NamedTuple):
+    """Exchanges of robots with one kind of board at full power."""
+
+    receiver: NDArray[np.int64]  # (k,) index of the robot that measured
+    transmitter: NDArray[np.int64]  # (k,) index of the robot that lit its emitters
+    readings: FloatArray  # (k, n, n) [count], [sensor, emitter], NaN where not measured or dead
+    poses: FloatArray  # (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad]
+    stamp_ns: NDArray[np.int64]  # (k,)
+
+    def select(self, rows: NDArray[np.bool_]) -> BoardReadings:
+        """The exchanges where `rows` (k,) is True."""
+        return BoardReadings._make(column[rows] for column in self)
+
+
+@dataclass(frozen=True)
+class BoardModel:
+    """A fitted board."""
+
+    platform: IrPlatform  # The board
+    sensor_gains: FloatArray  # (robots, n) gains of the receivers' sensors; 1 where not estimated
+    # (robots,) True where estimated; their spread is the platform's `element_sigma`
+    gains_sought: NDArray[np.bool_]
+    truth_yaw: FloatArray  # (robots,) heading of each robot minus that of its ground truth [rad]
+    scatter: FloatArray  # (k, n, n) residuals of the fitted readings [sigma]
+    angles: FloatArray  # (2, k, n, n) angles of the paths at sensors and emitters [rad]
+
+
+def fit_board(start: IrPlatform, data: BoardReadings, robots: int, *, gains: bool = True) -> BoardModel:
+    """Fit a board, starting from an approximate platform.
+
+    Args:
+        start: Platform that defines arrangement, saturation and initial noise.
+        data: Exchanges; poses must be finite.
+        robots: Number of robots.
+        gains: Whether to estimate gains of sensors with enough exchanges.
+    """
+    noise = round(noise_floor(data), 2)
+    platform = replace(start, noise=noise, curve_sigma=0.3, relative_noise=0.0, element_sigma=0.0)
+    unknowns = _Problem(platform, data, robots, gains=gains).first_unknowns()
+    for _ in range(_ROUNDS):
+        problem = _Problem(platform, data, robots, gains=gains)
+        unknowns = least_squares(
+            problem.residuals, unknowns, problem.slopes, x_scale="jac", max_nfev=_MAX_EVALUATIONS
+        ).x
+        platform = _with_noise(problem.platform_of(unknowns), problem, unknowns)
+    scatter = problem.scatter(unknowns)
+    yaw = problem.parts(unknowns)[3]
+    logs, sought = problem.log_gains(unknowns), problem.gains_sought
+    if sought.any():
+        spread = float(np.sqrt(np.mean(logs[sought] ** 2)))
+        platform = replace(platform, element_sigma=round(min(max(spread, _MIN_SPREAD), 1.0), 3))
+    return BoardModel(platform, np.exp(logs), sought, yaw, scatter, problem.angles(yaw)[1])
+
+
+def turned(poses: FloatArray, receiver_yaw: FloatArray, transmitter_yaw: FloatArray) -> FloatArray:
+    """Relative poses (k, 3) after adding yaw offsets (k,) to the true headings [rad]."""
+    moved: FloatArray = poses.copy()
+    moved[:, 1] = wrap_angle(poses[:, 1] - receiver_yaw)
+    moved[:, 2] = wrap_angle(poses[:, 2] + transmitter_yaw - receiver_yaw)
+    return moved
+
+
+def noise_floor(data: BoardReadings) -> float:
+    """Robust standard deviation of dark readings [count].
+
+    It is computed from differences of one element's dark readings in successive exchanges of a receiver, so
+    offset and drift of the amplifier cancel.
+    """
+    middle = float(np.nanmedian(data.readings))
+    limit = _DIM * max(_TO_SIGMA * float(np.nanmedian(np.abs(data.readings - middle))), 0.5)
+    steps = []
+    for receiver in np.unique(data.receiver).tolist():
+        rows = np.flatnonzero(data.receiver == receiver)
+        own = data.readings[rows[np.argsort(data.stamp_ns[rows], kind="stable")]]
+        dark = np.abs(own - middle) < limit
+        steps.append(np.diff(own, axis=0)[dark[1:] & dark[:-1]])
+    found = np.concatenate(steps)
+    return float(max(_robust_sigma(found) / np.sqrt(2.0), 0.5)) if found.size else 0.5
+
+
+class _Problem:
+    """The least-squares problem for a platform with fixed noise."""
+
+    def __init__(self, platform: IrPlatform, data: BoardReadings, robots: int, *, gains: bool) -> None:
+        self._platform, self._data, self._robots = platform, data, robots
+        often = np.bincount(data.receiver, minlength=robots) >= _MIN_MEASURED
+        self._often = np.flatnonzero(often & gains)
+        self.gains_sought: NDArray[np.bool_] = often & gains
+        count = len(_KNOTS)
+        flat = ((1, np.zeros(count)), (1, np.zeros(count)))
+        self._spline = CubicSpline(_KNOTS, np.eye(count), bc_type=flat)
+        self._bend = np.diff(np.eye(count), 2, axis=0) / _BEND
+        self._known = np.isfinite(data.readings)
+        self._saturated = data.readings >= platform.saturation
+        self._read = self._stable(np.clip(np.nan_to_num(data.readings), None, platform.saturation))
+        self._units = np.stack([np.cos(platform.angles), np.sin(platform.angles)], axis=-1)
+
+    def first_unknowns(self) -> FloatArray:
+        """Initial values: cosine-like curves, and the amplitude of most of the brightest readings."""
+        data = self._data
+        shape = np.log(np.interp(_KNOTS[1:], np.radians([0, 40, 90, 180]), [1.0, 0.8, 0.05, 0.01]))
+        gap = data.poses[:, 0] - 2.0 * self._platform.radius + _OFFSET
+        brightest = np.maximum(np.nan_to_num(data.readings).max(axis=(1, 2)), 1.0)
+        scale = np.median(np.log(brightest) + _EXPONENT * np.log(np.maximum(gap, 1e-3)))
+        zeros = np.zeros(self._robots + self._often.size * self._platform.n)
+        return np.concatenate([[scale, _OFFSET, _EXPONENT], shape, shape, zeros])
+
+    def parts(self, unknowns: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Law (log scale, offset, exponent), log curves of sensors and emitters at the knots, yaw."""
+        count = len(_KNOTS) - 1
+        law, sensor, emitter, rest = np.split(unknowns, [3, 3 + count, 3 + 2 * count])
+        return law, np.r_[0.0, sensor], np.r_[0.0, emitter], rest[: self._robots]
+
+    def log_gains(self, unknowns: FloatArray) -> FloatArray:
+        """Log-gains (robots, n) of sensors."""
+        n = self._platform.n
+        logs = np.zeros((self._robots, n))
+        logs[self._often] = unknowns[unknowns.size - self._often.size * n :].reshape(-1, n)
+        return logs
+
+    def angles(self, yaw: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Distances (k, n, n) [m], and angles (2, k, n, n) at sensors and emitters [rad]."""
+        data = self._data
+        return self._angles(turned(data.poses, yaw[data.receiver], yaw[data.transmitter]))
+
+    def _angles(self, poses: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Distances and angles, as `angles` returns them, at relative poses (k, 3)."""
+        rho, ahead = self._platform.radius, np.array(self._platform.angles)
+        distance, bearing, heading = poses.T
+        at = ahead + heading[:, None]
+        emitters = rho * np.stack([np.cos(at), np.sin(at)], axis=-1)
+        centre = distance[:, None] * np.stack([np.cos(bearing), np.sin(bearing)], axis=-1)
+        way = (centre[:, None] + emitters)[:, None] - rho * self._units[None, :, None]
+        along = np.arctan2(way[..., 1], way[..., 0])
+        sensor = np.abs(wrap_angle(along - ahead[None, :, None]))
+        emitter = np.abs(wrap_angle(along + np.pi - at[:, None]))
+        return np.hypot(way[..., 0], way[..., 1]), np.stack([sensor, emitter])
+
+    def expected(self, unknowns: FloatArray) -> FloatArray:
+        """Expected readings (k, n, n) [count]."""
+        law, sensor, emitter, yaw = self.parts(unknowns)
+        distance, (alpha, beta) = self.angles(yaw)
+        logs = law[0] - law[2] * np.log(np.maximum(distance + law[1], 1e-3))
+        logs += self.log_gains(unknowns)[self._data.receiver, :, None]
+        readings: FloatArray = np.exp(logs + self._spline(alpha) @ sensor + self._spline(beta) @ emitter)
+        return readings
+
+    def scatter(self, unknowns: FloatArray) -> FloatArray:
+        """Residuals (k, n, n) of readings [sigma]; NaN where there is no reading."""
+        more = self._read - self._stable(self.expected(unknowns))
+        more = np.where(self._saturated, np.maximum(more, 0.0), more)
+        return np.where(self._known, more, np.nan)
+
+    def residuals(self, unknowns: FloatArray) -> FloatArray:
+        """Residuals of readings after the robust loss, and of the regularization."""
+        limited = _limited(np.nan_to_num(self.scatter(unknowns)))[0]
+        return np.concatenate([limited.ravel(), self._held(unknowns)])
+
+    def slopes(self, unknowns: FloatArray) -> FloatArray:
+        """Jacobian of the residuals."""
+        data, count, n = self._data, len(_KNOTS) - 1, self._platform.n
+        law, sensor, emitter, yaw = self.parts(unknowns)
+        distance, (alpha, beta) = self.angles(yaw)
+        bright = self.expected(unknowns)
+        scatter = self.scatter(unknowns)
+        by_log = -bright / np.hypot(self._platform.noise, self._platform.relative * bright)
+        by_log = np.nan_to_num(np.where(scatter == 0.0, 0.0, by_log) * _limited(np.nan_to_num(scatter))[1])
+        by_log[~self._known] = 0.0
+        away = np.maximum(distance + law[1], 1e-3)
+        columns = np.zeros((unknowns.size, *bright.shape))
+        columns[0], columns[1], columns[2] = by_log, -by_log * law[2] / away, -by_log * np.log(away)
+        columns[3 : 3 + count] = np.moveaxis(self._spline(alpha)[..., 1:], -1, 0) * by_log
+        columns[3 + count : 3 + 2 * count] = np.moveaxis(self._spline(beta)[..., 1:], -1, 0) * by_log
+        first = 3 + 2 * count
+        for side, robots in ((0, data.receiver), (1, data.transmitter)):
+            turn = np.zeros((2, len(robots)))
+            turn[side] = _STEP
+            distance_there, (alpha_there, beta_there) = self._angles(
+                turned(data.poses, yaw[data.receiver] + turn[0], yaw[data.transmitter] + turn[1])
+            )
+            change = -law[2] * np.log(np.maximum(distance_there + law[1], 1e-3) / away)
+            change += (self._spline(alpha_there) - self._spline(alpha)) @ sensor
+            change += (self._spline(beta_there) - self._spline(beta)) @ emitter
+            columns[first + robots, np.arange(len(robots))] += by_log * change / _STEP
+        for place, robot in enumerate(self._often.tolist()):
+            rows = np.flatnonzero(data.receiver == robot)
+            for i in range(n):
+                columns[first + self._robots + place * n + i, rows, i] = by_log[rows, i]
+        return np.concatenate([columns.reshape(unknowns.size, -1).T, self._held_slopes(unknowns)])
+
+    def _held_slopes(self, unknowns: FloatArray) -> FloatArray:
+        """Jacobian of the regularization by finite differences, which are cheap here."""
+        here, slopes = self._held(unknowns), []
+        for k in range(unknowns.size):
+            ahead = unknowns.copy()
+            ahead[k] += _STEP
+            slopes.append((self._held(ahead) - here) / _STEP)
+        return np.stack(slopes, axis=1)
+
+    def _held(self, unknowns: FloatArray) -> FloatArray:
+        """Residuals of the regularization and the priors."""
+        law, sensor, emitter, yaw = self.parts(unknowns)
+        held = [self._bend @ sensor, self._bend @ emitter, yaw / _YAW_SIGMA]
+        held += [
+            _STEEPNESS * np.maximum(np.diff(curve)[_FALLS_FROM - 1 :], 0.0) for curve in (sensor, emitter)
+        ]
+        held.append(self.log_gains(unknowns)[self._often].ravel() / _GAIN_SIGMA)
+        held.append((law[1:] - [_OFFSET, _EXPONENT]) / [_OFFSET_SIGMA, _EXPONENT_SIGMA])
+        return _PRIOR * np.concatenate(held)
+
+    def platform_of(self, unknowns: FloatArray) -> IrPlatform:
+        """The platform with the law and curves of these unknowns."""
+        law, sensor, emitter, _ = self.parts(unknowns)
+        amplitude = Amplitude(float(np.exp(law[0])), float(law[1]), float(law[2]), nearest=_nearest(law[1]))
+        return replace(
+            self._platform,
+            sensor=self._curve(sensor),
+            emitter=self._curve(emitter),
+            amplitudes=(amplitude, *self._platform.amplitudes[1:]),
+        )
+
+    def _curve(self, logs: FloatArray) -> TabulatedCurve:
+        """A symmetric table that decreases beyond its maximum."""
+        values = np.exp(self._spline(_TABLE) @ logs)
+        top = int(values.argmax())
+        values[top:] = np.minimum.accumulate(values[top:])
+        both = np.concatenate([values[:0:-1], values]).round(4)
+        angles = np.concatenate([-_TABLE[:0:-1], _TABLE]).round(5)
+        return TabulatedCurve(tuple(angles.tolist()), tuple(both.tolist()))
+
+    def _stable(self, values: FloatArray) -> FloatArray:
+        """Variance-stabilizing transform of brightness [sigma]."""
+        relative, noise = self._platform.relative, self._platform.noise
+        return np.asarray(np.arcsinh(relative * values / noise) / relative)
+
+
+def _limited(values: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Residuals after the robust loss, and their derivatives by the residuals."""
+    part = np.exp(-(values**2) / (2.0 * _LIMIT**2))
+    size = np.sqrt(2.0 * _LIMIT**2 * (1.0 - part))
+    slope = np.where(size > 1e-6, np.abs(values) * part / np.maximum(size, 1e-12), 1.0)
+    return np.sign(values) * size, slope
+
+
+def _nearest(offset: float) -> float:
+    """Minimum distance at which a law with this offset is valid [m]."""
+    return 0.0 if offset > 0.0 else 0.005 - offset
+
+
+def _with_noise(platform: IrPlatform, problem: _Problem, unknowns: FloatArray) -> IrPlatform:
+    """The platform with noise and outlier shares estimated from its residuals."""
+    expected, scatter = problem.expected(unknowns), problem.scatter(unknowns)
+    known = np.isfinite(scatter)
+    lit = known & (expected > _LIT * platform.noise) & (expected < platform.saturation)
+    relative = platform.relative * (_robust_sigma(scatter[lit]) if lit.any() else 1.0)
+    blocked = float(np.mean(scatter[lit] < -_OUTLIER)) if lit.any() else 0.0
+    bright = float(np.mean(scatter[known & ~lit] > _OUTLIER))
+    return replace(
+        platform,
+        curve_sigma=round(min(max(relative, 0.01), 1.0), 3),
+        blocked_share=round(min(max(blocked, _MIN_SHARE), _MAX_SHARE), 3),
+        bright_share=round(min(max(bright, _MIN_SHARE), _MAX_SHARE), 3),
+    )
+
+
+def _robust_sigma(values: FloatArray) -> float:
+    """Robust standard deviation about zero, from the median."""
+    return float(_TO_SIGMA * np.median(np.abs(values)))
+
 
 MAX_RANGE = 0.3  # Maximum distance of exchanges that are used [m]; farther readings are mostly noise
 _BODIES = 2.0

@@ -9,12 +9,12 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.curves import curve_at
+from swarm_loc_estimator.infrared.brightness import curve_at
 from swarm_loc_estimator.offline.calibration.infrared.board import BLOCKS, BoardCalibration, BoardRecording
-from swarm_loc_estimator.offline.calibration.infrared.dead_elements import ElementVerdicts
+from swarm_loc_estimator.offline.calibration.infrared.element_likelihood import ElementVerdicts
 from swarm_loc_estimator.offline.calibration.infrared.gains import BoardFit, InfraredCalibration, rms
 from swarm_loc_estimator.offline.report.style import INK, SOFT, TRUTH, colour_of, save, style
-from swarm_loc_estimator.swarm.ir_curves import AngleCurve
+from swarm_loc_estimator.swarm.ir_board import AngleCurve
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 _REACH = 6.0

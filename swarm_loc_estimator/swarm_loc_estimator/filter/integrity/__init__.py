@@ -1,1 +1,0 @@
-"""Integrity: fault detection, noise inflation and loss of track."""
