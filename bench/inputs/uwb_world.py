@@ -15,8 +15,8 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import RANGES, encode
 from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
+from swarm_loc_estimator.filter.measurements import concatenate, select
 from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.sensor import chosen, joined
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Anchor, Robot, StartSigma, Swarm, UwbDevice
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
@@ -156,8 +156,8 @@ def _measured(world: UwbWorld, rng: np.random.Generator) -> Ranges:
         parts.append(
             Ranges(steps, np.full_like(steps, robot), np.full_like(steps, device), distance, arrivals_ns)
         )
-    ranges = joined(parts)
-    return chosen(ranges, np.lexsort((ranges.device, ranges.robot, ranges.step)))
+    ranges = concatenate(parts)
+    return select(ranges, np.lexsort((ranges.device, ranges.robot, ranges.step)))
 
 
 def _nlos(plan: Plan, count: int, rng: np.random.Generator) -> FloatArray:

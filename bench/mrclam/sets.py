@@ -13,10 +13,10 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray
 from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
 from swarm_loc_estimator.offline.datasets.mrclam import Delay, convert, read_dataset
 from swarm_loc_estimator.sensors.camera import NO_DETECTIONS
-from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -85,7 +85,7 @@ def with_two_seeing(recording: Recording, swarm: Swarm, seeing: tuple[int, int])
 
 def _masked(recording: Recording, kept: BoolArray) -> Recording:
     """The recording with only some of the detections (d,)."""
-    return replace(recording, detections=chosen(recording.detections, kept))
+    return replace(recording, detections=select(recording.detections, kept))
 
 
 def _shows_landmark(recording: Recording, swarm: Swarm) -> BoolArray:

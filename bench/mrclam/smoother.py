@@ -103,7 +103,7 @@ def _tracks_and_measurements(recording: Recording, swarm: Swarm) -> tuple[Odomet
     tracks = OdometryTracks(swarm.robots)
     driven = valid.rows["odometry"]
     tracks.extend(driven.robot, driven.stamp_ns, driven.pose)
-    return tracks, valid.measurements
+    return tracks, valid.rows["detections"]
 
 
 def _solved(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values) -> gtsam.Values:

@@ -11,12 +11,12 @@ import numpy as np
 from swarm_loc_drivers.sim.run import in_order_of_arrival
 from swarm_loc_drivers.sim.scenarios.bags import as_detections
 from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.replay import ListedSchedule, Runner
 from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.sensors.registry import Batch
-from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.timeline.estimator import Estimator
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def inputs_between(tick_ns: IntArray, **rows: Any) -> list[Batch]:
     }
     parts = []
     for k, now_ns in enumerate(tick_ns.tolist()):
-        part = {name: chosen(one, slice(*cuts[name][k : k + 2])) for name, one in rows.items()}
+        part = {name: select(one, slice(*cuts[name][k : k + 2])) for name, one in rows.items()}
         parts.append(Batch.of(now_ns, now_ns, **part))
     return parts
 

@@ -19,9 +19,8 @@ from swarm_loc_estimator.common.messages.detections import (
 )
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS, record_pair
 from swarm_loc_estimator.filter.integrity import is_kidnapped
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns
+from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
@@ -85,8 +84,7 @@ def _compile_updates() -> None:
     """Fuse no measurements: the sequential update takes as long to compile as all that comes before it."""
     swarm = _swarm(infrared=False)
     fusion = Fusion(swarm, Settings().resolved_for(swarm), OdometryTracks(swarm.robots), {})
-    none = np.zeros(0, MEASUREMENT_DTYPE)
-    fusion.step(fusion.new_state(), none, np.zeros(0, np.uint8), np.zeros(0))
+    fusion.step(fusion.new_state(), NO_MEASUREMENTS, [], np.zeros(0, np.uint8), np.zeros(0))
 
 
 def precompile_infrared() -> None:
@@ -150,8 +148,6 @@ def _call_rare(swarm: Swarm) -> None:
     """What is called once something contradicts, or once many infrared exchanges are fused together."""
     state = SwarmState(ParameterTable.of(swarm.robots, swarm.surveyed), pairs=2)
     is_kidnapped(state.integrity, 0)
-    columns = MeasurementColumns.of(np.zeros(2, MEASUREMENT_DTYPE))
-    record_pair(columns, 0, state.arrays(), np.zeros((PAIR_ROWS, 3)))
 
 
 def _light() -> FloatArray:

@@ -15,6 +15,7 @@ from rosbags.serde import SerdeError
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
+from swarm_loc_estimator.filter.measurements import concatenate
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
@@ -23,10 +24,9 @@ from swarm_loc_estimator.sensors.registry import (
     Batch,
     InputConverter,
     InputTopic,
-    Measurements,
     live_topics,
 )
-from swarm_loc_estimator.sensors.sensor import DropCounts, joined
+from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradicted, Contradiction
 from swarm_loc_estimator.timeline.estimate import Status
@@ -131,10 +131,12 @@ class Evidence:
     @cached_property
     def _joined(self) -> dict[str, Any]:
         parts = self.read[0]
-        return {name: joined([one.nothing, *(part[name] for part in parts)]) for name, one in SENSORS.items()}
+        return {
+            name: concatenate([one.nothing, *(part[name] for part in parts)]) for name, one in SENSORS.items()
+        }
 
     @cached_property
-    def converted(self) -> tuple[list[Measurements], DropCounts]:
+    def converted(self) -> tuple[list[Batch], DropCounts]:
         """The measurements of all readings, and numbers of readings that cannot be used."""
         converter = InputConverter(self.swarm, SETTINGS)
         return [converter.convert(part) for part in self.read[0]], converter.drops
@@ -143,14 +145,14 @@ class Evidence:
     def odometry(self) -> OdometryRows:
         """All valid odometry."""
         found = (part.rows.get("odometry", NO_ODOMETRY) for part in self.converted[0])
-        rows: OdometryRows = joined([NO_ODOMETRY, *found])
+        rows: OdometryRows = concatenate([NO_ODOMETRY, *found])
         return rows
 
     @cached_property
     def turn_rates(self) -> TurnRateRows:
         """All valid turn rates of gyroscopes."""
         found = (part.rows.get("imu", NO_TURN_RATES) for part in self.converted[0])
-        rows: TurnRateRows = joined([NO_TURN_RATES, *found])
+        rows: TurnRateRows = concatenate([NO_TURN_RATES, *found])
         return rows
 
     @cached_property

@@ -19,10 +19,10 @@ from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.doctor.evidence import Evidence, Finding
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
 from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot
 
 _WINDOW_NS = 6_000_000_000  # Odometry is trusted this long
@@ -54,11 +54,11 @@ _WRONG: MappingProxyType[str, Change] = MappingProxyType(
 
 def _check_turns(evidence: Evidence, index: int, own: OdometryRows) -> Iterator[Finding]:
     """Turns of a gyroscope beside those of the wheels."""
-    rates = chosen(evidence.turn_rates, evidence.turn_rates.robot == index)
+    rates = select(evidence.turn_rates, evidence.turn_rates.robot == index)
     if rates.stamp_ns.size < _MIN_ROWS or own.robot.size < _MIN_ROWS:
         return
     order, by = np.argsort(own.stamp_ns, kind="stable"), np.argsort(rates.stamp_ns, kind="stable")
-    own, rates = chosen(own, order), chosen(rates, by)
+    own, rates = select(own, order), select(rates, by)
     passed_s = 1e-9 * np.diff(rates.stamp_ns)
     turned = np.append(0.0, np.cumsum(0.5 * (rates.rate[1:] + rates.rate[:-1]) * passed_s))
     begin_ns = max(own.stamp_ns[0], rates.stamp_ns[0])
@@ -91,7 +91,7 @@ def check_motion(evidence: Evidence) -> Iterator[Finding]:
     """Sightings of landmarks agree with odometry."""
     rows = evidence.odometry
     for index, robot in enumerate(evidence.swarm.robots):
-        own, camera = chosen(rows, rows.robot == index), robot.camera
+        own, camera = select(rows, rows.robot == index), robot.camera
         yield from _check_turns(evidence, index, own)
         if camera is None:
             continue

@@ -72,7 +72,8 @@ from swarm_loc_estimator.common.small_matrix import (
 )
 from swarm_loc_estimator.filter.belief import BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.filter.integrity import find_pair
-from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementArray, MeasurementColumns
+from swarm_loc_estimator.filter.measurements import Measurements
+from swarm_loc_estimator.filter.models import POLAR
 from swarm_loc_estimator.odometry.track_arrays import OdometrySample
 
 PAIR_ROWS = 10  # Rows of three numbers stored per pair
@@ -86,18 +87,16 @@ _STATIONARY_SIGMA = 1e-4
 _NEGLIGIBLE = 1e-8  # Share of the information of a measurement that is neglected
 
 
-def at_initialization(measurement: MeasurementArray) -> MeasurementArray:
-    """A measurement (1,) with the inflated noise for initialization; fixes are returned unchanged."""
-    if measurement["observer"][0] < 0 or not (measurement["systematic_share"] > 0.0).any():
-        return measurement
-    wider: MeasurementArray = measurement.copy()
-    wider["covariance"] *= _INITIAL_INFLATION
-    return wider
+def at_initialization(one: Measurements) -> Measurements:
+    """A row of measurements with the inflated noise for initialization; fixes are returned unchanged."""
+    if one.observer < 0 or not (one.systematic_share > 0.0).any():
+        return one
+    return one._replace(covariance=one.covariance * _INITIAL_INFLATION)
 
 
 @inlined_njit
 def use_mean(
-    measurements: MeasurementColumns,
+    measurements: Measurements,
     k: int,
     belief: BeliefArrays,
     poses: FloatArray,
@@ -120,10 +119,10 @@ def use_mean(
         noise: (3, 3) covariance of the measurement, changed.
         pair: (PAIR_ROWS, 3) written: the memory of the pair if the measurement is used.
     """
-    place = _place(measurements, k, belief)
+    observer, target = measurements.observer[k], measurements.target[k]
+    place = _place(belief, observer, target, measurements.systematic_share[k])
     if place < 0:
         return
-    observer, target = measurements.observer[k], measurements.target[k]
     _write_track(belief.transform[observer], poses[0], pair[_OBSERVER])
     _write_track(belief.transform[target], poses[1], pair[_TARGET])
     pair[_NOISE, 0] = _gathered(belief.preintegrated_covariance[observer])
@@ -328,63 +327,53 @@ def _gathered(covariance: FloatArray) -> float:
 
 
 @cached_njit
-def record_pair(measurements: MeasurementColumns, k: int, belief: BeliefArrays, pair: FloatArray) -> None:
+def record_pair(measurements: Measurements, k: int, belief: BeliefArrays, pair: FloatArray) -> None:
     """Store the memory of a pair (PAIR_ROWS, 3) that `use_mean` has written, once its measurement is used."""
-    place = _place(measurements, k, belief)
+    observer, target = measurements.observer[k], measurements.target[k]
+    place = _place(belief, observer, target, measurements.systematic_share[k])
     if place >= 0:
-        _keep(measurements, k, belief, place, pair)
+        _keep(belief, observer, target, measurements.stamp_ns[k], place, pair)
 
 
 @cached_njit
-def record_constraint(
-    measurements: MeasurementColumns, k: int, belief: BeliefArrays, tracks: OdometrySample
-) -> None:
+def record_constraint(one: Measurements, belief: BeliefArrays, tracks: OdometrySample) -> None:
     """Store a measurement that may initialize a robot, with correlated initial error.
 
     Args:
-        measurements: (m,).
-        k: Index of the measurement.
+        one: A row of measurements.
         belief: Its memory of pairs is changed.
         tracks: (2,) of observer and target.
     """
-    place = _place(measurements, k, belief)
+    observer: int = one.observer  # type: ignore[assignment]  # of a row, these are scalars
+    target: int = one.target  # type: ignore[assignment]
+    place = _place(belief, observer, target, one.systematic_share)
     if place < 0:
         return
-    pair, noise = np.zeros((PAIR_ROWS, 3)), measurements.covariance[k].copy()
-    assign(pair[_MEAN], measurements.value[k])
+    pair, noise = np.zeros((PAIR_ROWS, 3)), one.covariance.copy()
+    assign(pair[_MEAN], one.value)
     assign_matrix(pair[_OBSERVER : _TARGET + 1], tracks.pose)
     pair[_NOISE, 0], pair[_NOISE, 1] = _gathered(tracks.covariance[0]), _gathered(tracks.covariance[1])
     for i in range(3):
-        again = min(measurements.systematic_share[k, i], 1.0) * noise[i, i]
+        again = min(one.systematic_share[i], 1.0) * noise[i, i]
         pair[_RANDOM, i], pair[_SYSTEMATIC, i] = noise[i, i] - again, again
         pair[_VARIANCE, i] = noise[i, i]
     _start_mean(noise, pair)
     for i in range(3):
         pair[_VARIANCE, i] = noise[i, i]
-    _keep(measurements, k, belief, place, pair)
+    _keep(belief, observer, target, one.stamp_ns, place, pair)  # type: ignore[arg-type]
 
 
 @inlined_njit
-def _place(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
-    """Slot of the pair of measurement k, or of the oldest pair; -1: no systematic errors."""
+def _place(belief: BeliefArrays, observer: int, target: int, share: FloatArray) -> int:
+    """Slot of a pair, or of the oldest pair; -1: no pair, or no systematic errors."""
     places, best = belief.pair_robot.shape[1], 0
-    if places == 0 or measurements.observer[k] < 0 or measurements.target[k] < 0:
+    if places == 0 or observer < 0 or target < 0:
         return -1
-    if (
-        not max(
-            measurements.systematic_share[k, 0],
-            measurements.systematic_share[k, 1],
-            measurements.systematic_share[k, 2],
-        )
-        > 0.0
-    ):
+    if not max(share[0], share[1], share[2]) > 0.0:
         return -1
-    robots, stamps_ns = (
-        belief.pair_robot[measurements.observer[k]],
-        belief.pair_stamp_ns[measurements.observer[k]],
-    )
+    robots, stamps_ns = belief.pair_robot[observer], belief.pair_stamp_ns[observer]
     for place in range(places):
-        if robots[place] == measurements.target[k]:
+        if robots[place] == target:
             return place
         if stamps_ns[place] < stamps_ns[best]:
             best = place
@@ -393,21 +382,20 @@ def _place(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> in
 
 @inlined_njit
 def _keep(
-    measurements: MeasurementColumns, k: int, belief: BeliefArrays, place: int, pair: FloatArray
+    belief: BeliefArrays, observer: int, target: int, stamp_ns: int, place: int, pair: FloatArray
 ) -> None:
-    """Write the memory of the pair of measurement k (PAIR_ROWS, 3)."""
-    observer = measurements.observer[k]
-    belief.pair_robot[observer, place] = measurements.target[k]
-    belief.pair_stamp_ns[observer, place] = measurements.stamp_ns[k]
+    """Write the memory of a pair (PAIR_ROWS, 3)."""
+    belief.pair_robot[observer, place] = target
+    belief.pair_stamp_ns[observer, place] = stamp_ns
     assign_matrix(belief.pair_history[observer, place], pair)
 
 
-def without_repeats(measurements: MeasurementArray) -> list[slice]:
+def without_repeats(measurements: Measurements) -> list[slice]:
     """Split measurements (m,) into parts with at most one correlated measurement per pair or robot."""
     edges, seen = [0], set[tuple[int, int]]()
-    comes_again: BoolArray = measurements["systematic_share"].max(axis=1) > 0.0
+    comes_again: BoolArray = measurements.systematic_share.max(axis=1) > 0.0
     if comes_again.any():
-        pairs = zip(measurements["observer"].tolist(), measurements["target"].tolist(), strict=True)
+        pairs = zip(measurements.observer.tolist(), measurements.target.tolist(), strict=True)
         for k, pair in itertools.compress(enumerate(pairs), comes_again):
             if pair in seen:
                 edges.append(k)
@@ -423,7 +411,7 @@ _ROUNDING = 1e-12
 
 @cached_njit
 def count_repeated(
-    measurements: MeasurementColumns,
+    measurements: Measurements,
     k: int,
     belief: BeliefArrays,
     predicted: FloatArray,
@@ -450,7 +438,7 @@ def count_repeated(
         2 if measurements.target[k] >= 0 else 1,
     )
     state, after, wider = belief.integrity, np.zeros((2, 3, 3)), np.empty((2, 3, 3))
-    kept = _kept(state, robots[0], place, measurements.kind[k], predicted)
+    kept = _kept(state, robots[0], place, measurements.model[k], predicted)
     for i in range(sides):
         own_gain = gain[:, 3 * i : 3 * i + 3].T
         left, own = _left(own_gain, jacobian, i, i), state.repeated[robots[i]]
@@ -513,10 +501,10 @@ def _left(gain: FloatArray, jacobian: FloatArray, i: int, j: int) -> FloatArray:
 
 
 @cached_njit
-def _kept(state: IntegrityArrays, observer: int, place: int, kind: int, predicted: FloatArray) -> float:
+def _kept(state: IntegrityArrays, observer: int, place: int, model: int, predicted: FloatArray) -> float:
     """Share of the repeated error that is left after the motion since the last sighting of the pair."""
     x, y, last = predicted[0], predicted[1], state.repeated_at[observer, place]
-    if kind == POLAR:
+    if model == POLAR:
         x, y = predicted[0] * math.cos(predicted[1]), predicted[0] * math.sin(predicted[1])
     moved = math.hypot(x - last[0], y - last[1])
     last[0], last[1] = x, y

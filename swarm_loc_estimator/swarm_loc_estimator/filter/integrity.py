@@ -33,7 +33,8 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays, covariance_within
-from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementColumns, has_kernel
+from swarm_loc_estimator.filter.measurements import Loss, Measurements
+from swarm_loc_estimator.filter.models import POLAR, has_kernel
 from swarm_loc_estimator.filter.prediction import LOG_SCALES, WINDOWS
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW
 from swarm_loc_estimator.swarm.error_models import SensorModel
@@ -54,7 +55,7 @@ _LINK_TREND = 5.0
 
 @inlined_njit
 def assess_link(
-    measurements: MeasurementColumns, k: int, belief: BeliefArrays, distance: float, whitened: float
+    measurements: Measurements, k: int, belief: BeliefArrays, distance: float, whitened: float
 ) -> float:
     """Update the evidence against the pair of measurement k of a model without a kernel.
 
@@ -136,7 +137,7 @@ def forget_trend(state: IntegrityArrays, observer: int, place: int) -> None:
 
 
 @inlined_njit
-def find_pair(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
+def find_pair(measurements: Measurements, k: int, belief: BeliefArrays) -> int:
     """The slot of the pair of measurement k; -1: it has none, or it is no pair."""
     observer, source = measurements.observer[k], source_of(measurements, k, belief)
     if observer >= 0 and source >= 0:
@@ -167,12 +168,12 @@ def new_pair(state: IntegrityArrays, observer: int, source: int) -> int:
 
 
 @inlined_njit
-def source_of(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> int:
+def source_of(measurements: Measurements, k: int, belief: BeliefArrays) -> int:
     """The source of measurement k: a robot, N + l for landmark l, or -1.
 
     N + L more for a model without a kernel.
     """
-    landmark: int = measurements.landmark[k] - 1
+    landmark: int = measurements.landmark[k]
     target: int = measurements.target[k]
     source = belief.tracked.size + landmark if landmark >= 0 else target
     is_link = source >= 0 and not has_kernel(measurements, k)
@@ -185,7 +186,7 @@ _SUSPECT_UNITS, MAX_UNITS = 2.0, 5.0
 
 
 @inlined_njit
-def stamp_variance(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> float:
+def stamp_variance(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
     """Variance of the stamp of measurement k, as described and with inflation [s^2]."""
     variance: float = measurements.stamp_variance[k]
     observer = measurements.observer[k]
@@ -195,15 +196,13 @@ def stamp_variance(measurements: MeasurementColumns, k: int, belief: BeliefArray
 
 
 @inlined_njit
-def add_noise_inflation(
-    measurements: MeasurementColumns, k: int, belief: BeliefArrays, noise: FloatArray
-) -> None:
+def add_noise_inflation(measurements: Measurements, k: int, belief: BeliefArrays, noise: FloatArray) -> None:
     """Add the noise inflation of its observer to the noise (3, 3) of measurement k."""
     observer = measurements.observer[k]
     units = belief.integrity.noise_inflation[observer] if observer >= 0 else 0.0
     if units > 0.0:
         noise[0, 0] += (units * _POSITION_SIGMA) ** 2
-        noise[1, 1] += (units * (_BEARING_SIGMA if measurements.kind[k] == POLAR else _POSITION_SIGMA)) ** 2
+        noise[1, 1] += (units * (_BEARING_SIGMA if measurements.model[k] == POLAR else _POSITION_SIGMA)) ** 2
         noise[2, 2] += (units * _HEADING_SIGMA) ** 2
 
 
@@ -298,7 +297,7 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
 
 @inlined_njit
 def assess(
-    measurements: MeasurementColumns,
+    measurements: Measurements,
     k: int,
     belief: BeliefArrays,
     max_fault_score: float,
@@ -377,7 +376,7 @@ def excluded_pairs(state: IntegrityArrays, now_ns: int) -> list[tuple[int, int]]
 
 
 @inlined_njit
-def is_excluded(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> bool:
+def is_excluded(measurements: Measurements, k: int, belief: BeliefArrays) -> bool:
     """Whether the pair of measurement k is excluded."""
     observer, place = measurements.observer[k], find_pair(measurements, k, belief)
     aside: bool = place >= 0 and belief.integrity.evidence[observer, place] >= EXCLUDED
@@ -385,9 +384,9 @@ def is_excluded(measurements: MeasurementColumns, k: int, belief: BeliefArrays) 
 
 
 @inlined_njit
-def cause_of(kind: int, innovation: FloatArray, predicted: FloatArray) -> int:
+def cause_of(model: int, innovation: FloatArray, predicted: FloatArray) -> int:
     """Smallest cause that explains an innovation (3,) of a prediction (3,), of the three above."""
-    if kind == POLAR:
+    if model == POLAR:
         distance, along, across = predicted[0], abs(innovation[0]), abs(innovation[1]) * predicted[0]
     else:
         distance = math.hypot(predicted[0], predicted[1])
@@ -399,11 +398,11 @@ def cause_of(kind: int, innovation: FloatArray, predicted: FloatArray) -> int:
 
 
 @inlined_njit
-def small_variances(kind: int, predicted: FloatArray) -> tuple[float, float]:
+def small_variances(model: int, predicted: FloatArray) -> tuple[float, float]:
     """Variances of position errors too small to be outliers: forward or range, left or bearing."""
-    distance = predicted[0] if kind == POLAR else math.hypot(predicted[0], predicted[1])
+    distance = predicted[0] if model == POLAR else math.hypot(predicted[0], predicted[1])
     small = (_SMALL_M + _SMALL_SHARE * abs(distance)) ** 2
-    return small, (small / max(distance * distance, 1e-6) if kind == POLAR else small)
+    return small, (small / max(distance * distance, 1e-6) if model == POLAR else small)
 
 
 @inlined_njit
@@ -483,7 +482,7 @@ def _outliers(state: IntegrityArrays, node: int, now_ns: int) -> tuple[int, floa
 
 
 @inlined_njit
-def noise_of_frequent_looks(measurements: MeasurementColumns, k: int, belief: BeliefArrays) -> float:
+def noise_of_frequent_looks(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
     """Factor on the noise of measurement k that follows closely on another one of its pair."""
     observer, place = measurements.observer[k], find_pair(measurements, k, belief)
     if place < 0:
@@ -492,6 +491,7 @@ def noise_of_frequent_looks(measurements: MeasurementColumns, k: int, belief: Be
     return _INDEPENDENT_NS / since_ns if 0 < since_ns < _INDEPENDENT_NS else 1.0
 
 
+_GATED, _OFF_FIXES = int(Loss.GATED), int(Loss.OFF_FIXES)
 CONFIRMED = 2  # Number of agreeing sightings after which an assumed pose counts as known
 WELL_CONFIRMED = 12
 _SUSPECT_SCORE = 2.0
@@ -516,7 +516,7 @@ class LossLimits(NamedTuple):
 
 
 @inlined_njit
-def confirm(measurements: MeasurementColumns, k: int, belief: BeliefArrays, accepted: bool) -> int:
+def confirm(measurements: Measurements, k: int, belief: BeliefArrays, accepted: bool) -> int:
     """Check measurement k against assumed poses; return a robot that is kidnapped, or -1."""
     observer, target = measurements.observer[k], measurements.target[k]
     known = belief.integrity.confirmations
@@ -575,14 +575,14 @@ def count_seen(state: IntegrityArrays, robot: int) -> None:
 
 @inlined_njit
 def count_gated(
-    measurements: MeasurementColumns, k: int, belief: BeliefArrays, accepted: bool, limits: LossLimits
-) -> int:
-    """Count fixes and gated measurements; return a robot with too many gated in a row, or -1.
+    measurements: Measurements, k: int, belief: BeliefArrays, accepted: bool, limits: LossLimits
+) -> tuple[int, int]:
+    """Count fixes and gated measurements; return a robot that is lost by too many in a row, or -1, and why.
 
     One source alone counts at most four times a second.
     """
     observer, target = measurements.observer[k], measurements.target[k]
-    lost, state = -1, belief.integrity
+    lost, why, state = -1, 0, belief.integrity
     for side in (observer, target):
         if side >= 0:
             source = source_of(measurements, k, belief) if side == observer else observer
@@ -593,14 +593,14 @@ def count_gated(
                 state.gated_in_a_row[side] += 1
                 state.gated_source[side], state.gated_ns[side] = source, now_ns
             if state.gated_in_a_row[side] >= limits.gated_in_a_row:
-                lost = side
+                lost, why = side, _GATED
     if observer < 0 and not accepted and _is_off_its_fixes(state, target, measurements.stamp_ns[k]):
-        lost = target
+        lost, why = target, _OFF_FIXES
     if accepted and (observer < 0 or target < 0):
         fixed = max(observer, target)
         state.gated_fixes[fixed] = 0
         belief.last_fix_ns[fixed] = max(belief.last_fix_ns[fixed], measurements.stamp_ns[k])
-    return lost
+    return lost, why
 
 
 @cached_njit

@@ -41,7 +41,6 @@ from swarm_loc_estimator.filter.belief import (
     own_column,
     own_covariance,
 )
-from swarm_loc_estimator.filter.measurement_model import MeasurementColumns
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, DRIVES, TURN_BIAS
 
@@ -58,20 +57,6 @@ _MEMORY_S = 30.0  # Time constant with which likelihoods are forgotten
 _POSE_SHARE = 0.25
 """Share of the variance of the pose by which corrections scatter beyond a consistent filter's."""
 _STATIONARY_M2 = 1e-8  # Position noise of a window below which the robot has not moved [m^2]
-
-
-@cached_njit
-def learn_all(measurements: MeasurementColumns, belief: BeliefArrays, poses: FloatArray) -> None:
-    """Learn the scales of all robots that measurements (m,) involve, after their update.
-
-    Args:
-        measurements: (m,) sorted by stamp.
-        belief: Its integrity is changed.
-        poses: (m, 2, 3) observers and targets in `map` at the stamps.
-    """
-    for k in range(measurements.stamp_ns.size):
-        learn(belief, measurements.observer[k], poses[k, 0], measurements.stamp_ns[k])
-        learn(belief, measurements.target[k], poses[k, 1], measurements.stamp_ns[k])
 
 
 @cached_njit

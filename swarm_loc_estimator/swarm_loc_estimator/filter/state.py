@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityA
 from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS
 from swarm_loc_estimator.filter.integrity import inflate_all_noise, new_integrity
 from swarm_loc_estimator.filter.joint_filter import DenseFilter, JointFilter
-from swarm_loc_estimator.filter.measurement_model import NOBODY
+from swarm_loc_estimator.filter.measurements import NOBODY, Loss
 from swarm_loc_estimator.identification.memory import IdentityMemory
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.swarm.calibration_states import (
@@ -97,6 +97,9 @@ class SwarmState:
         origin: Robot whose pose was the origin when a local frame began, see `initializer.py`; IN_MAP: none.
         frame_moves: How often all poses have moved from a local frame to `map`.
         meetings: Robots that have met while nobody was located.
+        lost_why: (N,) why the robot was deinitialized last, of `Loss`; 0: it never was.
+        lost_ns: (N,) stamp of the measurement or command that showed it.
+        losses: (len(Loss) + 1,) how often robots were deinitialized, by reason.
     """
 
     def __init__(self, table: ParameterTable, pairs: int = 0, joint: JointFilter | None = None) -> None:
@@ -123,10 +126,13 @@ class SwarmState:
         self.pair_history: FloatArray = np.zeros((robots, pairs, PAIR_ROWS, 3))
         self.constraints: dict[int, NDArray[np.void]] = {}
         self.next_attempt_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
-        self.windows: dict[int, NDArray[np.void]] = {}
+        self.windows: dict[int, Any] = {}  # of `window.Window`
         self.next_window_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.images = IdentityMemory()
         self.origin, self.frame_moves, self.meetings = IN_MAP, 0, Meetings()
+        self.lost_why: IntArray = np.zeros(robots, dtype=np.int64)
+        self.lost_ns: IntArray = np.full(robots, NEVER_NS)
+        self.losses: IntArray = np.zeros(len(Loss) + 1, dtype=np.int64)
 
     def copy(self) -> SwarmState:
         """Return an independent copy."""
@@ -224,8 +230,16 @@ class SwarmState:
         self._restart_drift(tracked)
         self.integrity.excess[:], self.integrity.repeated[:] = 0.0, 0.0
 
-    def deinitialize(self, robot: int) -> None:
-        """Remove the robot from the estimate until a fix initializes it."""
+    def deinitialize(self, robot: int, why: Loss, stamp_ns: int) -> None:
+        """Remove the robot from the estimate until a fix initializes it.
+
+        Args:
+            robot: Its index.
+            why: Reason, for diagnostics.
+            stamp_ns: Stamp of the measurement or command that shows it.
+        """
+        self.lost_why[robot], self.lost_ns[robot] = why, stamp_ns
+        self.losses[why] += 1
         self._decorrelate(np.array([robot]), np.eye(3)[None])
         self._forget_pairs(robot)
         self.tracked[robot] = False

@@ -20,8 +20,8 @@ from swarm_loc_estimator.common.se2 import adjoint
 from swarm_loc_estimator.common.se2_scalar import carry, composed, moved_by_twist, wrap
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix, cholesky3, solve3
 from swarm_loc_estimator.filter.belief import BeliefArrays, covariance_within
-from swarm_loc_estimator.filter.gating import gate_threshold
-from swarm_loc_estimator.filter.measurement_model import NOBODY, POLAR, MeasurementArray
+from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
+from swarm_loc_estimator.filter.models import POLAR, gate_threshold
 from swarm_loc_estimator.filter.state import InitialPose
 
 CONSTRAINT_DTYPE = np.dtype(
@@ -84,24 +84,24 @@ THE_MAP = OtherSide(NOBODY, -1, np.zeros(3), np.zeros(3), np.zeros((3, 3)))
 
 def with_constraint(
     constraints: ConstraintArray,
-    one: MeasurementArray,
+    one: Measurements,
     camera: FloatArray,
     waiting: Waiting,
     other: OtherSide,
     window_ns: int,
 ) -> ConstraintArray:
-    """Constraints (k,) and that of a newer measurement (1,); of too many, the most redundant one is dropped.
+    """Constraints (k,) and that of a newer measurement; of too many, the most redundant one is dropped.
 
     Args:
         constraints: In order of time; not changed.
-        one: Between the robot and a localized side.
+        one: Row of a measurement between the robot and a localized side.
         camera: (2,) estimated yaw offset [rad] and scale error of its sensor.
         waiting: The robot without a pose.
         other: The localized side.
         window_ns: Age up to which constraints are kept.
     """
     out = np.empty(_MAX_CONSTRAINTS + 1, dtype=CONSTRAINT_DTYPE)
-    count = _take_over(constraints, one, window_ns, out)
+    count = _take_over(constraints, int(one.stamp_ns) - window_ns, out)
     _describe(one, camera, waiting, other, out[count : count + 1])
     if count < _MAX_CONSTRAINTS:
         return out[: count + 1]
@@ -110,13 +110,11 @@ def with_constraint(
 
 
 @cached_njit
-def _take_over(
-    constraints: ConstraintArray, one: MeasurementArray, window_ns: int, out: ConstraintArray
-) -> int:
-    """Write the constraints (k,) within the window before a measurement (1,); return their number."""
+def _take_over(constraints: ConstraintArray, oldest_ns: int, out: ConstraintArray) -> int:
+    """Write the constraints (k,) that are not older than an instant; return their number."""
     count = 0
     for k in range(constraints.size):
-        if constraints[k].stamp_ns >= one[0].stamp_ns - window_ns:
+        if constraints[k].stamp_ns >= oldest_ns:
             out[count] = constraints[k]
             count += 1
     return count
@@ -174,14 +172,14 @@ def spread_at(spread: FloatArray, x: float, y: float) -> tuple[float, float, flo
 
 @cached_njit
 def _describe(
-    measurements: MeasurementArray,
+    one: Measurements,
     camera: FloatArray,
     waiting: Waiting,
     other: OtherSide,
     constraints: ConstraintArray,
 ) -> None:
-    """Write the constraint (1,) of a measurement (1,), see `with_constraint`."""
-    one, constraint = measurements[0], constraints[0]
+    """Write the constraint (1,) of a row of measurements, see `with_constraint`."""
+    constraint = constraints[0]
     value, covariance, sensor, marker = one.value, one.covariance, one.sensor, one.marker
     sees, track = one.observer == waiting.robot, waiting.pose
     on_track, on_map = (sensor, marker) if sees else (marker, sensor)
@@ -194,7 +192,7 @@ def _describe(
         mtheta += camera[0]
     x, y, angle = value[0], value[1], ltheta if sees else mtheta
     xx, xy, yy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
-    if one.kind == POLAR:  # along and across the line of sight
+    if one.model == POLAR:  # along and across the line of sight
         x, y, angle = value[0], 0.0, angle + value[1]
         xy, yy = value[0] * xy, value[0] * value[0] * yy
     size = 1.0 / (1.0 + camera[1])
@@ -202,7 +200,7 @@ def _describe(
     cos, sin = math.cos(angle), math.sin(angle)
     x, y = cos * x - sin * y, sin * x + cos * y
     xx, xy, yy = turned(xx, xy, yy, cos, sin)
-    constraint.stamp_ns, constraint.marker_id = one.stamp_ns, one.marker_id
+    constraint.stamp_ns, constraint.marker_id = one.stamp_ns, one.reading
     constraint.other, constraint.landmark = other.robot, other.landmark
     # the measurement noise acts on the side of the sensor: on the track or on the map
     local, there, sign = (1.0, 0.0, 1.0) if sees else (0.0, 1.0, -1.0)
@@ -213,8 +211,8 @@ def _describe(
     constraint.turn = constraint.other_turn = math.nan
     if one.has_heading:
         constraint.turn = mtheta - ltheta - sign * value[2]
-    if one.has_alternative:
-        constraint.other_turn = mtheta - ltheta - sign * one.alternative[2]
+    if one.has_second:
+        constraint.other_turn = mtheta - ltheta - sign * one.second[2]
     constraint.turn_variance = covariance[2, 2]
     assign_matrix(constraint.track_noise, waiting.covariance)
     assign(constraint.frame, other.frame)

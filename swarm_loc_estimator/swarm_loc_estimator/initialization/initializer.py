@@ -29,14 +29,8 @@ import numpy as np
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.filter.integrity import CONFIRMED, WELL_CONFIRMED
-from swarm_loc_estimator.filter.measurement_model import (
-    NOBODY,
-    POLAR,
-    Command,
-    MeasurementArray,
-    MeasurementColumns,
-    locates_alone,
-)
+from swarm_loc_estimator.filter.measurements import NOBODY, Loss, Measurements, select
+from swarm_loc_estimator.filter.models import MODELS, locates_alone
 from swarm_loc_estimator.filter.prediction import new_scratch, predict
 from swarm_loc_estimator.filter.state import IN_MAP, InitialPose, Meetings, Starts, SwarmState
 from swarm_loc_estimator.initialization.alignment import (
@@ -53,7 +47,7 @@ from swarm_loc_estimator.initialization.alignment import (
 )
 from swarm_loc_estimator.initialization.window import (
     NO_WINDOW,
-    WINDOW_DTYPE,
+    Window,
     is_redundant,
     locate,
     with_row,
@@ -74,8 +68,8 @@ _SHORTEST_WINDOW_PAUSE_NS, _WINDOW_PAUSE_SHARE = 500_000_000, 4
 """The same for windows of measurements of one degree of freedom, whose attempts take longer."""
 
 
-Keep = Callable[[SwarmState, MeasurementArray], bool]
-"""Keeps a measurement (1,); returns whether it helps to locate a robot."""
+Keep = Callable[[SwarmState, Measurements], bool]
+"""Keeps a row of measurements; returns whether it helps to locate a robot."""
 Located = Callable[[SwarmState, int, InitialPose, Preintegrated, int], None]
 """Called with a robot, the pose of its track, the instant, and how many measurements confirm the pose."""
 
@@ -94,13 +88,13 @@ class Initializer:
         self._tracks = tracks
         self._window_ns = int(window_s * 1e9)
 
-    def note(self, state: SwarmState, one: MeasurementArray) -> bool:
-        """Keep a measurement (1,) that ties a waiting robot to something located; enough of them locate it.
+    def note(self, state: SwarmState, one: Measurements) -> bool:
+        """Keep a measurement that ties a waiting robot to something located; enough of them locate it.
 
         Returns:
             Whether the measurement does so.
         """
-        observer, target, now_ns = int(one["observer"][0]), int(one["target"][0]), int(one["stamp_ns"][0])
+        observer, target, now_ns = int(one.observer), int(one.target), int(one.stamp_ns)
         knows_observer, knows_target = state.is_known(observer), state.is_known(target)
         robot, other = (target, observer) if knows_observer else (observer, target)
         if knows_observer == knows_target or not self._tracks.has_started(robot, now_ns):
@@ -108,9 +102,9 @@ class Initializer:
         return self.constrain(state, robot, other, one, SwarmState.initialize)
 
     def constrain(
-        self, state: SwarmState, robot: int, other: int, one: MeasurementArray, located: Located
+        self, state: SwarmState, robot: int, other: int, one: Measurements, located: Located
     ) -> bool:
-        """Keep a measurement (1,) between a robot with odometry and a located side.
+        """Keep a measurement between a robot with odometry and a located side.
 
         Args:
             state: Keeps it.
@@ -122,16 +116,16 @@ class Initializer:
         Returns:
             True.
         """
-        observer, now_ns = int(one["observer"][0]), int(one["stamp_ns"][0])
-        track = self._tracks.at(np.array([robot]), one["stamp_ns"])
+        observer, now_ns = int(one.observer), int(one.stamp_ns)
+        track = self._tracks.at(np.array([robot]), np.array([now_ns]))
         at = Preintegrated(now_ns, track.covariance[0], track.jacobian[0])
-        if locates_alone(MeasurementColumns.of(one), 0) and self._is_sure(one["covariance"][0]):
+        if locates_alone(one.columns(), 0) and self._is_sure(one.covariance):
             located(state, robot, _fixed(one, track.pose[0]), at, CONFIRMED)
             return True
-        if one["kind"][0] > POLAR:
+        if MODELS[int(one.model)].initializes != "alone":
             return self._note_partial(state, one, robot, other, at, located)
         old = state.constraints.get(robot, NO_CONSTRAINTS)
-        same = old[(old["marker_id"] == one["marker_id"][0]) & (old["other"] == other)]
+        same = old[(old["marker_id"] == one.reading) & (old["other"] == other)]
         if same.size and abs(now_ns - int(same["stamp_ns"][-1])) < _INDEPENDENT_NS:
             return True
         camera = np.zeros(2) if observer == NOBODY else state.parameter[observer, [CAMERA_YAW, CAMERA_SCALE]]
@@ -152,26 +146,26 @@ class Initializer:
     def _note_partial(
         self,
         state: SwarmState,
-        one: MeasurementArray,
+        one: Measurements,
         robot: int,
         other: int,
         at: Preintegrated,
         located: Located,
     ) -> bool:
-        """Keep a measurement (1,) of one degree of freedom, see `window.py`."""
-        row = np.zeros(1, dtype=WINDOW_DTYPE)
-        row["measurement"], row["noise"] = one, at.covariance
-        row["track"] = self._tracks.at(np.array([robot]), one["stamp_ns"]).pose
+        """Keep a measurement of one degree of freedom, see `window.py`."""
+        stamp_ns, none = np.array([at.stamp_ns]), (np.zeros((1, 3)), np.zeros((1, 3, 3)))
+        track = self._tracks.at(np.array([robot]), stamp_ns).pose
         if other != NOBODY:
-            sample = self._tracks.at(np.array([other]), one["stamp_ns"])
-            row["other_track"], row["other_noise"] = sample.pose, sample.covariance
+            sample = self._tracks.at(np.array([other]), stamp_ns)
+            none = sample.pose, sample.covariance
+        row = Window(one.columns(), track, at.covariance[None], *none)
         old = state.windows.get(robot, NO_WINDOW)
         if is_redundant(old, row):
             return True
         window = state.windows[robot] = with_row(old, row, self._window_ns)
         if at.stamp_ns < state.next_window_ns[robot]:
             return True
-        first_ns = int(window["measurement"]["stamp_ns"][0])
+        first_ns = int(window.measured.stamp_ns[0])
         state.next_window_ns[robot] = at.stamp_ns + max(
             _SHORTEST_WINDOW_PAUSE_NS, (at.stamp_ns - first_ns) // _WINDOW_PAUSE_SHARE
         )
@@ -185,28 +179,27 @@ class Initializer:
         x, y, heading = np.sqrt(np.diag(covariance)).tolist()
         return bool(max(x, y) < POSITION_SIGMA and heading < self._heading_sigma)
 
-    def _located(self, state: SwarmState, other: int, one: MeasurementArray) -> OtherSide:
-        """The side of a measurement (1,) that is located, brought up to its stamp."""
-        landmark = int(one["landmark"][0]) - 1
+    def _located(self, state: SwarmState, other: int, one: Measurements) -> OtherSide:
+        """The side of a measurement that is located, brought up to its stamp."""
+        landmark = int(one.landmark)
         if landmark >= 0:
             moved = state.landmark[landmark].copy()
             return OtherSide(NOBODY, landmark, moved, moved, np.zeros((3, 3)))
         if other == NOBODY:
             return THE_MAP
-        sample = self._tracks.at(np.array([other]), one["stamp_ns"])
-        at = Preintegrated(int(one["stamp_ns"][0]), sample.covariance[0], sample.jacobian[0])
+        sample = self._tracks.at(np.array([other]), np.array([one.stamp_ns]))
+        at = Preintegrated(int(one.stamp_ns), sample.covariance[0], sample.jacobian[0])
         # so that how it erred until now is shared by all that are located by it
         predict(state.arrays(), other, at, new_scratch())
         transform = state.transform[other].copy()
         return OtherSide(other, -1, se2.compose(transform, sample.pose[0]), transform, at.covariance)
 
 
-def _fixed(one: MeasurementArray, on_track: FloatArray) -> InitialPose:
-    """The initial pose of a robot at a pose (3,) on its track by an absolute measurement (1,) of its pose."""
-    sensor, value = one["sensor"][0], one["value"][0]
-    pose = se2.compose(se2.compose(sensor, value), se2.inverse(one["marker"][0]))
-    carry = se2.adjoint(sensor)  # from errors seen by the sensor to errors in map
-    covariance = carry @ se2.error_covariance(value, one["covariance"][0]) @ carry.T
+def _fixed(one: Measurements, on_track: FloatArray) -> InitialPose:
+    """The initial pose of a robot at a pose (3,) on its track by an absolute measurement of its pose."""
+    pose = se2.compose(se2.compose(one.sensor, one.value), se2.inverse(one.marker))
+    carry = se2.adjoint(one.sensor)  # from errors seen by the sensor to errors in map
+    covariance = carry @ se2.error_covariance(one.value, one.covariance) @ carry.T
     return InitialPose(se2.compose(pose, se2.inverse(on_track)), covariance)
 
 
@@ -259,15 +252,17 @@ class ConfiguredStarts:
         covariance[~walks], jacobian[~walks] = 0.0, 0.0  # nothing is preintegrated at the start of a track
         state.start(robots, Starts(transform, error, begun_ns, covariance, jacobian))
 
-    def initialize_measured(self, state: SwarmState, measurements: MeasurementArray) -> bool:
+    def initialize_measured(self, state: SwarmState, measurements: Measurements) -> bool:
         """Initialize pending robots of measurements (m,) at their starts; return whether there were any.
 
         Not earlier: when the first odometry of a robot arrives late, only its measurements are fused again.
         """
         initialized = False
         for side in ("observer", "target"):
-            new = np.append(state.start_pending, False)[measurements[side]]  # NOBODY (-1) is the last element
-            robots, stamps_ns = measurements[side][new], measurements["stamp_ns"][new]
+            new = np.append(state.start_pending, False)[
+                getattr(measurements, side)
+            ]  # NOBODY (-1) is the last element
+            robots, stamps_ns = getattr(measurements, side)[new], measurements.stamp_ns[new]
             ready = self._may_start(state, robots, stamps_ns)
             chosen_robots, first = np.unique(robots[ready], return_index=True)
             if chosen_robots.size:
@@ -280,11 +275,10 @@ _ORIGIN_SIGMA = 1e-4
 """Standard deviation of the pose of the origin [m, rad]; not zero, so that its covariance is invertible."""
 
 
-def is_absolute(measurements: MeasurementArray) -> BoolArray:
-    """Whether measurements (m,) tie a robot to `map`: fixes, landmarks, and poses set by a user."""
-    command, landmark = measurements["command"], measurements["landmark"] > 0
-    alone = (measurements["observer"] == NOBODY) | (measurements["target"] == NOBODY)
-    return np.asarray((alone | landmark) & (command != Command.FORGET))
+def is_absolute(measurements: Measurements) -> BoolArray:
+    """Whether measurements (m,) tie a robot to `map`: fixes and landmarks."""
+    alone = (measurements.observer == NOBODY) | (measurements.target == NOBODY)
+    return np.asarray(alone | (measurements.landmark != NOBODY))
 
 
 class LocalFrame:
@@ -304,7 +298,7 @@ class LocalFrame:
         self._after_ns = round(after_s * 1e9)
         self._tracks, self._initializer = tracks, initializer
 
-    def parts(self, state: SwarmState, measurements: MeasurementArray) -> Iterator[tuple[slice, bool]]:
+    def parts(self, state: SwarmState, measurements: Measurements) -> Iterator[tuple[slice, bool]]:
         """Split measurements (m,) by what may be done with them, as the state changes in between.
 
         Yields:
@@ -322,32 +316,33 @@ class LocalFrame:
                 end = begin + 1 if absolute[begin] else begin + int(other[0]) if other.size else end
                 yield slice(begin, end), bool(absolute[begin])
                 if not state.tracked.any():
-                    self.leave(state)
+                    self.leave(state, int(measurements.stamp_ns[end - 1]))
             else:
-                end = begin + self._first_local(state, measurements[begin:], absolute[begin:])
+                end = begin + self._first_local(
+                    state, select(measurements, slice(begin, None)), absolute[begin:]
+                )
                 if end > begin:
                     yield slice(begin, end), False
                 if end < measurements.size and not state.tracked.any():
-                    self._begin(state, int(measurements["stamp_ns"][end]))
+                    self._begin(state, int(measurements.stamp_ns[end]))
             begin = end
 
     def _may_begin(self, state: SwarmState) -> bool:
         return self._is_wanted and not state.tracked.any()
 
-    def _first_local(self, state: SwarmState, measurements: MeasurementArray, absolute: BoolArray) -> int:
+    def _first_local(self, state: SwarmState, measurements: Measurements, absolute: BoolArray) -> int:
         """Index of the first measurement (of m) that a local frame may use; m if none.
 
         Notes which robots have met.
         """
         if not self._may_begin(state):
             return measurements.size
-        for k, one in enumerate(measurements):
-            stamp_ns = int(one["stamp_ns"])
+        for k, stamp_ns in enumerate(measurements.stamp_ns.tolist()):
             if absolute[k]:
                 state.meetings = Meetings()
                 continue
-            pair = (int(one["observer"]), int(one["target"]))
-            if one["command"] != Command.NONE or not self._tracks.has_started(np.array(pair), stamp_ns).all():
+            pair = (int(measurements.observer[k]), int(measurements.target[k]))
+            if not self._tracks.has_started(np.array(pair), stamp_ns).all():
                 continue
             first_ns = state.meetings.first_ns if state.meetings.pairs else stamp_ns
             if pair not in state.meetings.pairs:
@@ -367,15 +362,14 @@ class LocalFrame:
         state.initialize(robot, initial, at, WELL_CONFIRMED)
         state.origin, state.meetings = robot, Meetings()
 
-    def collect(self, state: SwarmState, one: MeasurementArray) -> bool:
-        """Keep an absolute measurement (1,) of a swarm in a local frame; enough of them move it to `map`.
+    def collect(self, state: SwarmState, one: Measurements) -> bool:
+        """Keep an absolute measurement of a swarm in a local frame; enough of them move it to `map`.
 
         Returns:
             Whether the measurement does so.
         """
-        sides = int(one["observer"][0]), int(one["target"][0])
-        robot = max(sides)
-        if not self._tracks.has_started(robot, int(one["stamp_ns"][0])):
+        robot = int(max(one.observer, one.target))
+        if not self._tracks.has_started(robot, int(one.stamp_ns)):
             return False
         return self._initializer.constrain(state, robot, NOBODY, one, self.move_to_map)
 
@@ -396,14 +390,14 @@ class LocalFrame:
             predict(state.arrays(), robot, at, new_scratch())
             state.move(robot, initial)
         else:
-            self.leave(state)
+            self.leave(state, at.stamp_ns)
             state.initialize(robot, initial, at, confirmations)
 
     @staticmethod
-    def leave(state: SwarmState) -> None:
+    def leave(state: SwarmState, stamp_ns: int) -> None:
         """Deinitialize all robots of a local frame."""
         state.origin = IN_MAP
         for other in np.flatnonzero(state.tracked).tolist():
-            state.deinitialize(other)
+            state.deinitialize(other, Loss.FRAME, stamp_ns)
         state.constraints.clear()
         state.windows.clear()

@@ -6,7 +6,7 @@ many starts. Each minimum is a hypothesis. The best one is accepted when its cov
 measurements agree with it, and every other hypothesis is much worse, also without any one of the links. So a
 mirrored pose, which fits as well until the robot turns, is not taken before.
 
-Models are used by `predict` and `innovation` alone.
+Of the models, only predictions and innovations are used.
 """
 
 from __future__ import annotations
@@ -14,24 +14,39 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MODELS
+from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, Measurements, concatenate, select
+from swarm_loc_estimator.filter.models import MODELS
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 
-WINDOW_DTYPE = np.dtype(
-    [
-        ("measurement", MEASUREMENT_DTYPE),
-        ("track", np.float64, (3,)),  # pose on the track of the waiting robot
-        ("noise", np.float64, (3, 3)),  # preintegrated covariance of this track
-        ("other_track", np.float64, (3,)),  # the same of the robot on the other side, zero if it is none
-        ("other_noise", np.float64, (3, 3)),
-    ]
-)
-WindowArray = NDArray[np.void]
-NO_WINDOW: WindowArray = np.zeros(0, dtype=WINDOW_DTYPE)
+
+class Window(NamedTuple):
+    """Measurements (k,) of one component of a waiting robot, with the tracks of both sides."""
+
+    measured: Measurements  # (k,) between it and localized sides
+    track: FloatArray  # (k, 3) pose on the track of the waiting robot
+    noise: FloatArray  # (k, 3, 3) preintegrated covariance of this track
+    other_track: FloatArray  # (k, 3) the same of the robot on the other side, zero if it is none
+    other_noise: FloatArray  # (k, 3, 3)
+
+    @property
+    def size(self) -> int:
+        """Number of measurements."""
+        return self.measured.size
+
+    def some(self, rows: BoolArray | IntArray) -> Window:
+        """Select rows."""
+        return Window(select(self.measured, rows), *(column[rows] for column in self[1:]))
+
+    def with_newest(self, row: Window) -> Window:
+        """Append a row (1,)."""
+        columns = (np.concatenate(both) for both in zip(self[1:], row[1:], strict=True))
+        return Window(concatenate([self.measured, row.measured]), *columns)
+
+
+NO_WINDOW = Window(NO_MEASUREMENTS, *(np.zeros((0, *shape)) for shape in ((3,), (3, 3), (3,), (3, 3))))
 
 _MAX_ROWS = 48
 _INDEPENDENT_NS = 100_000_000  # Measurements of one link within this time are redundant
@@ -54,16 +69,16 @@ _APART_M, _APART_RAD = 0.1, 0.1
 _MIN_SPREAD_M = 1.0
 
 
-def with_row(window: WindowArray, row: WindowArray, window_ns: int) -> WindowArray:
+def with_row(window: Window, row: Window, window_ns: int) -> Window:
     """Window (k,) and a newer row (1,), without those that are too old; of too many, the most redundant goes.
 
     It is the row that leaves the smallest gap between rows of its link, for its age.
     """
-    stamp_ns, now_ns = window["measurement"]["stamp_ns"], int(row["measurement"]["stamp_ns"][0])
-    out: WindowArray = np.concatenate([window[stamp_ns >= now_ns - window_ns], row])
+    stamp_ns, now_ns = window.measured.stamp_ns, int(row.measured.stamp_ns[0])
+    out = window.some(stamp_ns >= now_ns - window_ns).with_newest(row)
     if out.size <= _MAX_ROWS:
         return out
-    stamp_ns, link = out["measurement"]["stamp_ns"], links(out)
+    stamp_ns, link = out.measured.stamp_ns, links(out)
     least, gone = np.inf, 0
     for one in np.unique(link).tolist():
         (places,) = np.nonzero(link == one)
@@ -73,20 +88,20 @@ def with_row(window: WindowArray, row: WindowArray, window_ns: int) -> WindowArr
             k = int(np.argmin(gap))
             if gap[k] < least:
                 least, gone = float(gap[k]), int(places[k + 1])
-    return np.delete(out, gone)
+    return out.some(np.delete(np.arange(out.size), gone))
 
 
-def links(window: WindowArray) -> IntArray:
+def links(window: Window) -> IntArray:
     """Number of the link of each row (k,): equal for rows between the same bodies."""
-    one = window["measurement"]
-    sides = np.stack([one["observer"], one["target"], one["landmark"], one["marker_id"]])
+    one = window.measured
+    sides = np.stack([one.observer, one.target, one.landmark, one.reading])
     return np.unique(sides, axis=1, return_inverse=True)[1].reshape(-1)
 
 
-def is_redundant(window: WindowArray, row: WindowArray) -> bool:
+def is_redundant(window: Window, row: Window) -> bool:
     """Whether the newest row of a link follows another one of the window (k,) too closely."""
-    both = np.concatenate([window, row])
-    link, stamp_ns = links(both), both["measurement"]["stamp_ns"]
+    both = window.with_newest(row)
+    link, stamp_ns = links(both), both.measured.stamp_ns
     same = stamp_ns[:-1][link[:-1] == link[-1]]
     return bool(same.size) and int(stamp_ns[-1] - same[-1]) < _INDEPENDENT_NS
 
@@ -133,21 +148,21 @@ class Problem:
         noise: (3, 3) preintegrated covariance of its track until now.
     """
 
-    def __init__(self, state: SwarmState, robot: int, window: WindowArray, noise: FloatArray) -> None:
-        one = window["measurement"]
+    def __init__(self, state: SwarmState, robot: int, window: Window, noise: FloatArray) -> None:
+        one = window.measured
         self._window = window
-        self._sees: BoolArray = one["observer"] == robot
-        self._other: IntArray = np.where(self._sees, one["target"], one["observer"])
-        others, marks = np.maximum(self._other, 0), one["landmark"] - 1
-        self._other_pose = se2.compose(state.transform[others], window["other_track"])
+        self._sees: BoolArray = one.observer == robot
+        self._other: IntArray = np.where(self._sees, one.target, one.observer)
+        others, marks = np.maximum(self._other, 0), one.landmark
+        self._other_pose = se2.compose(state.transform[others], window.other_track)
         by_mark = marks >= 0
         self._other_pose[by_mark] = state.landmark[marks[by_mark]]
         self._other_pose[(self._other < 0) & ~by_mark] = 0.0
         self._column = np.where(self._other >= 0, 3 * self._other, -1)
         self._column[by_mark] = [state.landmark_column(mark) for mark in marks[by_mark].tolist()]
-        self._drift = noise - window["noise"]
+        self._drift = noise - window.noise
         self._link = links(window)
-        self.centre = window["track"].mean(axis=0)
+        self.centre = window.track.mean(axis=0)
         self._shared = {
             column: state.filter.block(column + np.arange(3))
             for column in np.unique(self._column[self._column >= 0]).tolist()
@@ -155,15 +170,15 @@ class Problem:
         # how much another robot's track has drifted since: independent of what is known of it now
         moved = others[self._other >= 0]
         self._other_drift = np.zeros((window.size, 3, 3))
-        drift = state.preintegrated_covariance[moved] - window["other_noise"][self._other >= 0]
+        drift = state.preintegrated_covariance[moved] - window.other_noise[self._other >= 0]
         towards = se2.adjoint(state.transform[moved])
         later = np.where(np.trace(drift, axis1=1, axis2=2) > 0.0, 1.0, -1.0)[:, None, None]
         self._other_drift[self._other >= 0] = later * towards @ drift @ np.swapaxes(towards, 1, 2)
 
     def starts(self) -> FloatArray:
         """Transforms (h, 3) to begin with: around the other sides, in all directions."""
-        one = self._window["measurement"]
-        far = np.where(self._sees[:, None], one["marker"], one["sensor"])
+        one = self._window.measured
+        far = np.where(self._sees[:, None], one.marker, one.sensor)
         far[:, 2] = 0.0
         place = se2.compose(self._other_pose, far)[:, :2]
         middle = place.mean(axis=0)
@@ -177,20 +192,20 @@ class Problem:
     def fit(self, transform: FloatArray) -> _Fit:
         """Linearize all rows about a transform (3,)."""
         count = self._window.size
-        poses = se2.compose(transform, self._window["track"])
+        poses = se2.compose(transform, self._window.track)
         residual, jacobians = np.zeros(count), np.zeros((2, count, 3))
         for k in range(count):
-            one = self._window["measurement"][k : k + 1]
-            model, sees = MODELS[int(one["kind"][0])], bool(self._sees[k])
+            one, sees = self._window.measured.row(k), bool(self._sees[k])
+            model = MODELS[int(one.model)]
             sides = (poses[k], self._other_pose[k]) if sees else (self._other_pose[k], poses[k])
-            predicted = model.predict(one, *sides)
-            residual[k] = model.innovation(one, predicted.value)[0]
+            predicted = model.predicted(one, *sides)
+            residual[k] = model.innovation(one.value, predicted.value)[0]
             jacobians[0 if sees else 1, k] = predicted.observer_jacobian[0]
             jacobians[1 if sees else 0, k] = predicted.target_jacobian[0]
         own, other = jacobians
         lost = ~(np.isfinite(residual) & np.isfinite(own).all(axis=1) & np.isfinite(other).all(axis=1))
         residual[lost], own[lost], other[lost] = np.inf, 0.0, 0.0
-        variance = self._window["measurement"]["covariance"][:, 0, 0] + _within(other, self._other_drift)
+        variance = self._window.measured.covariance[:, 0, 0] + _within(other, self._other_drift)
         on_track = own @ se2.adjoint(transform)
         variance = variance + np.maximum(_within(on_track, self._drift), 0.0)
         for column, covariance in self._shared.items():
@@ -256,8 +271,7 @@ class Problem:
             own, other, column = fit.jacobian[good], fit.other_jacobian[good], self._column[good]
             on_track = own @ se2.adjoint(transform)
             alone = np.diag(
-                self._window["measurement"]["covariance"][good, 0, 0]
-                + _within(other, self._other_drift[good])
+                self._window.measured.covariance[good, 0, 0] + _within(other, self._other_drift[good])
             )
             upper = np.triu(np.einsum("ka,lab,lb->kl", on_track, self._drift[good], on_track))
             alone = alone + upper + np.triu(upper, 1).T
@@ -283,31 +297,31 @@ class Problem:
         whole = initial.covariance.copy()
         for column, share in zip(initial.columns.tolist(), initial.shares, strict=True):
             whole += share @ self._shared[column] @ share.T
-        pose = se2.compose(initial.transform, self._window["track"][-1])
+        pose = se2.compose(initial.transform, self._window.track[-1])
         return se2.pose_covariance(pose, whole)
 
 
 def locate(
-    state: SwarmState, robot: int, window: WindowArray, noise: FloatArray, heading_sigma: float
+    state: SwarmState, robot: int, window: Window, noise: FloatArray, heading_sigma: float
 ) -> InitialPose | None:
     """The transform of a waiting robot's track; None while it is ambiguous or uncertain.
 
     Args:
         state: Poses of the others.
         robot: The waiting robot.
-        window: (m,) of WINDOW_DTYPE.
+        window: (m,) its measurements.
         noise: (3, 3) preintegrated covariance of the track until now.
         heading_sigma: Largest standard deviation of the heading [rad].
     """
-    rows = window["measurement"]
+    rows = window.measured
     known = np.append(state.tracked, True)  # index NOBODY (-1) selects the last element
-    window = window[known[np.where(rows["observer"] == robot, rows["target"], rows["observer"])]]
+    window = window.some(known[np.where(rows.observer == robot, rows.target, rows.observer)])
     if window.size < _MIN_ROWS:
         return None
     whole = Problem(state, robot, window, noise)
-    by_link = np.lexsort((window["measurement"]["stamp_ns"], links(window)))
+    by_link = np.lexsort((window.measured.stamp_ns, links(window)))
     some = np.sort(by_link[:: -(-window.size // _FIRST_ROWS)])
-    first = Problem(state, robot, window[some], noise)
+    first = Problem(state, robot, window.some(some), noise)
     begun = [first.descend(start, _FIRST_STEPS) for start in first.starts()]
     found: list[_Hypothesis] = []
     for rough in _distinct(whole, begun):
@@ -327,12 +341,12 @@ def locate(
     return initial if is_sure else None
 
 
-def _is_agreed(fit: _Fit, window: WindowArray) -> bool:
+def _is_agreed(fit: _Fit, window: Window) -> bool:
     """Whether enough of a window agrees with a hypothesis, and as well as its noise allows."""
     agrees = fit.squared < _TRUNCATED
     has_many_links = np.unique(links(window)).size >= _MIN_LINKS
     least = max(_MIN_ROWS, (_MIN_SHARE if has_many_links else _FEW_SHARE) * window.size)
-    is_long = has_many_links or np.ptp(window["measurement"]["stamp_ns"]) >= _FEW_NS
+    is_long = has_many_links or np.ptp(window.measured.stamp_ns) >= _FEW_NS
     return bool(is_long and agrees.sum() >= least and fit.squared[agrees].mean() <= _MAX_EXCESS)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import Level, Report, drop_values, level_of, listed
-from swarm_loc_estimator.filter.measurement_model import MeasurementArray
+from swarm_loc_estimator.filter.measurements import Measurements, Verdict
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
@@ -20,7 +20,6 @@ from swarm_loc_estimator.sensors.registry import InputTopic
 from swarm_loc_estimator.swarm.swarm import FixedCamera, Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import Contradiction
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
-from swarm_loc_estimator.timeline.verdicts import Verdict
 
 _FULL_LOAD = 0.95
 _CAUSES = {
@@ -63,7 +62,7 @@ class TickCost:
         self.shed += shed
 
 
-Recent = tuple[MeasurementArray, NDArray[np.uint8], FloatArray]
+Recent = tuple[Measurements, NDArray[np.uint8], FloatArray]
 
 
 def add_contradictions(reports: Sequence[Report], contradictions: Sequence[Contradiction]) -> None:
@@ -359,8 +358,8 @@ def _patience_s(topic: InputTopic, robot: Robot | None, statistics: InputStatist
 def _used_per_source(recent: Recent, sources: int) -> tuple[list[int], list[float]]:
     """How many measurements of each robot or fixed camera were used, and their mean NIS (NaN for none)."""
     measurements, verdicts, nis = recent
-    mine = (verdicts == Verdict.USED) & (measurements["received_from"] >= 0) & np.isfinite(nis)
-    observers = measurements["received_from"][mine]
+    mine = (verdicts == Verdict.USED) & (measurements.received_from >= 0) & np.isfinite(nis)
+    observers = measurements.received_from[mine]
     count = np.bincount(observers, minlength=sources)
     total = np.bincount(observers, nis[mine], minlength=sources)
     mean = np.divide(total, count, out=np.full(sources, np.nan), where=count > 0)

@@ -23,8 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.sensors.registry import SENSORS, Batch
-from swarm_loc_estimator.sensors.sensor import Sensor, chosen
+from swarm_loc_estimator.sensors.sensor import Sensor
 from swarm_loc_estimator.timeline.settings import end_of_period
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # Fractional part of the golden ratio in units of 2^-64
@@ -80,7 +81,7 @@ class Thinning:
         ):
             self._decide_as_before(one.exchange, mine)
             if not mine.all():
-                rows[sensor.name] = chosen(messages[sensor.name], mine[one.of_row])
+                rows[sensor.name] = select(messages[sensor.name], mine[one.of_row])
                 shed[f"shed_{sensor.name}"] = int(np.sum(~mine))
         left = replace(messages, rows=rows, dropped={**messages.dropped, **shed})
         return Thinned(left, used.size, sum(shed.values()))

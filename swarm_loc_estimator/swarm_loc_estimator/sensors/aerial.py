@@ -11,7 +11,8 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DETECTIONS
 from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, AnonymousMessage, decode_anonymous
 from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
-from swarm_loc_estimator.filter.measurement_model import NOBODY, Kind
+from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
+from swarm_loc_estimator.filter.models import ANONYMOUS
 from swarm_loc_estimator.sensors.fix import about_robots, take_out_headings
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
@@ -19,7 +20,6 @@ from swarm_loc_estimator.sensors.sensor import (
     DropCounts,
     InputKind,
     Known,
-    Measured,
     Sensor,
     SensorSettings,
     of_none,
@@ -71,12 +71,12 @@ def _create_converter(_swarm: Swarm, settings: SensorSettings, _drops: DropCount
     sigma, heading_sigma = settings.aerial_position_sigma, settings.aerial_heading_sigma
     noise = np.diag(np.square([sigma, sigma, heading_sigma]))
 
-    def convert(rows: AerialRows) -> Measured:
-        shown = about_robots(NOBODY, rows.stamp_ns, rows.pose, rows.covariance, Kind.ANONYMOUS)
-        shown["marker_id"] = rows.number
-        shown["covariance"][rows.covariance[:, 0, 0] == _UNKNOWN_VARIANCE] = noise
+    def convert(rows: AerialRows) -> Measurements:
+        shown = about_robots(NOBODY, rows.stamp_ns, rows.pose, rows.covariance, ANONYMOUS)
+        shown.reading[:], shown.arrival_ns[:] = rows.number, rows.arrival_ns
+        shown.covariance[rows.covariance[:, 0, 0] == _UNKNOWN_VARIANCE] = noise
         take_out_headings(shown, np.isnan(rows.pose[:, 2]))
-        return Measured(shown, rows.arrival_ns)
+        return shown
 
     return convert
 

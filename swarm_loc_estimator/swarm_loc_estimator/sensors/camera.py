@@ -23,7 +23,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from typing import NamedTuple
 
 import numpy as np
@@ -39,52 +39,21 @@ from swarm_loc_estimator.common.messages.detections import (
     decode_shared_detections,
 )
 from swarm_loc_estimator.common.messages.streams import DetectionColumns, DetectionReader, MessageBatch
-from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.small_matrix import assign
-from swarm_loc_estimator.filter.gating import gate_threshold
-from swarm_loc_estimator.filter.measurement_model import (
-    MEASUREMENT_DTYPE,
-    MODELS,
-    NOBODY,
-    POLAR,
-    Kind,
-    MeasurementArray,
-    MeasurementColumns,
-    MeasurementModel,
-    Prediction,
-    predict,
-    register,
-)
+from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, select
+from swarm_loc_estimator.filter.models import BEARING, MODELS, POLAR, gate_threshold
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Converter,
     DropCounts,
     InputKind,
     Known,
-    Measured,
     Sensor,
     SensorSettings,
     shared_kind,
 )
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Robot, Swarm
-
-BEARING = 4  # Number of the model; the first component of a value is the bearing, positive to the left [rad]
-
-
-def _predict_bearing(one: MeasurementArray, observer: FloatArray, target: FloatArray) -> Prediction:
-    polar = one.copy()
-    polar["kind"] = POLAR
-    value, jacobian = predict(polar, observer[None], target[None])
-    row = jacobian[0, 1:2, :3]
-    return Prediction(value[0, 1:2], -row, row)
-
-
-def _bearing_innovation(one: MeasurementArray, predicted: FloatArray) -> FloatArray:
-    return wrap_angle(one["value"][0, :1] - predicted)
-
-
-register(MeasurementModel("bearing", BEARING, 1, _predict_bearing, _bearing_innovation))
 
 
 @cached_njit
@@ -291,8 +260,7 @@ def convert_all(
     detections: Detections,
     cameras: Cameras,
     markers: Markers,
-    out: MeasurementColumns,
-    marker_id: IntArray,
+    out: Measurements,
     outcomes: IntArray,
 ) -> None:
     """Fill the measurements (d,) except stamps and observers, and write their outcomes (d,)."""
@@ -302,7 +270,7 @@ def convert_all(
         outcomes[k] = _outcome(detections, k, cameras, markers, camera, place)
         if outcomes[k] != MEASURED:
             continue
-        marker_id[k] = markers.id[place]
+        out.reading[k] = markers.id[place]
         out.stamp_ns[k] += round(cameras.sensor[camera].time_offset_s * 1e9)
         out.target[k], out.landmark[k] = markers.owner[place], markers.landmark[place]
         assign(out.sensor[k], cameras.mount[camera])
@@ -321,36 +289,36 @@ def convert_all(
 
 
 @cached_njit
-def _measure_bearing(optical: FloatArray, k: int, cameras: Cameras, out: MeasurementColumns) -> None:
+def _measure_bearing(optical: FloatArray, k: int, cameras: Cameras, out: Measurements) -> None:
     """Write value and covariance of measurement k of a direction (3,) in the optical frame."""
     camera, position = out.observer[k], np.empty(3)
     sensor = cameras.sensor[camera]
     to_level_frame(cameras.level[camera], optical, position)
-    out.kind[k], out.gate[k], out.marker[k, 2] = BEARING, cameras.bearing_gate[camera], 0.0
+    out.model[k], out.gate[k], out.marker[k, 2] = BEARING, cameras.bearing_gate[camera], 0.0
     out.value[k, 0] = _calibrated_bearing(sensor, position)
     out.covariance[k, 0, 0] = sensor.bearing_sigma**2 + cameras.variance[camera, 2]
     out.covariance[k, 1, 1] = out.covariance[k, 2, 2] = 1.0
 
 
 @cached_njit
-def _measure_upright(detections: Detections, k: int, cameras: Cameras, out: MeasurementColumns) -> None:
+def _measure_upright(detections: Detections, k: int, cameras: Cameras, out: Measurements) -> None:
     """Write value and covariance of measurement k of an upright marker."""
     sensor, level = cameras.sensor[out.observer[k]], cameras.level[out.observer[k]]
     position = np.empty(3)
     to_level_frame(level, detections.position[k], position)
     scale(position, 1.0 / sensor.distance_scale)
     if not out.has_heading[k]:
-        out.kind[k], out.marker[k, 2] = POLAR, 0.0
+        out.model[k], out.marker[k, 2] = POLAR, 0.0
         _calibrate(sensor, position, out.target[k], out.value[k], out.covariance[k])
         return
     out.value[k, 0], out.value[k, 1] = position[0], position[1]
     out.value[k, 2] = face_heading(level, detections.orientation[k])
     if detections.content[k] == CONTENT_POSE_TWO:
-        out.has_alternative[k] = 1
+        out.has_second[k] = True
         to_level_frame(level, detections.alternative_position[k], position)
         scale(position, 1.0 / sensor.distance_scale)
-        out.alternative[k, 0], out.alternative[k, 1] = position[0], position[1]
-        out.alternative[k, 2] = face_heading(level, detections.alternative_orientation[k])
+        out.second[k, 0], out.second[k, 1] = position[0], position[1]
+        out.second[k, 2] = face_heading(level, detections.alternative_orientation[k])
     _pose_noise(sensor, level, detections.covariance[k], out.covariance[k])
 
 
@@ -361,7 +329,7 @@ def _measure_lying(
     cameras: Cameras,
     markers: Markers,
     place: int,
-    out: MeasurementColumns,
+    out: Measurements,
 ) -> int:
     """Write value and covariance of measurement k of a lying marker; return its outcome."""
     camera = out.observer[k]
@@ -392,16 +360,16 @@ def _measure_lying(
 
 
 @cached_njit
-def _add_common_noise(of_camera: FloatArray, of_face: float, k: int, out: MeasurementColumns) -> None:
+def _add_common_noise(of_camera: FloatArray, of_face: float, k: int, out: Measurements) -> None:
     """Add the variances of a fixed camera's pose (3,) and of a face's position to measurement k."""
     noise, distance2 = out.covariance[k], 1.0
-    if out.kind[k] == POLAR:
+    if out.model[k] == POLAR:
         distance2 = max(out.value[k, 0] ** 2, 1e-6)
     noise[0, 0] += of_face + of_camera[0]
     noise[1, 1] += (of_face + of_camera[1]) / distance2
     if out.has_heading[k]:
         noise[2, 2] += of_camera[2]
-    if out.kind[k] == POLAR:
+    if out.model[k] == POLAR:
         noise[1, 1] += of_camera[2]
     if of_camera[0] > 0.0:
         out.systematic_share[k, 0] = of_camera[0] / noise[0, 0]
@@ -531,21 +499,13 @@ class DetectionRows(NamedTuple):
 
     robot: IntArray  #: (d,) index of the robot or fixed camera into `Swarm.sources`
     stamp_ns: IntArray  #: (d,) exposure times
-    detection: NDArray[np.void]  #: (d,) structured, see `SightingConverter.convert`
+    #: (d,) structured, with fields id, content, position (3,), orientation (4,) xyzw, covariance (6, 6),
+    #: alternative_position, alternative_orientation, as published in the optical frame
+    detection: NDArray[np.void]
     arrival_ns: IntArray  #: (d,) arrival times
 
 
 NO_DETECTIONS = DetectionRows(NO_ROWS, NO_ROWS, np.zeros(0, dtype=DETECTION_DTYPE), NO_ROWS)
-
-
-@dataclass(frozen=True)
-class Conversion:
-    """Result of converting detections."""
-
-    measurements: MeasurementArray  # (m,) of MEASUREMENT_DTYPE
-    measured: NDArray[np.bool_]  # (d,) True for detections that were converted
-    # Robots or fixed cameras (k,) of the dropped detections by reason, see `OUTCOMES`
-    dropped: dict[str, IntArray]
 
 
 class SightingConverter:
@@ -553,9 +513,11 @@ class SightingConverter:
 
     Args:
         swarm: Cameras, their calibration, and owners of markers.
+        drops: Where dropped detections are counted, by the reasons in `OUTCOMES`.
     """
 
-    def __init__(self, swarm: Swarm) -> None:
+    def __init__(self, swarm: Swarm, drops: DropCounts | None = None) -> None:
+        self._drops = drops or DropCounts(len(swarm.sources))
         fixed, robots = swarm.cameras, swarm.robots
         mounts: list[CameraMount | FixedCamera] = [robot.camera or CameraMount() for robot in robots]
         mounts += fixed
@@ -570,17 +532,17 @@ class SightingConverter:
             height=np.array([m.z for m in mounts], dtype=np.float64),
             level=np.array(tilts).reshape(-1, 3, 3),
             sensor=np.array(sensors, dtype=SENSOR_DTYPE),
-            gate=MODELS[Kind.POLAR].gate([model.gate_probability for model in models]),
+            gate=MODELS[POLAR].gate([model.gate_probability for model in models]),
             bearing_gate=MODELS[BEARING].gate([model.gate_probability for model in models]),
             variance=np.square([(position, position, yaw) for position, yaw in sigmas]).reshape(-1, 3),
         )
         owners = sorted(swarm.owner_of.items())
         markers = [owner.marker for _, owner in owners]
-        number = {mark.id: k + 1 for k, mark in enumerate(swarm.landmarks)}
+        number = {mark.id: k for k, mark in enumerate(swarm.landmarks)}
         self._markers = Markers(
             id=np.array([marker_id for marker_id, _ in owners], dtype=np.int64),
             owner=np.array([owner.robot_index for _, owner in owners], dtype=np.int64),
-            landmark=np.array([number.get(marker_id, 0) for marker_id, _ in owners], dtype=np.int64),
+            landmark=np.array([number.get(marker_id, NOBODY) for marker_id, _ in owners], dtype=np.int64),
             pose=np.array([[m.x, m.y, np.nan if m.yaw is None else m.yaw] for m in markers]).reshape(-1, 3),
             height=np.array([m.z for m in markers], dtype=float),
             size=np.array([m.size for m in markers], dtype=float),
@@ -588,46 +550,35 @@ class SightingConverter:
             variance=np.array([m.position_sigma**2 if isinstance(m, Face) else 0.0 for m in markers]),
         )
 
-    def convert(self, robots: IntArray, stamps_ns: IntArray, detections: NDArray[np.void]) -> Conversion:
-        """Convert detections to measurements.
-
-        Args:
-            robots: (d,) index of the robot with the camera, or of the fixed camera, see `DetectionRows`.
-            stamps_ns: (d,) exposure times.
-            detections: (d,) with fields id, content, position (3,), orientation (4,) xyzw, covariance (6, 6),
-                alternative_position, alternative_orientation, as published in the optical frame.
-        """
-        measurements = np.zeros(robots.size, dtype=MEASUREMENT_DTYPE)
-        measurements["stamp_ns"] = stamps_ns
-        measurements["received_from"] = measurements["observer"] = robots
-        outcomes = np.zeros(robots.size, dtype=np.int64)
-        convert_all(
-            Detections(*(detections[name] for name in Detections._fields)),
-            self._cameras,
-            self._markers,
-            MeasurementColumns.views(measurements),
-            measurements["marker_id"],
-            outcomes,
-        )
+    def convert(self, rows: DetectionRows) -> Measurements:
+        """Convert detections (d,) to measurements (m,); count the others in `drops`."""
+        out, outcomes = Measurements.empty(rows.robot.size), np.zeros(rows.robot.size, dtype=np.int64)
+        out.stamp_ns[:], out.arrival_ns[:] = rows.stamp_ns, rows.arrival_ns
+        out.received_from[:] = out.observer[:] = rows.robot
+        out.covariance[:] = 0.0
+        detections = Detections(*(rows.detection[name] for name in Detections._fields))
+        convert_all(detections, self._cameras, self._markers, out, outcomes)
         found = np.flatnonzero(np.bincount(outcomes, minlength=len(OUTCOMES))).tolist()
-        dropped = {OUTCOMES[k]: robots[outcomes == k] for k in found if k != MEASURED}
-        measured: NDArray[np.bool_] = outcomes == MEASURED
-        measurements = measurements[measured]
-        measurements["observer"][measurements["observer"] >= self._cameras.robots] = NOBODY
-        self._note_stamp_variance(measurements)
-        return Conversion(measurements, measured, dropped)
+        for k in found:
+            if k != MEASURED:
+                self._drops.add(OUTCOMES[k], rows.robot[outcomes == k])
+        if found != [MEASURED]:
+            out = select(out, outcomes == MEASURED)
+        out.observer[out.observer >= self._cameras.robots] = NOBODY
+        self._note_stamp_variance(out)
+        return out
 
-    def _note_stamp_variance(self, measurements: MeasurementArray) -> None:
+    def _note_stamp_variance(self, measurements: Measurements) -> None:
         """Write the variance of the stamps.
 
         All measurements of an image share the error of its stamp. The filter assumes independent errors, so
         each measurement gets the variance times their number.
         """
-        variance = np.square(self._cameras.sensor["time_sigma_s"])[measurements["received_from"]]
+        variance = np.square(self._cameras.sensor["time_sigma_s"])[measurements.received_from]
         if variance.any():
-            pictures = np.stack([measurements["received_from"], measurements["stamp_ns"]])
+            pictures = np.stack([measurements.received_from, measurements.stamp_ns])
             _, picture, count = np.unique(pictures, axis=1, return_inverse=True, return_counts=True)
-            measurements["stamp_variance"] = variance * count[picture]
+            measurements.stamp_variance[:] = variance * count[picture]
 
 
 def _columns(
@@ -643,15 +594,7 @@ def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> DetectionRows:
 
 
 def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts) -> Converter:
-    converter = SightingConverter(swarm)
-
-    def convert(rows: DetectionRows) -> Measured:
-        found = converter.convert(rows.robot, rows.stamp_ns, rows.detection)
-        for reason, robots in found.dropped.items():
-            drops.add(reason, robots)
-        return Measured(found.measurements, rows.arrival_ns[found.measured])
-
-    return convert
+    return SightingConverter(swarm, drops).convert
 
 
 def _has_camera(robot: Robot) -> bool:

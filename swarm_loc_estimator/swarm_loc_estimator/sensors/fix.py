@@ -15,13 +15,8 @@ from swarm_loc_estimator.common.messages.cdr import POSE_WITH_COVARIANCE, SWARM_
 from swarm_loc_estimator.common.messages.detections import SharedMessage, decode_shared_numbers
 from swarm_loc_estimator.common.messages.poses import FixMessage, decode_fix
 from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
-from swarm_loc_estimator.filter.measurement_model import (
-    MEASUREMENT_DTYPE,
-    MODELS,
-    NOBODY,
-    Kind,
-    MeasurementArray,
-)
+from swarm_loc_estimator.filter.measurements import Measurements, select
+from swarm_loc_estimator.filter.models import CARTESIAN, MODELS
 from swarm_loc_estimator.sensors.sensor import (
     FOREIGN_FRAME,
     NO_ROWS,
@@ -29,10 +24,8 @@ from swarm_loc_estimator.sensors.sensor import (
     DropCounts,
     InputKind,
     Known,
-    Measured,
     Sensor,
     SensorSettings,
-    chosen,
     of_none,
     shared_kind,
 )
@@ -42,7 +35,7 @@ HEADING_UNKNOWN = math.pi**2
 """Variance from which a heading counts as not measured [rad^2]; it exceeds that of uniform headings."""
 NO_COVARIANCE = "fix_without_covariance"
 """Reason to drop a fix without covariance of a robot whose description has no `fix.position_sigma`."""
-_GATE = float(MODELS[Kind.CARTESIAN].gate(0.9999))
+_GATE = float(MODELS[CARTESIAN].gate(0.9999))
 
 
 class FixRows(NamedTuple):
@@ -83,7 +76,7 @@ def _columns(
     stamp_ns, arrival_ns = found.stamp_ns[found.valid], batch.log_ns[found.valid]
     rows = FixRows(robot[found.valid], stamp_ns, pose, covariance, arrival_ns)
     at_home = np.array([m.frame_id == known.map_frame for m in messages], dtype=bool)
-    return chosen(rows, at_home), {FOREIGN_FRAME: int(np.sum(~at_home))}
+    return select(rows, at_home), {FOREIGN_FRAME: int(np.sum(~at_home))}
 
 
 def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> FixRows:
@@ -97,22 +90,21 @@ def about_robots(
     stamps_ns: IntArray | int,
     poses: FloatArray,
     covariances: FloatArray,
-    kind: int,
-) -> MeasurementArray:
+    model: int,
+) -> Measurements:
     """Absolute measurements (m,) of poses (m, 3) in `map` with covariances (m, 3, 3)."""
-    measurements = np.zeros(len(poses), dtype=MEASUREMENT_DTYPE)
-    measurements["stamp_ns"], measurements["kind"] = stamps_ns, kind
-    measurements["received_from"] = measurements["target"] = robots
-    measurements["observer"] = NOBODY
-    measurements["value"], measurements["covariance"] = poses, covariances
-    measurements["has_heading"], measurements["gate"] = 1, _GATE
-    return measurements
+    out = Measurements.empty(len(poses))
+    out.stamp_ns[:], out.model[:] = stamps_ns, model
+    out.received_from[:] = out.target[:] = robots
+    out.value[:], out.covariance[:] = poses, covariances
+    out.has_heading[:], out.gate[:] = True, _GATE
+    return out
 
 
-def take_out_headings(measurements: MeasurementArray, without: NDArray[np.bool_]) -> None:
+def take_out_headings(measurements: Measurements, without: NDArray[np.bool_]) -> None:
     """Remove the headings of those measurements (m,) selected by `without` (m,)."""
-    measurements["has_heading"][without], measurements["value"][without, 2] = 0, 0.0
-    covariance = measurements["covariance"]
+    measurements.has_heading[without], measurements.value[without, 2] = False, 0.0
+    covariance = measurements.covariance
     covariance[without, 2, :] = covariance[without, :, 2] = [0.0, 0.0, 1.0]
 
 
@@ -122,16 +114,16 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
     default = np.array(sigmas).reshape(-1, 3, 1) ** 2 * np.eye(3)
     share = np.array([one.systematic_share for one in models])
 
-    def convert(rows: FixRows) -> Measured:
+    def convert(rows: FixRows) -> Measurements:
         unknown = is_unknown(rows.covariance)
         if unknown.any():
             rows, unknown = _with_covariance(rows, unknown), unknown & (default[rows.robot, 0, 0] == 0.0)
             drops.add(NO_COVARIANCE, rows.robot[unknown])
-            rows = chosen(rows, ~unknown)
-        fixes = about_robots(rows.robot, rows.stamp_ns, rows.pose, rows.covariance, Kind.CARTESIAN)
-        fixes["systematic_share"] = share[rows.robot][:, None]
+            rows = select(rows, ~unknown)
+        fixes = about_robots(rows.robot, rows.stamp_ns, rows.pose, rows.covariance, CARTESIAN)
+        fixes.systematic_share[:], fixes.arrival_ns[:] = share[rows.robot][:, None], rows.arrival_ns
         take_out_headings(fixes, np.isnan(rows.pose[:, 2]))
-        return Measured(fixes, rows.arrival_ns)
+        return fixes
 
     def _with_covariance(rows: FixRows, unknown: NDArray[np.bool_]) -> FixRows:
         pose, covariance = rows.pose.copy(), rows.covariance.copy()

@@ -15,6 +15,7 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import IMU, decode, nanoseconds
 from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Converter,
@@ -23,7 +24,6 @@ from swarm_loc_estimator.sensors.sensor import (
     Known,
     Sensor,
     SensorSettings,
-    chosen,
 )
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
@@ -96,7 +96,7 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
             "imu_absurd": ~(np.abs(rows.rate) <= _MAX_RATE),
         }
         good = drops.screen(rows.robot, reasons)
-        return rows if good.all() else chosen(rows, good)
+        return rows if good.all() else select(rows, good)
 
     return valid
 

@@ -20,12 +20,12 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import BRIGHTNESS as MESSAGE_TYPE
 from swarm_loc_estimator.common.messages.detections import BrightnessMessage, decode_brightness
 from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MODELS, Kind, MeasurementArray
+from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, Measurements, concatenate, select
+from swarm_loc_estimator.filter.models import MODELS, POLAR
 from swarm_loc_estimator.infrared.closed_form import ClosedForm
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.search import IrEstimator, IrOutcome, IrSolutions
 from swarm_loc_estimator.sensors.sensor import (
-    NO_MEASUREMENTS,
     NO_ROWS,
     REJECT_REASONS,
     Change,
@@ -156,7 +156,7 @@ class _Exchange:
 
     readings: Readings = field(default_factory=dict)  # Received matrices
     # Current measurement (1,), or (0,) if there is none
-    measurement: MeasurementArray = field(default_factory=NO_MEASUREMENTS.copy)
+    measurement: Measurements = NO_MEASUREMENTS
     fault: str = ""  # Reason why there is none
 
 
@@ -176,9 +176,7 @@ class BrightnessConverter:
     def __init__(self, swarm: Swarm) -> None:
         self._validator = MatrixScreening(swarm)
         self._ir = self._validator.boards
-        self._gate = {
-            robot: float(MODELS[Kind.POLAR].gate(ir.gate_probability)) for robot, ir in self._ir.items()
-        }
+        self._gate = {robot: float(MODELS[POLAR].gate(ir.gate_probability)) for robot, ir in self._ir.items()}
         self._dropped: Counter[str] = Counter()
         self._measured = 0
         self._exchanges: dict[ExchangeKey, _Exchange] = {}
@@ -223,7 +221,7 @@ class BrightnessConverter:
                 withdrawn.append(exchange.measurement)
                 added.append(measurement)
                 exchange.measurement = measurement
-        return Change(np.concatenate(added), np.concatenate(withdrawn))
+        return Change(concatenate(added), concatenate(withdrawn))
 
     def _forget(self, keys: Iterable[ExchangeKey]) -> None:
         """Discard exchanges and count their unused matrices."""
@@ -239,7 +237,7 @@ class BrightnessConverter:
             groups.setdefault(_estimator(ir.platform, ir.estimator), []).append(key)
         return groups.values()
 
-    def _solved(self, keys: list[ExchangeKey]) -> list[tuple[_Exchange, MeasurementArray]]:
+    def _solved(self, keys: list[ExchangeKey]) -> list[tuple[_Exchange, Measurements]]:
         """Exchanges of one group whose measurement changes, with the new one, (1,) or (0,)."""
         ir = self._ir[keys[0].receiver]
         exchanges = [self._exchanges[key] for key in keys]
@@ -253,29 +251,28 @@ class BrightnessConverter:
             exchange.fault = (
                 _reason(int(solutions.outcomes[k]), readings[k], limits[k]) or REJECT_REASONS[faults[k]]
             )
-            measurement = NO_MEASUREMENTS if exchange.fault else measurements[k : k + 1]
-            if measurement.tobytes() != exchange.measurement.tobytes():
+            measurement = NO_MEASUREMENTS if exchange.fault else select(measurements, slice(k, k + 1))
+            if not measurement.equals(exchange.measurement):
                 changed.append((exchange, measurement))
         return changed
 
-    def _measurements(self, keys: list[ExchangeKey], solutions: IrSolutions) -> MeasurementArray:
+    def _measurements(self, keys: list[ExchangeKey], solutions: IrSolutions) -> Measurements:
         """Measurements (k,) for the filter: the transmitter's base_link in the receiver's base_link.
 
         The two directions between two robots are separate measurements: they use different sensors and
         emitters, so their noise and gains are independent.
         """
-        measurements = np.zeros(len(keys), dtype=MEASUREMENT_DTYPE)
+        out = Measurements.empty(len(keys))
         stamps_ns, receivers, transmitters = np.array(keys, dtype=np.int64).T
-        measurements["stamp_ns"], measurements["target"] = stamps_ns, transmitters
-        measurements["received_from"] = measurements["observer"] = receivers
-        measurements["kind"], measurements["has_heading"] = Kind.POLAR, 1
-        measurements["gate"] = [self._gate[receiver] for receiver in receivers.tolist()]
-        measurements["value"], measurements["covariance"] = solutions.poses, solutions.covariances
-        measurements["systematic_share"] = np.nan_to_num(solutions.systematic_share)
-        ambiguous = np.isfinite(solutions.alternatives).all(axis=1)
-        measurements["has_alternative"] = ambiguous
-        measurements["alternative"][ambiguous] = solutions.alternatives[ambiguous]
-        return measurements
+        out.stamp_ns[:], out.target[:] = stamps_ns, transmitters
+        out.received_from[:] = out.observer[:] = receivers
+        out.model[:], out.has_heading[:] = POLAR, True
+        out.gate[:] = [self._gate[receiver] for receiver in receivers.tolist()]
+        out.value[:], out.covariance[:] = solutions.poses, solutions.covariances
+        out.systematic_share[:] = np.nan_to_num(solutions.systematic_share)
+        out.has_second[:] = np.isfinite(solutions.alternatives).all(axis=1)
+        out.second[out.has_second] = solutions.alternatives[out.has_second]
+        return out
 
 
 def _faults(exchanges: Iterable[_Exchange]) -> Counter[str]:

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.messages.cdr import LASER_SCAN
 from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
-from swarm_loc_estimator.filter.measurement_model import Kind
+from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, select
+from swarm_loc_estimator.filter.models import SCAN
 from swarm_loc_estimator.mapping.messages import ScanMessage, decode_scan
 from swarm_loc_estimator.mapping.sweeps import LidarSweep, read_sweep
 from swarm_loc_estimator.sensors.fix import about_robots
-from swarm_loc_estimator.sensors.sensor import NO_MEASUREMENTS, NO_ROWS, Change, InputKind, Known, Sensor
+from swarm_loc_estimator.sensors.sensor import NO_ROWS, Change, InputKind, Known, Sensor
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 
@@ -59,7 +60,7 @@ class SweepStore:
     def take(self, rows: ScanRows) -> Change:
         """Add scans."""
         nothing = np.zeros((len(rows.scan), 3))
-        added = about_robots(rows.robot, rows.stamp_ns, nothing, np.eye(3)[None], Kind.SCAN)
+        added = about_robots(rows.robot, rows.stamp_ns, nothing, np.eye(3)[None], SCAN)
         usable = np.ones(len(rows.scan), dtype=bool)
         columns = rows.robot.tolist(), rows.stamp_ns.tolist(), rows.scan
         for k, (robot, stamp_ns, scan) in enumerate(zip(*columns, strict=True)):
@@ -70,8 +71,9 @@ class SweepStore:
             shift_ns = stamp_ns - sweep.stamp_ns  # of the robot's clock
             sweep = sweep._replace(stamp_ns=stamp_ns, beam_ns=sweep.beam_ns + shift_ns)
             self.sweeps.setdefault((robot, stamp_ns), sweep)
-            added["stamp_ns"][k], added["marker_id"][k] = sweep.beam_ns[-1], stamp_ns
-        return Change(added[usable], NO_MEASUREMENTS)
+            added.stamp_ns[k], added.reading[k] = sweep.beam_ns[-1], stamp_ns
+        added.arrival_ns[:] = rows.arrival_ns
+        return Change(select(added, usable), NO_MEASUREMENTS)
 
     def forget_before(self, oldest_ns: int) -> None:
         """Discard sweeps that ended before an instant."""

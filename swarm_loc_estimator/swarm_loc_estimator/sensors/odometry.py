@@ -14,6 +14,7 @@ from swarm_loc_estimator.common.messages.cdr import SWARM_ODOMETRY
 from swarm_loc_estimator.common.messages.detections import SharedMessage, decode_shared_numbers
 from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, PoseColumns, PoseReader
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Converter,
@@ -22,7 +23,6 @@ from swarm_loc_estimator.sensors.sensor import (
     Known,
     Sensor,
     SensorSettings,
-    chosen,
     shared_kind,
 )
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
@@ -55,7 +55,7 @@ def _columns(
     found: PoseColumns, batch: MessageBatch, robot: IntArray, _known: Known
 ) -> tuple[OdometryRows, Mapping[str, int]]:
     rows = OdometryRows(robot, found.stamp_ns, found.pose, found.twist, batch.log_ns)
-    return rows if found.valid.all() else chosen(rows, found.valid), {}
+    return rows if found.valid.all() else select(rows, found.valid), {}
 
 
 def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> OdometryRows:
@@ -73,7 +73,7 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
             "odometry_absurd": ~(np.abs(rows.pose).max(axis=1) <= _MAX_DISTANCE_M),
         }
         good = drops.screen(rows.robot, reasons)
-        return rows if good.all() else chosen(rows, good)
+        return rows if good.all() else select(rows, good)
 
     return valid
 

@@ -7,7 +7,6 @@ and the other one is not, both change places and the sign. See doc/uwb.md.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -18,74 +17,18 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import RANGES as MESSAGE_TYPE
 from swarm_loc_estimator.common.messages.cdr import Rows, decode, nanoseconds
 from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
-from swarm_loc_estimator.filter.measurement_model import (
-    MEASUREMENT_DTYPE,
-    MeasurementArray,
-    MeasurementModel,
-    Prediction,
-    register,
-)
+from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, select
+from swarm_loc_estimator.filter.models import MODELS, RANGE, RANGE_DIFFERENCE
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Converter,
     DropCounts,
     InputKind,
     Known,
-    Measured,
     Sensor,
     SensorSettings,
-    chosen,
 )
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm, UwbDevice
-
-
-def _predict_range(one: MeasurementArray, observer: FloatArray, target: FloatArray) -> Prediction:
-    """Slant range; `sensor` and `marker` are the antennas, with the height in place of the yaw."""
-    sensor, marker = one["sensor"][0].tolist(), one["marker"][0].tolist()
-    sx, sy = _moved(sensor, observer)
-    is_fixed = one["target"][0] < 0 and one["landmark"][0] == 0
-    mx, my = (marker[0], marker[1]) if is_fixed else _moved(marker, target)
-    distance, ux, uy = _direction(mx - sx, my - sy, marker[2] - sensor[2])
-    return Prediction(
-        np.array([distance]),
-        np.array([[-ux, -uy, ux * sy - uy * sx]]),
-        np.array([[ux, uy, uy * mx - ux * my]]),
-    )
-
-
-def _predict_difference(one: MeasurementArray, observer: FloatArray, target: FloatArray) -> Prediction:
-    """Slant range minus that to the reference, whose place in `map` is `alternative`."""
-    value, own, other = _predict_range(one, observer, target)
-    sensor, reference = one["sensor"][0].tolist(), one["alternative"][0].tolist()
-    sx, sy = _moved(sensor, observer)
-    distance, ux, uy = _direction(reference[0] - sx, reference[1] - sy, reference[2] - sensor[2])
-    return Prediction(value - distance, own + np.array([[ux, uy, uy * sx - ux * sy]]), other)
-
-
-def _moved(place: list[float], pose: FloatArray) -> tuple[float, float]:
-    """Position in `map` of a place on a body at a pose (3,)."""
-    x, y, theta = pose.tolist()
-    cos, sin = math.cos(theta), math.sin(theta)
-    return x + cos * place[0] - sin * place[1], y + sin * place[0] + cos * place[1]
-
-
-def _direction(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Length of a vector, and the horizontal components of its direction; zero at length zero."""
-    length = math.sqrt(x * x + y * y + z * z)
-    scale = 1.0 / length if length > 1e-6 else 0.0
-    return length, scale * x, scale * y
-
-
-def _innovation(one: MeasurementArray, predicted: FloatArray) -> FloatArray:
-    innovation: FloatArray = one["value"][0, :1] - predicted
-    return innovation
-
-
-RANGE = MeasurementModel("range", 10, 1, _predict_range, _innovation)  # Distance of two antennas [m]
-RANGE_DIFFERENCE = MeasurementModel("range difference", 11, 1, _predict_difference, _innovation)
-"""Distance to one antenna minus that to the reference [m]."""
-register(RANGE)
-register(RANGE_DIFFERENCE)
 
 
 class RangeRows(NamedTuple):
@@ -148,10 +91,10 @@ class _Devices(NamedTuple):
     @classmethod
     def of(cls, swarm: Swarm) -> _Devices:
         """The radios of a swarm."""
-        first = len(swarm.landmarks) + 1
-        rows = [(0, -1, 0, (0.0, 0.0, 0.0), 0.0, 0.0)]
+        first = len(swarm.landmarks)
+        rows = [(0, NOBODY, NOBODY, (0.0, 0.0, 0.0), 0.0, 0.0)]
         rows += [
-            (u.address, k, 0, (u.x, u.y, u.z), u.range_bias, 0.0)
+            (u.address, k, NOBODY, (u.x, u.y, u.z), u.range_bias, 0.0)
             for k, robot in enumerate(swarm.robots)
             if (u := robot.uwb) is not None
         ]
@@ -175,9 +118,9 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
     antenna = np.array([(radio.x, radio.y, radio.z) for radio in radios]).reshape(-1, 3)
     sigma = np.array([(radio.range_sigma, radio.difference_sigma) for radio in radios]).reshape(-1, 2)
     scale, bias = (np.array([getattr(r, name) for r in radios]) for name in ("range_scale", "range_bias"))
-    gate = RANGE.gate([radio.gate_probability for radio in radios])
+    gate = MODELS[RANGE].gate([radio.gate_probability for radio in radios])
 
-    def convert(rows: RangeRows) -> Measured:
+    def convert(rows: RangeRows) -> Measurements:
         device, reference = devices.find(rows.device), devices.find(rows.reference)
         rows, device, reference = _usable(rows, device, reference)
         is_difference = rows.reference > 0
@@ -187,20 +130,20 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
         swapped = is_difference & (devices.robot[reference] >= 0)
         value[swapped] *= -1.0
         device, reference = np.where(swapped, reference, device), np.where(swapped, device, reference)
-        out = np.zeros(rows.robot.size, dtype=MEASUREMENT_DTYPE)
-        out["stamp_ns"], out["gate"] = rows.stamp_ns, gate[rows.robot]
-        out["received_from"] = out["observer"] = rows.robot
-        out["kind"] = np.where(is_difference, RANGE_DIFFERENCE.number, RANGE.number)
-        out["target"], out["landmark"] = devices.robot[device], devices.landmark[device]
-        out["marker_id"] = device + devices.address.size * reference
-        out["sensor"], out["marker"] = antenna[rows.robot], devices.place[device]
-        out["alternative"] = devices.place[reference]
-        out["value"][:, 0] = value / scale[rows.robot]
+        out = Measurements.empty(rows.robot.size)
+        out.stamp_ns[:], out.gate[:], out.arrival_ns[:] = rows.stamp_ns, gate[rows.robot], rows.arrival_ns
+        out.received_from[:] = out.observer[:] = rows.robot
+        out.model[:] = np.where(is_difference, RANGE_DIFFERENCE, RANGE)
+        out.target[:], out.landmark[:] = devices.robot[device], devices.landmark[device]
+        out.reading[:] = device + devices.address.size * reference
+        out.sensor[:, :2], out.marker[:, :2] = antenna[rows.robot, :2], devices.place[device, :2]
+        out.height[:] = np.column_stack([antenna[rows.robot, 2], devices.place[device, 2]])
+        out.reference[:] = devices.place[reference]
+        out.value[:, 0] = value / scale[rows.robot]
         described = np.square(sigma[rows.robot, is_difference.astype(np.int64)])
         noise = np.where(rows.variance == 0.0, described, rows.variance) / np.square(scale[rows.robot])
-        out["covariance"] = np.eye(3)
-        out["covariance"][:, 0, 0] = noise + devices.variance[reference]
-        return Measured(out, rows.arrival_ns)
+        out.covariance[:, 0, 0] = noise + devices.variance[reference]
+        return out
 
     def _usable(
         rows: RangeRows, device: IntArray, reference: IntArray
@@ -217,7 +160,7 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
             "bad_covariance": rows.variance < 0.0,
         }
         usable = drops.screen(rows.robot, reasons)
-        return chosen(rows, usable), device[usable], reference[usable]
+        return select(rows, usable), device[usable], reference[usable]
 
     return convert
 

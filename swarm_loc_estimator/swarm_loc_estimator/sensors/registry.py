@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.filter.measurement_model import MeasurementArray
+from swarm_loc_estimator.filter.measurements import Measurements, select
 from swarm_loc_estimator.sensors.aerial import AERIAL
 from swarm_loc_estimator.sensors.camera import DETECTIONS
 from swarm_loc_estimator.sensors.fix import FIXES
@@ -23,8 +23,6 @@ from swarm_loc_estimator.sensors.odometry import ODOMETRY
 from swarm_loc_estimator.sensors.ranges import RANGES
 from swarm_loc_estimator.sensors.sensor import (
     BAD_MEASUREMENT,
-    NO_MEASUREMENTS,
-    NO_ROWS,
     REJECT_REASONS,
     VALID,
     Accumulator,
@@ -32,10 +30,8 @@ from swarm_loc_estimator.sensors.sensor import (
     DropCounts,
     Guard,
     InputKind,
-    Measured,
     Sensor,
     SensorSettings,
-    chosen,
     is_about_swarm,
     reject_reasons,
 )
@@ -112,13 +108,15 @@ def _is_sent(topic: InputTopic, swarm: Swarm, stood_for: Collection[str]) -> boo
 
 @dataclass(frozen=True)
 class Batch:
-    """Raw readings of an interval of monotonic arrival time."""
+    """Readings of an interval of monotonic arrival time, as they came or converted by `InputConverter`."""
 
     begin_ns: int  #: Arrival of the first message
     end_ns: int  #: Arrival of the last message
-    #: Readings by sensor, in order of arrival; sensors without readings are omitted
+    #: Readings by sensor, in order of arrival; sensors without readings are omitted. Converted, those that
+    #: need no other readings are `Measurements`
     rows: Mapping[str, Any] = field(default_factory=dict)
     dropped: Mapping[str, int] = field(default_factory=dict)  #: Number of unreadable readings by reason
+    is_converted: bool = False  #: Whether only valid readings are left
 
     @classmethod
     def of(cls, begin_ns: int, end_ns: int, **rows: Any) -> Batch:
@@ -139,30 +137,13 @@ class Batch:
         """The readings of a sensor."""
         return self.rows.get(sensor, SENSORS[sensor].nothing)
 
-
-@dataclass(frozen=True)
-class Measurements:
-    """Measurements of a batch, in order of arrival."""
-
-    begin_ns: int  # Arrival of the first message
-    end_ns: int  # Arrival of the last message
-    measurements: MeasurementArray  # (m,) with finite values and valid covariances
-    arrival_ns: IntArray  # (m,) arrival times
-    rows: Mapping[str, Any]  # Valid unconverted readings by sensor: odometry and inputs of accumulators
-
-    def until_each(self, stamps_ns: IntArray) -> Iterator[Measurements]:
+    def until_each(self, stamps_ns: IntArray) -> Iterator[Batch]:
         """Split at instants (s,) into s + 1 parts by arrival time."""
-        rows = {name: _between(one.arrival_ns, stamps_ns) for name, one in self.rows.items()}
-        measured, begin_ns = _between(self.arrival_ns, stamps_ns), self.begin_ns
+        places = {name: _between(one.arrival_ns, stamps_ns) for name, one in self.rows.items()}
+        begin_ns = self.begin_ns
         for k, end_ns in enumerate([*stamps_ns.tolist(), self.end_ns]):
-            part = measured[k]
-            yield Measurements(
-                begin_ns,
-                end_ns,
-                self.measurements[part],
-                self.arrival_ns[part],
-                {name: chosen(one, rows[name][k]) for name, one in self.rows.items()},
-            )
+            rows = {name: select(one, places[name][k]) for name, one in self.rows.items()}
+            yield replace(self, begin_ns=begin_ns, end_ns=end_ns, rows=rows)
             begin_ns = end_ns
 
 
@@ -199,10 +180,9 @@ class InputConverter:
         self._future_ns = round(settings.future_tolerance_s * 1e9)
         self._robots, self._landmarks = len(swarm.robots), len(swarm.surveyed)
 
-    def convert(self, batch: Batch) -> Measurements:
+    def convert(self, batch: Batch) -> Batch:
         """Convert valid readings; count the others in `drops`."""
         self.drops.total.update(batch.dropped)
-        parts: list[Measured] = []
         kept: dict[str, Any] = {}
         for name in SENSORS:
             rows = batch.rows.get(name)
@@ -211,30 +191,16 @@ class InputConverter:
             late = rows.stamp_ns > rows.arrival_ns + self._future_ns
             if late.any():
                 self.drops.add("future_stamp", rows.robot[late])
-                rows = chosen(rows, ~late)
+                rows = select(rows, ~late)
             with Guard(name, rows.robot.size, self.drops.total):
                 found = self._converters[name](rows) if name in self._converters else rows
-                if isinstance(found, Measured):
-                    parts.append(self._valid(found))
-                elif found.robot.size:
-                    kept[name] = found
-        return Measurements(batch.begin_ns, batch.end_ns, *_in_order_of_arrival(parts), kept)
+                kept[name] = self._valid(found) if isinstance(found, Measurements) else found
+        return replace(batch, rows=kept, dropped={}, is_converted=True)
 
-    def _valid(self, found: Measured) -> Measured:
+    def _valid(self, found: Measurements) -> Measurements:
         """Select valid measurements; count the others in `drops`."""
-        reasons = reject_reasons(found.measurements)
-        reasons[~is_about_swarm(found.measurements, self._robots, self._landmarks)] = BAD_MEASUREMENT
+        reasons = reject_reasons(found)
+        reasons[~is_about_swarm(found, self._robots, self._landmarks)] = BAD_MEASUREMENT
         for k in set(reasons[reasons != VALID].tolist()):
-            self.drops.add(REJECT_REASONS[k], found.measurements["received_from"][reasons == k])
-        return chosen(found, reasons == VALID)
-
-
-def _in_order_of_arrival(parts: list[Measured]) -> tuple[MeasurementArray, IntArray]:
-    """Concatenate measurements and sort them by arrival; the sort is stable."""
-    parts = [part for part in parts if part.measurements.size]
-    if len(parts) < 2:
-        return parts[0] if parts else (NO_MEASUREMENTS, NO_ROWS)
-    measurements = np.concatenate([part.measurements for part in parts])
-    arrival_ns = np.concatenate([part.arrival_ns for part in parts])
-    order = np.argsort(arrival_ns, kind="stable")
-    return measurements[order], arrival_ns[order]
+            self.drops.add(REJECT_REASONS[k], found.received_from[reasons == k])
+        return found if not reasons.any() else select(found, reasons == VALID)

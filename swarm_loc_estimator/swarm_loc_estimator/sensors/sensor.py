@@ -27,31 +27,17 @@ from swarm_loc_estimator.common.messages.cdr import CdrError
 from swarm_loc_estimator.common.messages.detections import SharedMessage
 from swarm_loc_estimator.common.messages.streams import MessageBatch
 from swarm_loc_estimator.common.small_matrix import cholesky3
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MODELS, NOBODY, MeasurementArray
+from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, concatenate, select
+from swarm_loc_estimator.filter.models import MODELS
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
-Rows = TypeVar("Rows", bound="tuple[NDArray[Any], ...]")
+Rows = TypeVar("Rows", bound="tuple[Any, ...]")
 NO_ROWS: IntArray = np.zeros(0, dtype=np.int64)
-NO_MEASUREMENTS: MeasurementArray = np.zeros(0, dtype=MEASUREMENT_DTYPE)
-
-
-def chosen(rows: Rows, some: slice | NDArray[np.bool_] | IntArray) -> Rows:
-    """Select rows of a tuple of columns by a slice, a mask or indices."""
-    return type(rows)(*(column[some] for column in rows))
-
-
-def joined(parts: Sequence[Rows]) -> Rows:
-    """Concatenate tuples of columns; dtypes are those of the first."""
-    if len(parts) == 1:
-        return parts[0]
-    # without dtype, records lose their padding and numba compiles again for the new type
-    columns = (np.concatenate(column, dtype=column[0].dtype) for column in zip(*parts, strict=True))
-    return type(parts[0])(*columns)
 
 
 def in_order_of_arrival(parts: Sequence[Rows]) -> Rows:
     """Concatenate tuples of columns and sort them by arrival; the sort is stable."""
-    rows = joined(parts)
+    rows = concatenate(parts)
     order = np.argsort(rows[-1], kind="stable")  # the last column is the arrival
     return type(rows)(*(column[order] for column in rows))
 
@@ -180,18 +166,11 @@ class InputKind:
         return f"<robot>/{self.topic}" if self.of_each else self.topic
 
 
-class Measured(NamedTuple):
-    """Measurements of a sensor."""
-
-    measurements: MeasurementArray  #: (m,) of MEASUREMENT_DTYPE
-    arrival_ns: IntArray  #: (m,) arrival times
-
-
 class Change(NamedTuple):
     """Change of a sensor's measurements by new readings."""
 
-    added: MeasurementArray  #: (m,) new measurements
-    withdrawn: MeasurementArray  #: (w,) earlier measurements that are replaced
+    added: Measurements  #: (m,) new measurements
+    withdrawn: Measurements  #: (w,) earlier measurements that are replaced
 
 
 class Accumulator(Protocol):
@@ -232,7 +211,7 @@ class SensorSettings(Protocol):
 
 
 Converter = Callable[[Any], Any]
-"""Converts readings to `Measured`, or filters valid readings for odometry and accumulators."""
+"""Converts readings to `Measurements`, or filters valid readings for odometry and accumulators."""
 
 
 @dataclass(frozen=True)
@@ -263,17 +242,16 @@ _MIN_VARIANCE, _MAX_VARIANCE = 1e-14, 1e14
 _ASYMMETRY, _ROUNDING = 1e-6, 1e-9
 
 
-def reject_reasons(measurements: MeasurementArray) -> IntArray:
+def reject_reasons(measurements: Measurements) -> IntArray:
     """Reasons (m,) to reject measurements (m,), as indices of `REJECT_REASONS`; `VALID` if none."""
-    value = measurements["value"]
-    reasons = np.full(measurements.size, VALID)
-    _check_covariances(measurements["covariance"], reasons)
+    value, reasons = measurements.value, np.full(measurements.size, VALID)
+    _check_covariances(measurements.covariance, reasons)
     reasons[np.abs(value).max(axis=1) > _MAX_DISTANCE_M] = REJECT_REASONS.index("absurd")
     reasons[~np.isfinite(value).all(axis=1)] = REJECT_REASONS.index("non_finite")
     return reasons
 
 
-def is_about_swarm(measurements: MeasurementArray, robots: int, landmarks: int) -> BoolArray:
+def is_about_swarm(measurements: Measurements, robots: int, landmarks: int) -> BoolArray:
     """Whether measurements (m,) have a registered model, valid indices, and finite parameters."""
     valid = np.empty(measurements.size, dtype=np.bool_)
     _check_parameters(measurements, np.array(list(MODELS)), robots, landmarks, valid)
@@ -282,20 +260,25 @@ def is_about_swarm(measurements: MeasurementArray, robots: int, landmarks: int) 
 
 @cached_njit
 def _check_parameters(
-    measurements: MeasurementArray, models: IntArray, robots: int, landmarks: int, valid: BoolArray
+    measurements: Measurements, models: IntArray, robots: int, landmarks: int, valid: BoolArray
 ) -> None:
     for k in range(valid.size):
-        one = measurements[k]
-        good = NOBODY <= one.observer < robots and NOBODY <= one.target < robots
-        good = good and 0 <= one.landmark <= landmarks
-        good = good and (one.observer != one.target or one.observer == NOBODY)
-        good = good and math.isfinite(one.stamp_variance) and one.stamp_variance >= 0.0
-        good = good and not math.isnan(one.gate)
+        observer, target = measurements.observer[k], measurements.target[k]
+        good = NOBODY <= observer < robots and NOBODY <= target < robots
+        good = good and NOBODY <= measurements.landmark[k] < landmarks
+        good = good and (observer != target or observer == NOBODY)
+        variance = measurements.stamp_variance[k]
+        good = good and math.isfinite(variance) and variance >= 0.0
+        good = good and not math.isnan(measurements.gate[k])
         for i in range(3):
-            good = good and math.isfinite(one.sensor[i]) and math.isfinite(one.marker[i])
+            good = (
+                good and math.isfinite(measurements.sensor[k, i]) and math.isfinite(measurements.marker[k, i])
+            )
+            good = good and math.isfinite(measurements.reference[k, i])
+        good = good and math.isfinite(measurements.height[k, 0]) and math.isfinite(measurements.height[k, 1])
         known = False
         for number in models:
-            known = known or one.kind == number
+            known = known or measurements.model[k] == number
         valid[k] = good and known
 
 
@@ -389,7 +372,7 @@ class SharedReader:
             else:
                 rows = self._rows_of(message, np.full(message.robot.size, arrival_ns))
                 parts.append(self._sound(rows, dropped))
-        return SharedColumns(stamp_ns, valid, joined(parts), +dropped)
+        return SharedColumns(stamp_ns, valid, concatenate(parts), +dropped)
 
     def _fault(self, message: SharedMessage) -> str:
         """Reason to drop all readings of a message; "" if there is none."""
@@ -405,7 +388,7 @@ class SharedReader:
         unknown, unstamped = rows.robot >= self._known.robots, rows.stamp_ns < 0
         dropped[UNKNOWN_ROBOT] += int(np.sum(unknown))
         dropped[BAD_STAMP] += int(np.sum(unstamped & ~unknown))
-        return chosen(rows, ~(unknown | unstamped))
+        return select(rows, ~(unknown | unstamped))
 
 
 def _shared_columns(

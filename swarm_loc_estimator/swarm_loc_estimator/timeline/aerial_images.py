@@ -13,9 +13,9 @@ import numpy as np
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.filter.gating import gate_threshold
 from swarm_loc_estimator.filter.integrity import CONFIRMED, count_missed, count_seen, is_contradicted
-from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.filter.measurements import Loss, Measurements, select
+from swarm_loc_estimator.filter.models import CARTESIAN, gate_threshold
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.identification.anchors import Scale
 from swarm_loc_estimator.identification.assignment import (
@@ -65,9 +65,9 @@ class PictureFusion:
             scale_drift=settings.aerial_scale_drift,
         )
 
-    def assigned(self, state: SwarmState, image: MeasurementArray) -> Assignment:
+    def assigned(self, state: SwarmState, image: Measurements) -> Assignment:
         """Assign the detections (n,) of an image to localized robots; indices are of all robots (N,)."""
-        stamp_ns = int(image["stamp_ns"][0])
+        stamp_ns = int(image.stamp_ns[0])
         picture = picture_of(image)
         estimate = estimate_at(state, self._tracks.arrays, self._limits, stamp_ns)
         robots = np.flatnonzero(state.tracked)
@@ -80,7 +80,7 @@ class PictureFusion:
         before_ns = state.images.newest.stamp_ns if state.images.newest is not None else stamp_ns
         unseen &= state.last_fix_ns[robots] <= before_ns  # no other fix since the previous image
         for robot in robots[unseen & in_view].tolist():
-            self._miss_robot(state, robot)
+            self._miss_robot(state, robot, stamp_ns)
         strangers = int(np.sum(found.robot == UNSEEN)) - int(np.sum(~state.tracked & self._moves))
         for robot in robots[unseen & ~in_view].tolist() if strangers > 0 else ():
             # the robot may have left the view, or be one of the unassigned detections
@@ -97,14 +97,14 @@ class PictureFusion:
         )
         return Assignment(place, robot, probability)
 
-    def _miss_robot(self, state: SwarmState, robot: int) -> None:
+    def _miss_robot(self, state: SwarmState, robot: int, stamp_ns: int) -> None:
         """Increase the fault score of a robot that was not detected at its estimated position."""
         unconfirmed = state.integrity.confirmations[robot] < CONFIRMED
         doubt = count_missed(state.integrity, robot, self._miss)
         if unconfirmed or doubt >= self._settings.max_fault_score:
-            state.deinitialize(robot)
+            state.deinitialize(robot, Loss.NOT_IN_IMAGE, stamp_ns)
 
-    def identify(self, state: SwarmState, image: MeasurementArray, assignment: Assignment) -> bool:
+    def identify(self, state: SwarmState, image: Measurements, assignment: Assignment) -> bool:
         """Search an image for robots that are not localized or were not detected at their estimate.
 
         Args:
@@ -115,7 +115,7 @@ class PictureFusion:
         Returns:
             Whether any robot was searched.
         """
-        images, stamp_ns = state.images, int(image["stamp_ns"][0])
+        images, stamp_ns = state.images, int(image.stamp_ns[0])
         looking = self._moves & (~state.tracked | (assignment.place == UNSEEN))
         for robot in [robot for robot in images.chains if not looking[robot]]:
             if assignment.place[robot] != AMBIGUOUS:
@@ -123,7 +123,7 @@ class PictureFusion:
         free = np.flatnonzero(assignment.robot < 0)
         claims: dict[int, Identity] = {}
         for robot in np.flatnonzero(looking).tolist():
-            outcome, claim = self._look(state, robot, image[free])
+            outcome, claim = self._look(state, robot, select(image, free))
             if claim is not None:
                 claims[robot] = claim
             else:
@@ -134,14 +134,12 @@ class PictureFusion:
             images.outcomes[Outcome.ANSWERED if agreed else Outcome.CONFLICT] += 1
             if agreed:
                 self._initialize(state, robot, stamp_ns, claim)
-        self._tell(state, image[free], looking, claims, taken)
+        self._tell(state, select(image, free), looking, claims, taken)
         return bool(looking.any())
 
-    def _look(
-        self, state: SwarmState, robot: int, image: MeasurementArray
-    ) -> tuple[Outcome, Identity | None]:
+    def _look(self, state: SwarmState, robot: int, image: Measurements) -> tuple[Outcome, Identity | None]:
         """Search one robot among unassigned detections (n,)."""
-        stamp_ns = int(image["stamp_ns"][0]) if image.size else 0
+        stamp_ns = int(image.stamp_ns[0]) if image.size else 0
         if not image.size:
             return Outcome.UNDECIDED, None
         if image.size > _MAX_FREE:
@@ -186,7 +184,7 @@ class PictureFusion:
     def _tell(
         self,
         state: SwarmState,
-        image: MeasurementArray,
+        image: Measurements,
         looking: np.typing.NDArray[np.bool_],
         claims: dict[int, Identity],
         taken: Counter[int],
@@ -199,7 +197,7 @@ class PictureFusion:
         for robot in np.flatnonzero(looking).tolist():
             claim = claims.get(robot)
             if claim is not None and taken[claim.place] == 1:
-                place[robot], probability[robot] = int(image["marker_id"][claim.place]), claim.probability
+                place[robot], probability[robot] = int(image.reading[claim.place]), claim.probability
             else:
                 chains = state.images.chains.get(robot)
                 place[robot] = -1
@@ -214,21 +212,20 @@ def relieve_seen(state: SwarmState, robots: IntArray) -> None:
         count_seen(state.integrity, robot)
 
 
-def picture_of(image: MeasurementArray) -> Picture:
+def picture_of(image: Measurements) -> Picture:
     """Poses and covariances of the detections (n,) of an image."""
-    return Picture(image["value"], image["covariance"], image["has_heading"].astype(bool))
+    return Picture(image.value, image.covariance, image.has_heading)
 
 
-def as_fixes(image: MeasurementArray, robots: IntArray) -> MeasurementArray:
+def as_fixes(image: Measurements, robots: IntArray) -> Measurements:
     """Convert identified detections (k,) to absolute fixes of robots (k,)."""
-    fixes: MeasurementArray = image.copy()
-    fixes["kind"], fixes["target"], fixes["marker_id"] = Kind.CARTESIAN, robots, 0
-    return fixes
+    none = np.zeros(image.size, dtype=np.int64)
+    return image._replace(model=none + CARTESIAN, target=robots, reading=none)
 
 
-def _numbers(image: MeasurementArray, places: IntArray) -> IntArray:
+def _numbers(image: Measurements, places: IntArray) -> IntArray:
     """Indices (k,) in the message of the detections at `places` (k,); arbitrary for negative places."""
-    numbers: IntArray = image["marker_id"][np.maximum(places, 0)]
+    numbers: IntArray = image.reading[np.maximum(places, 0)]
     return numbers
 
 

@@ -10,7 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from swarm_loc_estimator.filter.belief import NEVER_NS
-from swarm_loc_estimator.filter.measurement_model import NO_MODEL, Command
+from swarm_loc_estimator.filter.measurements import (
+    Command,
+    CommandKind,
+    Measurements,
+    Verdict,
+    concatenate,
+    drops_by_reason,
+)
+from swarm_loc_estimator.filter.models import CARTESIAN
 from swarm_loc_estimator.filter.state import IN_MAP
 from swarm_loc_estimator.identification.memory import Identities, Outcome
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
@@ -18,8 +26,8 @@ from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.sensors.imu import TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.lidar import SCANS, SweepStore
 from swarm_loc_estimator.sensors.odometry import ODOMETRY, OdometryRows
-from swarm_loc_estimator.sensors.registry import Batch, InputConverter, Measurements
-from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, joined, reject_reasons
+from swarm_loc_estimator.sensors.registry import Batch, InputConverter
+from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.contradictions import ConstantOdometry, Contradiction, contradictions
 from swarm_loc_estimator.timeline.estimate import Estimate, Status, TrackedLimits, estimate_at
@@ -28,7 +36,6 @@ from swarm_loc_estimator.timeline.self_calibration import learned, learns
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.sightings import Recent
 from swarm_loc_estimator.timeline.timeline import HasBudget, Timeline
-from swarm_loc_estimator.timeline.verdicts import Verdict, drops_by_reason
 
 __all__ = ["Estimate", "Estimator", "Status"]
 
@@ -101,20 +108,21 @@ class Estimator:
             " sparse one."
         )
 
-    def convert(self, batch: Batch) -> Measurements:
+    def convert(self, batch: Batch) -> Batch:
         """Convert readings to measurements for `receive`; invalid ones are counted in `drops`."""
         return self._converter.convert(batch)
 
-    def receive(self, inputs: Batch | Measurements) -> None:
+    def receive(self, inputs: Batch) -> None:
         """Add new data; reset first if their arrival times show that the clock jumped back."""
         self._check_clock(inputs.begin_ns)
         self._check_clock(inputs.end_ns)
-        arrivals = self.convert(inputs) if isinstance(inputs, Batch) else inputs
-        self._timeline.add(arrivals.measurements)
+        arrivals = inputs if inputs.is_converted else self.convert(inputs)
         for name, rows in arrivals.rows.items():
-            if not rows.robot.size:
+            if isinstance(rows, Measurements):
+                self._timeline.add(rows)
+            elif not rows.robot.size:
                 continue
-            if name == ODOMETRY.name:
+            elif name == ODOMETRY.name:
                 self._odometry.append(rows)
             elif name == TURN_RATES.name:
                 self._turn_rates.append(rows)
@@ -130,23 +138,21 @@ class Estimator:
             "" on success, else a reason of `drops`, such as "not_localized" before its first odometry.
         """
         self._use_odometry()
-        command = about_robots(robot, stamp_ns, np.array([pose]), np.array([covariance]), NO_MODEL)
-        command["command"] = Command.SET_POSE
-        fault = REJECT_REASONS[reject_reasons(command)[0]] or (
+        fix = about_robots(robot, stamp_ns, np.array([pose]), np.array([covariance]), CARTESIAN)
+        fault = REJECT_REASONS[reject_reasons(fix)[0]] or (
             "" if self._tracks.has_started(robot, stamp_ns) else "not_localized"
         )
         if fault:
             self.drop(fault)
         else:
-            self._timeline.add(command)
+            command = Command(stamp_ns, CommandKind.SET_POSE, robot, fix.value[0], fix.covariance[0])
+            self._timeline.command(command)
             self._constant.forget(robot)
         return fault
 
     def forget(self, robot: int, stamp_ns: int) -> None:
         """Remove a robot from the estimate until a fix initializes it."""
-        command = about_robots(robot, stamp_ns, np.zeros((1, 3)), np.eye(3)[None], NO_MODEL)
-        command["command"] = Command.FORGET
-        self._timeline.add(command)
+        self._timeline.command(Command(stamp_ns, CommandKind.FORGET, robot, np.zeros(3), np.eye(3)))
 
     def drop(self, reason: str, count: int = 1) -> None:
         """Count data that were dropped before they reached the estimator."""
@@ -233,7 +239,7 @@ class Estimator:
         self._use_odometry()
         if fuse:
             self._timeline.advance(newest_ns, has_budget)
-            needed_ns = min([oldest_ns, *self._timeline.measurements["stamp_ns"][:1].tolist()])
+            needed_ns = min([oldest_ns, *self._timeline.measurements.stamp_ns[:1].tolist()])
             for accumulator in self._converter.accumulators.values():
                 accumulator.forget_before(needed_ns if accumulator is self._sweeps else oldest_ns)
         return self._estimate(now_ns)
@@ -248,14 +254,14 @@ class Estimator:
 
     def _use_odometry(self) -> None:
         if self._turn_rates:  # first, so that they are known when the steps are integrated
-            rates, self._turn_rates = joined(self._turn_rates), []
+            rates, self._turn_rates = concatenate(self._turn_rates), []
             change = self._tracks.extend_turns(rates.robot, rates.stamp_ns, rates.rate)
             self.drop("imu_duplicate", change.duplicates)
             self._converter.drops.add("imu_too_old", change.too_old)
             self._timeline.invalidate(change.changed_from_ns)
         if not self._odometry:
             return
-        rows, self._odometry = joined(self._odometry), []
+        rows, self._odometry = concatenate(self._odometry), []
         change = self._tracks.extend(rows.robot, rows.stamp_ns, rows.pose, rows.twist)
         self.drop("odometry_duplicate", change.duplicates)
         self._converter.drops.add("odometry_too_old", change.too_old)

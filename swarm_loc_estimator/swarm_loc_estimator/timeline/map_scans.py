@@ -13,7 +13,8 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import between
 from swarm_loc_estimator.filter.integrity import CONFIRMED, count_missed, count_seen
-from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.filter.measurements import Loss, Measurements, Verdict
+from swarm_loc_estimator.filter.models import CARTESIAN
 from swarm_loc_estimator.filter.state import IN_MAP, SwarmState
 from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.mapping.map_matching import BLOCKED, OFF_MAP, WallMap, match, wall_map
@@ -23,7 +24,6 @@ from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.settings import Settings
-from swarm_loc_estimator.timeline.verdicts import Verdict
 
 _SYSTEMATIC_SHARE = 0.7
 """Share of a match's variance that the next scans have, too: what is wrong with the map at a place."""
@@ -67,15 +67,15 @@ class MapScans:
         self._limits = TrackedLimits.of(swarm, settings)
         self._walls = walls_of(swarm)
 
-    def fix_of(self, state: SwarmState, one: MeasurementArray) -> tuple[MeasurementArray | None, Verdict]:
-        """Match a scan (1,); returns its fix (1,), or None and why there is none.
+    def fix_of(self, state: SwarmState, one: Measurements) -> tuple[Measurements | None, Verdict]:
+        """Match a scan; returns its fix (1,), or None and why there is none.
 
         Args:
             state: Its fault scores are changed.
-            one: The scan, whose robot is initialized if its start is known.
+            one: Row of the scan, whose robot is initialized if its start is known.
         """
-        robot, stamp_ns = int(one["target"][0]), int(one["stamp_ns"][0])
-        sweep = self._sweeps.get((robot, int(one["marker_id"][0])))
+        robot, stamp_ns = int(one.target), int(one.stamp_ns)
+        sweep = self._sweeps.get((robot, int(one.reading)))
         if self._walls is None or sweep is None or state.origin != IN_MAP or not state.tracked[robot]:
             return None, Verdict.NOT_LOCALIZED
         estimate = estimate_at(state, self._tracks.arrays, self._limits, stamp_ns)
@@ -85,17 +85,17 @@ class MapScans:
         if found.outcome == OFF_MAP:
             confirmed = state.integrity.confirmations[robot] >= CONFIRMED
             if count_missed(state.integrity, robot, 1.0) >= (_MAX_MISSED if confirmed else _MAX_AT_START):
-                state.deinitialize(robot)  # later ones may fit by chance, elsewhere
+                state.deinitialize(robot, Loss.OFF_MAP, stamp_ns)  # later ones may fit by chance, elsewhere
             return None, Verdict.OFF_MAP
         if found.outcome == BLOCKED:
             return None, Verdict.BLOCKED
         count_seen(state.integrity, robot)
         if found.determined < _ALL or found.fitting < _SURE_FIT:  # does not confirm a start
             state.integrity.confirmed_ns[robot] = stamp_ns
-        fix = about_robots(robot, stamp_ns, found.pose[None], found.covariance[None], Kind.CARTESIAN)
-        fix["systematic_share"] = _SYSTEMATIC_SHARE
-        # with an alternative it locates no robot alone: it was sought near the pose that may be wrong
-        fix["has_alternative"], fix["alternative"] = 1, fix["value"]
+        fix = about_robots(robot, stamp_ns, found.pose[None], found.covariance[None], CARTESIAN)
+        fix.systematic_share[:] = _SYSTEMATIC_SHARE
+        # with a second solution it locates no robot alone: it was sought near the pose that may be wrong
+        fix.has_second[:], fix.second[:] = True, fix.value
         return fix, Verdict.OPEN
 
     def _beams(

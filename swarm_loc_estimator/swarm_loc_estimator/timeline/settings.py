@@ -8,16 +8,12 @@ T]: a measurement at the instant of fusion belongs to the period that ends then.
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, TypeVar
-
-import numpy as np
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.parameters import UserError, number, number_specs
-from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 
 if TYPE_CHECKING:
     from swarm_loc_estimator.swarm.swarm import Swarm
@@ -62,20 +58,6 @@ def middle_of_period(stamp_ns: int, period_ns: int) -> int:
     It does not depend on the measurements, so late measurements of the period use the same prediction.
     """
     return _end_of_period(stamp_ns, period_ns) - period_ns + period_ns // 2
-
-
-_NO_IMAGE_NS = np.iinfo(np.int64).min
-
-
-def parts_by_way(measurements: MeasurementArray) -> list[slice]:
-    """Parts of measurements (m,) in order that are fused in one way: an aerial image, a scan, or others."""
-    anonymous, scan = (measurements["kind"] == kind for kind in (Kind.ANONYMOUS, Kind.SCAN))
-    if not (anonymous.any() or scan.any()):
-        return [slice(0, measurements.size)]
-    image_ns = np.where(anonymous, measurements["stamp_ns"], _NO_IMAGE_NS)
-    changes = (np.diff(image_ns) != 0) | scan[1:] | scan[:-1]
-    edges = [0, *(np.flatnonzero(changes) + 1).tolist(), measurements.size]
-    return [slice(begin, end) for begin, end in itertools.pairwise(edges)]
 
 
 class SettingsError(UserError):

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.messages.cdr import SWARM_SIGHTINGS, CdrError, decode, encode, nanoseconds
-from swarm_loc_estimator.filter.measurement_model import Command, MeasurementArray
-from swarm_loc_estimator.timeline.verdicts import Verdict
+from swarm_loc_estimator.filter.measurements import Measurements, Verdict, select
 
 RECENT_NS = 2_000_000_000  # Maximum age of reported measurements
 
@@ -17,7 +16,7 @@ RECENT_NS = 2_000_000_000  # Maximum age of reported measurements
 class Recent(NamedTuple):
     """Recent measurements with their verdicts."""
 
-    measurements: MeasurementArray  # (m,) sorted by stamp
+    measurements: Measurements  # (m,) sorted by stamp
     verdicts: NDArray[np.uint8]  # (m,) of `Verdict`
     nis: NDArray[np.float64]  # (m,) normalized innovation squared
 
@@ -40,13 +39,13 @@ def newest_sightings(recent: Recent, now_ns: int) -> Sightings:
         now_ns: The current instant.
     """
     rows, verdicts, nis = recent
-    first = int(np.searchsorted(rows["stamp_ns"], now_ns - RECENT_NS))
-    rows, verdicts, nis = rows[first:], verdicts[first:], nis[first:]
-    robot, landmark = rows["target"], rows["landmark"]
-    target = np.where(landmark > 0, -landmark, robot)
-    observer = rows["observer"]
-    shown = (rows["command"] == Command.NONE) & (verdicts <= Verdict.NOT_LOCALIZED)
-    chosen = np.flatnonzero(shown & ((landmark > 0) | (robot >= 0)))[::-1]
+    first = int(np.searchsorted(rows.stamp_ns, now_ns - RECENT_NS))
+    rows, verdicts, nis = select(rows, slice(first, None)), verdicts[first:], nis[first:]
+    robot, landmark = rows.target, rows.landmark
+    target = np.where(landmark >= 0, -1 - landmark, robot)
+    observer = rows.observer
+    shown = verdicts <= Verdict.NOT_LOCALIZED
+    chosen = np.flatnonzero(shown & ((landmark >= 0) | (robot >= 0)))[::-1]
     # np.unique keeps the first of equal keys, which is the newest in reversed order
     _, places = np.unique((observer[chosen] << 32) + target[chosen], return_index=True)
     kept = chosen[places]
@@ -56,7 +55,7 @@ def newest_sightings(recent: Recent, now_ns: int) -> Sightings:
         target[kept].astype(np.int32),
         verdicts[kept].astype(np.uint8),
         np.where(computed, nis[kept], np.nan).astype(np.float32),
-        ((now_ns - rows["stamp_ns"][kept]) * 1e-9).astype(np.float32),
+        ((now_ns - rows.stamp_ns[kept]) * 1e-9).astype(np.float32),
     )
 
 

@@ -1,66 +1,39 @@
-"""Out-of-sequence measurements: rollback to checkpoints and re-fusion.
+"""Out-of-sequence measurements: a sorted buffer, rollback to checkpoints and re-fusion.
 
-States after some of the steps are stored as checkpoints. A late measurement rolls the filter back to the
-last checkpoint before it, and all later steps are repeated; the result equals that of in-order arrival.
-`state_period_s` assigns measurements to the closest stored state instead, as the e-puck paper (V-B) does.
-
-Buffer of measurements sorted by stamp, into which late measurements are merged.
+Measurements wait in a buffer sorted by stamp, into which late ones are merged. States after some of the steps
+are stored as checkpoints. A late measurement rolls the filter back to the last checkpoint before it, and all
+later steps are repeated; the result equals that of in-order arrival.
 
 The order does not depend on the order of arrival: measurements with equal stamps are sorted by all their
-fields. Measurements equal in all bits are duplicates.
+columns but the arrival. Measurements equal in all of them are duplicates.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from bisect import insort
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, Kind, MeasurementArray
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
+from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
+from swarm_loc_estimator.filter.measurements import (
+    Command,
+    Measurements,
+    Verdict,
+    concatenate,
+    select,
+)
+from swarm_loc_estimator.filter.models import ANONYMOUS
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.timeline.settings import Settings, end_of_period, middle_of_period
-from swarm_loc_estimator.timeline.verdicts import Verdict
 
-_WORDS = MEASUREMENT_DTYPE.itemsize // 8  # every field is made of 8-byte numbers, the stamp is the first
-
-
-_FIRST = (
-    "stamp_ns",
-    "observer",
-    "target",
-    "marker_id",
-    "command",
-    "kind",
-    "covariance",
-    "alternative",
-    "value",
-)
-"""First sort keys of measurements with equal stamps."""
-
-
-def _words_in_order() -> tuple[IntArray, NDArray[np.bool_]]:
-    """Indices (w,) of all words, most significant sort key first, and (w,) True for floats."""
-    fields: Any = MEASUREMENT_DTYPE.fields
-    words: list[int] = []
-    floats: list[bool] = []
-    for name in [*_FIRST, *(name for name in fields if name not in _FIRST)]:
-        field, begin = fields[name][:2]
-        places = range(begin // 8, (begin + field.itemsize) // 8)
-        words += reversed(places)
-        floats += [field.base.kind == "f"] * len(places)
-    return np.array(words, dtype=np.int64), np.array(floats, dtype=bool)
-
-
-_ORDER, _IS_FLOAT = _words_in_order()
 _FIRST_CAPACITY = 1024
-_Columns = tuple[IntArray, IntArray, NDArray[np.uint8], FloatArray]
-"""Rows as words (n, w), their stamps (n,), verdicts and normalized innovations squared."""
 
 
 class Merged(NamedTuple):
@@ -86,12 +59,12 @@ class MeasurementBuffer:
     @property
     def stamp_ns(self) -> IntArray:
         """Stamps (m,), sorted."""
-        return self._stamp_ns[self._begin : self._end]
+        return self._columns.stamp_ns[self._begin : self._end]
 
     @property
-    def measurements(self) -> MeasurementArray:
-        """Measurements (m,) of MEASUREMENT_DTYPE, sorted."""
-        return self._rows[self._begin : self._end]
+    def measurements(self) -> Measurements:
+        """Measurements (m,), sorted."""
+        return select(self._columns, slice(self._begin, self._end))
 
     @property
     def verdicts(self) -> NDArray[np.uint8]:
@@ -103,25 +76,22 @@ class MeasurementBuffer:
         """(m,) to be written."""
         return self._nis[self._begin : self._end]
 
-    def merge(self, new: MeasurementArray) -> Merged:
+    def merge(self, new: Measurements) -> Merged:
         """Insert measurements (k,)."""
         self._make_room(new.size)
-        words = np.ascontiguousarray(new).view(np.int64).reshape(-1, _WORDS)
-        columns = self._words, self._stamp_ns, self._verdicts, self._nis
-        count, first_ns = _merge(columns, self._begin, self._end, words)
+        count, first_ns = _merge(self._columns, self._verdicts, self._nis, self._begin, self._end, new)
         self._end += count
         return Merged(first_ns if count else None, new.size - count)
 
-    def remove(self, gone: MeasurementArray) -> int | None:
+    def remove(self, gone: Measurements) -> int | None:
         """Remove measurements (k,); return the stamp of the first one found, None if none was found."""
-        words = np.ascontiguousarray(gone).view(np.int64).reshape(-1, _WORDS)
         first_ns = None
-        for one in words[np.argsort(words[:, 0], kind="stable")]:
-            place = _lower_bound(self._words, self._stamp_ns, self._begin, self._end, one)
-            if place == self._end or _compared(self._words[place], one) != 0:
+        for k in np.argsort(gone.stamp_ns, kind="stable").tolist():
+            place = _lower_bound(self._columns, self._begin, self._end, gone, k)
+            if place == self._end or _compared(self._columns, place, gone, k) != 0:
                 continue
-            first_ns = int(one[0]) if first_ns is None else first_ns
-            for column in (self._words, self._stamp_ns, self._verdicts, self._nis):
+            first_ns = int(gone.stamp_ns[k]) if first_ns is None else first_ns
+            for column in (*self._columns, self._verdicts, self._nis):
                 column[place : self._end - 1] = column[place + 1 : self._end].copy()
             self._end -= 1
         return first_ns
@@ -131,92 +101,160 @@ class MeasurementBuffer:
         self._begin += count
 
     def _allocate(self, capacity: int) -> None:
-        self._words = np.zeros((capacity, _WORDS), dtype=np.int64)
-        self._rows: MeasurementArray = self._words.view(MEASUREMENT_DTYPE)[:, 0]
-        self._stamp_ns = np.zeros(capacity, dtype=np.int64)
+        self._columns = Measurements.empty(capacity)
         self._verdicts = np.zeros(capacity, dtype=np.uint8)
         self._nis: FloatArray = np.full(capacity, np.nan)
 
     def _make_room(self, count: int) -> None:
         """Reserve space for `count` rows: reuse that of removed rows, or double the capacity."""
-        if self._end + count <= self._stamp_ns.size:
+        if self._end + count <= self._verdicts.size:
             return
-        size, old = len(self), slice(self._begin, self._end)
-        words, stamp_ns = self._words[old].copy(), self._stamp_ns[old].copy()
-        verdicts, nis = self._verdicts[old].copy(), self._nis[old].copy()
-        if 2 * (size + count) > self._stamp_ns.size:
+        size, old = len(self), (self.measurements, self.verdicts, self.nis)
+        kept = [column.copy() for column in (*old[0], *old[1:])]
+        if 2 * (size + count) > self._verdicts.size:
             self._allocate(4 * (size + count))
-        self._words[:size], self._stamp_ns[:size] = words, stamp_ns
-        self._verdicts[:size], self._nis[:size] = verdicts, nis
+        for column, values in zip((*self._columns, self._verdicts, self._nis), kept, strict=True):
+            column[:size] = values
         self._begin, self._end = 0, size
 
 
 @cached_njit
-def _merge(columns: _Columns, begin: int, end: int, new: IntArray) -> tuple[int, int]:
-    """Merge new rows into rows `begin` to `end`; space behind them must be reserved.
+def _merge(
+    columns: Measurements,
+    verdicts: NDArray[np.uint8],
+    nis: FloatArray,
+    begin: int,
+    end: int,
+    new: Measurements,
+) -> tuple[int, int]:
+    """Merge new measurements into rows `begin` to `end`; space after them must be reserved.
 
     Returns:
         Number of inserted rows, and the stamp of the first one.
     """
-    rows, stamps_ns, verdicts, nis = columns
-    order = np.argsort(new[:, 0], kind="mergesort")
-    for k in range(1, order.size):  # sort rows with equal stamps
+    # Sort the new rows: by stamp, then those with equal stamps by all columns.
+    order = np.argsort(new.stamp_ns, kind="mergesort")
+    for k in range(1, order.size):
         row, place = order[k], k
-        while place > 0 and _compared(new[row], new[order[place - 1]]) < 0:
+        while place > 0 and _compared(new, row, new, order[place - 1]) < 0:
             order[place] = order[place - 1]
             place -= 1
         order[place] = row
+    # Leave out duplicates, among themselves and of the buffer.
     kept = 0
     for k in range(order.size):
         row = order[k]
-        if kept and _compared(new[row], new[order[kept - 1]]) == 0:
+        if kept and _compared(new, row, new, order[kept - 1]) == 0:
             continue
-        place = _lower_bound(rows, stamps_ns, begin, end, new[row])
-        if place < end and _compared(rows[place], new[row]) == 0:
+        place = _lower_bound(columns, begin, end, new, row)
+        if place < end and _compared(columns, place, new, row) == 0:
             continue
         order[kept] = row
         kept += 1
+    # Merge from the back: each old row moves once.
     old, place = end - 1, end + kept - 1
     for k in range(kept - 1, -1, -1):
         row = order[k]
-        while old >= begin and _compared(new[row], rows[old]) < 0:
-            _copy(rows[place], rows[old])
-            stamps_ns[place], verdicts[place], nis[place] = stamps_ns[old], verdicts[old], nis[old]
+        while old >= begin and _compared(new, row, columns, old) < 0:
+            _copy(columns, place, columns, old)
+            verdicts[place], nis[place] = verdicts[old], nis[old]
             old -= 1
             place -= 1
-        _copy(rows[place], new[row])
-        stamps_ns[place], verdicts[place], nis[place] = new[row, 0], 0, math.nan
+        _copy(columns, place, new, row)
+        verdicts[place], nis[place] = 0, math.nan
         place -= 1
-    return kept, new[order[0], 0] if kept else 0
+    return kept, new.stamp_ns[order[0]] if kept else 0
 
 
 @cached_njit
-def _lower_bound(rows: IntArray, stamps_ns: IntArray, begin: int, end: int, one: IntArray) -> int:
-    """Index of the first row in rows[begin:end] that is not less than a row."""
-    place: int = begin + np.searchsorted(stamps_ns[begin:end], one[0])
-    while place < end and _compared(rows[place], one) < 0:
+def _lower_bound(columns: Measurements, begin: int, end: int, new: Measurements, k: int) -> int:
+    """Index of the first row from `begin` to `end` that is not less than row k of others."""
+    place: int = begin + np.searchsorted(columns.stamp_ns[begin:end], new.stamp_ns[k])
+    while place < end and _compared(columns, place, new, k) < 0:
         place += 1
     return place
 
 
 @cached_njit
-def _compared(one: IntArray, other: IntArray) -> int:
-    """Compare two rows: -1 if `one` is less than `other`, 1 if greater, 0 if equal."""
-    for k in range(_ORDER.size):
-        a, b = one[_ORDER[k]], other[_ORDER[k]]
-        if a != b:
-            both_negative = _IS_FLOAT[k] and a < 0 and b < 0  # floats are sign and magnitude
-            return -1 if (a < b) != both_negative else 1
+def _compared(a: Measurements, i: int, b: Measurements, j: int) -> int:
+    """Compare row i of measurements with row j of others: -1 if it is less, 1 if greater, 0 if equal."""
+    if a.stamp_ns[i] != b.stamp_ns[j]:
+        return -1 if a.stamp_ns[i] < b.stamp_ns[j] else 1
+    if a.observer[i] != b.observer[j]:
+        return -1 if a.observer[i] < b.observer[j] else 1
+    if a.target[i] != b.target[j]:
+        return -1 if a.target[i] < b.target[j] else 1
+    if a.reading[i] != b.reading[j]:
+        return -1 if a.reading[i] < b.reading[j] else 1
+    if a.model[i] != b.model[j]:
+        return -1 if a.model[i] < b.model[j] else 1
+    # Only measurements that contradict each other get here.
+    for r in range(2, -1, -1):
+        order = _compared_vectors(a.covariance[i, r], b.covariance[j, r])
+        if order != 0:
+            return order
+    order = _compared_vectors(a.second[i], b.second[j])
+    if order != 0:
+        return order
+    order = _compared_vectors(a.value[i], b.value[j])
+    if order != 0:
+        return order
+    if a.received_from[i] != b.received_from[j]:
+        return -1 if a.received_from[i] < b.received_from[j] else 1
+    if a.landmark[i] != b.landmark[j]:
+        return -1 if a.landmark[i] < b.landmark[j] else 1
+    if a.has_heading[i] != b.has_heading[j]:
+        return -1 if b.has_heading[j] else 1
+    if a.has_second[i] != b.has_second[j]:
+        return -1 if b.has_second[j] else 1
+    if a.stamp_variance[i] != b.stamp_variance[j]:
+        return -1 if a.stamp_variance[i] < b.stamp_variance[j] else 1
+    if a.gate[i] != b.gate[j]:
+        return -1 if a.gate[i] < b.gate[j] else 1
+    order = _compared_vectors(a.sensor[i], b.sensor[j])
+    if order != 0:
+        return order
+    order = _compared_vectors(a.marker[i], b.marker[j])
+    if order != 0:
+        return order
+    order = _compared_vectors(a.height[i], b.height[j])
+    if order != 0:
+        return order
+    order = _compared_vectors(a.reference[i], b.reference[j])
+    if order != 0:
+        return order
+    return _compared_vectors(a.systematic_share[i], b.systematic_share[j])
+
+
+@cached_njit
+def _compared_vectors(a: FloatArray, b: FloatArray) -> int:
+    """Compare vectors, last components first."""
+    for i in range(a.size - 1, -1, -1):
+        if a[i] != b[i]:
+            return -1 if a[i] < b[i] else 1
     return 0
 
 
 @cached_njit
-def _copy(target: IntArray, source: IntArray) -> None:
-    for i in range(target.size):
-        target[i] = source[i]
+def _copy(out: Measurements, i: int, rows: Measurements, k: int) -> None:
+    """Write row k of measurements to row i of others."""
+    out.stamp_ns[i], out.received_from[i] = rows.stamp_ns[k], rows.received_from[k]
+    out.observer[i], out.target[i], out.landmark[i] = rows.observer[k], rows.target[k], rows.landmark[k]
+    out.model[i], out.reading[i] = rows.model[k], rows.reading[k]
+    out.has_heading[i], out.has_second[i] = rows.has_heading[k], rows.has_second[k]
+    out.stamp_variance[i], out.gate[i] = rows.stamp_variance[k], rows.gate[k]
+    assign(out.sensor[i], rows.sensor[k])
+    assign(out.marker[i], rows.marker[k])
+    assign(out.height[i], rows.height[k])
+    assign(out.reference[i], rows.reference[k])
+    assign(out.value[i], rows.value[k])
+    assign(out.second[i], rows.second[k])
+    assign_matrix(out.covariance[i], rows.covariance[k])
+    assign(out.systematic_share[i], rows.systematic_share[k])
+    out.arrival_ns[i] = rows.arrival_ns[k]
 
 
-Step = Callable[[SwarmState, MeasurementArray, NDArray[np.uint8], FloatArray], None]
+Step = Callable[[SwarmState, Measurements, Sequence[Command], NDArray[np.uint8], FloatArray], None]
 HasBudget = Callable[[], bool]  # Returns True if there is time for another step
 
 _CHECKPOINTS = 40
@@ -264,8 +302,10 @@ class Timeline:
         self.is_busy = False
         self._head_key = _BEFORE_ALL
         self._checkpoints = [_Checkpoint(_BEFORE_ALL, state.copy())]
-        self._new: list[MeasurementArray] = []
-        self._withdrawn: list[MeasurementArray] = []
+        self._new: list[Measurements] = []
+        self._withdrawn: list[Measurements] = []
+        self._new_commands: list[Command] = []
+        self._commands: list[Command] = []
         self._redo_from_ns: int | None = None
         self._buffer = MeasurementBuffer()
         self.settled: NDArray[np.int64] = np.zeros(len(Verdict), dtype=np.int64)
@@ -273,7 +313,7 @@ class Timeline:
         self.too_old = 0
 
     @property
-    def measurements(self) -> MeasurementArray:
+    def measurements(self) -> Measurements:
         """Measurements (m,) within the horizon, sorted by stamp."""
         return self._buffer.measurements
 
@@ -287,12 +327,16 @@ class Timeline:
         """Normalized innovation squared (m,) of the measurements."""
         return self._buffer.nis
 
-    def add(self, measurements: MeasurementArray) -> None:
+    def add(self, measurements: Measurements) -> None:
         """Add measurements (m,), to be fused by the next `advance`."""
         if measurements.size:
             self._new.append(measurements)
 
-    def withdraw(self, measurements: MeasurementArray) -> None:
+    def command(self, command: Command) -> None:
+        """Add a command, to be executed at its stamp by the next `advance`."""
+        self._new_commands.append(command)
+
+    def withdraw(self, measurements: Measurements) -> None:
         """Remove measurements (m,) added before, and undo their effect at the next `advance`."""
         if measurements.size:
             self._withdrawn.append(measurements)
@@ -306,6 +350,7 @@ class Timeline:
         """Stamp of the oldest measurement left to fuse, at most `otherwise_ns`."""
         due_ns = [otherwise_ns] if self._redo_from_ns is None else [otherwise_ns, self._redo_from_ns]
         due_ns += self._buffer.stamp_ns[self._count_until(self._head_key) :][:1].tolist()
+        due_ns += [one.stamp_ns for one in self._commands if one.stamp_ns > self._head_key]
         return min(due_ns)
 
     def invalidate(self, changed_from_ns: NDArray[np.int64]) -> None:
@@ -316,10 +361,14 @@ class Timeline:
         """
         rows = self._buffer.measurements
         first = _first_touched(
-            self._buffer.stamp_ns, rows["observer"], rows["target"], changed_from_ns, self._fusion_period_ns
+            rows.stamp_ns, rows.observer, rows.target, changed_from_ns, self._fusion_period_ns
         )
         if first < len(self._buffer):
-            self._redo_from(int(self._buffer.stamp_ns[first]))
+            self._redo_from(int(rows.stamp_ns[first]))
+        for command in self._commands:
+            if command.stamp_ns > changed_from_ns[command.robot]:
+                self._redo_from(command.stamp_ns)
+                break
 
     def verdict_counts(self) -> NDArray[np.int64]:
         """Number of measurements by verdict (len(Verdict),) since the last restart."""
@@ -334,6 +383,8 @@ class Timeline:
         if not self.is_busy:
             if self._new:
                 self._merge(now_ns - self._horizon_ns)
+            if self._new_commands:
+                self._order(now_ns - self._horizon_ns)
             if self._withdrawn:
                 self._remove(now_ns - self._horizon_ns)
             if self._redo_from_ns is not None:
@@ -367,6 +418,16 @@ class Timeline:
         if merged.first_ns is not None:
             self._redo_from(merged.first_ns)
 
+    def _order(self, oldest_ns: int) -> None:
+        """Insert new commands by their stamps."""
+        for command in self._new_commands:
+            if command.stamp_ns < oldest_ns:
+                self.too_old += 1
+                continue
+            insort(self._commands, command, key=lambda one: (one.stamp_ns, one.robot))
+            self._redo_from(command.stamp_ns)
+        self._new_commands = []
+
     def _remove(self, oldest_ns: int) -> None:
         """Remove withdrawn measurements, unless their replacements were rejected as too old."""
         gone, self._withdrawn = self._not_older(self._withdrawn, oldest_ns), []
@@ -374,20 +435,18 @@ class Timeline:
         if first_ns is not None:
             self._redo_from(first_ns)
 
-    def _not_older(self, parts: list[MeasurementArray], oldest_ns: int) -> MeasurementArray:
+    def _not_older(self, parts: list[Measurements], oldest_ns: int) -> Measurements:
         """Select measurements (m,) whose stamps are not older than an instant.
 
         With `state_period_s`, stamps are rounded to the closest stored state.
         """
-        rows, period = parts[0] if len(parts) == 1 else np.concatenate(parts), self._state_period_ns
-        fresh = rows["stamp_ns"] >= oldest_ns
+        rows, period = concatenate(parts), self._state_period_ns
+        fresh = rows.stamp_ns >= oldest_ns
         if not fresh.all():
-            rows = rows[fresh]
-        if period:
-            rows = rows.copy()
-            stamp_ns = rows["stamp_ns"]  # detections of different aerial images must not be mixed
-            nearest_ns = (stamp_ns + period // 2) // period * period
-            rows["stamp_ns"] = np.where(rows["kind"] == Kind.ANONYMOUS, stamp_ns, nearest_ns)
+            rows = select(rows, fresh)
+        if period:  # detections of different aerial images must not be mixed
+            nearest_ns = (rows.stamp_ns + period // 2) // period * period
+            rows = rows._replace(stamp_ns=np.where(rows.model == ANONYMOUS, rows.stamp_ns, nearest_ns))
         return rows
 
     def _go_back(self, key: int) -> None:
@@ -400,29 +459,30 @@ class Timeline:
 
     def _compute(self, due_ns: int, has_budget: HasBudget) -> bool:
         """Compute steps that end until `due_ns` within the budget; return whether all are done."""
-        buffer, begin = self._buffer, self._count_until(self._head_key)
-        while begin < len(buffer):
-            end = self._end_of_steps(begin)
-            key = self._key(int(buffer.stamp_ns[end - 1]))
+        buffer = self._buffer
+        while True:
+            # A run of steps up to the next checkpoint, which are computed together.
+            begin = self._count_until(self._head_key)
+            commands = [one for one in self._commands if one.stamp_ns > self._head_key]
+            stamps_ns = [*buffer.stamp_ns[begin : begin + 1].tolist(), *(one.stamp_ns for one in commands)]
+            if not stamps_ns:
+                return True
+            last_ns = end_of_period(min(stamps_ns), self._fusion_period_ns or self._spacing_ns)
+            end = self._count_until(last_ns)
+            commands = [one for one in commands if one.stamp_ns <= last_ns]
+            newest_ns = [one.stamp_ns for one in commands] + buffer.stamp_ns[begin:end][-1:].tolist()
+            key = self._key(max(newest_ns))
             if key > due_ns:
-                break
+                return True
+            # Fuse, and store a checkpoint if the last one is old.
             rows = slice(begin, end)
-            self._step(self._ahead, buffer.measurements[rows], buffer.verdicts[rows], buffer.nis[rows])
+            measurements = select(buffer.measurements, rows)
+            self._step(self._ahead, measurements, commands, buffer.verdicts[rows], buffer.nis[rows])
             self._head_key = key
             if key - max(self._checkpoints[-1].key, -(2**62)) >= self._spacing_ns:
                 self._checkpoints.append(_Checkpoint(key, self._ahead.copy()))
-            begin = end
-            if begin < len(buffer) and not has_budget():
+            if end < len(buffer) and not has_budget():
                 return False
-        return True
-
-    def _end_of_steps(self, begin: int) -> int:
-        """End of the run of steps from `begin` to the next checkpoint, which are computed together."""
-        stamps_ns, length_ns = self._buffer.stamp_ns, self._fusion_period_ns or self._spacing_ns
-        last_ns = end_of_period(int(stamps_ns[begin]), length_ns)
-        return (
-            stamps_ns.size if stamps_ns[-1] <= last_ns else int(stamps_ns.searchsorted(last_ns, side="right"))
-        )
 
     def _forget_before(self, key: int) -> None:
         """Drop data before step `key`, except one checkpoint and the measurements after it."""
@@ -433,6 +493,7 @@ class Timeline:
             return
         del self._checkpoints[: older - 1]
         passed = self._count_until(self._checkpoints[0].key)
+        self._commands = [one for one in self._commands if one.stamp_ns > self._checkpoints[0].key]
         self.settled += np.bincount(self.verdicts[:passed], minlength=len(Verdict))
         self._buffer.drop_first(passed)
 

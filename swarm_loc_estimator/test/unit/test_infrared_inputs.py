@@ -15,7 +15,7 @@ from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.infrared.search import IrOutcome, IrSolutions
 from swarm_loc_estimator.sensors import infrared as brightness_sightings
 from swarm_loc_estimator.sensors.infrared import BrightnessConverter, BrightnessRows
-from swarm_loc_estimator.sensors.sensor import chosen
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.swarm.ir_board import IrMethod, IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
@@ -283,5 +283,5 @@ def test_only_what_changed_is_looked_at_again() -> None:
     events = heard()
     converter = BrightnessConverter(swarm_of())
     assert converter.take(rows_of(*events)).added.size == 2
-    nothing = converter.take(chosen(rows_of(*events), slice(0)))
+    nothing = converter.take(select(rows_of(*events), slice(0)))
     assert (nothing.added.size, nothing.withdrawn.size) == (0, 0)

@@ -22,7 +22,7 @@ from swarm_loc_estimator.sensors.camera import DETECTIONS
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.odometry import ODOMETRY
 from swarm_loc_estimator.sensors.registry import Batch
-from swarm_loc_estimator.sensors.sensor import chosen
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -324,7 +324,7 @@ def test_a_heading_reset_of_an_unseen_robot_misleads_nobody(turn: float | None) 
         time_s = (seen.stamp_ns - begin_ns) * 1e-9
         own = np.isin(seen.detection["id"], [face.id for face in world.swarm.robots[who].faces])
         unseen = ((seen.robot == who) | own) & (time_s >= 24.5) & (time_s < 35.0)
-        rows |= {DETECTIONS.name: chosen(seen, ~unseen)} if seen.robot.size else {}
+        rows |= {DETECTIONS.name: select(seen, ~unseen)} if seen.robot.size else {}
         return replace(batch, rows=rows)
 
     result, named = world.result(change)

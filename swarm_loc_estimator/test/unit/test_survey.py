@@ -24,7 +24,8 @@ from swarm_loc_estimator.sensors.camera import FROM_OPTICAL, NO_DETECTIONS, Dete
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.ranges import RangeRows
-from swarm_loc_estimator.sensors.sensor import chosen, in_order_of_arrival
+from swarm_loc_estimator.filter.measurements import select
+from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import ImuModel
 from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, StartSigma, Swarm, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -153,7 +154,7 @@ def test_what_is_rare_or_lone_is_named_with_a_remedy() -> None:
     mine, yours = (1000, 1001, 1002, 1003), (1004, 1005, 1006, 1007)
     apart = np.where(robot == 0, np.isin(ids, mine), np.isin(ids, yours))
     apart[np.flatnonzero((ids == 1007) & apart)[3:]] = False
-    seen = chosen(rows, apart)
+    seen = select(rows, apart)
     done = survey(replace(recording, detections=seen), unplaced(world.swarm))
     assert "Marker 1007 was seen 3 x only and is left out; drive past it." in done.text
     assert "cannot be placed: nothing connects them with the others" in done.text
@@ -166,7 +167,7 @@ def test_a_robot_that_takes_no_part_or_stands_costs_nothing() -> None:
     recording = recording_of(world)
     rows, seen = recording.odometry, recording.detections
     absent = replace(
-        recording, odometry=chosen(rows, rows.robot > 0), detections=chosen(seen, seen.robot > 0)
+        recording, odometry=select(rows, rows.robot > 0), detections=select(seen, seen.robot > 0)
     )
     first, *others = world.swarm.robots
     for robot in (first, replace(first, stands=True)):
@@ -359,7 +360,7 @@ def test_anchors_are_placed_by_their_ranges(seed: int, wrong: float) -> None:
 def test_what_was_measured_rarely_is_named() -> None:
     world = simulate(PLAN, 0)
     ranges = measured_ranges(world, np.random.default_rng(0))
-    recording = replace(recording_of(world), ranges=chosen(ranges, np.arange(40)))
+    recording = replace(recording_of(world), ranges=select(ranges, np.arange(40)))
     robots = tuple(
         replace(robot, uwb=replace(RADIO, address=k)) for k, robot in enumerate(world.swarm.robots, 1)
     )

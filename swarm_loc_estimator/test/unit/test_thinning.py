@@ -17,7 +17,7 @@ from swarm_loc_estimator.sensors.fix import FixRows
 from swarm_loc_estimator.sensors.infrared import BrightnessRows
 from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.sensors.registry import Batch
-from swarm_loc_estimator.sensors.sensor import joined
+from swarm_loc_estimator.filter.measurements import concatenate
 from swarm_loc_estimator.timeline.settings import end_of_period
 
 ROBOTS = 20
@@ -68,7 +68,7 @@ def test_one_that_floods_is_the_first_to_lose() -> None:
     thinning, kept = Thinning(ROBOTS), np.zeros(ROBOTS)
     for tick in range(200):
         quiet, flood = images(tick, range(1, ROBOTS), 1), images(tick, [0], 200)
-        both = Batch.of(tick, tick, detections=joined([quiet["detections"], flood["detections"]]))
+        both = Batch.of(tick, tick, detections=concatenate([quiet["detections"], flood["detections"]]))
         left = thinning.thin(both, 0.1).messages
         kept += np.bincount(left["detections"].robot, minlength=ROBOTS)
     assert set(kept[1:]) == {200.0}, "they sent less than everyone's part"

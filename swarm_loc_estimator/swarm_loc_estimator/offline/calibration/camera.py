@@ -16,7 +16,8 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
-from swarm_loc_estimator.filter.measurement_model import Kind
+from swarm_loc_estimator.filter.measurements import select
+from swarm_loc_estimator.filter.models import POLAR
 from swarm_loc_estimator.offline.calibration.recording import Recording
 from swarm_loc_estimator.offline.calibration.robust import (
     fit_with_prior,
@@ -24,7 +25,6 @@ from swarm_loc_estimator.offline.calibration.robust import (
     spread,
 )
 from swarm_loc_estimator.sensors.camera import SightingConverter
-from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm
 
@@ -59,15 +59,15 @@ def sightings_of(recording: Recording, swarm: Swarm, observer: int) -> CameraSig
     logged = _logged(recording, swarm, observer)
     truth = recording.truth.get(swarm.robots[observer].name)
     if truth is None:
-        return chosen(logged, slice(0))
+        return select(logged, slice(0))
     known, lone = _observer_known(truth, logged.stamp_ns)
     for target in np.unique(logged.target[logged.target >= 0]).tolist():
         rows = logged.target == target
         other = recording.truth.get(swarm.robots[target].name)
         known[rows] &= other is not None and _dense_around(other, logged.stamp_ns[rows])
     known &= np.isnan(lone[:, 0]) | (logged.target < 0)  # a lone pose gives no time of exposure
-    used = chosen(logged._replace(lone=lone), known)
-    return chosen(used, slice(None, None, max(1, -(-used.stamp_ns.size // _MAX_SIGHTINGS))))
+    used = select(logged._replace(lone=lone), known)
+    return select(used, slice(None, None, max(1, -(-used.stamp_ns.size // _MAX_SIGHTINGS))))
 
 
 def true_values(
@@ -112,20 +112,20 @@ def true_values(
 def _logged(recording: Recording, swarm: Swarm, observer: int) -> CameraSightings:
     """All sightings of known markers by a robot."""
     ideal = replace(swarm, robots=tuple(_ideal(robot) for robot in swarm.robots))
-    rows = chosen(recording.detections, recording.detections.robot == observer)
+    rows = select(recording.detections, recording.detections.robot == observer)
     if not rows.robot.size:
         empty = np.zeros(0, dtype=np.int64)
         return CameraSightings(
             empty, empty == 0, np.zeros((0, 3)), empty, np.zeros((0, 3)), empty, np.zeros((0, 3))
         )
-    m = SightingConverter(ideal).convert(rows.robot, rows.stamp_ns, rows.detection).measurements
+    m = SightingConverter(ideal).convert(rows)
     return CameraSightings(
-        stamp_ns=m["stamp_ns"].copy(),
-        polar=m["kind"] == Kind.POLAR,
-        value=m["value"].copy(),
-        marker_id=m["marker_id"].copy(),
-        marker=m["marker"].copy(),
-        target=m["target"].copy(),
+        stamp_ns=m.stamp_ns,
+        polar=m.model == POLAR,
+        value=m.value,
+        marker_id=m.reading,
+        marker=m.marker,
+        target=m.target,
         lone=np.full((m.size, 3), np.nan),
     )
 

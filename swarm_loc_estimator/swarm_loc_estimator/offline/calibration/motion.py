@@ -21,6 +21,7 @@ from scipy.signal import lfilter
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.offline.calibration.camera import DENSE_GAP_NS
 from swarm_loc_estimator.offline.calibration.recording import Recording
@@ -30,7 +31,6 @@ from swarm_loc_estimator.offline.calibration.robust import (
     ridge,
     spread,
 )
-from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.calibration_states import TURN_BIAS
 from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
@@ -385,7 +385,7 @@ def _held_out_error(
         for block in range(_BLOCKS):
             held_out = (rows.block == block) & (rows.last_block == block)
             fitted = (rows.block != block) & (rows.last_block != block)
-            shares = _solved(chosen(rows, fitted), speeds, turn_rates).ravel()
+            shares = _solved(select(rows, fitted), speeds, turn_rates).ravel()
             error = rows.wanted[held_out] - rows.basis[held_out] @ shares
             total[block] += np.mean(np.abs(error)) / np.mean(np.abs(rows.wanted))
     return total

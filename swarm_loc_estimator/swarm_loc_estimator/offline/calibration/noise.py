@@ -19,10 +19,10 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.calibration.recording import Recording, rerun
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
 from swarm_loc_estimator.swarm.swarm import Swarm
 
@@ -126,7 +126,7 @@ def thinned(recording: Recording) -> Recording:
         own = np.flatnonzero(rows.robot == robot)
         slot = rows.stamp_ns[own] // _SPACING_NS
         keep[own] = np.concatenate([[True], np.diff(slot) != 0])
-    return replace(recording, odometry=chosen(rows, keep))
+    return replace(recording, odometry=select(rows, keep))
 
 
 def fit_noise(

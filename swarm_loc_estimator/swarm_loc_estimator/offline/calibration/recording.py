@@ -15,6 +15,7 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
+from swarm_loc_estimator.filter.measurements import concatenate, select
 from swarm_loc_estimator.offline.recorded_bag import Progress, read_bag, unwatched
 from swarm_loc_estimator.offline.replay import PeriodicSchedule, Runner
 from swarm_loc_estimator.offline.result import ReplayResult
@@ -25,7 +26,6 @@ from swarm_loc_estimator.sensors.infrared import NO_BRIGHTNESS, BrightnessRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.ranges import NO_RANGES, RangeRows
 from swarm_loc_estimator.sensors.registry import Batch, InputConverter
-from swarm_loc_estimator.sensors.sensor import chosen, joined
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
@@ -81,7 +81,7 @@ class Recording:
             (rows.arrival_ns >= from_ns) & (rows.arrival_ns < to_ns)
             for rows in (self.odometry, self.detections)
         )
-        return replace(self, odometry=chosen(self.odometry, driven), detections=chosen(self.detections, seen))
+        return replace(self, odometry=select(self.odometry, driven), detections=select(self.detections, seen))
 
     @property
     def messages(self) -> Batch:
@@ -90,7 +90,7 @@ class Recording:
 
     def track(self, robot: int) -> Trajectory:
         """A robot's raw odometry in the order of its stamps, each stamp once."""
-        rows = chosen(self.odometry, self.odometry.robot == robot)
+        rows = select(self.odometry, self.odometry.robot == robot)
         return _each_stamp_once(rows.stamp_ns, rows.pose)
 
 
@@ -121,13 +121,13 @@ def read_recording(
     detections = [part["detections"] for part in parts if part["detections"].robot.size]
     return Recording(
         bag.name,
-        joined([NO_ODOMETRY, *(rows.get("odometry", NO_ODOMETRY) for rows in moved)]),
-        joined(detections or [NO_DETECTIONS]),
+        concatenate([NO_ODOMETRY, *(rows.get("odometry", NO_ODOMETRY) for rows in moved)]),
+        concatenate(detections or [NO_DETECTIONS]),
         {name: _each_stamp_once(track.stamp_ns, track.pose) for name, track in tracks.items()},
-        joined([NO_BRIGHTNESS, *(part["brightness"] for part in parts)]),
-        joined([NO_FIXES, *(part["fixes"] for part in parts)]),
-        joined([NO_TURN_RATES, *(rows.get("imu", NO_TURN_RATES) for rows in moved)]),
-        joined([NO_RANGES, *(part["ranges"] for part in parts)]),
+        concatenate([NO_BRIGHTNESS, *(part["brightness"] for part in parts)]),
+        concatenate([NO_FIXES, *(part["fixes"] for part in parts)]),
+        concatenate([NO_TURN_RATES, *(rows.get("imu", NO_TURN_RATES) for rows in moved)]),
+        concatenate([NO_RANGES, *(part["ranges"] for part in parts)]),
         converter.drops.total,
         summary.remarks,
     )

@@ -15,12 +15,12 @@ import numpy as np
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.filter.measurement_model import POLAR, MeasurementArray
+from swarm_loc_estimator.filter.measurements import Measurements, select
+from swarm_loc_estimator.filter.models import POLAR, is_compiled
 from swarm_loc_estimator.odometry.track_arrays import OdometrySample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.offline.calibration.recording import Recording
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE, CONTENT_POSE_TWO, SightingConverter
-from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
 
 STEP_NS = 100_000_000  # Shortest time between two instants at which the transform of a track is estimated
@@ -60,7 +60,7 @@ class SurveyProblem:
     is_known: BoolArray  # (L,) whether the place of a landmark is described
     knots: Knots  # Instants at which transforms are estimated
     # (m,) measurements of cameras; markers of landmarks are in the landmark's own frame
-    sightings: MeasurementArray
+    sightings: Measurements
     sides: IntArray  # (m, 2) knots of observer and target; -1: a landmark
     tracks: FloatArray  # (2, m, 3) poses of observer and target on their tracks
     slip: FloatArray  # (2, m, 3, 3) covariance of their slip since the knot, in the frame of the track
@@ -70,7 +70,7 @@ class SurveyProblem:
     @property
     def is_polar(self) -> BoolArray:
         """Whether sightings (m,) are range and bearing."""
-        return np.asarray(self.sightings["kind"] == POLAR)
+        return np.asarray(self.sightings.model == POLAR)
 
 
 def problem_of(recording: Recording, swarm: Swarm) -> SurveyProblem:
@@ -85,25 +85,25 @@ def problem_of(recording: Recording, swarm: Swarm) -> SurveyProblem:
     rows, turns = recording.odometry, recording.turn_rates
     tracks.extend_turns(turns.robot, turns.stamp_ns, turns.rate)
     tracks.extend(rows.robot, rows.stamp_ns, rows.pose, rows.twist)
-    seen = chosen(recording.detections, ~np.isin(recording.detections.detection["id"], list(rare)))
+    seen = select(recording.detections, ~np.isin(recording.detections.detection["id"], list(rare)))
     at_origin = [
         replace(one, x=0.0, y=0.0, yaw=None if one.yaw is None else 0.0) for one in described.landmarks
     ]
     converter = SightingConverter(replace(described, landmarks=tuple(at_origin)))
-    sightings = converter.convert(seen.robot, seen.stamp_ns, seen.detection).measurements
+    sightings = converter.convert(seen)
     # not directions alone, and not what fixed cameras see
-    sightings = sightings[(sightings["kind"] <= POLAR) & (sightings["observer"] >= 0)]
+    sightings = select(sightings, is_compiled(sightings.model) & (sightings.observer >= 0))
     knots = _knots(tracks, recording)
-    robots = np.stack([sightings["observer"], sightings["target"]])
-    sides = np.stack([knots.nearest(one, sightings["stamp_ns"]) for one in robots])
-    started = np.array([tracks.has_started(np.maximum(one, 0), sightings["stamp_ns"]) for one in robots])
-    kept = ((robots < 0) | (started & (sides >= 0))).all(axis=0)
-    sightings, robots, sides = sightings[kept], robots[:, kept], sides[:, kept]
+    robots = np.stack([sightings.observer, sightings.target])
+    sides = np.stack([knots.nearest(one, sightings.stamp_ns) for one in robots])
+    started = np.array([tracks.has_started(np.maximum(one, 0), sightings.stamp_ns) for one in robots])
+    kept: BoolArray = np.asarray(((robots < 0) | (started & (sides >= 0))).all(axis=0))
+    sightings, robots, sides = select(sightings, kept), robots[:, kept], sides[:, kept]
     known = {mark.id for mark in swarm.landmarks}
     poses, slip = np.zeros((2, sightings.size, 3)), np.zeros((2, sightings.size, 3, 3))
     for side in range(2):
         moves = sides[side] >= 0
-        at = tracks.at(robots[side][moves], sightings["stamp_ns"][moves])
+        at = tracks.at(robots[side][moves], sightings.stamp_ns[moves])
         poses[side, moves] = at.pose
         since = at.covariance - knots.sample.covariance[sides[side][moves]]
         slip[side, moves] = since * np.sign(np.trace(since, axis1=1, axis2=2))[:, None, None]
@@ -192,10 +192,10 @@ def _at_first(problem: SurveyProblem, robot: int, pose: FloatArray) -> FloatArra
 def _map_of(problem: SurveyProblem, robot: int) -> FloatArray:
     """Poses (L, 3) of the landmarks that a robot has seen, in the frame of its track; NaN: not seen."""
     sightings, places = problem.sightings, np.full((len(problem.swarm.landmarks), 3), np.nan)
-    rows = np.flatnonzero((sightings["observer"] == robot) & (sightings["landmark"] > 0))
+    rows = np.flatnonzero((sightings.observer == robot) & (sightings.landmark >= 0))
     seen = _seen_at(problem, rows, problem.tracks[0, rows])
-    for index in np.unique(sightings["landmark"][rows] - 1).tolist():
-        own = seen[sightings["landmark"][rows] - 1 == index]
+    for index in np.unique(sightings.landmark[rows]).tolist():
+        own = seen[sightings.landmark[rows] == index]
         x, y = np.median(own[:, :2], axis=0)
         heading = own[np.isfinite(own[:, 2]), 2]
         places[index] = (x, y, _median_angle(heading) if heading.size else 0.0)
@@ -204,12 +204,12 @@ def _map_of(problem: SurveyProblem, robot: int) -> FloatArray:
 
 def _seen_at(problem: SurveyProblem, rows: IntArray, observer: FloatArray) -> FloatArray:
     """Poses (k, 3) of the markers of sightings by robots at poses (k, 3); heading NaN: not seen."""
-    some, is_polar = problem.sightings[rows], problem.is_polar[rows]
-    value = some["value"].copy()
+    some, is_polar = select(problem.sightings, rows), problem.is_polar[rows]
+    value = some.value.copy()
     distance, bearing = value[is_polar, 0].copy(), value[is_polar, 1].copy()
     value[is_polar, 0], value[is_polar, 1] = distance * np.cos(bearing), distance * np.sin(bearing)
-    seen = se2.compose(se2.compose(observer, some["sensor"]), value)
-    seen[some["has_heading"] == 0, 2] = np.nan
+    seen = se2.compose(se2.compose(observer, some.sensor), value)
+    seen[some.has_heading == 0, 2] = np.nan
     return seen
 
 
@@ -262,22 +262,20 @@ def _by_robots(problem: SurveyProblem, start: Start, robot: int) -> list[FloatAr
     """Transforms of a robot's track by sightings with heading, between it and placed robots."""
     sightings = problem.sightings
     placed = np.isfinite(start.transform[:, 0])
-    seen_by = np.flatnonzero(
-        (sightings["target"] == robot) & placed[sightings["observer"]] & (sightings["has_heading"] > 0)
-    )
-    observers = se2.compose(start.transform[sightings["observer"][seen_by]], problem.tracks[0, seen_by])
+    seen_by = np.flatnonzero((sightings.target == robot) & placed[sightings.observer] & sightings.has_heading)
+    observers = se2.compose(start.transform[sightings.observer[seen_by]], problem.tracks[0, seen_by])
     markers = _seen_at(problem, seen_by, observers)
-    bodies = se2.compose(markers, se2.inverse(sightings["marker"][seen_by]))
+    bodies = se2.compose(markers, se2.inverse(sightings.marker[seen_by]))
     found = [*se2.compose(bodies, se2.inverse(problem.tracks[1, seen_by]))]
     sees = np.flatnonzero(
-        (sightings["observer"] == robot)
-        & (sightings["target"] >= 0)
-        & placed[np.maximum(sightings["target"], 0)]
-        & (sightings["has_heading"] > 0)
+        (sightings.observer == robot)
+        & (sightings.target >= 0)
+        & placed[np.maximum(sightings.target, 0)]
+        & sightings.has_heading
     )
     if sees.size:
-        targets = se2.compose(start.transform[sightings["target"][sees]], problem.tracks[1, sees])
-        markers = se2.compose(targets, sightings["marker"][sees])
+        targets = se2.compose(start.transform[sightings.target[sees]], problem.tracks[1, sees])
+        markers = se2.compose(targets, sightings.marker[sees])
         relative = _seen_at(problem, sees, problem.tracks[0, sees])
         found += [*se2.compose(markers, se2.inverse(relative))]
     return found

@@ -17,7 +17,8 @@ from scipy.sparse.linalg import SuperLU, splu
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.filter.measurement_model import predict
+from swarm_loc_estimator.filter.measurements import select
+from swarm_loc_estimator.filter.models import predict
 from swarm_loc_estimator.mapping.constraints import NormalFactor
 from swarm_loc_estimator.offline.survey.problem import Start, SurveyProblem
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -68,7 +69,7 @@ class Solver:
         self._knot, self._landmark = start.transform[knots.robot], start.landmark.copy()
         self._parameter = np.zeros((robots, PRIORS.size))
         is_placed = np.isfinite(self._knot[:, 0])
-        self._mark = problem.sightings["landmark"].astype(np.int64) - 1
+        self._mark = problem.sightings.landmark
         targets = np.where(self._mark >= 0, np.isfinite(self._landmark[self._mark, 0]), True)
         for side in range(2):
             targets &= (problem.sides[:, side] < 0) | is_placed[problem.sides[:, side]]
@@ -229,24 +230,24 @@ class Solver:
     def _sightings(self) -> tuple[FloatArray, FloatArray, IntArray]:
         """Whitened residuals (u, 3), Jacobians (u, 3, 8) and columns (u, 8) of the used sightings."""
         problem, rows = self._problem, self._rows
-        some, (observer, target) = problem.sightings[rows], problem.sides[rows].T
-        mark, robot = self._mark[rows], problem.sightings["observer"][rows]
+        some, (observer, target) = select(problem.sightings, rows), problem.sides[rows].T
+        mark, robot = self._mark[rows], problem.sightings.observer[rows]
         poses = [se2.compose(self._knot[observer], problem.tracks[0, rows])]
         moved = se2.compose(self._knot[target], problem.tracks[1, rows])
         poses.append(np.where((target >= 0)[:, None], moved, self._landmark[mark]))
         camera = self._parameter[robot, 3:]
         value, jacobian = predict(some, poses[0], poses[1], camera)
         by_pose = jacobian[:, :, :3]
-        noise = some["covariance"].copy()
+        noise = some.covariance.copy()
         for side, knot in enumerate((observer, target)):
             carried = np.where((knot >= 0)[:, None, None], by_pose @ se2.adjoint(self._knot[knot]), 0.0)
             noise += carried @ problem.slip[side, rows] @ carried.transpose(0, 2, 1)
-        innovation = _innovation(some["value"], value, problem.is_polar[rows], some["has_heading"] > 0)
+        innovation = _innovation(some.value, value, problem.is_polar[rows], some.has_heading > 0)
         root = np.linalg.inv(np.linalg.cholesky(noise))
         residual = -np.einsum("kij,kj->ki", root, innovation)
-        other = _innovation(some["alternative"], value, problem.is_polar[rows], some["has_heading"] > 0)
+        other = _innovation(some.second, value, problem.is_polar[rows], some.has_heading > 0)
         mirrored = -np.einsum("kij,kj->ki", root, other)
-        better = (some["has_alternative"] > 0) & (np.sum(mirrored**2, axis=1) < np.sum(residual**2, axis=1))
+        better = (some.has_second > 0) & (np.sum(mirrored**2, axis=1) < np.sum(residual**2, axis=1))
         residual[better] = mirrored[better]
         whole = np.concatenate([-by_pose, by_pose, jacobian[:, :, 3:]], axis=2)
         columns = np.full((rows.size, 8), -1)
@@ -259,7 +260,7 @@ class Solver:
     def _solution(self, matrix: csc_matrix) -> Solution:
         residual, _, _ = self._sightings()
         good = self._weight > 0.5
-        degrees = 2.0 + (self._problem.sightings["has_heading"][self._rows] > 0)
+        degrees = 2.0 + self._problem.sightings.has_heading[self._rows]
         ratio = float(np.sum(residual[good] ** 2) / max(1.0, np.sum(degrees[good])))
         factor = NormalFactor(_factor(matrix, 0.0), np.arange(self._size))
         covariance = np.zeros((self._landmarks, 3, 3))

@@ -64,7 +64,7 @@ def survey(
         raise CalibrationError(f"'{recording.name}' has no odometry, which a survey needs.")
     progress(0.0, "reading")
     problem = problem_of(recording, swarm)
-    if not problem.swarm.landmarks or not np.any(problem.sightings["landmark"] > 0):
+    if not problem.swarm.landmarks or not np.any(problem.sightings.landmark >= 0):
         raise CalibrationError(
             f"'{recording.name}' has no marker that belongs to nobody and was seen {MIN_SIGHTINGS} times."
         )
@@ -136,7 +136,7 @@ def _text(problem: SurveyProblem, solution: Solution, before: Swarm, found: Swar
     places = {mark.id: mark for mark in found.landmarks}
     lines = ["landmark        x [m]     y [m]  yaw [deg]  sigma [mm]  sightings  contradicting"]
     for index, mark in enumerate(problem.swarm.landmarks):
-        rows = problem.sightings["landmark"] == index + 1
+        rows = problem.sightings.landmark == index
         if mark.id not in places or not rows.any():
             continue
         one, wrong = places[mark.id], float(np.mean(_is_wrong(solution)[rows]))
@@ -204,10 +204,10 @@ def _remarks(problem: SurveyProblem, solution: Solution) -> list[str]:
     free = placed & (sigma > 0.0)
     usual = float(np.median(sigma[free])) if free.any() else 0.0
     observers = se2.compose(
-        se2.compose(solution.knot[problem.sides[:, 0]], problem.tracks[0]), sightings["sensor"]
+        se2.compose(solution.knot[problem.sides[:, 0]], problem.tracks[0]), sightings.sensor
     )
     for index in np.flatnonzero(free).tolist():
-        rows = (sightings["landmark"] == index + 1) & solution.used
+        rows = (sightings.landmark == index) & solution.used
         name = f"Landmark {problem.swarm.landmarks[index].id}"
         if not rows.any():
             remarks.append(f"{name} was not seen and stays as it is described.")

@@ -1,0 +1,763 @@
+"""The update: measurements correct the belief, in order or together, by one sequence of eight stages.
+
+1. Predict both sides to the stamp of the measurement.
+2. Innovation: measured minus predicted, linearized about the belief (eqs. (11) and (13) of the e-puck paper).
+3. Gate it; of two mirrored solutions, use the likelier one; a heading that may be flipped counts less.
+4. Attribute an outlier: to the observer, to what it measured, or to their pair, which may be excluded.
+5. Confirm a pose that was assumed, or refute it.
+6. Correct poses, parameters and landmarks (eqs. (11), (12) and (14)).
+7. Learn the process noise of the robots from what was corrected.
+8. Count gated measurements; a robot with too many in a row is lost.
+
+In order, each measurement passes all stages before the next one, at its exact stamp. Together, the stages
+take all measurements of a period, linearized about one belief; a large swarm is cheaper so.
+
+`fuse` is compiled. Where it needs what is not, it pauses, and is resumed at the next stage. Links, whose
+models have no compiled kernel, such as ranges, are evaluated by their records. Such a measurement is gated
+with the number of components of its model. When accepted it confirms the poses of its robots; when gated it
+counts towards their loss, but does not refute a configured start. A contradiction is evidence against its
+pair of observer and source, never against one of them. It takes no part in the noise inflation of robots or
+in the mean of repeated measurements (`correlated_noise.py`): these need positions and headings.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
+from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
+from swarm_loc_estimator.filter.belief import (
+    BeliefArrays,
+    correct,
+    covariance_within,
+    own_within,
+    to_map,
+)
+from swarm_loc_estimator.filter.correlated_noise import (
+    PAIR_ROWS,
+    count_repeated,
+    inflate_fix,
+    record_pair,
+    use_mean,
+)
+from swarm_loc_estimator.filter.integrity import (
+    LossLimits,
+    add_noise_inflation,
+    assess,
+    assess_link,
+    cause_of,
+    confirm,
+    count_gated,
+    is_excluded,
+    is_uncertain,
+    noise_of_frequent_looks,
+    small_variances,
+    stamp_variance,
+)
+from swarm_loc_estimator.filter.joint_filter import JointFilter, update_one
+from swarm_loc_estimator.filter.measurements import Loss, Measurements, Verdict
+from swarm_loc_estimator.filter.models import (
+    MODELS,
+    NO_HEADING,
+    POSE_GATE,
+    has_kernel,
+    is_misread,
+    position_distance,
+    predict_one,
+    soften_heading,
+    squared_distance,
+    write_innovation,
+)
+from swarm_loc_estimator.filter.prediction import learn, new_scratch, predict
+from swarm_loc_estimator.odometry.preintegration import Preintegrated
+from swarm_loc_estimator.odometry.track_arrays import (
+    OdometrySample,
+    TrackArrays,
+    look_up,
+    look_up_pose,
+    new_sample,
+    rate_at,
+)
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW
+
+DEPENDS_ON = 8
+"""Filter columns per measurement: three of the observer, three of the target, camera yaw and camera scale."""
+_USED, _GATED = int(Verdict.USED), int(Verdict.GATED)
+_UNCERTAIN, _REFUTED = int(Loss.UNCERTAIN), int(Loss.REFUTED)
+PREDICT, EVALUATE, ATTRIBUTE, SETTLE = 1, 2, 4, 7  # Stages at which `fuse` is begun or resumed
+FINISHED, LEFT_OUT, LOST, CONTRADICTED = 0, 1, 2, 3
+"""Why `fuse` returns: all is fused; a measurement of a robot that is not localized; a robot is lost; a robot
+or landmark is contradicted."""
+PREDICTED, IS_LINK, CORRECTS = 4, 5, 6
+"""Why it pauses: sides are predicted; links are to be evaluated by their records; the joint filter is to
+correct. It is resumed at EVALUATE, ATTRIBUTE and SETTLE."""
+
+
+class Innovations(NamedTuple):
+    """Measurements (m,) evaluated at one belief, and reused buffers for one evaluation."""
+
+    # (m, 2, 3) observers and targets in `map` at the stamps; of a landmark, its pose correction
+    pose: FloatArray
+    # (m, 3) rate of change of xi_target - xi_observer by driving [1/s], see `relative_motion`
+    motion: FloatArray
+    # (m, 3, 5) of the observer's error with the target's, and of the target's with yaw and scale of the
+    # observer's camera
+    cross_covariance: FloatArray
+    columns: IntArray  # (m, DEPENDS_ON) filter columns
+    jacobian: FloatArray  # (m, 3, DEPENDS_ON) Jacobian of the innovation
+    innovation: FloatArray  # (m, 3) measured minus predicted
+    noise: FloatArray  # (m, 3, 3) measurement covariances for the update
+    pair: FloatArray  # (m, PAIR_ROWS, 3) new mean of the pair, stored if used, see `correlated_noise`
+    distance: FloatArray  # (m,) squared Mahalanobis distance of the position, small errors left out
+    whitened: FloatArray  # (m, 2) position innovation over its standard deviation, without small errors
+    cause: IntArray  # (m,) possible cause of the innovation, see `integrity.cause_of`
+    accepted: BoolArray  # (m,) True if the innovation passes the gate
+    nis: FloatArray  # (m,) normalized innovation squared
+    lost: IntArray  # (N + 1,) why a robot is lost (`Loss`), 0: it is not; the last element is NOBODY
+    contradicted: BoolArray  # (N + L,) True for robots and landmarks that are contradicted
+    predicted: FloatArray  # (3,) value
+    other: FloatArray  # (3,) innovation of the second solution
+    value_jacobian: FloatArray  # (3, 5) Jacobian of the value, see `models.predict`
+    relative_covariance: FloatArray  # (3, 3) covariance of xi_target - xi_observer
+    innovation_covariance: FloatArray  # (3, 3) covariance of the innovation
+    variances: FloatArray  # (3,) of the predicted value
+
+
+@cached_njit
+def new_innovations(count: int, robots: int, sources: int) -> Innovations:
+    """Allocate innovations of `count` measurements; `sources` are robots and landmarks."""
+    return Innovations(
+        np.zeros((count, 2, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 5)),
+        np.zeros((count, DEPENDS_ON), dtype=np.int64),
+        np.zeros((count, 3, DEPENDS_ON)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, PAIR_ROWS, 3)),
+        np.zeros(count),
+        np.zeros((count, 2)),
+        np.zeros(count, dtype=np.int64),
+        np.zeros(count, dtype=np.bool_),
+        np.zeros(count),
+        np.zeros(robots + 1, dtype=np.int64),
+        np.zeros(sources, dtype=np.bool_),
+        np.zeros(3),
+        np.zeros(3),
+        np.zeros((3, 5)),
+        np.zeros((3, 3)),
+        np.zeros((3, 3)),
+        np.zeros(3),
+    )
+
+
+@cached_njit
+def fuse_in_order(
+    measurements: Measurements,
+    begin: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    verdicts: NDArray[np.uint8],
+    nis: FloatArray,
+) -> tuple[int, int, int, int]:
+    """Fuse measurements one by one, each at its exact stamp, from `begin` on; see `fuse`."""
+    work = new_innovations(1, belief.tracked.size, belief.integrity.fault_score.size)
+    return fuse(measurements, begin, PREDICT, -1, tracks, belief, limits, work, verdicts, nis)
+
+
+@cached_njit
+def fuse(
+    measurements: Measurements,
+    begin: int,
+    stage: int,
+    together_ns: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    work: Innovations,
+    verdicts: NDArray[np.uint8],
+    nis: FloatArray,
+) -> tuple[int, int, int, int]:
+    """Fuse measurements from `begin` on, one by one or all together.
+
+    Args:
+        measurements: (m,) sorted by stamp; together: between localized robots.
+        begin: Index of the first measurement to fuse.
+        stage: Stage at which to begin or resume.
+        together_ns: Instant to which robots are predicted for all measurements together; -1: one by one.
+        tracks: Odometry.
+        belief: Updated in place.
+        limits: Thresholds beyond which a robot is lost.
+        work: Of one measurement, or of all (m,) together; `lost` and `contradicted` are for these only.
+        verdicts: (m,) written.
+        nis: (m,) normalized innovation squared, written.
+
+    Returns:
+        Index of the measurement at which it returns, why, the robot or landmark concerned, and why a robot is
+        lost (`Loss`).
+    """
+    together, sample, scratch = together_ns >= 0, new_sample(2), new_scratch()
+    k = begin
+    while k < measurements.stamp_ns.size:
+        end = measurements.stamp_ns.size if together else k + 1
+        if stage <= PREDICT:
+            # 1. Predict both sides to the stamp.
+            if together:
+                _predict_together(measurements, together_ns, tracks, belief, limits, work, sample, scratch)
+                return k, PREDICTED, -1, 0
+            for side in (measurements.observer[k], measurements.target[k]):
+                if side >= 0 and not belief.tracked[side]:
+                    return k, LEFT_OUT, -1, 0
+            lost = _predict_one(measurements, k, tracks, belief, limits, work, sample, scratch)
+            if lost >= 0:
+                return k, LOST, lost, _UNCERTAIN
+        if stage <= EVALUATE:
+            # 2. Innovation. 3. Gate, second solution, heading.
+            links = False
+            for i in range(k, end):
+                if has_kernel(measurements, i):
+                    _evaluate(measurements, i, belief, work, i - k)
+                else:
+                    links = True
+            if links:
+                return k, IS_LINK, -1, 0
+        if stage <= ATTRIBUTE:
+            # 4. Attribute outliers; measurements of excluded pairs are not used.
+            for i in range(k, end):
+                row = i - k
+                whitened = (work.whitened[row, 0], work.whitened[row, 1])
+                if has_kernel(measurements, i):
+                    source = assess(
+                        measurements,
+                        i,
+                        belief,
+                        limits.max_fault_score,
+                        work.distance[row],
+                        whitened,
+                        work.cause[row],
+                    )
+                    if source >= 0 and not together:
+                        return k, CONTRADICTED, source, 0
+                    if source >= 0:
+                        work.contradicted[source] = True
+                else:
+                    scale = assess_link(measurements, i, belief, work.distance[row], whitened[0])
+                    for a in range(3):
+                        for b in range(3):
+                            work.noise[row, a, b] *= scale
+                work.accepted[row] = work.accepted[row] and not is_excluded(measurements, i, belief)
+                nis[i], verdicts[i] = work.nis[row], _USED if work.accepted[row] else _GATED
+            # 5. Confirm assumed poses, or refute them; a link does not refute.
+            for i in range(k, end):
+                row = i - k
+                if work.accepted[row] or has_kernel(measurements, i):
+                    robot = confirm(measurements, i, belief, work.accepted[row])
+                    if robot >= 0 and not together:
+                        return k, LOST, robot, _REFUTED
+                    if robot >= 0:
+                        work.lost[robot] = _REFUTED
+            # 6. Correct.
+            for i in range(k, end):
+                if work.accepted[i - k] and has_kernel(measurements, i):
+                    record_pair(measurements, i, belief, work.pair[i - k])
+            if together:
+                return k, CORRECTS, -1, 0
+            if work.accepted[0]:
+                columns, jacobian, noise = work.columns[0], work.jacobian[0], work.noise[0]
+                correction, gain = update_one(belief.covariance, columns, jacobian, work.innovation[0], noise)
+                if has_kernel(measurements, k):
+                    own = gain[:, columns[:6]]
+                    count_repeated(measurements, k, belief, work.predicted, own, jacobian, noise)
+                correct(belief, correction)
+        # 7. Learn the process noise of all involved robots.
+        if work.accepted.any():
+            for i in range(k, end):
+                learn(belief, measurements.observer[i], work.pose[i - k, 0], measurements.stamp_ns[i])
+                learn(belief, measurements.target[i], work.pose[i - k, 1], measurements.stamp_ns[i])
+        # 8. Count gated measurements.
+        for i in range(k, end):
+            robot, why = count_gated(measurements, i, belief, work.accepted[i - k], limits)
+            if robot >= 0 and not together:
+                return k, LOST, robot, why
+            if robot >= 0 and work.lost[robot] == 0:
+                work.lost[robot] = why
+        k, stage = end, PREDICT
+    return k, FINISHED, -1, 0
+
+
+@cached_njit
+def _predict_one(
+    measurements: Measurements,
+    k: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    work: Innovations,
+    sample: OdometrySample,
+    scratch: FloatArray,
+) -> int:
+    """Predict the sides of measurement k to its stamp; return a robot that is too uncertain, or -1."""
+    pose = work.pose[0]
+    sides = (measurements.observer[k], measurements.target[k])
+    for i in range(2):
+        if sides[i] >= 0:
+            look_up(tracks, sides[i], measurements.stamp_ns[k], sample, i)
+            to = Preintegrated(measurements.stamp_ns[k], sample.covariance[i], sample.jacobian[i])
+            predict(belief, sides[i], to, scratch)
+            assign(pose[i], sample.pose[i])
+            to_map(belief, sides[i], pose[i])
+            if is_uncertain(belief, sides[i], pose[i], limits):
+                lost: int = sides[i]
+                return lost
+    if measurements.landmark[k] >= 0:
+        assign(pose[1], belief.landmark[measurements.landmark[k]])
+    relative_motion(measurements, k, tracks, belief, pose, work.motion[0])
+    return -1
+
+
+@cached_njit
+def _predict_together(
+    measurements: Measurements,
+    stamp_ns: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    work: Innovations,
+    sample: OdometrySample,
+    scratch: FloatArray,
+) -> None:
+    """Predict every involved robot to one instant, and compute poses at the stamps of measurements (m,).
+
+    Robots that are too uncertain are marked in `work.lost`.
+    """
+    involved = np.zeros(belief.tracked.size, dtype=np.bool_)
+    for k in range(measurements.stamp_ns.size):
+        for robot in (measurements.observer[k], measurements.target[k]):
+            if robot >= 0 and not involved[robot]:
+                involved[robot] = True
+                look_up(tracks, robot, stamp_ns, sample, 0)
+                to = Preintegrated(stamp_ns, sample.covariance[0], sample.jacobian[0])
+                predict(belief, robot, to, scratch)
+    for k in range(measurements.stamp_ns.size):
+        _write_poses(measurements, k, tracks, belief, limits, work)
+
+
+@inlined_njit
+def _write_poses(
+    measurements: Measurements,
+    k: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    work: Innovations,
+) -> None:
+    """Write poses and motion of measurement k, from the predicted belief."""
+    sides = (measurements.observer[k], measurements.target[k])
+    for i in range(2):
+        if sides[i] >= 0:
+            pose = work.pose[k, i]
+            if _is_of_same_image(measurements, k, i):
+                assign(pose, work.pose[k - 1, i])
+                continue
+            look_up_pose(tracks, sides[i], measurements.stamp_ns[k], pose)
+            to_map(belief, sides[i], pose)
+            if is_uncertain(belief, sides[i], pose, limits):
+                work.lost[sides[i]] = _UNCERTAIN
+    if measurements.landmark[k] >= 0:
+        assign(work.pose[k, 1], belief.landmark[measurements.landmark[k]])
+    relative_motion(measurements, k, tracks, belief, work.pose[k], work.motion[k])
+
+
+@inlined_njit
+def _is_of_same_image(measurements: Measurements, k: int, side: int) -> bool:
+    """Whether measurement k - 1 has the same observer and stamp, so that its look-up can be reused."""
+    if side != 0 or k == 0 or measurements.observer[k] != measurements.observer[k - 1]:
+        return False
+    same: bool = measurements.stamp_ns[k] == measurements.stamp_ns[k - 1]
+    return same
+
+
+@cached_njit
+def related_columns(measurements: Measurements, belief: BeliefArrays) -> IntArray:
+    """First filter columns (m, 3) of observers, targets and observers' cameras; -1: none."""
+    columns = np.empty((measurements.stamp_ns.size, 3), dtype=np.int64)
+    for k in range(columns.shape[0]):
+        columns[k, 0], columns[k, 1] = body_columns(measurements, k, belief)
+        columns[k, 2] = -1
+        for m in (CAMERA_YAW, CAMERA_SCALE):
+            column = belief.table.column[max(measurements.observer[k], 0), m]
+            if measurements.observer[k] >= 0 and column >= 0:
+                columns[k, 2] = column - (m - CAMERA_YAW)
+    return columns
+
+
+@inlined_njit
+def _evaluate(
+    measurements: Measurements,
+    k: int,
+    belief: BeliefArrays,
+    work: Innovations,
+    row: int,
+) -> None:
+    """Linearize measurement k about the belief and gate it; of two planar solutions, use the likelier one.
+
+    Args:
+        measurements: (m,).
+        k: Index of the measurement.
+        belief: Not changed.
+        work: Input: `pose`, `motion` and, for a sparse filter, `cross_covariance`. Output: the others.
+        row: Row of `work`.
+    """
+    columns, jacobian, innovation = work.columns[row], work.jacobian[row], work.innovation[row]
+    pose, motion, noise = work.pose[row], work.motion[row], work.noise[row]
+    bodies = body_columns(measurements, k, belief)
+    camera, camera_columns = _camera(belief, measurements.observer[k])
+    predicted, value_jacobian, s, variances = (
+        work.predicted,
+        work.value_jacobian,
+        work.innovation_covariance,
+        work.variances,
+    )
+    # Linearize: predicted value, Jacobian, noise.
+    predict_one(measurements, k, pose[0], pose[1], camera, predicted, value_jacobian)
+    _write_jacobian(value_jacobian, bodies, camera_columns, columns, jacobian)
+    assign_matrix(noise, measurements.covariance[k])
+    add_noise_inflation(measurements, k, belief, noise)
+    of_stamp = stamp_variance(measurements, k, belief)
+    if of_stamp > 0.0:
+        _add_stamp_noise(value_jacobian, motion, of_stamp, noise)
+    # Covariance of the innovation, S = H P H^T + R, eq. (13).
+    assign_matrix(s, noise)
+    if belief.is_dense:
+        _read_cross_covariance(belief.covariance, bodies, camera_columns, work.cross_covariance[row])
+    _add_uncertainty(
+        belief,
+        bodies,
+        camera_columns,
+        value_jacobian,
+        work.cross_covariance[row],
+        work.relative_covariance,
+        s,
+    )
+    for i in range(3):
+        variances[i] = s[i, i] - noise[i, i]
+    # Innovation, eq. (11), of the likelier solution.
+    write_innovation(measurements, k, measurements.value[k], predicted, innovation)
+    if measurements.has_second[k]:
+        other = work.other
+        write_innovation(measurements, k, measurements.second[k], predicted, other)
+        if squared_distance(other, s) < squared_distance(innovation, s):
+            assign(innovation, other)
+    # Gate.
+    work.accepted[row] = position_distance(innovation, s) <= measurements.gate[k]
+    small = small_variances(measurements.model[k], predicted)
+    work.distance[row] = position_distance(innovation, s, small)
+    for i in range(2):
+        work.whitened[row, i] = innovation[i] / math.sqrt(s[i, i] + small[i])
+    work.cause[row] = cause_of(measurements.model[k], innovation, predicted)
+    if measurements.observer[k] < 0 and measurements.systematic_share[k, 0] > 0.0:
+        work.nis[row] = squared_distance(innovation, s)
+        work.accepted[row] = work.nis[row] <= POSE_GATE
+        for i in range(3):
+            for j in range(3):
+                s[i, j] -= noise[i, j]
+        inflate_fix(measurements.systematic_share[k], s, noise)
+        return
+    # A heading that may be flipped or misread counts less.
+    if measurements.has_heading[k]:
+        before = (noise[0, 2], noise[1, 2], noise[2, 2])
+        if measurements.observer[k] < 0 and is_misread(innovation[2], s[2, 2], measurements.gate[k]):
+            noise[0, 2] = noise[1, 2] = noise[2, 0] = noise[2, 1] = 0.0
+            noise[2, 2] = NO_HEADING
+        else:
+            soften_heading(innovation, s, noise)
+        for i in range(3):
+            s[i, 2] += noise[i, 2] - before[i]
+            if i < 2:
+                s[2, i] = s[i, 2]
+    work.nis[row] = squared_distance(innovation, s)
+    # Looks that follow each other closely share their errors; so do repeated exchanges of a pair.
+    scale = noise_of_frequent_looks(measurements, k, belief)
+    for i in range(3):
+        for j in range(3):
+            noise[i, j] *= scale
+    use_mean(measurements, k, belief, pose, predicted, variances, innovation, noise, work.pair[row])
+
+
+@inlined_njit
+def relative_motion(
+    measurements: Measurements,
+    k: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    pose: FloatArray,
+    motion: FloatArray,
+) -> None:
+    """Write the rate of change of xi_target - xi_observer (3,) of measurement k by driving [1/s].
+
+    Zero for an exact stamp, where the rate is not needed.
+
+    Args:
+        measurements: (m,).
+        k: Index of the measurement.
+        tracks: Odometry.
+        belief: Not changed.
+        pose: (2, 3) of observer and target in `map`.
+        motion: Written.
+    """
+    motion.fill(0.0)
+    if stamp_variance(measurements, k, belief) == 0.0:
+        return
+    sides = (measurements.observer[k], measurements.target[k])
+    for i in range(2):
+        if sides[i] >= 0:
+            rate = rate_at(tracks, sides[i], measurements.stamp_ns[k])
+            cos, sin, sign = np.cos(pose[i, 2]), np.sin(pose[i, 2]), 2.0 * i - 1.0
+            # the body's own velocity, seen from the origin of map
+            motion[0] += sign * (cos * rate[0] - sin * rate[1] + rate[2] * pose[i, 1])
+            motion[1] += sign * (sin * rate[0] + cos * rate[1] - rate[2] * pose[i, 0])
+            motion[2] += sign * rate[2]
+
+
+@inlined_njit
+def _camera(belief: BeliefArrays, observer: int) -> tuple[tuple[float, float], tuple[int, int]]:
+    """Yaw and scale of an observer's camera, and their filter columns; -1: not estimated."""
+    if observer < 0:
+        return (0.0, 0.0), (-1, -1)
+    parameter, column = belief.parameter, belief.table.column
+    return (
+        (parameter[observer, CAMERA_YAW], parameter[observer, CAMERA_SCALE]),
+        (column[observer, CAMERA_YAW], column[observer, CAMERA_SCALE]),
+    )
+
+
+@inlined_njit
+def _write_jacobian(
+    value_jacobian: FloatArray,
+    bodies: tuple[int, int],
+    camera_columns: tuple[int, int],
+    columns: IntArray,
+    jacobian: FloatArray,
+) -> None:
+    """Write the Jacobian of an innovation (3, DEPENDS_ON) and its filter columns (DEPENDS_ON,).
+
+    Missing columns are arbitrary: their Jacobian is zero.
+    """
+    for j in range(3):
+        columns[j], columns[3 + j] = max(bodies[0], 0) + j, max(bodies[1], 0) + j
+        for i in range(3):
+            jacobian[i, j] = -value_jacobian[i, j] if bodies[0] >= 0 else 0.0
+            jacobian[i, 3 + j] = value_jacobian[i, j] if bodies[1] >= 0 else 0.0
+    for j in range(2):
+        columns[6 + j] = max(camera_columns[j], 0)
+        for i in range(3):
+            jacobian[i, 6 + j] = value_jacobian[i, 3 + j] if camera_columns[j] >= 0 else 0.0
+
+
+@inlined_njit
+def _add_stamp_noise(
+    value_jacobian: FloatArray, motion: FloatArray, variance: float, noise: FloatArray
+) -> None:
+    """Add the covariance due to the stamp's variance [s^2] at the rate `motion` (3,) to `noise` (3, 3)."""
+    change = (
+        _along(value_jacobian, 0, motion),
+        _along(value_jacobian, 1, motion),
+        _along(value_jacobian, 2, motion),
+    )
+    for i in range(3):
+        for j in range(3):
+            noise[i, j] += variance * change[i] * change[j]
+
+
+@inlined_njit
+def _along(value_jacobian: FloatArray, row: int, motion: FloatArray) -> float:
+    """Rate of change of one component of the value."""
+    speed: float = (
+        value_jacobian[row, 0] * motion[0]
+        + value_jacobian[row, 1] * motion[1]
+        + value_jacobian[row, 2] * motion[2]
+    )
+    return speed
+
+
+@inlined_njit
+def body_columns(measurements: Measurements, k: int, belief: BeliefArrays) -> tuple[int, int]:
+    """First filter columns of the observer and the target of measurement k; -1: none."""
+    observer, target = measurements.observer[k], measurements.target[k]
+    first = 3 * target if target >= 0 else -1
+    if measurements.landmark[k] >= 0:
+        first = belief.table.survey_column[measurements.landmark[k]]
+    return (3 * observer if observer >= 0 else -1), first
+
+
+@inlined_njit
+def _read_cross_covariance(
+    p: FloatArray, bodies: tuple[int, int], camera: tuple[int, int], out: FloatArray
+) -> None:
+    """Write `cross_covariance` (3, 5) of one measurement; undefined if a side is missing."""
+    o, t = max(bodies[0], 0), max(bodies[1], 0)
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = p[o + i, t + j]
+        for k in range(2):
+            out[i, 3 + k] = p[t + i, max(camera[k], 0)]
+
+
+@inlined_njit
+def _add_uncertainty(
+    belief: BeliefArrays,
+    bodies: tuple[int, int],
+    camera: tuple[int, int],
+    value_jacobian: FloatArray,
+    cross_covariance: FloatArray,
+    relative: FloatArray,
+    s: FloatArray,
+) -> None:
+    """Add H P H^T (3, 3), eq. (13) of the e-puck paper, where H is `value_jacobian`.
+
+    The covariance of xi_target - xi_observer is computed first, which saves two thirds of the work.
+
+    Args:
+        belief: Not changed.
+        bodies: First columns of the observer and of the target; -1: none.
+        camera: Columns of the camera's parameters; -1: none.
+        value_jacobian: (3, 5).
+        cross_covariance: (3, 5) of the observer, the target and the camera, see `Innovations`.
+        relative: (3, 3) buffer.
+        s: (3, 3) sum to add to.
+    """
+    o, t = max(bodies[0], 0), max(bodies[1], 0)
+    of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0
+    for i in range(3):
+        for j in range(3):
+            both = of_target * of_observer * (cross_covariance[j, i] + cross_covariance[i, j])
+            of_t, of_o = covariance_within(belief, t, i, j), covariance_within(belief, o, i, j)
+            relative[i, j] = of_target * of_t + of_observer * of_o - both
+    for i in range(3):
+        x, y, z = _turned(value_jacobian, i, relative)
+        for j in range(3):
+            s[i, j] = s[i, j] + x * value_jacobian[j, 0] + y * value_jacobian[j, 1] + z * value_jacobian[j, 2]
+    for k in range(2):
+        if camera[k] >= 0:
+            for a in range(3):
+                own = own_within(belief, o // 3, a, 3 + CAMERA_YAW + k)
+                relative[a, 0] = of_target * cross_covariance[a, 3 + k] - of_observer * own
+            for i in range(3):
+                beside = value_jacobian[i, 0] * relative[0, 0] + value_jacobian[i, 1] * relative[1, 0]
+                beside += value_jacobian[i, 2] * relative[2, 0]
+                for other in range(2):  # its own variance, and its covariance with the other parameter
+                    if camera[other] >= 0:
+                        both = own_within(belief, o // 3, 3 + CAMERA_YAW + other, 3 + CAMERA_YAW + k)
+                        beside += 0.5 * value_jacobian[i, 3 + other] * both
+                for j in range(3):
+                    s[i, j] += beside * value_jacobian[j, 3 + k]
+                    s[j, i] += beside * value_jacobian[j, 3 + k]
+
+
+@inlined_njit
+def _turned(value_jacobian: FloatArray, row: int, matrix: FloatArray) -> tuple[float, float, float]:
+    """The product of the first three columns of a row of `value_jacobian` and a matrix (3, 3)."""
+    a, b, c = value_jacobian[row, 0], value_jacobian[row, 1], value_jacobian[row, 2]
+    return (
+        a * matrix[0, 0] + b * matrix[1, 0] + c * matrix[2, 0],
+        a * matrix[0, 1] + b * matrix[1, 1] + c * matrix[2, 1],
+        a * matrix[0, 2] + b * matrix[1, 2] + c * matrix[2, 2],
+    )
+
+
+_BODY: IntArray = np.arange(3)
+
+
+def evaluate_link(
+    one: Measurements,
+    k: int,
+    tracks: TrackArrays,
+    belief: BeliefArrays,
+    joint: JointFilter,
+    work: Innovations,
+) -> None:
+    """Evaluate a measurement whose model has no compiled kernel: stages 2 and 3 of `fuse`.
+
+    Missing components get zero rows and unit noise.
+
+    Args:
+        one: A row of measurements, between localized robots.
+        k: Row of `work`.
+        tracks: Odometry.
+        belief: Predicted belief.
+        joint: Its filter, prepared for an update with this measurement.
+        work: Input: `pose` and, for a sparse filter, `cross_covariance`; output: the other fields.
+    """
+    # Predict.
+    model, stamp_ns = MODELS[int(one.model)], int(one.stamp_ns)
+    predicted = model.predicted(one, work.pose[k, 0], work.pose[k, 1])
+    count, sides = predicted.value.size, (int(one.observer), int(one.target))
+    columns = _columns(one, belief)
+    work.columns[k], work.jacobian[k], work.innovation[k] = 0, 0.0, 0.0
+    work.noise[k], work.pair[k] = np.eye(3), 0.0
+    # Jacobian by both sides, and noise, with that of the stamp.
+    noise, slope = one.covariance[:count, :count].copy(), np.zeros(count)
+    for i, jacobian in enumerate((predicted.observer_jacobian, predicted.target_jacobian)):
+        if columns[i] >= 0:
+            body = slice(3 * i, 3 * i + 3)
+            work.columns[k, body], work.jacobian[k, :count, body] = columns[i] + _BODY, jacobian
+        if sides[i] >= 0:
+            slope += jacobian @ _motion(tracks, sides[i], stamp_ns, work.pose[k, i])
+    noise += one.stamp_variance * np.outer(slope, slope)
+    jacobian = work.jacobian[k, :count, :6]
+    s = jacobian @ _covariance(columns, belief, joint, work.cross_covariance[k]) @ jacobian.T + noise
+    innovation = model.innovation(one.value, predicted.value)
+    gated = slice(model.gated)
+    work.noise[k, :count, :count], work.innovation[k, :count] = noise, innovation
+    work.whitened[k], work.cause[k] = 0.0, 0
+    # Gate; a model that fails at these poses is gated, too.
+    if np.isfinite(s).all() and np.isfinite(innovation).all() and np.isfinite(jacobian).all():
+        work.distance[k] = innovation[gated] @ np.linalg.solve(s[gated, gated], innovation[gated])
+        work.accepted[k] = work.distance[k] <= one.gate
+        work.nis[k] = innovation @ np.linalg.solve(s, innovation)
+        work.whitened[k, 0] = innovation[0] / np.sqrt(s[0, 0])
+    else:
+        work.jacobian[k], work.innovation[k], work.noise[k] = 0.0, 0.0, np.eye(3)
+        work.distance[k], work.nis[k], work.accepted[k] = np.inf, np.nan, False
+
+
+def _columns(one: Measurements, belief: BeliefArrays) -> tuple[int, int]:
+    """First filter columns of observer and target of one measurement; -1: none."""
+    first = 3 * int(one.target) if one.target >= 0 else -1
+    if one.landmark >= 0:
+        first = int(belief.table.survey_column[one.landmark])
+    return (3 * int(one.observer) if one.observer >= 0 else -1), first
+
+
+def _covariance(
+    columns: tuple[int, int], belief: BeliefArrays, joint: JointFilter, cross_covariance: FloatArray
+) -> FloatArray:
+    """Covariance (6, 6) of the errors of observer and target; zero for a side without columns."""
+    covariance = np.zeros((6, 6))
+    for i, first in enumerate(columns):
+        if first >= 0:
+            covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = joint.block(first + _BODY)
+    if min(columns) >= 0:
+        o, t = columns
+        shared = belief.covariance[o : o + 3, t : t + 3] if joint.is_dense else cross_covariance[:, :3]
+        covariance[:3, 3:], covariance[3:, :3] = shared, shared.T
+    return covariance
+
+
+def _motion(tracks: TrackArrays, robot: int, stamp_ns: int, pose: FloatArray) -> FloatArray:
+    """Right-invariant velocity twist (3,) of a robot at a pose (3,) in `map` [1/s]."""
+    forward, left, turn = rate_at(tracks, robot, stamp_ns)
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    return np.array(
+        [
+            cos * forward - sin * left + turn * pose[1],
+            sin * forward + cos * left - turn * pose[0],
+            turn,
+        ]
+    )
