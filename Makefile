@@ -49,8 +49,8 @@ test-lowest: setup
 setup:
 	@$(PYTHON) tools/setup_workspace.py
 
-house:
-	@$(PYTHON) tools/house.py $(ARGS)
+house: setup
+	@./run -- python tools/house.py $(ARGS)
 
 # The README is the start page, under its own name for links and as the index.
 docs:

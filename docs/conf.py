@@ -16,7 +16,7 @@ project = html_title = "Swarm localization"
 author = "Swarm localization maintainers"
 root_doc = "README"
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
-include_patterns = ["*.md", "*/*.md", "*/doc/*.md", "docs/api/*.md", "*/CHANGELOG.rst"]
+include_patterns = ["*.md", "*/*.md", "*/doc/*.md", "docs/api/*.md", "docs/decisions/*.md", "*/CHANGELOG.rst"]
 exclude_patterns = ["docs/navigation.md", "out", "build", "install", "log", ".*"]
 myst_heading_anchors = 3
 highlight_language = "none"

@@ -1,9 +1,8 @@
 """Compilation of inner loops by numba, with a cache that is keyed by content.
 
-The hot paths operate on a few numbers a hundred thousand times, where calls of array functions cost ten to
-fifty times the arithmetic. The key of a compiled function is a hash of its byte code, that of all compiled
-functions that it calls, the constants and record types that they use, and the argument types; it contains
-no paths, times or docstrings. So another clone, another folder or a copy of the cache reuses the code.
+The key of a compiled function is a hash of its byte code, that of all compiled functions that it calls, the
+constants and record types that they use, and the argument types; no paths, times or docstrings. The reasons
+are in docs/decisions/0001-numba.md.
 """
 
 from __future__ import annotations

@@ -2,8 +2,7 @@
 
 Frame names and byte order hardly ever change from one message of a topic to the next. They are compared with
 those of the last message that `cdr` has decoded, and only the numbers are read; a message that differs is
-decoded by `cdr`. That takes 0.1 us a message instead of 20 us, which decides how many robots one process can
-listen to and how fast a bag replays.
+decoded by `cdr`. That takes 0.1 us a message instead of 20 us, see docs/decisions/0003-cdr-codec.md.
 
 Many serialized messages at once: one buffer, and columns with the place of each message in it.
 """
