@@ -21,17 +21,15 @@ import numpy as np
 from numba.core.dispatcher import Dispatcher
 
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.messages.cdr import encode
-from swarm_loc_estimator.common.messages.definitions import LASER_SCAN, ODOMETRY, RANGES
-from swarm_loc_estimator.common.messages.estimates import SwarmPosesEncoder
-from swarm_loc_estimator.common.messages.message_batch import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, ODOMETRY, RANGES, encode
+from swarm_loc_estimator.common.messages.poses import SwarmPosesEncoder
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.swarm.error_models import LidarModel
-from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Anchor, Robot, Swarm, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.uwb import Anchor, UwbDevice
 from swarm_loc_estimator.timeline.estimator import Estimator
 
 _BAGS = Path(__file__).resolve().parents[1] / "bags"
