@@ -22,7 +22,6 @@ Kernels that convert camera detections to measurements, see `camera`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import fields
 from typing import NamedTuple
 
@@ -38,19 +37,19 @@ from swarm_loc_estimator.common.messages.detections import (
     SharedMessage,
     decode_shared_detections,
 )
-from swarm_loc_estimator.common.messages.streams import DetectionColumns, DetectionReader, MessageBatch
+from swarm_loc_estimator.common.messages.streams import DetectionReader
 from swarm_loc_estimator.common.small_matrix import assign
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, select
 from swarm_loc_estimator.filter.models import BEARING, MODELS, POLAR, gate_threshold
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
-    Converter,
     DropCounts,
-    InputKind,
     Known,
+    Messages,
+    Reader,
     Sensor,
     SensorSettings,
-    shared_kind,
+    SharedTopic,
 )
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Robot, Swarm
@@ -581,37 +580,36 @@ class SightingConverter:
             measurements.stamp_variance[:] = variance * count[picture]
 
 
-def _columns(
-    found: DetectionColumns, batch: MessageBatch, robot: IntArray, _known: Known
-) -> tuple[DetectionRows, Mapping[str, int]]:
-    columns = (robot, found.stamp_ns, batch.log_ns)
-    robots, stamps_ns, arrivals_ns = (np.repeat(column, found.count) for column in columns)
-    return DetectionRows(robots, stamps_ns, found.detection, arrivals_ns), {}
-
-
 def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> DetectionRows:
     return DetectionRows(message.robot, message.reading_ns, message.columns[0], arrival_ns)
 
 
-def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts) -> Converter:
-    return SightingConverter(swarm, drops).convert
+class CameraSensor(Sensor):
+    """Cameras on robots, and fixed ones."""
 
+    name, topic, message_type = "detections", "detections", MESSAGE_TYPE
+    shared = SharedTopic("swarm/detections", SWARM_DETECTIONS, decode_shared_detections, _shared_rows)
+    of_cameras = True
 
-def _has_camera(robot: Robot) -> bool:
-    return robot.camera is not None
+    def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
+        super().__init__(swarm, settings, drops)
+        self.measure = SightingConverter(swarm, drops).convert  # type: ignore[method-assign]
 
+    @classmethod
+    def create_reader(cls, topics: int, _known: Known) -> Reader:
+        """Create a reader that decodes all messages of a batch at once."""
+        return DetectionReader(topics)
 
-_OWN = InputKind(
-    "detections",
-    "detections",
-    MESSAGE_TYPE,
-    lambda n, _: DetectionReader(n),
-    _columns,
-    _has_camera,
-    of_cameras=True,
-)
-_SHARED = shared_kind(
-    _OWN, "swarm/detections", SWARM_DETECTIONS, decode_shared_detections, _shared_rows, NO_DETECTIONS
-)
-DETECTIONS = Sensor("detections", NO_DETECTIONS, (_OWN, _SHARED), _create_converter)
-"""The sensor, see `registry.SENSORS`."""
+    @classmethod
+    def columns(cls, messages: Messages) -> DetectionRows:
+        """Convert decoded messages (n,) to a row per detection."""
+        if not messages.robot.size:
+            return NO_DETECTIONS
+        found = messages.decoded
+        robot, stamp_ns, arrival_ns = (np.repeat(column, found.count) for column in messages[:3])
+        return DetectionRows(robot, stamp_ns, found.detection, arrival_ns)
+
+    @classmethod
+    def expected_of(cls, robot: Robot) -> bool:
+        """Whether the description says that the robot has a camera."""
+        return robot.camera is not None

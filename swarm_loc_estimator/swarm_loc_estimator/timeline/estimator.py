@@ -23,9 +23,9 @@ from swarm_loc_estimator.filter.state import IN_MAP
 from swarm_loc_estimator.identification.memory import Identities, Outcome
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.fix import about_robots
-from swarm_loc_estimator.sensors.imu import TURN_RATES, TurnRateRows
-from swarm_loc_estimator.sensors.lidar import SCANS, SweepStore
-from swarm_loc_estimator.sensors.odometry import ODOMETRY, OdometryRows
+from swarm_loc_estimator.sensors.imu import TurnRateRows, TurnRateSensor
+from swarm_loc_estimator.sensors.lidar import ScanSensor, SweepStore
+from swarm_loc_estimator.sensors.odometry import OdometryRows, OdometrySensor
 from swarm_loc_estimator.sensors.registry import Batch, InputConverter
 from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -64,7 +64,7 @@ class Estimator:
         self._limits = TrackedLimits.of(swarm, self.settings)
         self._tracks = OdometryTracks(swarm.robots)
         self._converter = InputConverter(swarm, self.settings)
-        self._sweeps = cast(SweepStore, self._converter.accumulators[SCANS.name])
+        self._sweeps = cast(SweepStore, self._converter.accumulators[ScanSensor.name])
         self._fusion = Fusion(swarm, self.settings, self._tracks, self._sweeps.sweeps)
         grouped_s = self.settings.state_period_s + self.settings.fusion_period_s
         self._lookback_ns = self._tracks.lookback_ns + round(
@@ -122,9 +122,9 @@ class Estimator:
                 self._timeline.add(rows)
             elif not rows.robot.size:
                 continue
-            elif name == ODOMETRY.name:
+            elif name == OdometrySensor.name:
                 self._odometry.append(rows)
-            elif name == TURN_RATES.name:
+            elif name == TurnRateSensor.name:
                 self._turn_rates.append(rows)
             else:
                 change = self._converter.accumulators[name].take(rows)

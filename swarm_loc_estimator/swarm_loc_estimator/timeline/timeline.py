@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
 from swarm_loc_estimator.filter.measurements import (
     Command,
