@@ -22,11 +22,11 @@ LIMITS = {
 }
 PATH_LIMITS = {
     # Kind of message: modules, containers
-    "detection": (45, 19),
-    "odometry": (32, 14),
-    "range": (44, 19),
-    "scan": (46, 21),
-    "brightness": (53, 33),
+    "detection": (30, 15),
+    "odometry": (25, 14),
+    "range": (31, 16),
+    "scan": (35, 19),
+    "brightness": (37, 31),
 }
 ORDER = (
     *("common", "swarm", "odometry", "identification", "filter", "initialization", "infrared", "mapping"),
@@ -62,7 +62,7 @@ def test_a_detection_passes_reading_converting_fusing_and_encoding() -> None:
         "swarm_loc_estimator.sensors.camera",
         "swarm_loc_estimator.timeline.estimator",
         "swarm_loc_estimator.filter.prediction",  # compiled
-        "swarm_loc_estimator.common.messages.estimates",
+        "swarm_loc_estimator.common.messages.poses",
     ]
     assert [name for name in passed.modules if name in expected] == expected
     assert "swarm_loc_estimator.timeline.estimate.Estimate" in passed.containers
