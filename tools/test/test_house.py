@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -101,6 +102,14 @@ def test_the_folders_of_the_estimator_import_in_one_order() -> None:
     assert against == []
     folders = {path.name for path in (ROOT / "swarm_loc_estimator" / "swarm_loc_estimator").iterdir()}
     assert {name for name in folders - {"config", "__pycache__"} if "." not in name} == set(ORDER)
+
+
+def test_the_architecture_page_shows_the_folders_in_this_order() -> None:
+    page = (ROOT / "swarm_loc_estimator" / "doc" / "architecture.md").read_text(encoding="utf-8")
+    (diagram,) = [block for block in page.split("```") if "subgraph programs" in block]
+    rows = [line.split("~~~") for line in diagram.splitlines() if line.startswith(" " * 12)]
+    assert [name.strip() for row in reversed(rows) for name in row] == [*ORDER]
+    assert re.findall(r"^\| `(\w+)/` \|", page, re.MULTILINE) == [*ORDER]
 
 
 def product_and_tools() -> list[house.Module]:
