@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DETECTIONS
 from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, AnonymousMessage, decode_anonymous
+from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
 from swarm_loc_estimator.filter.models import ANONYMOUS
 from swarm_loc_estimator.sensors.fix import about_robots, take_out_headings
-from swarm_loc_estimator.sensors.sensor import DropCounts, Messages, Sensor, SensorSettings
+from swarm_loc_estimator.sensors.sensor import DropCounts, Sensor, SensorSettings
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 TOO_MANY = "aerial_too_many"  # Reason to drop an aerial image with more detections than MAX_ANONYMOUS
@@ -52,12 +53,14 @@ class AerialSensor(Sensor):
         return super().fault_of(message, map_frame) or too_many
 
     @classmethod
-    def columns(cls, messages: Messages) -> AerialRows:
+    def columns(cls, messages: Messages[Any]) -> AerialRows:
         """Convert decoded messages (n,) to a row per detection."""
         sizes = [message.detections.size for message in messages.decoded]
         found = (message.detections for message in messages.decoded)
         detections = np.concatenate([np.zeros(0, ANONYMOUS_DTYPE), *found])
-        robot, stamp_ns, arrival_ns = (np.repeat(column, sizes) for column in messages[:3])
+        robot, stamp_ns, arrival_ns = (
+            np.repeat(column, sizes) for column in (messages.robot, messages.stamp_ns, messages.arrival_ns)
+        )
         number = np.concatenate([np.zeros(0, dtype=np.int64), *(np.arange(size) for size in sizes)])
         pose = np.column_stack([detections["x"], detections["y"], detections["theta"]]).astype(float)
         covariance = detections["covariance"].astype(float)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,12 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import POSE_WITH_COVARIANCE, SWARM_FIXES
 from swarm_loc_estimator.common.messages.detections import SharedMessage, decode_shared_numbers
 from swarm_loc_estimator.common.messages.poses import decode_fix
+from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import Measurements, select
 from swarm_loc_estimator.filter.models import CARTESIAN, MODELS
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     DropCounts,
-    Messages,
     Sensor,
     SensorSettings,
     SharedTopic,
@@ -107,7 +107,7 @@ class FixSensor(Sensor):
         self._share = np.array([one.systematic_share for one in models])
 
     @classmethod
-    def columns(cls, messages: Messages) -> FixRows:
+    def columns(cls, messages: Messages[Any]) -> FixRows:
         """Convert decoded messages (n,).
 
         A heading with a NaN, non-positive or very large variance counts as not measured.

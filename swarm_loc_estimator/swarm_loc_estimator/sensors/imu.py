@@ -7,14 +7,15 @@ accelerations say nothing about a robot that drives on a floor.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import IMU
+from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.sensors.sensor import NO_ROWS, DropCounts, Messages, Sensor, SensorSettings
+from swarm_loc_estimator.sensors.sensor import NO_ROWS, DropCounts, Sensor, SensorSettings
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 _MAX_RATE = 200.0  # Larger turn rates are no measurements [rad/s]
@@ -55,7 +56,7 @@ class TurnRateSensor(Sensor):
         ).reshape(-1, 3)
 
     @classmethod
-    def columns(cls, messages: Messages) -> TurnRateRows:
+    def columns(cls, messages: Messages[Any]) -> TurnRateRows:
         """Convert decoded messages (n,); a first covariance of -1 says that there is no rate."""
         velocity = np.array(
             [

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import BRIGHTNESS as MESSAGE_TYPE
 from swarm_loc_estimator.common.messages.detections import decode_brightness
+from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, Measurements, concatenate, select
 from swarm_loc_estimator.filter.models import MODELS, POLAR
 from swarm_loc_estimator.infrared.closed_form import ClosedForm
@@ -28,7 +29,6 @@ from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     REJECT_REASONS,
     Change,
-    Messages,
     Sensor,
     reject_reasons,
 )
@@ -300,7 +300,7 @@ class BrightnessSensor(Sensor):
     decode = staticmethod(decode_brightness)
 
     @classmethod
-    def columns(cls, messages: Messages) -> BrightnessRows:
+    def columns(cls, messages: Messages[Any]) -> BrightnessRows:
         """Convert decoded messages (n,)."""
         readings = np.empty(len(messages.decoded), dtype=object)
         for k, message in enumerate(messages.decoded):

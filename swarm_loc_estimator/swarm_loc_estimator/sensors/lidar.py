@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.messages.cdr import LASER_SCAN
+from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, select
 from swarm_loc_estimator.filter.models import SCAN
 from swarm_loc_estimator.mapping.messages import decode_scan
 from swarm_loc_estimator.mapping.sweeps import LidarSweep, read_sweep
 from swarm_loc_estimator.sensors.fix import about_robots
-from swarm_loc_estimator.sensors.sensor import NO_ROWS, Change, Messages, Sensor
+from swarm_loc_estimator.sensors.sensor import NO_ROWS, Change, Sensor
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 
@@ -92,7 +93,7 @@ class ScanSensor(Sensor):
     decode = staticmethod(decode_scan)
 
     @classmethod
-    def columns(cls, messages: Messages) -> ScanRows:
+    def columns(cls, messages: Messages[Any]) -> ScanRows:
         """Keep the decoded messages (n,)."""
         scans = np.empty(len(messages.decoded), dtype=object)
         scans[:] = messages.decoded

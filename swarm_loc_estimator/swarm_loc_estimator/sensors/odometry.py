@@ -12,13 +12,12 @@ from swarm_loc_estimator.common.messages.cdr import ODOMETRY as MESSAGE_TYPE
 from swarm_loc_estimator.common.messages.cdr import SWARM_ODOMETRY
 from swarm_loc_estimator.common.messages.detections import SharedMessage, decode_shared_numbers
 from swarm_loc_estimator.common.messages.poses import decode_odometry
-from swarm_loc_estimator.common.messages.streams import PoseReader
+from swarm_loc_estimator.common.messages.streams import PoseColumns, PoseReader
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     DropCounts,
     Known,
-    Messages,
     Reader,
     Sensor,
     SensorSettings,
@@ -73,13 +72,17 @@ class OdometrySensor(Sensor):
         return PoseReader(topics, decode_odometry, names=2)
 
     @classmethod
-    def columns(cls, messages: Messages) -> OdometryRows:
+    def nothing(cls) -> OdometryRows:
+        """Empty readings."""
+        return NO_ODOMETRY
+
+    @classmethod
+    def columns(cls, messages: PoseColumns) -> OdometryRows:
         """Convert decoded messages (n,)."""
-        found = messages.decoded
-        if not messages.robot.size:
-            return NO_ODOMETRY
-        rows = OdometryRows(messages.robot, messages.stamp_ns, found.pose, found.twist, messages.arrival_ns)
-        return rows if found.valid.all() else select(rows, found.valid)
+        rows = OdometryRows(
+            messages.robot, messages.stamp_ns, messages.pose, messages.twist, messages.arrival_ns
+        )
+        return rows if messages.valid.all() else select(rows, messages.valid)
 
     def measure(self, rows: OdometryRows) -> OdometryRows:
         """Select finite poses of plausible size, of robots with odometry."""

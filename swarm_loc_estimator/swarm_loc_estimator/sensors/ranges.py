@@ -7,16 +7,17 @@ and the other one is not, both change places and the sign. See doc/uwb.md.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import RANGES as MESSAGE_TYPE
+from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, select
 from swarm_loc_estimator.filter.models import MODELS, RANGE, RANGE_DIFFERENCE
-from swarm_loc_estimator.sensors.sensor import NO_ROWS, DropCounts, Messages, Sensor, SensorSettings
+from swarm_loc_estimator.sensors.sensor import NO_ROWS, DropCounts, Sensor, SensorSettings
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm, UwbDevice
 
 
@@ -88,13 +89,15 @@ class RangeSensor(Sensor):
         self._gate = MODELS[RANGE].gate([radio.gate_probability for radio in radios])
 
     @classmethod
-    def columns(cls, messages: Messages) -> RangeRows:
+    def columns(cls, messages: Messages[Any]) -> RangeRows:
         """Convert decoded messages (n,)."""
         if not messages.decoded:
             return NO_RANGES
         counts = [message.ranges.size for message in messages.decoded]
         ranges = np.concatenate([message.ranges for message in messages.decoded])
-        robot, stamp_ns, arrival_ns = (np.repeat(column, counts) for column in messages[:3])
+        robot, stamp_ns, arrival_ns = (
+            np.repeat(column, counts) for column in (messages.robot, messages.stamp_ns, messages.arrival_ns)
+        )
         device, reference, value, variance = (ranges[name].copy() for name in ranges.dtype.names or ())
         return RangeRows(robot, stamp_ns, device, reference, value, variance, arrival_ns)
 

@@ -22,7 +22,7 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.cdr import CdrError, decode, nanoseconds
 from swarm_loc_estimator.common.messages.detections import SharedMessage
-from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, Messages
 from swarm_loc_estimator.common.small_matrix import cholesky3
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, concatenate, select
 from swarm_loc_estimator.filter.models import MODELS, Prediction
@@ -197,17 +197,6 @@ class SensorSettings(Protocol):
         """Standard deviation of the heading of aerial detections without covariance [rad]."""
 
 
-class Messages(NamedTuple):
-    """Decoded messages (n,) of one sensor, in order of arrival."""
-
-    robot: (
-        IntArray  #: (n,) index of the robot, or N plus that of the fixed camera, of the topic; -1: the swarm
-    )
-    stamp_ns: IntArray  #: (n,) stamps of their headers
-    arrival_ns: IntArray  #: (n,) arrival times
-    decoded: Any  #: list (n,) of what `Sensor.decode` returned; from a reader of its own, what that returned
-
-
 class SharedTopic(NamedTuple):
     """Topic with readings of many robots, which replaces their own topics."""
 
@@ -255,8 +244,12 @@ class Sensor:
         self.swarm, self.settings, self.drops = swarm, settings, drops
 
     @classmethod
-    def columns(cls, messages: Messages) -> Any:
-        """Convert decoded messages (n,) to readings; with no message, to empty columns."""
+    def columns(cls, messages: Any) -> Any:
+        """Convert decoded messages (n,) to readings; with no message, to empty columns.
+
+        Args:
+            messages: `Messages`, all of them valid, or what a reader of its own returned for all.
+        """
         raise NotImplementedError
 
     def measure(self, rows: Any) -> Any:
@@ -305,7 +298,7 @@ class Sensor:
     @classmethod
     def nothing(cls) -> Any:
         """Empty readings."""
-        return cls.columns(Messages(NO_ROWS, NO_ROWS, NO_ROWS, []))
+        return cls.columns(Messages(NO_ROWS, NO_ROWS > 0, []))
 
     @classmethod
     def kinds(cls) -> tuple[InputKind, ...]:
@@ -319,13 +312,13 @@ class Sensor:
     @classmethod
     def _read(cls, found: Any, batch: MessageBatch, robot: IntArray, known: Known) -> Any:
         """Convert what the reader returned for messages (n,) to readings, and count what is dropped."""
-        if not isinstance(found, MessageColumns):
-            return cls.columns(Messages(robot, found.stamp_ns, batch.log_ns, found)), {}
-        faults = [cls.fault_of(message, known.map_frame) for message in found.messages]
-        good = np.array([not fault for fault in faults], dtype=bool)
-        kept = np.flatnonzero(found.valid)[good]
-        messages = [one for one, fault in zip(found.messages, faults, strict=True) if not fault]
-        read = Messages(robot[kept], found.stamp_ns[kept], batch.log_ns[kept], messages)
+        found = replace(found, robot=robot, arrival_ns=batch.log_ns)
+        if not isinstance(found, Messages):
+            return cls.columns(found), {}
+        faults = [cls.fault_of(message, known.map_frame) for message in found.decoded]
+        kept = np.flatnonzero(found.valid)[np.array([not fault for fault in faults], dtype=bool)]
+        decoded = [one for one, fault in zip(found.decoded, faults, strict=True) if not fault]
+        read = Messages(found.stamp_ns[kept], found.valid[kept], decoded, robot[kept], batch.log_ns[kept])
         return cls.columns(read), Counter(fault for fault in faults if fault)
 
 
