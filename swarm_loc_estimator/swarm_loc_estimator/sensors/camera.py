@@ -22,8 +22,9 @@ Kernels that convert camera detections to measurements, see `camera`.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import fields
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -466,6 +467,7 @@ def _write_spread(sensor: SensorModel, content: int, published: FloatArray, spre
         spread[i, i] = sensor.heading_sigma**2
 
 
+_UNKNOWN_VARIANCE = -1.0  # First element of an unknown covariance
 FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation from the optical frame to x forward, y left, z up."""
 
@@ -585,6 +587,26 @@ class CameraSensor(Sensor):
     def create_reader(cls, topics: int, _known: Known) -> Reader:
         """Create a reader that decodes all messages of a batch at once."""
         return DetectionReader(topics)
+
+    @classmethod
+    def rows(cls, columns: Mapping[str, Any]) -> DetectionRows:
+        """Create readings from columns: those of `DetectionRows`, or the fields of a detection.
+
+        `id` and `position` are needed; without `orientation` a detection is a position, and without
+        `covariance` its noise is that of the camera.
+        """
+        if "detection" in columns:
+            as_given: DetectionRows = super().rows(columns)
+            return as_given
+        detection = np.zeros(len(columns["robot"]), dtype=DETECTION_DTYPE)
+        detection["content"] = CONTENT_POSE if "orientation" in columns else CONTENT_POSITION
+        detection["orientation"][:, 3], detection["covariance"][:, 0, 0] = 1.0, _UNKNOWN_VARIANCE
+        fields = {*columns} & {*(detection.dtype.names or ())}
+        for name in fields:
+            detection[name] = columns[name]
+        others = {name: columns[name] for name in {*columns} - fields}
+        made: DetectionRows = super().rows({**others, "detection": detection})
+        return made
 
     @classmethod
     def nothing(cls) -> DetectionRows:
