@@ -10,14 +10,13 @@ which is F. So a common motion of all robots and landmarks stays unobservable. T
 first-order Gauss-Markov process: it decays, and between the two instants its mean over this interval is
 used. So may be the yaw of a camera, which does not act on the motion.
 
-Adaptive process noise: the scale of a robot's odometry noise is learned from what measurements correct.
-
-Over a window, measurements move the transform T from `map` to a robot's odometry track by the drift of its
-odometry. In a consistent filter this correction is normal with variance s Q + P_begin - P_end, where Q is the
-described process noise of the window, P the variance of the pose, and s the scale of the noise, which is 1 as
-described. A robot that slips drifts by much more. Each window gives a likelihood of s; they are multiplied
-for a grid of scales and forgotten with a time constant. The scale that is used is never below 1: a minute on
-a good floor says little of the next metre.
+The scale of a robot's process noise is learned from what measurements correct. Over a window, measurements
+move the transform T from `map` to a robot's odometry track by the drift of its odometry. In a consistent
+filter this correction is normal with variance s Q + P_begin - P_end, where Q is the described process noise
+of the window, P the variance of the pose, and s the scale of the noise, which is 1 as described. A robot that
+slips drifts by much more. Each window gives a likelihood of s; they are multiplied for a grid of scales and
+forgotten with a time constant. The scale that is used is never below 1: a minute on a good floor says little
+of the next metre.
 
 Two windows run in parallel: the short one reacts fast, the long one sees slow drifts. While nothing measures
 a robot, its scale stays. Robots whose scales of distance or turn are estimated by description keep scale 1:

@@ -597,15 +597,15 @@ def _add_uncertainty(
                 own = own_within(belief, o // 3, a, 3 + CAMERA_YAW + k)
                 relative[a, 0] = of_target * cross_covariance[a, 3 + k] - of_observer * own
             for i in range(3):
-                beside = value_jacobian[i, 0] * relative[0, 0] + value_jacobian[i, 1] * relative[1, 0]
-                beside += value_jacobian[i, 2] * relative[2, 0]
+                shared = value_jacobian[i, 0] * relative[0, 0] + value_jacobian[i, 1] * relative[1, 0]
+                shared += value_jacobian[i, 2] * relative[2, 0]
                 for other in range(2):  # its own variance, and its covariance with the other parameter
                     if camera[other] >= 0:
                         both = own_within(belief, o // 3, 3 + CAMERA_YAW + other, 3 + CAMERA_YAW + k)
-                        beside += 0.5 * value_jacobian[i, 3 + other] * both
+                        shared += 0.5 * value_jacobian[i, 3 + other] * both
                 for j in range(3):
-                    s[i, j] += beside * value_jacobian[j, 3 + k]
-                    s[j, i] += beside * value_jacobian[j, 3 + k]
+                    s[i, j] += shared * value_jacobian[j, 3 + k]
+                    s[j, i] += shared * value_jacobian[j, 3 + k]
 
 
 @inlined_njit
@@ -630,7 +630,7 @@ def evaluate_link(
     joint: JointFilter,
     work: Innovations,
 ) -> None:
-    """Evaluate a row of measurements whose model has no compiled kernel: stages 2 and 3; write row k of `work`.
+    """Evaluate a measurement whose model has no compiled kernel: stages 2 and 3; write row k of `work`.
 
     Its sides are localized and predicted, the filter is prepared. Components that its model lacks get zero
     rows and unit noise.

@@ -1,9 +1,7 @@
 """Alignment of a robot's track with the map: the transform on which most constraints agree, if it is unique.
 
-The parts are compiled because every waiting robot tries repeatedly; they are not inlined, which would
-lengthen compilation.
-
-Constraints by sightings on the pose of the odometry track of a robot that is not localized.
+Constraints are sightings by or of a robot that is not localized. The parts are compiled because every waiting
+robot tries repeatedly; they are not inlined, which would lengthen compilation.
 """
 
 from __future__ import annotations

@@ -1,13 +1,10 @@
 """Preintegration of odometry: calibrated poses along a track, with their covariance and Jacobian.
 
-Checks of odometry steps: jumps, resets, and odometry whose pose is constant while its twist is not.
-
-A step is compared with what the robot can do between two stamps, and with the twists at both ends. Drivers
-report the twist of the step before, of the step after or of the instant, so the mean twist of a step lies
-between the two; while it does not, or the twist is not filled, it proves nothing.
-
-Turn rates of gyroscopes, integrated to the turns of odometry steps.
-"""
+Steps are checked for jumps, resets, and a pose that is constant while the twist is not. A step is compared
+with what the robot can do between two stamps, and with the twists at both ends. Drivers report the twist of
+the step before, of the step after or of the instant, so the mean twist of a step lies between the two; while
+it does not, or the twist is not filled, it proves nothing. Where there is a gyroscope, its turn rate is
+integrated to the turn."""
 
 from __future__ import annotations
 
@@ -253,7 +250,7 @@ def turn_by_gyro(tracks: TrackArrays, robot: int, begin_ns: int, end_ns: int, is
 
 @inlined_njit
 def _angle_at(tracks: TrackArrays, robot: int, k: int, stamp_ns: int) -> float:
-    """Integral of the turn rate until an instant beside measurement k; the rate is linear in between."""
+    """Integral of the turn rate until an instant next to measurement k; the rate is linear in between."""
     stamps, rates = tracks.gyro_ns[robot], tracks.gyro_rate[robot]
     angle: float = tracks.gyro_angle[robot, k]
     if stamps[k] == stamp_ns:
@@ -384,7 +381,7 @@ def integrate(tracks: TrackArrays, oldest_ns: int, rows: NewRows, changed_from_n
 
 @cached_njit
 def integrate_again(tracks: TrackArrays, from_ns: IntArray, changed_from_ns: IntArray) -> None:
-    """Integrate the rows of each robot behind an instant (N,) again; lower `changed_from_ns` (N,)."""
+    """Integrate the rows of each robot after an instant (N,) again; lower `changed_from_ns` (N,)."""
     for robot in range(from_ns.size):
         stamps = tracks.stamp_ns[robot, : tracks.filled[robot]]
         first = max(1, np.searchsorted(stamps, from_ns[robot], side="right"))

@@ -5,18 +5,10 @@ a measurement in the planar sensor frame: at the camera's position on the robot 
 `map`, rotated by its yaw, with the mount's pitch and roll removed. A fixed camera has no observer, and the
 error of its pose is the systematic share of its measurements.
 
-Measurement model of the direction of a marker; it is evaluated by its record.
-
-Vectors and orientations in the optical frame of a camera, for compiled code.
-
-Pose in the plane of a marker that lies flat, by casting its corners onto the plane of its height.
-
 The tilt and the distance of a small marker in an image are uncertain, and the error of one is that of the
 other. But a marker that lies flat has neither: its corners, projected by its measured pose into the image and
 from there onto the plane in which it lies, tell its position and the direction of its x axis. These depend on
 the pixels only, whichever of the two mirrored poses was measured.
-
-Kernels that convert camera detections to measurements, see `camera`.
 """
 
 from __future__ import annotations
