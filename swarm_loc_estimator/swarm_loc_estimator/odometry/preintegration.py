@@ -4,7 +4,8 @@ Steps are checked for jumps, resets, and a pose that is constant while the twist
 with what the robot can do between two stamps, and with the twists at both ends. Drivers report the twist of
 the step before, of the step after or of the instant, so the mean twist of a step lies between the two; while
 it does not, or the twist is not filled, it proves nothing. Where there is a gyroscope, its turn rate is
-integrated to the turn."""
+integrated to the turn.
+"""
 
 from __future__ import annotations
 

@@ -251,7 +251,7 @@ class Estimator:
         self._use_odometry()
         if fuse:
             self._timeline.advance(newest_ns, has_budget)
-            needed_ns = min([oldest_ns, *self._timeline.measurements.stamp_ns[:1].tolist()])
+            needed_ns = min([oldest_ns, *self._timeline.stamp_ns[:1].tolist()])
             for accumulator in self._gathering.values():
                 accumulator.forget_before(needed_ns if accumulator is self._sweeps else oldest_ns)
         return self._estimate(now_ns)

@@ -54,9 +54,14 @@ class MeasurementBuffer:
         return self._columns.stamp_ns[self._begin : self._end]
 
     @property
-    def measurements(self) -> Measurements:
-        """Measurements (m,), sorted."""
-        return select(self._columns, slice(self._begin, self._end))
+    def sides(self) -> tuple[IntArray, IntArray]:
+        """Observers and targets (m,)."""
+        rows = slice(self._begin, self._end)
+        return self._columns.observer[rows], self._columns.target[rows]
+
+    def part(self, begin: int, end: int) -> Measurements:
+        """Measurements from one index to another, sorted."""
+        return select(self._columns, slice(self._begin + begin, self._begin + end))
 
     @property
     def verdicts(self) -> NDArray[np.uint8]:
@@ -102,7 +107,7 @@ class MeasurementBuffer:
         if self._end + count <= self._verdicts.size:
             return
         size = len(self)
-        kept: list[Any] = [one.copy() for one in (*self.measurements, self.verdicts, self.nis)]
+        kept: list[Any] = [one.copy() for one in (*self.part(0, size), self.verdicts, self.nis)]
         if 2 * (size + count) > self._verdicts.size:
             self._allocate(4 * (size + count))
         columns: list[Any] = [*self._columns, self._verdicts, self._nis]
@@ -302,7 +307,12 @@ class Timeline:
     @property
     def measurements(self) -> Measurements:
         """Measurements (m,) within the horizon, sorted by stamp."""
-        return self._buffer.measurements
+        return self._buffer.part(0, len(self._buffer))
+
+    @property
+    def stamp_ns(self) -> IntArray:
+        """Stamps (m,) of the measurements."""
+        return self._buffer.stamp_ns
 
     @property
     def verdicts(self) -> NDArray[np.uint8]:
@@ -346,12 +356,10 @@ class Timeline:
         Args:
             changed_from_ns: (N,) instant after which each robot's track has changed.
         """
-        rows = self._buffer.measurements
-        first = _first_touched(
-            rows.stamp_ns, rows.observer, rows.target, changed_from_ns, self._fusion_period_ns
-        )
+        stamp_ns = self._buffer.stamp_ns
+        first = _first_touched(stamp_ns, *self._buffer.sides, changed_from_ns, self._fusion_period_ns)
         if first < len(self._buffer):
-            self._redo_from(int(rows.stamp_ns[first]))
+            self._redo_from(int(stamp_ns[first]))
         for command in self._commands:
             if command.stamp_ns > changed_from_ns[command.robot]:
                 self._redo_from(command.stamp_ns)
@@ -462,8 +470,7 @@ class Timeline:
             if key > due_ns:
                 return True
             # Fuse, and store a checkpoint if the last one is old.
-            rows = slice(begin, end)
-            measurements = select(buffer.measurements, rows)
+            rows, measurements = slice(begin, end), buffer.part(begin, end)
             self._step(self._ahead, measurements, commands, buffer.verdicts[rows], buffer.nis[rows])
             self._head_key = key
             if key - max(self._checkpoints[-1][0], -(2**62)) >= self._spacing_ns:
