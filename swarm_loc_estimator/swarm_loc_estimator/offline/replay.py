@@ -300,7 +300,7 @@ class Runner:
             self._flush()
 
     def _note_losses(self) -> None:
-        """Store the newest losses; late data undo a loss, or move it."""
+        """Store the newest losses; one that late data move back replaces those after it."""
         for one in self._estimator.losses:
             mine = self._losses.setdefault(one.robot, [])
             while mine and mine[-1].stamp_ns > one.stamp_ns:

@@ -140,7 +140,7 @@ class ReplayResult:
         found: dict[int, dict[str, list[str]]] = {}
         for one in (one for one in self.losses if one.why is not Loss.FRAME):
             times = found.setdefault(one.robot, {}).setdefault(one.cause, [])
-            times.append(f"{(one.stamp_ns - begin_ns) * 1e-9:.1f} s")
+            times.append(f"{max(0, one.stamp_ns - begin_ns) * 1e-9:.1f} s")
         remarks = []
         for robot, times_of in list(found.items())[:_MAX_LOST]:
             count = sum(map(len, times_of.values()))

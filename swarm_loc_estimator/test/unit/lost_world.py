@@ -13,6 +13,7 @@ from core_messages import SECOND, T0, Event, batch_of
 from core_world import Plan, World, simulate
 from mapping_world import LIDAR, SWEEP_NS, LidarRobot, room_map, scan_bytes
 
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import Report
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
@@ -41,10 +42,12 @@ CAUSES = {
 }
 """What users read of each reason."""
 TICK_NS = 100_000_000
-_HOME = (0.2, -0.1, 0.5)
-_FIXED = Swarm((Robot("a", start=_HOME, start_sigma=StartSigma(0.02, 0.02, 0.05), camera=None),))
+FIX_COVARIANCE = np.diag([1e-4, 1e-4, 1e-3])
+HOME = (0.2, -0.1, 0.5)
+FIXED = Swarm((Robot("a", start=HOME, start_sigma=StartSigma(0.02, 0.02, 0.05), camera=None),))
 _NEVER = Settings(max_fault_score=1e9)
-_CARRIED = Plan(robots=2, duration_s=10.0, carried=(0,))
+_PLAN = Plan(robots=2, duration_s=10.0)
+_CARRIED = replace(_PLAN, carried=(0,))
 
 
 @dataclass(frozen=True)
@@ -53,7 +56,7 @@ class Story:
 
     swarm: Swarm
     inputs: Iterable[Batch]  # By arrival; read until it is lost
-    settings: Settings = Settings()
+    settings: Settings | None = None
 
 
 @dataclass(frozen=True)
@@ -119,22 +122,27 @@ def _fixes(
         yield batch_of([(stamp_ns, Event(0, stamp_ns, (speed * second, 0.0, 0.0)))])
         if k % 3 or second < fixes_from_s:
             continue
-        stamp, along = np.array([stamp_ns]), speed * second
-        x, y = np.cos(_HOME[2]), np.sin(_HOME[2])
-        pose = np.array([_HOME]) + np.array([[along * x + offset_m(second), along * y, 0.0]])
-        covariance = np.diag([1e-4, 1e-4, 1e-3])[None]
-        yield Batch.of(stamp_ns, stamp_ns, fixes=FixRows(np.array([0]), stamp, pose, covariance, stamp))
+        along = speed * second
+        x, y = along * np.cos(HOME[2]) + offset_m(second), along * np.sin(HOME[2])
+        yield fix_of(stamp_ns, np.add(HOME, (x, y, 0.0)), stamp_ns)
+
+
+def fix_of(stamp_ns: int, pose: FloatArray, arrival_ns: int) -> Batch:
+    """A fix of robot 0 at a pose (3,) in map."""
+    stamp, arrival = np.array([stamp_ns]), np.array([arrival_ns])
+    fix = FixRows(np.array([0]), stamp, pose[None], FIX_COVARIANCE[None], arrival)
+    return Batch.of(arrival_ns, arrival_ns, fixes=fix)
 
 
 def _uncertain(_folder: Path) -> Story:
     """It drives for five seconds before its first fix."""
     driven = _fixes(lambda _: 0.0, speed=0.3, fixes_from_s=5.0)
-    return Story(_FIXED, driven, Settings(lost_sigma=0.05))
+    return Story(FIXED, driven, Settings(lost_sigma=0.05))
 
 
 def _refuted(_folder: Path) -> Story:
     """Its start is wrong."""
-    return Story(_FIXED, _fixes(lambda _: 1.0))
+    return Story(FIXED, _fixes(lambda _: 1.0))
 
 
 def _gated(_folder: Path) -> Story:
@@ -145,7 +153,7 @@ def _gated(_folder: Path) -> Story:
 
 def _off_fixes(_folder: Path) -> Story:
     """Its fixes jump by a metre."""
-    return Story(_FIXED, _fixes(lambda second: 1.0 if second > 5.0 else 0.0))
+    return Story(FIXED, _fixes(lambda second: 1.0 if second > 5.0 else 0.0))
 
 
 def _kidnapped(_folder: Path) -> Story:
@@ -176,15 +184,21 @@ def _off_map(folder: Path) -> Story:
 
 
 def _not_in_image(_folder: Path) -> Story:
-    """It was carried, and images show it elsewhere."""
-    world = seen_from_above(replace(_CARRIED, speed=0.15), View(), 1).world
-    return Story(world.swarm, _played(world))
+    """Images show it until it is taken away."""
+    seen = seen_from_above(replace(_PLAN, robots=6), View(), 1)
+    events = [
+        replace(one, aerial=one.aerial[seen.robot[one.stamp_ns] != 0])
+        if one.aerial.size and one.stamp_ns > T0 + 5 * SECOND
+        else one
+        for one in seen.world.events
+    ]
+    return Story(seen.world.swarm, _played(replace(seen.world, events=tuple(events))))
 
 
 def _command(_folder: Path) -> Story:
     """Located by fixes, until the end."""
     fixes = list(_fixes(lambda _: 0.0))
-    return Story(_FIXED, fixes[:30])
+    return Story(FIXED, fixes[:30])
 
 
 _STORIES: dict[Loss, Callable[[Path], Story]] = {
