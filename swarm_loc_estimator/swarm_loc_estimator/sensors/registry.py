@@ -13,20 +13,21 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.filter.measurements import Measurements, select
-from swarm_loc_estimator.sensors.aerial import AERIAL
-from swarm_loc_estimator.sensors.camera import DETECTIONS
-from swarm_loc_estimator.sensors.fix import FIXES
-from swarm_loc_estimator.sensors.imu import TURN_RATES
-from swarm_loc_estimator.sensors.infrared import BRIGHTNESS
-from swarm_loc_estimator.sensors.lidar import SCANS
-from swarm_loc_estimator.sensors.odometry import ODOMETRY
-from swarm_loc_estimator.sensors.ranges import RANGES
+from swarm_loc_estimator.filter.models import MODELS, MeasurementModel
+from swarm_loc_estimator.filter.models import register as register_model
+from swarm_loc_estimator.sensors.aerial import AerialSensor
+from swarm_loc_estimator.sensors.camera import CameraSensor
+from swarm_loc_estimator.sensors.fix import FixSensor
+from swarm_loc_estimator.sensors.imu import TurnRateSensor
+from swarm_loc_estimator.sensors.infrared import BrightnessSensor
+from swarm_loc_estimator.sensors.lidar import ScanSensor
+from swarm_loc_estimator.sensors.odometry import OdometrySensor
+from swarm_loc_estimator.sensors.ranges import RangeSensor
 from swarm_loc_estimator.sensors.sensor import (
     BAD_MEASUREMENT,
     REJECT_REASONS,
     VALID,
     Accumulator,
-    Converter,
     DropCounts,
     Guard,
     InputKind,
@@ -37,18 +38,47 @@ from swarm_loc_estimator.sensors.sensor import (
 )
 from swarm_loc_estimator.swarm.swarm import Swarm
 
-SENSORS: dict[str, Sensor] = {
+SENSORS: dict[str, type[Sensor]] = {
     sensor.name: sensor
-    for sensor in (ODOMETRY, TURN_RATES, DETECTIONS, BRIGHTNESS, FIXES, RANGES, SCANS, AERIAL)
+    for sensor in (
+        OdometrySensor,
+        TurnRateSensor,
+        CameraSensor,
+        BrightnessSensor,
+        FixSensor,
+        RangeSensor,
+        ScanSensor,
+        AerialSensor,
+    )
 }
 """All sensors by name. Simultaneous measurements are fused in this order."""
+_FIRST_OWN_MODEL = 1000  # Number of the first model of a sensor that is registered
+
+
+def register(sensor: type[Sensor]) -> type[Sensor]:
+    """Add a sensor, and its model if it has one; may be used as a decorator of its class.
+
+    Raises:
+        ValueError: There is a sensor of its name, or it gates other than 1, 2 or 3 components.
+    """
+    if sensor.name in SENSORS:
+        raise ValueError(f"there is a sensor '{sensor.name}' already")
+    if sensor.components:
+        sensor.model = max([_FIRST_OWN_MODEL, *(number + 1 for number in MODELS)])
+        names, gated = sensor.components, len(sensor.components)
+        angles = sensor.is_angle[:gated]
+        model = MeasurementModel(sensor.name, sensor.model, names, angles, gated, sensor.predict)
+        register_model(model)
+    SENSORS[sensor.name] = sensor
+    return sensor
+
 
 THE_SWARM = -1  # Robot index of topics about the whole swarm
 
 
 def kinds() -> dict[str, InputKind]:
     """All kinds of topics by name, shared topics last."""
-    found = [kind for sensor in SENSORS.values() for kind in sensor.kinds]
+    found = [kind for sensor in SENSORS.values() for kind in sensor.kinds()]
     return {kind.name: kind for kind in sorted(found, key=lambda kind: bool(kind.stands_for))}
 
 
@@ -128,14 +158,56 @@ class Batch:
         for name, given in rows.items():
             if name not in SENSORS:
                 raise TypeError(f"there is no sensor '{name}', only {', '.join(SENSORS)}")
-            columns = type(SENSORS[name].nothing)
+            columns = type(SENSORS[name].nothing())
             if not isinstance(given, columns) or len({len(column) for column in given}) != 1:
                 raise TypeError(f"{name} must be {columns.__name__} with columns of equal length")
         return cls(begin_ns, end_ns, rows)
 
+    @classmethod
+    def of_columns(
+        cls, swarm: Swarm, begin_ns: int, now_ns: int, readings: Mapping[str, Mapping[str, Any]]
+    ) -> Batch:
+        """Create a batch from columns by sensor, see `Estimator.step`.
+
+        Args:
+            swarm: Gives the indices of robots and fixed cameras.
+            begin_ns: Instant before which nothing can arrive any more.
+            now_ns: Latest arrival; readings without `arrival_ns` arrive at their stamps, but not later.
+            readings: Columns by the names of sensors.
+
+        Raises:
+            TypeError: There is no such sensor, robot or column, or a column has another length or shape.
+        """
+        names = [one.name for one in swarm.robots] + [one.name for one in swarm.cameras]
+        index = {name: k for k, name in enumerate(names)}
+        rows = {}
+        for name, given in readings.items():
+            if name not in SENSORS:
+                raise TypeError(f"there is no sensor '{name}', only {', '.join(SENSORS)}")
+            columns = dict(given)
+            if "stamp_s" in columns:
+                columns["stamp_ns"] = np.round(1e9 * np.asarray(columns.pop("stamp_s"))).astype(np.int64)
+            if "stamp_ns" not in columns:
+                raise TypeError(f"{name}: the column 'stamp_s' or 'stamp_ns' is missing")
+            stamp_ns = columns["stamp_ns"] = np.atleast_1d(np.asarray(columns["stamp_ns"], dtype=np.int64))
+            robots = -1 if name == AerialSensor.name else columns["robot"]
+            robots = np.broadcast_to(np.asarray(robots), stamp_ns.shape).tolist()
+            unknown = [one for one in robots if isinstance(one, str) and one not in index]
+            if unknown:
+                raise TypeError(f"{name}: there is no robot or camera '{unknown[0]}'")
+            columns["robot"] = np.array(
+                [index[one] if isinstance(one, str) else one for one in robots], dtype=np.int64
+            )
+            columns.setdefault("arrival_ns", np.clip(stamp_ns, begin_ns, now_ns))
+            made = SENSORS[name].rows(columns)
+            rows[name] = select(made, np.argsort(made.arrival_ns, kind="stable"))
+        arrivals_ns = [int(one.arrival_ns[0]) for one in rows.values() if one.robot.size]
+        return cls(min([now_ns, *arrivals_ns]), now_ns, rows)
+
     def __getitem__(self, sensor: str) -> Any:
         """The readings of a sensor."""
-        return self.rows.get(sensor, SENSORS[sensor].nothing)
+        rows = self.rows.get(sensor)
+        return SENSORS[sensor].nothing() if rows is None else rows
 
     def until_each(self, stamps_ns: IntArray) -> Iterator[Batch]:
         """Split at instants (s,) into s + 1 parts by arrival time."""
@@ -168,15 +240,11 @@ class InputConverter:
     def __init__(self, swarm: Swarm, settings: SensorSettings) -> None:
         self.drops = DropCounts(len(swarm.sources))
         self.accumulators: dict[str, Accumulator] = {
-            name: sensor.create_accumulator(swarm)
+            name: sensor.accumulator(swarm)
             for name, sensor in SENSORS.items()
-            if sensor.create_accumulator is not None
+            if sensor.accumulator is not None
         }
-        self._converters: dict[str, Converter] = {
-            name: sensor.create_converter(swarm, settings, self.drops)
-            for name, sensor in SENSORS.items()
-            if sensor.create_converter is not None
-        }
+        self._sensors = {name: sensor(swarm, settings, self.drops) for name, sensor in SENSORS.items()}
         self._future_ns = round(settings.future_tolerance_s * 1e9)
         self._robots, self._landmarks = len(swarm.robots), len(swarm.surveyed)
 
@@ -193,7 +261,7 @@ class InputConverter:
                 self.drops.add("future_stamp", rows.robot[late])
                 rows = select(rows, ~late)
             with Guard(name, rows.robot.size, self.drops.total):
-                found = self._converters[name](rows) if name in self._converters else rows
+                found = self._sensors[name].measure(rows)
                 kept[name] = self._valid(found) if isinstance(found, Measurements) else found
         return replace(batch, rows=kept, dropped={}, is_converted=True)
 

@@ -12,10 +12,10 @@ from ir_swarm import DROPLET, T0, Light, brightness_rows, calibrated, exchange
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.infrared.search import IrOutcome, IrSolutions
 from swarm_loc_estimator.sensors import infrared as brightness_sightings
 from swarm_loc_estimator.sensors.infrared import BrightnessConverter, BrightnessRows
-from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.swarm.ir_board import IrMethod, IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 

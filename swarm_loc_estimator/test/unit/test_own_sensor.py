@@ -35,7 +35,6 @@ from swarm_loc_estimator.filter.measurement_model import (
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import SENSORS
-from swarm_loc_estimator.filter.measurements import Measurements
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     Converter,

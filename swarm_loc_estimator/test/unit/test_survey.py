@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from swarm_loc_estimator.cli import survey as command
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.survey.problem import problem_of, start_of
 from swarm_loc_estimator.offline.survey.solve import Solver
@@ -24,7 +25,6 @@ from swarm_loc_estimator.sensors.camera import FROM_OPTICAL, NO_DETECTIONS, Dete
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.ranges import RangeRows
-from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import ImuModel
 from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, StartSigma, Swarm, UwbDevice
