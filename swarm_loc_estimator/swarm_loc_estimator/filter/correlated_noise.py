@@ -16,8 +16,8 @@ has already fused z with the information L, so the exchange adds
 
 This holds whatever other measurements of the two robots are fused in between; but it is linearised about an
 estimate that is worst at first, when pairs have most information. So the noise r is inflated where the
-predicted variance e is not small beside it, by e^2 / (e + r); the information held back enters with the next
-exchange. For the same reason a measurement counts by two thirds when it initializes a robot.
+predicted variance e is not small compared with it, by e^2 / (e + r); the information held back enters with
+the next exchange. For the same reason a measurement counts by two thirds when it initializes a robot.
 
 A new mean starts where the robots have moved, because odometry is uncertain. The fused information of the old
 mean decays as the predicted variance of their relative pose grows. It does not count after turns, which use
@@ -243,7 +243,7 @@ def _covariance(before: FloatArray, now: FloatArray, weight: float, pair: FloatA
 
 @cached_njit
 def _hold_back(noise: FloatArray, pair: FloatArray) -> None:
-    """Inflate the noise (3, 3) of a pair where the predicted variances are not small beside it."""
+    """Inflate the noise (3, 3) of a pair where the predicted variances are not small compared with it."""
     for i in range(3):
         expected = pair[_VARIANCE, i]
         noise[i, i] += expected * expected / (expected + noise[i, i])

@@ -1,25 +1,24 @@
-"""Loss of track: confirmation of assumed poses, reported uncertainty, and when a robot is lost.
+"""Integrity: which measurements are wrong, whose fault that is, and when a robot is lost.
 
-Pairs of observer and source: evidence against each, trends of its innovations, and links without a kernel.
+**Faults.** A measurement is an outlier when the squared Mahalanobis distance of its position exceeds a
+threshold that one good measurement in twenty exceeds, or when the whitened innovations of its last few have a
+trend. An outlier raises the fault score of whichever of observer and source has the larger share of outliers
+among its pairs. A robot whose camera was turned disagrees with all that it sees; a landmark that was moved
+disagrees with all that see it. Either is contradicted once its fault score reaches a limit. If both agree
+with others, the outlier is evidence against the pair alone, and the pair is excluded. Inliers lower scores
+and evidence.
 
-Where measurements of models without a kernel contradict, such as ranges by radio, their link is wrong more
-often than one of its ends: a wall between two radios lengthens ranges for seconds. They are evidence against
-their pair only, which is counted apart from that of other sensors, and which also inflates their noise.
+**Links.** Where measurements of models without a kernel contradict, such as ranges by radio, their link is
+wrong more often than one of its ends: a wall between two radios lengthens ranges for seconds. They are
+evidence against their pair only, which is counted apart from that of other sensors, and which also inflates
+their noise.
 
-Noise inflation: measurements that scatter more than described get more noise, in units per robot.
+**Noise inflation.** A robot whose measurements still contradict the estimate although all its parameters are
+states has more noise than described: its markers are mounted inexactly, its images are stamped inexactly.
+Each time its measurements are contradicted, their noise grows by one unit.
 
-A robot whose measurements still contradict the estimate although all its parameters are states has more
-noise than described: its markers are mounted inexactly, its images are stamped inexactly. Each time its
-measurements are contradicted, their noise grows by one unit.
-
-Fault detection and exclusion: outliers are attributed to an observer, to a source, or to their pair.
-
-A measurement is an outlier when the squared Mahalanobis distance of its position exceeds a threshold that one
-good measurement in twenty exceeds, or when the whitened innovations of its last few have a trend. An outlier
-raises the fault score of whichever of observer and source has the larger share of outliers among its pairs.
-A robot whose camera was turned disagrees with all that it sees; a landmark that was moved disagrees with all
-that see it. Either is contradicted once its fault score reaches a limit. If both agree with others, the
-outlier is evidence against the pair alone, and the pair is excluded. Inliers lower scores and evidence.
+**Loss.** An assumed pose is confirmed by measurements that agree, or refuted. A robot is lost that is too
+uncertain, or with too many gated measurements in a row.
 """
 
 from __future__ import annotations
@@ -263,6 +262,7 @@ _INDEPENDENT_NS = 100_000_000  # Measurements of a pair that follow each other f
 def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
     """All fault scores zero, no pair known."""
     return IntegrityArrays(
+        # pairs of observer and source
         source=np.full((robots, _SOURCES), -1),
         source_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
         counted_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
@@ -273,6 +273,7 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         whitened=np.zeros((robots, _SOURCES, 2)),
         squares=np.zeros((robots, _SOURCES)),
         looks=np.zeros((robots, _SOURCES), dtype=np.int64),
+        # robots and landmarks
         fault_score=np.zeros(robots + landmarks),
         confirmations=np.zeros(robots, dtype=np.int64),
         confirmed_ns=np.full(robots, NEVER_NS // 2),
@@ -282,6 +283,7 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         gated_fixes=np.zeros(robots, dtype=np.int64),
         gated_fix_ns=np.full(robots, NEVER_NS // 2),
         noise_inflation=np.zeros(robots),
+        # the scale of a robot's process noise
         drift_ns=np.full((robots, WINDOWS), NEVER_NS // 2),
         drift_transform=np.zeros((robots, WINDOWS, 3)),
         drift_noise=np.zeros((robots, WINDOWS, 3, 3)),
@@ -289,6 +291,7 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         motion_likelihood=np.zeros((robots, LOG_SCALES.size)),
         motion_scale=np.ones(robots),
         motion_explained=np.zeros(robots, dtype=bool),
+        # errors that repeat
         excess=np.zeros((robots, 3, 3)),
         repeated=np.zeros((robots, _SOURCES, 2, 3, 3)),
         repeated_at=np.zeros((robots, _SOURCES, 2)),

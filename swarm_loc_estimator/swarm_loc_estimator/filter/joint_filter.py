@@ -2,13 +2,8 @@
 
 A filter operates on columns and Jacobians, not on robots or sensors. It does not hold the mean: an update
 returns the correction, which the caller applies on the manifold. Columns 3i..3i+2 are the error twist of
-body i; columns of parameters follow those of the robots.
-
-Inverses of covariance and information matrices.
-
-Joint filter with a full covariance matrix.
-
-Implements `JointFilter` of `joint_filter.py`.
+body i; columns of parameters follow those of the robots. `DenseFilter` holds a full covariance matrix, the
+sparse implementation is in `sparse/`.
 """
 
 from __future__ import annotations

@@ -6,11 +6,7 @@ the transform in closed form (a rigid alignment); a sighting with heading determ
 it has a mirrored solution. The transform on which most constraints agree is refined by least squares. It is
 accepted when its covariance is small enough and no other transform explains the constraints about as well.
 A whole pose by a mapper locates a robot alone: it is an estimate, which its next poses would not confirm.
-Measurements of one degree of freedom are collected apart, see `window.py`.
-
-Initialization of robots at the start poses of the swarm description.
-
-A frame without a map: that of the best connected robot, until something absolute is measured.
+Measurements of one component are collected apart, see `window.py`. Robots with a described start begin there.
 
 Robots that only see each other can be located relative to one of them. It becomes the origin when nobody has
 a start and nothing absolute has been measured for a while: no landmark, no fix, no aerial image. Others are

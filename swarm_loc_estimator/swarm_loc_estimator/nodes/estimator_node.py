@@ -157,8 +157,8 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             f"ready: {len(self._swarm.robots)} robots and {len(self._swarm.landmarks)} landmarks"
             f" of '{self.params.swarm_file}'"
         )
-        if note := self._estimator.note:
-            self.get_logger().warning(note)
+        if hint := self._estimator.hint:
+            self.get_logger().warning(hint)
 
     def _on_tick(self) -> None:
         begin_s = time.perf_counter()

@@ -1,9 +1,4 @@
-"""Rows and models of odometry tracks, as arrays for compiled code.
-
-Process noise of odometry steps and gaps.
-
-Interpolation and extrapolation of odometry tracks.
-"""
+"""Odometry tracks as arrays for compiled code: process noise, interpolation, extrapolation."""
 
 from __future__ import annotations
 

@@ -1,7 +1,4 @@
-"""Table of all sensors, input topics of a swarm, and batches of readings.
-
-Conversion of batches to measurements, with counts of dropped readings.
-"""
+"""Table of all sensors, input topics of a swarm, and batches of readings and their conversion."""
 
 from __future__ import annotations
 

@@ -1,9 +1,7 @@
 """Reports of detected faults: which robot or landmark contradicts the estimate, by which sensor; lost robots.
 
-Detection of odometry that is constant while measurements say that its robot moves.
-
-Drivers that fill only the twist are recognised by it, see `odometry/preintegration.py`; readings without a
-twist, as those of shared topics, and dead encoders only by poses that move nevertheless.
+Odometry whose pose is constant is noticed by its twist, see `odometry/preintegration.py`; without a twist, as
+from shared topics or dead encoders, by the poses of the robot, which move nevertheless.
 """
 
 from __future__ import annotations

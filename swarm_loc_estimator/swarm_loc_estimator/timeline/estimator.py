@@ -115,7 +115,7 @@ class Estimator:
         self._begin()
 
     @property
-    def note(self) -> str:
+    def hint(self) -> str:
         """Hint about the choice of filter for this swarm, one sentence; "" if there is none."""
         count, largest = len(self.swarm.robots), self.settings.sparse_from
         if count < largest or self._fusion.is_sparse:

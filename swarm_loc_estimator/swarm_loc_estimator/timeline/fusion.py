@@ -187,11 +187,11 @@ class Fusion:
         assignment = self._pictures.assigned(state, image)
         known = assignment.robot >= 0
         if known.any():
-            fixes, fates = as_fixes(select(image, known), assignment.robot[known]), verdicts[known]
-            squares = nis[known]
-            self._fuse(state, fixes, fates, squares)
-            verdicts[known], nis[known] = fates, squares
-            relieve_seen(state, assignment.robot[known][fates == Verdict.USED])
+            fixes, outcome = as_fixes(select(image, known), assignment.robot[known]), verdicts[known]
+            own_nis = nis[known]
+            self._fuse(state, fixes, outcome, own_nis)
+            verdicts[known], nis[known] = outcome, own_nis
+            relieve_seen(state, assignment.robot[known][outcome == Verdict.USED])
         # The others may be robots that are not located.
         unknown = (
             Verdict.CONSTRAINT if self._pictures.identify(state, image, assignment) else Verdict.UNASSIGNED
@@ -279,14 +279,14 @@ class Fusion:
             rows, before = select(rows, good), work
             work = new_innovations(rows.size, *self._sides)
             work.pose[:], work.motion[:] = before.pose[good], before.motion[good]
-        fates, squares = verdicts[good], nis[good]
+        outcome, own_nis = verdicts[good], nis[good]
         # Evaluate, links by their records, and attribute.
         belief = state.arrays()
         places = Robots(self._poses(state, newest_ns)[:, :2], state.tracked.copy())
         state.filter.prepare_update(related_columns(rows, belief), places, work.cross_covariance)
         stage, why = EVALUATE, IS_LINK
         while why == IS_LINK:
-            _, why, _, _ = fuse(rows, 0, stage, middle_ns, tracks, belief, limits, work, fates, squares)
+            _, why, _, _ = fuse(rows, 0, stage, middle_ns, tracks, belief, limits, work, outcome, own_nis)
             for k in np.flatnonzero(~is_compiled(rows.model)).tolist() if why == IS_LINK else ():
                 evaluate_link(rows.row(k), k, tracks, belief, state.filter, work)
             stage = ATTRIBUTE
@@ -297,15 +297,15 @@ class Fusion:
             correction = state.filter.update(work.columns[used], *evaluated)
             belief = state.arrays()  # the update may have reallocated them
             correct(belief, correction)
-        fuse(rows, 0, SETTLE, middle_ns, tracks, belief, limits, work, fates, squares)
+        fuse(rows, 0, SETTLE, middle_ns, tracks, belief, limits, work, outcome, own_nis)
         lost = work.lost > 0
         self._deinitialize(state, work, newest_ns)
         for source in np.flatnonzero(work.contradicted).tolist():
             self._augment(state, source, newest_ns)
         for k in np.flatnonzero(~work.accepted & lost[rows.target]).tolist():
             if locates_alone(rows, k) and not state.tracked[rows.target[k]]:
-                fates[k] = self._note(state, rows.row(k))
-        verdicts[good], nis[good] = fates, squares
+                outcome[k] = self._note(state, rows.row(k))
+        verdicts[good], nis[good] = outcome, own_nis
         return verdicts, nis
 
     @staticmethod

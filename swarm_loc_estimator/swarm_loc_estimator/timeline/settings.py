@@ -1,6 +1,4 @@
-"""Settings of the estimator.
-
-Fusion periods, and the swarm and batch sizes at which the fusion strategy changes.
+"""Settings of the estimator, and the sizes of swarms and batches at which its strategy changes.
 
 A large swarm fuses the measurements of a fusion period as one batch. A period is closed at its end, (t, t +
 T]: a measurement at the instant of fusion belongs to the period that ends then.

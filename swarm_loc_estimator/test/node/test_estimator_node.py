@@ -312,7 +312,7 @@ class StandIn:
         self.counters: dict[str, int] = {}
         self.identities = None
         self.is_fusing = False
-        self.note = ""
+        self.hint = ""
         self.settings = Settings()
 
     def receive(self, messages: Batch) -> None:
