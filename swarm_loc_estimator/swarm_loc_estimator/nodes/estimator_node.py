@@ -262,7 +262,9 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             return [merged(causes, "estimator")]
         now_ns = self._time_ns()
         own = [self._estimator.drops_of(source) for source in range(len(self._swarm.sources))]
-        reports = self._diagnostics.reports(now_ns, self._estimate, self._estimator.recent(), drops, own)
+        losses = [self._estimator.loss_of(robot) for robot in range(len(self._swarm.robots))]
+        recent = self._estimator.recent()
+        reports = self._diagnostics.reports(now_ns, self._estimate, recent, drops, own, losses)
         contradictions = self._estimator.contradictions(now_ns)
         add_contradictions(reports, contradictions)
         add_identities(reports, self._estimator.identities)

@@ -29,7 +29,7 @@ from swarm_loc_estimator.sensors.ingest import MAX_PAUSE_NS
 from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.timeline.contradictions import Contradicted
+from swarm_loc_estimator.timeline.contradictions import Contradicted, LossReport
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.self_calibration import swapped_signs
 from swarm_loc_estimator.timeline.settings import Settings
@@ -98,6 +98,7 @@ def replay(
         remarks.append("Poses before the first landmark or fix are relative to a robot, without errors.")
     if result.self_calibrated:
         remarks += swapped_signs(result.self_calibrated)
+    remarks += result.loss_remarks
     return replace(result, remarks=tuple(remarks), maps=summary.maps, goals=summary.goals)
 
 
@@ -127,6 +128,9 @@ _TICKS_AT_ONCE = 256
 _SIGHTINGS_PERIOD_NS = 500_000_000
 _MAX_SIGHTINGS = 500_000
 """Maximum number of sightings stored for display; later ones of a long run are not stored."""
+
+_MAX_LOSSES = 100_000
+"""Maximum number of losses of robots that are stored; later ones of a long run are not stored."""
 
 
 class Schedule(Protocol):
@@ -220,6 +224,8 @@ class Runner:
         self._sightings_left = _MAX_SIGHTINGS if keep_sightings else 0
         self._sightings: list[tuple[int, Sightings]] = []
         self._images = AerialImages() if keep_sightings else None
+        self._losses: dict[int, list[LossReport]] = {}
+        self._losses_left = _MAX_LOSSES
         self._filled = 0
 
     def take(self, inputs: Batch) -> None:
@@ -265,6 +271,7 @@ class Runner:
             covariances=self._spool.array("covariance", np.float64, robots, 3, 3),
             status=self._spool.array("status", np.uint8, robots),
             sightings=tuple(self._sightings),
+            losses=tuple(one for _, losses in sorted(self._losses.items()) for one in losses),
             images=self._images.images() if self._images is not None else (),
             self_calibrated=estimator.learned() if estimator.is_self_calibrated else None,
             truth=truth,
@@ -282,6 +289,7 @@ class Runner:
         k, self._filled = self._filled, self._filled + 1
         self._stamp_ns[k], self._pose[k], self._covariance[k] = now_ns, estimate.poses, estimate.covariances
         self._status[k], self._is_local[k] = estimate.status, bool(self._estimator.origin)
+        self._note_losses()
         if self._images is not None:
             self._images.note(self._estimator.identities)
         if self._sightings_left > 0 and now_ns % _SIGHTINGS_PERIOD_NS == 0:
@@ -290,6 +298,16 @@ class Runner:
             self._sightings_left -= len(seen.observer)
         if self._filled == _TICKS_AT_ONCE:
             self._flush()
+
+    def _note_losses(self) -> None:
+        """Store the newest losses; one that late data move back replaces those after it."""
+        for one in self._estimator.losses:
+            mine = self._losses.setdefault(one.robot, [])
+            while mine and mine[-1].stamp_ns > one.stamp_ns:
+                mine.pop()
+            if self._losses_left and (not mine or mine[-1].stamp_ns < one.stamp_ns):
+                mine.append(one)
+                self._losses_left -= 1
 
     def _flush(self) -> None:
         """Move the ticks in memory to the temporary file."""

@@ -1,4 +1,4 @@
-"""Reports of detected faults: which robot or landmark contradicts the estimate, and by which sensor.
+"""Reports of detected faults: which robot or landmark contradicts the estimate, by which sensor; lost robots.
 
 Odometry whose pose is constant is noticed by its twist, see `odometry/preintegration.py`; without a twist, as
 from shared topics or dead encoders, by the poses of the robot, which move nevertheless.
@@ -13,11 +13,13 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray
 from swarm_loc_estimator.filter.belief import NEVER_NS
-from swarm_loc_estimator.filter.integrity import excluded_pairs, is_contradicted
+from swarm_loc_estimator.filter.integrity import CONFIRMED, excluded_pairs, is_contradicted
+from swarm_loc_estimator.filter.measurements import Loss
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import Estimate
+from swarm_loc_estimator.timeline.settings import Settings
 
 _MOVES = 3
 """Number of moves that prove motion; one or two may be the correction of a wrong start or calibration."""
@@ -25,6 +27,41 @@ _MOVE_M, _MOVE_SIGMAS = 0.05, 3.0
 """Minimum displacement of a move: a length, and a multiple of the standard deviation of both ends."""
 _MEMORY_NS = 30_000_000_000  # Time within which these moves happen, and for which they are remembered
 _LONG_AGO_NS = np.iinfo(np.int64).min // 2
+
+LOSS_CAUSES = {
+    Loss.UNCERTAIN: "its standard deviation exceeded {0.lost_sigma:g} m (lost_sigma) or"
+    " {0.lost_heading_sigma:g} rad (lost_heading_sigma)",
+    Loss.REFUTED: f"a measurement contradicted its pose before {CONFIRMED} had confirmed it",
+    Loss.GATED: "{0.lost_after} measurements in a row were gated",
+    Loss.OFF_FIXES: "several absolute fixes in a row were gated",
+    Loss.KIDNAPPED: "its measurements can only mean that it is elsewhere",
+    Loss.OFF_MAP: "its scans contradict the map",
+    Loss.NOT_IN_IMAGE: "aerial images do not show it where it should be",
+    Loss.COMMAND: "a command removed it",
+    Loss.FRAME: "its local frame ended",
+}
+"""Why robots are lost, in words; with fields of the settings."""
+
+
+class LossReport(NamedTuple):
+    """Loss of a robot."""
+
+    robot: int  # Its index
+    why: Loss  # Reason
+    stamp_ns: int  # Stamp of the measurement or command that showed it
+    cause: str  # The reason in words, with the settings
+
+    def text(self, now_ns: int) -> str:
+        """Message for users at an instant, one sentence."""
+        return f"lost {max(0, now_ns - self.stamp_ns) * 1e-9:.1f} s ago: {self.cause}"
+
+
+def last_loss(state: SwarmState, robot: int, settings: Settings) -> LossReport | None:
+    """The last loss of a robot, located again or not; None without one."""
+    why = int(state.lost_why[robot])
+    if not why:
+        return None
+    return LossReport(robot, Loss(why), int(state.lost_ns[robot]), LOSS_CAUSES[Loss(why)].format(settings))
 
 
 class ConstantOdometry:

@@ -13,6 +13,7 @@ from swarm_loc_estimator.filter.belief import NEVER_NS
 from swarm_loc_estimator.filter.measurements import (
     Command,
     CommandKind,
+    Loss,
     Measurements,
     Verdict,
     concatenate,
@@ -29,7 +30,13 @@ from swarm_loc_estimator.sensors.odometry import OdometryRows, OdometrySensor
 from swarm_loc_estimator.sensors.registry import Batch, InputConverter
 from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, Accumulator, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline.contradictions import ConstantOdometry, Contradiction, contradictions
+from swarm_loc_estimator.timeline.contradictions import (
+    ConstantOdometry,
+    Contradiction,
+    LossReport,
+    contradictions,
+    last_loss,
+)
 from swarm_loc_estimator.timeline.estimate import Estimate, Status, TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.fusion import Fusion
 from swarm_loc_estimator.timeline.self_calibration import learned, learns
@@ -190,7 +197,7 @@ class Estimator:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Numbers of used data by name, since the last reset."""
+        """Numbers of used data by name, and of losses of robots by reason, since the last reset."""
         others = {
             "constraints kept": int(self._timeline.verdict_counts()[Verdict.CONSTRAINT]),
         }
@@ -198,6 +205,8 @@ class Estimator:
             others |= accumulator.counters
         outcomes = self._timeline.state.images.outcomes
         others |= {f"identities {one.name.lower().replace('_', ' ')}": int(outcomes[one]) for one in Outcome}
+        losses = self._timeline.state.losses
+        others |= {f"lost: {why.name.lower().replace('_', ' ')}": int(losses[why]) for why in Loss}
         return {"measurements used": self.used} | {name: count for name, count in others.items() if count}
 
     def recent(self) -> Recent:
@@ -213,6 +222,18 @@ class Estimator:
         """Contradicted robots and landmarks at an instant, robots first."""
         unmoved = self._constant.contradicted(now_ns)
         return contradictions(self.swarm, self._timeline.state, self._tracks, unmoved, now_ns)
+
+    @property
+    def losses(self) -> list[LossReport]:
+        """The last loss of each robot that was lost since the last reset, located again or not."""
+        state = self._timeline.state
+        found = (last_loss(state, robot, self.settings) for robot in np.flatnonzero(state.lost_why).tolist())
+        return [one for one in found if one is not None]
+
+    def loss_of(self, robot: int) -> LossReport | None:
+        """Why a robot was lost that is not located now; None for a located one, and without a loss."""
+        state = self._timeline.state
+        return None if state.tracked[robot] else last_loss(state, robot, self.settings)
 
     @property
     def is_self_calibrated(self) -> bool:

@@ -402,6 +402,7 @@ def recorded(result: ReplayResult) -> str:
     frames += [sightings_frame(stamp_ns, one) for stamp_ns, one in result.sightings[::seen_stride]]
     frames += [*_maps(result), *_goals(result), *_images(result)]
     header = about(result.swarm, result.title, commands=False)
+    header["losses"] = [[one.robot, one.stamp_ns * 1e-6, one.cause] for one in result.losses]
     return recording(header, sorted(frames, key=lambda frame: frame.stamp_ns))
 
 
