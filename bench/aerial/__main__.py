@@ -15,7 +15,6 @@ from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
 _METHODS = {
     "angular": "angular.n{}.success",
     "linear": "linear.n{}.success",
-    "random, printed": "random.n{}.printed.success",
     "random": "random.n{}.success",
     "chained, 4 images": "chained4.n{}.success",
     "... scale unknown": "random.n{}.scale_unknown.success",
