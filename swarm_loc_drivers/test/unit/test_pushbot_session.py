@@ -105,7 +105,7 @@ def test_wheels_stand_at_the_end(generation: FirmwareGeneration) -> None:
 
 def deaf_to_stops(wire: PushbotWire) -> None:
     """Let a robot ignore duty cycles."""
-    wire.firmware.board.set_duty = lambda _motor, _percent: True  # type: ignore[method-assign]
+    wire.firmware.board.set_duty = lambda _motor, _percent: True  # type: ignore[assignment, method-assign]
 
 
 @pytest.mark.parametrize("generation", [FIRST_FIRMWARE, SECOND_FIRMWARE], ids=lambda one: one.name)
