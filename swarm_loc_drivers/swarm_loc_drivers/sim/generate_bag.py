@@ -29,6 +29,7 @@ from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.scenarios.bags import (
+    simulate_wandering,
     write_aerial_bag,
     write_bag,
     write_droplet_bag,
@@ -38,7 +39,6 @@ from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, simulat
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight, simulate_eight_images
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.pushbot_bag import PushbotBagSettings, write_pushbot_bag
-from swarm_loc_drivers.sim.scenarios.wandering import simulate_wandering
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
 

@@ -15,7 +15,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from swarm_loc_drivers.sim.link_folder import link_folder
+from swarm_loc_drivers.sim.link_host import link_folder
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
 from swarm_loc_drivers.sim.simulation import (
     ROBOT_TYPES,

@@ -19,7 +19,7 @@ from node_world import Program, Ros, overrides, stamp_ns, values_of
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_drivers.droplet.droplet_driver_node import DropletDriverNode
+from swarm_loc_drivers.droplet.droplet_nodes import DropletDriverNode
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.swarm.board_file import load_ir_platform

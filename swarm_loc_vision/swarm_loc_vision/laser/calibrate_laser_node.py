@@ -29,8 +29,14 @@ from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node
 from swarm_loc_estimator.common.parameters import ParameterError, number, text
 from swarm_loc_msgs.msg import LaserDistance
-from swarm_loc_vision.laser.calibration import CalibrationError, LaserCalibration, fit_hyperbola, save_laser
-from swarm_loc_vision.laser.drive import WallDrive, recorded_drive
+from swarm_loc_vision.laser.calibration import (
+    CalibrationError,
+    LaserCalibration,
+    WallDrive,
+    fit_hyperbola,
+    recorded_drive,
+    save_laser,
+)
 
 _QOS = QoSProfile(depth=10)
 _COMMAND_S = 0.05

@@ -21,7 +21,7 @@ from test_marker_detector_node import FAMILY, camera_info, image
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPoses
-from swarm_loc_vision.markers.marker_detector_node import MarkerDetectorNode
+from swarm_loc_vision.markers.marker_nodes import MarkerDetectorNode
 
 pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
 

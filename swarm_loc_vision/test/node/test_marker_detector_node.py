@@ -20,7 +20,7 @@ from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
 from swarm_loc_vision.common import camera_node
 from swarm_loc_vision.markers.families import family_named
-from swarm_loc_vision.markers.marker_detector_node import MarkerDetectorNode
+from swarm_loc_vision.markers.marker_nodes import MarkerDetectorNode
 
 pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
 
