@@ -25,7 +25,6 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
 from swarm_loc_drivers.common.ros_messages import stamp_message
 from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners
@@ -64,7 +63,9 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
         for name in self.params.relayed_ids:
             path = _relayed_path(robot, name)
             self._odometry[name] = self._odometry_output(f"/{path}/odom", f"{path}/")
-        listeners = DropletListeners(self._publish_odometry, self._publish_brightness)
+        listeners = DropletListeners(
+            lambda name, state: self._odometry[name].publish(state), self._publish_brightness
+        )
         self._driver = DropletDriver(self.params, listeners, self._now_ns)
         for name in self._odometry:
             topic = f"/{_relayed_path(robot, name)}/cmd_vel" if name else "cmd_vel"
@@ -82,9 +83,6 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
             response.success = True
             response.message = f"{len(self.params.partners)} partners are asked to emit."
         return response
-
-    def _publish_odometry(self, name: str, state: OdometryState) -> None:
-        self._odometry[name].publish(state)
 
     def _publish_brightness(self, receiver: int, one: Brightness) -> None:
         message = BrightnessMatrix(

@@ -18,7 +18,6 @@ from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovarianceStamped, Twis
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from swarm_loc_drivers.common.velocity_command import Velocity
 from swarm_loc_drivers.pushbot.parameters import ExplorationParameters, driven_robots
 from swarm_loc_drivers.pushbot.stop_and_go import MapGoal, StopAndGo, StopAndGoSettings
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -77,7 +76,8 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
         if stamp_ns < 0 or not np.isfinite(pose).all():
             self.health.drop("bad_odometry")
             return
-        self._command(index, robot.motion.command(stamp_ns, pose))
+        forward, _, rate = robot.motion.command(stamp_ns, pose)
+        self._commands[index].publish(Twist(linear=Vector3(x=forward), angular=Vector3(z=rate)))
 
     def _can_begin(self, name: str) -> bool:
         """Whether all nodes that produce and use a robot's distances run, so that none is lost."""
@@ -107,10 +107,6 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
             self.health.drop("bad_goal")
         elif not robot.motion.take_goal(MapGoal(stamp_ns, pose, position)):
             self.health.drop("goal_of_another_time")
-
-    def _command(self, index: int, velocity: Velocity) -> None:
-        forward, _, rate = velocity
-        self._commands[index].publish(Twist(linear=Vector3(x=forward), angular=Vector3(z=rate)))
 
     def _on_diagnostics(self) -> None:
         self.health.warn_of_drops()

@@ -137,7 +137,8 @@ class Edges:
             for axis in ((1, 0), (0, 1))
         )
         slope = np.hypot(across, down)
-        slope[~_shrunk(seen)] = 0.0
+        # the rim of the valid area is no edge
+        slope[cv2.erode(seen.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0] = 0.0
         least = _EDGE_SHARE * contrast
         rows, columns = np.nonzero(slope > least)
         strength = slope[rows, columns]
@@ -170,11 +171,6 @@ def peaks(votes: Plain, diameter_px: float, most: int) -> FloatArray:
     rows, columns = np.nonzero((votes >= highest) & (votes > 0.0))
     order = np.argsort(-votes[rows, columns], kind="stable")[:most]
     return np.stack([columns[order], rows[order]], axis=1).astype(float)
-
-
-def _shrunk(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Erode the valid area: its rim is no edge."""
-    return np.asarray(cv2.erode(seen.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
 
 
 RAYS = 64

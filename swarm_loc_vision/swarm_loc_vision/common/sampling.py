@@ -34,12 +34,6 @@ def _brightness(image: Gray, u: float, v: float) -> float:
 
 
 @cached_njit
-def _is_inside(image: Gray, u: float, v: float) -> bool:
-    """Whether `_brightness` is defined at a raw pixel; False for NaN."""
-    return bool(0.0 <= u < image.shape[1] - 1 and 0.0 <= v < image.shape[0] - 1)
-
-
-@cached_njit
 def profile_crossings(
     image: Gray,
     lens: FloatArray,
@@ -127,7 +121,8 @@ def _profile(image: Gray, u: float, v: float, du: float, dv: float, half: int, p
     """Sample 2 half + 1 points around a raw pixel; False when they leave the image."""
     du, dv = _STEP_PX * du, _STEP_PX * dv
     for end in (-half, half):
-        if not _is_inside(image, u + end * du, v + end * dv):
+        x, y = u + end * du, v + end * dv
+        if not (0.0 <= x < image.shape[1] - 1 and 0.0 <= y < image.shape[0] - 1):  # also if NaN
             return False
     for j in range(2 * half + 1):
         profile[j] = _brightness(image, u + (j - half) * du, v + (j - half) * dv)

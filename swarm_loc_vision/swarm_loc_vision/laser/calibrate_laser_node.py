@@ -95,7 +95,8 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
                 break
             if self._drive.is_done or self._is_silent():
                 done_s = min(done_s, time.monotonic())
-            self._speed = self.params.speed if math.isinf(done_s) and self._hears_all() else 0.0
+            hears_all = min(self._heard_s.values()) > time.monotonic() - 1.0
+            self._speed = self.params.speed if math.isinf(done_s) and hears_all else 0.0
         self._command.publish(Twist())
         executor.shutdown()
         if self._error is not None:
@@ -117,9 +118,6 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
         save_laser(Path(chosen.output), calibration)
         print(summary(calibration, drive.count, chosen.output), file=sys.stdout)
         return 0
-
-    def _hears_all(self) -> bool:
-        return min(self._heard_s.values()) > time.monotonic() - 1.0
 
     def _is_silent(self) -> bool:
         last_s = max(self._begin_s, min(self._heard_s.values()))

@@ -395,7 +395,8 @@ def refine(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, spacing
     contrast = np.ones(len(quads))
     crossings = np.empty((len(quads), 4, MAX_PROFILES, 3))
     lengths = np.linalg.norm(np.roll(quads, -1, axis=1) - quads, axis=2)
-    reaches = _narrower(lengths) / cells
+    # a cell of the shorter of the two means of opposite sides
+    reaches = 0.5 * np.minimum(lengths[:, 0] + lengths[:, 2], lengths[:, 1] + lengths[:, 3]) / cells
     profile_crossings(image, lens, corners, reaches, spacing, crossings)
     ends, of_ends = np.empty((len(quads), 8)), np.empty((len(quads), 8, 8))
     _fit_lines(crossings, reaches, lengths, ends, of_ends, contrast)
@@ -426,12 +427,6 @@ def refine_read(
         again = refine(image, lens, quads[lost], cells)
         corners[lost], covariance[lost], contrast[lost] = again
     return Corners(corners, covariance, contrast)
-
-
-def _narrower(lengths: FloatArray) -> FloatArray:
-    """(N,) the shorter of two mean opposite sides, of lengths (N, 4) [px]."""
-    narrower: FloatArray = 0.5 * np.minimum(lengths[:, 0] + lengths[:, 2], lengths[:, 1] + lengths[:, 3])
-    return narrower
 
 
 @cached_njit

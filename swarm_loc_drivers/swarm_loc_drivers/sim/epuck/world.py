@@ -126,7 +126,9 @@ class EpuckWorld:
         self.steps += self.rates * step_s
         self.now_ns += STEP_NS
         self._past.append((self.now_ns, self.poses))
-        taken = [self._take(robot) for robot in range(len(self._next)) if self._is_due(self._next[robot])]
+        # those that have ended and whose stamp has passed
+        ends_ns = [max(one.stamp_ns, one.middle_ns + self._half_exposure_ns) for one in self._next]
+        taken = [self._take(robot) for robot, end_ns in enumerate(ends_ns) if self.now_ns >= end_ns]
         return sorted([*taken, *self._seen_from_above()], key=lambda exposure: exposure.stamp_ns)
 
     def image(self, exposure: Exposure) -> GrayImage:
@@ -177,10 +179,6 @@ class EpuckWorld:
             return []
         self._overhead_images += 1
         return [Exposure(OVERHEAD, number, middle_ns, middle_ns)]
-
-    def _is_due(self, exposure: Exposure) -> bool:
-        """Whether the exposure has ended and its stamp has passed."""
-        return self.now_ns >= max(exposure.stamp_ns, exposure.middle_ns + self._half_exposure_ns)
 
     def _random(self, *what: int) -> np.random.Generator:
         """Random numbers of their own for one purpose."""

@@ -54,7 +54,12 @@ class CameraRig:
         self.scene = _scene(swarm, truth, arena, self.faces, np.random.default_rng(seed))
         self._renderer = Renderer(self.scene, model)
         self.cameras = [
-            RobotCamera(index, model, _true_mount(robot.camera, mount), focal_scale=1.0 / scale)
+            RobotCamera(
+                index,
+                model,
+                replace(robot.camera or CameraMount(), x=mount[0], y=mount[1], yaw=mount[2]),
+                focal_scale=1.0 / scale,
+            )
             for index, (robot, mount, scale) in enumerate(
                 zip(swarm.robots, truth.mounts.tolist(), truth.scales.tolist(), strict=True)
             )
@@ -72,11 +77,6 @@ class CameraRig:
             rng: Source of the sensor's noise.
         """
         return self._renderer.take(self.cameras[robot], middle_ns, track.all_at, rng)
-
-
-def _true_mount(camera: CameraMount | None, true: list[float]) -> CameraMount:
-    """A described mount with its true place and yaw."""
-    return replace(camera or CameraMount(), x=true[0], y=true[1], yaw=true[2])
 
 
 def _faces(swarm: Swarm, truth: HiddenGeometry, family: Family) -> list[list[Patches]]:
