@@ -19,7 +19,7 @@ _PAPERS = ChainModel(detection_probability=0.999, absent=1e-3, entering=1e-3, fa
 _UNKNOWN = replace(_PAPERS, scale=Scale(1.0, 0.5))
 """The scale anywhere from a half to one and a half, more or less."""
 _ROBOTS_PER_WORLD = 5
-_DENSE = (7, 9, 13)  # Numbers of images of the dense arena; the last one is told as the figure
+_DENSE = (7, 9, 13)  # Numbers of images of the dense arena; the last one makes the figure
 
 
 def measure(results: Results, worlds: int, seed: int) -> None:

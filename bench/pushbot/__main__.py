@@ -7,7 +7,7 @@ Maps are made of simulated distances by the core that the mapper node runs: turn
 .2 m/s, distance noise 1.5 %, .64 deg a turn, .3 deg a root metre, slip 0, 2 and 5 % in turn, .1 px (px3:
 .3 px), 1 % dropouts, .3 % outliers, range 2.5 m. Errors are those of poses in the frame of the first robot's
 start; "aligned" after one rigid fit. Diverged is a run with any pose off by more than 30 cm after the last
-solution, "online" one with such a pose at the time when it was told. bend,
+solution, "online" one with such a pose when it was published. bend,
 atrium and tee are halls that nothing was developed in. In open12 and corridor25 poses are compared with their
 covariances, too: misleading is the share off by more than 5 sigma and 2 cm, diverged_unreported counts
 runs in which one was off by more than 30 cm and 3 sigma. "lidar" is a robot like a TurtleBot 3, see

@@ -43,24 +43,24 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class RunResult:
-    """What came of a run; errors are against the truth, in the frame of the first robot's start."""
+    """The result of a run; errors are against the truth, in the frame of the first robot's start."""
 
     settings: RunSettings  # Of the run
     position_cm: float  # Error of the robots' last poses, mean over the robots
-    heading_deg: float  # Likewise
+    heading_deg: float  # Error of their headings, mean over the robots
     worst_cm: float  # Largest error of any pose after the last solution
-    online_position_cm: float  # Median error of poses at the time when they were told
+    online_position_cm: float  # Median error of poses when they were published
     online_worst_cm: float  # The largest of these
     aligned_cm: float  # RMS error of all poses after one rigid fit
     wall_cm: float  # Mean distance of occupied cells from a wall
-    wall_aligned_cm: float  # Likewise after the fit
+    wall_aligned_cm: float  # The same after the fit
     coverage: float  # Share of walls with an occupied cell nearby
-    coverage_90_s: float  # When this was nine tenths, as told at the time and after the fit; NaN: never
+    coverage_90_s: float  # When this was nine tenths, as published then and after the fit; NaN: never
     cpu_s_per_s: float  # Time that mapping took, per second
     bumps: int  # How often a robot hit something
     cells: FloatArray  # (n, 2) occupied cells [m]
     path: FloatArray  # (m, 3) robot, x, y of all poses [m]
-    # Share of poses off by more than 5 sigma and 2 cm when told; NaN: not compared
+    # Share of poses off by more than 5 sigma and 2 cm when published; NaN: not compared
     misleading_share: float = math.nan
     diverged_unreported: float = 0.0  # 1 if one was off by more than `DIVERGED_CM` and 3 sigma, else 0
     sweep_ms: float = math.nan  # CPU time per sweep of a lidar [ms]; NaN: it has none
@@ -72,7 +72,7 @@ class RunResult:
 
     @property
     def is_diverged_online(self) -> bool:
-        """Whether any pose was off by more than that when it was told."""
+        """Whether any pose was off by more than that when it was published."""
         return not self.online_worst_cm <= DIVERGED_CM
 
     @property
@@ -196,7 +196,7 @@ def _score(
     arrivals = exploration.arrivals
     truth, online = np.array([one.truth for one in arrivals]), np.array([one.online for one in arrivals])
     robots = np.array([one.robot for one in arrivals])
-    errors, told = (100.0 * np.hypot(*(poses - truth)[:, :2].T) for poses in (final, online))
+    errors, online_errors = (100.0 * np.hypot(*(poses - truth)[:, :2].T) for poses in (final, online))
     last = [int(np.flatnonzero(robots == robot)[-1]) for robot in exploration.robots]
     heading = np.degrees(np.abs(se2.wrap_angle(final[last, 2] - truth[last, 2])))
     fit = se2.rigid_fit(final[:, :2], truth[:, :2])
@@ -208,8 +208,8 @@ def _score(
         position_cm=float(errors[last].mean()),
         heading_deg=float(heading.mean()),
         worst_cm=float(errors.max()),
-        online_position_cm=float(np.median(told)),
-        online_worst_cm=float(told.max()),
+        online_position_cm=float(np.median(online_errors)),
+        online_worst_cm=float(online_errors.max()),
         aligned_cm=100.0 * float(np.sqrt(np.square(aligned).sum(axis=1).mean())),
         wall_cm=wall_distance_cm(cells, plan),
         wall_aligned_cm=wall_distance_cm(se2.transform_points(fit, cells), plan),

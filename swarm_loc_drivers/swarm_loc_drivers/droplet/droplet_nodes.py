@@ -98,7 +98,7 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
 
 
 def _relayed_path(robot: str, name: str) -> str:
-    """Namespace of a robot without a cable: beside that of the robot at the cable."""
+    """Namespace of a robot without a cable: next to that of the robot at the cable."""
     return "/".join([*robot.split("/")[:-1], name])
 
 
@@ -144,7 +144,7 @@ class DropletFleetNode(ConfiguredNode[DropletFleetParameters]):
 
 
 def _driver(robot: str, parameters: dict[str, Any]) -> DropletDriverNode:
-    """Node of one robot; remappings on the command line apply to the fleet node only."""
+    """Node of one robot; remappings on the command line apply only to the fleet node."""
     return DropletDriverNode(
         namespace=robot,
         parameter_overrides=[Parameter(name, value=value) for name, value in parameters.items()],

@@ -154,7 +154,7 @@ class PollingExchange:
         self._skips.clear()
         self._requested = len(self._partners)
 
-    def note(self, said: Said) -> None:
+    def observe(self, said: Said) -> None:
         """Process a printed line."""
         if isinstance(said.event, SendAborted):
             self._counts["busy_sends"] += 1

@@ -165,7 +165,7 @@ class DropletSession:
         elif isinstance(event, MoveStarted):
             self._note_move(event)
         else:
-            self._exchanging.note(said)
+            self._exchanging.observe(said)
 
     def _note_move(self, started: MoveStarted) -> None:
         """A command to move, from here or by infrared."""

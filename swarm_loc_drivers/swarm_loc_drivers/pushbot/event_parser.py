@@ -63,9 +63,9 @@ class EventParser:
     def feed(self, data: bytes) -> Parsed:
         """Take bytes; the events and lines that are complete and confirmed."""
         buffer = np.frombuffer(self._rest + data, np.uint8)
-        room = len(buffer) // 2 + 1
-        columns = np.empty((3, room), np.uint8)
-        times = np.empty(room, np.int64)
+        capacity = len(buffer) // 2 + 1
+        columns = np.empty((3, capacity), np.uint8)
+        times = np.empty(capacity, np.int64)
         spans = np.empty((len(buffer) + 1, 3), np.int64)
         tally = np.zeros(len(_COUNTS), np.int64)
         used, events, lines = _parse(buffer, self._stamp_bytes, self._state, columns, times, spans, tally)
@@ -123,7 +123,7 @@ def _parse(
                 events, state[:] = run_events, before
                 elapsed = _elapsed(stamp, state, stamp_bytes)
                 if state[_STARTED] == 0 or not _is_plausible(elapsed, stamp_bytes):
-                    at, lines, run_at = run_at + 1, run_lines, -1  # no boundary: search behind it
+                    at, lines, run_at = run_at + 1, run_lines, -1  # no boundary: search after it
                     tally[_SKIPPED] += 1
                     continue
                 run_at = -1

@@ -47,9 +47,9 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("exploration", ExplorationParameters, **node_arguments)
-        chosen = self.params
-        self._names = driven_robots(chosen, load_swarm(Path(chosen.swarm_file)))
-        self._robots = [_Robot(chosen.settings) for _ in self._names]
+        params = self.params
+        self._names = driven_robots(params, load_swarm(Path(params.swarm_file)))
+        self._robots = [_Robot(params.settings) for _ in self._names]
         self._commands = [self.create_publisher(Twist, f"{name}/cmd_vel", 1) for name in self._names]
         for index, name in enumerate(self._names):
             self.create_subscription(Odometry, f"{name}/odom", partial(self._on_odometry, index), _QOS)
@@ -59,7 +59,7 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
             )
             self.create_subscription(PoseStamped, f"{name}/goal", partial(self._on_goal, index), _LATCHED)
         self.start_diagnostics(self._on_diagnostics)
-        self.get_logger().info(f"ready: {len(self._names)} robots of '{chosen.swarm_file}'")
+        self.get_logger().info(f"ready: {len(self._names)} robots of '{params.swarm_file}'")
 
     def destroy_node(self) -> None:
         """Stop the robots first."""

@@ -14,7 +14,7 @@ In place of detections,
     droplets writes <robot>/brightness and <robot>/fix
     aerial writes aerial/detections
     pushbots writes map, <robot>/laser, <robot>/lights, <robot>/fix and <robot>/goal, with --events also
-        <robot>/events, and beside the bag walls.csv and the calibrations of the lasers
+        <robot>/events, and next to the bag walls.csv and the calibrations of the lasers
 The same arguments give the same bytes.
 """
 

@@ -83,7 +83,7 @@ class _Port(Protocol):
 
 
 class ConsoleFirmware(Protocol):
-    """A firmware behind a serial port."""
+    """A firmware at a serial port."""
 
     def receive(self, data: bytes) -> bytes:
         """Process received bytes; returns the immediate answer."""
@@ -93,7 +93,7 @@ class ConsoleFirmware(Protocol):
 
 
 class StreamFirmware(ConsoleFirmware, Protocol):
-    """A firmware behind a TCP port, which answers as it streams."""
+    """A firmware at a TCP port, which answers as it streams."""
 
     def disconnect(self) -> None:
         """Handle a disconnected client."""
@@ -230,7 +230,7 @@ class FirmwareHost:
         self._ports: list[_Port] = []
 
     def serve_pty(self, firmware: ConsoleFirmware, link: Path | None = None, *, waits: bool = False) -> Path:
-        """Put a firmware behind a pseudo-terminal.
+        """Put a firmware at a pseudo-terminal.
 
         Args:
             firmware: Who answers.
@@ -245,7 +245,7 @@ class FirmwareHost:
         return link or port.path
 
     def serve_tcp(self, firmware: StreamFirmware, host: str = "127.0.0.1", port: int = 0) -> int:
-        """Put a firmware behind a TCP port, 0 for any that is free; returns the port."""
+        """Put a firmware at a TCP port, 0 for any that is free; returns the port."""
         server = _TcpPort(firmware, host, port, self._selector)
         self._add(server)
         return server.port

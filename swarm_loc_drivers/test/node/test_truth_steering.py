@@ -1,4 +1,4 @@
-"""Robots are steered from when all of them have told odometry."""
+"""Robots are steered from when all of them have sent odometry."""
 
 from __future__ import annotations
 

@@ -35,8 +35,8 @@ class PushbotWire:
     """The two ends, and what each has said.
 
     Attributes:
-        velocities: What the robot is told [ticks per 21 ms].
-        hears: Whether the robot's bytes arrive; likewise `is_heard` those of the host.
+        velocities: What the robot is commanded [ticks per 21 ms].
+        hears: Whether the robot's bytes arrive; `is_heard`: those of the host.
     """
 
     def __init__(

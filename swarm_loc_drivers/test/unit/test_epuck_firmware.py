@@ -288,7 +288,9 @@ def test_without_camera_fifty_readings_a_second_come_each_a_cycle_old(
     assert {message.id for message in messages} == {epuck_wifi.SENSORS_ID}
     assert 98 <= len(messages) <= 100
     counters = [int(message.sensors["left_counter"]) for message in messages]
-    assert counters[0] == counters[1] == 0  # read when the robot was switched on, and when it was told to go
+    assert (
+        counters[0] == counters[1] == 0
+    )  # read when the robot was switched on, and when it was commanded to go
     assert np.diff(counters)[1:] == pytest.approx(10, abs=1)
     assert counters[-1] == pytest.approx(500 * (messages[-2].stamp_ns - messages[0].stamp_ns) / SECOND, abs=1)
     assert (messages[-1].sensors["proximity"] == PROXIMITY).all()

@@ -236,7 +236,7 @@ def test_a_robot_that_was_reset_is_set_up_anew() -> None:
     wire.velocities = (0, 0)
     wire.run(1.0)
     assert wire.session.connected
-    # what it rolled out while its ticks began anew is all that is missing
+    # what it rolled out while its ticks began again is all that is missing
     assert np.linalg.norm(wire.states[-1].pose - before) < 0.03
 
 

@@ -80,8 +80,8 @@ def steepest(values: FloatArray, reach: FloatArray, polarity: float, edges: Edge
     steps = (2.0 * sums[..., _SIDE:-_SIDE] - sums[..., : -2 * _SIDE] - sums[..., 2 * _SIDE :]) / _SIDE
     between = np.clip(near, 1, steps.shape[2] - 2)
     for _ in range(_AWAY):  # uphill: a higher step farther away is another edge
-        beside = np.stack([np.take_along_axis(steps, between[..., None] + k, 2)[..., 0] for k in (-1, 0, 1)])
-        between = np.clip(between + np.argmax(beside, axis=0) - 1, 1, steps.shape[2] - 2)
+        around = np.stack([np.take_along_axis(steps, between[..., None] + k, 2)[..., 0] for k in (-1, 0, 1)])
+        between = np.clip(between + np.argmax(around, axis=0) - 1, 1, steps.shape[2] - 2)
     share = SHARES[0] + pitch * (between + _vertex(steps, between) + _SIDE - 0.5)
     size = np.take_along_axis(steps, between[..., None], axis=2)[..., 0]
     around = np.pad(np.where(edges.is_edge, size, 0.0), ((0, 0), (_NEIGHBOURS, _NEIGHBOURS)), mode="wrap")
@@ -90,7 +90,7 @@ def steepest(values: FloatArray, reach: FloatArray, polarity: float, edges: Edge
 
 
 def _vertex(steps: FloatArray, between: NDArray[np.int64]) -> FloatArray:
-    """(C, R) offset of the vertex of the parabola through steps (C, R, S) at and beside places (C, R)."""
+    """(C, R) offset of the vertex of the parabola through steps (C, R, S) at and next to places (C, R)."""
     rows = np.indices(between.shape)
     left, mid, right = (steps[rows[0], rows[1], between + k] for k in (-1, 0, 1))
     bend = left - 2.0 * mid + right
@@ -205,7 +205,7 @@ class Circles(NamedTuple):
     kind: NDArray[np.int64]  # (C,) `TOP`, `SIDES` or `PARTLY`: what the outline is
     soft: NDArray[np.bool_]  # (C,) whether the edges are taken for blurred ones
 
-    def chosen(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Circles:
+    def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Circles:
         """Some of the rows."""
         columns: list[NDArray[Any]] = [column[rows] for column in self]
         return Circles(*columns)

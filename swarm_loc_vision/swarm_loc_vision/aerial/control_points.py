@@ -42,7 +42,7 @@ class ControlPoints:
     def __len__(self) -> int:
         return len(self.names)
 
-    def joined(self, other: ControlPoints) -> ControlPoints:
+    def concatenate(self, other: ControlPoints) -> ControlPoints:
         """These points and others."""
         return ControlPoints(
             [*self.names, *other.names],

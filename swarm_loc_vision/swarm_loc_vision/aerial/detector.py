@@ -43,7 +43,7 @@ _SIZES_PX = 16.0, 32.0  # Least and largest diameter of robots in the rectified 
 _ROUGH_PX = 14.0
 _MAX_SHARE = 0.25  # Largest robot that is searched for, over the shorter side of the image
 _SPARE, _SPARE_SHARE = 60, 4
-_APART = 0.75  # Least distance of two robots, in diameters
+_LEAST_DISTANCE = 0.75  # Least distance of two robots, in diameters
 _MAX_SPREAD, _MAX_SPREAD_PX = 0.03, 0.2
 """Largest rms distance of a disc's rim from a circle: a share of the radius, plus pixels."""
 _MAX_OVAL = 0.15  # Largest second harmonic of a disc's outline, over its radius: what motion leaves
@@ -157,21 +157,21 @@ class AerialDetector:
     def _chosen(self, rims: Rims, circles: Circles, grid: Rectification) -> tuple[_Found, dict[str, int]]:
         """Select discs that do not overlap and are alike."""
         covered = circles.coverage >= self._settings.min_coverage
-        circles = circles.chosen((_quality(circles) > 0.0) & covered & _inside(grid, circles.centre))
-        circles = circles.chosen(_apart(circles))
+        circles = circles.select((_quality(circles) > 0.0) & covered & _inside(grid, circles.centre))
+        circles = circles.select(_apart(circles))
         if not len(circles.radius):
             return _Found(rims, circles), {}
         quality = _quality(circles)
         alike = np.abs(circles.radius / commonest(circles.radius, quality) - 1.0) <= _SAME_SIZE
         dropped = {"other_size": int(np.sum(~alike))}
-        circles = circles.chosen(alike)
+        circles = circles.select(alike)
         whole = _whole(circles)
         dropped["not_whole"] = int(np.sum(~whole))
-        circles = circles.chosen(whole)
+        circles = circles.select(whole)
         most = self._settings.max_robots
         dropped["too_many"] = max(len(circles.radius) - most, 0)
         order = np.argsort(-_quality(circles), kind="stable")[:most]
-        return _Found(rims, circles.chosen(order)), dropped
+        return _Found(rims, circles.select(order)), dropped
 
     def _located(self, grid: Rectification, found: _Found, dropped: dict[str, int]) -> AerialDetections:
         """Locate discs in map: fit the mark, then the rim again without the light of the mark."""
@@ -183,14 +183,14 @@ class AerialDetector:
             marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
             again = rims.measure(circles.centre, circles.radius, circles.kind, circles.soft, marks.light)
             better = (marks.step != 0.0) & (again.coverage >= settings.min_coverage)
-            circles = circles.updated(np.flatnonzero(better), again.chosen(better))
+            circles = circles.updated(np.flatnonzero(better), again.select(better))
         marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
         has_mark = np.isfinite(marks.theta)
         is_strong |= has_mark  # a shadow may weaken a rim, but shows no mark
         alike = _marked_alike(circles, has_mark) | ~is_strong
         dropped |= {"other_contrast": int(np.sum(~is_strong)), "without_mark": int(np.sum(~alike))}
         kept = alike & is_strong
-        circles, marks = circles.chosen(kept), Marks(*(column[kept] for column in marks))
+        circles, marks = circles.select(kept), Marks(*(column[kept] for column in marks))
         circles = _refined(rims, circles, marks.light)
         places = grid.places(circles.centre)
         of_outline = circles.covariance + _of_motion(circles.oval)
@@ -231,7 +231,7 @@ def _outlined(rims: Rims, centre: FloatArray, radius: FloatArray) -> Circles:
         rows = np.flatnonzero((_quality(best) < weight) & (best.coverage >= _PART))
         other = rims.measure(centre[rows], radius[rows], np.full(len(rows), kind), np.full(len(rows), soft))
         better = weight * _quality(other) > np.maximum(_quality(best)[rows], _SURE)
-        best = best.updated(rows[better], other.chosen(better))
+        best = best.updated(rows[better], other.select(better))
     return best
 
 
@@ -278,7 +278,7 @@ def _apart(circles: Circles) -> NDArray[np.int64]:
     kept: list[int] = []
     for row in np.argsort(-_quality(circles), kind="stable").tolist():
         away = np.linalg.norm(circles.centre[kept] - circles.centre[row], axis=1)
-        if (away >= 2.0 * _APART * circles.radius[row]).all():
+        if (away >= 2.0 * _LEAST_DISTANCE * circles.radius[row]).all():
             kept.append(row)
     return np.array(kept, np.int64)
 

@@ -290,7 +290,7 @@ def _centre(hits: _Hits, near: IntArray, peak: IntArray, radius: float, row: Flo
 
 
 def direction(u: float, v: float, focal_px: float) -> tuple[float, float]:
-    """Bearing to the left and elevation [rad] of a place (u, v) [px] beside a level camera's optical axis."""
+    """Bearing to the left and elevation [rad] of a place (u, v) [px] off a level camera's optical axis."""
     x, y = -u / focal_px, -v / focal_px
     return math.atan(x), math.atan2(y, math.hypot(1.0, x))
 

@@ -65,13 +65,13 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("calibrate_laser", CalibrateLaserParameters, **node_arguments)
-        chosen = self.params
-        if chosen.stop_distance >= 0.5 * chosen.start_distance:
+        params = self.params
+        if params.stop_distance >= 0.5 * params.start_distance:
             raise ParameterError(
-                f"parameter stop_distance = {chosen.stop_distance} must be less than half of"
-                f" start_distance = {chosen.start_distance}."
+                f"parameter stop_distance = {params.stop_distance} must be less than half of"
+                f" start_distance = {params.start_distance}."
             )
-        self._drive = WallDrive(chosen.start_distance, chosen.stop_distance)
+        self._drive = WallDrive(params.start_distance, params.stop_distance)
         self._heard_s = {"odom": -math.inf, "laser": -math.inf}
         self._command = self.create_publisher(Twist, "cmd_vel", QoSProfile(depth=1))
         self.create_subscription(Odometry, "odom", self._on_odometry, _QOS)
@@ -113,10 +113,10 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
         return self._fit(self._drive)
 
     def _fit(self, drive: WallDrive) -> int:
-        chosen = self.params
-        calibration = fit_hyperbola(drive.drive(chosen.start_sigma, chosen.camera_x))
-        save_laser(Path(chosen.output), calibration)
-        print(summary(calibration, drive.count, chosen.output), file=sys.stdout)
+        params = self.params
+        calibration = fit_hyperbola(drive.drive(params.start_sigma, params.camera_x))
+        save_laser(Path(params.output), calibration)
+        print(summary(calibration, drive.count, params.output), file=sys.stdout)
         return 0
 
     def _is_silent(self) -> bool:

@@ -154,8 +154,8 @@ def _calibrate(camera: CameraDetector, data: bytes) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
-    beside = swarm_beside(options.bag)
-    swarm_file = options.swarm or (beside if beside.exists() else None)
+    recorded = swarm_beside(options.bag)
+    swarm_file = options.swarm or (recorded if recorded.exists() else None)
     described = "" if swarm_file is None else str(swarm_file)
     given: dict[str, Value] = {
         "autostart": True,

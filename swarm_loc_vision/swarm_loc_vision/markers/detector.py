@@ -76,7 +76,7 @@ class _Markers(NamedTuple):
     corners: NDArray[Any]
     covariance: NDArray[Any]
 
-    def chosen(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> _Markers:
+    def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> _Markers:
         """A selection of rows."""
         return _Markers(*(column[rows] for column in self))
 
@@ -176,7 +176,7 @@ class MarkerDetector:
             fine.corners,
             fine.covariance,
         )
-        return markers.chosen(fine.contrast > 0.0)
+        return markers.select(fine.contrast > 0.0)
 
     def _poses(self, markers: _Markers) -> tuple[Poses | None, int]:
         """Poses of all markers, jointly for bodies, and the number of misfits."""
@@ -193,7 +193,7 @@ def _best(markers: _Markers) -> _Markers:
     near = KDTree(middle).query_ball_point(middle, _SAME * _diagonals(markers.corners))
     for i in np.lexsort((-markers.contrast, markers.errors)):
         kept[i] = not kept[near[i]].any()
-    return markers.chosen(kept)
+    return markers.select(kept)
 
 
 def _diagonals(quads: FloatArray) -> FloatArray:

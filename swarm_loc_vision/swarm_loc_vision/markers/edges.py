@@ -43,7 +43,7 @@ _PARAMETERS = _ENDS + 7
 _OF_SIDE = 2 + _PARAMETERS - _ENDS
 """Parameters of a pixel: the two ends of its side, and those that all sides share."""
 _ROUNDS = 5
-_STILL = 0.2  # Maximum motion of an end at convergence, in standard deviations
+_CONVERGED = 0.2  # Maximum motion of an end at convergence, in standard deviations
 _FIRST_BLUR, _MIN_BLUR, _MAX_BLUR = 0.45, 0.08, 12.0  # Variance of the blur [px^2]
 _BLUR_FREEDOM = 4.0  # Prior standard deviation of that variance [px^2]
 _LIGHT_FREEDOM = 0.2  # Prior standard deviation of the relative difference of light over a marker
@@ -132,7 +132,7 @@ def _fit_sides(pixels: SidePixels, n: int, strips: Bits, border: int, work: _Wor
         moved = _advance(noise, work)
         if p[_CONTRAST] <= 0.0 or np.abs(p[:_ENDS]).max() > _MAX_SHIFT_PX:
             return 0.0
-        if moved < _STILL:
+        if moved < _CONVERGED:
             break
     work.normal[:] *= noise * noise
     _set_gaps(pixels, n, strips, border, noise, work)

@@ -43,7 +43,7 @@ class MarkerNode(CameraNode[Markers]):
             source: Its messages.
         """
         self._camera = camera
-        self._told = (0, 0)  # markers and misfits
+        self._reported = (0, 0)  # markers and misfits
         if not is_precompiled(precompile):
             self.get_logger().info("compiling for this machine: about half a minute")
         precompile()
@@ -63,8 +63,8 @@ class MarkerNode(CameraNode[Markers]):
 
     def trouble(self) -> str:
         """A warning if many markers since the last call do not fit a square."""
-        markers, misfits = self._camera.markers - self._told[0], self._camera.misfits - self._told[1]
-        self._told = self._camera.markers, self._camera.misfits
+        markers, misfits = self._camera.markers - self._reported[0], self._camera.misfits - self._reported[1]
+        self._reported = self._camera.markers, self._camera.misfits
         if misfits <= _MAX_MISFIT_SHARE * markers:
             return ""
         return f"{misfits} of {markers} markers fit no square: is camera_info that of this camera?"

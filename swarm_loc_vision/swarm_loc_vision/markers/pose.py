@@ -19,7 +19,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 
 _ROUNDS = 12
-_STILL = 1e-6  # Threshold of the weighted squared step at convergence
+_CONVERGED = 1e-6  # Threshold of the weighted squared step at convergence
 _NOWHERE = 1e12
 _NO_SQUARE = 1e-15  # Determinant of corners on one line
 _LYING = 1e-6  # Length of a z axis along the direction up
@@ -303,7 +303,7 @@ def _refine(sight: _Sight, rotation: FloatArray, position: FloatArray, covarianc
             normal[:], slope[:] = trial_normal, trial_slope
             cost = trial
             damping *= 0.1
-            if gain < _STILL:
+            if gain < _CONVERGED:
                 break
         else:
             damping *= 10.0

@@ -39,7 +39,7 @@ def image(number: int, encoding: str = "mono8", channels: int = 1) -> Image:
 
 
 def compressed(number: int, how: str = "jpeg", suffix: str = ".jpg") -> CompressedImage:
-    """The scene in a file's bytes, likewise."""
+    """The scene in a file's bytes."""
     message = CompressedImage(format=how)
     message.header.frame_id = FRAME
     message.header.stamp.sec = number

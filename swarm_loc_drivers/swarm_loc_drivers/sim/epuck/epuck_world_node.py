@@ -138,7 +138,7 @@ class EpuckWorldNode(WorldNode[EpuckWorldParameters]):
                 self._unanswered.ask(exposure.robot, exposure.stamp_ns, now_ns)
 
     def is_held(self) -> bool:
-        """Whether simulated time waits for the detections of an image; it does not wait for ever."""
+        """Whether simulated time waits for the detections of an image; up to a limit of real time."""
         if not self._unanswered.is_late(self._world.now_ns):
             self._held_since_s = None
             return False

@@ -167,9 +167,9 @@ def _to_discs(origins: FloatArray, rays: FloatArray, centres: FloatArray) -> Flo
         return np.full(rays.shape[:2], math.inf)
     to_centre = centres - origins[:, None, None]
     along = (to_centre * rays[:, :, None]).sum(axis=-1)
-    beside = (to_centre**2).sum(axis=-1) - along**2
-    depth = np.sqrt(np.maximum(PROXIMITY_RADIUS_M**2 - beside, 0.0))
-    met = (beside < PROXIMITY_RADIUS_M**2) & (along > 0.0)
+    off_ray = (to_centre**2).sum(axis=-1) - along**2
+    depth = np.sqrt(np.maximum(PROXIMITY_RADIUS_M**2 - off_ray, 0.0))
+    met = (off_ray < PROXIMITY_RADIUS_M**2) & (along > 0.0)
     nearest: FloatArray = np.where(met, np.maximum(along - depth, 0.0), math.inf).min(axis=-1)
     return nearest
 

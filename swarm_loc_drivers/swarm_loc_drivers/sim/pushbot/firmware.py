@@ -106,17 +106,17 @@ class EventRing:
     def __len__(self) -> int:
         return len(self._words)
 
-    def put(self, words: NDArray[np.uint16], times_us: NDArray[np.int64], room: int) -> None:
+    def put(self, words: NDArray[np.uint16], times_us: NDArray[np.int64], sent: int) -> None:
         """Take events `0yyyyyyy pxxxxxxx`, in order, with their board's time.
 
         Args:
             words: (N,).
             times_us: (N,) [us].
-            room: Events that are sent while these come, which leave their places.
+            sent: Number of events that are sent while these come, which leave their places.
         """
         self._words = np.concatenate([self._words, words])
         self._times = np.concatenate([self._times, times_us])
-        self._forget(RING + room)
+        self._forget(RING + sent)
 
     def _forget(self, kept: int) -> None:
         extra = len(self._words) - kept
@@ -309,10 +309,10 @@ class Board:
             self._report_in, self._report_due = period_ms, False
         self._report_period = period_ms
 
-    def see(self, words: NDArray[np.uint16], times_us: NDArray[np.int64], room: int) -> None:
+    def see(self, words: NDArray[np.uint16], times_us: NDArray[np.int64], sent: int) -> None:
         """Take the camera's events (N,) with times of the world [us]; see `EventRing.put`."""
         if self.is_streaming:
-            self.ring.put(words, times_us - self._boot_us, room)
+            self.ring.put(words, times_us - self._boot_us, sent)
         else:
             self.ring.clear()
 

@@ -73,7 +73,7 @@ class CameraRig:
         Args:
             robot: Its index.
             middle_ns: Middle of the exposure.
-            track: True paths, from half an exposure before to half an exposure behind.
+            track: True paths, from half an exposure before to half an exposure after.
             rng: Source of the sensor's noise.
         """
         return self._renderer.take(self.cameras[robot], middle_ns, track.all_at, rng)

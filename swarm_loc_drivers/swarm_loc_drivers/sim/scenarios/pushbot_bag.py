@@ -1,4 +1,4 @@
-"""Write a simulated exploration by PushBots as a bag, with the floor plan beside it."""
+"""Write a simulated exploration by PushBots as a bag, with the floor plan next to it."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class PushbotBagSettings:
 def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) -> int:
     """Write `map`, and per robot `odom`, `laser`, `lights`, `fix`, `goal`, `events` and `ground_truth`.
 
-    Beside the bag come `swarm.yaml`, `walls.csv`, and `<robot>.yaml` with the calibration of each laser.
+    Next to the bag come `swarm.yaml`, `walls.csv`, and `<robot>.yaml` with the calibration of each laser.
 
     Args:
         settings: Settings of a run.
