@@ -88,11 +88,13 @@ class WheelOdometry:
             The state; None if the reading is too close to the last one or impossible.
         """
         right, last = as_counter(self._right_sign * right), self._last
+        # the first reading, and those that come too early
         if last is None:
             self._restart(stamp_ns, doubt_ns, left, right)
             return self._reckoning.state(stamp_ns, 0.0, 0.0, 0.0)
         if 0 <= stamp_ns - last[0] < _MIN_PERIOD_NS:
             return None
+        # the longest time in which the wheels may have turned
         has_jumped = stamp_ns < last[0]
         if has_jumped:
             self._counts["time_jumps"] += 1
@@ -101,6 +103,7 @@ class WheelOdometry:
             self._gap_ns = self._since_ns(last[0]), stamp_ns
         longest_s = max(elapsed_s, (stamp_ns - self._since_ns(stamp_ns)) * 1e-9)
         longest_s += _TIMING_SLACK_S + (self._last_doubt_ns + doubt_ns) * 1e-9
+        # steps that the commands can explain, also if the right counter runs backwards
         steps = self._steps(left, right, elapsed_s)
         mirrored = self._steps(left, right, elapsed_s, right_sign=-1)
         paths = 0.0, 0.0

@@ -92,6 +92,7 @@ def _parse(
     run_at, run_events, run_lines = -1, 0, 0  # where an unconfirmed jump of time began
     before, tally_before = state.copy(), tally.copy()
     while at < len(data):
+        # a line of text, up to its newline
         if data[at] < _HIGH:
             end, verdict = _line_end(data, at)
             if verdict == 0:
@@ -109,6 +110,7 @@ def _parse(
             tally[_LONG if verdict == 3 else _SKIPPED] += 1 if verdict == 3 else end - at
             at = end
             continue
+        # an event: its stamp must follow plausibly, or begins a run that others must confirm
         size, stamp = _stamp(data, at, stamp_bytes)
         if size == 0:
             break
@@ -133,6 +135,7 @@ def _parse(
                 tally_before[:] = tally
             state[_TIME] += elapsed
             state[_RAW], state[_STARTED] = stamp, 1
+        # take the event
         columns[0, events], columns[1, events] = data[at + 1] & 0x7F, data[at] & 0x7F
         columns[2, events] = data[at + 1] >> 7
         times[events] = state[_TIME]

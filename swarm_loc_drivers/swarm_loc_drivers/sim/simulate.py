@@ -42,6 +42,7 @@ def parse(arguments: Sequence[str] | None) -> SimulationOptions:
         default=defaults.world,
         help="error model of robots and sensors (default: w2 for e-pucks, d1 for Droplets)",
     )
+    # one option for each number of SimulationOptions
     for name, spec in number_specs(SimulationOptions).items():
         default = getattr(defaults, name)
         kind = type(default)

@@ -178,6 +178,7 @@ class AerialDetector:
         circles, rims, settings = found.circles, found.rims, self._settings
         if not len(circles.radius):
             return _nothing(dropped)
+        # the mark, then the rim again without its light, in turns
         is_strong = circles.contrast >= _SAME_CONTRAST * commonest(circles.contrast, _quality(circles))
         for _ in range(_MARK_ROUNDS):
             marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
@@ -185,14 +186,17 @@ class AerialDetector:
             better = (marks.step != 0.0) & (again.coverage >= settings.min_coverage)
             circles = circles.updated(np.flatnonzero(better), again.select(better))
         marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
+        # discs that are too weak, or that lack the mark of the others, are no robots
         has_mark = np.isfinite(marks.theta)
         is_strong |= has_mark  # a shadow may weaken a rim, but shows no mark
         alike = _marked_alike(circles, has_mark) | ~is_strong
         dropped |= {"other_contrast": int(np.sum(~is_strong)), "without_mark": int(np.sum(~alike))}
         kept = alike & is_strong
         circles, marks = circles.select(kept), Marks(*(column[kept] for column in marks))
+        # the rim once more, and the centres on the floor
         circles = _refined(rims, circles, marks.light)
         places = grid.places(circles.centre)
+        # noise of the outline, of pixels, of the camera's pose and of the robots' height
         of_outline = circles.covariance + _of_motion(circles.oval)
         of_pixel = self._ground.pixel_covariances(places, of_outline * grid.metres_per_px**2)
         of_pixel = of_pixel + settings.pixel_sigma**2 * np.eye(2)

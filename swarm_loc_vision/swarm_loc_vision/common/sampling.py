@@ -60,6 +60,7 @@ def profile_crossings(
         reach = min(max(reaches[n], _MIN_REACH_PX), _MAX_REACH_PX)
         half = math.ceil(reach / _STEP_PX)
         taken = 0
+        # take the profiles of each side, clear of its corners
         for k in range(4):
             crossings[n, k, :, 2] = 0.0
             u, v = quads[n, k, 0], quads[n, k, 1]
@@ -82,8 +83,10 @@ def profile_crossings(
                     crossings[n, k, m, 0] = along
                     crossings[n, k, m, 2] = light[k, m] - dark[k, m]
                     taken += 1
+        # of a small marker all profiles share one level
         is_small = reach < _MIN_CLEAR_CELL_PX and taken > 0
         common = _common_level(crossings[n, :, :, 2], dark, light) if is_small else 0.0
+        # where each profile crosses its level
         for k in range(4):
             for m in range(MAX_PROFILES):
                 if crossings[n, k, m, 2] > 0.0:

@@ -223,6 +223,7 @@ def _set_equations(
     total, square = 0.0, 0.0
     for i in range(pixels.counts[n]):
         k, a = pixels.side[n, i], pixels.along[n, i]
+        # only pixels in the window of the outer edge, clear of the corners
         if k >= INNER:
             continue
         across, along, inside, outside, clear = work.windows[k]
@@ -231,12 +232,14 @@ def _set_equations(
         d = pixels.outside[n, i] - (1.0 - s) * p[2 * k] - s * p[2 * k + 1]
         if a < clear or a > frame[LENGTH] - clear or d < -inside or d > outside:
             continue
+        # model: light (dark + contrast * profile), with the white cells behind the border
         gap = frame[NEAR] + s * (frame[FAR] - frame[NEAR])
         white = _white(a + frame[SHEAR] * (d + gap), along, strips[k], border, pixels.boundaries[n, k])
         level, slope, widening = _profile(d, gap, across, white)
         x, y = pixels.place[n, i]
         light = 1.0 + p[_LIGHT_X] * x + p[_LIGHT_Y] * y
         paint = p[_DARK] + p[_CONTRAST] * level
+        # its derivatives by the ends, ink, contrast, light and blur
         by_place = light * p[_CONTRAST] * slope
         by_variance = light * p[_CONTRAST] * widening / (2.0 * across * across)
         jacobian[0], jacobian[1] = (s - 1.0) * by_place, -s * by_place
@@ -244,6 +247,7 @@ def _set_equations(
         jacobian[4], jacobian[5] = x * paint, y * paint
         jacobian[6], jacobian[7] = by_variance * frame[DV] ** 2, by_variance * frame[DU] ** 2
         jacobian[8] = -2.0 * by_variance * frame[DU] * frame[DV]
+        # add the pixel with Huber's weight to the equations of its side
         rest = pixels.value[n, i] - light * paint
         weight = min(1.0, _OUTLIER * noise / max(abs(rest), 1e-9))
         total += weight
@@ -253,6 +257,7 @@ def _set_equations(
             towards[k, m] += weighed * rest
             for o in range(_OF_SIDE):
                 of_side[k, m, o] += weighed * jacobian[o]
+    # put the equations of the four sides together
     work.normal[:], work.gradient[:] = 0.0, 0.0
     for k in range(4):
         for m in range(_OF_SIDE):
@@ -469,6 +474,7 @@ def _fit_line(crossings: FloatArray, min_variance: float, line: FloatArray) -> f
     variance, mean_contrast = 0.0, 0.0
     n, sx, sxx = 0.0, 0.0, 0.0
     for _ in range(3):
+        # sums of the crossings within the limit of the last round
         n, sx, sy, sxx, sxy, syy, sc = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for m in range(len(crossings)):
             x, y, contrast = crossings[m, 0], crossings[m, 1], crossings[m, 2]
@@ -481,6 +487,7 @@ def _fit_line(crossings: FloatArray, min_variance: float, line: FloatArray) -> f
             sxy += x * y
             syy += y * y
             sc += contrast
+        # the line and the variance of the crossings around it
         if n < _MIN_CROSSINGS:
             return 0.0
         determinant = sxx - sx * sx / n
@@ -492,6 +499,7 @@ def _fit_line(crossings: FloatArray, min_variance: float, line: FloatArray) -> f
         variance = rest / max(n - 2.0, 1.0)
         limit = max(2.5 * math.sqrt(variance), 0.1)
         mean_contrast = sc / n
+    # covariance of offset and slope
     of_one = (variance + min_variance) / _SHARE_FRESH
     determinant = sxx - sx * sx / n
     line[0], line[1] = offset, slope
@@ -536,6 +544,7 @@ def _meet(corners: FloatArray, ends: FloatArray, moved: FloatArray, jacobian: Fl
     """
     normal, direction = np.empty((4, 2)), np.empty((4, 2))
     rest, lengths = np.empty(4), np.empty(4)
+    # the lines along the sides
     for k in range(4):
         du = corners[(k + 1) % 4, 0] - corners[k, 0]
         dv = corners[(k + 1) % 4, 1] - corners[k, 1]
@@ -547,6 +556,7 @@ def _meet(corners: FloatArray, ends: FloatArray, moved: FloatArray, jacobian: Fl
         slope = (ends[2 * k + 1] - ends[2 * k]) / lengths[k]
         normal[k, 0], normal[k, 1] = dv - slope * du, -du - slope * dv
         rest[k] = ends[2 * k] + normal[k, 0] * corners[k, 0] + normal[k, 1] * corners[k, 1]
+    # each corner is where the line before it and its own meet
     jacobian[:] = 0.0
     for k in range(4):
         a = (k + 3) % 4

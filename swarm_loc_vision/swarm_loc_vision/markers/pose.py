@@ -286,6 +286,7 @@ def _refine(sight: _Sight, rotation: FloatArray, position: FloatArray, covarianc
     cost = _equations(sight, rotation, position, normal, slope)
     damping = 1e-4
     for _ in range(_ROUNDS):
+        # a damped Gauss-Newton step (Levenberg-Marquardt)
         if not cost < _NOWHERE:
             return np.inf
         if not _factorized(normal, damping, factor):
@@ -298,6 +299,7 @@ def _refine(sight: _Sight, rotation: FloatArray, position: FloatArray, covarianc
                 trial_position[i] = position[i] + step[i]
         _rotated(rotation, step, trial_rotation)
         trial = _equations(sight, trial_rotation, trial_position, trial_normal, trial_slope)
+        # keep it if the cost falls, else damp more
         if trial <= cost:
             rotation[:], position[:] = trial_rotation, trial_position
             normal[:], slope[:] = trial_normal, trial_slope
@@ -307,6 +309,7 @@ def _refine(sight: _Sight, rotation: FloatArray, position: FloatArray, covarianc
                 break
         else:
             damping *= 10.0
+    # the covariance is the inverse of the normal matrix
     if not _factorized(normal, 0.0, factor):
         return np.inf
     unit = np.zeros(6)
@@ -331,6 +334,7 @@ def _equations(
     points, pixels, weights, intrinsics = sight.points, sight.pixels, sight.weights, sight.intrinsics
     fx, fy = intrinsics[0], intrinsics[1]
     for m in range(len(weights)):
+        # residuals and Jacobian of the four corners
         for k in range(4):
             x, y, z = 0.0, 0.0, 0.0
             for i in range(3):
@@ -350,6 +354,7 @@ def _equations(
             jacobian[2 * k + 1, 1], jacobian[2 * k + 1, 2] = b, -b * v
             jacobian[2 * k + 1, 3], jacobian[2 * k + 1, 4] = -b * (z + v * y), b * v * x
             jacobian[2 * k + 1, 5] = b * x
+        # sums weighted by the inverse covariance of the corners
         for i in range(8):
             weighed[:] = 0.0
             weighed_rest = 0.0

@@ -276,6 +276,7 @@ def _sides(
     """
     lines = np.empty((4, 3))  # normal (outwards) and offset
     for k in range(4):
+        # the chord between two corners
         begin, end = corners[k], corners[(k + 1) % 4]
         count = end - begin if end > begin else end - begin + length
         du = points[end, 0] - points[begin, 0]
@@ -283,6 +284,7 @@ def _sides(
         chord = math.hypot(du, dv)
         if chord < 0.6 * min_side:
             return False
+        # moments of the outline near it, clear of the corners
         steps = max(abs(du), abs(dv))
         skip = min(int(0.15 * steps), 12)
         slack = _SLACK_PX + _SLACK * chord
@@ -298,6 +300,7 @@ def _sides(
             suu += u * u
             suv += u * v
             svv += v * v
+        # the line along the larger principal axis, which must be straight
         if n < max(_MIN_SEEN * (steps - 2 * skip), 2):
             return False
         su, sv = su / n, sv / n
@@ -311,6 +314,7 @@ def _sides(
             normal_u, normal_v = -normal_u, -normal_v
         lines[k, 0], lines[k, 1] = normal_u, normal_v
         lines[k, 2] = normal_u * (points[begin, 0] + su) + normal_v * (points[begin, 1] + sv) + 0.5
+    # neighbouring lines meet near the corners of the outline
     for k in range(4):
         a, b = lines[k - 1], lines[k]
         determinant = a[0] * b[1] - a[1] * b[0]

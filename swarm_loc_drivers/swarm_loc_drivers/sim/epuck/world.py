@@ -85,6 +85,7 @@ class EpuckWorld:
         self._drive = Drive(
             settings.wheels.wheel_separation, settings.errors.wheel_noise, settings.errors.turn_slip
         )
+        # true geometry and cameras
         rng = np.random.default_rng(settings.seed)
         truth = hidden_geometry(rng, swarm, settings.errors)
         self.rig = CameraRig(swarm, truth, settings.arena, settings.camera, settings.seed)
@@ -96,6 +97,7 @@ class EpuckWorld:
             else None
         )
         self._overhead_images = 0
+        # motion
         count = len(swarm.robots)
         self._slip = LastingNoise(rng, (count, 2), STEP_NS * 1e-9, _SLIP_S)
         self.now_ns = settings.start_ns
@@ -105,6 +107,7 @@ class EpuckWorld:
         """(N, 2) of the left and the right wheel, as commanded [steps/s]."""
         self.steps: FloatArray = np.zeros((count, 2))
         """(N, 2) that the left and the right motor have done since the start."""
+        # images: past poses for their exposures, and the next exposure of each camera
         self._period_ns = round(1e9 / settings.camera_rate_hz)
         early_ns = round(1e9 * settings.errors.exposure_early_s)
         remembered_ns = self._period_ns + early_ns + 2 * self._half_exposure_ns + _KEPT_NS
