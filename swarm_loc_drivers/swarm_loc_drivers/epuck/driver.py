@@ -29,6 +29,7 @@ from swarm_loc_drivers.epuck.wifi_session import WifiSession
 
 Rates = tuple[float, float]
 
+# Checked by test_epuck_motion.py and by the bad links of test_epuck_sessions.py.
 _TIMING_SLACK_S = 0.15
 """Further uncertainty of a stamp, beyond that known to the session: stamps are those of the computer."""
 _DELAY_NS = 500_000_000  # Longest delay of a command to the robot, and of a reading from it

@@ -18,6 +18,7 @@ from swarm_loc_drivers.pushbot.hardware import TIMESTAMPS
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.jit import cached_njit, note_precompiled
 
+# Checked by lost bytes in test_pushbot_events.py.
 CONFIRMATIONS = 8  # Consecutive events that confirm a jump of time
 MAX_LINE = 256  # Longer lines are dropped
 _MAX_HELD = 1024  # Most bytes that wait for the confirmation of a jump; then it is accepted

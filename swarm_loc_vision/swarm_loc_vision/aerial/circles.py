@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.aerial.rectification import Brightness, Plain, logarithm
 
+# Shares and limits were chosen on the pictures of `make bench-aerial`, see `detector`.
 _NEAREST, _FARTHEST, _SAMPLES = 0.45, 1.6, 47
 SHARES = np.linspace(_NEAREST, _FARTHEST, _SAMPLES)  # Samples on a ray, over the length to the expected edge
 _SIDE = 5  # Number of samples compared on each side of an edge: an eighth of the diameter

@@ -22,6 +22,7 @@ from swarm_loc_vision.common.camera import Camera
 
 MIN_POINTS = 4
 MAX_POINTS = 1000
+# Checked by test_control_points.py.
 _MIN_SPREAD = 0.02  # Least ratio of the extents of points; below it they count as on one line
 _STEPS = 200
 _FAR = 1e4  # Residual of a point that a pose does not see [sigma]

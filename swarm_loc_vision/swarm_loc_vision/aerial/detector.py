@@ -39,6 +39,8 @@ from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, GrayOf
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.common.images import Gray, ImageError
 
+# Numbers below were chosen on drawn pictures (bench/aerial/pictures.py), but not on those of seeds 101 to 104,
+# which doc/aerial_camera_node.md reports on (`make bench-aerial`).
 _SIZES_PX = 16.0, 32.0  # Least and largest diameter of robots in the rectified image
 _ROUGH_PX = 14.0
 _MAX_SHARE = 0.25  # Largest robot that is searched for, over the shorter side of the image

@@ -24,6 +24,7 @@ def inside_mark(places: FloatArray) -> FloatArray:
     return np.asarray(np.minimum(MARK_RADIUS - np.linalg.norm(places, axis=-1), places[..., 0]))
 
 
+# Samples and limits of the mark were chosen on the pictures of `make bench-aerial`, see `detector`.
 _TURNS = 48
 _RINGS, _SPOKES, _OUTERMOST = 7, 48, 0.82
 _SOFTNESSES = (0.07, 0.14, 0.28)  # Candidates for the blur of the mark's edges, in radii of the disc

@@ -16,6 +16,7 @@ from swarm_loc_vision.common.camera import raw_pixel
 from swarm_loc_vision.common.images import Gray
 
 MAX_PROFILES = 40
+# Profiles: checked by the corners of small and blurred markers in `make bench-vision` and test_detector.py.
 _MIN_REACH_PX, _MAX_REACH_PX = 1.5, 6.0
 _STEP_PX = 0.5
 _MIN_SHARED_CELL_PX = 2.0

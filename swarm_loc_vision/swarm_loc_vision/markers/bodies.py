@@ -14,6 +14,7 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Robo
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.pose import Poses, Upright, body_pose, marker_poses, square
 
+# Checked by the NEES of test_bodies.py.
 _MIN_SIGMA = 0.0005  # Minimum of `position_sigma` [m]
 _MAX_CHI2 = 25.0
 """Maximum chi square per degree of freedom; above it the faces contradict the description and stay single."""

@@ -21,6 +21,8 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.markers.families import Family
 from swarm_loc_vision.markers.layouts import Layout, Words
 
+# Limits of the decoder: checked by random squares and by black squares with a speck in `make bench-vision`,
+# and by test_decoder.py.
 FALSE_READINGS = 1e-5
 """Maximum false positive rate for random squares, with whole bits and one threshold. Weighted bits and the
 second threshold increase it: with all 4096 ids to one or two of 100 000 random squares."""

@@ -44,6 +44,8 @@ _OF_SIDE = 2 + _PARAMETERS - _ENDS
 """Parameters of a pixel: the two ends of its side, and those that all sides share."""
 _ROUNDS = 5
 _CONVERGED = 0.2  # Maximum motion of an end at convergence, in standard deviations
+# Windows, priors and model errors: checked by errors of corners in `make bench-vision` and their NEES in
+# test_sides.py.
 _FIRST_BLUR, _MIN_BLUR, _MAX_BLUR = 0.45, 0.08, 12.0  # Variance of the blur [px^2]
 _BLUR_FREEDOM = 4.0  # Prior standard deviation of that variance [px^2]
 _LIGHT_FREEDOM = 0.2  # Prior standard deviation of the relative difference of light over a marker
@@ -368,6 +370,7 @@ def _invert(matrix: FloatArray) -> bool:
     return True
 
 
+# Lines by crossings: checked by `make bench-vision` and test_detector.py.
 _MIN_CROSSINGS = 3
 _MIN_SINE = 0.1  # Minimum sine of the angle between neighbouring sides
 _MIN_SIGMA_PX = 0.004  # Standard deviation of a line without noise, from print, lens and pixels

@@ -23,6 +23,7 @@ _CONVERGED = 1e-6  # Threshold of the weighted squared step at convergence
 _NOWHERE = 1e12
 _NO_SQUARE = 1e-15  # Determinant of corners on one line
 _LYING = 1e-6  # Length of a z axis along the direction up
+# Checked by the NEES of test_pose.py.
 _TRUST = 6.0
 """Prior degrees of freedom of the corners' covariance. The pose covariance is inflated where residuals are
 larger, as on a partly covered marker. A single marker has two degrees of freedom."""

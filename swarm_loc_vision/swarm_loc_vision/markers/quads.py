@@ -26,6 +26,7 @@ _MIN_SIDE_PX = 3  # Minimum size of an image with inner pixels
 _DARK = 255
 _FOLLOWED = 1  # Value of a dark pixel on a followed outline whose left neighbour is light
 _SAME = 0.15  # Maximum distance of duplicate quadrangles, relative to their size
+# Limits of outlines: checked by the recall of `make bench-vision` and by test_detector.py.
 _NOISE_SIGMAS = 1.25
 """Minimum ratio of contrast to noise; below it, specks of noise would dominate the run time."""
 _SMOOTHING_PX = 0.5
