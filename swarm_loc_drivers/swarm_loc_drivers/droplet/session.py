@@ -154,7 +154,6 @@ class DropletSession:
         return not self.ending
 
     def _on_said(self, said: Said) -> None:
-        """Process a printed line."""
         event = said.event
         if isinstance(event, Identity):
             self._exchanging.validator.robot = event.robot

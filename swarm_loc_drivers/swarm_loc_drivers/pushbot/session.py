@@ -310,5 +310,4 @@ class PushbotSession(TalkSession):
 
 
 def _tick_period_ms(params: PushbotParameters) -> int:
-    """Period of the wheel ticks [ms]."""
     return max(1, round(1e3 * params.tick_period_s))

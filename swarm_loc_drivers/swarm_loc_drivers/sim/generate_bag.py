@@ -111,7 +111,6 @@ def _pushbots(options: argparse.Namespace, comment: str) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     swarms = parser.add_subparsers(dest="swarm", required=True, metavar="SWARM")
     # e-pucks on the eight

@@ -68,7 +68,6 @@ class AerialCameraNode(CameraNode[AerialParameters]):
 
 
 def _pose_figures(fit: PoseFit | None) -> dict[str, str]:
-    """Diagnostics of the camera's pose."""
     if fit is None:
         return {"control points": "0"}
     worst = int(fit.residuals.argmax())

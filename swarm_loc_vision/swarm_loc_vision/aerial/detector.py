@@ -39,7 +39,7 @@ from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, GrayOf
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.common.images import Gray, ImageError
 
-# Numbers below were chosen on drawn pictures (bench/aerial/pictures.py), but not on those of seeds 101 to 104,
+# Numbers below were chosen on drawn pictures (bench/aerial/pictures.py), not on those of seeds 101 to 104,
 # which doc/aerial_camera_node.md reports on (`make bench-aerial`).
 _SIZES_PX = 16.0, 32.0  # Least and largest diameter of robots in the rectified image
 _ROUGH_PX = 14.0
@@ -343,7 +343,6 @@ def _with_heading(spread: FloatArray, turned: Marks) -> FloatArray:
 
 
 def _nothing(dropped: Mapping[str, int]) -> AerialDetections:
-    """No robots."""
     none = np.zeros(0)
     return AerialDetections(
         np.zeros((0, 2)), none, np.zeros((0, 3, 3)), np.zeros((0, 2)), none, none, dropped
@@ -425,7 +424,6 @@ class AerialCamera(CalibratedCamera):
         return encode_anonymous(MAP, nanoseconds(message.header.stamp), anonymous_rows(detections))
 
     def _seen(self, gray: Gray) -> AerialDetections:
-        """The robots in an image."""
         ground = self.control.look(gray) if self.control else None
         if ground is None:
             raise ImageError("no_control_points", self.why_nothing)

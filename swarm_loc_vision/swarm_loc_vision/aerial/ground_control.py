@@ -168,7 +168,6 @@ class GroundControl:
         return not np.median(away) <= _MOVED * np.hypot(self._settings.control_sigma_px, fit.rms_px)
 
     def _solve(self, points: ControlPoints) -> None:
-        """Solve for the pose with points."""
         try:
             self.fit, self.trouble = _solved(self._camera, points, self._settings), ""
         except ControlPointError as error:

@@ -142,7 +142,6 @@ def _picture(path: Path, size: tuple[int, int]) -> Gray:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     parser.add_argument("name", help="the camera's name in the swarm description")
     parser.add_argument("control_points", type=Path, help="file of control points")

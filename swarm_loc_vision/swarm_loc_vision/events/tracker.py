@@ -124,7 +124,6 @@ class LightTracker:
         return reports
 
     def _reset(self) -> None:
-        """Forget all events."""
         self._bursts.event_ns[:] = self._bursts.begin_ns[:] = _LONG_AGO_NS
         self._bursts.source[:] = -1
         self._hits.clear()

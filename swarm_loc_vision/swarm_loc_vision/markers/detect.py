@@ -199,7 +199,6 @@ def _summary(name: str, camera: CameraDetector) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     add_bag(parser)
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="the new bag")

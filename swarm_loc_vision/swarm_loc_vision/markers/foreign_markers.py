@@ -199,7 +199,6 @@ class ForeignMarkers(Calibration):
                 yield marker
 
     def _solved(self, camera: Camera, markers: list[ForeignMarker]) -> Detections:
-        """The markers with poses."""
         count = len(markers)
         ids = np.array([marker.id for marker in markers], np.int64)
         corners = np.array([marker.corners for marker in markers]).reshape(-1, 4, 2)

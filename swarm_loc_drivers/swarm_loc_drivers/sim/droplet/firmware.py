@@ -290,7 +290,6 @@ class DropletFirmware:
             self._say(f"\t{direction}\t{self._body.lengths[direction]}")
 
     def _reset(self) -> None:
-        """Reset as after power-on."""
         self._stop()
         self._tasks.clear()
         self._line.clear()

@@ -118,7 +118,6 @@ class SerialFirmware:
         return f"{self._answer(line.decode('latin-1'))}\r\n".encode()
 
     def _answer(self, text: str) -> str:
-        """Execute a line."""
         letter, motors = text[0].upper(), self._motors
         if letter == "D":
             motors.set_speeds(*_filled(text, motors.commanded))

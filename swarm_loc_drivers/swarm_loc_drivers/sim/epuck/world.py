@@ -288,7 +288,6 @@ class EpuckWorldParameters:
 
 
 def _floor_markers(parameters: EpuckWorldParameters) -> tuple[FloorMarker, ...]:
-    """The markers on the floor."""
     path = parameters.control_points_file
     if not path:
         return ()

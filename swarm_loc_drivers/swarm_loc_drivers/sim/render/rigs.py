@@ -99,7 +99,6 @@ def _scene(
     faces: list[list[Patches]],
     rng: np.random.Generator,
 ) -> Scene:
-    """Arena, landmarks and robots."""
     boards = [
         _board(pose, mark, arena.family)
         for pose, mark in zip(truth.landmarks.tolist(), swarm.landmarks, strict=True)

@@ -363,7 +363,6 @@ def _brightness(run: DropletRun, robot: int) -> Stream:
 
 
 def _fixes(run: DropletRun, robot: int) -> Stream:
-    """The robot's fixes."""
     own = [fix for fix in run.fixes if fix.robot == robot]
     covariance = np.diag([FIX_SIGMA**2, FIX_SIGMA**2, FIX_HEADING_SIGMA**2])
     data = [encode_fix("map", fix.stamp_ns, fix.pose, covariance) for fix in own]
