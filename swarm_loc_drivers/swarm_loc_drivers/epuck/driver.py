@@ -1,4 +1,4 @@
-"""Wheel odometry of an e-puck from its step counters.
+"""Driver of one e-puck: link, wheel commands and odometry from its step counters, without ROS.
 
 The counters count commanded steps, so a change that the commands since the last reading cannot explain means
 that a reading has lost bytes or that the robot has restarted. After a gap between readings, delayed readings

@@ -1,4 +1,8 @@
-"""A temporary folder for the serial ports of a simulation, which is removed even after a kill."""
+"""Pseudo-terminals and TCP ports at which emulated firmware answers, and a temporary folder for their names.
+
+Everything happens in the thread that calls `poll`, so a world that steps its bodies there needs no locks. The
+folder is removed even after a kill.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Aerial detector: an overhead image in, places and headings of robots without identity out."""
+"""Aerial detector: an overhead image in, places and headings of robots without identity out.
+
+`AerialCamera` takes CameraInfo and images and gives serialized anonymous detections. Messages may be those of
+rclpy or of rosbags, whose fields have the same names.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""Poses of the markers in one image: each alone, and jointly for markers of one body."""
+"""Poses of the markers in one image: each alone, and jointly for markers of one body.
+
+The pose of one face of a body seen head-on is ambiguous, that of two faces is not. Each of n faces gets the
+common pose and n times its covariance, so an estimator that treats the faces as independent obtains the
+covariance of the common pose. As for a single face, the covariance does not contain `position_sigma` of the
+description, which the estimator adds to each face.
+"""
 
 from __future__ import annotations
 

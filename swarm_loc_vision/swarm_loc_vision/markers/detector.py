@@ -1,4 +1,8 @@
-"""Detector of square fiducial markers: computes ids, corners and poses from an image."""
+"""Detector of square fiducial markers: computes ids, corners and poses from an image.
+
+`CameraDetector` is that of one camera: it converts CameraInfo and images to serialized detections. Messages
+may be those of rclpy or of rosbags, whose fields have the same names.
+"""
 
 from __future__ import annotations
 

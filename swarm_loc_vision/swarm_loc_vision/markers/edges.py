@@ -1,10 +1,14 @@
-"""Least-squares fit of a decoded marker's four sides, its blur and its light to the raw pixels.
+"""Sub-pixel refinement of corners: lines along the sides of a marker, which are intersected.
 
-The image of a decoded marker depends on few unknowns: the sides, the brightness of ink and paper, the
-gradient of the light, and the blur of optics, pixels and motion, an ellipse. Their least-squares fit to raw
-pixels needs no interpolation, which would shift edges along rows or columns by up to a tenth of a pixel. The
-white cells behind the border, known from the word of the marker, are part of the model, because their light
-blurs into the border. The fit gives the covariance, which is larger for blurred markers.
+`fit_sides` fits the four sides of a decoded marker, its blur and its light to the raw pixels. The image of a
+decoded marker depends on few unknowns: the sides, the brightness of ink and paper, the gradient of the light,
+and the blur of optics, pixels and motion, an ellipse. Their least-squares fit to raw pixels needs no
+interpolation, which would shift edges along rows or columns by up to a tenth of a pixel. The white cells
+behind the border, known from the word of the marker, are part of the model, because their light blurs into
+the border. The fit gives the covariance, which is larger for blurred markers.
+
+Before a marker is decoded, and where that fit fails, lines are fitted to the edges that profiles across each
+side cross. The spread of the crossings around their line gives the covariance of the lines and corners.
 """
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""The motors of an emulated PushBot: the velocity controller, decaying velocities and duty cycles.
+"""The firmware of an emulated PushBot, as far as drivers use it: motors, events, board, console, wire.
 
-Source: motors.c and main.c of the board's firmware EDVSBoardOS (eDVS4337), version 0.7.1.
+Source: uart.c, pwm.c, motors.c, sensors.c, DVS128Chip.c and main.c of the board's firmware EDVSBoardOS
+(eDVS4337), its first public revision and version 0.7.1.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""E-pucks that wander at random, seen by a camera above that cannot tell them apart.
+"""Write simulated runs as bags, as a recorder of the real swarm would have left them.
 
-They drive and turn at speeds of their own, which change every now and then, turn back at the arena's edge,
-and stop and turn before others. The camera sees all of it; it misses some robots, and takes other things
-for robots.
+Among them are e-pucks that wander at random, seen by a camera above that cannot tell them apart. They drive
+and turn at speeds of their own, which change every now and then, turn back at the arena's edge, and stop and
+turn before others. The camera sees all of it; it misses some robots, and takes other things for robots.
 """
 
 from __future__ import annotations
