@@ -5,10 +5,10 @@ row p = p_inf + f b / d. (The PushBot paper uses a logarithm, figure 2, which is
 over 10 to 250 cm.) An error sigma_px of the row makes an error d^2 sigma_px / (f b) of the distance.
 
 `WallDrive` collects the samples of the drive, live or from a bag. The hyperbola is fitted first, then the
-bias of tracked rows within pixels. The centre of all events of a spot that is hardly larger than a pixel is pulled
-towards the middles of pixels (pixel locking). The spot runs along one line of the image as the distance
-changes, so this error is a function of the row: a robot that turns in front of a wall makes the same error in
-many readings, and averaging over a scan does not remove it as it removes noise.
+bias of tracked rows within pixels. The centre of all events of a spot that is hardly larger than a pixel is
+pulled towards the middles of pixels (pixel locking). The spot runs along one line of the image as the
+distance changes, so this error is a function of the row: a robot that turns in front of a wall makes the same
+error in many readings, and averaging over a scan does not remove it as it removes noise.
 """
 
 from __future__ import annotations
