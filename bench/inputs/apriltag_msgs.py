@@ -18,7 +18,7 @@ from bench.vision.comparison import MARKERS, solved_by_opencv
 from bench.vision.peers import FAMILY, Found, all_peers, as_found, own_detector
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS, decode
-from swarm_loc_vision.markers.camera_detector import detection_rows
+from swarm_loc_vision.markers.detector import detection_rows
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.foreign_markers import ForeignMarkers, ForeignParameters
 

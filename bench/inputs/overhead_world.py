@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.sim.render.ceiling import CeilingRig
+from bench.vision.ceiling import CeilingRig
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena
 from swarm_loc_drivers.sim.run import CAMERA_LATENESS, START_NS, LivedRun, Trajectories, arrival_ns
+from swarm_loc_drivers.sim.scenarios.bags import places, wander
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, drive_robots
-from swarm_loc_drivers.sim.scenarios.wandering import places, wander
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.swarm.error_models import SensorModel
@@ -29,8 +29,7 @@ from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, located
 from swarm_loc_vision.aerial.locate_camera import fixed_camera
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.markers.bodies import robot_body, up_of
-from swarm_loc_vision.markers.camera_detector import detection_rows
-from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
+from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector, detection_rows
 from swarm_loc_vision.markers.families import family_named
 
 ROBOTS, PERIOD_NS = 20, 100_000_000

@@ -61,7 +61,7 @@ class SimulationOptions:
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
     )
     plan: str = "corridor"  # The hall of PushBots, see `floor_plan`
-    # Whether e-pucks are located by an overhead camera only, which cannot tell them apart
+    # Whether e-pucks are located only by an overhead camera, which cannot tell them apart
     aerial: bool = False
     parameter_file: str | None = None  # Path of a ROS parameter file for all nodes, None for none
 
@@ -141,7 +141,7 @@ def placed(options: SimulationOptions, swarm: Swarm) -> Swarm:
     """The swarm with a start for each robot; who has none stands where its world puts it, off the others.
 
     Raises:
-        UserError: The world has no place for so many robots.
+        UserError: The world has no place for this number of robots.
     """
     described = [robot.start for robot in swarm.robots if robot.start is not None]
     if len(described) == len(swarm.robots):

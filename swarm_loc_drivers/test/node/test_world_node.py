@@ -26,7 +26,7 @@ SPEED = 0.06
 RATE = 0.5
 """Simulated seconds per second: on a busy machine, too, commands come before the robots have gone far."""
 AT_PLACE, COMMANDS = 0.05, 10
-"""A robot that is told again and again to be so little faster or slower is where it should be, to 6 mm."""
+"""A robot that is commanded to be this little faster or slower is where it should be, to 6 mm."""
 
 
 @pytest.fixture

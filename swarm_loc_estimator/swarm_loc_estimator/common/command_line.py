@@ -42,19 +42,20 @@ _FOR_BAGS = ("lz4", "mcap", "rosbags", "zstandard")
 
 @dataclass(frozen=True)
 class Program:
-    """An entry point that imports a module only when it is called, and then runs its `main`.
+    """An entry point that imports a module only when it is called, and then runs its function.
 
     A signal during the import ends the process with status 128 + n and without a traceback, a missing package
     of others with one sentence and status 1.
     """
 
     module: str  # Full name of the module
+    function: str = "main"  # The one to run
 
     def __call__(self) -> int:
         """Run the program; returns its exit status."""
         handlers = {number: signal.signal(number, lambda n, _: os._exit(128 + n)) for number in _SIGNALS}
         try:
-            main: Callable[[], int] = import_module(self.module).main
+            main: Callable[[], int] = getattr(import_module(self.module), self.function)
             for number, handler in handlers.items():
                 signal.signal(number, handler)
             return main()

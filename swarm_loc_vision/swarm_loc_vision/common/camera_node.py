@@ -69,11 +69,11 @@ class CameraNode(ManagedNode[Parameters]):
         )
 
     def figures(self) -> dict[str, str]:
-        """Values for the diagnostics beside images, cost and drops."""
+        """Values for the diagnostics in addition to images, cost and drops."""
         raise NotImplementedError
 
     def trouble(self) -> str:
-        """What is wrong beside missing topics, a sentence; empty: nothing. Called once per diagnostics."""
+        """What is wrong but missing topics, a sentence; empty: nothing. Called once per diagnostics."""
         raise NotImplementedError
 
     def _on_camera_info(self, message: CameraInfo) -> None:

@@ -22,8 +22,7 @@ from swarm_loc_vision.aerial.locate_camera import fixed_camera
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.bodies import Seen, robot_body, solve_bodies
-from swarm_loc_vision.markers.camera_detector import detection_rows
-from swarm_loc_vision.markers.detector import Detections
+from swarm_loc_vision.markers.detector import Detections, detection_rows
 from swarm_loc_vision.markers.pose import marker_poses, square
 
 INTRINSICS = np.array([CAMERA[0, 0], CAMERA[1, 1], CAMERA[0, 2], CAMERA[1, 2]])

@@ -194,7 +194,6 @@ def _runs(rows: BoolArray) -> NDArray[np.int64]:
 
 
 def _load() -> dict[str, FloorPlan]:
-    """The plans of `floor_plans.json`."""
     path = Path(__file__).with_name("floor_plans.json")
     checks = TreeChecks(path, FloorPlanError)
     plans = json.loads(path.read_text(encoding="utf-8"))
