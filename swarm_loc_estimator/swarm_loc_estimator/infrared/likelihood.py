@@ -81,7 +81,17 @@ class MaximumLikelihood:
     def solve(
         self, readings: ArrayLike, gains: PairGains | None = None, saturation: ArrayLike | None = None
     ) -> IrSolutions:
-        """Relative poses of k pairs, see `solution.IrEstimator`."""
+        """Relative poses of k pairs.
+
+        Args:
+            readings: (k, modes, n, n) [count], [mode, sensor, emitter], NaN where not measured.
+            gains: Of the k pairs; None: never calibrated.
+            saturation: (k, modes) minimum of saturated readings, which are only lower bounds [count];
+                None: the platform's.
+
+        Raises:
+            ReadingsError: They have another shape.
+        """
         values, known, limits = checked(self._platform, readings, gains, saturation)
         flat = values.reshape(len(values), math.prod(values.shape[1:]))
         return _solve_all(self._models, flat, known, limits)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -67,15 +67,10 @@ class IrSolutions(NamedTuple):
     # readings
     misfits: FloatArray
 
-    @classmethod
-    def none(cls, count: int) -> IrSolutions:
-        """Solutions of `count` pairs, all without a pose."""
-        return no_solutions(count)
-
 
 @cached_njit
 def no_solutions(count: int) -> IrSolutions:
-    """Solutions of `count` pairs, all without a pose; also for compiled code."""
+    """Solutions of `count` pairs, all without a pose."""
     return IrSolutions(
         np.full((count, 3), np.nan),
         np.full((count, 3, 3), np.nan),
@@ -89,25 +84,6 @@ def no_solutions(count: int) -> IrSolutions:
 
 class ReadingsError(ValueError):
     """Readings that do not belong to the platform; the message is one sentence."""
-
-
-class IrEstimator(Protocol):
-    """One of `ClosedForm` and `MaximumLikelihood`."""
-
-    def solve(
-        self, readings: ArrayLike, gains: PairGains | None = None, saturation: ArrayLike | None = None
-    ) -> IrSolutions:
-        """Relative poses of k pairs.
-
-        Args:
-            readings: (k, modes, n, n) [count], [mode, sensor, emitter], NaN where not measured.
-            gains: Of the k pairs; None: never calibrated.
-            saturation: (k, modes) minimum of saturated readings, which are only lower bounds [count];
-                None: the platform's.
-
-        Raises:
-            ReadingsError: They have another shape.
-        """
 
 
 def checked(

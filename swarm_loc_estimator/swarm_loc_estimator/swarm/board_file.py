@@ -20,7 +20,6 @@ from swarm_loc_estimator.swarm.ir_board import (
     Amplitude,
     AngleCurve,
     IrGains,
-    IrMethod,
     IrPlatform,
     IrPlatformError,
     PowerCurve,
@@ -28,14 +27,13 @@ from swarm_loc_estimator.swarm.ir_board import (
     RobotIr,
     TabulatedCurve,
 )
-from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks, nearest
+from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 
 _SECTION_NUMBERS = number_specs(RobotIr)
 _DEAD = ("dead_sensors", "dead_emitters")
-_LAYER = ("platform", "estimator", "gains", *_DEAD, *_SECTION_NUMBERS)
+_LAYER = ("platform", "gains", *_DEAD, *_SECTION_NUMBERS)
 _GAIN_LISTS = ("sensor", "emitter")
 _GAIN_NUMBERS = number_specs(IrGains)
-_METHODS = {method.value: method for method in IrMethod}
 MAX_BOARD_ID = 2**16 - 1
 
 Values = dict[str, Any]
@@ -58,11 +56,14 @@ class IrSection:
         """The values of one layer (defaults, type or robot); only a robot has an id. None: no board."""
         if tree is None:
             return None
+        if isinstance(tree, dict) and "estimator" in tree:
+            raise self._checks.said(
+                f"{key}.estimator is no longer an option: poses are always estimated by likelihood; remove it"
+            )
         mapping = self._checks.mapping(tree, key, ("id", *_LAYER) if of_robot else _LAYER)
         readers: dict[str, Callable[[Tree, str], Any]] = {
             "id": partial(self._checks.address, high=MAX_BOARD_ID),
             "platform": self._platform,
-            "estimator": self._method,
             "gains": self._gains,
             **dict.fromkeys(_DEAD, self._elements),
         }
@@ -115,12 +116,6 @@ class IrSection:
             raise self._checks.error(key, value, "must be a list of numbers of elements, from 0 on")
         return tuple(int(number) for number in numbers)
 
-    def _method(self, value: Tree, key: str) -> IrMethod:
-        """An estimator by name."""
-        if not isinstance(value, str) or value not in _METHODS:
-            raise self._checks.error(key, value, f"must be one of the estimators{nearest(value, _METHODS)}")
-        return _METHODS[value]
-
     def _gains(self, tree: Tree, key: str) -> IrGains | None:
         """Factors of all elements; null: never calibrated."""
         if tree is None:
@@ -139,8 +134,6 @@ def ir_tree(ir: RobotIr, folder: Path) -> Values:
     """The section as it is written to a file in a folder, without the id."""
     is_path = Path(ir.source).is_absolute()
     values: Values = {"platform": os.path.relpath(ir.source, folder.resolve()) if is_path else ir.source}
-    if ir.estimator is not IrMethod.LIKELIHOOD:
-        values["estimator"] = ir.estimator.value
     if ir.gains is not None:
         gains = asdict(ir.gains)
         values["gains"] = {

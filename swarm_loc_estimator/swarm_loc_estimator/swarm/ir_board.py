@@ -26,7 +26,6 @@ from swarm_loc_estimator.common.parameters import number, number_specs
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 from dataclasses import replace
-from enum import Enum
 from functools import cached_property
 
 _CELLS = 128  # Number of cubics per piece; the error for the curves of the Droplet is 2e-6
@@ -407,13 +406,6 @@ def _without(factors: FloatArray, dead: list[tuple[int, ...]]) -> FloatArray:
     return factors
 
 
-class IrMethod(Enum):
-    """Method to estimate a relative pose from brightness."""
-
-    LIKELIHOOD = "likelihood"  # maximum likelihood over all readings of all powers
-    CLOSED_FORM = "closed_form"  # eqs (9)-(18) of the Droplet paper, corrected
-
-
 @dataclass(frozen=True)
 class RobotIr:
     """The infrared board of one robot."""
@@ -421,7 +413,6 @@ class RobotIr:
     id: int  #: Id in its exchanges, 1 to 65535, unique in the swarm
     platform: IrPlatform  #: Model of the board
     source: str  #: Name of a packaged platform, or absolute path of its file
-    estimator: IrMethod = IrMethod.LIKELIHOOD  #: Method to estimate poses
     gains: IrGains | None = None  #: Calibrated gains of its elements; None: never calibrated
     dead_sensors: tuple[int, ...] = ()  #: Numbers of sensors to ignore
     dead_emitters: tuple[int, ...] = ()  #: Numbers of emitters to ignore

@@ -8,7 +8,7 @@ from typing import Any
 
 from swarm_loc_estimator.common.parameters import NumberSpec, number_specs
 from swarm_loc_estimator.swarm.board_file import MAX_BOARD_ID, packaged_platforms
-from swarm_loc_estimator.swarm.ir_board import GAIN_RANGE, IrGains, IrMethod, RobotIr
+from swarm_loc_estimator.swarm.ir_board import GAIN_RANGE, IrGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import MAX_ADDRESS, Anchor, Face, FixedCamera, Landmark, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import (
     FILE_VERSION,
@@ -142,7 +142,6 @@ def _board() -> Schema:
     platforms = f"one of {', '.join(packaged_platforms())}, or the path of a file"
     return {
         "platform": {"type": "string", "description": platforms},
-        "estimator": {"enum": [method.value for method in IrMethod]},
         "gains": _section("factors of the elements", gains, required=["sensor", "emitter"]),
         "dead_sensors": {**elements, "description": "sensors to ignore"},
         "dead_emitters": {**elements, "description": "emitters to ignore"},

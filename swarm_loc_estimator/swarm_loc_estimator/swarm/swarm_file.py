@@ -24,7 +24,6 @@ types:
     camera: null
     ir:                                     # its infrared board; null: it has none
       platform: droplet                     # a packaged one, or the path of a file, from here
-      estimator: likelihood                 # or closed_form
 robots:
   epuck1:                 # the same keys; what is not said comes from its type
     type: epuck

@@ -190,7 +190,6 @@ def test_null_is_valid_where_it_means_something(path: str) -> None:
         ("robots.droplet1.ir.gains", {"sensor": [1] * 6}),
         ("robots.droplet1.ir.gains.sensor", [0.01] * 6),
         ("types.droplet.ir.id", 4097),
-        ("types.droplet.ir.estimator", "guess"),
         ("types.droplet.ir.dead_sensors", None),
         ("types.droplet.random_walk.position", -1.0),
         ("types.epuck.odometry.wheel_separation", 0.0001),

@@ -19,7 +19,7 @@ from swarm_loc_estimator.swarm.error_models import (
     RandomWalk,
     SensorModel,
 )
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrMethod, RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, StartSigma, Swarm
 from swarm_loc_estimator.swarm.swarm_file import RESERVED_NAMES, load_swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
@@ -51,7 +51,6 @@ def boards(board_id: int) -> st.SearchStrategy[RobotIr]:
         st.just(board_id),
         st.just(DROPLET),
         st.just("droplet"),
-        st.sampled_from(IrMethod),
         st.none() | st.builds(IrGains, gain, gain, st.floats(0.0, 1.0), st.floats(0.0, 1.0)),
         gate_probability=st.floats(0.5, 1.0),
     )
