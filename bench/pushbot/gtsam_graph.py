@@ -17,15 +17,14 @@ from bench.shared.common import Cell, table
 from swarm_loc_drivers.sim.pushbot.exploration import Exploration, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.mapping.constraints import STOP_UNKNOWNS
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.pose_graph import STOP_UNKNOWNS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from swarm_loc_estimator.common.arrays import FloatArray
-    from swarm_loc_estimator.mapping.constraints import NormalEquations
-    from swarm_loc_estimator.mapping.pose_graph import PoseGraph
+    from swarm_loc_estimator.mapping.pose_graph import NormalEquations, PoseGraph
 
 SLIP, PLAN = 0.02, "corridor"
 _REPEATS = 5

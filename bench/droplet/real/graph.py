@@ -28,8 +28,7 @@ from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.board_file import save_ir_platform
 from swarm_loc_estimator.swarm.ir_board import IrGains
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 from swarm_loc_estimator.timeline.settings import Settings
 

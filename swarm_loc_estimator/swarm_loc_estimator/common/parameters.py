@@ -1,6 +1,6 @@
 """Parameters with default, unit, range and documentation, and the base class of users' errors.
 
-A frozen dataclass is filled from ROS parameters (`common.ros_parameters`), checks a swarm file
+A frozen dataclass is filled from ROS parameters (`common/node.py`), checks a swarm file
 or the settings, and gives the tables under doc/. A field with the metadata `numbers_of` holds a
 dataclass of numbers, each of which is a parameter; a field with `is_internal` is not a parameter.
 """
@@ -122,7 +122,7 @@ def flag(default: bool, doc: str) -> Any:
 
 
 def autostart() -> Any:
-    """The flag that the parameters of each managed node have, see `common/lifecycle.py`."""
+    """The flag that the parameters of each managed node have, see `common/node.py`."""
     return flag(True, "configure and activate at the start; false: wait for a lifecycle manager")
 
 

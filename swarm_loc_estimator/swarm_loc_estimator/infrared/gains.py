@@ -165,11 +165,7 @@ def _known(exchanges: Exchanges) -> NDArray[np.bool_]:
 
 
 def _residuals(
-    platform: IrPlatform,
-    exchanges: Exchanges,
-    logs: FloatArray,
-    poses: FloatArray,
-    used: NDArray[np.bool_],
+    platform: IrPlatform, exchanges: Exchanges, logs: FloatArray, poses: FloatArray, used: NDArray[np.bool_]
 ) -> FloatArray:
     """Residuals (k, modes, n, n) [sigma]; NaN where not used."""
     linear = _linearized(platform, exchanges, logs, poses, used)
@@ -196,11 +192,7 @@ class _Linear(NamedTuple):
 
 
 def _linearized(
-    platform: IrPlatform,
-    exchanges: Exchanges,
-    logs: FloatArray,
-    poses: FloatArray,
-    used: NDArray[np.bool_],
+    platform: IrPlatform, exchanges: Exchanges, logs: FloatArray, poses: FloatArray, used: NDArray[np.bool_]
 ) -> _Linear:
     """Linearize the readings of the exchanges used."""
     pairs = PairGains(*(values[used] for values in _pairs(exchanges, logs, 0.0)))
@@ -216,11 +208,7 @@ def _linearized(
 
 
 def _improved(
-    platform: IrPlatform,
-    exchanges: Exchanges,
-    logs: FloatArray,
-    poses: FloatArray,
-    used: NDArray[np.bool_],
+    platform: IrPlatform, exchanges: Exchanges, logs: FloatArray, poses: FloatArray, used: NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray, float]:
     """One Gauss-Newton step: log-gains, two covariances (2, P, P), and the largest change.
 

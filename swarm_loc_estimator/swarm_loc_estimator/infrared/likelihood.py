@@ -319,16 +319,7 @@ def _search_blurred(model: IrModel, pair: Pair, work: Workspace, start: FloatArr
     """Write the minimum of the blurred model as the first start."""
     p = pair
     soft = Pair(
-        p.readings,
-        p.cut,
-        p.stable,
-        p.kinds,
-        work.soft,
-        p.sensor,
-        p.emitter,
-        p.prior,
-        p.nearest,
-        p.farthest,
+        p.readings, p.cut, p.stable, p.kinds, work.soft, p.sensor, p.emitter, p.prior, p.nearest, p.farthest
     )
     write_costs(model.errors, soft)
     search(model, soft, start, _LOOSE, work.plain, work.minima[0])

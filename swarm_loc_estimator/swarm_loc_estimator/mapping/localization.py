@@ -13,8 +13,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import between, wrap_angle
 from swarm_loc_estimator.mapping.matching import Lattice, accumulate, agreement, search_offsets
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
-from swarm_loc_estimator.mapping.scans import LightSightings
-from swarm_loc_estimator.mapping.stops import ScanStop
+from swarm_loc_estimator.mapping.scans import LightSightings, ScanStop
 
 _TARGETS, _MIN_OVERLAP = 7, 0.2
 _START_TARGETS, _MIN_START_OVERLAP = 8, 0.08

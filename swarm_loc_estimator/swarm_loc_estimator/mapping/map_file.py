@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError
-from swarm_loc_estimator.common.yaml_tree import read_file, read_tree, tree_text
+from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, TreeChecks, read_file, read_tree, tree_text
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
-from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196

@@ -190,12 +190,7 @@ def match(
 
 @cached_njit
 def normal_equations(
-    walls: WallMap,
-    ends: FloatArray,
-    origin: FloatArray,
-    variance: FloatArray,
-    pose: FloatArray,
-    reach: float,
+    walls: WallMap, ends: FloatArray, origin: FloatArray, variance: FloatArray, pose: FloatArray, reach: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The information (3, 3) of a sweep on a pose (3,), the part that normals imitate, and the gradient (3,).
 

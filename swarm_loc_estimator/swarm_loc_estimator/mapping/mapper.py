@@ -3,12 +3,16 @@
 A robot with a laser pointer stops, scans by turning in place, and drives on; one with a lidar scans while it
 drives. Each stop, and a sweep of a lidar wherever its robot has moved on, becomes a node of the pose graph;
 its beams are matched against those of stops of all robots. Robots may join and leave at any time.
+
+What the mapper knows of one robot on its way.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,10 +30,45 @@ from swarm_loc_estimator.mapping.localization import (
     find_slip,
 )
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
-from swarm_loc_estimator.mapping.scans import UNSEEN, LightSightings, Readings, turn_ratio
+from swarm_loc_estimator.mapping.scans import (
+    MIN_TURN,
+    UNSEEN,
+    LightSightings,
+    MotionTracker,
+    Readings,
+    ScanStop,
+    turn_ratio,
+)
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.mapping.stops import MIN_TURN, ScanStop
-from swarm_loc_estimator.mapping.track import Located, Track
+
+
+class Located(NamedTuple):
+    """Where a robot was: its pose (3,) in map at a time."""
+
+    stamp_ns: int
+    pose: FloatArray
+
+
+@dataclass
+class Track:
+    """State of one robot."""
+
+    prior: FloatArray  # (3,) start pose
+    prior_sigma: FloatArray  # (3,) standard deviations of the start pose
+    motion: MotionTracker = field(default_factory=MotionTracker)  # Detects stops
+    stop: ScanStop | None = None  # The current stop
+    node: int | None = None  # Its newest stop in the graph
+    is_known: bool = False  # Whether `stop` is in the graph, as `node`
+    passes: bool = False  # Whether the next stop replaces `node` because the graph is full
+    # (3,) pose by odometry at departure from `node`
+    left: FloatArray = field(default_factory=lambda: np.zeros(3))
+    last: FloatArray | None = None  # (3,) newest pose by odometry
+    path: float = 0.0  # Length driven since the departure [m]
+    target: FloatArray | None = None  # (2,) final target position [m]
+    goal: Goal | None = None  # Its next stop
+    located: Located | None = None  # Where its newest scan says that it was
+    home: FloatArray | None = None  # (2,) old stop to which it returns to reduce its position uncertainty [m]
+
 
 START_TURN = 4.5 * math.pi
 """Turn by odometry of a complete first scan [rad]: a slow quarter that fixes the heading, then two turns."""

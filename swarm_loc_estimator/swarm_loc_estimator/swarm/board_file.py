@@ -14,7 +14,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number_specs
-from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree, shown, tree_text
+from swarm_loc_estimator.common.yaml_tree import (
+    WHOLE_FILE,
+    Tree,
+    TreeChecks,
+    YamlTreeError,
+    read_tree,
+    shown,
+    tree_text,
+)
 from swarm_loc_estimator.swarm.ir_board import (
     POWERS,
     Amplitude,
@@ -27,7 +35,6 @@ from swarm_loc_estimator.swarm.ir_board import (
     RobotIr,
     TabulatedCurve,
 )
-from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 
 _SECTION_NUMBERS = number_specs(RobotIr)
 _DEAD = ("dead_sensors", "dead_emitters")

@@ -229,11 +229,7 @@ class SensorModel:
     )
     heading_sigma: float = number(0.1, "rad", 0.0, 10.0, "noise of the marker's heading", above=True)
     residual_position_sigma: float = number(
-        0.0,
-        "m",
-        0.0,
-        10.0,
-        "additional error forward and left, such as of calibration",
+        0.0, "m", 0.0, 10.0, "additional error forward and left, such as of calibration"
     )
     residual_heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "additional error of the marker's heading")
     range_sigma: float = number(

@@ -7,6 +7,7 @@ from dataclasses import fields
 from typing import Any
 
 from swarm_loc_estimator.common.parameters import NumberSpec, number_specs
+from swarm_loc_estimator.common.yaml_tree import hexadecimal
 from swarm_loc_estimator.swarm.board_file import MAX_BOARD_ID, packaged_platforms
 from swarm_loc_estimator.swarm.ir_board import GAIN_RANGE, IrGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import MAX_ADDRESS, Anchor, Face, FixedCamera, Landmark, UwbDevice
@@ -24,11 +25,6 @@ from swarm_loc_estimator.swarm.swarm_file import (
     RESPONSE,
     START,
 )
-from swarm_loc_estimator.swarm.tree_checks import hexadecimal
-
-SCHEMA_FILE = "swarm.schema.json"  # Name of the schema beside a description
-SCHEMA_COMMENT = f"yaml-language-server: $schema={SCHEMA_FILE}"
-"""First comment of a description, by which editors find the schema."""
 
 Schema = dict[str, Any]
 
@@ -89,10 +85,7 @@ def swarm_schema() -> Schema:
                 "propertyNames": free_names,
             },
             "landmarks": _section("static markers, by marker id", named={"^[0-9]+$": landmark}),
-            "cameras": {
-                **_section("fixed cameras", named={_pattern(): camera}),
-                "propertyNames": free_names,
-            },
+            "cameras": {**_section("fixed cameras", named={_pattern(): camera}), "propertyNames": free_names},
             "anchors": {"type": ["array", "null"], "items": anchor, "description": "fixed radios"},
             "map": {"type": ["string", "null"], "minLength": 1, "description": "map's .yaml; null: none"},
         },

@@ -16,7 +16,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 from swarm_loc_estimator.common.parameters import number, number_specs
-from swarm_loc_estimator.common.yaml_tree import Tree
+from swarm_loc_estimator.common.yaml_tree import Tree, TreeChecks
 from swarm_loc_estimator.swarm.error_models import (
     TURN,
     ClockModel,
@@ -27,7 +27,6 @@ from swarm_loc_estimator.swarm.error_models import (
     RandomWalk,
     SensorModel,
 )
-from swarm_loc_estimator.swarm.tree_checks import TreeChecks
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Reader of swarm descriptions: `swarm.yaml` to `Swarm`.
+"""Swarm descriptions: read `swarm.yaml` to a `Swarm`, and write one.
 
 ```yaml
 fileversion: 1
@@ -43,6 +43,7 @@ anchors:                  # UWB radios, see doc/uwb.md
 map: floor.yaml           # walls that lidars see, as of map_server, from here; null or left out: none
 ```
 Numbers, units, ranges and defaults are those of the classes in `swarm/swarm.py`.
+When a description is written, values common to all robots of a type are written with the type.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from swarm_loc_estimator.common.parameters import UserError, number_specs
-from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
+from swarm_loc_estimator.common.yaml_tree import Numbers, Tree, TreeChecks, YamlTreeError, nearest, read_tree
 from swarm_loc_estimator.swarm.board_file import IrSection, Values
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import (
@@ -81,12 +82,24 @@ from swarm_loc_estimator.swarm.swarm import (
     uwb_device,
     uwb_layer,
 )
-from swarm_loc_estimator.swarm.tree_checks import Numbers, TreeChecks, nearest
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping
+import textwrap
+from dataclasses import asdict
+from os.path import relpath
+
+from swarm_loc_estimator.common.yaml_tree import tree_text
+from swarm_loc_estimator.swarm.board_file import ir_tree
+from swarm_loc_estimator.swarm.swarm import Anchor, UwbDevice
+
+if TYPE_CHECKING:
+    from collections.abc import Iterable
 
 FILE_VERSION = 1
+SCHEMA_FILE = "swarm.schema.json"  # Name of the schema beside a description
+SCHEMA_COMMENT = f"yaml-language-server: $schema={SCHEMA_FILE}"
+"""First comment of a description, by which editors find the schema."""
 
 _SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors", "map")
 LAYER = (
@@ -117,25 +130,11 @@ RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
 MAX_ID = 2**32 - 1
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 MAX_NAME = 64  # Maximum length of a robot name; DDS limits the length of topic names
-RESERVED_NAMES = frozenset(
-    [
-        "aerial",
-        "clock",
-        "diagnostics",
-        "estimator",
-        "map",
-        "mapper",
-        "odom",
-        "parameter_events",
-        "player",
-        "rosout",
-        "swarm",
-        "tf",
-        "tf_static",
-        "visitation",
-        "watch",
-    ]
+_RESERVED = (
+    *("aerial", "clock", "diagnostics", "estimator", "map", "mapper", "odom", "parameter_events"),
+    *("player", "rosout", "swarm", "tf", "tf_static", "visitation", "watch"),
 )
+RESERVED_NAMES = frozenset(_RESERVED)
 """Names of topics, nodes and frames that a robot's namespace must not collide with."""
 MAX_ROBOTS = 5000  # Maximum number of robots; larger swarms have not been tested
 MAX_PARAMETERS = 10_000
@@ -219,7 +218,6 @@ class _Loader(TreeChecks):
         return swarm
 
     def _map(self, name: Tree) -> Path | None:
-        """Parse the path of a map."""
         if name is not None and (not isinstance(name, str) or not name):
             raise self.error("map", name, "must be the path of a map's .yaml file, from here")
         return None if name is None else (self._folder / name).resolve()
@@ -251,7 +249,6 @@ class _Loader(TreeChecks):
         )
 
     def _layer(self, tree: Tree, key: str, known: Collection[str], *, of_robot: bool = False) -> _Layer:
-        """Parse the settings of one layer."""
         mapping = self.mapping(tree, key, known)
         sections: dict[str, Values | None] = {
             section: None
@@ -283,7 +280,6 @@ class _Loader(TreeChecks):
         return place
 
     def _fixed_camera(self, name: str, tree: Tree) -> FixedCamera:
-        """Parse one fixed camera."""
         key, specs = f"cameras.{name}", number_specs(FixedCamera)
         pose: Any = self.numbers(tree, key, specs, ("x", "y", "z"), ("sensor",))
         sensor: Any = self.numbers(tree.get("sensor"), f"{key}.sensor", number_specs(SensorModel))
@@ -297,20 +293,12 @@ class _Loader(TreeChecks):
         for name in RESPONSE:
             if name not in mapping:
                 raise self.said(f"{key} lacks {name}, a list of numbers")
-        axes = {
-            name: self.list_of_numbers(mapping[name], f"{key}.{name}") for name in ("speeds", "turn_rates")
-        }
-        tables = {
-            name: tuple(
-                self.list_of_numbers(row, f"{key}.{name}[{index}]")
-                for index, row in enumerate(self.items(mapping[name], f"{key}.{name}"))
-            )
-            for name in ("speed_share", "turn_share")
-        }
+        lists: Values = {name: self.list_of_numbers(mapping[name], f"{key}.{name}") for name in RESPONSE[:2]}
+        for name in RESPONSE[2:]:
+            rows = enumerate(self.items(mapping[name], f"{key}.{name}"))
+            lists[name] = tuple(self.list_of_numbers(row, f"{key}.{name}[{index}]") for index, row in rows)
         try:
-            return MotionResponse(
-                axes["speeds"], axes["turn_rates"], tables["speed_share"], tables["turn_share"]
-            )
+            return MotionResponse(**lists)
         except MotionResponseError as error:
             raise self.said(f"{key.removesuffix('response')}{error}".removesuffix(".")) from error
 
@@ -353,7 +341,6 @@ class _Loader(TreeChecks):
         return (float(numbers["x"] or 0.0), float(numbers["y"] or 0.0), float(numbers["theta"] or 0.0))
 
     def _marker_id(self, value: Tree, key: str) -> int:
-        """Parse a marker id."""
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
             raise self.error(key, value, f"must be a marker id, a whole number in [0, {MAX_ID}]")
         return value
@@ -363,17 +350,13 @@ class _Loader(TreeChecks):
         mapping = self.mapping(tree, key)
         for name in mapping:
             if not isinstance(name, str) or not NAME.fullmatch(name):
-                raise self.error(
-                    f"a name in {key}",
-                    name,
-                    "must be letters, digits and underscores and start with a letter",
-                )
+                rule = "must be letters, digits and underscores and start with a letter"
+                raise self.error(f"a name in {key}", name, rule)
             if len(name) > MAX_NAME:
                 raise self.error(f"a name in {key}", name, f"must have at most {MAX_NAME} characters")
             if key in ("robots", "cameras") and name in RESERVED_NAMES:
-                rule = ", ".join(sorted(RESERVED_NAMES))
-                rule = f"must be none of {rule}, which topics, nodes and frames have"
-                raise self.error(f"a name in {key}", name, rule)
+                rule = f"must be none of {', '.join(sorted(RESERVED_NAMES))}"
+                raise self.error(f"a name in {key}", name, f"{rule}, which topics, nodes and frames have")
         return list(mapping.items())
 
 
@@ -385,3 +368,147 @@ def _said(layers: Iterable[_Layer], section: str) -> Values | None:
             said = layer.sections[section]
             values = None if said is None else {**(values or {}), **said}
     return values
+
+
+_WHOLE = frozenset({"camera", "faces", "response"})
+Entries = dict[Any, Any]
+
+
+def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
+    """Write a swarm description that `load_swarm` reads back equal.
+
+    Its first line names the JSON Schema if that lies beside it, so that editors complete its keys.
+
+    Args:
+        swarm: What to write.
+        path: The file; replaced when it exists, its folder created when missing.
+        comment: Comment lines for the top of the file.
+
+    Raises:
+        SwarmFileError: It has numbers that `load_swarm` refuses; nothing is written.
+    """
+    path = Path(path)
+    tree = _tree(swarm, path.parent)
+    parse_swarm(tree, path)
+    schema = [SCHEMA_COMMENT] if (path.parent / SCHEMA_FILE).is_file() else []
+    text = "".join(f"# {line}\n" for line in [*schema, *comment.splitlines(), *_units()])
+    text += tree_text(tree)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)
+
+
+def _units() -> list[str]:
+    """One comment per group of numbers, with the unit of each."""
+    groups = {**MODELS, "uwb": UwbDevice, "faces": Face, "landmarks": Landmark}
+    groups |= {"cameras": FixedCamera, "anchors": Anchor}
+    lines = ["Units:"]
+    for name, cls in groups.items():
+        units = ", ".join(f"{key} [{spec.unit}]" for key, spec in number_specs(cls).items())
+        lines += textwrap.wrap(f"{name}: {units}", 100, initial_indent="  ", subsequent_indent="      ")
+    return lines
+
+
+def _tree(swarm: Swarm, folder: Path) -> Entries:
+    """The content of a file in a folder."""
+    types: Entries = {}
+    for robot in swarm.robots:
+        if robot.type and robot.type not in types:
+            alike = [_layer(other, folder) for other in swarm.robots if other.type == robot.type]
+            types[robot.type] = _shared(alike)
+    robots = {robot.name: _robot(robot, types.get(robot.type, {}), folder) for robot in swarm.robots}
+    landmarks = {mark.id: _numbers(mark, keep=("x", "y")) for mark in swarm.landmarks}
+    defaults = _taken_out(LANDMARK_DEFAULTS, list(landmarks.values()))
+    anchors = [{"address": one.address, **_numbers(one, keep=("x", "y"))} for one in swarm.anchors]
+    cameras = {one.name: _numbers(one, keep=("x", "y", "z")) for one in swarm.cameras}
+    for one in swarm.cameras:
+        if sensor := _numbers(one.sensor):
+            cameras[one.name]["sensor"] = sensor
+    tree = {
+        "fileversion": FILE_VERSION,
+        "defaults": {"landmark": defaults} if defaults else {},
+        "types": types,
+        "robots": robots,
+        "landmarks": landmarks,
+        "cameras": cameras,
+        "anchors": anchors,
+        "map": None if swarm.map is None else relpath(swarm.map, folder),
+    }
+    return {key: value for key, value in tree.items() if value}
+
+
+def _taken_out(names: Iterable[str], entries: list[Entries]) -> Entries:
+    """Those of the named values that all entries share, taken out of them."""
+    shared = {name: entries[0][name] for name in names if entries and name in entries[0]}
+    shared = {name: value for name, value in shared.items() if all(e.get(name) == value for e in entries)}
+    for entry in entries:
+        for name in shared:
+            del entry[name]
+    return shared
+
+
+def _numbers(model: Any, keep: tuple[str, ...] = ()) -> Entries:
+    """The numbers of a dataclass that differ from its defaults."""
+    values = asdict(model)
+    defaults = {name: type(model).__dataclass_fields__[name].default for name in number_specs(type(model))}
+    return {name: values[name] for name in defaults if values[name] != defaults[name] or name in keep}
+
+
+def _layer(robot: Robot, folder: Path) -> Entries:
+    """Everything about a robot that a type can say, as far as it differs from the defaults."""
+    layer: Entries = {section: _numbers(getattr(robot, section)) for section in MODELS if section != "camera"}
+    response = {} if robot.response is None else asdict(robot.response)
+    layer["response"] = {name: _listed(value) for name, value in response.items()}
+    layer["camera"] = None if robot.camera is None else _numbers(robot.camera)
+    if robot.stands:
+        layer["odometry"] = None
+    layer["ir"] = {} if robot.ir is None else ir_tree(robot.ir, folder)
+    layer["uwb"] = {} if robot.uwb is None else _numbers(robot.uwb)
+    layer["faces"] = {
+        face.name: _numbers(face) | ({"lies": True} if face.lies else {}) for face in robot.faces
+    }
+    return layer
+
+
+def _listed(value: Any) -> Any:
+    """Tuples as lists, which YAML has."""
+    return [_listed(item) for item in value] if isinstance(value, tuple) else value
+
+
+def _shared(layers: list[Entries]) -> Entries:
+    """What all robots of a type have in common; cameras and faces as a whole, the rest number by number."""
+    shared: Entries = {}
+    for section, first in layers[0].items():
+        if section in _WHOLE or any(layer[section] is None for layer in layers):
+            if all(layer[section] == first for layer in layers):
+                shared[section] = first
+        else:
+            shared[section] = {
+                name: value
+                for name, value in first.items()
+                if all(layer[section].get(name) == value for layer in layers)
+            }
+    return {section: value for section, value in shared.items() if value != {}}
+
+
+def _robot(robot: Robot, shared: Entries, folder: Path) -> Entries:
+    """A robot without what its type says."""
+    entry: Entries = {"type": robot.type} if robot.type else {}
+    for section, value in _layer(robot, folder).items():
+        rest = value
+        if section in shared:
+            same = value == shared[section]
+            whole = section in _WHOLE
+            rest = {} if same or whole else {k: v for k, v in value.items() if k not in shared[section]}
+        if rest != {}:
+            entry[section] = rest
+    if robot.ir is not None:
+        entry["ir"] = {"id": robot.ir.id, **entry.get("ir", {})}
+    if robot.uwb is not None:
+        entry["uwb"] = {"address": robot.uwb.address, **entry.get("uwb", {})}
+    if robot.faces:
+        entry["ids"] = {face.name: face.id for face in robot.faces}
+    if robot.start is not None:
+        entry["start"] = dict(zip(("x", "y", "theta"), robot.start, strict=True))
+    return entry

@@ -17,8 +17,7 @@ from swarm_loc_estimator.common.yaml_tree import read_tree
 from swarm_loc_estimator.swarm import swarm_file
 from swarm_loc_estimator.swarm.schema import SCHEMA_FILE, schema_text, swarm_schema
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_file import MODELS, SwarmFileError, load_swarm, parse_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import MODELS, SwarmFileError, load_swarm, parse_swarm, save_swarm
 
 ROOT = Path(__file__).parents[3]
 WRITTEN = ROOT / "swarm_loc_estimator" / "doc" / SCHEMA_FILE

@@ -21,8 +21,7 @@ from swarm_loc_estimator.swarm.error_models import (
 )
 from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, StartSigma, Swarm
-from swarm_loc_estimator.swarm.swarm_file import RESERVED_NAMES, load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import RESERVED_NAMES, load_swarm, save_swarm
 
 RESPONSE = MotionResponse(
     (0.0, 0.1), (0.0, 0.5, 1.0), ((1.0, 0.9, 0.9), (1.0, 0.8, 0.7)), ((1.0, 0.9, 0.8),) * 2

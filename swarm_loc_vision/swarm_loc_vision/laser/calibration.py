@@ -24,8 +24,7 @@ from scipy.optimize import least_squares
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number, number_specs
-from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
-from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
+from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, YamlTreeError, read_tree
 
 MIN_SAMPLES = 50
 _MIN_SPREAD = 2.0

@@ -42,7 +42,7 @@ from swarm_loc_estimator.common.messages.poses import (
     encode_pose_stamped,
 )
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 FAMILY = 0  # MarkerDetection.FAMILY_ARTOOLKIT_BCH
 TRUTH_PERIOD_NS = 100_000_000

@@ -292,12 +292,7 @@ def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> Factor:
 
 @cached_njit
 def _eliminate(
-    factor: Factor,
-    prior: Prior,
-    measured: Information,
-    order: IntArray,
-    begin: IntArray,
-    looser: float,
+    factor: Factor, prior: Prior, measured: Information, order: IntArray, begin: IntArray, looser: float
 ) -> None:
     """Write a factor; the measured blocks of front f are order[begin[f]:begin[f + 1]]."""
     pattern = factor.pattern

@@ -37,7 +37,7 @@ from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.error_models import RandomWalk
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, RobotIr
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 ROBOT_TYPE = "droplet"
 DIAMETER_M = 0.044
