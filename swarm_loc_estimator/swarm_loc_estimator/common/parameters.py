@@ -96,8 +96,7 @@ class ParameterSpec:
             raise ParameterError(f"parameter {self.name} = '{value}' must be one of {self.range_text}.")
         if self.required and value == "":
             raise ParameterError(f"parameter {self.name} is not set: {self.doc}.")
-        checked: Value = value
-        return checked
+        return value
 
     @property
     def _type_text(self) -> str:

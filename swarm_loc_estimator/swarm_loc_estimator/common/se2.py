@@ -119,8 +119,7 @@ def error_covariance(pose: ArrayLike, covariance: ArrayLike) -> FloatArray:
     """Covariances (..., 3, 3) of the right-invariant error from those of x, y, theta."""
     jacobian = error_to_pose_jacobian(pose)
     jacobian[..., :2, 2] *= -1.0  # the inverse: a shear with the opposite sign
-    error: FloatArray = jacobian @ np.asarray(covariance, dtype=float) @ np.swapaxes(jacobian, -1, -2)
-    return error
+    return np.asarray(jacobian @ np.asarray(covariance, dtype=float) @ np.swapaxes(jacobian, -1, -2))
 
 
 def _arc_coefficients(phi: FloatArray) -> tuple[FloatArray, FloatArray]:

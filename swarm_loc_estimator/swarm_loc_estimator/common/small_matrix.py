@@ -123,8 +123,7 @@ def invert_factor(numbers: FloatArray, size: int) -> bool:
 @cache
 def _plan(size: int) -> IntArray:
     """The steps (s, 3) that invert the factor of a matrix: which, the first row, number of rows."""
-    steps: IntArray = np.array(_steps(0, size), dtype=np.int64).reshape(-1, 3)
-    return steps
+    return np.array(_steps(0, size), dtype=np.int64).reshape(-1, 3)
 
 
 def _steps(begin: int, rows: int) -> list[tuple[int, int, int]]:

@@ -98,7 +98,9 @@ def estimate_gains(
         progress(f"gains, round {number + 1}")
         logs, covariances, moved = _improved(platform, exchanges, logs, poses, used)
         poses, used = _poses(estimator, exchanges, _pairs(exchanges, logs, _SEARCH_SIGMA))
-        used = _without_worst(_residuals(platform, exchanges, logs, poses, used), used)
+        # leave out the few exchanges that fit far worse than most
+        squares = np.nanmean(_residuals(platform, exchanges, logs, poses, used)[used] ** 2, axis=(1, 2, 3))
+        used[np.flatnonzero(used)] = squares <= _WORST * max(float(np.median(squares)), 1.0)
         if moved < _STILL:
             break
     after = _residuals(platform, exchanges, logs, poses, used)
@@ -138,7 +140,7 @@ def _poses(
         GainsError: No pose is reliable.
     """
     solutions = estimator.solve(exchanges.readings, pairs, exchanges.saturation)
-    known = _known(exchanges)
+    known = np.isfinite(exchanges.poses[:, 0])
     sure = (solutions.odds < _MAX_ODDS) & (solutions.misfits < _MAX_MISFIT)
     found = solutions.outcomes == IrOutcome.FOUND
     used = np.asarray(found & (known | sure))
@@ -158,12 +160,6 @@ def _apart(poses: FloatArray, others: FloatArray) -> FloatArray:
     return apart
 
 
-def _known(exchanges: Exchanges) -> NDArray[np.bool_]:
-    """(k,) whether the pose is known."""
-    known: NDArray[np.bool_] = np.isfinite(exchanges.poses[:, 0])
-    return known
-
-
 def _residuals(
     platform: IrPlatform, exchanges: Exchanges, logs: FloatArray, poses: FloatArray, used: NDArray[np.bool_]
 ) -> FloatArray:
@@ -172,14 +168,6 @@ def _residuals(
     residuals = np.full(exchanges.readings.shape, np.nan)
     residuals[used] = np.where(linear.weight > 0.0, linear.residual * np.sqrt(linear.weight), np.nan)
     return residuals
-
-
-def _without_worst(residuals: FloatArray, used: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """The used exchanges without the few that fit far worse than most."""
-    kept: NDArray[np.bool_] = used.copy()
-    squares = np.nanmean(residuals[used] ** 2, axis=(1, 2, 3))
-    kept[used] = squares <= _WORST * max(float(np.median(squares)), 1.0)
-    return kept
 
 
 class _Linear(NamedTuple):
@@ -194,7 +182,6 @@ class _Linear(NamedTuple):
 def _linearized(
     platform: IrPlatform, exchanges: Exchanges, logs: FloatArray, poses: FloatArray, used: NDArray[np.bool_]
 ) -> _Linear:
-    """Linearize the readings of the exchanges used."""
     pairs = PairGains(*(values[used] for values in _pairs(exchanges, logs, 0.0)))
     expected, slopes = expected_with_slopes(platform, poses[used], pairs)
     readings, limit = exchanges.readings[used], exchanges.saturation[used][..., None, None]

@@ -128,7 +128,6 @@ def _solve_at(
     out: IrSolutions,
     k: int,
 ) -> None:
-    """Solve pair k."""
     pair = Pair(
         readings[k],
         work.cut,
@@ -160,6 +159,7 @@ def _solve_one(
     models: Models, saturation: FloatArray, pair: Pair, work: Workspace, out: IrSolutions, k: int
 ) -> int:
     """Solve one pair; returns the outcome."""
+    # enough readings, and brighter than noise
     measured, saturated, bright = classify(models.exact, saturation, pair)
     if measured < _FEWEST:
         return _UNDETERMINED if saturated > 0 else _TOO_FEW
@@ -167,11 +167,13 @@ def _solve_one(
     faintest = _FAINTEST_OF_OUTLIERS if two_sided else _FAINTEST
     if bright < measured + faintest * math.sqrt(2.0 * measured):
         return _TOO_WEAK
+    # the best two minima of the negative log likelihood
     write_costs(models.exact.errors, pair)
     _find_minima(models, pair, work, measured)
     if two_sided:
         _weigh_minima(models.exact, pair, work)
     best, other = work.minima[0], work.minima[1]
+    # the covariance at the best one, and whether it explains the readings
     covariance, odds = work.covariance, math.exp(best[3] - other[3])
     determined = pose_covariance(models.exact, pair, work.best, work.full, covariance)
     misfit = work.full.tally[0] / max(work.full.tally[1], 1.0)
@@ -179,6 +181,7 @@ def _solve_one(
         return _MISFIT
     if not determined:
         return _UNDETERMINED
+    # larger where the fit is bad, or where the pose may be the other minimum, or any other one
     share = 0.0 if two_sided else odds / (1.0 + odds)
     for p in range(3):
         for q in range(3):
@@ -189,6 +192,7 @@ def _solve_one(
             return _UNDETERMINED
     elif max(covariance[1, 1], covariance[2, 2]) > models.exact.scale * _WIDEST * _WIDEST:
         return _UNDETERMINED
+    # write the solution
     out.misfits[k], out.odds[k] = misfit, odds
     assign(out.systematic_share[k], work.full.of_gains)
     assign_matrix(out.covariances[k], covariance)

@@ -118,42 +118,25 @@ TABLE_STARTS = 3  # Maximum number of starts from the table
 
 
 class Workspace(NamedTuple):
-    """Memory of one search, reused for all pairs.
+    """Memory of one search, reused for all pairs."""
 
-    Attributes:
-        plain: Workspace for a search over the pose only.
-        full: Workspace that includes the gains where they are unknown, else `plain`.
-        start: Workspace of the search for starts.
-        starts: (S, 4) range, bearing, heading, misfit.
-        pattern: (F,) compressed readings.
-        present: (F,) 1 where there is a reading, else 0.
-        cut, stable, kinds: (F,) of `Pair`.
-        exact, soft: Likelihoods of the readings for the exact and the blurred model.
-        prior: (2, 2) of `Pair`.
-        minima: (2, 4) range, bearing, heading and cost of the best two distinct minima.
-        best: (P,) the best minimum with its gains.
-        found: (P,) another minimum.
-        first: (4,) the table's best start.
-        covariance: (3, 3) pose covariance at a minimum.
-    """
-
-    plain: CostWorkspace
-    full: CostWorkspace
-    start: StartWorkspace
-    starts: FloatArray
-    pattern: Float32Array
-    present: Float32Array
-    cut: FloatArray
-    stable: FloatArray
-    kinds: NDArray[np.int8]
-    exact: Costs
-    soft: Costs
-    prior: FloatArray
-    minima: FloatArray
-    best: FloatArray
-    found: FloatArray
-    first: FloatArray
-    covariance: FloatArray
+    plain: CostWorkspace  # For a search over only the pose
+    full: CostWorkspace  # Includes the gains where they are unknown, else `plain`
+    start: StartWorkspace  # Of the search for starts
+    starts: FloatArray  # (S, 4) range, bearing, heading, misfit
+    pattern: Float32Array  # (F,) compressed readings
+    present: Float32Array  # (F,) 1 where there is a reading, else 0
+    cut: FloatArray  # (F,) of `Pair`
+    stable: FloatArray  # (F,) of `Pair`
+    kinds: NDArray[np.int8]  # (F,) of `Pair`
+    exact: Costs  # Likelihoods of the readings for the exact model
+    soft: Costs  # Likelihoods of the readings for the blurred model
+    prior: FloatArray  # (2, 2) of `Pair`
+    minima: FloatArray  # (2, 4) range, bearing, heading and cost of the best two distinct minima
+    best: FloatArray  # (P,) the best minimum with its gains
+    found: FloatArray  # (P,) another minimum
+    first: FloatArray  # (4,) the table's best start
+    covariance: FloatArray  # (3, 3) pose covariance at a minimum
 
 
 @cached_njit

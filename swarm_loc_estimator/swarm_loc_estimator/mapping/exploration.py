@@ -35,8 +35,7 @@ class PlanningGrid(NamedTuple):
 
     def point(self, index: tuple[int, int]) -> FloatArray:
         """Centre (2,) of a cell [m]."""
-        middle: FloatArray = self.corner + (np.array(index) + 0.5) * self.cell
-        return middle
+        return self.corner + (np.array(index) + 0.5) * self.cell
 
 
 def planning_grid(
@@ -226,8 +225,7 @@ def _candidates(length: FloatArray, cell: float) -> IntArray:
     step = round(_LATTICE / cell)
     on_lattice = far[(far % step == 0).all(axis=1)]
     cells = on_lattice if len(on_lattice) else np.argwhere(reached & (length > 1.0))
-    chosen: IntArray = cells[np.linspace(0, len(cells) - 1, min(len(cells), _CANDIDATES)).astype(int)]
-    return chosen
+    return np.asarray(cells[np.linspace(0, len(cells) - 1, min(len(cells), _CANDIDATES)).astype(int)])
 
 
 def first_hop(

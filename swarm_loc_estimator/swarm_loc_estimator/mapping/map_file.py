@@ -130,8 +130,7 @@ def _resampled(log_odds: FloatArray, scale: float, checks: TreeChecks) -> FloatA
         np.minimum(((np.arange(count) + 0.5) * scale).astype(np.int64), size - 1)
         for count, size in zip((height, width), log_odds.shape, strict=True)
     )
-    resampled: FloatArray = log_odds[::-1][rows][::-1][:, columns]
-    return resampled
+    return np.asarray(log_odds[::-1][rows][::-1][:, columns])
 
 
 def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:

@@ -89,32 +89,20 @@ class LightMessage(NamedTuple):
 
 
 def decode_laser(data: bytes) -> LaserMessage:
-    """Read a swarm_loc_msgs/LaserDistance.
-
-    Raises:
-        CdrError: The bytes are not one.
-    """
+    """Read a swarm_loc_msgs/LaserDistance; raises CdrError unless the bytes are a whole one."""
     message = decode(data, LASER)
     return LaserMessage(nanoseconds(message.header.stamp), message.distance, message.sigma, message.v_px)
 
 
 def decode_scan(data: bytes) -> ScanMessage:
-    """Read a sensor_msgs/LaserScan.
-
-    Raises:
-        CdrError: The bytes are not one.
-    """
+    """Read a sensor_msgs/LaserScan; raises CdrError unless the bytes are a whole one."""
     message = decode(data, LASER_SCAN)
     numbers = {name: float(getattr(message, name)) for name in ScanMessage._fields[1:-1]}
     return ScanMessage(nanoseconds(message.header.stamp), **numbers, ranges=message.ranges.astype(float))
 
 
 def decode_lights(data: bytes) -> list[LightMessage]:
-    """Read a swarm_loc_msgs/LightBearingArray; lights with non-finite numbers are skipped.
-
-    Raises:
-        CdrError: The bytes are not one.
-    """
+    """Read a swarm_loc_msgs/LightBearingArray without lights of non-finite numbers; raises CdrError unless whole."""
     message = decode(data, LIGHTS)
     lights, stamp_ns = message.lights, nanoseconds(message.header.stamp)
     columns = lights["frequency"], lights["bearing"], np.sqrt(np.maximum(0.0, lights["covariance"][:, 0]))

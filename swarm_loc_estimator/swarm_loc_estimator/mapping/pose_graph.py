@@ -148,8 +148,7 @@ def slips(count: int, slip: FloatArray, usual: float, sigma: float) -> Linearise
 
 def _unknowns(stop: IntArray, count: int) -> IntArray:
     """Indices (m, count) of the first unknowns of stops (m,)."""
-    index: IntArray = STOP_UNKNOWNS * stop[:, None] + np.arange(count)
-    return index
+    return STOP_UNKNOWNS * stop[:, None] + np.arange(count)
 
 
 _DAMPING = 1e-6
@@ -228,8 +227,7 @@ class NormalFactor:
         for number, direction in enumerate(chosen):
             np.add.at(columns[:, number], self._place[index], direction)
         covariance: NDArray[np.float64] = columns.T @ self._factor.solve(columns)
-        symmetric: FloatArray = 0.5 * (covariance + covariance.T)
-        return symmetric
+        return np.asarray(0.5 * (covariance + covariance.T))
 
 
 _Row = tuple[int, int, FloatArray]
@@ -357,8 +355,7 @@ class PoseGraph:
     @property
     def sees_walls(self) -> BoolArray:
         """(count,) whether walls that scans can be matched with were seen from each stop."""
-        seen: BoolArray = self._lines.usable[: self.count].sum(axis=1) >= _MIN_SEEN_BINS
-        return seen
+        return np.asarray(self._lines.usable[: self.count].sum(axis=1) >= _MIN_SEEN_BINS)
 
     def is_sweep(self, stop: int) -> bool:
         """Whether a stop is a sweep of a lidar."""
@@ -449,8 +446,7 @@ class PoseGraph:
     def distances(self, stop: int) -> FloatArray:
         """Distances (count,) of all stops from one stop [m]."""
         off = self.states[: self.count, :2] - self.states[stop, :2]
-        distances: FloatArray = np.hypot(off[:, 0], off[:, 1])
-        return distances
+        return np.hypot(off[:, 0], off[:, 1])
 
     def neighbours(self, stop: int, limit: int, least: float) -> list[int]:
         """The nearest stops in range whose lines overlap at least the share `least` of a stop's beams."""

@@ -18,8 +18,8 @@ from swarm_loc_estimator.swarm.new_swarm import (
     SwarmPlan,
     planned_swarm,
 )
-from swarm_loc_estimator.swarm.schema import SCHEMA_FILE, schema_text
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.schema import schema_text
+from swarm_loc_estimator.swarm.swarm_file import SCHEMA_FILE, load_swarm
 
 
 def sensor_sets(name: str) -> list[tuple[str, ...]]:

@@ -61,7 +61,6 @@ _STEP = 1 << 20
 class Chunk:
     """Where a run of messages lies, and how to unpack it."""
 
-    record: int  # Where its record begins
     offset: int  # Where its content begins
     stored: int  # How long that is
     first_ns: int  # Log time of its first message
@@ -95,9 +94,7 @@ def parse_chunk(head: bytes, begin: int, length: int, *, whole: bool) -> Chunk |
     (stored,) = _LENGTH.unpack_from(head, behind_name)
     data = behind_name + _LENGTH.size
     stored = min(stored, length - data)
-    return Chunk(
-        begin - RECORD.size, begin + data, stored, first_ns, last_ns, compression, size, checksum, whole
-    )
+    return Chunk(begin + data, stored, first_ns, last_ns, compression, size, checksum, whole)
 
 
 def unpack(stored: bytes, chunk: Chunk) -> bytes:
@@ -173,7 +170,12 @@ _DEFINITIONS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_I
 
 
 class McapFile:
-    """One open MCAP file; see `BagFile`."""
+    """One open MCAP file.
+
+    Attributes:
+        message_count: Number of messages, as far as they can be counted before reading.
+        losses: What could not be read; more may come while reading.
+    """
 
     def __init__(self, path: Path) -> None:
         """Open it.
@@ -211,7 +213,7 @@ class McapFile:
 
     @property
     def time_range_ns(self) -> tuple[int, int]:
-        """First and last log time."""
+        """First and last log time; (0, 0) without messages."""
         chunks = [chunk for chunk in self._chunks if chunk.last_ns]
         if not chunks:
             return 0, 0
@@ -288,7 +290,6 @@ class McapFile:
         return offset
 
     def _note(self, opcode: int, begin: int, length: int) -> None:
-        """Record a top-level record."""
         if opcode == Opcode.CHUNK:
             self._note_chunk(begin, length, whole=True)
         elif opcode == Opcode.MESSAGE:
@@ -317,7 +318,7 @@ class McapFile:
             last.stored = end - last.offset
             last.first_ns, last.last_ns = min(last.first_ns, log_ns), max(last.last_ns, log_ns)
             return
-        self._chunks.append(Chunk(offset, offset, end - offset, log_ns, log_ns, is_run=True))
+        self._chunks.append(Chunk(offset, end - offset, log_ns, log_ns, is_run=True))
 
     def _define(self, opcode: int, content: bytes) -> None:
         """A schema, a channel, the statistics or an entry of the index; damaged ones define nothing."""

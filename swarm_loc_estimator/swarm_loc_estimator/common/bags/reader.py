@@ -28,7 +28,7 @@ from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import parse_qos
 from typing_extensions import Self
 
-from swarm_loc_estimator.common.bags.bag_file import BagFile, BagTopic, RawMessage
+from swarm_loc_estimator.common.bags.bag_file import BagTopic, RawMessage
 from swarm_loc_estimator.common.bags.mcap_file import McapFile
 from swarm_loc_estimator.common.bags.sqlite_file import SqliteFile
 from swarm_loc_estimator.common.health import listed
@@ -130,7 +130,8 @@ def _unpacked_message(data: bytes) -> bytes | None:
 
 __all__ = ["BagError", "BagReader", "BagTopic", "RawMessage"]
 
-_STORAGES: dict[str, type[McapFile | SqliteFile]] = {".mcap": McapFile, ".db3": SqliteFile}
+BagFile = McapFile | SqliteFile
+_STORAGES: dict[str, type[BagFile]] = {".mcap": McapFile, ".db3": SqliteFile}
 _METADATA_BYTES = 20_000_000
 """Larger metadata are not read; the three thousand topics of a thousand robots take a tenth of it."""
 _ENCODINGS = ("cdr", "")

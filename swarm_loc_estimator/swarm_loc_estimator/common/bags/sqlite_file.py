@@ -35,7 +35,7 @@ CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGE
 
 
 class SqliteFile:
-    """One open sqlite3 bag file; see `BagFile`."""
+    """One open sqlite3 bag file; its attributes are those of `McapFile`."""
 
     def __init__(self, path: Path) -> None:
         """Open it.

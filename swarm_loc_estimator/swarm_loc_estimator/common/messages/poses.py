@@ -84,11 +84,7 @@ def planar_pose(pose: Any) -> tuple[float, float, float]:
 
 
 def decode_odometry(data: bytes) -> OdometryMessage:
-    """Read a nav_msgs/Odometry.
-
-    Raises:
-        CdrError: The bytes are not one whole message.
-    """
+    """Read a nav_msgs/Odometry; raises CdrError unless the bytes are a whole one."""
     message = decode(data, ODOMETRY)
     header, pose, twist = message.header, message.pose, message.twist.twist
     return OdometryMessage(
@@ -102,21 +98,13 @@ def decode_odometry(data: bytes) -> OdometryMessage:
 
 
 def decode_pose_stamped(data: bytes) -> PoseMessage:
-    """Read a geometry_msgs/PoseStamped.
-
-    Raises:
-        CdrError: The bytes are not one whole message.
-    """
+    """Read a geometry_msgs/PoseStamped; raises CdrError unless the bytes are a whole one."""
     message = decode(data, POSE_STAMPED)
     return PoseMessage(nanoseconds(message.header.stamp), message.header.frame_id, planar_pose(message.pose))
 
 
 def decode_fix(data: bytes) -> FixMessage:
-    """Read a geometry_msgs/PoseWithCovarianceStamped.
-
-    Raises:
-        CdrError: The bytes are not one whole message.
-    """
+    """Read a geometry_msgs/PoseWithCovarianceStamped; raises CdrError unless the bytes are a whole one."""
     message = decode(data, POSE_WITH_COVARIANCE)
     header, pose = message.header, message.pose
     covariance = pose.covariance.reshape(6, 6)[PLANE]

@@ -400,8 +400,7 @@ def _gabriel(places: FloatArray) -> IntArray:
     a, b = places[pairs[:, 0]], places[pairs[:, 1]]
     nearest, _ = scipy.spatial.cKDTree(places).query(0.5 * (a + b))
     empty = nearest**2 >= 0.25 * np.sum((a - b) ** 2, axis=1) * (1.0 - 1e-9)
-    gabriel: IntArray = pairs[empty]
-    return gabriel
+    return np.asarray(pairs[empty])
 
 
 def spread(places: FloatArray, count: int) -> IntArray:
@@ -433,8 +432,7 @@ class Situation(NamedTuple):
 
     def near(self) -> IntArray:
         """Pairs (k, 2) of near bodies."""
-        pairs: IntArray = self.bodies[near_pairs(self.places[self.bodies])]
-        return pairs
+        return self.bodies[near_pairs(self.places[self.bodies])]
 
     def pattern(self, order: Order, near: IntArray) -> Pattern:
         """The pattern that contains all pairs."""

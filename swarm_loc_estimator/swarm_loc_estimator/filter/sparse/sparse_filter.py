@@ -527,8 +527,7 @@ class SparseFilter:
         if columns.size == 0:
             return np.zeros((0, 0))
         body, own = self._groups.columns(columns)
-        covariance: FloatArray = self.marginal[body][np.ix_(own, own)]
-        return covariance
+        return np.asarray(self.marginal[body][np.ix_(own, own)])
 
     def prepare_update(self, columns: IntArray, robots: Robots, cross_covariance: FloatArray) -> None:
         """Write the covariances between the bodies of measurements (m,), before an update with them.
