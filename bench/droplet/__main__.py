@@ -31,8 +31,7 @@ from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import Exchanges, estimate_gains
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.search import IrOutcome, IrSolutions
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains, load_ir_platform
 
 CENTIMETRES = (6, 8, 10, 12, 13, 14, 15, 16, 18, 20, 24, 28)
 POSES, LIVE, REPLAYS = 12000, 2, 6

@@ -28,10 +28,9 @@ from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE_TWO, CONTENT_POSITION
 from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import OdometryModel
-from swarm_loc_estimator.swarm.ir_board import RobotIr
+from swarm_loc_estimator.swarm.ir_board import RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.fusion import Fusion

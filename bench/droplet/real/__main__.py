@@ -38,8 +38,7 @@ from swarm_loc_estimator.offline.calibration.infrared.board import (
     turned,
     without_dead,
 )
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrPlatform
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, load_ir_platform
 
 DEFAULT_FOLDER = OUT.parent.parent / "shared" / "data" / "droplet_2016"
 METHODS = ("firmware", "closed_form", "stock", "board")

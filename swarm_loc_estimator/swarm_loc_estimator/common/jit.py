@@ -333,7 +333,6 @@ def _mark(precompile: Callable[[], None]) -> Path:
 
 
 def _functions_of(module: ModuleType) -> Iterator[Any]:
-    """All functions and methods that a module defines."""
     for value in vars(module).values():
         if getattr(value, "__module__", None) == module.__name__:
             for member in vars(value).values() if isinstance(value, type) else [value]:

@@ -544,7 +544,7 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode[Parameters]):
         return TransitionCallbackReturn.SUCCESS
 
     def _take_back(self, level: int) -> TransitionCallbackReturn:
-        """Undo all steps but so many."""
+        """Undo all steps except the first `level`."""
         while len(self._made) > level:
             self._made.pop().close()
         return TransitionCallbackReturn.SUCCESS

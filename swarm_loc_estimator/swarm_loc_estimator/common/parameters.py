@@ -62,6 +62,11 @@ def number_specs(cls: type) -> dict[str, NumberSpec]:
     return {f.name: f.metadata["spec"] for f in fields(cls) if "spec" in f.metadata}
 
 
+def number_values(holder: Any) -> dict[str, Any]:
+    """The values of these numbers of an object."""
+    return {name: getattr(holder, name) for name in number_specs(type(holder))}
+
+
 @dataclass(frozen=True)
 class ParameterSpec:
     """One parameter."""
@@ -89,7 +94,9 @@ class ParameterSpec:
         if isinstance(self.default, tuple) and isinstance(value, list | tuple):
             value = tuple(str(item) for item in value)
         if type(value) is not type(self.default):
-            raise ParameterError(f"parameter {self.name} = {value!r} must be {self._type_text}.")
+            texts = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+            wanted = texts.get(type(self.default), "a list of texts")
+            raise ParameterError(f"parameter {self.name} = {value!r} must be {wanted}.")
         if self.number is not None and isinstance(value, int | float) and not self.number.allows(value):
             raise ParameterError(f"parameter {self.name} = {value} must lie in {self.number.range_text}.")
         if self.choices and value not in self.choices:
@@ -97,12 +104,6 @@ class ParameterSpec:
         if self.required and value == "":
             raise ParameterError(f"parameter {self.name} is not set: {self.doc}.")
         return value
-
-    @property
-    def _type_text(self) -> str:
-        return {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}.get(
-            type(self.default), "a list of texts"
-        )
 
 
 def text(default: str, doc: str, *, required: bool = False) -> Any:

@@ -48,7 +48,7 @@ def add_scaled(target: FloatArray, source: FloatArray, factor: float) -> None:
 
 @inlined_njit
 def factor_numbers(matrix: FloatArray) -> tuple[float, float, float, float, float, float]:
-    """The rows of the lower Cholesky factor of a positive definite matrix (3, 3), one behind the other."""
+    """The rows of the lower Cholesky factor of a positive definite matrix (3, 3), one after the other."""
     a = math.sqrt(matrix[0, 0])
     b = matrix[1, 0] / a
     c = math.sqrt(matrix[1, 1] - b * b)

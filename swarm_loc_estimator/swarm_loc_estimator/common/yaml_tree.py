@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import difflib
+import math
 import re
 import reprlib
 import warnings
+from collections.abc import Iterable, Mapping
 from io import StringIO
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 from ruamel.yaml import YAML
 from ruamel.yaml.constructor import ConstructorError, SafeConstructor
@@ -15,16 +19,7 @@ from ruamel.yaml.nodes import Node, ScalarNode
 from ruamel.yaml.representer import SafeRepresenter
 from ruamel.yaml.resolver import VersionedResolver
 
-from swarm_loc_estimator.common.parameters import UserError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-import difflib
-import math
-from collections.abc import Iterable, Mapping
-from pathlib import Path
-
-from swarm_loc_estimator.common.parameters import NumberSpec
+from swarm_loc_estimator.common.parameters import NumberSpec, UserError
 
 Tree = Any  # dict, list, str, int, float, bool or None
 
@@ -118,7 +113,7 @@ def read_file(path: Path, most_bytes: int) -> bytes:
         YamlTreeError: It cannot be read, is no regular file, or is larger than `most_bytes`.
     """
     try:
-        if path.exists() and not path.is_file():  # opening a pipe would wait for ever
+        if path.exists() and not path.is_file():  # opening a pipe would never return
             raise YamlTreeError(f"{path} cannot be read: it is no regular file.")
         with path.open("rb") as file:
             data = file.read(most_bytes + 1)
@@ -161,6 +156,15 @@ def tree_text(tree: Tree) -> str:
     yaml.default_flow_style = None
     yaml.dump(tree, stream)
     return stream.getvalue()
+
+
+def write_tree(tree: Tree, path: Path, comments: Iterable[str] = ()) -> None:
+    """Write a tree with lines of comments above it, whole or not at all; creates the folder where missing."""
+    text = "".join(f"# {line}\n" for line in comments) + tree_text(tree)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(path.name + ".part")
+    temporary.write_text(text, encoding="utf-8")
+    temporary.replace(path)
 
 
 def _yaml() -> YAML:

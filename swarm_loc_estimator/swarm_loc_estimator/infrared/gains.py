@@ -115,11 +115,7 @@ def _pairs(exchanges: Exchanges, logs: FloatArray, sigma: float) -> PairGains:
 
 
 def _check_curves(estimator: MaximumLikelihood, exchanges: Exchanges, unknown: PairGains) -> None:
-    """Check that most exchanges fit some pose with free gains.
-
-    Raises:
-        GainsError: Most exchanges do not fit.
-    """
+    """Raise GainsError if most exchanges fit no pose with free gains."""
     misfits = estimator.solve(exchanges.readings, unknown, exchanges.saturation).misfits
     found = misfits[np.isfinite(misfits)]
     if found.size and np.median(found) > _MAX_MISFIT:

@@ -140,18 +140,12 @@ def _solve_at(
         models.table.ranges[0],
         2.0 * models.table.ranges[-1],
     )
-    _write_prior(gains.sigma[k], pair.sensor.size, work.prior)
+    for side in range(2):  # the information of the prior on the log-gains of sensors, and of emitters
+        own, common = max(gains.sigma[k, 2 * side], _EXACT) ** 2, gains.sigma[k, 2 * side + 1] ** 2
+        work.prior[side, 0], work.prior[side, 1] = 1.0 / own, common / (own + pair.sensor.size * common)
     exact = with_stray_light(models.exact, pair.readings)
     soft = with_stray_light(models.blurred, pair.readings)
     out.outcomes[k] = _solve_one(Models(exact, soft, models.table), saturation[k], pair, work, out, k)
-
-
-@norefcount_njit
-def _write_prior(sigma: FloatArray, n: int, prior: FloatArray) -> None:
-    """Write `Pair.prior` for the standard deviations (4,) of `PairGains`."""
-    for side in range(2):
-        own, common = max(sigma[2 * side], _EXACT) ** 2, sigma[2 * side + 1] ** 2
-        prior[side, 0], prior[side, 1] = 1.0 / own, common / (own + n * common)
 
 
 @norefcount_njit

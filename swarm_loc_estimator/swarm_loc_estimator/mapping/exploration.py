@@ -50,7 +50,7 @@ def planning_grid(
     passable = (state == OPEN) & (distance_transform_edt(state != WALL) * cell > kept)
     middles = occupancy.corner[:, None, None] + (np.indices(shape) + 0.5) * cell
     own = np.hypot(*(middles - position[:, None, None]))
-    passable |= (own < kept + cell) & (state == OPEN)  # a robot beside a wall must get away from it
+    passable |= (own < kept + cell) & (state == OPEN)  # a robot next to a wall must get away from it
     for other in others:
         passable &= (
             np.hypot(*(middles - other[:, None, None])) > 2.0 * settings.robot_radius + settings.margin

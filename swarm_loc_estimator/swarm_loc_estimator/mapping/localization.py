@@ -51,7 +51,7 @@ def align(graph: PoseGraph, stop: int, path: float) -> bool:
 
 
 def _align_alone(graph: PoseGraph, stop: int, path: float) -> bool:
-    """Align the newest stop only; restores it if the shift exceeds the limits."""
+    """Align only the newest stop; restores it if the shift exceeds the limits."""
     predicted, slip = graph.states[stop].copy(), graph.slip.copy()
     graph.solve(4, [stop], _GATE)
     shift, turn = np.hypot(*(graph.states[stop] - predicted)[:2]), graph.states[stop, 2] - predicted[2]

@@ -1,4 +1,4 @@
-"""Maps as files: an image and a YAML beside it, by the convention of ROS's map_server."""
+"""Maps as files: an image and a YAML file next to it, by the convention of ROS's map_server."""
 
 from __future__ import annotations
 
@@ -33,11 +33,7 @@ class MapFileError(UserError):
 
 
 def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
-    """Write PATH.yaml and PATH.pgm; returns both.
-
-    Raises:
-        MapFileError: They cannot be written.
-    """
+    """Write PATH.yaml and PATH.pgm; returns both, raises MapFileError if they cannot be written."""
     from PIL import Image  # noqa: PLC0415 - an estimator without a map starts without it
 
     image_path, yaml_path = path.with_suffix(".pgm"), path.with_suffix(".yaml")

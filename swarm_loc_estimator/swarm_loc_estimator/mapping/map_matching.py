@@ -6,7 +6,7 @@ a Cauchy loss begin at the predicted pose, and go no way that the walls do not t
 
 Errors of beams are not independent: what is wrong with a piece of wall is wrong for all beams that meet it.
 n beams on one piece have the information 1 / (m + s/n) with the variances m of the map and s of a range.
-Errors that whole walls share remain however many pieces there are, and are added to the covariance.
+Errors that whole walls share remain for any number of pieces, and are added to the covariance.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _IMITATED = 5.0  # Information over what errors of normals imitate, below which 
 _MIN_INFORMATION = 4.0  # Information below which a direction is not determined [1/m^2]
 UNDETERMINED_SIGMA = 2.0
 """Standard deviation where walls tell nothing [m, or rad times the mean range]; robots are lost before."""
-_THROUGH_M = 0.25  # A beam that ends so far behind a wall has gone through it [m]
+_THROUGH_M = 0.25  # A beam that ends farther than this beyond a wall has gone through it [m]
 _MIN_BEAMS, _MIN_FIT, _MAX_THROUGH = 20, 0.5, 0.1
 """Minimum number and share of beams that fit, and maximum share of beams that go through walls."""
 

@@ -3,8 +3,6 @@
 A robot with a laser pointer stops, scans by turning in place, and drives on; one with a lidar scans while it
 drives. Each stop, and a sweep of a lidar wherever its robot has moved on, becomes a node of the pose graph;
 its beams are matched against those of stops of all robots. Robots may join and leave at any time.
-
-What the mapper knows of one robot on its way.
 """
 
 from __future__ import annotations
@@ -90,9 +88,6 @@ _HOME_AGE, _HOME_RADIUS, _AT_HOME = 10, 4.0, 0.5
 
 class CooperativeMapper:
     """Poses, map and goals of many robots.
-
-    Args:
-        settings: Noise and limits.
 
     Attributes:
         settings: Noise and limits.
@@ -365,7 +360,6 @@ class CooperativeMapper:
         align_start(self.graph, nodes, track.prior_sigma)
 
     def _choose_goal(self, robot: int, track: Track, stop: ScanStop) -> None:
-        """Set the next goal of a robot."""
         node = track.node
         if node is None:
             return

@@ -104,11 +104,10 @@ class ReadingPairer(OdometryQueue):
         poses, known = self.poses_at(stamps)
         if not known.all():
             self.drops["laser_without_odometry"] += int((~known).sum())
-        return Readings(stamps[known], poses[known], inverses[known], self._sigma()) if known.any() else None
-
-    def _sigma(self) -> float:
-        """Median standard deviation of recent inverse distances; NaN if there are none."""
-        return float(np.median(self._sigmas)) if self._sigmas else math.nan
+        if not known.any():
+            return None
+        sigma = float(np.median(self._sigmas)) if self._sigmas else math.nan
+        return Readings(stamps[known], poses[known], inverses[known], sigma)
 
 
 class SweepPairer(OdometryQueue):

@@ -228,7 +228,8 @@ class BestOffset(NamedTuple):
 
 def search_offsets(scans: Scans, parts: IntArray, against: IntArray, lattice: Lattice) -> BestOffset:
     """The offset of stops (p,), a rigid body that turns about the first, that fits others (q,) best."""
-    scores = np.zeros(_shape(lattice))
+    cells = 2 * int(lattice.reach / lattice.step) + 1
+    scores = np.zeros((2 * int(lattice.turn_reach / lattice.turn_step) + 1, cells, cells))
     for k in parts:
         stride = max(3, int(scans.beams.counts[k]) // _BEAMS)
         scores += _scores(scans, int(k), int(parts[0]), against, lattice, stride)
@@ -236,16 +237,11 @@ def search_offsets(scans: Scans, parts: IntArray, against: IntArray, lattice: La
     half = (np.array(scores.shape) - 1) // 2
     a, b, c = (int(index) for index in best - half)
     offset = np.array([b * lattice.step, c * lattice.step, a * lattice.turn_step])
-    cells = np.arange(scores.shape[1])
-    apart = np.hypot(cells[:, None] - best[1], cells[None, :] - best[2]) * lattice.step > _APART_M
+    along_x, along_y = np.ogrid[:cells, :cells]
+    apart = np.hypot(along_x - best[1], along_y - best[2]) * lattice.step > _APART_M
     other = float(scores[:, apart].max()) if apart.any() else 0.0
     count = len(parts)
     return BestOffset(offset, float(scores[best]) / count, other / count)
-
-
-def _shape(lattice: Lattice) -> tuple[int, int, int]:
-    cells = 2 * int(lattice.reach / lattice.step) + 1
-    return 2 * int(lattice.turn_reach / lattice.turn_step) + 1, cells, cells
 
 
 @cached_njit

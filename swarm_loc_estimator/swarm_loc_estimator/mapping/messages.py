@@ -36,11 +36,7 @@ class GridMessage(NamedTuple):
 
 
 def decode_occupancy_grid(data: bytes) -> GridMessage:
-    """Read a nav_msgs/OccupancyGrid.
-
-    Raises:
-        CdrError: The bytes are not a valid OccupancyGrid.
-    """
+    """Read a nav_msgs/OccupancyGrid; raises CdrError unless the bytes are a valid one."""
     message = decode(data, OCCUPANCY_GRID)
     header, about, cells = message.header, message.info, message.data
     origin = planar_pose(about.origin)
@@ -102,7 +98,7 @@ def decode_scan(data: bytes) -> ScanMessage:
 
 
 def decode_lights(data: bytes) -> list[LightMessage]:
-    """Read a swarm_loc_msgs/LightBearingArray without lights of non-finite numbers; raises CdrError unless whole."""
+    """Read the finite lights of a LightBearingArray; raises CdrError unless the bytes are a whole one."""
     message = decode(data, LIGHTS)
     lights, stamp_ns = message.lights, nanoseconds(message.header.stamp)
     columns = lights["frequency"], lights["bearing"], np.sqrt(np.maximum(0.0, lights["covariance"][:, 0]))
@@ -112,11 +108,7 @@ def decode_lights(data: bytes) -> list[LightMessage]:
 
 
 def led_frequencies(entries: Collection[str], robots: Collection[str]) -> dict[str, float]:
-    """Robot -> frequency of its LEDs [Hz].
-
-    Raises:
-        ParameterError: An entry is not a robot's name, '=' and a number above 0.
-    """
+    """Robot -> frequency of its LEDs [Hz]; raises ParameterError unless each entry is ROBOT=FREQUENCY."""
     found: dict[str, float] = {}
     for entry in entries:
         name, _, value = entry.partition("=")

@@ -307,9 +307,6 @@ _MIN_SEEN_BINS = 15  # Directions with a usable line, one degree each, from whic
 class PoseGraph:
     """Stops with beams and lines, and constraints; optimized by Gauss-Newton over all or some stops.
 
-    Args:
-        settings: Settings of the mapper.
-
     Attributes:
         settings: Settings of the mapper.
         count: Number of stops.
@@ -557,7 +554,6 @@ class PoseGraph:
             equations.add_blocks(unknowns.reshape(-1, 8), squares, gradient)
 
     def _grow(self) -> None:
-        """Double the capacity."""
         self.states, self.robot, self.place = map(_doubled, (self.states, self.robot, self.place))
         self.turned, self._turned_all = _doubled(self.turned), _doubled(self._turned_all)
         self._fitted_ratio = _doubled(self._fitted_ratio)

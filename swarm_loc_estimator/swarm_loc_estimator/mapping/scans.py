@@ -24,7 +24,7 @@ UNSEEN = 0.0  #: Inverse distance of a beam without reflection
 class Readings(NamedTuple):
     """Readings (n,) of one robot in order of time.
 
-    The inverse of a distance is what a camera beside a laser measures: it is linear in the pixel at which the
+    A camera next to a laser measures the inverse of a distance: it is linear in the pixel at which the
     reflection is seen, d = f b / (p - p_inf), so its noise does not depend on the distance.
     """
 
@@ -317,9 +317,6 @@ _MAX_SPEED, _MAX_STEP, _MAX_RATE, _MAX_TURN = 3.0, 0.05, 20.0, 0.3
 class ScanStop:
     """A stop of a robot with its readings.
 
-    Args:
-        arrival: (3,) pose by odometry on arrival.
-
     Attributes:
         arrival: (3,) pose by odometry on arrival.
         departure: (3,) pose by odometry at the last reading.
@@ -483,7 +480,6 @@ def _labels(stamp_ns: IntArray, odometry: FloatArray, state: FloatArray, before_
 
 @cached_njit
 def _completed(stamp_ns: IntArray, turn: FloatArray, full: float) -> int:
-    """See `ScanStop.completed`."""
     furthest, rest_turn, rest_ns = 0.0, math.inf, 0
     for k in range(len(turn)):
         furthest = max(furthest, abs(turn[k]))

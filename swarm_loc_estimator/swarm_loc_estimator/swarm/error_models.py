@@ -172,7 +172,11 @@ class LidarModel:
         12.0, "m", 0.2, 50.0, "where range_max is greater or missing: space is free up to here", above=True
     )
     map_sigma: float = number(
-        0.02, "m", 0.0, 1.0, "error of the walls of the map in which it localizes, beside that of its cells"
+        0.02,
+        "m",
+        0.0,
+        1.0,
+        "error of the walls of the map for localization, in addition to that of its cells",
     )
 
     @property
@@ -266,7 +270,7 @@ class SensorModel:
 
 @dataclass(frozen=True)
 class FixModel:
-    """Error model of a robot's absolute fixes, beside or in place of the covariance of each."""
+    """Error model of a robot's absolute fixes, in addition to or in place of the covariance of each."""
 
     systematic_share: float = number(
         0.0, "1", 0.0, 1.0, "share of a fix's variance that earlier fixes have, too; 1: fixes of a mapper"

@@ -14,9 +14,8 @@ from itertools import chain
 from types import MappingProxyType
 
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.error_models import FixModel, ImuModel, OdometryModel, RandomWalk
-from swarm_loc_estimator.swarm.ir_board import RobotIr
+from swarm_loc_estimator.swarm.ir_board import RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, Swarm
 
 SENSORS = MappingProxyType(
@@ -245,9 +244,11 @@ def planned_swarm(plan: SwarmPlan) -> Swarm:
         PlanError: The family has too few ids.
     """
     known, sensors = plan.known, plan.sensors
+    # places and ids of all markers
     places = list(_wall_places(plan)) if "landmarks" in sensors else []
     faces = known.faces if "robots" in sensors else ()
     face_ids, landmark_ids = _ids(plan, len(faces), len(places))
+    # what all robots have in common
     board = load_ir_platform("droplet") if "infrared" in known.sensors else None
     odometry, size = known.odometry, plan.size or known.marker_size
     if odometry is not None and plan.wheel_separation is not None:
@@ -262,25 +263,17 @@ def planned_swarm(plan: SwarmPlan) -> Swarm:
         imu=known.imu if "imu" in sensors else ImuModel(),
         fix=_MAPPED if "mapper" in sensors else _TRACKED if "fix" in sensors else FixModel(),
     )
-    robots = tuple(
-        replace(
-            common,
-            name=f"{plan.prefix}{k + 1}",
-            faces=_numbered(faces, face_ids[k * len(faces) :], size),
-            ir=None if board is None else RobotIr(_FIRST_BOARD + k, board, "droplet"),
-        )
-        for k in range(plan.robots)
-    )
+    # the robots with their own ids, and the landmarks along the walls
+    robots, ids = [], iter(face_ids)
+    for k in range(plan.robots):
+        own = tuple(replace(face, id=next(ids), size=size) for face in faces)
+        ir = None if board is None else RobotIr(_FIRST_BOARD + k, board, "droplet")
+        robots.append(replace(common, name=f"{plan.prefix}{k + 1}", faces=own, ir=ir))
     landmarks = tuple(
         Landmark(marker_id, *place, size=plan.landmark_size)
         for marker_id, place in zip(landmark_ids, places, strict=True)
     )
-    return Swarm(robots, landmarks)
-
-
-def _numbered(faces: tuple[Face, ...], ids: list[int], size: float) -> tuple[Face, ...]:
-    """Faces with the first of some ids."""
-    return tuple(replace(face, id=marker_id, size=size) for face, marker_id in zip(faces, ids, strict=False))
+    return Swarm(tuple(robots), landmarks)
 
 
 def _ids(plan: SwarmPlan, faces: int, landmarks: int) -> tuple[list[int], list[int]]:

@@ -49,13 +49,23 @@ When a description is written, values common to all robots of a type are written
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+import textwrap
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from os.path import relpath
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from swarm_loc_estimator.common.parameters import UserError, number_specs
-from swarm_loc_estimator.common.yaml_tree import Numbers, Tree, TreeChecks, YamlTreeError, nearest, read_tree
-from swarm_loc_estimator.swarm.board_file import IrSection, Values
+from swarm_loc_estimator.common.parameters import UserError, number_specs, number_values
+from swarm_loc_estimator.common.yaml_tree import (
+    Numbers,
+    Tree,
+    TreeChecks,
+    YamlTreeError,
+    nearest,
+    read_tree,
+    write_tree,
+)
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import (
     ClockModel,
@@ -68,36 +78,22 @@ from swarm_loc_estimator.swarm.error_models import (
     RandomWalk,
     SensorModel,
 )
+from swarm_loc_estimator.swarm.ir_board import DEAD, GAIN_LISTS, IrSection, RobotIr, Values
 from swarm_loc_estimator.swarm.swarm import (
+    Anchor,
     CameraMount,
     Face,
     FixedCamera,
     Landmark,
-    Pose2,
     Robot,
     StartSigma,
     Swarm,
     SwarmError,
-    read_anchors,
-    uwb_device,
-    uwb_layer,
+    UwbDevice,
 )
 
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping
-import textwrap
-from dataclasses import asdict
-from os.path import relpath
-
-from swarm_loc_estimator.common.yaml_tree import tree_text
-from swarm_loc_estimator.swarm.board_file import ir_tree
-from swarm_loc_estimator.swarm.swarm import Anchor, UwbDevice
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
 FILE_VERSION = 1
-SCHEMA_FILE = "swarm.schema.json"  # Name of the schema beside a description
+SCHEMA_FILE = "swarm.schema.json"  # Name of the schema next to a description
 SCHEMA_COMMENT = f"yaml-language-server: $schema={SCHEMA_FILE}"
 """First comment of a description, by which editors find the schema."""
 
@@ -127,7 +123,7 @@ START = {
 }
 LANDMARK_DEFAULTS = {name: number_specs(Landmark)[name] for name in ("size", "position_sigma", "yaw_sigma")}
 RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
-MAX_ID = 2**32 - 1
+MAX_ID, MAX_ADDRESS = 2**32 - 1, 2**64 - 1
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 MAX_NAME = 64  # Maximum length of a robot name; DDS limits the length of topic names
 _RESERVED = (
@@ -138,7 +134,7 @@ RESERVED_NAMES = frozenset(_RESERVED)
 """Names of topics, nodes and frames that a robot's namespace must not collide with."""
 MAX_ROBOTS = 5000  # Maximum number of robots; larger swarms have not been tested
 MAX_PARAMETERS = 10_000
-"""Maximum number of states beside the poses; the dense filter's covariance then has 800 MB per checkpoint."""
+"""Maximum number of states but the poses; the dense filter's covariance then has 800 MB per checkpoint."""
 
 
 class SwarmFileError(UserError):
@@ -204,7 +200,7 @@ class _Loader(TreeChecks):
         landmarks = self._landmarks(sections.get("landmarks", {}), sections.get("defaults", {}))
         fixed = self._named(sections.get("cameras", {}), "cameras")
         cameras = tuple(self._fixed_camera(name, tree) for name, tree in fixed)
-        anchors = read_anchors(self, sections.get("anchors"))
+        anchors = self._anchors(sections.get("anchors"))
         try:
             swarm = Swarm(robots, landmarks, cameras, anchors, self._map(sections.get("map")))
         except SwarmError as error:
@@ -236,15 +232,19 @@ class _Loader(TreeChecks):
             section: None if (values := sections[section]) is None else cls(**values)
             for section, cls in MODELS.items()
         }
+        uwb, start = sections["uwb"], mapping.get("start")
+        if start is not None:  # else it is unknown
+            pose = self.numbers(start, f"{key}.start", START, required=tuple(START))
+            start = tuple(float(pose[axis] or 0.0) for axis in START)
         return Robot(
             name=name,
             type=type_name or "",
             response=next((layer.response for layer in reversed(layers) if layer.says_response), None),
             faces=self._faces(key, layers, mapping.get("ids", {})),
-            start=self._start(mapping.get("start"), f"{key}.start"),
+            start=start,
             stands=models["odometry"] is None,
             ir=self._ir.board(sections["ir"], f"{key}.ir"),
-            uwb=uwb_device(self, sections["uwb"], f"{key}.uwb"),
+            uwb=UwbDevice(**{**uwb, **self._address(uwb, f"{key}.uwb")}) if uwb else None,
             **{**models, "odometry": models["odometry"] or OdometryModel()},
         )
 
@@ -260,7 +260,7 @@ class _Loader(TreeChecks):
         if "ir" in mapping:
             sections["ir"] = self._ir.layer(mapping["ir"], f"{key}.ir", of_robot=of_robot)
         if "uwb" in mapping:
-            sections["uwb"] = uwb_layer(self, mapping["uwb"], f"{key}.uwb", of_robot=of_robot)
+            sections["uwb"] = self._radio(mapping["uwb"], f"{key}.uwb", of_robot=of_robot)
         faces = self._named(mapping.get("faces", {}), f"{key}.faces")
         return _Layer(
             sections,
@@ -269,8 +269,29 @@ class _Loader(TreeChecks):
             {name: None if face is None else self._face(face, f"{key}.faces.{name}") for name, face in faces},
         )
 
+    def _radio(self, tree: Tree, key: str, *, of_robot: bool) -> Values | None:
+        """Parse the radio of one layer; only a robot has an address. None: no radio."""
+        if tree is None:
+            return None
+        others = ("address",) if of_robot else ()
+        values: Values = {**self.numbers(tree, key, number_specs(UwbDevice), others=others)}
+        return values if "address" not in tree else {**values, **self._address(tree, key)}
+
+    def _anchors(self, tree: Tree) -> tuple[Anchor, ...]:
+        anchors, specs = [], number_specs(Anchor)
+        for index, entry in enumerate(self.items([] if tree is None else tree, "anchors")):
+            key = f"anchors[{index}]"
+            numbers: Values = {**self.numbers(entry, key, specs, ("x", "y"), ("address",))}
+            anchors.append(Anchor(**numbers, **self._address(entry, key)))
+        return tuple(anchors)
+
+    def _address(self, tree: Values, key: str) -> Values:
+        """Parse the address of a radio, which must be there."""
+        if "address" not in tree:
+            raise self.said(f"{key} lacks address, a whole number in [1, {MAX_ADDRESS}]")
+        return {"address": self.address(tree["address"], f"{key}.address", MAX_ADDRESS)}
+
     def _face(self, tree: Tree, key: str) -> Numbers:
-        """Parse the place of a marker on a robot."""
         specs = number_specs(Face)
         place = self.numbers(tree, key, specs, others=("lies",))
         if "lies" in self.mapping(tree, key):
@@ -323,7 +344,6 @@ class _Loader(TreeChecks):
         )
 
     def _landmarks(self, tree: Tree, defaults: Tree) -> tuple[Landmark, ...]:
-        """Parse all landmarks, in the order of the file."""
         shared_tree = self.mapping(defaults, "defaults").get("landmark", {})
         shared = self.numbers(shared_tree, "defaults.landmark", LANDMARK_DEFAULTS)
         result = []
@@ -332,13 +352,6 @@ class _Loader(TreeChecks):
             numbers = self.numbers(place, key, number_specs(Landmark), required=("x", "y"))
             result.append(Landmark(self._marker_id(number, key), **{**shared, **numbers}))  # type: ignore[arg-type]
         return tuple(result)
-
-    def _start(self, tree: Tree, key: str) -> Pose2 | None:
-        """Parse a start pose; None if it is unknown."""
-        if tree is None:
-            return None
-        numbers = self.numbers(tree, key, START, required=tuple(START))
-        return (float(numbers["x"] or 0.0), float(numbers["y"] or 0.0), float(numbers["theta"] or 0.0))
 
     def _marker_id(self, value: Tree, key: str) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
@@ -377,7 +390,7 @@ Entries = dict[Any, Any]
 def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
     """Write a swarm description that `load_swarm` reads back equal.
 
-    Its first line names the JSON Schema if that lies beside it, so that editors complete its keys.
+    Its first line names the JSON Schema if that lies next to it, so that editors complete its keys.
 
     Args:
         swarm: What to write.
@@ -391,12 +404,7 @@ def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
     tree = _tree(swarm, path.parent)
     parse_swarm(tree, path)
     schema = [SCHEMA_COMMENT] if (path.parent / SCHEMA_FILE).is_file() else []
-    text = "".join(f"# {line}\n" for line in [*schema, *comment.splitlines(), *_units()])
-    text += tree_text(tree)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
+    write_tree(tree, path, [*schema, *comment.splitlines(), *_units()])
 
 
 def _units() -> list[str]:
@@ -411,7 +419,6 @@ def _units() -> list[str]:
 
 
 def _tree(swarm: Swarm, folder: Path) -> Entries:
-    """The content of a file in a folder."""
     types: Entries = {}
     for robot in swarm.robots:
         if robot.type and robot.type not in types:
@@ -450,9 +457,17 @@ def _taken_out(names: Iterable[str], entries: list[Entries]) -> Entries:
 
 def _numbers(model: Any, keep: tuple[str, ...] = ()) -> Entries:
     """The numbers of a dataclass that differ from its defaults."""
-    values = asdict(model)
-    defaults = {name: type(model).__dataclass_fields__[name].default for name in number_specs(type(model))}
-    return {name: values[name] for name in defaults if values[name] != defaults[name] or name in keep}
+    fields = type(model).__dataclass_fields__
+    return {n: v for n, v in number_values(model).items() if v != fields[n].default or n in keep}
+
+
+def _board(ir: RobotIr, folder: Path) -> Entries:
+    """An infrared board without its id."""
+    is_path = Path(ir.source).is_absolute()
+    board: Entries = {"platform": relpath(ir.source, folder.resolve()) if is_path else ir.source}
+    if ir.gains is not None:
+        board["gains"] = {name: list(getattr(ir.gains, name)) for name in GAIN_LISTS} | _numbers(ir.gains)
+    return board | {name: list(getattr(ir, name)) for name in DEAD if getattr(ir, name)} | _numbers(ir)
 
 
 def _layer(robot: Robot, folder: Path) -> Entries:
@@ -463,7 +478,7 @@ def _layer(robot: Robot, folder: Path) -> Entries:
     layer["camera"] = None if robot.camera is None else _numbers(robot.camera)
     if robot.stands:
         layer["odometry"] = None
-    layer["ir"] = {} if robot.ir is None else ir_tree(robot.ir, folder)
+    layer["ir"] = {} if robot.ir is None else _board(robot.ir, folder)
     layer["uwb"] = {} if robot.uwb is None else _numbers(robot.uwb)
     layer["faces"] = {
         face.name: _numbers(face) | ({"lies": True} if face.lies else {}) for face in robot.faces

@@ -29,8 +29,13 @@ from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.cost import Pair, cost_of, new_cost_workspace
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.search import IrOutcome, ReadingsError
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, TabulatedCurve
+from swarm_loc_estimator.swarm.ir_board import (
+    IrGains,
+    IrPlatform,
+    PairGains,
+    TabulatedCurve,
+    load_ir_platform,
+)
 
 ALIKE = MaximumLikelihood(droplet())
 DIFFERING = MaximumLikelihood(droplet(0.1))

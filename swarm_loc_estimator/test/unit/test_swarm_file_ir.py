@@ -6,13 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.swarm import board_file as ir_platform_file
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr
+from swarm_loc_estimator.swarm import ir_board
+from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm, save_swarm
 
-PACKAGED_DROPLET = Path(ir_platform_file.__file__).parents[1] / "config" / "ir" / "droplet.yaml"
+PACKAGED_DROPLET = Path(ir_board.__file__).parents[1] / "config" / "ir" / "droplet.yaml"
 IR = """\
 fileversion: 1
 types:

@@ -10,7 +10,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.parameters import number_specs
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.error_models import (
     ClockModel,
     FixModel,
@@ -19,7 +18,7 @@ from swarm_loc_estimator.swarm.error_models import (
     RandomWalk,
     SensorModel,
 )
-from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, StartSigma, Swarm
 from swarm_loc_estimator.swarm.swarm_file import RESERVED_NAMES, load_swarm, save_swarm
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from functools import lru_cache
+from pathlib import Path
+from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from mcap.writer import CompressionType
@@ -23,9 +25,6 @@ from swarm_loc_estimator.common.bags.bag_file import BagError
 from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS, MESSAGE_PACKAGE, message_folder
 
 if TYPE_CHECKING:
-    from pathlib import Path
-    from types import TracebackType
-
     from rosbags.interfaces import Connection
     from rosbags.rosbag2.writer import StorageWriter
     from rosbags.typesys.store import Typestore

@@ -46,7 +46,7 @@ DETECTION_DTYPE = renamed(
 )
 """One swarm_loc_msgs/MarkerDetection as it lies in little-endian CDR; quaternions are x, y, z, w.
 
-It begins 4 bytes behind a multiple of 8; where the first of a message does not, see `DETECTION_GAP`.
+It begins 4 bytes after a multiple of 8; where the first of a message does not, see `DETECTION_GAP`.
 """
 DETECTION_GAP = DETECTION_DTYPE.fields["corners_px"][1]  # type: ignore[index]  # it has fields
 """A detection that starts at a multiple of 8 has 4 bytes of padding here, before its first double."""

@@ -39,7 +39,7 @@ UNKNOWN_COVARIANCE = np.diag([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 """6x6; a negative first element says that the sender does not know (the convention of sensor_msgs)."""
 STAMP_SIZE = 8
 _COVARIANCE = POSE_DOUBLES + np.arange(36).reshape(6, 6)[PLANE].ravel()
-"""Where a planar covariance stands behind a pose."""
+"""Where a planar covariance stands after a pose."""
 
 
 class OdometryMessage(NamedTuple):
@@ -256,11 +256,7 @@ class SwarmPosesReader:
         self._length = -1
 
     def read(self, data: bytes) -> EstimateMessage:
-        """The columns of a message.
-
-        Raises:
-            CdrError: It is not a whole SwarmPoses of little-endian CDR.
-        """
+        """The columns of a message; raises CdrError unless it is a whole SwarmPoses of little-endian CDR."""
         raw, layout = np.frombuffer(data, dtype=np.uint8), self._layout
         if len(data) != self._length or not np.array_equal(raw[layout.others], layout.expected):
             if bytes(data[:2]) != b"\x00\x01":

@@ -272,11 +272,7 @@ class Prior(NamedTuple):
 
 
 def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> Factor:
-    """The factor of a prior and measurements.
-
-    Raises:
-        LinAlgError: The prior is not positive definite.
-    """
+    """The factor of a prior and measurements; raises LinAlgError if the prior is not positive definite."""
     earlier = np.minimum(pattern.front[measured.first], pattern.front[measured.second])
     order = np.argsort(earlier, kind="stable")
     begin = np.searchsorted(earlier[order], np.arange(pattern.fronts + 1))

@@ -260,7 +260,7 @@ class _Sequence(NamedTuple):
 
 @cached_njit
 def _want_pairs(old: _Sequence, new: Pattern, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
-    """Mark all pairs of the new pattern, and of bodies beside, at the front of the earlier body."""
+    """Mark all pairs of the new pattern and of `beside` at the front of the earlier body."""
     for f in range(new.pivot_begin.size - 1):
         for k in range(new.pivot_begin[f], new.pivot_begin[f + 1]):
             a = new.pivot[k]
@@ -274,7 +274,7 @@ def _want_pairs(old: _Sequence, new: Pattern, place: IntArray, beside: IntArray,
 
 @cached_njit
 def _want_with(old: _Sequence, a: int, b: int, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
-    """Mark a pair of bodies, and the pairs of the bodies beside them."""
+    """Mark a pair of bodies, and the pairs with those of `beside`."""
     _want(old, place[a], place[b], wanted)
     if beside[a] >= 0:
         _want(old, place[beside[a]], place[b], wanted)

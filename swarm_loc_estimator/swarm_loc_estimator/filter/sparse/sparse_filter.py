@@ -67,9 +67,6 @@ _DRIVEN = slice(3, 3 + DRIVES)
 class Marginals:
     """The marginal covariance of each body with its parameters, as predictions change it.
 
-    Args:
-        groups: Which bodies have blocks of parameters.
-
     Attributes:
         groups: Which bodies have blocks of parameters.
         current: (n, w, w) see `JointFilter.marginal`.
@@ -95,11 +92,8 @@ class Marginals:
         """Append bodies or blocks, without error."""
         self.groups, transition = groups, _no_transition(groups)
         transition[: len(self.transition)] = self.transition
-        self.current, self._settled, self.transition = (
-            _enlarged(self.current, groups),
-            _enlarged(self._settled, groups),
-            transition,
-        )
+        self.current, self._settled = (_enlarged(one, groups) for one in (self.current, self._settled))
+        self.transition = transition
 
     def set_prior(self, bodies: IntArray, own: IntArray, covariances: FloatArray) -> None:
         """Give columns (c,) of bodies (k,) covariances (k, c, c), independent of their other columns."""
@@ -138,11 +132,8 @@ class Marginals:
         Returns:
             Process noise (k, w, w) of bodies and parameters, and the transition.
         """
-        count, before, adjoint = (
-            self.groups.owner.size,
-            self._settled[bodies],
-            translation_adjoints(places[bodies]),
-        )
+        count, before = self.groups.owner.size, self._settled[bodies]
+        adjoint = translation_adjoints(places[bodies])
         moves = Moves(np.full(count, -1), np.zeros((count, 3, 3)), np.ones((count, 3)))
         if len(self.transition):
             of_robots = np.flatnonzero(bodies < len(self.transition))
@@ -427,7 +418,6 @@ class SparseFilter:
 
     @property
     def _groups(self) -> Groups:
-        """The blocks of each body."""
         return self._marginals.groups
 
     def set_prior(self, columns: IntArray, covariance: FloatArray) -> None:
@@ -462,13 +452,11 @@ class SparseFilter:
         self._marginals.set_prior(bodies, np.arange(3), covariances)
 
     def _append(self, bodies: IntArray, derived: Sequence[Derived]) -> None:
-        """Append new bodies (k,)."""
         self._number[bodies] = self._next_number + np.arange(len(derived))
         self._new += tuple(derived)
 
     @property
     def _next_number(self) -> int:
-        """The number of the next body to append."""
         return self._factor.pattern.front.size + len(self._new)
 
     def add(self, columns: IntArray, covariance: FloatArray) -> None:
@@ -496,10 +484,8 @@ class SparseFilter:
         placed, self._new = self._new[-1], self._new[:-1]
         for other in np.unique(bodies).tolist():
             self._take_in(other)
-        adjoint, back = (
-            translation_adjoints(self._place[[body]])[0],
-            translation_adjoints(-self._place[bodies]),
-        )
+        adjoint = translation_adjoints(self._place[[body]])[0]
+        back = translation_adjoints(-self._place[bodies])
         shares = adjoint @ mapping.reshape(3, -1, 3).transpose(1, 0, 2) @ back
         alike = np.linalg.cholesky(carried(self._place[bodies], self.marginal[bodies, :3, :3]))
         common = np.sum(shares @ alike, axis=0)
@@ -572,15 +558,11 @@ class SparseFilter:
             change_shared(covariance, pattern, self._number, shares, others)
             shares = others
         self._updates += 1
-        self._add_noise(covariance, bodies, noise)
+        for (row, column), of, first, second in self._marginals.within(bodies):  # of bodies and their blocks
+            covariance[self._number[first], self._number[second]] += noise[of, row, column]
         prior = Prior(covariance, self._number)
         self._prepared = _Prepared(pattern, prior, self._by_body(shares, active), active)
         return self._prepared
-
-    def _add_noise(self, covariance: FloatArray, bodies: IntArray, noise: FloatArray) -> None:
-        """Add the process noise of bodies (k,) and their blocks to covariances by number."""
-        for (row, column), of, first, second in self._marginals.within(bodies):
-            covariance[self._number[first], self._number[second]] += noise[of, row, column]
 
     def _by_body(self, shares: FloatArray, active: IntArray) -> FloatArray:
         """Shares of copies (n, 3, r) of all bodies, from those by number."""
