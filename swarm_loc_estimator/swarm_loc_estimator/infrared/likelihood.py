@@ -41,12 +41,13 @@ from swarm_loc_estimator.infrared.start_table import (
 )
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
+# The constants of the likelihood are checked by `make bench-droplet` and, for outliers, test_ir_outliers.py.
 _WORSE = 2.0  # Maximum misfit of a start relative to that of the best start
 _LOOSE, _STILL = 0.1, 1e-4
 """Minimum predicted decrease of the cost per step, for the blurred and for the exact model."""
 _SAME = 0.02  # Maximum difference in cost of two searches that reached the same minimum
 _SUSPICIOUS = 1.3  # Threshold of the misfit above which a minimum may be wrong
-_FEWEST = 9
+_FEWEST = 9  # Minimum number of measured readings
 _FAINTEST = 6.0  # Minimum excess of the readings' sum of squares over noise [sigma]
 _FAINTEST_OF_OUTLIERS = 3.0
 """The same for platforms with bright outliers, where the posterior over all poses also rejects noise."""
@@ -60,7 +61,7 @@ _ASIDE = np.array([(0.0, 0.1, 0.3), (0.0, -0.1, -0.3), *((0.0, b, h) for b, h in
 """Offsets (range [m], bearing, heading [rad]) of additional starts: two from the best minimum, near which the
 second-best often is, the others from the table's best start."""
 _OF_SECOND = 2  # Number of these offsets that start from the best minimum
-_MIN_ODDS = 1e-4
+_MIN_ODDS = 1e-4  # Minimum odds of a second pose that is reported
 _WORTH_WEIGHING = 8.0  # Maximum difference in cost of two minima compared by the probability around them
 _NO_MINIMUM = np.full(4, math.inf)
 _EXACT = 1e-4  # Standard deviation of each log-gain where only the common log-gain is uncertain

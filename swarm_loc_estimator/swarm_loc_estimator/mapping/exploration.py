@@ -92,9 +92,10 @@ def paths_from(passable: BoolArray, i: int, j: int) -> tuple[FloatArray, IntArra
     return length, before
 
 
-_RAYS = 60
+# The constants of exploration are checked by `make bench-pushbot`: corridor, office and ring, 20 seeds each.
+_RAYS = 60  # Number of directions in which the gain of a scan is summed
 _SURE = 2.0  # Log odds above which a wall yields no information gain
-_WALL_GAIN = 0.5
+_WALL_GAIN = 0.5  # Gain of a wall of no evidence; that of unknown space is its area in cells
 
 
 @cached_njit
@@ -159,12 +160,13 @@ def goal_by_odometry(
     return there
 
 
-_LATTICE, _CANDIDATES = 0.2, 260
-_MIN_PATH = 0.3
+_LATTICE, _CANDIDATES = 0.2, 260  # Distance of possible goals [m], and their maximum number
+_MIN_PATH = 0.3  # Minimum length of the path to a goal [m]
 _REACH_SHARE = 0.72  # Share of the laser's range within which walls are measured accurately
 _MIN_WALL = 0.6
 """Length of the walls in sight of a place below which it is in the open; false echoes are shorter [m]."""
 _CROWD_RADIUS, _GOAL_RADIUS, _GOAL_WEIGHT = 0.45, 2.0, 0.8
+"""Distances within which earlier stops and goals of others make a goal less valuable [m], and how much."""
 
 
 def next_stop(

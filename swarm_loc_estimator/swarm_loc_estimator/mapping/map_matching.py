@@ -25,6 +25,7 @@ from swarm_loc_estimator.filter.gating import POSE_GATE
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import MapFileError
 
+# The constants of matching to a map are checked by `make bench-inputs`: lidars in a known map.
 _WALL_M, _MIN_WINDOW = 0.12, 2
 """Half the side of the window in which the line of a wall is fitted [m], and at least this many cells."""
 _SURFACE = 1.5  # Depth in cells up to which occupied cells are the surface of a wall, and not its inside
@@ -208,6 +209,7 @@ def normal_equations(
     size = walls.cell * walls.kind.shape[1]
     width = int(size / _PIECE_M) + 1
     beams = np.zeros((int(walls.cell * walls.kind.shape[0] / _PIECE_M) + 1) * width, dtype=np.int64)
+    # each beam that ends near a wall: its residual r = n.(p - c), derivatives, noise, and piece of wall
     for k in range(count):
         arm_x, arm_y = cos * ends[k, 0] - sin * ends[k, 1], sin * ends[k, 0] + cos * ends[k, 1]
         i, j = _cell_of(walls, pose[0] + arm_x, pose[1] + arm_y)
@@ -226,6 +228,7 @@ def normal_equations(
         imitation[k] = walls.normal_variance[wall]
         piece[k] = int((x - walls.corner[0]) / _PIECE_M) * width + int((y - walls.corner[1]) / _PIECE_M)
         beams[piece[k]] += 1
+    # sums over beams; n on a piece have the information 1 / (m + s/n) together, and the loss is Cauchy's
     information, imitated, gradient = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
     for k in range(count):
         if piece[k] < 0:

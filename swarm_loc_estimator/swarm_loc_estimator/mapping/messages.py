@@ -68,11 +68,7 @@ class ScanMessage(NamedTuple):
     range_min: float
     range_max: float
     ranges: FloatArray
-
-    @property
-    def frame_id(self) -> str:
-        """Not read: the mount is that of the swarm description."""
-        return ""
+    frame_id: str = ""  # Not read: the mount is that of the swarm description
 
 
 class LightMessage(NamedTuple):
@@ -93,7 +89,7 @@ def decode_laser(data: bytes) -> LaserMessage:
 def decode_scan(data: bytes) -> ScanMessage:
     """Read a sensor_msgs/LaserScan; raises CdrError unless the bytes are a whole one."""
     message = decode(data, LASER_SCAN)
-    numbers = {name: float(getattr(message, name)) for name in ScanMessage._fields[1:-1]}
+    numbers = {name: float(getattr(message, name)) for name in ScanMessage._fields[1:-2]}
     return ScanMessage(nanoseconds(message.header.stamp), **numbers, ranges=message.ranges.astype(float))
 
 

@@ -294,12 +294,12 @@ def _arrays(rows: list[_Row]) -> tuple[IntArray, IntArray, FloatArray]:
 
 
 _REFIT_RATIO = 0.0006  # Threshold of the change of the turn ratio above which lines are refitted
-_MIN_RATIO_SIGMA = 0.0013
+_MIN_RATIO_SIGMA = 0.0013  # Minimum standard deviation of a turn ratio; checked by `make bench-pushbot`
 _MATCH_WEIGHT, _START_WEIGHT = 0.3, 1.5
 """Total weight of the matches of a stop; beams of a pair share the errors of one scan."""
 _SMALL_STEP = (1e-3, 1e-3, 5e-4)
 MATCH_GATE = 0.03  # Maximum distance of a matched beam from its line in the final solution [m]
-_OVERLAP_STRIDE = 6
+_OVERLAP_STRIDE = 6  # Every sixth beam decides on the overlap of stops
 _FREE_RANGE_SHARE = 0.76  # Share of the range of a laser pointer that counts as free without a reflection
 _MIN_SEEN_BINS = 15  # Directions with a usable line, one degree each, from which a stop sees walls
 

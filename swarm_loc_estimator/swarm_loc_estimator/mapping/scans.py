@@ -95,13 +95,14 @@ UNKNOWN, FREE, POINT, LINE = 0, 1, 2, 3
 
 _SEEN, _CC, _CS, _SS, _YC, _YS, _YY, _C, _S, _Y, _ALL, _W = range(12)
 """Sums over the beams of a direction, all but the two counts weighted; y is the inverse distance."""
-_WINDOWS = (40, 28, 20, 14, 9, 6)
-_MIN_BEAMS, _MIN_SEEN_SHARE = 5, 0.85
+# The constants below are checked by `make bench-pushbot`: corridor, office and ring, 20 seeds each.
+_WINDOWS = (40, 28, 20, 14, 9, 6)  # Widths in degrees of the windows that may be a line, longest first
+_MIN_BEAMS, _MIN_SEEN_SHARE = 5, 0.85  # Minimum number of reflections in a window, and their share of beams
 _MAX_THIRD_SIGMAS = 2.2
 """Maximum distance of the mean of a third of a window from the line; beyond it the wall has a step."""
 _MIN_INCIDENCE = 0.15  # Minimum cosine between beam and normal
-_MAX_NORMAL_SIGMA = 0.08
-_RANGE_SIGMAS = 2.5
+_MAX_NORMAL_SIGMA = 0.08  # Maximum standard deviation of the normal of a usable line [rad]
+_RANGE_SIGMAS = 2.5  # Lines nearer to the laser's range than this are left out [sigma]
 
 
 class Lines(NamedTuple):
@@ -258,8 +259,8 @@ def _is_free(total: FloatArray, m: int) -> bool:
 
 
 MIN_OVERLAP = 50  # Minimum number of beams of the first turn with a neighbour in the second
-_LOW, _HIGH, _STEP = 0.90, 1.02, 0.0005
-_OUTLIER = 9.0
+_LOW, _HIGH, _STEP = 0.90, 1.02, 0.0005  # Range and step of the turn ratios that are tried
+_OUTLIER = 9.0  # Maximum squared difference of two beams, in variances
 
 
 @cached_njit

@@ -20,7 +20,7 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -210,20 +210,8 @@ class CdrError(ValueError):
     """Bytes that are not a whole message of the expected type; the message is one sentence."""
 
 
-class Stamp(Protocol):
-    """A builtin_interfaces/Time, whatever has built it."""
-
-    @property
-    def sec(self) -> int:
-        """Whole seconds, which may be negative."""
-
-    @property
-    def nanosec(self) -> int:
-        """The rest [ns]."""
-
-
-def nanoseconds(stamp: Stamp) -> int:
-    """A stamp [ns]; it may lie before zero, which `rclpy.time.Time` refuses."""
+def nanoseconds(stamp: Any) -> int:
+    """A builtin_interfaces/Time [ns]; it may lie before zero, which `rclpy.time.Time` refuses."""
     return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)
 
 

@@ -32,10 +32,10 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 
 _LEAF = 24  # Sets of at most this size are not split
-_CUTS = (0.5, 0.42, 0.58)
+_CUTS = (0.5, 0.42, 0.58)  # Shares of the bodies on the lower side; checked by `make bench-scaling`
 _FEW = 60  # Sets of at most this size are split in the middle only
 _UNEQUAL = 1.15  # Factor by which the separator of an uneven split must be smaller
-_DIRECTIONS = 4
+_DIRECTIONS = 4  # Number of directions in which a set is cut
 _BELOW, _ABOVE, _SEPARATOR, _OUTSIDE = 0, 1, 2, -1
 
 
@@ -59,6 +59,7 @@ def dissect(bodies: IntArray, places: FloatArray, adjacency: Adjacency) -> Order
         waiting -= 1
         first, last = left[waiting, 0], left[waiting, 1]
         part = members[first:last]
+        # a small part is a group; of a larger one the separator is, and its halves are left
         if 0 < part.size <= _LEAF:
             for body in part:
                 groups[written] = body
@@ -334,7 +335,7 @@ def _follow(old: Pattern, position: IntArray, wanted: BoolArray, f: int) -> int:
     return count
 
 
-_NEAREST = 8
+_NEAREST = 8  # Number of nearest bodies that are neighbours; checked by `make bench-scaling`
 
 
 class Adjacency(NamedTuple):
