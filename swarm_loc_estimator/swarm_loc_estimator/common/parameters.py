@@ -50,11 +50,9 @@ class NumberSpec:
         return f"{'(' if self.above else '['}{self.low:g}, {self.high:g}]{unit}"
 
 
-def number(
-    default: float | None, unit: str, low: float, high: float, doc: str, *, above: bool = False
-) -> Any:
-    """A dataclass field that carries its `NumberSpec`; a default of None says that None is allowed."""
-    return field(default=default, metadata={"spec": NumberSpec(unit, low, high, above, doc, default is None)})
+def number(value: float | None, unit: str, low: float, high: float, doc: str, *, above: bool = False) -> Any:
+    """A dataclass field with its default and `NumberSpec`; a default of None says that None is allowed."""
+    return field(default=value, metadata={"spec": NumberSpec(unit, low, high, above, doc, value is None)})
 
 
 def number_specs(cls: type) -> dict[str, NumberSpec]:

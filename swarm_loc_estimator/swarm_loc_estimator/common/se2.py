@@ -109,10 +109,7 @@ def error_to_pose_jacobian(pose: ArrayLike) -> FloatArray:
 def pose_covariance(pose: ArrayLike, error_covariance: ArrayLike) -> FloatArray:
     """Covariances (..., 3, 3) of x, y, theta from those of the right-invariant error."""
     jacobian = error_to_pose_jacobian(pose)
-    covariance: FloatArray = (
-        jacobian @ np.asarray(error_covariance, dtype=float) @ np.swapaxes(jacobian, -1, -2)
-    )
-    return covariance
+    return np.asarray(jacobian @ np.asarray(error_covariance, dtype=float) @ np.swapaxes(jacobian, -1, -2))
 
 
 def error_covariance(pose: ArrayLike, covariance: ArrayLike) -> FloatArray:

@@ -280,17 +280,12 @@ def _as_gains(
     sigmas = [_sigmas(exchanges, covariance, logs.shape, unseen, used) for covariance in covariances]
     own, shared = np.max(sigmas, axis=0)
     factors = np.clip(np.exp(logs), *GAIN_RANGE)
-    return tuple(
-        IrGains(
-            tuple(factors[0, k].tolist()),
-            tuple(factors[1, k].tolist()),
-            max(float(own[k]), _MIN_SIGMA),
-            float(shared[k]),
-        )
-        if max(own[k], shared[k]) < platform.element_sigma
-        else IrGains.unknown(platform)
-        for k in range(logs.shape[1])
-    )
+    gains = []
+    for k, (sensor, emitter) in enumerate(zip(*factors.tolist(), strict=True)):
+        of_robot = IrGains(tuple(sensor), tuple(emitter), max(float(own[k]), _MIN_SIGMA), float(shared[k]))
+        is_better = max(own[k], shared[k]) < platform.element_sigma
+        gains.append(of_robot if is_better else IrGains.unknown(platform))
+    return tuple(gains)
 
 
 def _sigmas(
@@ -310,10 +305,8 @@ def _sigmas(
     means = blocks.mean(axis=(1, 3))
     own = np.array([np.trace(blocks[k, :, k]) / n - means[k, k] for k in range(2 * robots)])
     common: list[list[float]] = [[] for _ in range(2 * robots)]
-    pairs = np.unique(
-        np.stack([exchanges.receiver[used], robots + exchanges.transmitter[used]], axis=1), axis=0
-    )
-    for sensors, emitters in pairs.tolist():
+    pairs = np.stack([exchanges.receiver[used], robots + exchanges.transmitter[used]], axis=1)
+    for sensors, emitters in np.unique(pairs, axis=0).tolist():
         both = means[sensors, sensors] + means[emitters, emitters] + 2.0 * means[sensors, emitters]
         common[sensors].append(0.5 * float(both))
         common[emitters].append(0.5 * float(both))

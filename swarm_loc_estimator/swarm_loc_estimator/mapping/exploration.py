@@ -52,9 +52,8 @@ def planning_grid(
     own = np.hypot(*(middles - position[:, None, None]))
     passable |= (own < kept + cell) & (state == OPEN)  # a robot next to a wall must get away from it
     for other in others:
-        passable &= (
-            np.hypot(*(middles - other[:, None, None])) > 2.0 * settings.robot_radius + settings.margin
-        )
+        away = np.hypot(*(middles - other[:, None, None]))
+        passable &= away > 2.0 * settings.robot_radius + settings.margin
     grid = PlanningGrid(occupancy.corner, cell, state.astype(np.int8), highest, passable)
     grid.passable[grid.cell_of(position)] = True
     return grid
@@ -140,24 +139,20 @@ class Goal:
     pose: FloatArray  #: (3,) pose of the robot in map at that time
 
 
-def goal_by_odometry(
-    pose: FloatArray, odometry: FloatArray, position: FloatArray, ratio: float
-) -> FloatArray:
+def goal_by_odometry(pose: FloatArray, odometry: FloatArray, goal: FloatArray, ratio: float) -> FloatArray:
     """Goal (2,) in the odom frame for a turn followed by a straight drive by odometry [m].
 
     Args:
         pose: (3,) pose of the robot in map.
         odometry: (3,) pose of the robot by odometry.
-        position: (2,) goal in map [m].
+        goal: (2,) in map [m].
         ratio: True turn over turn by odometry.
     """
-    way = position - pose[:2]
+    way = goal - pose[:2]
     turn = float(wrap_angle(math.atan2(way[1], way[0]) - pose[2])) / ratio
     course = odometry[2] + turn
-    there: FloatArray = odometry[:2] + math.hypot(way[0], way[1]) * np.array(
-        [math.cos(course), math.sin(course)]
-    )
-    return there
+    ahead = np.array([math.cos(course), math.sin(course)])
+    return np.asarray(odometry[:2] + math.hypot(way[0], way[1]) * ahead)
 
 
 _LATTICE, _CANDIDATES = 0.2, 260  # Distance of possible goals [m], and their maximum number

@@ -100,9 +100,9 @@ class OccupancyMap:
         probability = 100.0 / (1.0 + np.exp(-self.log_odds))
         return np.where(self.log_odds == 0.0, -1.0, probability)
 
-    def centres(self, chosen: BoolArray) -> FloatArray:
-        """Centres (n, 2) of the cells where `chosen` (nx, ny) is True [m]."""
-        return self.corner + (np.argwhere(chosen) + 0.5) * self.cell
+    def centres(self, cells: BoolArray) -> FloatArray:
+        """Centres (n, 2) of the cells where `cells` (nx, ny) is True [m]."""
+        return self.corner + (np.argwhere(cells) + 0.5) * self.cell
 
     def index(self, points: FloatArray) -> IntArray:
         """Cells (n, 2) of points (n, 2) [m], which may lie outside."""

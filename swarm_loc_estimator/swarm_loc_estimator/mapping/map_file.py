@@ -72,9 +72,8 @@ def load_map(path: Path, cell: float | None = None) -> OccupancyMap:
     checks = TreeChecks(path, MapFileError)
     about = checks.mapping(read_tree(path), WHOLE_FILE, required=("image", "origin", *_NUMBERS))
     numbers = {name: checks.number(about[name], name, spec) or 0.0 for name, spec in _NUMBERS.items()}
-    origin = [
-        checks.number(value, "origin", _PLACE) or 0.0 for value in checks.items(about["origin"], "origin")
-    ]
+    places = checks.items(about["origin"], "origin")
+    origin = [checks.number(value, "origin", _PLACE) or 0.0 for value in places]
     if len(origin) != 3 or origin[2] != 0.0:
         raise checks.error("origin", about["origin"], "must be x, y and a yaw of 0")
     mode, negate = about.get("mode", "trinary"), about.get("negate", 0)
@@ -90,11 +89,10 @@ def load_map(path: Path, cell: float | None = None) -> OccupancyMap:
     log_odds = _log_odds(shade, mode, free, occupied)[pixels]
     if mode == "scale":
         log_odds[~seen] = 0.0
+    own = numbers["resolution"]
     if cell is None:
-        return OccupancyMap(
-            np.array(origin[:2]), numbers["resolution"], np.ascontiguousarray(log_odds[::-1].T)
-        )
-    scale = cell / numbers["resolution"]
+        return OccupancyMap(np.array(origin[:2]), own, np.ascontiguousarray(log_odds[::-1].T))
+    scale = cell / own
     if not math.isclose(scale, 1.0, rel_tol=1e-3):
         log_odds = _resampled(log_odds, scale, checks)
     corner = np.round(np.array(origin[:2]) / cell) * cell

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,7 +89,7 @@ def decode_laser(data: bytes) -> LaserMessage:
 def decode_scan(data: bytes) -> ScanMessage:
     """Read a sensor_msgs/LaserScan; raises CdrError unless the bytes are a whole one."""
     message = decode(data, LASER_SCAN)
-    numbers = {name: float(getattr(message, name)) for name in ScanMessage._fields[1:-2]}
+    numbers: dict[str, Any] = {name: float(getattr(message, name)) for name in ScanMessage._fields[1:-2]}
     return ScanMessage(nanoseconds(message.header.stamp), **numbers, ranges=message.ranges.astype(float))
 
 

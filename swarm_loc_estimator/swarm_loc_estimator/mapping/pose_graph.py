@@ -200,9 +200,8 @@ class NormalEquations:
     def solve(self) -> tuple[FloatArray, NormalFactor]:
         """The step (u,), zero for fixed unknowns, and the factor for covariances."""
         matrix, gradient = self.system()
-        factor = splu(
-            matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True}
-        )
+        options = {"SymmetricMode": True}
+        factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
         step = np.zeros(len(self._free))
         step[self._free] = factor.solve(gradient)
         return step, NormalFactor(factor, self._place)
@@ -222,9 +221,9 @@ class NormalFactor:
 
     def covariance(self, index: IntArray, directions: FloatArray | None = None) -> FloatArray:
         """Covariance (d, d) of free unknowns (c,), or of linear combinations (d, c) of them."""
-        chosen = np.eye(len(index)) if directions is None else directions
-        columns = np.zeros((self._factor.shape[0], len(chosen)))
-        for number, direction in enumerate(chosen):
+        rows = np.eye(len(index)) if directions is None else directions
+        columns = np.zeros((self._factor.shape[0], len(rows)))
+        for number, direction in enumerate(rows):
             np.add.at(columns[:, number], self._place[index], direction)
         covariance: NDArray[np.float64] = columns.T @ self._factor.solve(columns)
         return np.asarray(0.5 * (covariance + covariance.T))

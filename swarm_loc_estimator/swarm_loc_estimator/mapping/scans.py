@@ -447,11 +447,9 @@ class MotionTracker:
         bounds = [0, *(np.flatnonzero(changes) + 1).tolist(), len(labels)]
         for begin, end in pairwise(bounds):
             part = slice(begin, end)
-            chosen = Readings(
-                readings.stamp_ns[part], readings.odometry[part], readings.inverse[part], readings.sigma
-            )
-            label = int(labels[begin])
-            yield Run(label != _DRIVES, label >= _ARRIVES, label == _JUMPS, chosen)
+            columns = (readings.stamp_ns[part], readings.odometry[part], readings.inverse[part])
+            label, some = int(labels[begin]), Readings(*columns, readings.sigma)
+            yield Run(label != _DRIVES, label >= _ARRIVES, label == _JUMPS, some)
 
 
 @cached_njit

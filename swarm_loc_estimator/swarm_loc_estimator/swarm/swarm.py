@@ -233,9 +233,7 @@ class Swarm:
         names = Counter(one.name for one in self.sources)
         if twice := [name for name, count in names.items() if count > 1]:
             raise SwarmError(f"name '{twice[0]}' is given to two robots or cameras; names must be unique.")
-        faces = [
-            (f"face '{face.name}' of robot '{r.name}'", face.id) for r in self.robots for face in r.faces
-        ]
+        faces = [(f"face '{f.name}' of robot '{r.name}'", f.id) for r in self.robots for f in r.faces]
         marks = [(f"landmark {mark.id}", mark.id) for mark in self.landmarks]
         boards = [(f"robot '{r.name}'", r.ir.id) for r in self.robots if r.ir is not None]
         radios = [(f"robot '{r.name}'", r.uwb.address) for r in self.robots if r.uwb is not None]

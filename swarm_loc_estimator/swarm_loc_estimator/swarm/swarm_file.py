@@ -201,8 +201,12 @@ class _Loader(TreeChecks):
         fixed = self._named(sections.get("cameras", {}), "cameras")
         cameras = tuple(self._fixed_camera(name, tree) for name, tree in fixed)
         anchors = self._anchors(sections.get("anchors"))
+        name = sections.get("map")
+        if name is not None and (not isinstance(name, str) or not name):
+            raise self.error("map", name, "must be the path of a map's .yaml file, from here")
+        file = None if name is None else (self._folder / name).resolve()
         try:
-            swarm = Swarm(robots, landmarks, cameras, anchors, self._map(sections.get("map")))
+            swarm = Swarm(robots, landmarks, cameras, anchors, file)
         except SwarmError as error:
             raise self.said(str(error).removesuffix(".")) from error
         states = ParameterTable.of(swarm.robots, swarm.surveyed).filter_size - 3 * len(robots)
@@ -212,11 +216,6 @@ class _Loader(TreeChecks):
                 f" but must make at most {MAX_PARAMETERS}"
             )
         return swarm
-
-    def _map(self, name: Tree) -> Path | None:
-        if name is not None and (not isinstance(name, str) or not name):
-            raise self.error("map", name, "must be the path of a map's .yaml file, from here")
-        return None if name is None else (self._folder / name).resolve()
 
     def _robot(self, name: str, tree: Tree, defaults: _Layer, types: Mapping[str, _Layer]) -> Robot:
         """Parse one robot from its three layers."""
@@ -480,9 +479,7 @@ def _layer(robot: Robot, folder: Path) -> Entries:
         layer["odometry"] = None
     layer["ir"] = {} if robot.ir is None else _board(robot.ir, folder)
     layer["uwb"] = {} if robot.uwb is None else _numbers(robot.uwb)
-    layer["faces"] = {
-        face.name: _numbers(face) | ({"lies": True} if face.lies else {}) for face in robot.faces
-    }
+    layer["faces"] = {f.name: _numbers(f) | ({"lies": True} if f.lies else {}) for f in robot.faces}
     return layer
 
 

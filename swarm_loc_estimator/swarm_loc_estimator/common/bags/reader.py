@@ -11,7 +11,7 @@ import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Any, BinaryIO
+from typing import TYPE_CHECKING, Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
@@ -56,7 +56,11 @@ def unpack_file(path: Path, folder: Path, losses: list[str]) -> Path:
     unpacked, free = folder / path.stem, shutil.disk_usage(folder).free // 2
     with path.open("rb") as packed, unpacked.open("wb") as file:
         try:
-            for part in _unpacked_parts(packed, path.suffix):
+            if path.suffix == ".lz4":
+                source = lz4.frame.LZ4FrameFile(packed)
+            else:
+                source = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+            while part := source.read1(_STEP):  # read would lose what stands before an early end
                 free -= len(part)
                 if free < 0:
                     raise BagError(f"{path} unpacks to more than half of the free space in {folder.parent}.")
@@ -64,15 +68,6 @@ def unpack_file(path: Path, folder: Path, losses: list[str]) -> Path:
         except _ERRORS as error:
             losses.append(f"{path.name}: its compression is damaged ({error}); the part before was read.")
     return unpacked
-
-
-def _unpacked_parts(packed: BinaryIO, suffix: str) -> Iterator[bytes]:
-    if suffix == ".lz4":
-        source = lz4.frame.LZ4FrameFile(packed)
-    else:
-        source = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-    while part := source.read1(_STEP):  # read would lose what stands before an early end
-        yield part
 
 
 def unpack_messages(batches: Iterator[MessageBatch], losses: ReadErrors) -> Iterator[MessageBatch]:
@@ -196,10 +191,10 @@ class BagReader:
             (topic, type, log time [ns], serialized message).
         """
         wanted = None if topics is None else {name.lstrip("/") for name in topics}
-        chosen = [topic for topic in self.topics if wanted is None or topic.name in wanted]
-        for batch in self._batches({topic: number for number, topic in enumerate(chosen)}):
+        read = [topic for topic in self.topics if wanted is None or topic.name in wanted]
+        for batch in self._batches({topic: number for number, topic in enumerate(read)}):
             for number, log_ns, data in batch.messages():
-                yield chosen[number].name, chosen[number].type, log_ns, data
+                yield read[number].name, read[number].type, log_ns, data
 
     def batches(self, topics: Sequence[str]) -> Iterator[MessageBatch]:
         """All messages of some topics in order of log time, many at once.

@@ -69,10 +69,8 @@ class _McapStorage:
     def __init__(self, folder: Path, compression: CompressionMode) -> None:
         self.path = folder / f"{folder.name}.mcap"
         self._file = self.path.open("xb")
-        packed = compression == CompressionMode.STORAGE
-        self._writer = McapWriter(
-            self._file, compression=CompressionType.ZSTD if packed else CompressionType.NONE
-        )
+        packed = CompressionType.ZSTD if compression == CompressionMode.STORAGE else CompressionType.NONE
+        self._writer = McapWriter(self._file, compression=packed)
         self._writer.start("ros2", "swarm_loc_estimator")
         self._schemas: dict[str, int] = {}
         self._channels: dict[int, int] = {}

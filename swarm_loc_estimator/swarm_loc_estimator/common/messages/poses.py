@@ -198,8 +198,8 @@ def _copies(model: bytes, stamp_ns: IntArray, numbers: FloatArray) -> list[bytes
     rows = np.tile(np.frombuffer(model, np.uint8), (len(stamp_ns), 1))
     rows[:, ENCAPSULATION : ENCAPSULATION + STAMP_SIZE] = stamp_bytes(stamp_ns)
     rows[:, -8 * numbers.shape[1] :] = np.ascontiguousarray(numbers, dtype="<f8").view(np.uint8)
-    joined = rows.tobytes()
-    return [joined[begin : begin + len(model)] for begin in range(0, len(joined), len(model))]
+    copies = rows.tobytes()
+    return [copies[begin : begin + len(model)] for begin in range(0, len(copies), len(model))]
 
 
 _DOUBLES = 3 + 9 + 1  # Numbers of a robot in swarm/poses: pose, covariance and age of the fix

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-import numpy.typing as npt
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
@@ -48,7 +47,7 @@ class SerializedMessage(NamedTuple):
 class MessageBatch(NamedTuple):
     """Messages (n,) of several topics."""
 
-    data: npt.NDArray[np.uint8]  # (b,) bytes, read-only
+    data: NDArray[np.uint8]  # (b,) bytes, read-only
     topic: IntArray  # (n,) number of the topic of each
     log_ns: IntArray  # (n,) when each was recorded or arrived
     offset: IntArray  # (n,) where each begins in `data`
@@ -82,11 +81,9 @@ class MessageBatch(NamedTuple):
         for topic, log_ns, offset, length in zip(*(c.tolist() for c in columns), strict=True):
             yield topic, log_ns, bytes(view[offset : offset + length])
 
-    def chosen(self, rows: slice | npt.NDArray[np.intp] | npt.NDArray[np.bool_]) -> MessageBatch:
+    def chosen(self, k: slice | NDArray[np.intp] | NDArray[np.bool_]) -> MessageBatch:
         """Some of them, in the same buffer."""
-        return MessageBatch(
-            self.data, self.topic[rows], self.log_ns[rows], self.offset[rows], self.length[rows]
-        )
+        return MessageBatch(self.data, self.topic[k], self.log_ns[k], self.offset[k], self.length[k])
 
     def in_order_of_time(self) -> MessageBatch:
         """Sorted by time, equal ones as they lie."""

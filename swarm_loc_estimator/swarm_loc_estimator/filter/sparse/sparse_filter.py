@@ -349,7 +349,7 @@ def _rows(shares: FloatArray, bodies: IntArray) -> FloatArray:
     return out
 
 
-# The constants below are checked by `make bench-scaling`: swarms of six shapes, compared with the exact filter.
+# The constants below are checked by `make bench-scaling`, which compares with the exact filter.
 _COPIES = 64  # Maximum number of bodies that are copied
 _COPIED_SHARE = 4  # At most one of this number of bodies is copied
 _COPIED_AGAIN = 100
