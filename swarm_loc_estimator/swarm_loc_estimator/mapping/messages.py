@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +68,11 @@ class ScanMessage(NamedTuple):
     range_min: float
     range_max: float
     ranges: FloatArray
-    frame_id: str = ""  # Not read: the mount is that of the swarm description
+
+    @property
+    def frame_id(self) -> str:
+        """Not read: the mount is that of the swarm description."""
+        return ""
 
 
 class LightMessage(NamedTuple):
@@ -89,7 +93,7 @@ def decode_laser(data: bytes) -> LaserMessage:
 def decode_scan(data: bytes) -> ScanMessage:
     """Read a sensor_msgs/LaserScan; raises CdrError unless the bytes are a whole one."""
     message = decode(data, LASER_SCAN)
-    numbers: dict[str, Any] = {name: float(getattr(message, name)) for name in ScanMessage._fields[1:-2]}
+    numbers = {name: float(getattr(message, name)) for name in ScanMessage._fields[1:-1]}
     return ScanMessage(nanoseconds(message.header.stamp), **numbers, ranges=message.ranges.astype(float))
 
 

@@ -186,6 +186,7 @@ class _Loader(TreeChecks):
         version = sections.get("fileversion")
         if version != FILE_VERSION or isinstance(version, bool):
             raise self.error("fileversion", version, f"must be {FILE_VERSION}")
+        # what robots have in common, then the robots
         defaults = self._layer(sections.get("defaults", {}), "defaults", _DEFAULTS)
         types = {
             name: self._layer(tree, f"types.{name}", LAYER)
@@ -197,6 +198,7 @@ class _Loader(TreeChecks):
         if len(named) > MAX_ROBOTS:
             raise self.said(f"robots names {len(named)} robots but must name at most {MAX_ROBOTS}")
         robots = tuple(self._robot(name, tree, defaults, types) for name, tree in named)
+        # what is fixed in map
         landmarks = self._landmarks(sections.get("landmarks", {}), sections.get("defaults", {}))
         fixed = self._named(sections.get("cameras", {}), "cameras")
         cameras = tuple(self._fixed_camera(name, tree) for name, tree in fixed)
@@ -205,6 +207,7 @@ class _Loader(TreeChecks):
         if name is not None and (not isinstance(name, str) or not name):
             raise self.error("map", name, "must be the path of a map's .yaml file, from here")
         file = None if name is None else (self._folder / name).resolve()
+        # the swarm as a whole
         try:
             swarm = Swarm(robots, landmarks, cameras, anchors, file)
         except SwarmError as error:
