@@ -25,7 +25,7 @@ from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE
 from swarm_loc_estimator.offline.live.graph import LiveGraph, cpu_seconds
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 WORLD = "w2"
 _SILENCE_PATIENCE_S = 120.0

@@ -34,7 +34,7 @@ from swarm_loc_drivers.sim.link_host import FirmwareHost
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue
 from swarm_loc_estimator.offline.live.graph import LiveGraph, Recorder, cpu_seconds
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 SIZES = (50, 100, 200)
 MULTICAST, SERVER = "multicast", "server"

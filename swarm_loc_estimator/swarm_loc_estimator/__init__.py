@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.swarm.swarm import Swarm as Swarm
     from swarm_loc_estimator.swarm.swarm import UwbDevice as UwbDevice
     from swarm_loc_estimator.swarm.swarm_file import load_swarm as load_swarm
-    from swarm_loc_estimator.swarm.swarm_writer import save_swarm as save_swarm
+    from swarm_loc_estimator.swarm.swarm_file import save_swarm as save_swarm
     from swarm_loc_estimator.timeline.estimate import Estimate as Estimate
     from swarm_loc_estimator.timeline.estimate import Status as Status
     from swarm_loc_estimator.timeline.estimator import Estimator as Estimator
@@ -101,8 +101,7 @@ _MODULES = {
         "Swarm",
         "UwbDevice",
     ),
-    "swarm_loc_estimator.swarm.swarm_file": ("load_swarm",),
-    "swarm_loc_estimator.swarm.swarm_writer": ("save_swarm",),
+    "swarm_loc_estimator.swarm.swarm_file": ("load_swarm", "save_swarm"),
     "swarm_loc_estimator.timeline.estimate": ("Estimate", "Status"),
     "swarm_loc_estimator.timeline.estimator": ("Estimator", "Step"),
     "swarm_loc_estimator.timeline.settings": ("Settings",),

@@ -16,7 +16,7 @@ IMPORT_ALL_WITHOUT_ROS = """
 import importlib, pathlib, re, sys
 
 WITH_ROS = re.compile(
-    r"_nodes?$|^swarm_loc_estimator\\.(common\\.(node|lifecycle|ros_parameters)$|nodes\\.|watch\\.)"
+    r"_nodes?$|^swarm_loc_estimator\\.(common\\.node$|nodes\\.|watch\\.)"
     r"|^swarm_loc_estimator\\.(offline\\.live\\.|doctor\\.listener$|cli\\.demo$)"
     r"|^swarm_loc_drivers\\..*_(diagnostics|messages|output)$"
 )

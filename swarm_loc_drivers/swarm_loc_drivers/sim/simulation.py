@@ -26,8 +26,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, check_parameter_file
 from swarm_loc_estimator.common.parameters import ParameterError, number
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_vision.aerial.ground_file import save_ground
 
 Parameters = dict[str, ParameterValue]

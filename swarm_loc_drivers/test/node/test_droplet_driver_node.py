@@ -22,7 +22,7 @@ from tf2_msgs.msg import TFMessage
 from swarm_loc_drivers.droplet.droplet_nodes import DropletDriverNode
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import load_ir_platform
 from swarm_loc_msgs.msg import BrightnessMatrix
 
 

@@ -17,7 +17,7 @@ from rosgraph_msgs.msg import Clock
 from swarm_loc_drivers.droplet.droplet_nodes import DropletFleetNode
 from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, describe_droplets, starts
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_msgs.msg import BrightnessMatrix
 
 ROBOTS = 3

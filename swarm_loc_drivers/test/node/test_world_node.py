@@ -18,7 +18,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 SECOND = 1_000_000_000
 SIZE = {"width": 320, "height": 240}

@@ -29,10 +29,9 @@ from swarm_loc_estimator.offline.calibration.infrared.board import calibrate_fro
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
 from swarm_loc_estimator.offline.calibration.infrared.plots import board_text, draw, draw_board, text_of
 from swarm_loc_estimator.offline.calibration.recording import read_recording
-from swarm_loc_estimator.swarm.board_file import save_ir_platform
+from swarm_loc_estimator.swarm.ir_board import save_ir_platform
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
 
 @exit_with_message

@@ -20,12 +20,10 @@ from typing import TypeVar
 
 from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.swarm.new_swarm import FAMILY_IDS, SwarmPlan, planned_swarm
-from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS, SENSORS
-from swarm_loc_estimator.swarm.schema import SCHEMA_FILE, schema_text
+from swarm_loc_estimator.swarm.new_swarm import FAMILY_IDS, KNOWN_ROBOTS, SENSORS, SwarmPlan, planned_swarm
+from swarm_loc_estimator.swarm.schema import schema_text
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_file import MAX_NAME, MAX_ROBOTS, NAME
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import MAX_NAME, MAX_ROBOTS, NAME, SCHEMA_FILE, save_swarm
 
 Answer = TypeVar("Answer")
 QUESTIONS = {

@@ -42,8 +42,7 @@ from swarm_loc_estimator.offline.export import read_truth, write_mcap, write_tum
 from swarm_loc_estimator.offline.replay import TICK_S, TICKS_S, replay
 from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_estimator.timeline.self_calibration import swapped_signs
 from swarm_loc_estimator.timeline.settings import Settings
 

@@ -78,7 +78,7 @@ def adjoint_of(transform: FloatArray) -> tuple[tuple[float, ...], ...]:
 
 @cached_njit
 def carry(transform: FloatArray, matrix: FloatArray, out: FloatArray) -> None:
-    """Write Ad(T) M Ad(T)^T (3, 3), of a transform (3,) and the covariance M (3, 3) of an error behind it."""
+    """Write Ad(T) M Ad(T)^T (3, 3), of a transform (3,) and the covariance M (3, 3) of an error after it."""
     adjoint = adjoint_of(transform)
     for i in range(3):
         a, b, c = adjoint[i]

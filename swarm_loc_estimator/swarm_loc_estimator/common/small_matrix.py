@@ -48,7 +48,7 @@ def add_scaled(target: FloatArray, source: FloatArray, factor: float) -> None:
 
 @inlined_njit
 def factor_numbers(matrix: FloatArray) -> tuple[float, float, float, float, float, float]:
-    """The rows of the lower Cholesky factor of a positive definite matrix (3, 3), one behind the other."""
+    """The rows of the lower Cholesky factor of a positive definite matrix (3, 3), one after the other."""
     a = math.sqrt(matrix[0, 0])
     b = matrix[1, 0] / a
     c = math.sqrt(matrix[1, 1] - b * b)
@@ -123,8 +123,7 @@ def invert_factor(numbers: FloatArray, size: int) -> bool:
 @cache
 def _plan(size: int) -> IntArray:
     """The steps (s, 3) that invert the factor of a matrix: which, the first row, number of rows."""
-    steps: IntArray = np.array(_steps(0, size), dtype=np.int64).reshape(-1, 3)
-    return steps
+    return np.array(_steps(0, size), dtype=np.int64).reshape(-1, 3)
 
 
 def _steps(begin: int, rows: int) -> list[tuple[int, int, int]]:

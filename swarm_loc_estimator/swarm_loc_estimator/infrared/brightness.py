@@ -162,46 +162,34 @@ WAY_ROWS = 22  # Number of rows of the workspace of `predict_brightness`
 
 
 class _Ways(NamedTuple):
-    """Quantities of the W = n * n paths from each sensor to each emitter, ordered by sensor.
+    """Quantities of the W = n * n paths from each sensor to each emitter (W,), ordered by sensor.
 
     Every step of a prediction is a vectorized loop over all paths, without branches.
-
-    Attributes:
-        x, y: (W,) from sensor to emitter in the receiver's frame [m].
-        length, direction: (W,) polar coordinates of that vector [m], [rad].
-        emitter_x, emitter_y: (W,) the emitter's direction in the receiver's frame.
-        at_sensor, at_emitter: (W,) angles between the path and the axes of sensor and emitter [rad].
-        piece: (W,) workspace of `curves_at`.
-        seen, seen_slope, lit, lit_slope: (W,) the curves S and E.
-        share: (W,) their product.
-        bright, bright_slope: (W,) the amplitude of one power.
-        by_length, by_turn: (3, W) factors of the amplitude's slope and of the amplitude in the derivatives by
-            range, bearing and heading.
     """
 
-    x: FloatArray
+    x: FloatArray  # From sensor to emitter in the receiver's frame [m]
     y: FloatArray
-    length: FloatArray
+    length: FloatArray  # Polar coordinates of that vector [m], [rad]
     direction: FloatArray
-    emitter_x: FloatArray
+    emitter_x: FloatArray  # The emitter's direction in the receiver's frame
     emitter_y: FloatArray
-    at_sensor: FloatArray
+    at_sensor: FloatArray  # Angles between the path and the axes of sensor and emitter [rad]
     at_emitter: FloatArray
-    piece: FloatArray
-    seen: FloatArray
+    piece: FloatArray  # Workspace of `curves_at`
+    seen: FloatArray  # The curve S
     seen_slope: FloatArray
-    lit: FloatArray
+    lit: FloatArray  # The curve E
     lit_slope: FloatArray
-    share: FloatArray
-    bright: FloatArray
+    share: FloatArray  # The product of S and E
+    bright: FloatArray  # The amplitude of one power
     bright_slope: FloatArray
+    # (3, W) factors in the derivatives by range, bearing and heading: of the amplitude's slope
     by_length: FloatArray
-    by_turn: FloatArray
+    by_turn: FloatArray  # (3, W) of the amplitude
 
 
 @cached_njit
 def _predict_all(model: IrModel, poses: FloatArray, readings: FloatArray, slopes: FloatArray) -> None:
-    """Predict the readings and slopes of all poses."""
     work = np.empty((WAY_ROWS, model.angles.size**2))
     for k in range(poses.shape[0]):
         predict_brightness(model, poses[k, 0], poses[k, 1], poses[k, 2], work, readings[k], slopes[k])
@@ -242,12 +230,15 @@ def predict_brightness(
         r[16:19],
         r[19:22],
     )
+    # the vectors r from sensors to emitters, their lengths, and the angles at both ends, eqs (1)-(4)
     _lay(model, distance, bearing, heading, ways)
     _measure(ways.x, ways.y, ways.length, ways.direction)
     _write_angles(model.angles, heading, ways)
+    # the curves S and E there, and what does not depend on the power
     curves_at(model.sensor, ways.at_sensor, ways.piece, ways.seen, ways.seen_slope)
     curves_at(model.emitter, ways.at_emitter, ways.piece, ways.lit, ways.lit_slope)
     _write_changes(model.radius, distance, bearing, ways)
+    # for each power the readings A S E, and their derivatives by range, bearing and heading
     count = ways.share.size
     for m in range(model.amplitudes.shape[0]):
         begin, end = m * count, (m + 1) * count
@@ -294,7 +285,6 @@ def _write_angles(angles: FloatArray, heading: float, ways: _Ways) -> None:
 
 @norefcount_njit
 def _write_changes(rho: float, distance: float, bearing: float, ways: _Ways) -> None:
-    """Write `by_length` and `by_turn`."""
     ux, uy = math.cos(bearing), math.sin(bearing)
     by_length, by_turn = ways.by_length, ways.by_turn
     for w in range(ways.share.size):
@@ -315,13 +305,13 @@ def _write_changes(rho: float, distance: float, bearing: float, ways: _Ways) -> 
 
 @cached_njit
 def _multiply(a: FloatArray, b: FloatArray, out: FloatArray) -> None:
-    """Write a b."""
+    """Write the products of the entries of two vectors."""
     for w in range(out.size):
         out[w] = a[w] * b[w]
 
 
 @cached_njit
 def _combine(a: FloatArray, b: FloatArray, c: FloatArray, d: FloatArray, out: FloatArray) -> None:
-    """Write a b + c d."""
+    """Write a b + c d, entry by entry."""
     for w in range(out.size):
         out[w] = a[w] * b[w] + c[w] * d[w]

@@ -76,7 +76,7 @@ def add_spread(table: StartTable, work: StartWorkspace, pose: FloatArray, covari
 
 
 _DIRECTIONS = (16, 24)  # Minimum and maximum number of bearings, and of headings; in between, two per element
-_LEVELS = 16
+_LEVELS = 16  # Number of ranges; checked with the starts by `make bench-droplet`
 _KNEE = 10.0  # Brightness above which compression is logarithmic instead of linear [sigma]
 _SHOWN = 2.0  # Brightness of an aligned pair at the maximum range of the table [sigma]
 

@@ -6,7 +6,7 @@ a Cauchy loss begin at the predicted pose, and go no way that the walls do not t
 
 Errors of beams are not independent: what is wrong with a piece of wall is wrong for all beams that meet it.
 n beams on one piece have the information 1 / (m + s/n) with the variances m of the map and s of a range.
-Errors that whole walls share remain however many pieces there are, and are added to the covariance.
+Errors that whole walls share remain for any number of pieces, and are added to the covariance.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from swarm_loc_estimator.filter.models import POSE_GATE
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import MapFileError
 
+# The constants of matching to a map are checked by `make bench-inputs`: lidars in a known map.
 _WALL_M, _MIN_WINDOW = 0.12, 2
 """Half the side of the window in which the line of a wall is fitted [m], and at least this many cells."""
 _SURFACE = 1.5  # Depth in cells up to which occupied cells are the surface of a wall, and not its inside
@@ -42,7 +43,7 @@ _IMITATED = 5.0  # Information over what errors of normals imitate, below which 
 _MIN_INFORMATION = 4.0  # Information below which a direction is not determined [1/m^2]
 UNDETERMINED_SIGMA = 2.0
 """Standard deviation where walls tell nothing [m, or rad times the mean range]; robots are lost before."""
-_THROUGH_M = 0.25  # A beam that ends so far behind a wall has gone through it [m]
+_THROUGH_M = 0.25  # A beam that ends farther than this beyond a wall has gone through it [m]
 _MIN_BEAMS, _MIN_FIT, _MAX_THROUGH = 20, 0.5, 0.1
 """Minimum number and share of beams that fit, and maximum share of beams that go through walls."""
 
@@ -190,12 +191,7 @@ def match(
 
 @cached_njit
 def normal_equations(
-    walls: WallMap,
-    ends: FloatArray,
-    origin: FloatArray,
-    variance: FloatArray,
-    pose: FloatArray,
-    reach: float,
+    walls: WallMap, ends: FloatArray, origin: FloatArray, variance: FloatArray, pose: FloatArray, reach: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The information (3, 3) of a sweep on a pose (3,), the part that normals imitate, and the gradient (3,).
 
@@ -213,6 +209,7 @@ def normal_equations(
     size = walls.cell * walls.kind.shape[1]
     width = int(size / _PIECE_M) + 1
     beams = np.zeros((int(walls.cell * walls.kind.shape[0] / _PIECE_M) + 1) * width, dtype=np.int64)
+    # each beam that ends near a wall: its residual r = n.(p - c), derivatives, noise, and piece of wall
     for k in range(count):
         arm_x, arm_y = cos * ends[k, 0] - sin * ends[k, 1], sin * ends[k, 0] + cos * ends[k, 1]
         i, j = _cell_of(walls, pose[0] + arm_x, pose[1] + arm_y)
@@ -231,6 +228,7 @@ def normal_equations(
         imitation[k] = walls.normal_variance[wall]
         piece[k] = int((x - walls.corner[0]) / _PIECE_M) * width + int((y - walls.corner[1]) / _PIECE_M)
         beams[piece[k]] += 1
+    # sums over beams; n on a piece have the information 1 / (m + s/n) together, and the loss is Cauchy's
     information, imitated, gradient = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros(3)
     for k in range(count):
         if piece[k] < 0:

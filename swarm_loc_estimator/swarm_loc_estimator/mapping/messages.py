@@ -36,11 +36,7 @@ class GridMessage(NamedTuple):
 
 
 def decode_occupancy_grid(data: bytes) -> GridMessage:
-    """Read a nav_msgs/OccupancyGrid.
-
-    Raises:
-        CdrError: The bytes are not a valid OccupancyGrid.
-    """
+    """Read a nav_msgs/OccupancyGrid; raises CdrError unless the bytes are a valid one."""
     message = decode(data, OCCUPANCY_GRID)
     header, about, cells = message.header, message.info, message.data
     origin = planar_pose(about.origin)
@@ -89,32 +85,20 @@ class LightMessage(NamedTuple):
 
 
 def decode_laser(data: bytes) -> LaserMessage:
-    """Read a swarm_loc_msgs/LaserDistance.
-
-    Raises:
-        CdrError: The bytes are not one.
-    """
+    """Read a swarm_loc_msgs/LaserDistance; raises CdrError unless the bytes are a whole one."""
     message = decode(data, LASER)
     return LaserMessage(nanoseconds(message.header.stamp), message.distance, message.sigma, message.v_px)
 
 
 def decode_scan(data: bytes) -> ScanMessage:
-    """Read a sensor_msgs/LaserScan.
-
-    Raises:
-        CdrError: The bytes are not one.
-    """
+    """Read a sensor_msgs/LaserScan; raises CdrError unless the bytes are a whole one."""
     message = decode(data, LASER_SCAN)
     numbers = {name: float(getattr(message, name)) for name in ScanMessage._fields[1:-1]}
     return ScanMessage(nanoseconds(message.header.stamp), **numbers, ranges=message.ranges.astype(float))
 
 
 def decode_lights(data: bytes) -> list[LightMessage]:
-    """Read a swarm_loc_msgs/LightBearingArray; lights with non-finite numbers are skipped.
-
-    Raises:
-        CdrError: The bytes are not one.
-    """
+    """Read the finite lights of a LightBearingArray; raises CdrError unless the bytes are a whole one."""
     message = decode(data, LIGHTS)
     lights, stamp_ns = message.lights, nanoseconds(message.header.stamp)
     columns = lights["frequency"], lights["bearing"], np.sqrt(np.maximum(0.0, lights["covariance"][:, 0]))
@@ -124,11 +108,7 @@ def decode_lights(data: bytes) -> list[LightMessage]:
 
 
 def led_frequencies(entries: Collection[str], robots: Collection[str]) -> dict[str, float]:
-    """Robot -> frequency of its LEDs [Hz].
-
-    Raises:
-        ParameterError: An entry is not a robot's name, '=' and a number above 0.
-    """
+    """Robot -> frequency of its LEDs [Hz]; raises ParameterError unless each entry is ROBOT=FREQUENCY."""
     found: dict[str, float] = {}
     for entry in entries:
         name, _, value = entry.partition("=")

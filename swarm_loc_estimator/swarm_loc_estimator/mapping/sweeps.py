@@ -57,6 +57,7 @@ def read_sweep(
     Returns:
         The sweep; None if the scan cannot be used.
     """
+    # geometry: angles and times of the beams
     count, step = len(scan.ranges), scan.angle_increment
     numbers = (scan.angle_min, scan.angle_max, step, scan.time_increment)
     is_finite = all(map(math.isfinite, numbers))
@@ -70,9 +71,11 @@ def read_sweep(
     if abs(step) * (count - 1) > _MAX_SWEEP_TURN:
         drops["scan_bad_geometry"] += 1
         return None
+    # ranges that can be true
     far = scan.range_max if math.isfinite(scan.range_max) and scan.range_max > 0.0 else math.inf
     reach = min(far, lidar.max_range)
     near = max(scan.range_min, lidar.min_range) if math.isfinite(scan.range_min) else 0.0
+    # beams without such a range are counted and left out
     wrong = {
         "beam_not_a_number": np.isnan(scan.ranges),
         "beam_too_near": (scan.ranges < near) | (scan.ranges <= 0.0),
@@ -84,6 +87,7 @@ def read_sweep(
     if not len(used):
         drops["scan_without_beams"] += 1
         return None
+    # the others, each with its own time
     beam_ns = scan.stamp_ns + np.round(used * (scan.time_increment * 1e9)).astype(np.int64)
     distance = np.where(scan.ranges[used] > reach, math.inf, scan.ranges[used])
     angle = scan.angle_min + used.astype(float) * step

@@ -24,9 +24,8 @@ from std_srvs.srv import Trigger
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Level, Report
 from swarm_loc_estimator.common.jit import is_precompiled
-from swarm_loc_estimator.common.lifecycle import ManagedNode
 from swarm_loc_estimator.common.messages.streams import MessageBatch
-from swarm_loc_estimator.common.node import BACKWARDS, Ticks, run_node
+from swarm_loc_estimator.common.node import BACKWARDS, ManagedNode, Ticks, run_node
 from swarm_loc_estimator.nodes.estimator_diagnostics import (
     Diagnostics,
     TickCost,

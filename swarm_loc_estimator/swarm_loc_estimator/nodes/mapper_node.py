@@ -31,7 +31,7 @@ from swarm_loc_estimator.common.node import BACKWARDS, ConfiguredNode, message_c
 from swarm_loc_estimator.mapping.exploration import Goal
 from swarm_loc_estimator.mapping.grid import CELL, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import MapFileError, load_map, save_map
-from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper, Located
 from swarm_loc_estimator.mapping.mapper_feed import (
     MapperFeed,
     MapperInput,
@@ -40,7 +40,6 @@ from swarm_loc_estimator.mapping.mapper_feed import (
     inputs_of,
 )
 from swarm_loc_estimator.mapping.messages import led_frequencies
-from swarm_loc_estimator.mapping.track import Located
 from swarm_loc_estimator.nodes.mapper_precompile import precompile
 from swarm_loc_estimator.nodes.parameters import (
     MapperParameters,

@@ -26,9 +26,8 @@ from swarm_loc_estimator.filter.measurement_model import (
 )
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.odometry.track_arrays import new_sample
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
-from swarm_loc_estimator.swarm.ir_board import RobotIr
+from swarm_loc_estimator.swarm.ir_board import RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Settings

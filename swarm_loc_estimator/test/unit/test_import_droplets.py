@@ -26,7 +26,7 @@ from swarm_loc_estimator.offline.datasets.droplets_bag import (
     find_fiducials,
     import_recording,
 )
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import load_ir_platform
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 QUARTER = 0.5 * math.pi

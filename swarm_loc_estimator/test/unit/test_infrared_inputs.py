@@ -13,10 +13,10 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.infrared.search import IrOutcome, IrSolutions
+from swarm_loc_estimator.infrared.search import IrOutcome, IrSolutions, no_solutions
 from swarm_loc_estimator.sensors import infrared as brightness_sightings
 from swarm_loc_estimator.sensors.infrared import BrightnessConverter, BrightnessRows
-from swarm_loc_estimator.swarm.ir_board import IrMethod, IrPlatform, PairGains, RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 POSES = np.array([[0.0, 0.0, 0.3], [0.14, 0.08, -1.2], [-0.05, 0.1, 2.0]])
@@ -25,8 +25,8 @@ OTHER_BOARD = replace(DROPLET, radius=0.03)
 ONE_POWER = replace(DROPLET, amplitudes=DROPLET.amplitudes[:1])
 
 
-def swarm_of(platform: IrPlatform = DROPLET, method: IrMethod = IrMethod.LIKELIHOOD) -> Swarm:
-    board = RobotIr(1, platform, "droplet", method, calibrated(platform))
+def swarm_of(platform: IrPlatform = DROPLET) -> Swarm:
+    board = RobotIr(1, platform, "droplet", calibrated(platform))
     robots = [Robot(f"d{k}", ir=replace(board, id=k + 1)) for k in range(3)]
     return Swarm((*robots, Robot("blind"), Robot("other", ir=replace(board, id=9, platform=OTHER_BOARD))))
 
@@ -45,9 +45,8 @@ def relative(observer: int, target: int) -> FloatArray:
     return np.array([np.hypot(x, y), np.arctan2(y, x), heading])
 
 
-@pytest.mark.parametrize("method", IrMethod)
-def test_the_transmitter_lies_where_it_is_seen_from_the_receiver(method: IrMethod) -> None:
-    converter = BrightnessConverter(swarm_of(method=method))
+def test_the_transmitter_lies_where_it_is_seen_from_the_receiver() -> None:
+    converter = BrightnessConverter(swarm_of())
     change = converter.take(rows_of(*heard(noise=0.0)))
     measured = change.added
     assert measured["observer"].tolist() == measured["received_from"].tolist() == [0, 2]
@@ -56,7 +55,7 @@ def test_the_transmitter_lies_where_it_is_seen_from_the_receiver(method: IrMetho
     assert measured["has_heading"].all()
     assert not measured["sensor"].any()
     assert not measured["marker"].any()
-    limit = [0.01, 0.2, 0.3] if method is IrMethod.CLOSED_FORM else [1e-3, 0.01, 0.02]
+    limit = [1e-3, 0.01, 0.02]
     for row in measured:
         error = row["value"] - relative(row["observer"], 1)
         assert (np.abs([error[0], *se2.wrap_angle(error[1:])]) < limit).all()
@@ -164,11 +163,10 @@ def test_what_cannot_be_used_has_a_reason(
     assert converter.take(rows).added.size == 1
 
 
-@pytest.mark.parametrize("method", IrMethod)
-def test_readings_below_zero_are_noise_around_it(method: IrMethod) -> None:
+def test_readings_below_zero_are_noise_around_it() -> None:
     events = heard()[:2]
     assert min(float(event.readings.min()) for event in events) < 0.0
-    assert BrightnessConverter(swarm_of(method=method)).take(rows_of(*events)).added.size == 1
+    assert BrightnessConverter(swarm_of()).take(rows_of(*events)).added.size == 1
 
 
 def test_a_matrix_that_is_useless_alone_is_counted_until_its_partner_makes_it_useful() -> None:
@@ -183,8 +181,7 @@ def test_a_matrix_that_is_useless_alone_is_counted_until_its_partner_makes_it_us
     assert not converter.drops
 
 
-@pytest.mark.parametrize("method", IrMethod)
-def test_what_is_read_in_the_dark_is_no_light(method: IrMethod) -> None:
+def test_what_is_read_in_the_dark_is_no_light() -> None:
     """Readings and the saturation of their matrix are both higher by it."""
     limit = 150
     for poses in (POSES, CLOSE):
@@ -193,7 +190,7 @@ def test_what_is_read_in_the_dark_is_no_light(method: IrMethod) -> None:
             board = replace(DROPLET, dark_level=dark)
             lifted = [replace(one, readings=np.minimum(one.readings + dark, limit + dark)) for one in events]
             told = with_column(saturation=limit + dark)(rows_of(*lifted))
-            results.append(BrightnessConverter(swarm_of(board, method)).take(told).added)
+            results.append(BrightnessConverter(swarm_of(board)).take(told).added)
         assert results[0].size
         assert results[0].tobytes() == results[1].tobytes()
 
@@ -257,7 +254,7 @@ class Ambiguous:
         assert gains is not None
         assert saturation is not None
         k = len(readings)
-        solutions = IrSolutions.none(k)
+        solutions = no_solutions(k)
         solutions.outcomes[:] = IrOutcome.FOUND
         solutions.poses[:] = [0.1, 0.2, 0.3]
         solutions.covariances[:] = np.eye(3)
@@ -269,7 +266,7 @@ class Ambiguous:
 def test_a_second_pose_becomes_the_alternative_and_no_covariance_is_no_measurement(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setitem(brightness_sightings._METHODS, IrMethod.LIKELIHOOD, Ambiguous)
+    monkeypatch.setattr(brightness_sightings, "MaximumLikelihood", Ambiguous)
     brightness_sightings._estimator.cache_clear()
     converter = BrightnessConverter(swarm_of())
     measured: MeasurementArray = converter.take(rows_of(*heard())).added

@@ -22,8 +22,7 @@ from swarm_loc_estimator.offline.report.report import SELF_CALIBRATED
 from swarm_loc_estimator.sensors.camera import SightingConverter
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm, save_swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.self_calibration import learns
 from swarm_loc_estimator.timeline.settings import Settings

@@ -11,9 +11,8 @@ from mapping_world import ROOM, RoomRobot, distance_in_room
 
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
-from swarm_loc_estimator.mapping.scans import LightSightings, Readings
+from swarm_loc_estimator.mapping.scans import LightSightings, MotionTracker, Readings, ScanStop
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.mapping.stops import MotionTracker, ScanStop
 
 START = (1.0, 1.0, 0.3)
 KNOWN = np.full(3, 1e-3)

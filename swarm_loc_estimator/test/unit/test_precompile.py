@@ -14,10 +14,9 @@ import numpy as np
 import pytest
 from compiled_code import compiled_since, printed_by_process, signatures
 
-from bench.shared.bags import encode_shared_detections, encode_shared_numbers
+from bench.shared.bags import SharedHead, encode_shared_detections, encode_shared_numbers
 from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,
-    SharedHead,
     swarm_key,
 )
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage

@@ -16,8 +16,7 @@ from swarm_loc_estimator.offline.calibration.infrared.reading_limits import (
     contradictions,
     find_reading_limits,
 )
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains, load_ir_platform
 
 ROBOTS, N = 3, 6
 NEVER = 1e8  # A saturation that nothing reaches [count]

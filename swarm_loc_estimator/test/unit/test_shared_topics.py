@@ -10,13 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.shared.bags import encode_shared_detections, encode_shared_numbers
+from bench.shared.bags import SharedHead, encode_shared_detections, encode_shared_numbers
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.cdr import SWARM_DETECTIONS, SWARM_FIXES, SWARM_ODOMETRY, CdrError
 from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,
-    SharedHead,
     decode_shared_detections,
     decode_shared_numbers,
     encode_detections,

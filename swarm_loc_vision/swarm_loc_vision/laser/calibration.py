@@ -27,8 +27,7 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.messages.cdr import LASER, ODOMETRY, CdrError
 from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number, number_specs
-from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
-from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
+from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, YamlTreeError, read_tree
 
 _MAX_SAMPLES = 100_000
 _MAX_OFF_COURSE = 0.1  # A robot that turns by more does not drive straight at a wall [rad]

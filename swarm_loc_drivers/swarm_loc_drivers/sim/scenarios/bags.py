@@ -58,7 +58,7 @@ from swarm_loc_estimator.common.messages.poses import (
     encode_pose_stamped,
 )
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 PERIOD_NS = 500_000_000
 _SIGMA = 0.008

@@ -67,8 +67,7 @@ def carried_pairs(places: FloatArray, across: FloatArray, others: FloatArray) ->
 def centres(covariances: FloatArray) -> FloatArray:
     """Points (n, 2) whose position errors are uncorrelated with the heading, for covariances (n, 3, 3)."""
     across = np.column_stack([-covariances[:, 1, 2], covariances[:, 0, 2]])
-    places: FloatArray = across / covariances[:, 2, 2, None]
-    return places
+    return across / covariances[:, 2, 2, None]
 
 
 @cached_njit

@@ -33,11 +33,10 @@ from swarm_loc_estimator.offline.datasets.droplets import (
     read_exchanges,
 )
 from swarm_loc_estimator.sensors.registry import kinds
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.error_models import RandomWalk
-from swarm_loc_estimator.swarm.ir_board import IrPlatform, RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 ROBOT_TYPE = "droplet"
 DIAMETER_M = 0.044

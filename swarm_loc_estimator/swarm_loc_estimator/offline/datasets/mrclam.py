@@ -31,7 +31,7 @@ from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.sensors.camera import CONTENT_POSITION
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Pose2, Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 MAX_TRUTH_GAP_NS = 500_000_000
 

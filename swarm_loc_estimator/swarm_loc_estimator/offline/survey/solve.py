@@ -19,7 +19,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.filter.models import predict
-from swarm_loc_estimator.mapping.constraints import NormalFactor
+from swarm_loc_estimator.mapping.pose_graph import NormalFactor
 from swarm_loc_estimator.offline.survey.problem import Start, SurveyProblem
 from swarm_loc_estimator.swarm.swarm import Swarm
 

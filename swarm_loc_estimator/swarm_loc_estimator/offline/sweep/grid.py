@@ -23,12 +23,11 @@ from swarm_loc_estimator.common.parameters import (
     Value,
     parameter_specs,
 )
-from swarm_loc_estimator.common.yaml_tree import Tree, read_tree
+from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, read_tree
 from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.offline.recorded_bag import Loss
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 from swarm_loc_estimator.timeline.settings import Settings
 
 MAX_JOBS = 100_000

@@ -403,7 +403,6 @@ def with_board(swarm: Swarm, board: BoardRecording, done: BoardCalibration, path
             ir.id,
             done.model.platform,
             str(path.resolve()),
-            ir.estimator,
             gains,
             *done.elements.numbers(place),
         )
