@@ -22,7 +22,7 @@ from swarm_loc_estimator.common.messages.detections import (
     encode_detections,
 )
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE
-from swarm_loc_estimator.offline.live.graph import LiveGraph, cpu_seconds
+from swarm_loc_estimator.offline.live_run import LiveGraph, cpu_seconds
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm

@@ -32,7 +32,7 @@ from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.world import EpuckWorldParameters, SimulatedEpuck, make_world
 from swarm_loc_drivers.sim.link_host import FirmwareHost
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue
-from swarm_loc_estimator.offline.live.graph import LiveGraph, Recorder, cpu_seconds
+from swarm_loc_estimator.offline.live_run import LiveGraph, Recorder, cpu_seconds
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 

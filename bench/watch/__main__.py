@@ -41,8 +41,7 @@ from swarm_loc_estimator.common.launch import (
     start,
     stop,
 )
-from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph, cpu_seconds
-from swarm_loc_estimator.offline.live.run import ESTIMATOR, PLAYER
+from swarm_loc_estimator.offline.live_run import ESTIMATOR, PLAYER, START_PATIENCE_S, LiveGraph, cpu_seconds
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.watch.server import free_port

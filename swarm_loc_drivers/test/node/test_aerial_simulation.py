@@ -11,7 +11,7 @@ from node_world import stamp_ns
 
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
-from swarm_loc_estimator.offline.live.graph import LiveGraph, Poses
+from swarm_loc_estimator.offline.live_run import LiveGraph, Poses
 from swarm_loc_estimator.swarm.swarm_writer import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 

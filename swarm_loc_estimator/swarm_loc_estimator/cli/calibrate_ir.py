@@ -27,7 +27,7 @@ from swarm_loc_estimator.common.command_line import (
 )
 from swarm_loc_estimator.offline.calibration.infrared.board import calibrate_from, with_board
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
-from swarm_loc_estimator.offline.calibration.infrared.plots import board_text, draw, draw_board, text_of
+from swarm_loc_estimator.offline.calibration.plots import board_text, draw_board, draw_gains, gains_text
 from swarm_loc_estimator.offline.calibration.recording import read_recording
 from swarm_loc_estimator.swarm.board_file import save_ir_platform
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -46,8 +46,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         recording = read_recording(options.bag, swarm, progress, options.remap)
         done = calibrate_infrared(recording, swarm, progress, with_truth=not options.without_truth)
     save_swarm(done.swarm, options.out, f"Infrared gains calibrated with {options.bag.name}.")
-    print("\n".join([text_of(done), *recording.sentences()]))
-    print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
+    print("\n".join([gains_text(done), *recording.sentences()]))
+    print(f"{options.out} written, picture: {draw_gains(done, options.out.with_suffix('.png'))}")
     return 0
 
 

@@ -30,13 +30,14 @@ from swarm_loc_estimator.common.command_line import (
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.nodes.playback import clock_step_ns
-from swarm_loc_estimator.offline.live.graph import Recorder, read_poses
-from swarm_loc_estimator.offline.live.run import (
+from swarm_loc_estimator.offline.live_run import (
     Agreement,
     BagContent,
     LiveRun,
+    Recorder,
     compare_with_replay,
     play_live,
+    read_poses,
 )
 from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.swarm.swarm import Swarm

@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from swarm_loc_estimator.common.command_line import ProgressLine, command_parser, exit_with_message, number_in
-from swarm_loc_estimator.offline.datasets.droplets_bag import (
+from swarm_loc_estimator.offline.datasets.droplets import (
     METRES_PER_PIXEL,
     ImportSettings,
     import_recording,

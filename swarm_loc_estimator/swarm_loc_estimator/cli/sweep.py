@@ -25,10 +25,8 @@ from swarm_loc_estimator.common.command_line import (
     folder_to_write,
 )
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.offline.sweep.fit import Best, run_fit
-from swarm_loc_estimator.offline.sweep.grid import read_sweep
-from swarm_loc_estimator.offline.sweep.jobs import NAMES, Backend, Line, run_sweep
 from swarm_loc_estimator.offline.sweep.report import rows_of, write_results
+from swarm_loc_estimator.offline.sweep.sweep import NAMES, Backend, Best, Line, read_sweep, run_fit, run_sweep
 
 
 @exit_with_message

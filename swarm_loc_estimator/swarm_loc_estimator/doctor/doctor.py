@@ -15,10 +15,10 @@ from swarm_loc_estimator.doctor.contents import (
     IMAGE,
     check_contents,
     check_estimate,
+    check_motion,
     check_pictures,
 )
 from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, Message, same_type
-from swarm_loc_estimator.doctor.motion import check_motion
 from swarm_loc_estimator.doctor.topics import DIAGNOSTICS, check_clocks, check_frames, check_topics
 from swarm_loc_estimator.offline.recorded_bag import Progress, renamed_topics
 from swarm_loc_estimator.sensors.registry import input_topics, kinds

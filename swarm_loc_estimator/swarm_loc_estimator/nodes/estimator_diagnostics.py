@@ -110,12 +110,7 @@ class Diagnostics:
     """
 
     def __init__(
-        self,
-        swarm: Swarm,
-        ingest: Ingest,
-        parameters: EstimatorParameters,
-        graph: Graph,
-        sole: Sequence[str],
+        self, swarm: Swarm, ingest: Ingest, parameters: EstimatorParameters, graph: Graph, sole: Sequence[str]
     ) -> None:
         self.duplicate_publishers: list[str] = []
         self._swarm = swarm

@@ -1,21 +1,150 @@
-"""Poses of tracked bodies as poses of the robots that carry them. No ROS here."""
+"""Messages of motion capture and of other localisers, as poses of named bodies. No ROS here.
+
+Messages may be those of rclpy or of `common.messages.cdr`, whose fields have the same names.
+
+Poses of tracked bodies as poses of the robots that carry them. No ROS here.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import Health
-from swarm_loc_estimator.common.parameters import ParameterError
-from swarm_loc_estimator.nodes.localizer_sources import BODY, SOURCES, BodyPose
-from swarm_loc_estimator.nodes.parameters import BridgeParameters
+from swarm_loc_estimator.common.messages.cdr import (
+    ODOMETRY,
+    POSE_STAMPED,
+    POSE_WITH_COVARIANCE,
+    TRANSFORMS,
+    nanoseconds,
+)
+from swarm_loc_estimator.common.messages.poses import PLANE, yaw_of
+from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text, texts
 from swarm_loc_estimator.sensors.fix import HEADING_UNKNOWN, has_heading, is_unknown
+
+BODY = "<body>"  # Stands for the name of a body in a topic
+_UNKNOWN: FloatArray = np.zeros((3, 3))
+
+
+class BodyPose(NamedTuple):
+    """Pose of a body."""
+
+    name: str  # Its name in the message; "": the message is about the body of its topic
+    frame_id: str  # Frame of the pose
+    stamp_ns: int  # Stamp of the message
+    pose: tuple[float, float, float]  # x [m], y [m] and yaw [rad], NaN if it was not measured
+    tilt: float  # Angle between the z axes of the body and of the frame [rad]; 0 without orientation
+    covariance: FloatArray = _UNKNOWN  # (3, 3) of the pose; zeros: unknown
+
+
+@dataclass(frozen=True)
+class LocalizerSource:
+    """Kind of messages of localisers."""
+
+    message_type: str  # Such as geometry_msgs/msg/PoseStamped
+    topic: str  # Default topic; contains `BODY` if each body has its own
+    bodies: Callable[[Any], Iterable[BodyPose]]  # Reads the poses of a message
+
+
+def _body(name: str, header: Any, place: Any, turn: Any, covariance: FloatArray = _UNKNOWN) -> BodyPose:
+    """A body at a geometry_msgs/Point or Vector3 with a Quaternion."""
+    x, y, z, w = turn.x, turn.y, turn.z, turn.w
+    norm = x * x + y * y + z * z + w * w
+    yaw, tilt = math.nan, 0.0
+    if math.isfinite(norm) and norm > 0.0:  # zeros or NaN: bodies that are tracked without orientation
+        yaw, tilt = yaw_of(x, y, z, w), math.acos(max(1.0 - 2.0 * (x * x + y * y) / norm, -1.0))
+    return BodyPose(
+        name, header.frame_id, nanoseconds(header.stamp), (place.x, place.y, yaw), tilt, covariance
+    )
+
+
+def _of_pose(message: Any) -> Iterator[BodyPose]:
+    yield _body("", message.header, message.pose.position, message.pose.orientation)
+
+
+def _of_pose_with_covariance(message: Any) -> Iterator[BodyPose]:
+    pose, covariance = message.pose.pose, np.reshape(message.pose.covariance, (6, 6))[PLANE]
+    yield _body("", message.header, pose.position, pose.orientation, covariance)
+
+
+def _of_transforms(message: Any) -> Iterator[BodyPose]:
+    for one in message.transforms:
+        yield _body(one.child_frame_id, one.header, one.transform.translation, one.transform.rotation)
+
+
+def _of_named_poses(message: Any) -> Iterator[BodyPose]:
+    for one in message.poses:
+        yield _body(one.name, message.header, one.pose.position, one.pose.orientation)
+
+
+def _of_rigid_bodies(message: Any) -> Iterator[BodyPose]:
+    for one in message.rigidbodies:
+        yield _body(one.rigid_body_name, message.header, one.pose.position, one.pose.orientation)
+
+
+SOURCES: Mapping[str, LocalizerSource] = {
+    "pose": LocalizerSource(POSE_STAMPED, f"/vrpn_mocap/{BODY}/pose", _of_pose),
+    "pose_with_covariance": LocalizerSource(
+        POSE_WITH_COVARIANCE, f"{BODY}/amcl_pose", _of_pose_with_covariance
+    ),
+    "odometry": LocalizerSource(ODOMETRY, f"{BODY}/odometry/global", _of_pose_with_covariance),
+    "tf": LocalizerSource(TRANSFORMS, "/tf", _of_transforms),
+    "named_poses": LocalizerSource(
+        "motion_capture_tracking_interfaces/msg/NamedPoseArray", "/poses", _of_named_poses
+    ),
+    "rigid_bodies": LocalizerSource("mocap4r2_msgs/msg/RigidBodies", "/rigid_bodies", _of_rigid_bodies),
+}
+"""Kinds of messages by name."""
+
+
+@dataclass(frozen=True)
+class BridgeParameters:
+    """Parameters of `localizer_bridge`."""
+
+    swarm_file: str = text("", "path of the swarm description", required=True)
+    source: str = choice("pose", tuple(SOURCES), "kind of messages, see the table of sources")
+    topic: str = text(
+        "",
+        "topic of the messages, with <body> in place of the body's name; empty: that of the table of sources",
+    )
+    output: str = choice(
+        "fix",
+        ("fix", "ground_truth"),
+        "<robot>/fix for the estimator, or <robot>/ground_truth to evaluate it",
+    )
+    bodies: tuple[str, ...] = texts(
+        "tracked bodies, such as cf1=epuck1, or epuck2 for a body with the robot's name;"
+        " empty: each robot has a body of its own name"
+    )
+    offsets: tuple[str, ...] = texts(
+        "poses of bodies in base_link, such as epuck1=0.01,0,1.5708 [m, m, rad];"
+        " the body of a robot not named here is at base_link"
+    )
+    source_frame: str = text("", "frame that the poses must be in; empty: map_frame or world")
+    map_frame: str = text("map", "frame of the published poses", required=True)
+    latency_s: float = number(
+        0.0, "s", 0.0, 2.0, "time from the exposure to the stamp of a message, subtracted from the stamp"
+    )
+    stamp_on_arrival: bool = flag(
+        False, "take the time of arrival in place of stamps, for a source with another clock or none"
+    )
+    position_sigma: float = number(
+        0.001, "m", 0.0, 10.0, "noise of x and of y, for poses without covariance", above=True
+    )
+    heading_sigma: float = number(
+        0.005, "rad", 0.0, 3.0, "noise of the heading, for poses without covariance", above=True
+    )
+    max_tilt: float = number(
+        0.35, "rad", 0.0, 3.1416, "largest angle between the z axes of a body and of the frame"
+    )
+
 
 _IN_TOPICS = re.compile(r"[A-Za-z0-9_/]+")
 _MAX_OFFSET_M = 10.0

@@ -42,10 +42,7 @@ from swarm_loc_estimator.mapping.mapper_feed import (
 from swarm_loc_estimator.mapping.messages import led_frequencies
 from swarm_loc_estimator.mapping.track import Located
 from swarm_loc_estimator.nodes.mapper_precompile import precompile
-from swarm_loc_estimator.nodes.parameters import (
-    MapperParameters,
-    chosen_robots,
-)
+from swarm_loc_estimator.nodes.parameters import MapperParameters, chosen_robots
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -141,10 +138,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._clear()
-        response.success, response.message = (
-            True,
-            "The map has been reset.",
-        )
+        response.success, response.message = (True, "The map has been reset.")
         return response
 
     def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:

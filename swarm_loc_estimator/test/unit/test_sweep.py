@@ -21,9 +21,8 @@ from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.offline.recorded_bag import Loss
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.sweep import grid, jobs
-from swarm_loc_estimator.offline.sweep.grid import Job, SweepFileError, read_sweep
-from swarm_loc_estimator.offline.sweep.jobs import FIGURES, outcome
 from swarm_loc_estimator.offline.sweep.report import Row, _span, write_results
+from swarm_loc_estimator.offline.sweep.sweep import FIGURES, Job, SweepFileError, outcome, read_sweep
 from swarm_loc_estimator.timeline.settings import Settings
 
 DEMO = Path(__file__).parents[3] / "bags" / "eight_one_robot_fast"

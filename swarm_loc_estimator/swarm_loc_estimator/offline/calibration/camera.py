@@ -18,11 +18,7 @@ from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.filter.measurement_model import Kind
 from swarm_loc_estimator.offline.calibration.recording import Recording
-from swarm_loc_estimator.offline.calibration.robust import (
-    fit_with_prior,
-    population,
-    spread,
-)
+from swarm_loc_estimator.offline.calibration.robust import fit_with_prior, population, spread
 from swarm_loc_estimator.sensors.camera import SightingConverter
 from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.error_models import SensorModel

@@ -24,12 +24,7 @@ from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.offline.calibration.camera import DENSE_GAP_NS
 from swarm_loc_estimator.offline.calibration.recording import Recording
-from swarm_loc_estimator.offline.calibration.robust import (
-    fit_with_prior,
-    population,
-    ridge,
-    spread,
-)
+from swarm_loc_estimator.offline.calibration.robust import fit_with_prior, population, ridge, spread
 from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.calibration_states import TURN_BIAS
 from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel

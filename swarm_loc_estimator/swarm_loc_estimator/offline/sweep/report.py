@@ -15,10 +15,9 @@ from matplotlib.figure import Figure
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import number_specs
+from swarm_loc_estimator.offline.report.plots import INK, SOFT, colour_of, length_unit, save, style
 from swarm_loc_estimator.offline.report.report import page_of, picture
-from swarm_loc_estimator.offline.report.style import INK, SOFT, colour_of, length_unit, save, style
-from swarm_loc_estimator.offline.sweep.grid import Sweep
-from swarm_loc_estimator.offline.sweep.jobs import FIGURES, Line
+from swarm_loc_estimator.offline.sweep.sweep import FIGURES, Line, Sweep
 from swarm_loc_estimator.timeline.settings import Settings
 
 Row = Mapping[str, Any]  # Column -> value; None where there is none

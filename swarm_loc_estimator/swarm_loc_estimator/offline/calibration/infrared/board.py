@@ -25,10 +25,7 @@ from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import Exchanges
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.search import IrOutcome
-from swarm_loc_estimator.offline.calibration.infrared.element_likelihood import (
-    ElementVerdicts,
-    find_dead_elements,
-)
+from swarm_loc_estimator.offline.calibration.infrared.elements import ElementVerdicts, find_dead_elements
 from swarm_loc_estimator.offline.calibration.infrared.gains import exchanges_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress

@@ -33,17 +33,15 @@ from swarm_loc_estimator.infrared.gains import POSE_SIGMA, Exchanges, GainsError
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.search import DARKEST, IrSolutions
 from swarm_loc_estimator.offline.calibration.camera import DENSE_GAP_NS
-from swarm_loc_estimator.offline.calibration.infrared.element_likelihood import (
+from swarm_loc_estimator.offline.calibration.infrared.elements import (
     BRIGHT_SPAN,
     LOWEST,
     MIN_SHARE,
     PEAK,
     ElementVerdicts,
-    find_dead_elements,
-)
-from swarm_loc_estimator.offline.calibration.infrared.reading_limits import (
     ReadingLimits,
     contradictions,
+    find_dead_elements,
     find_reading_limits,
 )
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
@@ -63,10 +61,7 @@ _SEED = 1
 
 
 def helpful_gains(
-    platform: IrPlatform,
-    robots: int,
-    exchanges: Exchanges,
-    progress: Callable[[str], None] = lambda _: None,
+    platform: IrPlatform, robots: int, exchanges: Exchanges, progress: Callable[[str], None] = lambda _: None
 ) -> BoolArray:
     """True (robots,) where gains estimated by `estimate_gains` improve held-out exchanges.
 
@@ -114,11 +109,7 @@ def _chosen_robots(
 
 
 def _by_block(
-    pairs: NDArray[np.int64],
-    logs: FloatArray,
-    blocks: NDArray[np.int64],
-    helps: BoolArray,
-    judged: BoolArray,
+    pairs: NDArray[np.int64], logs: FloatArray, blocks: NDArray[np.int64], helps: BoolArray, judged: BoolArray
 ) -> list[FloatArray]:
     """Log-likelihood ratios by block of the estimated gains to each other hypothesis."""
     receiver, transmitter = np.where(helps, GAINS, UNKNOWN)[pairs]
