@@ -44,12 +44,7 @@ _LENGTH = number_in(0.001, 10.0, "m")
 
 
 class Dialog:
-    """Takes each answer from an option, from the defaults, or from the terminal, until it can be used.
-
-    Args:
-        given: Answers of options, by name.
-        asks: Whether to ask for what was not given.
-    """
+    """Takes each answer from an option, from the defaults, or from the terminal, until it can be used."""
 
     def __init__(self, given: Mapping[str, str], *, asks: bool) -> None:
         self._given, self._asks = dict(given), asks

@@ -61,15 +61,7 @@ def evidence_of_bag(
     remap: Mapping[str, str] = MappingProxyType({}),
     namespace: str = "",
 ) -> Evidence:
-    """The first seconds of a bag.
-
-    Args:
-        bag: rosbag2 folder, .mcap or .db3 file.
-        swarm: The description.
-        seconds: How much of it is read [s].
-        progress: Called now and then.
-        remap: Expected topic -> topic of the bag, see `renamed_topics`.
-        namespace: Of the whole swarm, "" for none.
+    """The first `seconds` of a bag; `remap` as in `renamed_topics`, `namespace` of the whole swarm or "".
 
     Raises:
         BagError: Nothing in the bag can be read, or a topic cannot be mapped.

@@ -96,14 +96,7 @@ class Graph(Protocol):
 
 
 class Diagnostics:
-    """Creates the diagnostic reports of an interval.
-
-    Args:
-        swarm: The robots.
-        ingest: The inputs; each of its topics should have one publisher.
-        parameters: Expected frames of the odometry.
-        graph: Publishers of topics.
-        sole: Other topics that should have one publisher.
+    """Creates the diagnostic reports of an interval; inputs and `sole` topics should have one publisher each.
 
     Attributes:
         duplicate_publishers: One sentence for each topic that has more publishers, at the newest reports.
@@ -286,14 +279,7 @@ class Diagnostics:
 
 
 def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period_s: float) -> Report:
-    """Report of the ticks' durations, with advice if they are too long.
-
-    Args:
-        cost: The ticks of the interval.
-        elapsed_s: Length of the interval by the wall clock.
-        period_s: Parameter tick_period_s.
-        fusion_period_s: The fusion period in force [s].
-    """
+    """Report of the ticks in `elapsed_s` by the wall clock, with advice if they take too long."""
     load = cost.sum_s / elapsed_s if elapsed_s > 0.0 else 0.0
     values: dict[str, object] = {
         "ticks": str(cost.count),
@@ -311,11 +297,7 @@ def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period
 
 
 def shedding_report(cost: TickCost) -> Report:
-    """Report of the share of measurements dropped under overload.
-
-    Args:
-        cost: The ticks of the interval.
-    """
+    """Report of the share of measurements dropped under overload."""
     share = cost.shed / cost.sightings if cost.sightings else 0.0
     values: dict[str, object] = {"sightings left out [1]": _figure(share)}
     if not cost.shed:
@@ -326,11 +308,7 @@ def shedding_report(cost: TickCost) -> Report:
 
 
 def overload_report(count: int) -> Report:
-    """A warning about messages that the middleware dropped from full queues.
-
-    Args:
-        count: Number of dropped messages in the interval.
-    """
+    """A warning about `count` messages that the middleware dropped from full queues in the interval."""
     return Report("overload", f"overload: {count} messages were lost in full queues", Level.WARN)
 
 

@@ -84,9 +84,7 @@ CreateEstimator = Callable[[Swarm, Settings], Estimator]
 class EstimatorNode(ManagedNode[EstimatorParameters]):
     """Takes messages, runs the estimator once per tick and publishes the estimate.
 
-    Args:
-        create_estimator: Creates the estimator; tests pass another one.
-        node_arguments: Further arguments of `rclpy.node.Node`.
+    Tests pass another function that creates the estimator.
     """
 
     def __init__(self, create_estimator: CreateEstimator = Estimator, **node_arguments: Any) -> None:

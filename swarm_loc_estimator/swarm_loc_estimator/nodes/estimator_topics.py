@@ -56,11 +56,9 @@ class SetPoseError(ValueError):
 
 
 def planar_pose(pose: PoseWithCovariance, start_sigma: StartSigma) -> tuple[FloatArray, FloatArray]:
-    """The pose (3,) x [m], y [m], theta [rad] and its covariance (3, 3).
+    """The pose (3,) in map, x [m], y [m], theta [rad], and its covariance (3, 3).
 
-    Args:
-        pose: In map.
-        start_sigma: Used if the covariance is zero.
+    A covariance of zeros is replaced by `start_sigma`.
 
     Raises:
         SetPoseError: A number is not finite, or the quaternion is invalid.
@@ -78,12 +76,7 @@ def planar_pose(pose: PoseWithCovariance, start_sigma: StartSigma) -> tuple[Floa
 class PoseCommands:
     """Sets the pose of a robot, or deinitializes it until the next fix, at the user's request.
 
-    Args:
-        node: Owns the subscriptions.
-        swarm: The robots.
-        estimator: Executes the commands.
-        map_frame: Required frame of the poses.
-        by_topics: Whether to subscribe to a topic for each robot, too.
+    Poses must be in `map_frame`. Users ask by a service and, if `by_topics`, by a topic for each robot.
     """
 
     def __init__(
@@ -174,12 +167,8 @@ class EstimatorInputs:
     """Takes all inputs as raw bytes: building message objects would cost more than estimating.
 
     Messages wait in the middleware, which keeps the newest of each topic, and not in the executor, whose
-    queue is unbounded. Lost messages are detected by the publishers' sequence numbers.
-
-    Args:
-        node: Has the subscriptions, which no executor may handle.
-        topics: What to subscribe to; their index is their handle.
-        drop: Called with reason and count of lost messages.
+    queue is unbounded; no executor may handle the subscriptions. Lost messages are detected by the
+    publishers' sequence numbers. The index of a topic is its handle.
     """
 
     def __init__(self, node: Node, topics: Sequence[InputTopic], drop: Callable[[str, int], None]) -> None:
@@ -194,9 +183,8 @@ class EstimatorInputs:
     def take(self, time_ns: Callable[[], int]) -> list[SerializedMessage]:
         """Messages as handle, bytes and arrival in order of arrival; those above the limit remain queued.
 
-        Args:
-            time_ns: Returns the node's time [ns]. It is called after the messages are taken, since an earlier
-                time could be before their stamps. In simulated time, all arrive at that time.
+        `time_ns` returns the node's time. It is called after the messages are taken, since an earlier time
+        could be before their stamps. In simulated time, all arrive at that time.
         """
         taken = []
         for handle, subscription in enumerate(self._subscriptions):
@@ -280,13 +268,7 @@ def _children_by_topic(swarm: Swarm, parameters: EstimatorParameters) -> dict[st
 
 
 class StaticTransforms:
-    """Listens for static transforms into the estimator's own frames, which tf2 would accept.
-
-    Args:
-        node: Has the subscriptions.
-        swarm: Names of the robots.
-        parameters: Frames, and topics of transforms.
-    """
+    """Listens for static transforms into the estimator's own frames, which tf2 would accept."""
 
     def __init__(self, node: Node, swarm: Swarm, parameters: EstimatorParameters) -> None:
         self._parents: dict[tuple[str, str], str] = {}
@@ -319,13 +301,7 @@ class _Transforms(NamedTuple):
 
 
 class EstimateOutputs:
-    """Publishes estimates.
-
-    Args:
-        node: Owns the publishers.
-        swarm: Names of the robots.
-        parameters: Frames, and which topics to publish.
-    """
+    """Publishes estimates."""
 
     def __init__(self, node: Node, swarm: Swarm, parameters: EstimatorParameters) -> None:
         names = [robot.name for robot in swarm.robots]

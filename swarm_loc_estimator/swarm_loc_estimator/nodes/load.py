@@ -49,11 +49,8 @@ class Thinning:
     """Thins out measurements, but never odometry, which all predictions need.
 
     The result is deterministic. All matrices of an infrared exchange are used or none, and all detections of
-    an aerial image or none: a partial image would imply missing robots.
-
-    Args:
-        robots: Number of robots.
-        period_ns: Fusion period of a large swarm, to drop whole periods [ns]; 0: drop per source.
+    an aerial image or none: a partial image would imply missing robots. `period_ns` is the fusion period of a
+    large swarm, to drop whole periods; 0: measurements are dropped per source.
     """
 
     def __init__(self, robots: int, period_ns: int = 0) -> None:
@@ -162,12 +159,8 @@ class Shedding:
     """Cuts the share of measurements used while fusing falls behind, and lets it grow again.
 
     A node that is busy for a while and catches up again, as at its start, drops nothing. Using less saves
-    only the time of fusing: where fusing takes no more than its guaranteed share of a core, the share is not
-    cut further; where it takes less than half of that, the share grows.
-
-    Args:
-        fusion_load: That guaranteed share of a core.
-        horizon_s: Data older than this are dropped [s].
+    only the time of fusing: where fusing takes no more than its guaranteed share of a core, `fusion_load`,
+    the share is not cut further; where it takes less than half of that, the share grows.
 
     Attributes:
         share: Share of the measurements to use, in [MIN_SHARE, 1].
@@ -220,12 +213,7 @@ class Shedding:
 
 
 class FusionPace:
-    """Limits fusing to a share of a core, unless data would grow too old meanwhile.
-
-    Args:
-        load: Share of a core.
-        horizon_s: Data older than this are dropped [s].
-    """
+    """Limits fusing to a share `load` of a core, unless data would grow too old for `horizon_s` meanwhile."""
 
     def __init__(self, load: float, horizon_s: float) -> None:
         self._load = load
@@ -234,12 +222,7 @@ class FusionPace:
         self._fused_ns: int | None = None
 
     def is_due(self, wall_s: float, now_ns: int) -> bool:
-        """Whether to fuse now.
-
-        Args:
-            wall_s: A steady clock, that of the core.
-            now_ns: The node's time, that of the data.
-        """
+        """Whether to fuse now, by a steady clock (`wall_s`) and the node's time, that of the data."""
         if wall_s >= self._rested_s or self._fused_ns is None:
             return True
         return not 0 <= now_ns - self._fused_ns < self._longest_ns

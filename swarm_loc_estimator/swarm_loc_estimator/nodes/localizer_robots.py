@@ -170,12 +170,7 @@ class _UnusableError(Exception):
 
 
 class LocalizedRobots:
-    """Converts poses of bodies to poses of robots.
-
-    Args:
-        parameters: Of `localizer_bridge`.
-        robots: Names of the robots of the swarm.
-        health: Counts what is dropped, and records when bodies were seen.
+    """Converts poses of bodies to poses of robots; what was dropped and seen goes to `health`.
 
     Raises:
         ParameterError: A parameter cannot be used.
@@ -223,12 +218,9 @@ class LocalizedRobots:
         )
 
     def convert(self, bodies: Iterable[BodyPose], of_topic: str, arrival_ns: int) -> Iterator[RobotPose]:
-        """The poses of robots by those of bodies; what cannot be used is counted.
+        """The poses of robots by those of the bodies of one message; what cannot be used is counted.
 
-        Args:
-            bodies: Of one message.
-            of_topic: The body that its topic is about, "" if it names bodies itself.
-            arrival_ns: Time of arrival.
+        `of_topic` is the body that its topic is about, "" if it names bodies itself.
         """
         for body in bodies:
             name = body.name or of_topic

@@ -53,9 +53,6 @@ _OUTPUT_QOS = QoSProfile(depth=10)
 class MapperNode(ConfiguredNode[MapperParameters]):
     """Converts the inputs, calls the mapper and publishes its map, goals and fixes.
 
-    Args:
-        node_arguments: Further arguments of `rclpy.node.Node`.
-
     Attributes:
         feed: Converts the inputs and counts what was dropped.
     """

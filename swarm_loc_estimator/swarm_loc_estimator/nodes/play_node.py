@@ -190,12 +190,9 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
 
 
 def playing_qos(topic: str, recorded: Sequence[Qos]) -> QoSProfile:
-    """The profile to publish a topic with.
+    """The profile to publish a topic with, by the recorded profiles of its publishers.
 
-    Args:
-        topic: Its name in the bag.
-        recorded: Profiles of its publishers. If these differ or none is known, the result is reliable, and
-            latched for topics that are latched by convention.
+    If these differ or none is known, it is reliable, and latched for topics that are latched by convention.
     """
     profiles = [_profile(one) for one in recorded]
     if profiles and all(one == profiles[0] for one in profiles):

@@ -68,9 +68,7 @@ class LiveError(UserError):
 class LiveGraph:
     """A graph that runs as child processes while this process listens; use it as a context manager.
 
-    Args:
-        nodes: The estimator first; the others start when this process has discovered its poses.
-        log: File for the output of the nodes.
+    The estimator is the first node; the others start when this process has discovered its poses.
 
     Raises:
         LiveError: The estimator does not start.
@@ -225,9 +223,6 @@ class Poses(NamedTuple):
 
 class Recorder(Node):
     """Records all messages of swarm/poses with their times of reception, and counts from /diagnostics.
-
-    Args:
-        node_arguments: Further arguments of `rclpy.node.Node`.
 
     Attributes:
         raw: Serialized messages in order of reception.
@@ -387,11 +382,8 @@ def play_live(
 ) -> LiveRun:
     """Play a whole bag into a live graph and record its poses.
 
-    Args:
-        options: Options of the graph, with the bag.
-        log: File for the output of the nodes.
-        inputs_only: Whether only inputs of the estimator are played.
-        watch: Called about once per event while the bag plays.
+    The output of the nodes goes to `log`. `watch` is called about once per event while the bag plays. With
+    `inputs_only` only inputs of the estimator are played.
 
     Raises:
         ValueError: The options have no bag.
@@ -507,13 +499,7 @@ class Agreement:
 
 
 def compare_with_replay(live: LiveRun, bag: Path, settings: Settings | None = None) -> Agreement:
-    """Replay a bag at the stamps of live poses.
-
-    Args:
-        live: A run of the live graph.
-        bag: The bag that it was played.
-        settings: Of the live estimator.
-    """
+    """Replay a bag at the stamps of live poses, with the settings of the live estimator."""
     replayed = replay(bag, live.result.swarm, settings, stamp_ns=live.result.stamp_ns)
     difference = live.result.poses - replayed.poses
     located = np.isfinite(live.result.poses).all(axis=2)

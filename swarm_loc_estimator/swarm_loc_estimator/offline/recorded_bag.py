@@ -69,9 +69,7 @@ def truth_topics(swarm: Swarm) -> list[str]:
 class TruthReader:
     """Collects `<robot>/ground_truth`: PoseStamped, PoseWithCovarianceStamped, Odometry or TransformStamped.
 
-    Args:
-        swarm: The robots.
-        recorded: The topics of the recording, which declare the types.
+    The recorded topics declare the types.
 
     Attributes:
         topics: The index of a topic is its number in a batch.
@@ -170,11 +168,7 @@ NOTHING_LOST = Loss()
 
 
 class Network:
-    """Passes on the messages that are not lost.
-
-    Args:
-        loss: Which are.
-        topics: Names; the index is the number in a batch.
+    """Passes on the messages that are not lost; the index of a topic is its number in a batch.
 
     Attributes:
         lost: Number of messages.
@@ -219,15 +213,10 @@ def read_bag(
     remap: Mapping[str, str] = MappingProxyType({}),
     loss: Loss = NOTHING_LOST,
 ) -> BagSummary:
-    """Read a bag once.
+    """Read a bag once: a rosbag2 folder, .mcap or .db3 file.
 
-    Args:
-        bag: rosbag2 folder, .mcap or .db3 file.
-        swarm: Robots whose messages are read.
-        take: Called with the inputs, in order of arrival.
-        progress: Called now and then.
-        remap: Expected topic -> topic of the bag, see `renamed_topics`.
-        loss: Inputs that are not passed on; ground truth, maps and goals are complete.
+    `take` is called with the inputs, in order of arrival, less those that `loss` drops; ground truth, maps
+    and goals are complete. `remap` is as in `renamed_topics`.
 
     Raises:
         BagError: Nothing in the bag can be read, or a topic cannot be mapped.
@@ -268,13 +257,10 @@ def _from(batch: MessageBatch, first: int) -> MessageBatch:
 
 
 def renamed_topics(remap: Mapping[str, str], swarm: Swarm, known: Collection[str]) -> dict[str, str]:
-    """Topic of a bag -> the topic as which it is read.
+    """Topic of a bag -> the topic as which it is read, by rules expected topic -> topic of the bag.
 
-    Args:
-        remap: Expected topic -> topic of the bag, such as robot1/odom -> /robot1/odometry/filtered;
-            `<robot>` in both stands for each robot.
-        swarm: The robots.
-        known: Expected topics.
+    An example is robot1/odom -> /robot1/odometry/filtered; `<robot>` in both stands for each robot. `known`
+    are the expected topics.
 
     Raises:
         BagError: An expected topic is unknown, or two of them have the same topic of the bag.
@@ -379,10 +365,6 @@ MAX_GOALS = 20_000  # Maximum number of stored goals per robot
 
 class MapReader:
     """Collects the maps and goals of a bag for display; the estimator does not see them.
-
-    Args:
-        swarm: The robots.
-        max_bytes: Limit of all maps together.
 
     Attributes:
         topics: The index of a topic is its number in a batch.

@@ -45,13 +45,9 @@ class Frame(NamedTuple):
 
 
 def pack(kind: str, stamp_ns: int, columns: Mapping[str, npt.NDArray[Any]], **extra: object) -> Frame:
-    """A frame of columns (float64, float32, int32, uint8 or int8).
+    """A frame of columns by name (float64, float32, int32, uint8 or int8), each flattened.
 
-    Args:
-        kind: See `Frame`.
-        stamp_ns: Time of the content [ns].
-        columns: By name; each is flattened.
-        extra: Further entries of the header.
+    `extra` are further entries of the header.
     """
     flat = {name: np.ascontiguousarray(column).reshape(-1) for name, column in columns.items()}
     listed = [[name, _TYPES[str(column.dtype)], column.size] for name, column in flat.items()]
@@ -140,12 +136,7 @@ def map_frame(stamp_ns: int, grid: GridMessage) -> Frame:
 
 
 class History:
-    """A ring of frames.
-
-    Args:
-        span_ns: Maximum age of a frame.
-        max_bytes: Maximum size; the oldest frames are dropped first.
-    """
+    """A ring of frames of at most `span_ns` and `max_bytes`; the oldest are dropped first."""
 
     def __init__(self, span_ns: int = SPAN_NS, max_bytes: int = MAX_BYTES) -> None:
         self._span_ns = span_ns
@@ -218,11 +209,7 @@ def _parts() -> tuple[str, str, str]:
 
 
 def page(data: str = "") -> str:
-    """The page.
-
-    Args:
-        data: A recorded run (see `recording`) to play; "": the page asks its server for a live one.
-    """
+    """The page, with a recorded run to play (see `recording`); "": it asks its server for a live one."""
     markup, style, script = _parts()
     body, end = markup.split("<!-- data -->")
     recorded = f'<script type="application/octet-stream" id="recording">{data}</script>' if data else ""
@@ -239,12 +226,7 @@ def content_security_policy() -> str:
 
 
 def recording(about: dict[str, Any], frames: Iterable[Frame]) -> str:
-    """The text: base64 of gzip of the length of a JSON text, that text, and the frames.
-
-    Args:
-        about: Initial data of the page, see `about`.
-        frames: In the order of their stamps.
-    """
+    """The text: base64 of gzip of the length of a JSON text (`about`), that text, and frames by stamp."""
     head = json.dumps(about).encode()
     head += b" " * (-(4 + len(head)) % _ALIGNMENT)
     whole = b"".join([struct.pack("<I", len(head)), head, *(frame.data for frame in frames)])
@@ -252,14 +234,7 @@ def recording(about: dict[str, Any], frames: Iterable[Frame]) -> str:
 
 
 def about(swarm: Swarm, title: str, *, teleop: bool = False, commands: bool = True) -> dict[str, Any]:
-    """Description of the swarm for the page.
-
-    Args:
-        swarm: Its description.
-        title: Heading of the page.
-        teleop: Whether robots may be driven.
-        commands: Whether poses may be set and the estimator reset.
-    """
+    """Description of the swarm for the page, and what its users may do."""
     landmarks: list[list[Any]] = [[mark.id, mark.x, mark.y, mark.yaw] for mark in swarm.landmarks]
     landmarks += [[camera.name, camera.x, camera.y, None] for camera in swarm.cameras]
     return {

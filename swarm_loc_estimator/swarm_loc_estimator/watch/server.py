@@ -51,13 +51,7 @@ class WrongTokens:
         self._slots = [_Slot(0.0, 0)] * _SLOTS
 
     def refusal(self, client: str, given: str, token: str) -> str:
-        """Reason to refuse a token, one sentence; "" if it is right.
-
-        Args:
-            client: Address of the client.
-            given: The token that it sent; "" for none.
-            token: The right one.
-        """
+        """Reason to refuse what a client gave as token, "" for none, one sentence; "" if it is right."""
         place, guess = hash(client) % _SLOTS, hash((client, given))
         slot, now_s = self._slots[place], time.monotonic()
         if not given or guess == slot.guess:
@@ -79,11 +73,7 @@ class _Slot(NamedTuple):
 
 @dataclass(frozen=True)
 class Access:
-    """Decides which requests the server accepts.
-
-    Args:
-        address: Address on which the server listens.
-        token: Required token; "" for none, on a loopback address only.
+    """Decides which requests the server accepts; without a token, only on a loopback address.
 
     Raises:
         AccessError: The address is reachable from outside without a token, or the token is too short.
@@ -105,15 +95,10 @@ class Access:
             )
 
     def refusal(self, host: str, origin: str | None, token: str, client: str = "") -> str:
-        """Reason to refuse a request, one sentence; "" if it is accepted.
+        """Reason to refuse a request by its headers Host and Origin and its ?token=; "" if it is accepted.
 
-        Checks of Origin and Host prevent cross-site requests of the browser, and DNS rebinding.
-
-        Args:
-            host: Its Host header.
-            origin: Its Origin header, which browsers send with a WebSocket.
-            token: Its ?token=.
-            client: Address of the sender.
+        Checks of Origin, which browsers send with a WebSocket, and Host prevent cross-site requests of the
+        browser, and DNS rebinding.
         """
         parsed = _HOST.fullmatch(host.lower())
         if not parsed:
@@ -185,12 +170,7 @@ class ServerLoad(NamedTuple):
 class WatchServer:
     """Serves the page.
 
-    Args:
-        about: Initial data of pages, see `page.about`.
-        access: Address to listen on, and access control.
-        port: Port to listen on, 0 for any free one.
-        rate: Maximum frames of a kind per second and page.
-        on_command: Called with each command.
+    Port 0 is any free one. A page gets at most `rate` frames of a kind per second.
 
     Raises:
         ServerError: The port is taken, or the address is not this machine's.
@@ -252,12 +232,7 @@ class WatchServer:
         self._loop.call_soon_threadsafe(self._take, frame)
 
     def send_text(self, message: dict[str, Any], robot: int | None = None) -> None:
-        """Send a message to the pages; may be called from any thread.
-
-        Args:
-            message: The message.
-            robot: Only pages that show this robot get it.
-        """
+        """Send a message to the pages, or to those that show a robot; may be called from any thread."""
         self._loop.call_soon_threadsafe(self._note, message, robot)
 
     def close(self) -> None:
@@ -300,8 +275,7 @@ class WatchServer:
     def _close_slow_requests(self, known: Mapping[Connection, float]) -> None:
         """Close connections that have not become a WebSocket in time, now and once a second.
 
-        Args:
-            known: Pending connections, and when each was first seen [s].
+        `known` are pending connections, and when each was first seen [s].
         """
         now_s = self._loop.time()
         connections = self._runner.server.connections if self._runner.server else []
@@ -431,10 +405,6 @@ class LeftOut(NamedTuple):
 
 class Viewer:
     """Sends to one page; a slow page gets fewer frames, and its queues are bounded.
-
-    Args:
-        socket: The connection.
-        rate: Maximum frames of a kind per second.
 
     Attributes:
         selected: Index of the robot whose numbers the page shows; -1: none.

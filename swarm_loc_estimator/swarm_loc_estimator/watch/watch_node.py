@@ -66,13 +66,7 @@ _DRIVEN_NS = 400_000_000  # Time without a command after which a driven robot is
 
 
 class RobotCommands:
-    """Executes commands one after the other, in the node's thread.
-
-    Args:
-        node: Calls services and publishes.
-        names: The robots.
-        parameters: Allowed commands.
-        now_ns: A steady clock [ns].
+    """Executes commands one after the other, in the node's thread; `now_ns` is a steady clock.
 
     Attributes:
         dropped: Number of commands dropped from the full queue.
@@ -195,13 +189,7 @@ _NEWEST_ONLY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Places:
-    """The newest place of each robot of one kind.
-
-    Args:
-        kind: Kind of the frames.
-        keeps: Whether a place is valid until the next one, at any age.
-        drop: Called with the reason of a dropped message.
-    """
+    """The newest place of each robot; with `keeps` it is valid until the next one, at any age."""
 
     def __init__(self, kind: str, drop: Callable[[str], None], *, keeps: bool) -> None:
         self._kind = kind
@@ -239,11 +227,7 @@ class Places:
 
 
 class AerialNames:
-    """Joins anonymous detections with their identities, by the stamp of their image.
-
-    Args:
-        index_of: Robot name -> index.
-    """
+    """Joins anonymous detections with their identities, by the stamp of their image."""
 
     def __init__(self, index_of: dict[str, int]) -> None:
         self._index_of = index_of
@@ -276,12 +260,9 @@ class AerialNames:
 
 
 class NewestMessages:
-    """Topics of one type, one per robot; each is subscribed to once it has a publisher.
+    """Topics of one type, one per robot in their order; each is subscribed to once it has a publisher.
 
-    Args:
-        node: Owns the subscriptions; no executor may handle them.
-        message_class: Type of the topics.
-        topics: Names of the topics, in the order of the robots.
+    No executor may handle the subscriptions.
     """
 
     def __init__(self, node: Node, message_class: type, topics: Sequence[str]) -> None:
@@ -323,11 +304,7 @@ _PLACES_PERIOD_S = 0.1
 
 
 class WatchNode(ConfiguredNode[WatchParameters]):
-    """Converts messages to frames and passes them to the server.
-
-    Args:
-        node_arguments: Further arguments of `rclpy.node.Node`.
-    """
+    """Converts messages to frames and passes them to the server."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("watch", WatchParameters, **node_arguments)

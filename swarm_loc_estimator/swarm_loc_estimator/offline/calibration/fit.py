@@ -257,15 +257,9 @@ def _numbers(fit: CameraFit) -> dict[str, float]:
 
 
 def sway_of(time_s: FloatArray, marker: IntArray, bearing: FloatArray) -> tuple[float, float]:
-    """Standard deviation [rad] and time constant [s] of bearing errors that different markers share.
+    """Standard deviation [rad] and time constant [s] of bearing errors (m,) that different markers share.
 
-    Args:
-        time_s: (m,) of the sightings.
-        marker: (m,) their marker ids.
-        bearing: (m,) their bearing errors.
-
-    Returns:
-        Zeros if the errors of different markers are independent.
+    Zeros if the errors of different markers are independent.
     """
     order = np.argsort(time_s, kind="stable")
     time_s, marker, bearing = time_s[order], marker[order], bearing[order]

@@ -332,15 +332,10 @@ def nodes_of(values: FloatArray, duration_s: FloatArray, count: int) -> FloatArr
 
 
 def fit_response(drives: Sequence[Drive], late: Lateness, *, table: bool) -> MotionResponse:
-    """True per reported speed and turn rate, for robots of one type.
+    """True per reported speed and turn rate, for robots of one type with a known delay and lag.
 
     Several grids are compared by cross-validation over blocks of time; the smallest is used that is not
-    clearly worse than the best.
-
-    Args:
-        drives: Of all robots of the type.
-        late: Their delay and lag.
-        table: Whether there may be more than one scale factor of each.
+    clearly worse than the best. Without `table` there is one scale factor of each.
     """
     grids = [_grid(drives, count) for count in (_NODES if table else _NODES[:1])]
     held_out = [_held_out_error(drives, late, *grid) for grid in grids]

@@ -417,12 +417,6 @@ def import_recording(
 
     The bag holds <robot>/brightness, <robot>/ground_truth at each exchange, and <robot>/fix of the receivers.
 
-    Args:
-        path: The recording, see `datasets.droplets`.
-        folder: The bag to create.
-        settings: Board and scale of the recording.
-        progress: Called with the share done and what is being done.
-
     Raises:
         DropletRecordingError: The recording cannot be used.
         BagError: The folder is there already, or cannot be created.

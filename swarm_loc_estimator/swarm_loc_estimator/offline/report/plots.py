@@ -90,10 +90,7 @@ class Margins(NamedTuple):
 def save(figure: Figure, path: Path, margins: Margins | None = None) -> None:
     """Write a PNG with few colours and without version or time: equal results give equal files.
 
-    Args:
-        figure: Of a grid of axes.
-        path: File to write.
-        margins: None: as texts need it, but to measure them takes longer than to draw.
+    Without margins, they are as texts need it, but to measure them takes longer than to draw.
     """
     if margins is None:
         figure.set_layout_engine("constrained", w_pad=_PAD_IN, h_pad=_PAD_IN)
@@ -126,9 +123,6 @@ _MARGIN = 0.05  # Margin around the world, as a share of its size
 
 class WorldMap:
     """Draws a result on a map; all lengths in metres.
-
-    Args:
-        result: The run.
 
     Attributes:
         x: Limits from truth and landmarks; from estimates only without truth.
@@ -234,12 +228,7 @@ _NAME_PT = np.array([42.0, 22.0])  # Distance of a name from its robot, horizont
 
 
 def plot_overview(result: ReplayResult, path: Path) -> None:
-    """Draw paths, landmarks and the last poses with their covariance; beside it, errors over time.
-
-    Args:
-        result: The run, shown until its ground truth ends.
-        path: PNG file to write.
-    """
+    """Draw paths, landmarks and the last poses until the truth ends; to the right, errors over time."""
     result = _until_truth_ends(result)
     world = WorldMap(result)
     judged = any(len(errors.stamp_ns) for errors in result.errors.values())
@@ -392,12 +381,7 @@ _NEES_95 = (0.216, 9.348)  # 95 % bounds of the normalized squared error of thre
 def plot_paths(result: ReplayResult, path: Path) -> bool:
     """Draw each robot's true and estimated path in a panel of its own.
 
-    Args:
-        result: The run.
-        path: PNG file to write.
-
-    Returns:
-        Whether the file was written: not for one robot nor for more than `_MAX_PANELS`.
+    Returns whether the file was written: not for one robot nor for more than `_MAX_PANELS`.
     """
     robots = result.swarm.robots
     if not 1 < len(robots) <= _MAX_PANELS:
@@ -426,14 +410,9 @@ def plot_paths(result: ReplayResult, path: Path) -> bool:
 
 
 def plot_errors(result: ReplayResult, path: Path) -> bool:
-    """Draw errors over time with their 3-sigma bands, and NEES; the robots with the largest errors when many.
+    """Draw errors over time with their 3-sigma bands, and NEES; of many robots those with the largest errors.
 
-    Args:
-        result: The run.
-        path: PNG file to write.
-
-    Returns:
-        Whether the file was written: not without ground truth.
+    Returns whether the file was written: not without ground truth.
     """
     names = [name for name, errors in result.errors.items() if len(errors.stamp_ns)]
     if not names:

@@ -216,9 +216,7 @@ class ReportFiles:
 def write_report(result: ReplayResult, folder: Path | str) -> ReportFiles:
     """Write report.txt, report.html and overview.png, and if applicable paths.png and errors.png.
 
-    Args:
-        result: The run.
-        folder: Created if missing; files of an earlier report are replaced.
+    The folder is created if missing; files of an earlier report are replaced.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -269,12 +267,7 @@ small { display: block; color: var(--soft); }
 
 
 def html_report(result: ReplayResult, pictures: dict[str, Path]) -> str:
-    """One self-contained HTML page.
-
-    Args:
-        result: The run.
-        pictures: Heading -> PNG file below it.
-    """
+    """One self-contained HTML page, with pictures: heading -> PNG file below it."""
     parts = [
         f"<h1>{escape(result.title)}</h1>",
         _facts(result),

@@ -85,12 +85,7 @@ class SurveyProblem:
 
 
 def problem_of(recording: Recording, swarm: Swarm) -> SurveyProblem:
-    """Set up the problem of a recording.
-
-    Args:
-        recording: Odometry and detections of the robots.
-        swarm: Their description; landmarks in it are known places.
-    """
+    """Set up the problem of a recording; landmarks in the description are known places."""
     described, rare = _with_landmarks(recording, swarm)
     tracks = OdometryTracks(swarm.robots)
     rows, turns = recording.odometry, recording.turn_rates
@@ -327,12 +322,7 @@ class Solution:
 
 
 class Solver:
-    """Solves one problem.
-
-    Args:
-        problem: Sightings and odometry.
-        start: Where to begin; what is not connected there is left out.
-    """
+    """Solves one problem; what is not connected at the start is left out."""
 
     def __init__(self, problem: SurveyProblem, start: Start) -> None:
         self._problem, knots = problem, problem.knots

@@ -80,13 +80,9 @@ class Placed:
 
 
 def place_fixed(recording: Recording, swarm: Swarm, paths: Paths, *, cameras: bool) -> Placed:
-    """Place cameras and anchors.
+    """Place anchors and, if asked for, cameras that are described.
 
-    Args:
-        recording: Detections of fixed cameras, and ranges.
-        swarm: The description with corrected robots; described anchors stay, and other addresses are anchors.
-        paths: Of the robots.
-        cameras: Whether described cameras are placed again.
+    Described anchors stay, and other addresses are anchors. The robots of the description are corrected.
     """
     placed = Placed(swarm.cameras, swarm.anchors, [], [])
     if cameras and swarm.cameras:

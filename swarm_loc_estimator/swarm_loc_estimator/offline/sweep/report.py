@@ -63,10 +63,7 @@ def rows_of(sweep: Sweep, finished: Mapping[str, Line]) -> list[Row]:
 def write_results(rows: Sequence[Row], varied: Sequence[str], folder: Path) -> Path:
     """Write table.csv, a PNG for each varied value, and sweep.html; returns the page.
 
-    Args:
-        rows: Of the table, at least one.
-        varied: Columns with more than one value.
-        folder: Must exist; files of the same names are replaced.
+    The folder must exist; files of the same names are replaced.
     """
     cells = [[*rows[0]], *([_text(value) for value in row.values()] for row in rows)]
     with (folder / "table.csv").open("w", newline="", encoding="utf-8") as file:

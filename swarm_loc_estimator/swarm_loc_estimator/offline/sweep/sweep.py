@@ -252,11 +252,7 @@ _IN_ORDER = tuple(map(int, joblib.__version__.split(".")[:2])) < (1, 4)
 def run_sweep(sweep: Sweep, path: Path, backend: Backend, progress: Progress) -> dict[str, Line]:
     """Run all jobs but those that are finished in the file, and add them to it.
 
-    Args:
-        sweep: The jobs.
-        path: File with one line of JSON per job; created if missing, and what is not whole in it is ignored.
-        backend: Runs the workers.
-        progress: Called after each job.
+    The file has one line of JSON per job. It is created if missing, and what is not whole in it is ignored.
 
     Returns:
         Key of a job -> its newest line.
@@ -390,11 +386,7 @@ class Backend(NamedTuple):
 
 @contextmanager
 def workers(count: int, backend: Backend) -> Iterator[None]:
-    """A context in which `joblib.Parallel` has these workers.
-
-    Args:
-        count: Number of replays at a time; -1: one for each processor.
-        backend: Runs them.
+    """A context in which `joblib.Parallel` has `count` workers; -1: one for each processor.
 
     Raises:
         BackendError: A package is missing, or the cluster is not reached.
@@ -487,12 +479,8 @@ class Fitted(NamedTuple):
 def run_fit(sweep: Sweep, fit: Fit, path: Path, backend: Backend, progress: Progress) -> Fitted:
     """Run the trials of a fit; the defaults are the first one, where the ranges contain them.
 
-    Args:
-        sweep: The replays of each trial.
-        fit: What is tried.
-        path: See `run_sweep`; what is finished there is not run again, so a fit can be interrupted, too.
-        backend: Runs the workers.
-        progress: Called after each job.
+    What is finished in the file at `path` is not run again, see `run_sweep`, so a fit can be interrupted,
+    too.
 
     Raises:
         BackendError: optuna is not installed, or the back end is not reached.

@@ -453,10 +453,8 @@ class _Repeats(NamedTuple):
 def find_reading_limits(platform: IrPlatform, robots: int, exchanges: Exchanges) -> ReadingLimits:
     """Saturation and noise of all sensors of robots with one kind of board, by readings at full power.
 
-    Args:
-        platform: Its saturation and the directions of its elements are used.
-        robots: Number of robots.
-        exchanges: Exchanges in order of time; known poses are not used.
+    The saturation of the platform and the directions of its elements are used, known poses are not. Exchanges
+    are in order of time.
     """
     saturation = np.full((robots, platform.n), np.nan)
     firsts = _first_of_geometries(exchanges)
@@ -473,14 +471,7 @@ def find_reading_limits(platform: IrPlatform, robots: int, exchanges: Exchanges)
 def contradictions(
     platform: IrPlatform, exchanges: Exchanges, limits: ReadingLimits, names: Sequence[str]
 ) -> list[str]:
-    """Contradictions between exchanges and the description of the board, one sentence each.
-
-    Args:
-        platform: Description of the board.
-        exchanges: Exchanges, whose matrices also state a saturation.
-        limits: Limits estimated from them.
-        names: Names of the robots.
-    """
+    """Contradictions between exchanges, which state a saturation, and the board, one sentence each."""
     low = []
     for robot, name in enumerate(names):
         own = exchanges.receiver == robot

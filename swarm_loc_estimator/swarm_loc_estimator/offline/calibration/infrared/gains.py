@@ -63,14 +63,7 @@ _SEED = 1
 def helpful_gains(
     platform: IrPlatform, robots: int, exchanges: Exchanges, progress: Callable[[str], None] = lambda _: None
 ) -> BoolArray:
-    """True (robots,) where gains estimated by `estimate_gains` improve held-out exchanges.
-
-    Args:
-        platform: Of all robots.
-        robots: Number of robots.
-        exchanges: Their exchanges in order of time.
-        progress: Called with the name of each step.
-    """
+    """True (robots,) where gains by `estimate_gains` improve held-out exchanges, given in order of time."""
     count = len(exchanges.receiver)
     logs, blocks = np.full((count, HYPOTHESES, HYPOTHESES), np.nan), np.arange(count) * BLOCKS // count
     for block in range(BLOCKS):
@@ -140,12 +133,7 @@ def held_out_likelihoods(
 ) -> FloatArray:
     """Log likelihoods (k, H, H) of exchanges by the hypotheses on receiver and transmitter.
 
-    A constant per exchange is omitted; NaN where no pose is found.
-
-    Args:
-        platform: Of all robots.
-        gains: Of every robot, estimated without these exchanges.
-        exchanges: Held-out exchanges.
+    A constant per exchange is omitted; NaN where no pose is found. The gains were estimated without them.
     """
     found = np.full((len(exchanges.receiver), HYPOTHESES, HYPOTHESES), np.nan)
     factors, sigmas = _by_hypothesis(platform, gains)
@@ -320,13 +308,9 @@ class InfraredCalibration:
 def calibrate_infrared(
     recording: Recording, swarm: Swarm, progress: Progress, *, with_truth: bool = True
 ) -> InfraredCalibration:
-    """Calibrate the gains of all robots with infrared boards.
+    """Calibrate the gains of all robots with infrared boards; described gains are ignored.
 
-    Args:
-        recording: With brightness matrices.
-        swarm: The swarm of the recording; its gains are ignored.
-        progress: Called with the share done and the name of the step.
-        with_truth: Whether to use ground truth where available.
+    `with_truth`: whether to use ground truth where it is known.
 
     Raises:
         CalibrationError: No exchange can be used, or no gains are determined.
@@ -444,10 +428,7 @@ def _alike(screening: MatrixScreening) -> Iterator[list[int]]:
 def _true_poses(recording: Recording, swarm: Swarm, columns: IntArray) -> FloatArray:
     """Range [m], bearing and heading [rad] (k, 3) of transmitters seen from receivers; NaN where not known.
 
-    Args:
-        recording: With ground truth.
-        swarm: The swarm with the robots' names.
-        columns: (3, k) stamp, receiver and transmitter.
+    `columns` (3, k) are stamp, receiver and transmitter.
     """
     stamp_ns, *sides = columns
     places = np.full((2, stamp_ns.size, 3), np.nan)
