@@ -6,14 +6,13 @@
 
 The bag holds <robot>/brightness. <robot>/ground_truth is used if present; without it
 the poses are estimated together with the gains. The description is the `swarm.yaml` inside the bag's folder
-unless --swarm names another. Robots are calibrated with those of the same platform. Beside --out a picture of
-the same name shows the residuals before and after, and the gains.
+unless --swarm names another. Robots are calibrated with those of the same platform. A picture of
+the same name as --out shows the residuals before and after, and the gains.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 
 from swarm_loc_estimator.common.command_line import (
@@ -66,7 +65,6 @@ def _board(options: argparse.Namespace, swarm: Swarm) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     add_bag(parser, " with <robot>/brightness")
     add_remap(parser)
@@ -83,7 +81,3 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--without-truth", action="store_true", help="do as if there were no ground truth")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -179,7 +179,6 @@ class _Progress:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     parser.add_argument("bag", nargs="?", type=Path, default=BAG, help=f"what to play (default: {BAG})")
     parser.add_argument(
@@ -187,7 +186,3 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--out", type=folder_to_write, default="out/demo", help="folder for the report")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

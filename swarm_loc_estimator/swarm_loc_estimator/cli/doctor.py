@@ -10,7 +10,6 @@ anything is wrong.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from importlib import import_module
 
@@ -56,11 +55,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     add_live_or_bag(parser, f"how long to look (default: {_LIVE_S:g} s live, {_BAG_S:g} s of a bag)")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -11,7 +11,6 @@ the camera are corrected: misread ids, orientations wrong by quarter turns, robo
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -43,7 +42,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     parser.add_argument("recording", type=Path, help="text file, one exchange a line")
     parser.add_argument("bag", type=Path, help="bag folder to create")
@@ -57,7 +55,3 @@ def _parser() -> argparse.ArgumentParser:
         help="of the camera's image (default: robots of 44 mm that touch are 42 pixels apart)",
     )
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,7 +9,6 @@ The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -44,7 +43,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     parser.add_argument("folder", type=Path, help="folder with Robot*_Odometry.dat and the other files")
     parser.add_argument("bag", type=Path, help="bag folder to create")
@@ -57,7 +55,3 @@ def _parser() -> argparse.ArgumentParser:
         help="detections arrive evenly between LO and HI milliseconds late (default: at once)",
     )
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -4,14 +4,13 @@
     new epucks.yaml --yes --type epuck2 --robots 5 --arena 2.4x1.6            # asks nothing
 
 Options answer questions in advance; --yes takes the default for all others. Marker ids are given so that none
-appears twice. A JSON Schema is written beside the description, with which editors complete it.
+appears twice. A JSON Schema is written to the same folder, with which editors complete it.
 """
 
 from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -205,7 +204,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     parser.add_argument(
         "swarm_file", type=Path, nargs="?", default=Path("swarm.yaml"), help="file to write (swarm.yaml)"
@@ -262,7 +260,3 @@ def _arena(text: str) -> tuple[float, float]:
         raise argparse.ArgumentTypeError(
             f"'{text}' must be two lengths in [0.1, 1000] m, such as 2.4x1.6"
         ) from None
-
-
-if __name__ == "__main__":
-    sys.exit(main())

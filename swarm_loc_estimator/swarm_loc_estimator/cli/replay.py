@@ -111,7 +111,6 @@ def write_poses(result: ReplayResult, path: Path) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     add_bag(parser)
     add_remap(parser)
@@ -137,7 +136,3 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_set(parser, "parameter of the estimator")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

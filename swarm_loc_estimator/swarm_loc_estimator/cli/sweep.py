@@ -65,14 +65,9 @@ def _text_of(best: Best) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     parser.add_argument("file", metavar="SWEEP_FILE", type=Path, help="what is replayed")
     parser.add_argument("--out", type=folder_to_write, default="out/sweep", help="folder for the results")
     parser.add_argument("--backend", choices=NAMES, default=NAMES[0], help="what runs the replays")
     parser.add_argument("--cluster", metavar="ADDRESS", help="a running cluster of Ray or Dask")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,9 +1,6 @@
-"""Contents of messages: what the estimator drops or contradicts, unknown markers, other starts.
+"""Contents of messages: pictures, odometry and sightings, and what the estimator drops or contradicts.
 
-Images of the robots' cameras: calibration and encoding.
-
-Odometry beside sightings of static landmarks: scales, mounts and signs that cannot both be right.
-
+Odometry is compared with sightings of static landmarks: scales, mounts and signs that cannot both be right.
 A landmark stands at l = R (A d + m) + p in the odometry frame of a robot with pose (p, R), camera at m and
 sighting d. A is a scale and a rotation, which commute with R, so R d = B l - B (p + R m) with B = 1 / A. This
 is linear in B and, per landmark, in B l, which differences to the mean remove. The noisy sightings are on
@@ -74,7 +71,7 @@ def check_pictures(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 name, f"has the encoding '{image.encoding}', which the detectors cannot read", remedy
             )
-        # image_raw/compressed is a transport of image_raw, which has camera_info beside it
+        # image_raw/compressed is a transport of image_raw, which has a camera_info, too
         namespace = name.removesuffix("/compressed").rpartition("/")[0]
         info_name = f"{namespace}/camera_info".lstrip("/")
         found = evidence.topics.get(info_name, Heard(""))
@@ -85,7 +82,7 @@ def check_pictures(evidence: Evidence) -> Iterator[Finding]:
 
 
 def _of_intrinsics(name: str, info_name: str, info: Any, image: Any) -> Iterator[Finding]:
-    """What is wrong with the newest CameraInfo beside an image, which may be None."""
+    """What is wrong with the newest CameraInfo of an image, which may be None."""
     calibrate = "Calibrate the camera (camera_calibration) and let its driver load the file"
     if info is None:
         yield Finding(name, f"has no intrinsics: no message on {info_name}", calibrate)
@@ -292,7 +289,7 @@ _WRONG: MappingProxyType[str, Change] = MappingProxyType(
 
 
 def _check_turns(evidence: Evidence, index: int, own: OdometryRows) -> Iterator[Finding]:
-    """Turns of a gyroscope beside those of the wheels."""
+    """Turns of a gyroscope compared with those of the wheels."""
     rates = chosen(evidence.turn_rates, evidence.turn_rates.robot == index)
     if rates.stamp_ns.size < _MIN_MOTION_ROWS or own.robot.size < _MIN_MOTION_ROWS:
         return

@@ -1,9 +1,4 @@
-"""Topics: missing ones, other types and names, publishers, rates.
-
-Stamps and clocks: stamps beside the time of arrival.
-
-Frames: of odometry, and of transforms, where each frame must have one parent.
-"""
+"""Topics, clocks and frames: missing and other topics, publishers, rates, stamps, trees of transforms."""
 
 from __future__ import annotations
 

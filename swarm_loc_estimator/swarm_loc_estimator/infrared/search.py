@@ -88,7 +88,7 @@ def no_solutions(count: int) -> IrSolutions:
 
 
 class ReadingsError(ValueError):
-    """Readings that do not belong to the platform; the message is one sentence."""
+    """Readings that do not belong to the platform."""
 
 
 class IrEstimator(Protocol):

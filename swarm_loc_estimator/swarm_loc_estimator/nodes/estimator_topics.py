@@ -1,6 +1,6 @@
 """Topics of the estimator: raw inputs, which are queued until the next tick, and published estimates.
 
-Set the poses of robots by the service `set_robot_pose` and the topics `<robot>/initialpose`.
+Users set poses of robots by the service `set_robot_pose` and the topics `<robot>/initialpose`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ REFUSALS = {
 
 
 class SetPoseError(ValueError):
-    """A pose that cannot be set; the message is one sentence."""
+    """A pose that cannot be set."""
 
 
 def planar_pose(pose: PoseWithCovariance, start_sigma: StartSigma) -> tuple[FloatArray, FloatArray]:
@@ -151,7 +151,7 @@ DEPTH = 1000  # Queue length of a topic, which is emptied at each tick: enough f
 _SHARED_DEPTH = 500  # The same for a topic with the readings of many robots, whose messages are large
 _MAX_PER_TAKE = 5000  # Limit of messages per tick over all topics
 _MIN_PER_TOPIC = 100
-"""Least limit per topic: the messages of the usual horizon. With less, an estimator that has fallen behind
+"""Least limit per topic: the messages of the usual horizon. With less, an estimator that is late
 would get ever older data, which cost more to fuse, and never catch up."""
 
 _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
@@ -159,7 +159,7 @@ _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: 
 _TF_STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _MAX_FRAME_LENGTH = 64  # Longer names of foreign frames are cut
 _RELIABLE = QoSProfile(depth=10)
-_SIGHTINGS_PERIOD_NS = 180_000_000  # Publishing period of swarm/sightings, which are for display only
+_SIGHTINGS_PERIOD_NS = 180_000_000  # Publishing period of swarm/sightings, which are only for display
 _TF = QoSProfile(depth=100)  # what tf2's own broadcaster offers
 
 
@@ -330,7 +330,7 @@ class EstimateOutputs:
         ]
 
     def publish(self, estimate: Estimate) -> None:
-        """Publish all poses; robots that are not localized are in `swarm/poses` only, with status waiting."""
+        """Publish all poses; robots that are not localized are only in `swarm/poses`, with status waiting."""
         e = estimate
         located = e.status != Status.WAITING
         self._swarm_poses.publish(

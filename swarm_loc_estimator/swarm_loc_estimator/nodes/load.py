@@ -1,13 +1,12 @@
 """Limit the load of a live estimator: fuse less often, then drop a share of the measurements. No ROS here.
 
-Under overload, drop measurements uniformly over all robots and pairs.
-
-Each source (a robot's camera, infrared board or fixes, an overhead camera) has the same maximum number of
-used measurements, so those that send most lose measurements first (max-min fairness; D. Bertsekas, R.
-Gallager: Data Networks, 6.5.2). Measurement k of a source is used if the fractional part of k times the
-golden ratio is below the share. This sequence is uniform over any interval and over every n-th number (H.
-Weyl: Ueber die Gleichverteilung von Zahlen mod. Eins, 1916), so a robot that sends its detections always in
-the same order does not lose the same neighbour each time.
+Under overload, measurements are dropped uniformly over all robots and pairs. Each source (a robot's camera,
+infrared board or fixes, an overhead camera) has the same maximum number of used measurements, so those that
+send most lose measurements first (max-min fairness; D. Bertsekas, R. Gallager: Data Networks, 6.5.2).
+Measurement k of a source is used if the fractional part of k times the golden ratio is below the share. This
+sequence is uniform over any interval and over every n-th number (H. Weyl: Ueber die Gleichverteilung von
+Zahlen mod. Eins, 1916), so a robot that sends its detections always in the same order does not lose the same
+neighbour each time.
 
 A large swarm fuses the measurements of a fusion period as one batch, whose cost hardly depends on their
 number. So whole periods are used or dropped: period k by the same rule.
@@ -127,7 +126,7 @@ class _Units(NamedTuple):
     robot: IntArray  # (u,) robot index
     stamp_ns: IntArray  # (u,) time of measurement
     of_row: IntArray  # (k,) group of each row
-    exchange: Sequence[tuple[int, ...]] = ()  # Robot, stamp and transmitter of each group; infrared only
+    exchange: Sequence[tuple[int, ...]] = ()  # Robot, stamp and transmitter of each group of infrared
 
 
 def _units(sensor: Sensor, rows: Any) -> _Units:
@@ -156,7 +155,7 @@ _LONGEST_WAIT = 0.25  # Share of the horizon that data may wait to be fused
 
 
 class Shedding:
-    """Cuts the share of measurements used while fusing falls behind, and lets it grow again.
+    """Cuts the share of measurements used while fusing cannot keep up, and lets it grow again.
 
     A node that is busy for a while and catches up again, as at its start, drops nothing. Using less saves
     only the time of fusing: where fusing takes no more than its guaranteed share of a core, `fusion_load`,
@@ -193,11 +192,11 @@ class Shedding:
 
     def _adapt(self, elapsed_s: float, waited_s: float) -> None:
         load, fusing_load = self._busy_s / elapsed_s, self._fusing_s / elapsed_s
-        is_behind = load >= _BUSY and waited_s >= self._max_wait_s
+        is_late = load >= _BUSY and waited_s >= self._max_wait_s
         self._fusing_load += _SMOOTHING * (fusing_load - self._fusing_load)
         if load < _AT_EASE or self._fusing_load < 0.5 * self._fusion_load:
             self.share = min(1.0, _GROWTH * self.share)
-        elif is_behind and self._may_cut and fusing_load > self._fusion_load:
+        elif is_late and self._may_cut and fusing_load > self._fusion_load:
             self._may_cut = False
             cut = _AIM * self._handled_s / self._busy_s  # longer ticks are an overload
             self.share = max(MIN_SHARE, self.share * min(max(cut, _MAX_CUT), _MIN_CUT))

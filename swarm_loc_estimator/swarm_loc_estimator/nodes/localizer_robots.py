@@ -1,8 +1,6 @@
-"""Messages of motion capture and of other localisers, as poses of named bodies. No ROS here.
+"""Poses of tracked bodies, by motion capture and other localisers, as poses of the robots that carry them.
 
-Messages may be those of rclpy or of `common.messages.cdr`, whose fields have the same names.
-
-Poses of tracked bodies as poses of the robots that carry them. No ROS here.
+Messages may be those of rclpy or of `common.messages.cdr`, whose fields have the same names. No ROS here.
 """
 
 from __future__ import annotations

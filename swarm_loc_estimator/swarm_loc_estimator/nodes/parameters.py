@@ -34,7 +34,7 @@ class EstimatorParameters:
     transform_tolerance_s: float = number(
         0.0, "s", 0.0, 10.0, "time by which transforms are post-dated, as by AMCL"
     )
-    publish_robot_poses: bool = flag(True, "publish <robot>/pose beside swarm/poses, unless shared_topics")
+    publish_robot_poses: bool = flag(True, "publish <robot>/pose, too, unless shared_topics")
     shared_topics: bool = flag(
         False, "listen to swarm/odom, swarm/detections and swarm/fixes in place of topics of each robot"
     )

@@ -1,7 +1,4 @@
-"""Write a run as MCAP for viewers.
-
-Trajectories as text in the format of TUM, as evo uses it: `seconds x y z qx qy qz qw` per line.
-"""
+"""Write a run as MCAP for viewers, or as text in the format of TUM, which evo uses; read ground truth of TUM."""
 
 from __future__ import annotations
 
@@ -43,7 +40,7 @@ _MAX_S = 9_000_000_000
 
 
 class TumError(UserError):
-    """Files of trajectories that cannot be used; the message is one sentence."""
+    """Files of trajectories that cannot be used."""
 
 
 def write_tum(result: ReplayResult, folder: Path) -> None:

@@ -1,9 +1,7 @@
-"""Run a graph as child processes in a ROS domain of its own, and record its poses and diagnostics.
+"""Run a graph as child processes, record its poses, play a bag into it, and compare it with a replay.
 
 The graph is that of the commands and launch files. Its ROS domain is otherwise unused and limited
 to this machine, so that it cannot interfere with real robots.
-
-Play a bag into the live graph over DDS, record its poses, and compare them with those of a replay.
 """
 
 from __future__ import annotations
@@ -62,7 +60,7 @@ _WAKE_S = 0.05
 
 
 class LiveError(UserError):
-    """The live graph has failed; the message is one sentence."""
+    """The live graph has failed."""
 
 
 class LiveGraph:
@@ -514,11 +512,11 @@ def _settled(live: LiveRun) -> NDArray[np.bool_]:
     stamp_ns = live.result.stamp_ns
     counted_ns = np.array(sorted(live.taken), dtype=np.int64)
     before = np.searchsorted(counted_ns, stamp_ns, side="right")
-    behind = np.searchsorted(counted_ns, stamp_ns, side="left") + 1
+    after = np.searchsorted(counted_ns, stamp_ns, side="left") + 1
     settled = np.ones(stamp_ns.size, dtype=bool)
     for topic, arrival_ns in live.arrival_ns.items():
         # the messages of a topic come in order: equal counts mean equal messages
         taken = np.array([0, *(live.taken[at].get(topic, 0) for at in counted_ns.tolist()), arrival_ns.size])
         arrived = np.searchsorted(arrival_ns, stamp_ns, side="right")
-        settled &= (taken[before] == arrived) & (taken[behind] == arrived)
+        settled &= (taken[before] == arrived) & (taken[after] == arrived)
     return settled

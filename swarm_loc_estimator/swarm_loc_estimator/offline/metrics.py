@@ -17,7 +17,7 @@ MISLEADING_SIGMAS, MISLEADING_M = 5.0, 0.02
 
 
 class MetricsError(ValueError):
-    """Arrays whose sizes do not match; the message is one sentence."""
+    """Arrays whose sizes do not match."""
 
 
 @dataclass(frozen=True)

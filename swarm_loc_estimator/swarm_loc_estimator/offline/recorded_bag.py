@@ -1,6 +1,6 @@
-"""Ground truth of a recording, used only by evaluation and calibration: poses of several message types.
+"""Read a bag of a swarm once: inputs in order of arrival, ground truth, maps and goals.
 
-Read a bag of a swarm once: inputs in order of arrival, ground truth, maps and goals.
+Ground truth is used only by evaluation and calibration.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def unwatched(_share: float, _what: str) -> None:
 
 
 class LossError(UserError):
-    """A loss that cannot be used; the message is one sentence."""
+    """A loss that cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -149,7 +149,7 @@ class Loss:
     """Messages that are dropped at random before the estimator, as on a bad network.
 
     Whether a message is lost depends on the seed, its topic and its place among the messages of this topic;
-    with a greater share the same messages are lost and others beside them.
+    with a greater share the same messages are lost, and more.
 
     Raises:
         LossError: A number is out of range.

@@ -56,7 +56,7 @@ def replay(
 
     Args:
         bag: rosbag2 folder, .mcap or .db3 file.
-        swarm: Robots and landmarks; None: those of the `swarm.yaml` beside the bag.
+        swarm: Robots and landmarks; None: those of the `swarm.yaml` in its folder.
         settings: Of the estimator.
         tick_s: Time between two outputs [s].
         stamp_ns: (T,) increasing; outputs at these instants instead, such as those of a live run.
@@ -102,7 +102,7 @@ def replay(
 
 
 class ScheduleError(UserError):
-    """Outputs that cannot be scheduled; the message is one sentence."""
+    """Outputs that cannot be scheduled."""
 
 
 def _period_ns(tick_s: object) -> int:

@@ -1,6 +1,6 @@
-"""The page as one text, its initial data, and a recorded run inside it.
+"""The page as one text, its initial data, its binary messages, and a recorded run inside it.
 
-Frames, the binary messages to the page: a kind, an instant and columns of numbers; and their history.
+A frame, the binary message to the page, is a kind, an instant and columns of numbers:
 
     uint32 length of the header | header as JSON, blanks up to a multiple of 8 | columns, each padded as well
 

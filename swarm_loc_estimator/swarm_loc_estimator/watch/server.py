@@ -1,8 +1,7 @@
 """The server of the page, in a thread of its own: HTML once, then frames over a WebSocket, and commands back.
 
-Passing a frame to the server never blocks, however many or slow the pages are.
-
-Access control of the page: browsers of this machine, and other clients only with the token.
+Passing a frame to the server never blocks, however many or slow the pages are. Browsers of this machine have
+access, other clients only with the token.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ _WRONG = "The token is missing or wrong: open the address that the log shows, wi
 
 
 class AccessError(UserError):
-    """An address or a token that cannot be used; the message is one sentence."""
+    """An address or a token that cannot be used."""
 
 
 class WrongTokens:
@@ -154,7 +153,7 @@ OnCommand = Callable[[Command, Answer], None]  # Receives a page's command; call
 
 
 class ServerError(UserError):
-    """The server cannot listen; the message is one sentence."""
+    """The server cannot listen."""
 
 
 class ServerLoad(NamedTuple):
@@ -345,7 +344,7 @@ class WatchServer:
         try:
             await socket.send_str(json.dumps(self._about))
             await viewer.send_past(past)
-            await viewer.send_for_ever()
+            await viewer.keep_sending()
         except ConnectionError:
             await socket.close()
 
@@ -449,7 +448,7 @@ class Viewer:
             await self._send(frame)
         self._wake.set()
 
-    async def send_for_ever(self) -> None:
+    async def keep_sending(self) -> None:
         """Send until the connection breaks."""
         while True:
             await self._wake.wait()

@@ -1,8 +1,4 @@
-"""Commands of the page: reset the estimator, set a pose, drive a robot.
-
-Frames of published positions: ground truth, goals, aerial detections with identities.
-
-Serves a web page with a live view of the swarm.
+"""Serves a web page with a live view of the swarm.
 
     ./run swarm_loc_estimator watch_node --ros-args -p swarm_file:=swarm.yaml
 
@@ -297,7 +293,7 @@ def _unused(_data: bytes) -> None:
 
 
 _FLEETING = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Matches every publisher; messages that arrive too fast are lost for this node only."""
+"""Matches every publisher; messages that arrive too fast are lost only for this node."""
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _WORK_S, _LOOK_S = 0.05, 1.0
 _PLACES_PERIOD_S = 0.1

@@ -41,7 +41,7 @@ class CameraSightings(NamedTuple):
     marker_id: IntArray  # (m,)
     marker: FloatArray  # (m, 3) pose of the marker in `map`, or in the base_link of the target robot
     target: IntArray  # (m,) index of the target robot; -1 for a landmark
-    lone: FloatArray  # (m, 3) true pose of the observer where it is known at the stamp only, else NaN
+    lone: FloatArray  # (m, 3) true pose of the observer where it is known only at the stamp, else NaN
 
     @property
     def independent_share(self) -> float:
@@ -133,7 +133,7 @@ def _ideal(robot: Robot) -> Robot:
 
 
 def _observer_known(truth: Trajectory, stamp_ns: IntArray) -> tuple[BoolArray, FloatArray]:
-    """Whether the observer's pose is known (m,), and the poses (m, 3) that are known at the stamp only.
+    """Whether the observer's pose is known (m,), and the poses (m, 3) that are known only at the stamp.
 
     An isolated true pose with the stamp of an image belongs to its exposure, whatever the time offset is.
     """

@@ -1,21 +1,17 @@
-"""Calibrate process and measurement noise: small errors of position and heading at a consistent NEES.
-
-The cost is the error, with a penalty for the distance of the NEES from its aim. The filter's white
-noise represents correlated errors, too, so the likelihood of the true poses does not work as a cost: a few
-periods of correlated errors would increase the noise until measurements hardly count. Nor does the scatter of
-the sightings, which gives standard deviations two to three times too small.
-
-Calibrate a swarm from a recording with ground truth: cameras, motion, and the noise that remains.
+"""Calibrate a swarm from a recording with ground truth: cameras, motion, and the noise that remains.
 
 The noise is fitted to held-out data: each half of the recording is run with the calibration from the other
-half. So the covariances contain the errors of a calibration in other recordings.
+half. So the covariances contain the errors of a calibration in other recordings. The cost is the error of
+position and heading, with a penalty for the distance of the NEES from its aim. The filter's white noise
+represents correlated errors, too, so the likelihood of the true poses does not work as a cost: a few periods
+of correlated errors would increase the noise until measurements hardly count. Nor does the scatter of the
+sightings, which gives standard deviations two to three times too small.
 
-Scatter of a calibrated camera's sightings: noise of each robot's own, and sway of its camera.
-
-Bearing errors that all markers share at one time are errors of the camera's yaw: the mount sways, or the
-robot leans. They last for seconds, so a filter that takes them for noise of single sightings is too sure.
-Their covariance over the time between two sightings of different markers gives their standard deviation and
-time constant, those of a first-order Gauss-Markov process. What remains is noise.
+The scatter of a calibrated camera's sightings is noise of each robot's own, and sway of its camera. Bearing
+errors that all markers share at one time are errors of the camera's yaw: the mount sways, or the robot leans.
+They last for seconds, so a filter that takes them for noise of single sightings is too sure. Their covariance
+over the time between two sightings of different markers gives their standard deviation and time constant,
+those of a first-order Gauss-Markov process. What remains is noise.
 """
 
 from __future__ import annotations
@@ -305,7 +301,7 @@ turns on the spot and sees few markers is soon too sure of its place.
 
 @dataclass(frozen=True)
 class Options:
-    """What is fitted."""
+    """Choices of a calibration."""
 
     plain: bool = False  # Whether only noise is fitted
     # Whether a table of scale factors may be fitted, else one of speed and one of turn rate
@@ -340,7 +336,7 @@ class Calibration:
     """Result of a calibration."""
 
     swarm: Swarm  # Calibrated, with unchanged starts
-    models: FittedModels  # The fits behind it
+    models: FittedModels  # The fits that it is made of
     noise: dict[str, float] = field(default_factory=dict)  # Fitted noise parameters by name
     before: Score | None = None  # Score of the estimator on the recording, started at the true poses
     after: Score | None = None  # The same, calibrated
@@ -408,7 +404,7 @@ def _warning(folds: Sequence[Fold], swarm: Swarm, noise: dict[str, float]) -> st
 
 
 def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> FittedModels:
-    """Fit cameras and motion type by type; with `plain` only compute the errors.
+    """Fit cameras and motion type by type; with `plain` compute only the errors.
 
     Raises:
         CalibrationError: There is too little ground truth.

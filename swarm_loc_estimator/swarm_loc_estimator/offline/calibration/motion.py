@@ -1,10 +1,8 @@
-"""Calibrate the motion of a type of robot: scale factors by speed and turn rate, delay and lag.
+"""Calibrate the motion of a type of robot: scale factors by speed and turn rate, delay, lag and offsets.
 
 An odometry that is a command, or whose wheels slip, reports too much motion, and too early. The true shares
 of it are linear in the true motion over time windows, so a table of them is a linear regression; delay and
-lag are searched.
-
-Calibrate offsets of odometry: of the turn rate, of the course and of the axle.
+lag are searched. Offsets are those of the turn rate, of the course and of the axle.
 """
 
 from __future__ import annotations

@@ -1,7 +1,4 @@
-"""Table and plots of a calibration: residuals before and after.
-
-Figures of infrared calibration.
-"""
+"""Tables and plots of calibrations: residuals before and after, gains and curves of infrared boards."""
 
 from __future__ import annotations
 
@@ -16,7 +13,7 @@ from matplotlib.figure import Figure
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import curve_at
 from swarm_loc_estimator.offline.calibration.camera import CameraFit
-from swarm_loc_estimator.offline.calibration.fit import Calibration, Score
+from swarm_loc_estimator.offline.calibration.fit import Calibration
 from swarm_loc_estimator.offline.calibration.infrared.board import BLOCKS, BoardCalibration, BoardRecording
 from swarm_loc_estimator.offline.calibration.infrared.elements import ElementVerdicts
 from swarm_loc_estimator.offline.calibration.infrared.gains import BoardFit, InfraredCalibration, rms
@@ -50,7 +47,12 @@ def text_of(done: Calibration) -> str:
         late = motion.late
         lines.append(f"delay {late.delay_s:.3f} s, lag {late.lag_s:.3f} s")
     if done.before is not None and done.after is not None:
-        lines += _score_lines(done.before, done.after)
+        degrees = [math.degrees(one.heading_rmse) for one in (done.before, done.after)]
+        lines += [
+            _line("estimator, position RMSE [m]", done.before.position_rmse, done.after.position_rmse),
+            _line("estimator, heading RMSE [deg]", *degrees),
+            _line("estimator, NEES (ideal 3)", done.before.nees, done.after.nees),
+        ]
     lines += [f"{name} = {value:g}" for name, value in done.noise.items()]
     return "\n".join([*lines, *done.models.remarks, *([done.warning] if done.warning else [])])
 
@@ -66,7 +68,10 @@ def draw(done: Calibration, path: Path) -> Path:
     figure = Figure(figsize=(3.6 * columns, 2.9 * rows))
     axes: list[Any] = list(figure.subplots(rows, columns, squeeze=False).ravel())
     for axis, (label, before, after) in zip(axes, panels, strict=False):
-        _histogram(axis, label, before, after)
+        off = abs(float(np.median(before)))
+        reach = max(1e-6, 4.0 * max(spread(before - np.median(before)), spread(after)) + off)
+        _histogram(axis, f"error of {label}", before, after, np.linspace(-reach, reach, _BINS))
+        axis.locator_params(axis="x", nbins=5)
     if response is not None:
         for axis, name in zip(axes[len(panels) :], ("speed", "turn rate"), strict=False):
             _shares(axis, response, name)
@@ -90,19 +95,6 @@ def _sighting_errors(fits: Sequence[CameraFit]) -> Iterator[tuple[str, FloatArra
             yield label, before, after
 
 
-def _score_lines(before: Score, after: Score) -> list[str]:
-    """Errors of the estimator."""
-    return [
-        _line("estimator, position RMSE [m]", before.position_rmse, after.position_rmse),
-        _line(
-            "estimator, heading RMSE [deg]",
-            math.degrees(before.heading_rmse),
-            math.degrees(after.heading_rmse),
-        ),
-        _line("estimator, NEES (ideal 3)", before.nees, after.nees),
-    ]
-
-
 def _line(name: str, before: float, after: float) -> str:
     return f"{name:34}{before:10.3g}{after:10.3g}"
 
@@ -120,18 +112,13 @@ def _panels(done: Calibration) -> list[tuple[str, FloatArray, FloatArray]]:
     return panels
 
 
-def _histogram(axis: Any, label: str, before: FloatArray, after: FloatArray) -> None:
+def _histogram(axis: Any, title: str, before: FloatArray, after: FloatArray, bins: FloatArray) -> None:
     """Histograms of the errors before and after."""
-    reach = max(
-        1e-6, 4.0 * max(spread(before - np.median(before)), spread(after)) + abs(float(np.median(before)))
-    )
-    bins = np.linspace(-reach, reach, _BINS)
     style(axis)
     axis.hist(before, bins, color=TRUTH, alpha=0.6, label="before")
     axis.hist(after, bins, histtype="step", color=colour_of(0), linewidth=1.6, label="after")
-    axis.set_title(f"error of {label}", loc="left", fontsize=10, color=INK)
+    _title(axis, title)
     axis.set_yticks([])
-    axis.locator_params(axis="x", nbins=5)
     axis.spines["left"].set_visible(False)
 
 
@@ -145,7 +132,7 @@ def _shares(axis: Any, response: MotionResponse, name: str) -> None:
     axis.set_yticks(range(len(response.speeds)), [f"{v:.3f}" for v in response.speeds])
     axis.tick_params(colors=SOFT, labelsize=8, length=0)
     axis.spines[:].set_visible(False)
-    axis.set_title(f"true share of reported {name}", loc="left", fontsize=10, color=INK)
+    _title(axis, f"true share of reported {name}")
     axis.set_xlabel("turn rate [rad/s]", color=SOFT, fontsize=9)
     axis.set_ylabel("speed [m/s]", color=SOFT, fontsize=9)
 
@@ -208,7 +195,7 @@ def _limits(board: BoardFit, names: list[str]) -> list[str]:
     )
     for place, name in enumerate(names):
         said = [
-            f"{what} {_bracketed(values[place], digits)}"
+            f"{what} [{' '.join(f'{v:.{digits}f}' if np.isfinite(v) else '-' for v in values[place])}]"
             for what, values, digits in columns
             if np.isfinite(values[place]).any()
         ]
@@ -219,36 +206,19 @@ def _limits(board: BoardFit, names: list[str]) -> list[str]:
     return lines
 
 
-def _bracketed(values: FloatArray, digits: int) -> str:
-    """Numbers in brackets; a dash for NaN."""
-    return f"[{' '.join(f'{value:.{digits}f}' if np.isfinite(value) else '-' for value in values)}]"
-
-
 def draw_gains(done: InfraredCalibration, path: Path) -> Path:
     """Plot residuals before and after, in total and by brightness, and gains; one row per kind of board."""
     figure = Figure(figsize=(12.0, 3.2 * len(done.boards)))
     rows: list[Any] = list(figure.subplots(len(done.boards), 3, squeeze=False, width_ratios=(1.0, 1.0, 1.4)))
     for axes, board in zip(rows, done.boards, strict=True):
-        _residuals(axes[0], board)
+        errors = [one[np.isfinite(one)].clip(-_REACH, _REACH) for one in (board.fit.before, board.fit.after)]
+        bins = np.linspace(-_REACH, _REACH, _SIGMA_BINS)
+        _histogram(axes[0], f"{board.group.source}: residuals [sigma]", *errors, bins)
+        axes[0].legend(frameon=False, fontsize=9)
         _by_brightness(axes[1], board)
         _gains(axes[2], board, [done.swarm.robots[index].name for index in board.group.robots])
     save(figure, path)
     return path
-
-
-def _residuals(axis: Any, board: BoardFit) -> None:
-    """Histogram of all residuals."""
-    bins = np.linspace(-_REACH, _REACH, _SIGMA_BINS)
-    before, after = (
-        one[np.isfinite(one)].clip(-_REACH, _REACH) for one in (board.fit.before, board.fit.after)
-    )
-    style(axis)
-    axis.hist(before, bins, color=TRUTH, alpha=0.6, label="before")
-    axis.hist(after, bins, histtype="step", color=colour_of(0), linewidth=1.6, label="after")
-    axis.set_yticks([])
-    axis.spines["left"].set_visible(False)
-    axis.legend(frameon=False, fontsize=9)
-    _title(axis, f"{board.group.source}: residuals [sigma]")
 
 
 def _by_brightness(axis: Any, board: BoardFit) -> None:

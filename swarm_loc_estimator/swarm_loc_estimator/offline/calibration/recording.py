@@ -32,7 +32,7 @@ from swarm_loc_estimator.timeline.settings import Settings
 
 
 class CalibrationError(UserError):
-    """A recording that cannot be used for calibration; the message is one sentence."""
+    """A recording that cannot be used for calibration."""
 
 
 @dataclass(frozen=True)

@@ -1,18 +1,15 @@
-"""Read recordings of Droplets under an overhead camera: one exchange per line, with camera poses.
+"""Recordings of Droplets under an overhead camera: read, cleaned, and written as a bag with its description.
 
     {"TX", "RX", {{6 counts}, ...}, camera time [s], {"id"->{x, y, orientation}, ...}},
 
-Matrices are printed by the firmware's console, one row per emitter and one column per sensor. Positions are
-in pixels, y downwards, orientations in degrees. Ids are four hexadecimal digits.
+There is one exchange per line, with camera poses. Matrices are printed by the firmware's console, one row per
+emitter and one column per sensor. Positions are in pixels, y downwards, orientations in degrees. Ids are four
+hexadecimal digits.
 
-Write a recording of Droplets as a bag with its swarm description.
-
-The orientation of the fiducials on the robots is found from the brightness matrices.
-
-The sums of a brightness matrix over sensors and emitters point to the other robot whatever the board's curves
-are, eqs (5)-(10) of the Droplet paper. The mean of each robot gives the quarter turn of its fiducial, and all
-together whether the image is mirrored. The mean while a robot stood at one place shows whether its fiducial
-was misread there.
+The orientation of the fiducials on the robots is found from the brightness matrices. The sums of a matrix
+over sensors and emitters point to the other robot whatever the board's curves are, eqs (5)-(10) of the
+Droplet paper. The mean of each robot gives the quarter turn of its fiducial, and all together whether the
+image is mirrored. The mean while a robot stood at one place shows whether its fiducial was misread there.
 """
 
 from __future__ import annotations
@@ -53,7 +50,7 @@ _MAX_COUNT = 2**31 - 1
 
 
 class DropletRecordingError(UserError):
-    """A file that is not such a recording; the message is one sentence."""
+    """A file that is not such a recording."""
 
 
 @dataclass(frozen=True)

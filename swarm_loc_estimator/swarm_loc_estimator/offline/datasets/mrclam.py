@@ -1,10 +1,8 @@
-"""Read a folder of the UTIAS multi-robot cooperative localization and mapping dataset.
+"""Read a set of the UTIAS multi-robot cooperative localization and mapping dataset, and write it as a bag.
 
 K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu: The UTIAS multi-robot cooperative localization and
 mapping dataset, The International Journal of Robotics Research 30(8), 2011. Subjects with odometry are
 robots, subjects with a surveyed position are landmarks, whatever the number of the set.
-
-Write a set of the MRCLAM dataset as a bag with its swarm description.
 """
 
 from __future__ import annotations
@@ -41,7 +39,7 @@ _SIGHTINGS_TO_JUDGE = 10
 
 
 class MrclamError(UserError):
-    """A folder that is not such a dataset; the message is one sentence."""
+    """A folder that is not such a dataset."""
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
-"""Style of all plots: colours, axes, units, file format; and the common map of a swarm.
+"""Plots of a replay: the swarm on its map, the path of each robot, errors over time with 3-sigma bands.
 
-Plots of a replay: the swarm on its map, the path of each robot, errors over time with 3-sigma bands.
+The style of all plots (colours, axes, units, file format) stands here, too.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class WorldMap:
     """Draws a result on a map; all lengths in metres.
 
     Attributes:
-        x: Limits from truth and landmarks; from estimates only without truth.
+        x: Limits from truth and landmarks; without truth, from estimates.
         y: Limits in y.
         radius: Of the disc of a robot.
     """
@@ -229,7 +229,9 @@ _NAME_PT = np.array([42.0, 22.0])  # Distance of a name from its robot, horizont
 
 def plot_overview(result: ReplayResult, path: Path) -> None:
     """Draw paths, landmarks and the last poses until the truth ends; to the right, errors over time."""
-    result = _until_truth_ends(result)
+    # sensors may stop when all ground truth has ended
+    ends = [int(track.stamp_ns[-1]) for track in result.truth.values() if len(track.stamp_ns)]
+    result = result.select(result.stamp_ns <= max(ends)) if ends else result
     world = WorldMap(result)
     judged = any(len(errors.stamp_ns) for errors in result.errors.values())
     widths = [_MAP_IN, _ERRORS_IN] if judged else [_MAP_IN + _ERRORS_IN]
@@ -247,14 +249,6 @@ def plot_overview(result: ReplayResult, path: Path) -> None:
         )
         axes["h"].set_xlabel("time [s]", color=SOFT, fontsize=9)
     save(figure, path, _AROUND_MAP)
-
-
-def _until_truth_ends(result: ReplayResult) -> ReplayResult:
-    """The result without poses later than all ground truth, when sensors may have stopped, too."""
-    ends = [int(track.stamp_ns[-1]) for track in result.truth.values() if len(track.stamp_ns)]
-    if not ends:
-        return result
-    return result.select(result.stamp_ns <= max(ends))
 
 
 def _title(result: ReplayResult) -> str:
@@ -277,11 +271,15 @@ def _draw_swarm(axis: Axes, result: ReplayResult, world: WorldMap) -> float:
     world.draw_world(axis)
     label_map(axis)
     ends = [last_pose(result, index) for index in range(len(result.swarm.robots))]
-    enlarged = _enlargement([covariance for _, covariance in filter(None, ends)], world.width)
+    sigmas = [math.sqrt(float(np.linalg.eigvalsh(one[:2, :2])[-1])) for _, one in filter(None, ends)]
+    is_seen = not sigmas or 2.0 * _SIGMAS * max(sigmas) > _SEEN * world.width
+    enlarged = 1.0 if is_seen else _ENLARGED
+    late = result.stamp_ns >= result.stamp_ns.max(initial=0) - _TAIL_NS
     middle = np.mean([pose[:2] for pose, _ in filter(None, ends)] or [np.zeros(2)], axis=0)
     for index, end in enumerate(ends):
         world.draw_paths(axis, index, alpha=0.5)
-        _draw_tail(axis, result, index)
+        x, y, _ = result.poses[late, index].T
+        axis.plot(x, y, color=colour_of(index), linewidth=2.4, zorder=3)
         if end is None:
             continue
         pose, covariance = end
@@ -290,19 +288,6 @@ def _draw_swarm(axis: Axes, result: ReplayResult, world: WorldMap) -> float:
         if len(ends) <= _MAX_NAMES:
             _draw_name(axis, result.swarm.robots[index].name, pose, middle, colour_of(index))
     return enlarged
-
-
-def _draw_tail(axis: Axes, result: ReplayResult, index: int) -> None:
-    """Draw the last seconds of a path bold."""
-    late = result.stamp_ns >= result.stamp_ns.max(initial=0) - _TAIL_NS
-    x, y, _ = result.poses[late, index].T
-    axis.plot(x, y, color=colour_of(index), linewidth=2.4, zorder=3)
-
-
-def _enlargement(covariances: list[FloatArray], width: float) -> float:
-    """The factor by which ellipses are enlarged to be visible."""
-    sigmas = [math.sqrt(float(np.linalg.eigvalsh(one[:2, :2])[-1])) for one in covariances]
-    return 1.0 if not sigmas or 2.0 * _SIGMAS * max(sigmas) > _SEEN * width else _ENLARGED
 
 
 def _draw_ellipse(axis: Axes, pose: FloatArray, covariance: FloatArray, enlarged: float, colour: str) -> None:
@@ -316,7 +301,7 @@ def _draw_ellipse(axis: Axes, pose: FloatArray, covariance: FloatArray, enlarged
 
 
 def _draw_name(axis: Axes, name: str, pose: FloatArray, middle: FloatArray, colour: str) -> None:
-    """Write a robot's name beside its path, on the side away from the middle of the swarm."""
+    """Write a robot's name next to its path, on the side away from the middle of the swarm."""
     side = np.array([-math.sin(pose[2]), math.cos(pose[2])])
     away = math.copysign(1.0, float(side @ (pose[:2] - middle))) * side * _NAME_PT
     text = axis.annotate(

@@ -1,12 +1,10 @@
-"""Sightings and odometry of a recording as a least-squares problem of poses, landmarks and parameters.
+"""Poses, landmarks and parameters of a recording by robust batch least squares over SE(2).
 
 A robot's pose is X(t) = T(t) O(t) with the odometry track O, see `odometry/tracks.py`. Where wheels do not
-slip, T is constant, so it is estimated at a few instants per second only. A sighting in between uses the
+slip, T is constant, so it is estimated only at a few instants per second. A sighting in between uses the
 nearest of them; what the wheels may have slipped since then is added to its noise.
 
-Places to begin with: maps of single robots in the frames of their tracks, joined by what they share.
-
-Robust batch least squares over SE(2): transforms of tracks, landmarks, cameras and odometry scales.
+The first places are maps of single robots in the frames of their tracks, joined by what they share.
 
 Errors are right-invariant, X = exp(xi) X_hat, as in the filter, whose measurement models and odometry noise
 are used. Weights of Geman and McClure of whole sightings limit the influence of wrong ids; they are wide at

@@ -1,14 +1,11 @@
-"""Places of fixed cameras and UWB anchors from the surveyed paths of robots.
+"""Survey: from a recording to a swarm description with places, and what is badly determined.
 
-A fixed camera saw markers on robots whose poses are known by then, so its pose is that of the perspective
-from n points. An anchor was measured from many places, which is multilateration. Both are robust fits
-(Cauchy). Errors of neighbouring measurements are alike, so variances are those of a jackknife over spells of
-time, and of the frame of all paths. Nothing is placed that fits elsewhere as well: places on one line do not
-tell where about this line a camera or an anchor is.
-
-Survey: from a recording to a swarm description with places, and what is badly determined.
-
-Picture of a survey: landmarks with ellipses, paths of robots, fixed cameras and anchors.
+Fixed cameras and UWB anchors are placed by the surveyed paths of robots. A fixed camera saw markers on robots
+whose poses are known by then, so its pose is that of the perspective from n points. An anchor was measured
+from many places, which is multilateration. Both are robust fits (Cauchy). Errors of neighbouring measurements
+are alike, so variances are those of a jackknife over spells of time, and of the frame of all paths. Nothing
+is placed that fits elsewhere as well: places on one line do not tell where about this line a camera or an
+anchor is.
 """
 
 from __future__ import annotations
@@ -48,7 +45,7 @@ _DRAWS, _DRAWN = 60, 6  # Starts of an anchor: number of draws, and ranges of ea
 _OUTLIER = 5.0  # Residuals of more standard deviations contradict the others
 _LEAST_SIGMA = 1e-4
 _MOST_SIGMA, _MOST_YAW_SIGMA = 1.0, 0.5  # Standard deviations [m], [rad] from which nothing is placed
-_TURNS = 16  # Other places are sought in so many directions about the line of all robots
+_TURNS = 16  # Other places are sought in this number of directions about the line of all robots
 _AS_WELL, _ELSEWHERE, _ELSEWHERE_M = 1.2, 0.5, 0.3
 """Another place fits as well if its residuals are larger by no more than this factor. It is farther away than
 this share of the distance from the line, and this length."""

@@ -1,10 +1,8 @@
-"""Reader of sweeps, see doc/sweep.md: a YAML file to the list of all replays, in the order of the table.
+"""Sweeps, see doc/sweep.md: read one, run its replays, and fit settings.
 
-Run the replays of a sweep in workers; each finished one is a line of a file, and is not run again.
-
-Where the replays of a sweep run: processes of this machine, or a cluster of Ray or Dask, all by joblib.
-
-Fit settings to several bags at once: a sweep whose grid optuna extends by what it has seen so far.
+A YAML file gives the list of all replays, in the order of the table. They run in workers: processes of this
+machine, or a cluster of Ray or Dask, all by joblib. Each finished one is a line of a file, and is not run
+again. A fit is a sweep whose grid optuna extends by what it has seen so far.
 """
 
 from __future__ import annotations
@@ -67,7 +65,7 @@ _BLOCK = 2**22
 
 
 class SweepFileError(UserError):
-    """A sweep that cannot be run; the message is one sentence."""
+    """A sweep that cannot be run."""
 
 
 @dataclass(frozen=True)
@@ -246,7 +244,7 @@ Line = dict[str, Any]
 """A finished job: its key, and either its figures by column of the table or the reason of its failure."""
 
 _IN_ORDER = tuple(map(int, joblib.__version__.split(".")[:2])) < (1, 4)
-"""Whether this joblib, such as that of Ubuntu 24.04, gives results in the order of the jobs only."""
+"""Whether this joblib, such as that of Ubuntu 24.04, gives results only in the order of the jobs."""
 
 
 def run_sweep(sweep: Sweep, path: Path, backend: Backend, progress: Progress) -> dict[str, Line]:
@@ -315,34 +313,14 @@ def _read(path: Path) -> dict[str, Line]:
     return lines
 
 
-class _Failure:
-    """A context in which any error ends a job and not the sweep.
-
-    Attributes:
-        reason: The error in one line.
-    """
-
-    reason = ""
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, _: object) -> bool:
-        if kind is None or not isinstance(error, Exception):
-            return False
-        self.reason = " ".join(
-            f"{'' if isinstance(error, UserError) else kind.__name__ + ': '}{error}".split()
-        )
-        return True
-
-
 def outcome(job: Job) -> Line:
-    """Replay a job; only its figures leave the worker."""
-    failure = _Failure()
-    with failure:
+    """Replay a job; only its figures, or the error in one line, leave the worker."""
+    try:
         result = replay(job.bag, job.swarm, job.settings, loss=job.loss)
         return {"key": job.key, "figures": figures_of(result)}
-    return {"key": job.key, "reason": failure.reason}
+    except Exception as error:  # noqa: BLE001 - any error ends a job and not the sweep
+        kind = "" if isinstance(error, UserError) else f"{type(error).__name__}: "
+        return {"key": job.key, "reason": " ".join(f"{kind}{error}".split())}
 
 
 FIGURES = (
@@ -374,7 +352,7 @@ _PATIENCE_S = 10.0
 
 
 class BackendError(UserError):
-    """A back end that is not installed or not reached; the message is one sentence."""
+    """A back end that is not installed or not reached."""
 
 
 class Backend(NamedTuple):
@@ -507,7 +485,8 @@ def run_fit(sweep: Sweep, fit: Fit, path: Path, backend: Backend, progress: Prog
 
         finished |= run_sweep(replace(sweep, jobs=batch), path, backend, at)
         for trial, own in zip(trials, asked, strict=True):
-            mean = _mean(own, finished, fit.minimize)
+            values = [finished[job.key].get("figures", {}).get(fit.minimize) for job in own]
+            mean = None if None in values else float(np.mean(values))
             study.tell(trial, mean, state=None if mean is not None else optuna.trial.TrialState.FAIL)
     every = replace(sweep, jobs=tuple({job.key: job for job in jobs}.values()))
     complete = study.get_trials(states=[optuna.trial.TrialState.COMPLETE])
@@ -516,9 +495,3 @@ def run_fit(sweep: Sweep, fit: Fit, path: Path, backend: Backend, progress: Prog
     best = min(complete, key=lambda trial: trial.value)
     before = complete[0].value if complete[0].params == defaults else None
     return Fitted(every, finished, Best(best.params, fit.minimize, best.value, before))
-
-
-def _mean(jobs: Sequence[Job], finished: Mapping[str, Line], column: str) -> float | None:
-    """The mean of a column over jobs; None if one has no figure."""
-    values = [finished[job.key].get("figures", {}).get(column) for job in jobs]
-    return None if None in values else float(np.mean(values))

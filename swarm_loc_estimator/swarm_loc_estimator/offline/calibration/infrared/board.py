@@ -1,6 +1,4 @@
-"""Calibration of an infrared board from a recording with ground truth.
-
-Fit the model of an infrared board to exchanges of robots with known relative poses.
+"""Fit the model of an infrared board to exchanges of robots with known relative poses.
 
 The unknowns are the amplitude law, the symmetric curves of sensors and emitters as tables, and the offset of
 each robot's heading in ground truth. Residuals are computed after a variance-stabilizing transform, with a
@@ -420,9 +418,9 @@ def _clear(
     begin, end = (places[of_swarm[side], rows] for side in (data.receiver, data.transmitter))
     clear = np.ones(len(rows), dtype=np.bool_)
     for k, others in enumerate(places):
-        beside = _distance_to_line(others, begin, end)
+        away = _distance_to_line(others, begin, end)
         third = (of_swarm[data.receiver] != k) & (of_swarm[data.transmitter] != k)
-        clear &= ~(third & (beside < width))
+        clear &= ~(third & (away < width))
     return clear
 
 

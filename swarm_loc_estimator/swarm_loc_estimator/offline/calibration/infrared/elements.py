@@ -1,23 +1,19 @@
-"""Likelihood of exchanges as a function of the relative gain of one element, marginalized over poses.
+"""Single sensors and emitters, from readings of each other alone: dead ones, saturation and noise.
 
-The relative pose is unknown, so the likelihood is marginalized over a grid of relative poses. It is computed
-for a few relative gains of each sensor of the receiver and emitter of the transmitter; all other elements
-follow the board. Residuals are computed after a variance-stabilizing transform. Any reading may be blocked or
-too bright, at the rates of the board.
+Dead or shaded elements: a dead element stands out between bright ones wherever the other robot is, since no
+pose explains the readings of its neighbours. Each element is tested by the likelihood ratio of two
+hypotheses: it gives about all of its light, or a third of it or less. Under the first, the ratio exceeds 1 /
+p with a probability of at most p (Markov's inequality). Each element is tested at p / elements, so the
+probability of any false alarm is p (Wald's sequential test). In any one geometry of a pair an obstacle may
+block all light of an element, which is modelled by the board's share of blocked readings; so a few geometries
+carry little evidence, however often they were measured.
 
-Find sensors and emitters that are dead or shaded, from the robots' readings of each other alone.
+Since the relative pose is unknown, the likelihood is marginalized over a grid of relative poses. It is
+computed for a few relative gains of each sensor of the receiver and emitter of the transmitter; all other
+elements follow the board. Residuals are computed after a variance-stabilizing transform. Any reading may be
+blocked or too bright, at the rates of the board.
 
-A dead element stands out between bright ones wherever the other robot is, since no pose explains the readings
-of its neighbours. Each element is tested by the likelihood ratio of two hypotheses: it gives about all of its
-light, or a third of it or less. Under the first, the ratio exceeds 1 / p with a probability of at most p
-(Markov's inequality). Each element is tested at p / elements, so the probability of any false alarm is p
-(Wald's sequential test). In any one geometry of a pair an obstacle may block all light of an element, which
-is modelled by the board's share of blocked readings; so a few geometries carry little evidence, however often
-they were measured.
-
-Estimate the saturation and noise of sensors from exchanges alone.
-
-Neither poses nor curves are used, since a board's curves may be wrong.
+For saturation and noise, neither poses nor curves are used, since a board's curves may be wrong.
 
 Saturation: without saturation, the density of a sensor's readings over different geometries decreases with
 brightness near its maximum. Of the readings within a span below the maximum, at most the share window / span
@@ -612,8 +608,8 @@ def _unexplained(
 def _motions(level: FloatArray, order: NDArray[np.int64]) -> list[FloatArray]:
     """Directions of change of readings (p, n, n) with range, bearing and heading, unnormalized."""
     back = np.argsort(order)
-    ahead, behind = order[(back + 1) % len(order)], order[back - 1]
-    return [level, level[:, ahead] - level[:, behind], level[:, :, ahead] - level[:, :, behind]]
+    following, before = order[(back + 1) % len(order)], order[back - 1]
+    return [level, level[:, following] - level[:, before], level[:, :, following] - level[:, :, before]]
 
 
 def _stands(repeats: _Repeats, sigma: FloatArray, moving: FloatArray, rest: FloatArray) -> BoolArray:

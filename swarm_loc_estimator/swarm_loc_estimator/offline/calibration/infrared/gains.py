@@ -1,11 +1,9 @@
 """Calibrate the gains of infrared boards from a recording, one fit for each kind of board.
 
-Cross-validation of gains over blocks of time.
-
-Gains are estimated with one block held out at a time, and the likelihood of the held-out exchanges is
-evaluated. Gains are accepted where it is higher than with unit gains and with unknown gains.
-Errors of the curves are correlated over time, so the sum over all robots must exceed its scatter over blocks.
-Single robots need only a positive sum, since some have few readings.
+Gains are cross-validated: they are estimated with one block of time held out, and the likelihood of the
+held-out exchanges is evaluated. They are accepted where it is higher than with unit gains and with unknown
+gains. Errors of the curves are correlated over time, so the sum over all robots must exceed its scatter over
+blocks. Single robots need only a positive sum, since some have few readings.
 
 The relative pose of an exchange is unknown or uncertain, so the likelihood is marginalized over the pose by
 importance sampling around the solutions with and without gains. All hypotheses on a pair's gains are compared
