@@ -22,8 +22,9 @@ from scipy.spatial.transform import Rotation
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.health import listed
-from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, decoded, same_type
+from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, decoded
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.offline.recorded_bag import same_type
 from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
 from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.sensors.registry import SENSORS
@@ -370,7 +371,9 @@ def _of_robot(
     fit = _fitted(robot, own, seen, landmark, stamp_ns, lambda pose: pose)
     twist_moves = np.nan_to_num(own.twist[:, [0, 2]]).any()
     if np.ptp(own.pose[:, :2], axis=0).max() < _STANDS_M and np.ptp(own.pose[:, 2]) < _STANDS_M:
-        if not twist_moves and _spread(seen, landmark, stamp_ns) > _MIN_MOTION_M:
+        # how far landmarks move in the view, root mean square [m]
+        away = _centred(seen, _groups(landmark, stamp_ns), np.ones(len(seen)))
+        if not twist_moves and np.sqrt(np.mean(np.sum(away**2, axis=1))) > _MIN_MOTION_M:
             problem = "has odometry that stands while landmarks move in its camera"
             yield Finding(robot.name, problem, "Check its encoders, and that its driver reads them")
         return
@@ -408,12 +411,6 @@ def _centred(values: FloatArray, group: IntArray, weight: FloatArray) -> FloatAr
     total = np.maximum(np.bincount(group, weight), 1e-12)
     means = np.stack([np.bincount(group, weight * column) / total for column in values.T], axis=1)
     return np.asarray(values - means[group])
-
-
-def _spread(seen: FloatArray, landmark: IntArray, stamp_ns: IntArray) -> float:
-    """Root mean square motion of landmarks in the view [m]."""
-    away = _centred(seen, _groups(landmark, stamp_ns), np.ones(len(seen)))
-    return float(np.sqrt(np.mean(np.sum(away**2, axis=1))))
 
 
 def _fitted(

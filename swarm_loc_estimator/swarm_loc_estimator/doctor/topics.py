@@ -10,8 +10,9 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.messages.cdr import TRANSFORMS
-from swarm_loc_estimator.doctor.evidence import SETTINGS, Evidence, Finding, Heard, decoded, same_type
+from swarm_loc_estimator.doctor.evidence import SETTINGS, Evidence, Finding, Heard, decoded
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
+from swarm_loc_estimator.offline.recorded_bag import same_type
 from swarm_loc_estimator.sensors.ingest import CLOCKS_APART_S
 from swarm_loc_estimator.sensors.registry import InputTopic
 

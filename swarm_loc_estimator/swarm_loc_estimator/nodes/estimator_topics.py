@@ -105,7 +105,6 @@ class PoseCommands:
         return response
 
     def _obey(self, request: SetRobotPose.Request) -> str:
-        """Execute the request and log it."""
         robot = self._swarm.index_of.get(request.robot)
         if robot is None:
             raise SetPoseError(f"there is no robot '{request.robot}' in the swarm description.")
@@ -130,7 +129,6 @@ class PoseCommands:
             raise SetPoseError(f"the pose is in frame '{frame}' but must be in '{self._map_frame}'.")
 
     def _set_pose(self, robot: int, wanted: PoseWithCovariance) -> str:
-        """Set the present pose of a robot and log it."""
         pose, covariance = planar_pose(wanted, self._swarm.robots[robot].start_sigma)
         fault = self._estimator.set_pose(robot, self._now_ns(), pose, covariance)
         if fault:

@@ -1,4 +1,4 @@
-"""Write a run as MCAP for viewers, or as text in the format of TUM, which evo uses; read ground truth of TUM."""
+"""Write a run as MCAP for viewers, or as text in the format of TUM, which evo uses; read ground truth."""
 
 from __future__ import annotations
 

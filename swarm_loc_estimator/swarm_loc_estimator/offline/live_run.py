@@ -93,7 +93,7 @@ class LiveGraph:
             self._executor = EventsExecutor(context=context)
             stack.callback(self._executor.shutdown)
             self._executor.add_node(self.recorder)
-            stack.callback(self._stop)
+            stack.callback(lambda: stop([*self._children.values()], self._note))
             self._start_all()
             self._stack = stack.pop_all()
         return self
@@ -164,9 +164,6 @@ class LiveGraph:
 
     def _start(self, node: NodeSpec) -> None:
         self._children[node.full_name] = Child(node, start(node_command(node), self._output))
-
-    def _stop(self) -> None:
-        stop(list(self._children.values()), self._note)
 
     def _note(self, line: str) -> None:
         self._output.write(f"{line}\n".encode())

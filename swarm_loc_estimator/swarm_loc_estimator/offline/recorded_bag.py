@@ -277,8 +277,8 @@ def renamed_topics(remap: Mapping[str, str], swarm: Swarm, known: Collection[str
     return renamed
 
 
-def _same_type(one: str, other: str) -> bool:
-    """Whether two names of types are the same; some writers leave /msg/ out."""
+def same_type(one: str, other: str) -> bool:
+    """Whether two names of types are the same; some writers of bags leave /msg/ out."""
     return one.replace("/msg/", "/") == other.replace("/msg/", "/")
 
 
@@ -288,7 +288,7 @@ def _foreign(topics: Sequence[BagTopic], ingest: Ingest) -> dict[str, str]:
     return {
         topic.name: f"{topic.name} has the type {topic.type}, expected is {expected[topic.name]}: not read."
         for topic in topics
-        if topic.type and topic.name in expected and not _same_type(topic.type, expected[topic.name])
+        if topic.type and topic.name in expected and not same_type(topic.type, expected[topic.name])
     }
 
 
@@ -326,7 +326,7 @@ def _unusable(topics: Sequence[BagTopic], ingest: Ingest, swarm: Swarm) -> tuple
         others = [
             topic
             for topic in topics
-            if _same_type(topic.type, kind.message_type)
+            if same_type(topic.type, kind.message_type)
             and topic.name not in ingest.handle_of
             and not topic.name.endswith("/ground_truth")
         ]

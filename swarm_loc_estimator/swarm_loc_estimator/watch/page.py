@@ -29,7 +29,7 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.sightings import Sightings
 
 _TYPES = {"float64": "f8", "float32": "f4", "int32": "i4", "uint8": "u1", "int8": "i1"}
-_COLUMN_ALIGNMENT = 8
+_ALIGNMENT = 8
 SPAN_NS = 180_000_000_000
 MAX_BYTES = 24_000_000
 _SPACING_NS = {"poses": 200_000_000, "truth": 200_000_000, "map": 5_000_000_000}
@@ -52,11 +52,11 @@ def pack(kind: str, stamp_ns: int, columns: Mapping[str, npt.NDArray[Any]], **ex
     flat = {name: np.ascontiguousarray(column).reshape(-1) for name, column in columns.items()}
     listed = [[name, _TYPES[str(column.dtype)], column.size] for name, column in flat.items()]
     header = json.dumps({"kind": kind, "stamp": stamp_ns * 1e-6, "columns": listed, **extra}).encode()
-    header += b" " * (-(4 + len(header)) % _COLUMN_ALIGNMENT)
+    header += b" " * (-(4 + len(header)) % _ALIGNMENT)
     parts = [struct.pack("<I", len(header)), header]
     for column in flat.values():
         data = column.tobytes()
-        parts += [data, bytes(-len(data) % _COLUMN_ALIGNMENT)]
+        parts += [data, bytes(-len(data) % _ALIGNMENT)]
     return Frame(kind, stamp_ns, b"".join(parts))
 
 
@@ -67,7 +67,7 @@ def unpack(data: bytes) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
     at, columns = 4 + size, {}
     for name, kind, length in header["columns"]:
         columns[name] = np.frombuffer(data, f"<{kind}", length, at)
-        at += -(-columns[name].nbytes // _COLUMN_ALIGNMENT) * _COLUMN_ALIGNMENT
+        at += -(-columns[name].nbytes // _ALIGNMENT) * _ALIGNMENT
     return header, columns
 
 
@@ -195,7 +195,6 @@ _SCRIPTS = (
     "panel.js",
     "actions.js",
 )
-_ALIGNMENT = 8
 _BODY_PER_WHEELS = 0.66  # Ratio of body radius to wheel separation, as of an e-puck
 
 

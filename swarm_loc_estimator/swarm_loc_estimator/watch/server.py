@@ -12,7 +12,6 @@ import ipaddress
 import json
 import re
 import socket
-import socket as sockets
 import threading
 import time
 from collections import deque
@@ -204,7 +203,7 @@ class WatchServer:
     @property
     def url(self) -> str:
         """URL of the page."""
-        host = self._access.address if is_loopback(self._access.address) else _own_name()
+        host = self._access.address if is_loopback(self._access.address) else socket.gethostname()
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.port}/" + (f"?token={self._access.token}" if self._access.token else "")
 
@@ -252,7 +251,6 @@ class WatchServer:
                 viewer.note(message)
 
     def _run(self, port: int) -> None:
-        """The thread."""
         asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_until_complete(self._listen(port))
@@ -388,11 +386,6 @@ def read_command(text: str) -> Command | None:
     command.setdefault("robot", -1)
     is_valid = isinstance(command.get("do"), str) and type(command["robot"]) is int
     return command if is_valid else None
-
-
-def _own_name() -> str:
-    """Host name of this machine."""
-    return sockets.gethostname()
 
 
 class LeftOut(NamedTuple):

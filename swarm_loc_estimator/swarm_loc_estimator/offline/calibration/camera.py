@@ -107,7 +107,16 @@ def true_values(
 
 def _logged(recording: Recording, swarm: Swarm, observer: int) -> CameraSightings:
     """All sightings of known markers by a robot."""
-    ideal = replace(swarm, robots=tuple(_ideal(robot) for robot in swarm.robots))
+    # with an ideal sensor and a camera at the origin; the tilt and height of the mount are kept
+    mounts = [
+        one.camera and CameraMount(z=one.camera.z, pitch=one.camera.pitch, roll=one.camera.roll)
+        for one in swarm.robots
+    ]
+    robots = [
+        replace(one, camera=mount, sensor=SensorModel())
+        for one, mount in zip(swarm.robots, mounts, strict=True)
+    ]
+    ideal = replace(swarm, robots=tuple(robots))
     rows = chosen(recording.detections, recording.detections.robot == observer)
     if not rows.robot.size:
         empty = np.zeros(0, dtype=np.int64)
@@ -124,12 +133,6 @@ def _logged(recording: Recording, swarm: Swarm, observer: int) -> CameraSighting
         target=m["target"].copy(),
         lone=np.full((m.size, 3), np.nan),
     )
-
-
-def _ideal(robot: Robot) -> Robot:
-    """The robot with an ideal sensor and a camera at its origin; the mount's tilt and height are kept."""
-    camera = robot.camera and CameraMount(z=robot.camera.z, pitch=robot.camera.pitch, roll=robot.camera.roll)
-    return replace(robot, camera=camera, sensor=SensorModel())
 
 
 def _observer_known(truth: Trajectory, stamp_ns: IntArray) -> tuple[BoolArray, FloatArray]:

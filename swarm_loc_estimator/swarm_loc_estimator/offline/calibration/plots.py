@@ -211,9 +211,11 @@ def draw_gains(done: InfraredCalibration, path: Path) -> Path:
     figure = Figure(figsize=(12.0, 3.2 * len(done.boards)))
     rows: list[Any] = list(figure.subplots(len(done.boards), 3, squeeze=False, width_ratios=(1.0, 1.0, 1.4)))
     for axes, board in zip(rows, done.boards, strict=True):
-        errors = [one[np.isfinite(one)].clip(-_REACH, _REACH) for one in (board.fit.before, board.fit.after)]
+        before, after = (
+            one[np.isfinite(one)].clip(-_REACH, _REACH) for one in (board.fit.before, board.fit.after)
+        )
         bins = np.linspace(-_REACH, _REACH, _SIGMA_BINS)
-        _histogram(axes[0], f"{board.group.source}: residuals [sigma]", *errors, bins)
+        _histogram(axes[0], f"{board.group.source}: residuals [sigma]", before, after, bins)
         axes[0].legend(frameon=False, fontsize=9)
         _by_brightness(axes[1], board)
         _gains(axes[2], board, [done.swarm.robots[index].name for index in board.group.robots])

@@ -440,7 +440,8 @@ def import_recording(
         one.receiver in where and one.transmitter in where
         for one, where in zip(sized, truth.poses, strict=True)
     )
-    remarks = tuple(f"{count} {what}." for what, count in _counted(dropped + truth.remarks))
+    counts = sorted((what.replace("_", " "), count) for what, count in (dropped + truth.remarks).items())
+    remarks = tuple(f"{count} {what}." for what, count in counts if count)
     save_swarm(swarm, folder / "swarm.yaml", "\n".join([f"Imported from {path.name}.", *remarks]))
     return DropletImport(len(sized), known, fiducials, remarks)
 
@@ -497,8 +498,3 @@ def _write_bag(
                 f"{receiver}/base_link", stamp_ns, (one.receiver, one.transmitter), one.readings
             )
             bag.write(f"{receiver}/{_BRIGHTNESS.topic}", stamp_ns, matrix)
-
-
-def _counted(counts: Counter[str]) -> list[tuple[str, int]]:
-    """Reasons with their counts, without those of zero."""
-    return sorted((what.replace("_", " "), count) for what, count in counts.items() if count)

@@ -342,7 +342,7 @@ def picture(heading: str, path: Path) -> str:
     return f'<h2>{name}</h2><div class="wide"><img alt="{name}" src="data:image/png;base64,{data}"></div>'
 
 
-_Thing = TypeVar("_Thing", Frame, RecordedMap)
+_Thing = TypeVar("_Thing", bound=Frame | RecordedMap)
 MAX_BYTES = 12_000_000
 """Of poses and sightings before compression; maps, goals and aerial images have limits of their own."""
 _MAP_BYTES, _GOAL_BYTES, _IMAGE_BYTES = 6_000_000, 1_000_000, 2_000_000
@@ -399,5 +399,6 @@ def _goals(result: ReplayResult) -> list[Frame]:
 def _thinned(things: Sequence[_Thing], max_bytes: int) -> list[_Thing]:
     """The last of them and others, evenly spaced: as many as would fit, were all as large as the largest."""
     size = max((len(one.data) for one in things), default=1)
-    stride = max(1, -(-len(things) // max(1, max_bytes // size)))
-    return [*things[::-1][::stride]][::-1]
+    stride: int = max(1, -(-len(things) // max(1, max_bytes // size)))
+    kept: list[_Thing] = list(things[::-1][::stride])
+    return kept[::-1]

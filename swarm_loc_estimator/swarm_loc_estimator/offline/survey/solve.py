@@ -335,7 +335,8 @@ class Solver:
         self.used: BoolArray = np.asarray(targets)
         self._rows = np.flatnonzero(self.used)
         # exactly described landmarks have no columns
-        free = np.isfinite(self._landmark[:, 0]) & ~(problem.is_known & _is_exact(problem.swarm))
+        is_exact = np.array([not mark.is_estimated for mark in problem.swarm.landmarks], dtype=bool)
+        free = np.isfinite(self._landmark[:, 0]) & ~(problem.is_known & is_exact)
         self._knot_column, next_column = _numbered(is_placed, 0)
         self._landmark_column, next_column = _numbered(free, next_column)
         self._parameter_column = next_column + np.arange(robots * PRIORS.size).reshape(robots, -1)
@@ -347,7 +348,9 @@ class Solver:
 
     def solve(self, progress: Progress) -> Solution:
         """Solve, and compute covariances."""
-        flexible, self._knot_column = self._knot_column, self._rigid()
+        # first with exact odometry: all knots of a robot have the columns of its first one
+        first = np.searchsorted(self._problem.knots.robot, self._problem.knots.robot)
+        flexible, self._knot_column = self._knot_column, self._knot_column[first]
         self._descend(_SCALES[0])
         self._knot_column, self._is_rigid = flexible, False
         for k, scale in enumerate(_SCALES):
@@ -355,11 +358,6 @@ class Solver:
             self._descend(scale)
         matrix, _, _ = self._normal(_SCALES[-1])
         return self._solution(matrix)
-
-    def _rigid(self) -> IntArray:
-        """Columns of the knots where odometry is exact: those of a robot's first knot for all."""
-        first = np.searchsorted(self._problem.knots.robot, self._problem.knots.robot)
-        return np.asarray(self._knot_column[first])
 
     def _descend(self, scale: float) -> None:
         """Minimize the cost at one scale of the weights.
@@ -566,10 +564,6 @@ def _numbered(wanted: BoolArray, first: int) -> tuple[IntArray, int]:
     """First columns (k,) of bodies of three columns, -1 where not wanted; and the next free column."""
     columns = np.where(wanted, first + 3 * (np.cumsum(wanted) - 1), -1)
     return columns, first + 3 * int(wanted.sum())
-
-
-def _is_exact(swarm: Swarm) -> BoolArray:
-    return np.array([not mark.is_estimated for mark in swarm.landmarks], dtype=bool)
 
 
 def _steps(problem: SurveyProblem, is_placed: BoolArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:

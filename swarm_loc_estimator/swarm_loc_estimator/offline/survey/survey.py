@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -522,10 +522,10 @@ def _remarks(problem: SurveyProblem, solution: Solution) -> list[str]:
     located = {robot for robot in moved if np.isfinite(solution.knot[problem.knots.robot == robot]).all()}
     lone = [problem.swarm.robots[robot].name for robot in moved if robot not in located]
     if apart or lone:
-        said = _listed([*(f"robot {name}" for name in lone), *(f"landmark {name}" for name in apart)])
+        said = ", ".join([*(f"robot {name}" for name in lone), *(f"landmark {name}" for name in apart)])
         remarks.append(
-            f"{said} cannot be placed: nothing connects them with the others; let robots of both parts pass"
-            " the same landmarks, or each other."
+            f"{said[:1].upper()}{said[1:]} cannot be placed: nothing connects them with the others; let robots"
+            " of both parts pass the same landmarks, or each other."
         )
     sigma = np.sqrt(0.5 * (solution.landmark_covariance[:, 0, 0] + solution.landmark_covariance[:, 1, 1]))
     free = placed & (sigma > 0.0)
@@ -558,11 +558,6 @@ def _span(angles: FloatArray) -> float:
     kept = max(1, math.ceil(0.95 * ordered.size))
     turned = np.concatenate([ordered, ordered + 2.0 * np.pi])
     return float(np.min(turned[kept - 1 : kept - 1 + ordered.size] - turned[: ordered.size]))
-
-
-def _listed(names: Sequence[str]) -> str:
-    said = ", ".join(names)
-    return said[:1].upper() + said[1:]
 
 
 _SIGMAS = 3.0

@@ -26,6 +26,7 @@ from swarm_loc_estimator.infrared.search import IrOutcome
 from swarm_loc_estimator.offline.calibration.infrared.elements import ElementVerdicts, find_dead_elements
 from swarm_loc_estimator.offline.calibration.infrared.gains import exchanges_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
+from swarm_loc_estimator.offline.calibration.robust import TO_SIGMA, spread
 from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.swarm.ir_board import (
     Amplitude,
@@ -56,7 +57,6 @@ _OUTLIER = 3.0
 _MIN_SHARE, _MAX_SHARE = 0.02, 0.3
 _ROUNDS = 2
 _MAX_EVALUATIONS = 10
-_TO_SIGMA = 1.4826  # Standard deviation of a normal distribution per median absolute deviation
 
 
 class BoardReadings(NamedTuple):
@@ -108,8 +108,8 @@ def fit_board(start: IrPlatform, data: BoardReadings, robots: int, *, gains: boo
     yaw = problem.parts(unknowns)[3]
     logs, sought = problem.log_gains(unknowns), problem.gains_sought
     if sought.any():
-        spread = float(np.sqrt(np.mean(logs[sought] ** 2)))
-        platform = replace(platform, element_sigma=round(min(max(spread, _MIN_SPREAD), 1.0), 3))
+        size = float(np.sqrt(np.mean(logs[sought] ** 2)))
+        platform = replace(platform, element_sigma=round(min(max(size, _MIN_SPREAD), 1.0), 3))
     return BoardModel(platform, np.exp(logs), sought, yaw, scatter, problem.angles(yaw)[1])
 
 
@@ -128,7 +128,7 @@ def noise_floor(data: BoardReadings) -> float:
     offset and drift of the amplifier cancel.
     """
     middle = float(np.nanmedian(data.readings))
-    limit = _DIM * max(_TO_SIGMA * float(np.nanmedian(np.abs(data.readings - middle))), 0.5)
+    limit = _DIM * max(TO_SIGMA * float(np.nanmedian(np.abs(data.readings - middle))), 0.5)
     steps = []
     for receiver in np.unique(data.receiver).tolist():
         rows = np.flatnonzero(data.receiver == receiver)
@@ -136,7 +136,7 @@ def noise_floor(data: BoardReadings) -> float:
         dark = np.abs(own - middle) < limit
         steps.append(np.diff(own, axis=0)[dark[1:] & dark[:-1]])
     found = np.concatenate(steps)
-    return float(max(_robust_sigma(found) / np.sqrt(2.0), 0.5)) if found.size else 0.5
+    return float(max(spread(found) / np.sqrt(2.0), 0.5)) if found.size else 0.5
 
 
 class _Problem:
@@ -272,7 +272,8 @@ class _Problem:
     def platform_of(self, unknowns: FloatArray) -> IrPlatform:
         """The platform with the law and curves of these unknowns."""
         law, sensor, emitter, _ = self.parts(unknowns)
-        amplitude = Amplitude(float(np.exp(law[0])), float(law[1]), float(law[2]), nearest=_nearest(law[1]))
+        nearest = 0.0 if law[1] > 0.0 else 0.005 - law[1]  # least distance at which this law is valid [m]
+        amplitude = Amplitude(float(np.exp(law[0])), float(law[1]), float(law[2]), nearest=nearest)
         return replace(
             self._platform,
             sensor=self._curve(sensor),
@@ -303,17 +304,12 @@ def _limited(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.sign(values) * size, slope
 
 
-def _nearest(offset: float) -> float:
-    """Minimum distance at which a law with this offset is valid [m]."""
-    return 0.0 if offset > 0.0 else 0.005 - offset
-
-
 def _with_noise(platform: IrPlatform, problem: _Problem, unknowns: FloatArray) -> IrPlatform:
     """The platform with noise and outlier shares estimated from its residuals."""
     expected, scatter = problem.expected(unknowns), problem.scatter(unknowns)
     known = np.isfinite(scatter)
     lit = known & (expected > _LIT * platform.noise) & (expected < platform.saturation)
-    relative = platform.relative * (_robust_sigma(scatter[lit]) if lit.any() else 1.0)
+    relative = platform.relative * (spread(scatter[lit]) if lit.any() else 1.0)
     blocked = float(np.mean(scatter[lit] < -_OUTLIER)) if lit.any() else 0.0
     bright = float(np.mean(scatter[known & ~lit] > _OUTLIER))
     return replace(
@@ -322,11 +318,6 @@ def _with_noise(platform: IrPlatform, problem: _Problem, unknowns: FloatArray) -
         blocked_share=round(min(max(blocked, _MIN_SHARE), _MAX_SHARE), 3),
         bright_share=round(min(max(bright, _MIN_SHARE), _MAX_SHARE), 3),
     )
-
-
-def _robust_sigma(values: FloatArray) -> float:
-    """Robust standard deviation about zero, from the median."""
-    return float(_TO_SIGMA * np.median(np.abs(values)))
 
 
 MAX_RANGE = 0.3  # Maximum distance of exchanges that are used [m]; farther readings are mostly noise

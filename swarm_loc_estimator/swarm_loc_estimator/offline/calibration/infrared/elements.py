@@ -88,7 +88,8 @@ def find_dead_elements(platform: IrPlatform, robots: int, exchanges: Exchanges) 
     ambiguous. If exchanges do not discriminate between two elements of a robot (at the same probability),
     both are reported.
     """
-    n, bright = platform.n, _bright(platform, exchanges)
+    n = platform.n
+    bright = np.nan_to_num(exchanges.readings[:, 0]).max(axis=(1, 2)) > _BRIGHT * platform.noise
     readings: FloatArray = exchanges.readings[bright, 0]
     saturation = exchanges.saturation[bright, 0]
     robot_of = np.stack([exchanges.receiver[bright], exchanges.transmitter[bright]])
@@ -115,12 +116,6 @@ def find_dead_elements(platform: IrPlatform, robots: int, exchanges: Exchanges) 
     return ElementVerdicts(dead, ~dead & (scores < math.log(FALSE_ALARM)), shares)
 
 
-def _bright(platform: IrPlatform, exchanges: Exchanges) -> BoolArray:
-    """(k,) True where an exchange is bright enough."""
-    bright: BoolArray = np.nan_to_num(exchanges.readings[:, 0]).max(axis=(1, 2)) > _BRIGHT * platform.noise
-    return bright
-
-
 def _score(
     platform: IrPlatform,
     robot_of: NDArray[np.int64],
@@ -131,22 +126,18 @@ def _score(
 ) -> None:
     """Write log likelihood ratios and likeliest shares (2, robots, n), of robots `wanted` (2, robots)."""
     geometry = _geometries(robot_of, likelihoods.directions, _SAME_GEOMETRY * direction_step(platform))
+    # gains of elements that work differ by the board's `element_sigma`
+    sigma = max(platform.element_sigma, _MIN_SIGMA)
+    weight = -0.5 * (np.log(SHARES[_WHOLE_SHARES]) / sigma) ** 2
+    weight -= np.logaddexp.reduce(weight)
     for side, robot in zip(*np.nonzero(wanted), strict=True):
         rows = np.flatnonzero(robot_of[side] == robot)
         logs = likelihoods.log[rows, side]
         whole, lost = _by_hypothesis(logs, geometry[rows], max(platform.blocked_share, _MIN_BLOCKED))
-        weight = _log_prior(platform)
         scores[side, robot] = _log_sum(lost, np.full(lost.shape[-1], -math.log(lost.shape[-1])))
         scores[side, robot] -= _log_sum(whole, weight)
         both = np.concatenate([lost, whole], axis=-1)
         shares[side, robot] = SHARES[np.argmax(both, axis=-1)]
-
-
-def _log_prior(platform: IrPlatform) -> FloatArray:
-    """Log probabilities of the shares of elements that work: gains differ by the board's `element_sigma`."""
-    sigma = max(platform.element_sigma, _MIN_SIGMA)
-    log = -0.5 * (np.log(SHARES[_WHOLE_SHARES]) / sigma) ** 2
-    return np.asarray(log - np.logaddexp.reduce(log))
 
 
 def _by_hypothesis(

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -92,7 +92,9 @@ def _chosen_robots(
         for robot in np.flatnonzero(helps).tolist():
             alone = np.arange(robots) == robot
             own[robot] = min(by_block.sum() for by_block in _by_block(pairs, logs, blocks, helps, alone))
-        sure = min(_beyond_chance(by_block) for by_block in _by_block(pairs, logs, blocks, helps, helps))
+        # the margin by which each sum over blocks exceeds chance
+        whole = _by_block(pairs, logs, blocks, helps, helps)
+        sure = min(float(one.sum() - max(_EVIDENCE, np.linalg.norm(one))) for one in whole)
         if own.min() > 0.0 and sure > 0.0:
             break
         helps[own.argmin()] = False
@@ -110,11 +112,6 @@ def _by_block(
         gain = logs[rows, receiver, transmitter] - logs[rows, one, other]
         gains.append(np.bincount(blocks, np.nan_to_num(gain), BLOCKS).astype(np.float64))
     return gains
-
-
-def _beyond_chance(by_block: FloatArray) -> float:
-    """The margin by which a sum over blocks exceeds its threshold."""
-    return float(by_block.sum() - max(_EVIDENCE, np.linalg.norm(by_block)))
 
 
 class _PairElements(NamedTuple):
@@ -181,18 +178,13 @@ def _samples(
     ]
     draws = np.random.default_rng(_SEED).standard_normal((2 * len(solved), _POINTS, 3))
     known: BoolArray = np.isfinite(exchanges.poses[:, 0])
+    offsets = draws.reshape(-1, 3) * POSE_SIGMA
     return [
-        _about_known(exchanges.poses[k], draws)
+        (exchanges.poses[k] + offsets, np.zeros(len(offsets)))
         if known[k]
         else _about_found(solved, k, draws, platform.radius)
         for k in range(count)
     ]
-
-
-def _about_known(pose: FloatArray, draws: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Samples around a known pose, with equal weights."""
-    poses = pose + draws.reshape(-1, 3) * POSE_SIGMA
-    return poses, np.zeros(len(poses))
 
 
 def _about_found(
@@ -402,7 +394,10 @@ def _groups(
         raise CalibrationError(" ".join([f"recording '{recording.name}' {nothing}", *recording.remarks]))
     keys = sorted(exchanges)
     groups = []
-    for members in _alike(screening):
+    alike: dict[IrPlatform, list[int]] = {}
+    for robot, board in screening.boards.items():
+        alike.setdefault(board.platform, []).append(robot)
+    for members in alike.values():
         own = [key for key in keys if key.receiver in members]
         own = own[:: max(1, -(-len(own) // _MAX_EXCHANGES))]
         columns = np.array(own, dtype=np.int64).reshape(-1, 3).T
@@ -413,14 +408,6 @@ def _groups(
         read = Exchanges(place[0], place[1], readings, saturation, poses)
         groups.append((BoardGroup(board.source, board.platform, tuple(members), read), columns[0]))
     return groups, screening.dropped
-
-
-def _alike(screening: MatrixScreening) -> Iterator[list[int]]:
-    """Robots with the same kind of board, in ascending order."""
-    groups: dict[IrPlatform, list[int]] = {}
-    for robot, board in screening.boards.items():
-        groups.setdefault(board.platform, []).append(robot)
-    yield from groups.values()
 
 
 def _true_poses(recording: Recording, swarm: Swarm, columns: IntArray) -> FloatArray:
