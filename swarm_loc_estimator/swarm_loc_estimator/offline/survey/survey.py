@@ -524,8 +524,8 @@ def _remarks(problem: SurveyProblem, solution: Solution) -> list[str]:
     if apart or lone:
         said = ", ".join([*(f"robot {name}" for name in lone), *(f"landmark {name}" for name in apart)])
         remarks.append(
-            f"{said[:1].upper()}{said[1:]} cannot be placed: nothing connects them with the others; let robots"
-            " of both parts pass the same landmarks, or each other."
+            f"{said[:1].upper()}{said[1:]} cannot be placed: nothing connects them with the others; let"
+            " robots of both parts pass the same landmarks, or each other."
         )
     sigma = np.sqrt(0.5 * (solution.landmark_covariance[:, 0, 0] + solution.landmark_covariance[:, 1, 1]))
     free = placed & (sigma > 0.0)
