@@ -48,7 +48,7 @@ from swarm_loc_estimator.watch.server import free_port
 BAG = Path("bags/eight_five_robots")
 RATE = 3.0
 
-# What a sound estimator reaches on the bag with room to spare; it is at 3 mm, 1.2 degrees and NEES 3.
+# Limits of the bag of the demo, where the errors are 3 mm, 1.2 degrees and NEES 3.
 _POSITION_M = 0.010
 _HEADING_DEG = 3.0
 _NEES = (1.5, 6.0)

@@ -121,17 +121,20 @@ def start_lines(plan: SwarmPlan, file: str) -> list[str]:
     sheets = f"{plan.prefix.rstrip('_')}_markers"
     sees = bool(sensors & {"robots", "landmarks"})
     lines = []
+    # markers to print
     if sees or "aerial" in sensors:
         board = " --board 3x4" if "aerial" in sensors else ""
         lines.append(
             f"./run swarm_loc_vision print_markers {file} --family {plan.family}{board} --out {sheets}.pdf"
         )
+    # drivers, or what others must publish
     if known.driver:
         lines.append(f"./run swarm_loc_drivers {known.driver.format(robot=robot, file=file)}")
     needs = [] if known.driver or known.odometry is None else [("odom", "nav_msgs/Odometry")]
     needs += [("imu", "sensor_msgs/Imu")] if "imu" in sensors else []
     needs += [(f"{known.image}image_raw, camera_info", "calibrated images")] if sees else []
     lines += [f"# another node must publish {robot}/{topic}: {kind}" for topic, kind in needs]
+    # what detects, localizes and maps on or for each robot
     if sees:
         names = ("image_raw", "camera_info") if known.image else ()
         remapped = "".join(f" -r {name}:={known.image}{name}" for name in names)
@@ -155,6 +158,7 @@ def start_lines(plan: SwarmPlan, file: str) -> list[str]:
         lines.append(
             f"# the lines with {robot} are needed for {plan.prefix}2 to {plan.prefix}{plan.robots}, too"
         )
+    # what runs once for the swarm
     if "aerial" in sensors:
         lines.append(
             "./run swarm_loc_vision aerial_camera_node --ros-args -r __ns:=/aerial"

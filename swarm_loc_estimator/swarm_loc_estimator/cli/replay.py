@@ -60,6 +60,7 @@ _COLUMNS = ("stamp_ns", "robot", "x_m", "y_m", "theta_rad", *_COVARIANCE)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
+    # replay, and write all files
     settings = parameters_of(Settings, options.set)
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
     with ProgressLine() as progress:
@@ -80,6 +81,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             write_mcap(result, options.mcap)
         if options.tum:
             write_tum(result, options.tum)
+    # write what was learned, unless there is nothing or it cannot be right
     if options.learned:
         if not result.self_calibrated:
             print(_NOTHING_TO_LEARN, file=sys.stderr)
@@ -88,6 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("\n".join([*swapped, f"{options.learned} was not written."]), file=sys.stderr)
             return 1
         save_swarm(result.self_calibrated, options.learned, f"Learned from {result.title}.")
+    # say what was found
     print(files.text.read_text(encoding="utf-8"))
     print(f"Report:  {files.page}\nPicture: {files.overview}")
     if not np.isfinite(result.poses).all(axis=2).any():

@@ -13,7 +13,6 @@ the best values, by optuna.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -32,7 +31,12 @@ from swarm_loc_estimator.offline.sweep.sweep import NAMES, Backend, Best, Line, 
 @exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
+    parser = command_parser(__doc__)
+    parser.add_argument("file", metavar="SWEEP_FILE", type=Path, help="what is replayed")
+    parser.add_argument("--out", type=folder_to_write, default="out/sweep", help="folder for the results")
+    parser.add_argument("--backend", choices=NAMES, default=NAMES[0], help="what runs the replays")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="a running cluster of Ray or Dask")
+    options = parser.parse_args(arguments)
     if options.cluster and options.backend == "loky":
         raise UserError("--cluster is for --backend ray or dask; loky has the processes of this machine.")
     sweep = read_sweep(options.file)
@@ -62,12 +66,3 @@ def _text_of(best: Best) -> str:
     options = "".join(f" --set {name}={value:.6g}" for name, value in best.values.items())
     before = "" if best.mean_before is None else f", {best.mean_before:.6g} with the defaults"
     return f"Best: {options}\n       mean {best.minimized} {best.mean:.6g}{before}"
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
-    parser.add_argument("file", metavar="SWEEP_FILE", type=Path, help="what is replayed")
-    parser.add_argument("--out", type=folder_to_write, default="out/sweep", help="folder for the results")
-    parser.add_argument("--backend", choices=NAMES, default=NAMES[0], help="what runs the replays")
-    parser.add_argument("--cluster", metavar="ADDRESS", help="a running cluster of Ray or Dask")
-    return parser

@@ -94,6 +94,7 @@ def _of_intrinsics(name: str, info_name: str, info: Any, image: Any) -> Iterator
         yield Finding(info_name, problem, "Calibrate at the resolution that the driver publishes")
 
 
+# Limits of the doctor are checked by test_doctor.py with the set-ups of wrong_setups.py.
 _MIN_SIGHTINGS = 5  # Fewer sightings of an unknown marker are misread ones
 _MIN_SHARE = 0.05  # Smaller shares of dropped readings are not named
 _MIN_ROWS = 20
@@ -417,6 +418,7 @@ def _fitted(
     robot: Robot, own: OdometryRows, seen: FloatArray, landmark: IntArray, stamp_ns: IntArray, undo: Change
 ) -> _Alignment | None:
     """The fit with odometry whose poses are changed; None: the robot moves too little."""
+    # sightings while there is odometry
     tracks = OdometryTracks([robot])
     tracks.extend(np.zeros(own.robot.size, dtype=np.int64), own.stamp_ns, undo(own.pose), None)
     zeros = np.zeros(stamp_ns.size, dtype=np.int64)
@@ -424,6 +426,7 @@ def _fitted(
     camera = robot.camera
     if begun.sum() < _MIN_MOTION_ROWS or camera is None:
         return None
+    # R d, p + R m and the latter turned by a quarter, see the equation at the top
     pose = tracks.at(zeros[begun], stamp_ns[begun]).pose
     level = Rotation.from_euler("ZYX", [camera.yaw, camera.pitch, camera.roll]).as_matrix() @ FROM_OPTICAL
     view = (seen[begun] @ level.T)[:, :2] * robot.sensor.distance_scale
@@ -437,6 +440,7 @@ def _fitted(
     place = turned(np.tile([camera.x, camera.y], (len(view), 1))) + pose[:, :2]
     columns = [turned(view), place, np.stack([-place[:, 1], place[:, 0]], axis=1)]
     group, weight = _groups(landmark[begun], stamp_ns[begun]), np.ones(len(view))
+    # B = a + b i by weighted least squares on differences to the means, robustly
     scale = yaw = sigma = residual = 0.0
     for _ in range(_ROUNDS):
         sighted, along, across = (_centred(column, group, weight) for column in columns)

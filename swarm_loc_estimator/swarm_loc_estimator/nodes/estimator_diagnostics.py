@@ -307,11 +307,6 @@ def shedding_report(cost: TickCost) -> Report:
     return Report("shedding", sentence, Level.WARN, values)
 
 
-def overload_report(count: int) -> Report:
-    """A warning about `count` messages that the middleware dropped from full queues in the interval."""
-    return Report("overload", f"overload: {count} messages were lost in full queues", Level.WARN)
-
-
 def merged(reports: Sequence[Report], name: str) -> Report:
     """Several reports merged into one; warnings come first."""
     warnings = [report.message for report in reports if report.warning]

@@ -34,7 +34,6 @@ from swarm_loc_estimator.nodes.estimator_diagnostics import (
     add_identities,
     load_report,
     merged,
-    overload_report,
     shedding_report,
 )
 from swarm_loc_estimator.nodes.estimator_topics import (
@@ -262,7 +261,9 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         whole.values |= {"time jumps": self._estimator.time_jumps, **frames, **self._estimator.counters}
         foreign = self._static_transforms.foreign
         lost, self._lost = drops.get("overload", 0) - self._lost, drops.get("overload", 0)
-        causes += [overload_report(lost)] if lost else []
+        if lost:
+            text = f"overload: {lost} messages were lost in full queues"
+            causes.append(Report("overload", text, Level.WARN))
         causes += [Report("transforms", text, Level.WARN) for text in foreign]
         self.health.warn_of(
             "publishers", {text: text for text in [*self._diagnostics.duplicate_publishers, *foreign]}

@@ -140,6 +140,7 @@ def _units(sensor: Sensor, rows: Any) -> _Units:
     return _Units(robot, stamp_ns, of_row.reshape(-1), exchanges)
 
 
+# Checked by test_shedding.py and test_fusion_pace.py, and on live swarms by make bench-large_swarms.
 MIN_SHARE = 0.01
 """Least share, however busy the node is: without any measurements, robots would be lost for good."""
 _WINDOW_S = 0.5  # Least time over which the load is measured, since fusing comes in bursts
@@ -147,7 +148,7 @@ _BUSY = 0.9  # Load above which a node may not keep up
 _MAX_WAIT = 0.5  # Share of the horizon; data that wait longer to be fused would soon be too old
 _AT_EASE = 0.6  # Load below which the share grows. Between the two limits it stays.
 _SMOOTHING = 0.2  # Smoothing factor of the time that fusing takes, an average over about five windows
-_AIM = 0.75
+_AIM = 0.75  # Load to which a cut leads
 _MIN_CUT, _MAX_CUT = 0.5, 0.125  # Limits of the factor by which the share is cut per window
 _GROWTH = 1.3
 """Growth of the share per window at low load; it is too small to lead from one load limit past the other."""

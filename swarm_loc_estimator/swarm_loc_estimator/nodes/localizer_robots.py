@@ -184,11 +184,13 @@ class LocalizedRobots:
 
     def __init__(self, parameters: BridgeParameters, robots: Collection[str], health: Health) -> None:
         self._parameters, self._health = parameters, health
+        # which body is which robot, and where on it
         self.robot_of = _robots_of_bodies(parameters.bodies, robots)
         offsets = _offsets(parameters.offsets, self.robot_of.values())
         self._to_robot = {
             robot: se2.inverse(offsets.get(robot, np.zeros(3))) for robot in self.robot_of.values()
         }
+        # what poses must be in, and the topics that they come on
         self._frames = (
             [parameters.source_frame] if parameters.source_frame else [parameters.map_frame, "world"]
         )
@@ -209,6 +211,7 @@ class LocalizedRobots:
                 raise ParameterError(
                     f"parameter bodies: '{body}' cannot be part of a topic; name the body as its topic does."
                 )
+        # what is counted, and the noise of poses without covariance
         self.strangers: set[str] = set()
         self.used = 0
         self._variances = np.diag(
@@ -242,6 +245,7 @@ class LocalizedRobots:
 
     def _robot_pose(self, name: str, body: BodyPose, arrival_ns: int) -> RobotPose:
         parameters, robot, frames = self._parameters, self.robot_of[name], self._frames
+        # refuse what cannot be used
         if body.frame_id not in frames:
             raise _UnusableError(
                 "foreign_frame",
@@ -259,6 +263,7 @@ class LocalizedRobots:
         covariance = self._variances if is_unknown(body.covariance[None])[0] else body.covariance
         if not (np.isfinite(body.pose[:2]).all() and np.isfinite(covariance).all()):
             raise _UnusableError("not_finite", f"a number in the poses of body '{name}' is NaN or infinite")
+        # without heading, only a body at base_link tells where its robot is
         pose, to_robot = np.array(body.pose), self._to_robot[robot]
         if math.isnan(pose[2]) or not has_heading(covariance[None])[0]:
             if to_robot.any() or parameters.output == "ground_truth":
@@ -268,8 +273,9 @@ class LocalizedRobots:
             pose, covariance = np.array([*pose[:2], 0.0]), covariance.copy()
             covariance[2, :], covariance[:, 2] = 0.0, 0.0
             covariance[2, 2] = _NO_HEADING
+        # from the body to base_link; the lever between them turns with the heading
         placed = se2.compose(pose, to_robot)
-        by_heading = np.eye(3)  # the lever between robot and body turns with the heading
+        by_heading = np.eye(3)
         by_heading[:2, 2] = pose[1] - placed[1], placed[0] - pose[0]
         return RobotPose(
             robot,

@@ -13,7 +13,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -24,7 +24,6 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
 from typing_extensions import Self
 
@@ -42,6 +41,7 @@ from swarm_loc_estimator.common.launch import (
     stop,
 )
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
+from swarm_loc_estimator.common.messages.poses import EstimateMessage, SwarmPosesReader
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
@@ -207,15 +207,6 @@ _DROPPED = "dropped: "
 _RECEIVED = {f"{kind.topic} received": kind for kind in kinds().values()}
 
 
-class Poses(NamedTuple):
-    """One message of swarm/poses."""
-
-    stamp_ns: int  # Time of the poses
-    pose: FloatArray  # (N, 3) x [m], y [m], theta [rad] in map
-    covariance: FloatArray  # (N, 3, 3)
-    status: NDArray[np.uint8]  # (N,) of `SwarmPose.status`
-
-
 class Recorder(Node):
     """Records all messages of swarm/poses with their times of reception, and counts from /diagnostics.
 
@@ -234,7 +225,7 @@ class Recorder(Node):
         super().__init__("recorder", parameter_overrides=[simulated], **node_arguments)
         self.raw: list[bytes] = []
         self.received_ns: list[int] = []
-        self._poses: list[Poses] = []
+        self._poses: list[EstimateMessage] = []
         self.taken: dict[int, dict[str, int]] = {}
         self.inputs = 0
         self.drops: dict[str, int] = {}
@@ -242,16 +233,18 @@ class Recorder(Node):
         self.create_subscription(SwarmPoses, "swarm/poses", self._on_poses, _DEEP, raw=True)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _DEEP)
 
-    def poses(self) -> Sequence[Poses]:
+    def poses(self) -> Sequence[EstimateMessage]:
         """All messages so far in order of reception; each is decoded once."""
         self._poses.extend(map(read_poses, self.raw[len(self._poses) :]))
         return self._poses
 
     def result(self, title: str, swarm: Swarm, truth: Mapping[str, Trajectory]) -> ReplayResult:
         """All poses so far, at least one, with ground truth and the counts of dropped inputs."""
-        stamps_ns, poses, covariances, status = zip(*self.poses(), strict=True)
-        stamp_ns, columns = np.array(stamps_ns, dtype=np.int64), (np.array(poses), np.array(covariances))
-        return ReplayResult(title, swarm, stamp_ns, *columns, np.array(status), truth, dict(self.drops))
+        poses = self.poses()
+        stamp_ns = np.array([one.stamp_ns for one in poses], dtype=np.int64)
+        pose, covariance = np.array([one.pose for one in poses]), np.array([one.covariance for one in poses])
+        status = np.array([one.status for one in poses])
+        return ReplayResult(title, swarm, stamp_ns, pose, covariance, status, truth, dict(self.drops))
 
     def _on_poses(self, data: bytes) -> None:
         self.raw.append(data)
@@ -283,16 +276,9 @@ def _taken(statuses: Sequence[DiagnosticStatus]) -> dict[str, int]:
     return taken
 
 
-def read_poses(data: bytes) -> Poses:
+def read_poses(data: bytes) -> EstimateMessage:
     """Decode a serialized SwarmPoses."""
-    message = deserialize_message(data, SwarmPoses)
-    robots = message.robots
-    return Poses(
-        nanoseconds(message.header.stamp),
-        np.array([(one.x, one.y, one.theta) for one in robots]).reshape(-1, 3),
-        np.array([one.covariance for one in robots]).reshape(-1, 3, 3),
-        np.array([one.status for one in robots], dtype=np.uint8),
-    )
+    return SwarmPosesReader().read(data)
 
 
 ESTIMATOR, PLAYER = "estimator", "player"
@@ -389,6 +375,7 @@ def play_live(
     """
     if options.bag is None:
         raise ValueError("there is no bag to play")
+    # what is in the bag, and who plays it
     bag, swarm = Path(options.bag), load_swarm(Path(options.swarm_file))
     content = read_content(bag, swarm)
     nodes = [
@@ -396,6 +383,7 @@ def play_live(
         for node in graph_nodes(options)
     ]
     begin_s = time.monotonic()
+    # play it to its end, and measure the estimator meanwhile
     with LiveGraph(nodes, log) as graph:
         recorder, estimator, player = graph.recorder, graph.process(ESTIMATOR), graph.process(PLAYER)
 
@@ -413,6 +401,7 @@ def play_live(
             raise LiveError(f"The player ended with status {player.returncode}; see {log}.")
         _wait_for_the_rest(graph, content)
         memory_mb = resident_mb(estimator.pid)
+    # what was received, and how late
     result = replace(
         recorder.result(f"{bag.name}, live at {options.rate:g} x", swarm, content.truth),
         remarks=content.remarks,

@@ -27,7 +27,7 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm
 DENSE_GAP_NS = 200_000_000  # Longest gap of ground truth that is interpolated
 OFFSET_REACH_NS = 250_000_000  # Largest time offset of a camera
 
-_SAME_NS = 3_000_000
+_SAME_NS = 3_000_000  # A true pose this near to a sighting is taken for that of its exposure
 _SAME_VIEW_NS = 4_000_000_000  # Errors of sightings of one marker are correlated for about this long
 _MAX_SIGHTINGS = 2000
 
@@ -162,6 +162,7 @@ def _dense_around(truth: Trajectory, stamp_ns: IntArray) -> BoolArray:
 MIN_SIGHTINGS = 100  # Sightings with ground truth needed to calibrate a camera
 
 _OF_CAMERA = ("x", "y", "yaw")
+# Checked by test_calibration.py and make bench-mrclam.
 _WIDE = {
     "x": 0.03,
     "y": 0.02,

@@ -55,6 +55,7 @@ from swarm_loc_estimator.sensors.sensor import chosen
 from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel, SensorModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
+# Checked by make bench-mrclam: parameters are fitted to set 1 and measured on set 2.
 TICK_S = 1.0  # Interval at which errors are computed
 NEES_AIM = 1.7  # Target of the NEES, below 3 since errors in other recordings are larger
 _HEADING_WEIGHT = 0.2
@@ -62,13 +63,13 @@ _HEADING_WEIGHT = 0.2
 _OF_SENSOR = frozenset({"range_sigma_per_m", "bearing_sigma", "forward_sigma", "left_sigma", "heading_sigma"})
 """Noise in which robots differ."""
 
-_SPACING_NS = 50_000_000
+_SPACING_NS = 50_000_000  # Odometry is thinned out to this spacing for speed
 _INCONSISTENCY = 0.2  # A NEES of half or twice its aim costs as much as 10 % more error
 _LOSS = 5.0  # A hundredth of the poses missing costs as much as 5 % more error
 _FORGETTING = 0.005
 """Weight of the prior that parameters stay near their initial values, per squared factor of e."""
-_FIRST_STEP, _LAST_STEP = 0.7, 0.07
-_WORST = 1e3
+_FIRST_STEP, _LAST_STEP = 0.7, 0.07  # Trust radii of the search, in logarithms of the noise
+_WORST = 1e3  # Cost where nothing was estimated
 _BAD = 0.3  # Costs are capped this far above the initial one: when robots get lost, a score means nothing
 
 
@@ -200,8 +201,9 @@ def _clipped(names: Sequence[str], logarithms: FloatArray) -> dict[str, float]:
     }
 
 
+# Sway: checked by test_scatter.py.
 _EDGES_S = np.array([0.0, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0])  # Bins of the time between two sightings
-_MIN_PAIRS = 30
+_MIN_PAIRS = 30  # Minimum number of pairs of sightings of a bin that counts
 _MAX_STEPS = 60  # Sightings after each one that are compared with it
 _CUT = 4.0  # Errors are cut at this many spreads, so that outliers have no weight
 _MIN_SHARE = 0.05  # Smallest share of the variance of bearings that counts as sway

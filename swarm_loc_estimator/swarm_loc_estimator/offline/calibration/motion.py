@@ -173,11 +173,12 @@ LONGEST_LAG_S = 1.0
 
 WINDOW_S = 5.0  # Length of the windows in which motion is compared
 
-_SHORT_WINDOW_S = 0.5
+# The fit of the table and of lateness is checked by test_calibration.py and make bench-mrclam.
+_SHORT_WINDOW_S = 0.5  # Length of the windows in which turns show delay and lag
 _NODES = (0, 2, 5)  # Numbers of points above 0 that are tried for the table; 0: one scale factor
-_BLOCKS = 5
-_CLEAR_SIGMAS = 2.0
-_NEAR_ZERO = 0.05
+_BLOCKS = 5  # Blocks of time of the cross-validation
+_CLEAR_SIGMAS = 2.0  # A grid is worse than the best one from this many standard errors on
+_NEAR_ZERO = 0.05  # Share of the greatest value below which a point would duplicate 0
 _CLEARLY = 0.85  # Delay and lag are used if they reduce the errors of short windows to this share
 _MOVING = 1e-3  # Speeds below which a robot counts as stationary [m/s, rad/s]
 _SMOOTHNESS, _TO_ONE = 0.02, 0.001

@@ -289,6 +289,7 @@ def _by_robots(problem: SurveyProblem, start: Start, robot: int) -> list[FloatAr
 
 PRIORS: FloatArray = np.array([0.01, 0.03, 0.05, 0.05, 0.02])
 """Standard deviations of turn bias [rad/s], scales of path and of turn, camera yaw [rad] and camera scale."""
+# The steps are checked by test_survey.py and make bench-commissioning, also with wrong scales of wheels.
 _SCALES = (50.0, 20.0, 10.0, 5.0)
 """Residuals at which the weight of a sighting is a quarter [sigma], one after the other."""
 _ITERATIONS, _CONVERGED, _NEARLY = 15, 1e-2, 1e-3

@@ -39,6 +39,7 @@ from swarm_loc_estimator.offline.survey.solve import (
 from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
 from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, Robot, Swarm, UwbDevice
 
+# Checked by test_survey_cameras_and_anchors.py and, in four simulated worlds, by test_survey.py.
 MIN_MEASUREMENTS = 30  # Minimum number of sightings or ranges that place a camera or an anchor
 _SPELLS = 8  # Spells of time of the jackknife
 _DRAWS, _DRAWN = 60, 6  # Starts of an anchor: number of draws, and ranges of each
@@ -46,7 +47,7 @@ _OUTLIER = 5.0  # Residuals of more standard deviations contradict the others
 _LEAST_SIGMA = 1e-4
 _MOST_SIGMA, _MOST_YAW_SIGMA = 1.0, 0.5  # Standard deviations [m], [rad] from which nothing is placed
 _TURNS = 16  # Other places are sought in this number of directions about the line of all robots
-_AS_WELL, _ELSEWHERE, _ELSEWHERE_M = 1.2, 0.5, 0.3
+_EQUAL_FIT, _FAR_SHARE, _FAR_M = 1.2, 0.5, 0.3
 """Another place fits as well if its residuals are larger by no more than this factor. It is farther away than
 this share of the distance from the line, and this length."""
 _DEPTH = 0.05  # Least depth of a marker in front of a camera, of which its direction is computed [m]
@@ -145,12 +146,14 @@ def _located(
     Only directions are used: distances of a camera depend on its focal length and on sizes of markers. None:
     other poses fit as well.
     """
+    # directions of the markers: perspective from n points
     seen = optical[:, :2] / optical[:, 2:]
 
     def residual(pose: FloatArray, rows: BoolArray) -> FloatArray:
         level = Rotation.from_rotvec(pose[:3]).apply(place[rows] - pose[3:], inverse=True)
         return np.asarray(level[:, :2] / np.maximum(level[:, 2:], _DEPTH) - seen[rows])
 
+    # the best pose, and whether another fits as well
     start = _aligned(optical, place)
     pose, sigma, wrong = _robust(residual, start, len(seen))
     rotation = Rotation.from_rotvec(pose[:3])
@@ -160,6 +163,7 @@ def _located(
 
     if not _is_unique(residual, pose, sigma, place, turned, lambda other: other[3:]):
         return None
+    # uncertainty where it matters: at the middle of the view, on the floor
     height = float(np.median(place[:, 2]))
     below = np.median(optical, axis=0)
 
@@ -171,6 +175,7 @@ def _located(
         return np.append(centre, (turned * rotation.inv()).as_rotvec()[2])
 
     spread = _jackknife(residual, pose, sigma, stamp_ns, shift) + paths.variances(shift(pose)[:2])
+    # the pose as a description states it
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # straight down, yaw and roll are one angle
         yaw, pitch, roll = Rotation.from_matrix(rotation.as_matrix() @ FROM_OPTICAL.T).as_euler("ZYX")
@@ -199,6 +204,7 @@ def _aligned(points: FloatArray, to: FloatArray) -> FloatArray:
 
 def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Paths) -> Placed:
     """Anchors at all addresses that belong to nobody."""
+    # ranges to unknown addresses while the place of the robot's antenna is known
     rows = recording.ranges
     radios = [robot.uwb for robot in swarm.robots]
     known = {one.address for one in (*radios, *swarm.anchors) if one is not None}
@@ -214,6 +220,7 @@ def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
         for name in ("range_bias", "range_scale")
     )
     measured = (rows.range - bias) / scale
+    # one anchor after the other
     found, remarks = [*placed.anchors], [*placed.remarks]
     lines = ["anchor              x [m]     y [m]   z [m]             sigma [mm]  contradicting"]
     for address in np.unique(rows.device[usable]).tolist():
@@ -328,8 +335,8 @@ def _is_unique(
     good = at[np.linalg.norm(residual(best, every), axis=1) <= _OUTLIER * sigma]
     centre = good.mean(axis=0)
     line = np.linalg.svd(good - centre, full_matrices=False)[2][0]
-    apart = max(_ELSEWHERE * float(np.linalg.norm(np.cross(best[-3:] - centre, line))), _ELSEWHERE_M)
-    bound = _AS_WELL * max(float(np.median(np.abs(residual(best, every)))), sigma / 1.4826)
+    apart = max(_FAR_SHARE * float(np.linalg.norm(np.cross(best[-3:] - centre, line))), _FAR_M)
+    bound = _EQUAL_FIT * max(float(np.median(np.abs(residual(best, every)))), sigma / 1.4826)
     for angle in np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False)[1:]:
         other = turned(Rotation.from_rotvec(angle * line), centre)
         fits = float(np.median(np.abs(residual(other, every)))) < bound
@@ -352,6 +359,7 @@ def _jackknife(
     return np.asarray((_SPELLS - 1) / _SPELLS * np.sum(np.square(values - values.mean(axis=0)), axis=0))
 
 
+# From here on, checked by test_survey.py.
 _ONE_SIDE = math.radians(45.0)  # Landmarks seen from directions within less than this were seen from one side
 _WRONG = 0.3  # Share of sightings that contradict a landmark from which it is named
 _VAGUE_M, _VAGUE = 0.01, 3.0
@@ -514,8 +522,10 @@ def _frame(problem: SurveyProblem) -> list[str]:
 def _remarks(problem: SurveyProblem, solution: Solution) -> list[str]:
     """What is badly determined, a sentence each with a remedy."""
     sightings, remarks = problem.sightings, []
+    # markers that were seen rarely
     for marker_id, count in sorted(problem.rare.items()):
         remarks.append(f"Marker {marker_id} was seen {count} x only and is left out; drive past it.")
+    # what nothing connects with the rest
     placed = np.isfinite(solution.landmark[:, 0])
     apart = [str(mark.id) for mark, is_in in zip(problem.swarm.landmarks, placed, strict=True) if not is_in]
     moved = np.unique(problem.knots.robot).tolist()
@@ -527,6 +537,7 @@ def _remarks(problem: SurveyProblem, solution: Solution) -> list[str]:
             f"{said[:1].upper()}{said[1:]} cannot be placed: nothing connects them with the others; let"
             " robots of both parts pass the same landmarks, or each other."
         )
+    # landmarks that are contradicted, vague, or seen from one side
     sigma = np.sqrt(0.5 * (solution.landmark_covariance[:, 0, 0] + solution.landmark_covariance[:, 1, 1]))
     free = placed & (sigma > 0.0)
     usual = float(np.median(sigma[free])) if free.any() else 0.0
@@ -570,6 +581,7 @@ def draw(done: Surveyed, path: Path) -> Path:
     problem, solution = done.problem, done.solution
     placed = np.isfinite(solution.landmark[:, 0])
     places = solution.landmark[placed, :2]
+    # paths of the robots
     figure = Figure(figsize=(8.0, 7.0))
     axis = figure.subplots()
     style(axis)
@@ -581,6 +593,7 @@ def draw(done: Surveyed, path: Path) -> Path:
         name = problem.swarm.robots[robot].name
         if np.isfinite(own).all():
             axis.annotate(name, own[0, :2].tolist(), fontsize=8, color=colour_of(robot))
+    # landmarks with ellipses, enlarged if the largest is small
     size = float(np.ptp(places, axis=0).max()) if len(places) else 1.0
     axes = [np.linalg.eigh(one[:2, :2]) for one in solution.landmark_covariance[placed]]
     largest = max((_SIGMAS * math.sqrt(max(float(one[0][-1]), 0.0)) for one in axes), default=0.0)
@@ -592,6 +605,7 @@ def draw(done: Surveyed, path: Path) -> Path:
         axis.add_patch(Ellipse(pose[:2], width, height, angle=angle, facecolor=SOFT, alpha=0.35))
         ahead = 0.02 * size * np.array([math.cos(pose[2]), math.sin(pose[2])])
         axis.plot(*np.stack([pose[:2], pose[:2] + ahead]).T, color=INK, linewidth=1.5)
+    # ids of landmarks, cameras and anchors
     marks = [mark for mark, is_in in zip(problem.swarm.landmarks, placed, strict=True) if is_in]
     for mark, place in zip(marks, places.tolist(), strict=True):
         axis.annotate(str(mark.id), place, (4, 4), textcoords="offset points", fontsize=7, color=INK)

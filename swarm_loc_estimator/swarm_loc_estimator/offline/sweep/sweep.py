@@ -464,6 +464,7 @@ def run_fit(sweep: Sweep, fit: Fit, path: Path, backend: Backend, progress: Prog
         BackendError: optuna is not installed, or the back end is not reached.
         UserError: A worker was killed.
     """
+    # what is searched, with the defaults first
     optuna = loaded("optuna", "optuna")
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=0, n_startup_trials=_AT_ONCE))
@@ -472,6 +473,7 @@ def run_fit(sweep: Sweep, fit: Fit, path: Path, backend: Backend, progress: Prog
         study.enqueue_trial(defaults)
     kinds = {int: optuna.distributions.IntDistribution, float: optuna.distributions.FloatDistribution}
     searched = {name: kinds[type(defaults[name])](*bounds) for name, bounds in fit.ranges.items()}
+    # some trials at a time: ask, replay, tell
     jobs: list[Job] = []
     finished: dict[str, Line] = {}
     for first in range(0, fit.trials, _AT_ONCE):
@@ -488,6 +490,7 @@ def run_fit(sweep: Sweep, fit: Fit, path: Path, backend: Backend, progress: Prog
             values = [finished[job.key].get("figures", {}).get(fit.minimize) for job in own]
             mean = None if None in values else float(np.mean(values))
             study.tell(trial, mean, state=None if mean is not None else optuna.trial.TrialState.FAIL)
+    # the best trial, and the gain over the defaults
     every = replace(sweep, jobs=tuple({job.key: job for job in jobs}.values()))
     complete = study.get_trials(states=[optuna.trial.TrialState.COMPLETE])
     if not complete:

@@ -41,10 +41,11 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 _KNOTS = np.radians([0, 15, 30, 40, 50, 60, 70, 80, 90, 110, 135, 180])
 _TABLE = np.radians(np.arange(0, 181, 10))
 _FALLS_FROM = 5  # Index of the first knot from which curves must decrease
+# Weights and limits are checked by test_board_fit.py and, on recordings of 2016, by make bench-droplet_real.
 _STEEPNESS, _BEND = 5.0, 0.8
 """Weights of an increase beyond that knot, and of second differences of the log curves."""
 _YAW_SIGMA = np.radians(4.0)
-_OFFSET, _OFFSET_SIGMA, _EXPONENT, _EXPONENT_SIGMA = 0.05, 0.05, 2.5, 1.0
+_OFFSET, _OFFSET_SIGMA, _EXPONENT, _EXPONENT_SIGMA = 0.05, 0.05, 2.5, 1.0  # Prior of the law, [m] and 1
 _PRIOR = 3.0
 _STEP = 1e-5
 _GAIN_SIGMA, _MIN_SPREAD = 0.25, 0.01
@@ -53,7 +54,7 @@ _LIMIT = 2.0  # Maximum residual after the robust loss [sigma]
 _DIM = 3.0
 """Maximum distance from the median of readings that determine the noise [sigma]; most show no light."""
 _LIT = 8.0  # Minimum expectation of readings that determine the error of the curves [sigma]
-_OUTLIER = 3.0
+_OUTLIER = 3.0  # Residuals beyond it are of blocked or too bright readings [sigma]
 _MIN_SHARE, _MAX_SHARE = 0.02, 0.3
 _ROUNDS = 2
 _MAX_EVALUATIONS = 10

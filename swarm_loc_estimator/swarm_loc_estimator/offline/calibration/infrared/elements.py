@@ -46,6 +46,7 @@ from swarm_loc_estimator.infrared.start_table import start_table
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 FALSE_ALARM = 0.01  # Probability of a false alarm for any element: that it is dead, or that it saturates
+# Dead elements: checked by test_dead_elements.py and, on recordings of 2016, by make bench-droplet_real.
 _LOST, _WHOLE_SHARES = slice(0, 3), slice(3, None)
 """Relative gains (of `SHARES`) under the hypotheses dead or shaded, and working."""
 _SAME_GEOMETRY = 1.5  # Maximum difference of directions within one geometry, in steps of the grid
@@ -306,6 +307,7 @@ def _marginalize(
     sides, logs, tops = np.empty((poses, 2, n)), np.empty(poses), np.empty((2, n))
     dark, changed = np.empty((2, n)), np.empty((shares, 2, n))
     for k in range(stable.shape[0]):
+        # log likelihood of each pose with all elements working, and with each single one dead
         _likelihoods(table[0, 0], stable[k], kinds[k], outlier[k], changed[0])  # the same at all poses
         dark[:] = np.log(changed[0])
         tops[:] = -math.inf
@@ -317,6 +319,7 @@ def _marginalize(
             for side in range(2):
                 for e in range(n):
                     tops[side, e] = max(tops[side, e], logs[g] - sides[g, side, e] + dark[side, e])
+        # sum over the poses that count, with each relative gain of each element
         found[k] = 0.0
         base = logs[best[k]]
         for g in range(poses):
@@ -331,6 +334,7 @@ def _marginalize(
                     others = math.exp(logs[g] - sides[g, side, e] - base)
                     for s in range(shares):
                         found[k, side, e, s] += others * changed[s, side, e]
+        # back to logarithms
         for side in range(2):
             for e in range(n):
                 for s in range(shares):
@@ -387,6 +391,7 @@ def _likelihoods(
         sides[1, e] = max(sides[1, e], LOWEST)
 
 
+# Saturation and noise: checked by test_reading_limits.py.
 _SPAN, _WIDTHS = 0.3, (0.0, 0.005, 0.01, 0.02, 0.04)
 """Span below the highest reading, and widths of the windows at the top, relative to it."""
 _MIN_EMITTERS = 3
