@@ -27,7 +27,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import NodeSpec
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.trajectory import interpolate
-from swarm_loc_estimator.offline.live.graph import LiveGraph
+from swarm_loc_estimator.offline.live_run import LiveGraph
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status

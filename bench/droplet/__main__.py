@@ -98,6 +98,7 @@ def accuracy(poses_each: int) -> dict[str, float]:
     rows: list[list[Cell]] = []
     curves: dict[str, list[FloatArray]] = {"closed_form": [], "ml": [], "bound": []}
     ratios = []
+    # at each range: errors of both, and the bound of Cramer and Rao
     for centimetres in CENTIMETRES:
         rng = np.random.default_rng([centimetres, _SEED])
         poses = random_poses(rng, poses_each, centimetres, centimetres)
@@ -117,6 +118,7 @@ def accuracy(poses_each: int) -> dict[str, float]:
         curves["bound"].append(limit)
         ratios.append(ratio)
         print(f"\rat {centimetres:2} cm", end="", flush=True)
+    # table and plot
     head = [
         "R cm",
         "closed cm",

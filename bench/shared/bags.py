@@ -20,7 +20,7 @@ from swarm_loc_estimator.common.messages.cdr import (
 )
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.offline.ground_truth import TruthReader
+from swarm_loc_estimator.offline.recorded_bag import TruthReader
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 

@@ -59,6 +59,7 @@ _COLUMNS = ("stamp_ns", "robot", "x_m", "y_m", "theta_rad", *_COVARIANCE)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
+    # replay, and write all files
     settings = parameters_of(Settings, options.set)
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
     with ProgressLine() as progress:
@@ -79,6 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             write_mcap(result, options.mcap)
         if options.tum:
             write_tum(result, options.tum)
+    # write what was learned, unless there is nothing or it cannot be right
     if options.learned:
         if not result.self_calibrated:
             print(_NOTHING_TO_LEARN, file=sys.stderr)
@@ -87,6 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("\n".join([*swapped, f"{options.learned} was not written."]), file=sys.stderr)
             return 1
         save_swarm(result.self_calibrated, options.learned, f"Learned from {result.title}.")
+    # say what was found
     print(files.text.read_text(encoding="utf-8"))
     print(f"Report:  {files.page}\nPicture: {files.overview}")
     if not np.isfinite(result.poses).all(axis=2).any():
@@ -110,7 +113,6 @@ def write_poses(result: ReplayResult, path: Path) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     add_bag(parser)
     add_remap(parser)
@@ -136,7 +138,3 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_set(parser, "parameter of the estimator")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -39,7 +39,7 @@ os.execv(sys.argv[1], sys.argv[1:])
 
 
 class GraphError(UserError):
-    """A graph that cannot start; the message is one sentence."""
+    """A graph that cannot start."""
 
 
 @dataclass(frozen=True)

@@ -151,11 +151,11 @@ def message_class(message_type: str) -> Any:
 
 
 class MessageTypeError(UserError):
-    """A message type that is not installed; the message is one sentence."""
+    """A message type that is not installed."""
 
 
 class RosArgumentsError(UserError):
-    """The command line has ROS arguments that rcl cannot parse; the message is one sentence."""
+    """The command line has ROS arguments that rcl cannot parse."""
 
 
 class Stop:

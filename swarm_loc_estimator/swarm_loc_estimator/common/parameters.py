@@ -21,7 +21,7 @@ class UserError(ValueError):
 
 
 class ParameterError(UserError):
-    """A parameter that cannot be used; the message is one sentence."""
+    """A parameter that cannot be used."""
 
 
 @dataclass(frozen=True)

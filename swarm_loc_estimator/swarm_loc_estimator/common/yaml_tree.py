@@ -43,7 +43,7 @@ _SHORT.maxstring = _SHORT.maxother = 100
 
 
 class YamlTreeError(UserError):
-    """A file that is not such YAML; the message is one sentence."""
+    """A file that is not such YAML."""
 
 
 class _Resolver(VersionedResolver):

@@ -70,7 +70,7 @@ class GainsFit:
 
 
 class GainsError(ValueError):
-    """Exchanges that do not determine gains; the message is one sentence."""
+    """Exchanges that do not determine gains."""
 
 
 def estimate_gains(

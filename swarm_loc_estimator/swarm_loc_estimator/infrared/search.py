@@ -83,7 +83,7 @@ def no_solutions(count: int) -> IrSolutions:
 
 
 class ReadingsError(ValueError):
-    """Readings that do not belong to the platform; the message is one sentence."""
+    """Readings that do not belong to the platform."""
 
 
 def checked(

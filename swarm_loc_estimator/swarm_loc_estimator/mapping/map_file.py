@@ -29,7 +29,7 @@ _PLACE = NumberSpec("m", -1e6, 1e6, False, "of the lower left corner")
 
 
 class MapFileError(UserError):
-    """A map file that cannot be used or written; the message is one sentence."""
+    """A map file that cannot be used or written."""
 
 
 def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:

@@ -213,7 +213,7 @@ def inputs_of(robot: Robot, *, lights: bool = False) -> tuple[MapperInput, ...]:
 
 
 class MapperInputError(UserError):
-    """The mapper cannot start with these robots; the message is one sentence."""
+    """The mapper cannot start with these robots."""
 
 
 class MapperFeed:

@@ -95,26 +95,14 @@ class Graph(Protocol):
 
 
 class Diagnostics:
-    """Creates the diagnostic reports of an interval.
-
-    Args:
-        swarm: The robots.
-        ingest: The inputs; each of its topics should have one publisher.
-        parameters: Expected frames of the odometry.
-        graph: Publishers of topics.
-        sole: Other topics that should have one publisher.
+    """Creates the diagnostic reports of an interval; inputs and `sole` topics should have one publisher each.
 
     Attributes:
         duplicate_publishers: One sentence for each topic that has more publishers, at the newest reports.
     """
 
     def __init__(
-        self,
-        swarm: Swarm,
-        ingest: Ingest,
-        parameters: EstimatorParameters,
-        graph: Graph,
-        sole: Sequence[str],
+        self, swarm: Swarm, ingest: Ingest, parameters: EstimatorParameters, graph: Graph, sole: Sequence[str]
     ) -> None:
         self.duplicate_publishers: list[str] = []
         self._swarm = swarm
@@ -291,14 +279,7 @@ class Diagnostics:
 
 
 def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period_s: float) -> Report:
-    """Report of the ticks' durations, with advice if they are too long.
-
-    Args:
-        cost: The ticks of the interval.
-        elapsed_s: Length of the interval by the wall clock.
-        period_s: Parameter tick_period_s.
-        fusion_period_s: The fusion period in force [s].
-    """
+    """Report of the ticks in `elapsed_s` by the wall clock, with advice if they take too long."""
     load = cost.sum_s / elapsed_s if elapsed_s > 0.0 else 0.0
     values: dict[str, object] = {
         "ticks": str(cost.count),
@@ -316,11 +297,7 @@ def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period
 
 
 def shedding_report(cost: TickCost) -> Report:
-    """Report of the share of measurements dropped under overload.
-
-    Args:
-        cost: The ticks of the interval.
-    """
+    """Report of the share of measurements dropped under overload."""
     share = cost.shed / cost.sightings if cost.sightings else 0.0
     values: dict[str, object] = {"sightings left out [1]": _figure(share)}
     if not cost.shed:
@@ -328,15 +305,6 @@ def shedding_report(cost: TickCost) -> Report:
     dropped = f"{cost.shed} of {cost.sightings} measurements"
     sentence = f"overload: dropped {dropped} ({100.0 * share:.0f} %), uniformly over robots"
     return Report("shedding", sentence, Level.WARN, values)
-
-
-def overload_report(count: int) -> Report:
-    """A warning about messages that the middleware dropped from full queues.
-
-    Args:
-        count: Number of dropped messages in the interval.
-    """
-    return Report("overload", f"overload: {count} messages were lost in full queues", Level.WARN)
 
 
 def merged(reports: Sequence[Report], name: str) -> Report:

@@ -33,7 +33,6 @@ from swarm_loc_estimator.nodes.estimator_diagnostics import (
     add_identities,
     load_report,
     merged,
-    overload_report,
     shedding_report,
 )
 from swarm_loc_estimator.nodes.estimator_topics import (
@@ -83,9 +82,7 @@ CreateEstimator = Callable[[Swarm, Settings], Estimator]
 class EstimatorNode(ManagedNode[EstimatorParameters]):
     """Takes messages, runs the estimator once per tick and publishes the estimate.
 
-    Args:
-        create_estimator: Creates the estimator; tests pass another one.
-        node_arguments: Further arguments of `rclpy.node.Node`.
+    Tests pass another function that creates the estimator.
     """
 
     def __init__(self, create_estimator: CreateEstimator = Estimator, **node_arguments: Any) -> None:
@@ -117,7 +114,8 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._shedding = Shedding(self.params.fusion_load, self.params.settings.horizon_s)
         self._thinning = self._create_thinning()
         self._cost = TickCost()
-        self._diagnostics = self._create_diagnostics()
+        sole = ["swarm/poses", *(["/clock"] if self.get_clock().ros_time_is_active else [])]
+        self._diagnostics = Diagnostics(self._swarm, self._ingest, self.params, self, sole)
         self._outputs = EstimateOutputs(self, self._swarm, self.params)
         self._reported_s = time.monotonic()
         self._lost = 0
@@ -143,10 +141,6 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         is_large = robots >= settings.sparse_from
         return Thinning(robots, round(settings.fusion_period_s * 1e9) if is_large else 0)
 
-    def _create_diagnostics(self) -> Diagnostics:
-        sole = ["swarm/poses", *(["/clock"] if self.get_clock().ros_time_is_active else [])]
-        return Diagnostics(self._swarm, self._ingest, self.params, self, sole)
-
     def _start_ticks(self) -> None:
         self.at_end(Ticks(self, self.params.tick_period_s, self._on_tick).stop)
         # messages received before a backward jump must not be stamped after it
@@ -167,7 +161,9 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._receive(partial(newest_time_ns, self))
         now_ns = self._time_ns()
         self._estimate, fusing_s = self._estimate_at(now_ns, begin_s)
-        self._log_time_jumps()
+        if self._estimator.time_jumps != self._jumps:
+            self._jumps = self._estimator.time_jumps
+            self.get_logger().warning("clock jumped back; estimator reset")
         self._follow_frame()
         self._outputs.publish(self._estimate)
         self._outputs.publish_identities(self._estimator.identities)
@@ -204,12 +200,6 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             thinned = self._thinning.thin(messages, self._shedding.share)
             self._cost.note_sightings(thinned.measurements, thinned.shed)
             self._estimator.receive(thinned.messages)
-
-    def _log_time_jumps(self) -> None:
-        """Log each backward jump of the clock, at which the estimator has reset itself."""
-        if self._estimator.time_jumps != self._jumps:
-            self._jumps = self._estimator.time_jumps
-            self.get_logger().warning("clock jumped back; estimator reset")
 
     def _follow_frame(self) -> None:
         """Publish in the frame that the poses are in: `map_frame`, or that of the origin of a local frame."""
@@ -272,7 +262,9 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         whole.values |= {"time jumps": self._estimator.time_jumps, **frames, **self._estimator.counters}
         foreign = self._static_transforms.foreign
         lost, self._lost = drops.get("overload", 0) - self._lost, drops.get("overload", 0)
-        causes += [overload_report(lost)] if lost else []
+        if lost:
+            text = f"overload: {lost} messages were lost in full queues"
+            causes.append(Report("overload", text, Level.WARN))
         causes += [Report("transforms", text, Level.WARN) for text in foreign]
         self.health.warn_of(
             "publishers", {text: text for text in [*self._diagnostics.duplicate_publishers, *foreign]}

@@ -56,7 +56,7 @@ def replay(
 
     Args:
         bag: rosbag2 folder, .mcap or .db3 file.
-        swarm: Robots and landmarks; None: those of the `swarm.yaml` beside the bag.
+        swarm: Robots and landmarks; None: those of the `swarm.yaml` in its folder.
         settings: Of the estimator.
         tick_s: Time between two outputs [s].
         stamp_ns: (T,) increasing; outputs at these instants instead, such as those of a live run.
@@ -103,7 +103,7 @@ def replay(
 
 
 class ScheduleError(UserError):
-    """Outputs that cannot be scheduled; the message is one sentence."""
+    """Outputs that cannot be scheduled."""
 
 
 def _period_ns(tick_s: object) -> int:
@@ -202,13 +202,7 @@ class ListedSchedule:
 
 
 class Runner:
-    """Feeds an estimator, ticks it, and keeps its estimates in a temporary file: memory does not grow.
-
-    Args:
-        estimator: Fed by this runner only.
-        schedule: Schedule of its ticks.
-        keep_sightings: Whether sightings and aerial images are kept for display, too.
-    """
+    """Feeds an estimator, ticks it, and keeps its estimates in a temporary file: memory does not grow."""
 
     def __init__(self, estimator: Estimator, schedule: Schedule, *, keep_sightings: bool = False) -> None:
         self._estimator = estimator
@@ -252,14 +246,7 @@ class Runner:
         truth: Mapping[str, Trajectory],
         received: Mapping[str, int],
     ) -> ReplayResult:
-        """The poses of all ticks beside ground truth; may be called once.
-
-        Args:
-            title: Name of the recording.
-            range_ns: First and last arrival.
-            truth: Robot name -> ground truth.
-            received: Messages by topic.
-        """
+        """The poses of all ticks with ground truth, between first and last arrival; may be called once."""
         self._flush()
         estimator, robots = self._estimator, len(self._estimator.swarm.robots)
         return ReplayResult(

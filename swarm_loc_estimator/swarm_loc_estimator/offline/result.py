@@ -1,6 +1,6 @@
 """Result of a run of the estimator: poses, covariances, errors against ground truth, counters.
 
-Arrays that grow in a temporary file and are memory-mapped at the end.
+Long arrays grow in a temporary file and are memory-mapped at the end.
 """
 
 from __future__ import annotations
@@ -151,7 +151,7 @@ class ReplayResult:
         return [*remarks, f"{more} more robots were lost."] if more > 0 else remarks
 
     def select(self, rows: npt.NDArray[np.bool_]) -> ReplayResult:
-        """The result with the poses at some of the stamps (T,) only."""
+        """The result with only the poses at some of the stamps (T,)."""
         return replace(
             self,
             stamp_ns=self.stamp_ns[rows],

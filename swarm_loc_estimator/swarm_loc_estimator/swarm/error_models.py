@@ -13,7 +13,7 @@ from swarm_loc_estimator.common.parameters import number
 
 
 class MotionResponseError(ValueError):
-    """An inconsistent response; the message is one sentence."""
+    """An inconsistent response."""
 
 
 @dataclass(frozen=True)

@@ -213,7 +213,7 @@ _MAPPED = FixModel(systematic_share=1.0)
 
 
 class PlanError(UserError):
-    """A swarm that cannot be described; the message is one sentence."""
+    """A swarm that cannot be described."""
 
 
 @dataclass(frozen=True)

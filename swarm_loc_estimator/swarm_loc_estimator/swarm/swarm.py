@@ -211,7 +211,7 @@ class MarkerOwner:
 
 
 class SwarmError(ValueError):
-    """An inconsistent swarm; the message is one sentence."""
+    """An inconsistent swarm."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from ir_world import random_poses
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import Exchanges
-from swarm_loc_estimator.offline.calibration.infrared.element_likelihood import (
+from swarm_loc_estimator.offline.calibration.infrared.elements import (
     ElementVerdicts,
     find_dead_elements,
 )

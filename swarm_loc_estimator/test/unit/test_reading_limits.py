@@ -11,7 +11,7 @@ from ir_world import random_poses
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import Exchanges
-from swarm_loc_estimator.offline.calibration.infrared.reading_limits import (
+from swarm_loc_estimator.offline.calibration.infrared.elements import (
     ReadingLimits,
     contradictions,
     find_reading_limits,

@@ -18,8 +18,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
-from swarm_loc_estimator.offline.survey.problem import problem_of, start_of
-from swarm_loc_estimator.offline.survey.solve import Solver
+from swarm_loc_estimator.offline.survey.solve import Solver, problem_of, start_of
 from swarm_loc_estimator.offline.survey.survey import survey
 from swarm_loc_estimator.sensors.camera import FROM_OPTICAL, NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows

@@ -13,7 +13,7 @@ MAX_LOG_NS = 2**62
 
 
 class BagError(UserError):
-    """A bag of which nothing can be read; the message is one sentence."""
+    """A bag of which nothing can be read."""
 
 
 class BagTopic(NamedTuple):

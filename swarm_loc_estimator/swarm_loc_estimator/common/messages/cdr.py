@@ -122,7 +122,7 @@ _FIELD = re.compile(r"(?P<type>[\w/]+)(?P<array>\[(?P<count>\d*)\])?\s+(?P<name>
 
 
 class DefinitionsNotFoundError(UserError):
-    """A message type without a definition; the message is one sentence."""
+    """A message type without a definition."""
 
 
 class Field(NamedTuple):
@@ -207,7 +207,7 @@ _struct = lru_cache(maxsize=256)(struct.Struct)
 
 
 class CdrError(ValueError):
-    """Bytes that are not a whole message of the expected type; the message is one sentence."""
+    """Bytes that are not a whole message of the expected type."""
 
 
 def nanoseconds(stamp: Any) -> int:
