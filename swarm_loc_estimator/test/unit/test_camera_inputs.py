@@ -79,9 +79,7 @@ def test_a_rendered_landmark_comes_back_as_the_measurement_in_the_plane(
     np.testing.assert_allclose(towards.value[0, 0], bearing, atol=1e-12)
     assert (towards.model[0], towards.has_heading[0]) == (BEARING, 0)
     assert towards.gate < position.gate
-    np.testing.assert_allclose(
-        towards.covariance[0], np.diag([SensorModel().bearing_sigma ** 2, 1.0, 1.0])
-    )
+    np.testing.assert_allclose(towards.covariance[0], np.diag([SensorModel().bearing_sigma ** 2, 1.0, 1.0]))
     direction["position"] = 0.0
     assert converted(direction, swarm(mount))[1] == {"non_finite": 1}
 

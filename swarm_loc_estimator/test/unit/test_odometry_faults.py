@@ -14,6 +14,7 @@ from core_messages import SECOND, T0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.odometry.tracks import OdometryTracks, TrackChange
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.offline.replay import PeriodicSchedule, Runner
@@ -22,7 +23,6 @@ from swarm_loc_estimator.sensors.camera import DETECTIONS
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.odometry import ODOMETRY
 from swarm_loc_estimator.sensors.registry import Batch
-from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

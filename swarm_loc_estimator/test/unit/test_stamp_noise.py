@@ -70,9 +70,7 @@ def test_what_is_left_of_systematic_errors_adds_to_the_noise_that_a_detection_te
     known["covariance"] = np.diag([1e-6, 2e-6, 3e-6, 4e-6, 5e-6, 6e-6])
     sensor = replace(SEER.sensor, residual_position_sigma=0.01, residual_heading_sigma=0.02)
     seers = SWARM, replace(SWARM, robots=(replace(SEER, sensor=sensor), SWARM.robots[1]))
-    plain, more = (
-        measured_of(swarm, np.full(2, T0), joined([known, unknown])).covariance for swarm in seers
-    )
+    plain, more = (measured_of(swarm, np.full(2, T0), joined([known, unknown])).covariance for swarm in seers)
     np.testing.assert_allclose(more[0] - plain[0], np.diag([1e-4, 1e-4, 4e-4]), atol=1e-15)
     np.testing.assert_array_equal(more[1], plain[1])
 

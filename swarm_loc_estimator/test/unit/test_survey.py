@@ -16,6 +16,7 @@ from scipy.spatial.transform import Rotation
 from swarm_loc_estimator.cli import survey as command
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.survey.problem import problem_of, start_of
 from swarm_loc_estimator.offline.survey.solve import Solver
@@ -24,7 +25,6 @@ from swarm_loc_estimator.sensors.camera import FROM_OPTICAL, NO_DETECTIONS, Dete
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.ranges import RangeRows
-from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import ImuModel
 from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, StartSigma, Swarm, UwbDevice
@@ -132,7 +132,7 @@ def test_wrong_ids_change_little() -> None:
     spoilt = replace(recording, detections=recording.detections._replace(detection=rows))
     done = survey(spoilt, unplaced(world.swarm))
     assert rms(errors(done.swarm, world.swarm)) < 1.5 * clean + 0.002
-    of_landmarks = done.problem.sightings["landmark"] > 0
+    of_landmarks = done.problem.sightings.landmark >= 0
     assert 0.04 < np.mean(done.solution.weight[of_landmarks] < 0.1) < 0.16
 
 
@@ -173,7 +173,7 @@ def test_a_robot_that_takes_no_part_or_stands_costs_nothing() -> None:
     for robot in (first, replace(first, stands=True)):
         swarm = replace(world.swarm, robots=(robot, *others), landmarks=())
         done = survey(absent, swarm)
-        assert not (done.problem.sides[done.problem.sightings["landmark"] == 0] < 0).any()
+        assert not (done.problem.sides[done.problem.sightings.landmark < 0] < 0).any()
         assert rms(errors(done.swarm, world.swarm)) < 0.02
     standing = replace(world.swarm, robots=(replace(first, stands=True), *others), landmarks=())
     done = survey(replace(absent, detections=seen), standing)  # what it sees has no pose to start from

@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.filter.measurements import concatenate
 from swarm_loc_estimator.nodes.load import Thinning, water_level
 from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.sensors.camera import DetectionRows
@@ -17,7 +18,6 @@ from swarm_loc_estimator.sensors.fix import FixRows
 from swarm_loc_estimator.sensors.infrared import BrightnessRows
 from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.sensors.registry import Batch
-from swarm_loc_estimator.filter.measurements import concatenate
 from swarm_loc_estimator.timeline.settings import end_of_period
 
 ROBOTS = 20
