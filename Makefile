@@ -52,8 +52,15 @@ setup:
 house: setup
 	@./run -- python tools/house.py $(ARGS)
 
+# Draws diagrams in the browser: one file of the package, without what it depends on.
+.workspace/mermaid/mermaid.min.js: Makefile
+	@mkdir -p $(@D)
+	@npm pack --silent --pack-destination $(@D) mermaid@11.17.2 >/dev/null
+	@tar --extract --touch --file $(@D)/mermaid-11.17.2.tgz --directory $(@D) --strip-components 2 package/dist/mermaid.min.js
+	@rm $(@D)/mermaid-11.17.2.tgz
+
 # The README is the start page, under its own name for links and as the index.
-docs:
+docs: .workspace/mermaid/mermaid.min.js
 	@$(PYTHON) tools/setup_workspace.py --extra docs
 	@./run -- sphinx-build --quiet --fail-on-warning --keep-going -c docs --doctree-dir .workspace/doctrees . out/docs
 	@cp out/docs/README.html out/docs/index.html

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import fields, is_dataclass
+from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ if TYPE_CHECKING:
     from sphinx.application import Sphinx
 
 ROOT = Path(__file__).parents[1]
+DIAGRAM = re.compile(r"^```mermaid\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 project = html_title = "Swarm localization"
 author = "Swarm localization maintainers"
@@ -24,7 +26,7 @@ smartquotes_action = "D"
 default_role = "code"
 
 html_theme = "furo"
-html_static_path = ["static"]
+html_static_path = ["static", "../.workspace/mermaid"]
 html_css_files = ["site.css"]
 html_copy_source = False
 html_show_copyright = False
@@ -42,6 +44,7 @@ python_maximum_signature_line_length = 160
 def setup(app: Sphinx) -> None:
     """Connect the hooks."""
     app.connect("source-read", _read_source)
+    app.connect("html-page-context", _add_mermaid)
     app.connect("autodoc-process-signature", _shorten_signature)
     app.connect("autodoc-process-docstring", _prepare_docstring, priority=100)  # before napoleon
     app.connect("autodoc-skip-member", _skip_field)
@@ -57,6 +60,20 @@ def _read_source(_app: Sphinx, docname: str, source: list[str]) -> None:
     # A link to the file of a message leads there.
     message = r"\]\(([./\w]*)(?:msg|srv)/(\w+)\.(?:msg|srv)\)"
     source[0] = re.sub(message, lambda link: f"]({link[1]}README.md#{link[2].lower()})", source[0])
+    source[0] = DIAGRAM.sub(_diagram, source[0])
+
+
+def _diagram(block: re.Match[str]) -> str:
+    """A mermaid block, which GitHub draws, as what mermaid draws in a browser."""
+    return f'```{{raw}} html\n<pre class="mermaid">\n{escape(block[1])}</pre>\n```'
+
+
+def _add_mermaid(app: Sphinx, *event: Any) -> None:
+    """Load mermaid on pages with diagrams. It is part of the site: pages load nothing from other servers."""
+    _page, _template, context, _doctree = event
+    if '<pre class="mermaid">' in context.get("body", ""):
+        app.add_js_file("mermaid.min.js")
+        app.add_js_file(None, body='mermaid.initialize({theme: "neutral"})')
 
 
 def _shorten_signature(*event: Any) -> tuple[str | None, str | None]:

@@ -72,9 +72,9 @@ def passed(name: str) -> Passed:
     """
     kind = KINDS[name]
     with tempfile.TemporaryDirectory() as folder:
-        swarm = load_swarm(_BAGS / kind.bag / "swarm.yaml") if kind.bag else _swarm_with(name, Path(folder))
+        swarm = load_swarm(_BAGS / kind.bag / "swarm.yaml") if kind.bag else _room(Path(folder))
         ingest, estimator = Ingest(swarm), Estimator(swarm)
-    messages = _recorded(kind.bag, ingest.handle_of) if kind.bag else _simulated(swarm)
+    messages = _recorded(kind.bag, ingest.handle_of) if kind.bag else _simulated(name, swarm)
     encoder = SwarmPosesEncoder([robot.name for robot in swarm.robots], ingest.map_frame)
     begin_ns = None
     for topic, data, arrival_ns in messages:
@@ -169,46 +169,28 @@ def _recorded(bag: str, topics: Collection[str]) -> Iterator[Message]:
             yield topic, data, log_ns
 
 
-def _swarm_with(kind: str, folder: Path) -> Swarm:
-    """Robots with radios among anchors, or one with a lidar in a room whose map is written to a folder."""
-    if kind == "scan":
-        robot = Robot("robot1", start=(0.0, 0.0, 0.0), lidar=LidarModel(range_sigma=0.01))
-        return Swarm((robot,), map=_save_room(folder))
-    robots = (Robot(f"robot{k}", start=(0.4 * k, 0.0, 0.0), uwb=UwbDevice(k)) for k in (1, 2, 3))
-    places = enumerate([(-3.0, -3.0, 1.0), (3.0, -3.0, 1.0), (0.0, 3.0, 1.0)], 100)
-    return Swarm(tuple(robots), anchors=tuple(Anchor(address, *place) for address, place in places))
-
-
-def _simulated(swarm: Swarm) -> Iterator[Message]:
-    """Exact messages of robots that stand still."""
-    for at_ns in range(_STEP_NS, _END_NS, _STEP_NS):
-        header = {"stamp": at_ns - _STEP_NS}
-        for robot in swarm.robots:
-            odometry = {"header": header, "pose": {"pose": {"orientation": {"w": 1.0}}}}
-            yield f"{robot.name}/odom", encode(odometry, ODOMETRY), at_ns
-            if swarm.map:
-                yield f"{robot.name}/scan", encode({"header": header, **_sweep()}, LASER_SCAN), at_ns
-                continue
-            x, y, _ = robot.start or (0.0, 0.0, 0.0)
-            ranges = [
-                {"device": one.address, "range": math.dist((one.x, one.y, one.z), (x, y, 0.0))}
-                for one in swarm.anchors
-            ]
-            yield f"{robot.name}/ranges", encode({"header": header, "ranges": ranges}, RANGES), at_ns
-
-
-def _sweep() -> dict[str, Any]:
-    """A sweep of the lidar from the middle of the room."""
-    step = 2.0 * math.pi / 360
-    angle = step * (0.5 + np.arange(360))
-    ranges = np.minimum(_WALL_X / np.abs(np.cos(angle)), _WALL_Y / np.abs(np.sin(angle)))
-    limits = {"angle_min": angle[0], "angle_max": angle[-1], "angle_increment": step}
-    return {**limits, "range_min": 0.1, "range_max": 5.0, "ranges": ranges}
-
-
-def _save_room(folder: Path) -> Path:
-    """Write the map of the room, its walls on centres of cells."""
+def _room(folder: Path) -> Swarm:
+    """A robot with a lidar and a radio in the middle of a room with anchors; writes the map to a folder."""
     half = np.array([_WALL_X, _WALL_Y]) + 0.5 * _CELL
     log_odds = np.full(np.round(2.0 * half / _CELL).astype(int), -5.0)
     log_odds[[0, -1]] = log_odds[:, [0, -1]] = 5.0
-    return save_map(OccupancyMap(-half, _CELL, log_odds), folder / "room")[0]
+    walls, _ = save_map(OccupancyMap(-half, _CELL, log_odds), folder / "room")
+    robot = Robot("robot1", start=(0.0, 0.0, 0.0), lidar=LidarModel(range_sigma=0.01), uwb=UwbDevice(1))
+    anchors = (Anchor(100, -3.0, -3.0, 1.0), Anchor(101, 3.0, -3.0, 1.0), Anchor(102, 0.0, 3.0, 1.0))
+    return Swarm((robot,), anchors=anchors, map=walls)
+
+
+def _simulated(name: str, swarm: Swarm) -> Iterator[Message]:
+    """Odometry of the robot in the room, which stands still, and exact ranges or scans."""
+    step = 2.0 * math.pi / 360
+    angle = step * (0.5 + np.arange(360))
+    walls = np.minimum(_WALL_X / np.abs(np.cos(angle)), _WALL_Y / np.abs(np.sin(angle)))
+    limits = {"angle_min": angle[0], "angle_max": angle[-1], "angle_increment": step, "range_max": 5.0}
+    away = [{"device": one.address, "range": math.hypot(one.x, one.y, one.z)} for one in swarm.anchors]
+    content = {"scan": {**limits, "ranges": walls}, "range": {"ranges": away}}[name]
+    pose = {"pose": {"orientation": {"w": 1.0}}}
+    for at_ns in range(_STEP_NS, _END_NS, _STEP_NS):
+        header = {"stamp": at_ns - _STEP_NS}
+        yield "robot1/odom", encode({"header": header, "pose": pose}, ODOMETRY), at_ns
+        message_type = LASER_SCAN if name == "scan" else RANGES
+        yield f"robot1/{KINDS[name].topic}", encode({"header": header, **content}, message_type), at_ns

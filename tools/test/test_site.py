@@ -28,6 +28,15 @@ def test_the_reference_has_every_name_of_the_api() -> None:
     assert set(swarm_loc_estimator._MODULE_OF) - set(SHOWN.findall(pages)) == set()
 
 
+def test_diagrams_are_drawn_by_mermaid() -> None:
+    read_source = runpy.run_path(str(DOCS / "conf.py"))["_read_source"]
+    page = ["Text\n\n```mermaid\nflowchart LR\n    a --> b[x<br>y]\n```\n\n```\ncode\n```\n"]
+    read_source(None, "swarm_loc_estimator/doc/architecture", page)
+    diagram = "flowchart LR\n    a --&gt; b[x&lt;br&gt;y]\n"
+    raw = f'```{{raw}} html\n<pre class="mermaid">\n{diagram}</pre>\n```'
+    assert page == [f"Text\n\n{raw}\n\n```\ncode\n```\n"]
+
+
 def test_messages_stand_on_one_page_and_links_lead_there() -> None:
     read_source = runpy.run_path(str(DOCS / "conf.py"))["_read_source"]
     page = [(ROOT / "swarm_loc_msgs" / "README.md").read_text(encoding="utf-8")]

@@ -132,7 +132,8 @@ class Evidence:
     def _joined(self) -> dict[str, Any]:
         parts = self.read[0]
         return {
-            name: concatenate([one.nothing, *(part[name] for part in parts)]) for name, one in SENSORS.items()
+            name: concatenate([one.nothing(), *(part[name] for part in parts)])
+            for name, one in SENSORS.items()
         }
 
     @cached_property

@@ -134,7 +134,7 @@ class _Units(NamedTuple):
     exchange: Sequence[tuple[int, ...]] = ()  # Robot, stamp and transmitter of each group; infrared only
 
 
-def _units(sensor: Sensor, rows: Any) -> _Units:
+def _units(sensor: type[Sensor], rows: Any) -> _Units:
     """Group a sensor's readings by the columns `unit`; without these, each row is a group."""
     if not sensor.unit:
         return _Units(rows.robot, rows.stamp_ns, np.arange(rows.robot.size))

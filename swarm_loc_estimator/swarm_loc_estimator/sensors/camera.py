@@ -22,7 +22,6 @@ Kernels that convert camera detections to measurements, see `camera`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import fields
 from typing import NamedTuple
 
@@ -38,19 +37,18 @@ from swarm_loc_estimator.common.messages.detections import (
     SharedMessage,
     decode_shared_detections,
 )
-from swarm_loc_estimator.common.messages.streams import DetectionColumns, DetectionReader, MessageBatch
+from swarm_loc_estimator.common.messages.streams import DetectionColumns, DetectionReader
 from swarm_loc_estimator.common.small_matrix import assign
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, select
 from swarm_loc_estimator.filter.models import BEARING, MODELS, POLAR, gate_threshold
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
-    Converter,
     DropCounts,
-    InputKind,
     Known,
+    Reader,
     Sensor,
     SensorSettings,
-    shared_kind,
+    SharedTopic,
 )
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Robot, Swarm
@@ -243,21 +241,9 @@ class Markers(NamedTuple):
     variance: FloatArray
 
 
-class Detections(NamedTuple):
-    """The used fields of detections (d,)."""
-
-    id: NDArray[np.uint32]
-    content: NDArray[np.uint8]
-    position: FloatArray
-    orientation: FloatArray
-    covariance: FloatArray
-    alternative_position: FloatArray
-    alternative_orientation: FloatArray
-
-
 @cached_njit
 def convert_all(
-    detections: Detections,
+    detections: NDArray[np.void],
     cameras: Cameras,
     markers: Markers,
     out: Measurements,
@@ -266,7 +252,7 @@ def convert_all(
     """Fill the measurements (d,) except stamps and observers, and write their outcomes (d,)."""
     for k in range(outcomes.size):
         camera = out.observer[k]
-        place = min(np.searchsorted(markers.id, detections.id[k]), markers.id.size - 1)
+        place = min(np.searchsorted(markers.id, detections[k].id), markers.id.size - 1)
         outcomes[k] = _outcome(detections, k, cameras, markers, camera, place)
         if outcomes[k] != MEASURED:
             continue
@@ -276,10 +262,10 @@ def convert_all(
         assign(out.sensor[k], cameras.mount[camera])
         out.gate[k] = cameras.gate[camera]
         assign(out.marker[k], markers.pose[place])
-        with_heading = detections.content[k] in (CONTENT_POSE, CONTENT_POSE_TWO)
+        with_heading = detections[k].content in (CONTENT_POSE, CONTENT_POSE_TWO)
         out.has_heading[k] = with_heading and not math.isnan(out.marker[k, 2])
-        if detections.content[k] == CONTENT_BEARING:
-            _measure_bearing(detections.position[k], k, cameras, out)
+        if detections[k].content == CONTENT_BEARING:
+            _measure_bearing(detections[k].position, k, cameras, out)
             continue
         if markers.lies[place]:
             outcomes[k] = _measure_lying(detections, k, cameras, markers, place, out)
@@ -301,30 +287,30 @@ def _measure_bearing(optical: FloatArray, k: int, cameras: Cameras, out: Measure
 
 
 @cached_njit
-def _measure_upright(detections: Detections, k: int, cameras: Cameras, out: Measurements) -> None:
+def _measure_upright(detections: NDArray[np.void], k: int, cameras: Cameras, out: Measurements) -> None:
     """Write value and covariance of measurement k of an upright marker."""
     sensor, level = cameras.sensor[out.observer[k]], cameras.level[out.observer[k]]
     position = np.empty(3)
-    to_level_frame(level, detections.position[k], position)
+    to_level_frame(level, detections[k].position, position)
     scale(position, 1.0 / sensor.distance_scale)
     if not out.has_heading[k]:
         out.model[k], out.marker[k, 2] = POLAR, 0.0
         _calibrate(sensor, position, out.target[k], out.value[k], out.covariance[k])
         return
     out.value[k, 0], out.value[k, 1] = position[0], position[1]
-    out.value[k, 2] = face_heading(level, detections.orientation[k])
-    if detections.content[k] == CONTENT_POSE_TWO:
+    out.value[k, 2] = face_heading(level, detections[k].orientation)
+    if detections[k].content == CONTENT_POSE_TWO:
         out.has_second[k] = True
-        to_level_frame(level, detections.alternative_position[k], position)
+        to_level_frame(level, detections[k].alternative_position, position)
         scale(position, 1.0 / sensor.distance_scale)
         out.second[k, 0], out.second[k, 1] = position[0], position[1]
-        out.second[k, 2] = face_heading(level, detections.alternative_orientation[k])
-    _pose_noise(sensor, level, detections.covariance[k], out.covariance[k])
+        out.second[k, 2] = face_heading(level, detections[k].alternative_orientation)
+    _pose_noise(sensor, level, detections[k].covariance, out.covariance[k])
 
 
 @cached_njit
 def _measure_lying(
-    detections: Detections,
+    detections: NDArray[np.void],
     k: int,
     cameras: Cameras,
     markers: Markers,
@@ -335,14 +321,14 @@ def _measure_lying(
     camera = out.observer[k]
     sensor, level = cameras.sensor[camera], cameras.level[camera]
     spread, position, rotation = np.zeros((6, 6)), np.empty(3), np.empty((3, 3))
-    _write_spread(sensor, detections.content[k], detections.covariance[k], spread)
+    _write_spread(sensor, detections[k].content, detections[k].covariance, spread)
     height, result = markers.height[place] - cameras.height[camera], CAST
-    for solution in range(2 if detections.content[k] == CONTENT_POSE_TWO else 1):
-        assign(position, detections.alternative_position[k] if solution else detections.position[k])
-        if detections.content[k] == CONTENT_POSITION:
+    for solution in range(2 if detections[k].content == CONTENT_POSE_TWO else 1):
+        assign(position, detections[k].alternative_position if solution else detections[k].position)
+        if detections[k].content == CONTENT_POSITION:
             rotation[:] = level.T  # as a marker that lies
         else:
-            quaternion = detections.alternative_orientation[k] if solution else detections.orientation[k]
+            quaternion = detections[k].alternative_orientation if solution else detections[k].orientation
             write_rotation(quaternion, rotation)
         result = cast(
             level, position, rotation, spread, markers.size[place], height, out.value[k], out.covariance[k]
@@ -379,10 +365,10 @@ def _add_common_noise(of_camera: FloatArray, of_face: float, k: int, out: Measur
 
 @inlined_njit
 def _outcome(
-    detections: Detections, k: int, cameras: Cameras, markers: Markers, camera: int, place: int
+    detections: NDArray[np.void], k: int, cameras: Cameras, markers: Markers, camera: int, place: int
 ) -> int:
     """Outcome of detection k with the marker at index `place`: valid, or a reason to drop it."""
-    if place < 0 or markers.id[place] != detections.id[k]:
+    if place < 0 or markers.id[place] != detections[k].id:
         return _UNKNOWN_ID
     if markers.owner[place] == camera:
         return _OWN_MARKER
@@ -390,25 +376,25 @@ def _outcome(
         return _NO_CAMERA
     if camera >= cameras.robots and markers.owner[place] == NOBODY:
         return _FIXED_ON_FIXED
-    content = detections.content[k]
+    content = detections[k].content
     if not CONTENT_POSITION <= content <= CONTENT_BEARING or (
         content == CONTENT_BEARING and markers.lies[place]
     ):
         return _BAD_CONTENT
-    position, valid = detections.position[k], True
+    position, valid = detections[k].position, True
     for i in range(3):
         valid = valid and math.isfinite(position[i])
     if content == CONTENT_BEARING:
         valid = valid and (position[0] != 0.0 or position[1] != 0.0 or position[2] != 0.0)
     if content in (CONTENT_POSE, CONTENT_POSE_TWO):
-        valid = valid and is_rotation(detections.orientation[k])
+        valid = valid and is_rotation(detections[k].orientation)
         for i in range(6):
             for j in range(6):
-                valid = valid and math.isfinite(detections.covariance[k, i, j])
-    if detections.content[k] == CONTENT_POSE_TWO:
-        valid = valid and is_rotation(detections.alternative_orientation[k])
+                valid = valid and math.isfinite(detections[k].covariance[i, j])
+    if detections[k].content == CONTENT_POSE_TWO:
+        valid = valid and is_rotation(detections[k].alternative_orientation)
         for i in range(3):
-            valid = valid and math.isfinite(detections.alternative_position[k, i])
+            valid = valid and math.isfinite(detections[k].alternative_position[i])
     if not valid:
         return _NON_FINITE
     farthest = max(abs(position[0]), abs(position[1]), abs(position[2]))
@@ -556,8 +542,7 @@ class SightingConverter:
         out.stamp_ns[:], out.arrival_ns[:] = rows.stamp_ns, rows.arrival_ns
         out.received_from[:] = out.observer[:] = rows.robot
         out.covariance[:] = 0.0
-        detections = Detections(*(rows.detection[name] for name in Detections._fields))
-        convert_all(detections, self._cameras, self._markers, out, outcomes)
+        convert_all(rows.detection, self._cameras, self._markers, out, outcomes)
         found = np.flatnonzero(np.bincount(outcomes, minlength=len(OUTCOMES))).tolist()
         for k in found:
             if k != MEASURED:
@@ -581,37 +566,39 @@ class SightingConverter:
             measurements.stamp_variance[:] = variance * count[picture]
 
 
-def _columns(
-    found: DetectionColumns, batch: MessageBatch, robot: IntArray, _known: Known
-) -> tuple[DetectionRows, Mapping[str, int]]:
-    columns = (robot, found.stamp_ns, batch.log_ns)
-    robots, stamps_ns, arrivals_ns = (np.repeat(column, found.count) for column in columns)
-    return DetectionRows(robots, stamps_ns, found.detection, arrivals_ns), {}
-
-
 def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> DetectionRows:
     return DetectionRows(message.robot, message.reading_ns, message.columns[0], arrival_ns)
 
 
-def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts) -> Converter:
-    return SightingConverter(swarm, drops).convert
+class CameraSensor(Sensor):
+    """Cameras on robots, and fixed ones."""
 
+    name, topic, message_type = "detections", "detections", MESSAGE_TYPE
+    shared = SharedTopic("swarm/detections", SWARM_DETECTIONS, decode_shared_detections, _shared_rows)
+    of_cameras = True
 
-def _has_camera(robot: Robot) -> bool:
-    return robot.camera is not None
+    def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
+        super().__init__(swarm, settings, drops)
+        self.measure = SightingConverter(swarm, drops).convert  # type: ignore[method-assign]
 
+    @classmethod
+    def create_reader(cls, topics: int, _known: Known) -> Reader:
+        """Create a reader that decodes all messages of a batch at once."""
+        return DetectionReader(topics)
 
-_OWN = InputKind(
-    "detections",
-    "detections",
-    MESSAGE_TYPE,
-    lambda n, _: DetectionReader(n),
-    _columns,
-    _has_camera,
-    of_cameras=True,
-)
-_SHARED = shared_kind(
-    _OWN, "swarm/detections", SWARM_DETECTIONS, decode_shared_detections, _shared_rows, NO_DETECTIONS
-)
-DETECTIONS = Sensor("detections", NO_DETECTIONS, (_OWN, _SHARED), _create_converter)
-"""The sensor, see `registry.SENSORS`."""
+    @classmethod
+    def nothing(cls) -> DetectionRows:
+        """Empty readings."""
+        return NO_DETECTIONS
+
+    @classmethod
+    def columns(cls, messages: DetectionColumns) -> DetectionRows:
+        """Convert decoded messages (n,) to a row per detection."""
+        columns = (messages.robot, messages.stamp_ns, messages.arrival_ns)
+        robot, stamp_ns, arrival_ns = (np.repeat(column, messages.count) for column in columns)
+        return DetectionRows(robot, stamp_ns, messages.detection, arrival_ns)
+
+    @classmethod
+    def expected_of(cls, robot: Robot) -> bool:
+        """Whether the description says that the robot has a camera."""
+        return robot.camera is not None

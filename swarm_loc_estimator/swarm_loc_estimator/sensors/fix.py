@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,23 +12,18 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import POSE_WITH_COVARIANCE, SWARM_FIXES
 from swarm_loc_estimator.common.messages.detections import SharedMessage, decode_shared_numbers
-from swarm_loc_estimator.common.messages.poses import FixMessage, decode_fix
-from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
+from swarm_loc_estimator.common.messages.poses import decode_fix
+from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import Measurements, select
 from swarm_loc_estimator.filter.models import CARTESIAN, MODELS
 from swarm_loc_estimator.sensors.sensor import (
-    FOREIGN_FRAME,
     NO_ROWS,
-    Converter,
     DropCounts,
-    InputKind,
-    Known,
     Sensor,
     SensorSettings,
-    of_none,
-    shared_kind,
+    SharedTopic,
 )
-from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 HEADING_UNKNOWN = math.pi**2
 """Variance from which a heading counts as not measured [rad^2]; it exceeds that of uniform headings."""
@@ -65,20 +59,6 @@ def has_heading(covariance: FloatArray) -> NDArray[np.bool_]:
     return np.asarray(known | is_unknown(covariance))
 
 
-def _columns(
-    found: MessageColumns[FixMessage], batch: MessageBatch, robot: IntArray, known: Known
-) -> tuple[FixRows, Mapping[str, int]]:
-    """A heading with a NaN, non-positive or very large variance counts as not measured."""
-    messages = found.messages
-    pose = np.array([message.pose for message in messages], dtype=float).reshape(-1, 3)
-    covariance = np.array([message.covariance for message in messages]).reshape(-1, 3, 3)
-    pose[~has_heading(covariance), 2] = np.nan
-    stamp_ns, arrival_ns = found.stamp_ns[found.valid], batch.log_ns[found.valid]
-    rows = FixRows(robot[found.valid], stamp_ns, pose, covariance, arrival_ns)
-    at_home = np.array([m.frame_id == known.map_frame for m in messages], dtype=bool)
-    return select(rows, at_home), {FOREIGN_FRAME: int(np.sum(~at_home))}
-
-
 def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> FixRows:
     pose, covariance = message.columns[0], message.columns[1].reshape(-1, 3, 3)
     pose[~has_heading(covariance), 2] = np.nan
@@ -108,41 +88,55 @@ def take_out_headings(measurements: Measurements, without: NDArray[np.bool_]) ->
     covariance[without, 2, :] = covariance[without, :, 2] = [0.0, 0.0, 1.0]
 
 
-def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts) -> Converter:
-    models = [robot.fix for robot in swarm.robots]
-    sigmas = [(one.position_sigma, one.position_sigma, one.heading_sigma) for one in models]
-    default = np.array(sigmas).reshape(-1, 3, 1) ** 2 * np.eye(3)
-    share = np.array([one.systematic_share for one in models])
+class FixSensor(Sensor):
+    """Absolute poses of robots from outside, such as motion capture or AMCL."""
 
-    def convert(rows: FixRows) -> Measurements:
+    name, topic, message_type = "fixes", "fix", POSE_WITH_COVARIANCE
+    shared = SharedTopic(
+        "swarm/fixes", SWARM_FIXES, partial(decode_shared_numbers, widths=(3, 9)), _shared_rows
+    )
+    in_map = True
+
+    decode = staticmethod(decode_fix)
+
+    def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
+        super().__init__(swarm, settings, drops)
+        models = [robot.fix for robot in swarm.robots]
+        sigmas = [(one.position_sigma, one.position_sigma, one.heading_sigma) for one in models]
+        self._default = np.array(sigmas).reshape(-1, 3, 1) ** 2 * np.eye(3)
+        self._share = np.array([one.systematic_share for one in models])
+
+    @classmethod
+    def columns(cls, messages: Messages[Any]) -> FixRows:
+        """Convert decoded messages (n,).
+
+        A heading with a NaN, non-positive or very large variance counts as not measured.
+        """
+        pose = np.array([message.pose for message in messages.decoded], dtype=float).reshape(-1, 3)
+        covariance = np.array([message.covariance for message in messages.decoded]).reshape(-1, 3, 3)
+        pose[~has_heading(covariance), 2] = np.nan
+        return FixRows(messages.robot, messages.stamp_ns, pose, covariance, messages.arrival_ns)
+
+    def measure(self, rows: FixRows) -> Measurements:
+        """Convert fixes (f,)."""
         unknown = is_unknown(rows.covariance)
         if unknown.any():
-            rows, unknown = _with_covariance(rows, unknown), unknown & (default[rows.robot, 0, 0] == 0.0)
-            drops.add(NO_COVARIANCE, rows.robot[unknown])
+            rows, unknown = self._described(rows, unknown), unknown & (self._default[rows.robot, 0, 0] == 0.0)
+            self.drops.add(NO_COVARIANCE, rows.robot[unknown])
             rows = select(rows, ~unknown)
         fixes = about_robots(rows.robot, rows.stamp_ns, rows.pose, rows.covariance, CARTESIAN)
-        fixes.systematic_share[:], fixes.arrival_ns[:] = share[rows.robot][:, None], rows.arrival_ns
+        fixes.systematic_share[:], fixes.arrival_ns[:] = self._share[rows.robot][:, None], rows.arrival_ns
         take_out_headings(fixes, np.isnan(rows.pose[:, 2]))
         return fixes
 
-    def _with_covariance(rows: FixRows, unknown: NDArray[np.bool_]) -> FixRows:
+    def _described(self, rows: FixRows, unknown: NDArray[np.bool_]) -> FixRows:
+        """Fill in covariances that are not known from the swarm description."""
         pose, covariance = rows.pose.copy(), rows.covariance.copy()
-        covariance[unknown] = default[rows.robot[unknown]]
+        covariance[unknown] = self._default[rows.robot[unknown]]
         pose[unknown & (covariance[:, 2, 2] == 0.0), 2] = np.nan
         return rows._replace(pose=pose, covariance=covariance)
 
-    return convert
-
-
-_OWN = InputKind(
-    "fixes",
-    "fix",
-    POSE_WITH_COVARIANCE,
-    lambda n, _: EachReader(n, decode_fix),
-    _columns,
-    of_none,
-    in_map=True,
-)
-_decode_shared = partial(decode_shared_numbers, widths=(3, 9))
-_SHARED = shared_kind(_OWN, "swarm/fixes", SWARM_FIXES, _decode_shared, _shared_rows, NO_FIXES)
-FIXES = Sensor("fixes", NO_FIXES, (_OWN, _SHARED), _create_converter)  # The sensor, see `registry.SENSORS`
+    @classmethod
+    def expected_of(cls, _robot: Robot) -> bool:
+        """Fixes are optional."""
+        return False

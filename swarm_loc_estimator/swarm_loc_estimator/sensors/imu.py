@@ -7,24 +7,15 @@ accelerations say nothing about a robot that drives on a floor.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.cdr import IMU, decode, nanoseconds
-from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
+from swarm_loc_estimator.common.messages.cdr import IMU
+from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.sensors.sensor import (
-    NO_ROWS,
-    Converter,
-    DropCounts,
-    InputKind,
-    Known,
-    Sensor,
-    SensorSettings,
-)
+from swarm_loc_estimator.sensors.sensor import NO_ROWS, DropCounts, Sensor, SensorSettings
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 _MAX_RATE = 200.0  # Larger turn rates are no measurements [rad/s]
@@ -44,69 +35,52 @@ class TurnRateRows(NamedTuple):
 NO_TURN_RATES = TurnRateRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros(0), NO_ROWS)
 
 
-class ImuMessage(NamedTuple):
-    """The used part of a sensor_msgs/Imu: angular velocity [rad/s]."""
+class TurnRateSensor(Sensor):
+    """Gyroscopes of robots; their readings are used for prediction."""
 
-    stamp_ns: int
-    frame_id: str
-    velocity: tuple[float, float, float]
+    name, topic, message_type = "imu", "imu", IMU
+    only_expected, unit = True, None
 
-
-def decode_imu(data: bytes) -> ImuMessage:
-    """Read a sensor_msgs/Imu.
-
-    Raises:
-        CdrError: The bytes are not one whole message.
-    """
-    message = decode(data, IMU)
-    header, turn = message.header, message.angular_velocity
-    unknown = message.angular_velocity_covariance[0] == -1.0  # the convention of sensor_msgs
-    velocity = (math.nan,) * 3 if unknown else (turn.x, turn.y, turn.z)
-    return ImuMessage(nanoseconds(header.stamp), header.frame_id, velocity)
-
-
-def _columns(
-    found: MessageColumns[ImuMessage], batch: MessageBatch, robot: IntArray, _known: Known
-) -> tuple[TurnRateRows, Mapping[str, int]]:
-    velocity = np.array([message.velocity for message in found.messages], dtype=float).reshape(-1, 3)
-    valid = found.valid
-    rate = np.full(len(velocity), np.nan)
-    return TurnRateRows(robot[valid], found.stamp_ns[valid], velocity, rate, batch.log_ns[valid]), {}
-
-
-def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts) -> Converter:
-    """Create a filter for finite turn rates of robots with an IMU, which turns them to the vertical."""
-    models = [robot.imu for robot in swarm.robots]
-    # last row of Ry(pitch) Rx(roll): what rates about the axes of the IMU turn about the vertical
-    vertical = np.array(
-        [
+    def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
+        super().__init__(swarm, settings, drops)
+        # last row of Ry(pitch) Rx(roll): what rates about the axes of the IMU turn about the vertical
+        self._vertical = np.array(
             [
-                -math.sin(one.pitch),
-                math.cos(one.pitch) * math.sin(one.roll),
-                math.cos(one.pitch) * math.cos(one.roll),
+                [
+                    -math.sin(one.pitch),
+                    math.cos(one.pitch) * math.sin(one.roll),
+                    math.cos(one.pitch) * math.cos(one.roll),
+                ]
+                for one in (robot.imu for robot in swarm.robots)
             ]
-            for one in models
-        ]
-    ).reshape(-1, 3)
+        ).reshape(-1, 3)
 
-    def valid(rows: TurnRateRows) -> TurnRateRows:
-        rows = rows._replace(rate=np.sum(vertical[rows.robot] * rows.velocity, axis=1))
+    @classmethod
+    def columns(cls, messages: Messages[Any]) -> TurnRateRows:
+        """Convert decoded messages (n,); a first covariance of -1 says that there is no rate."""
+        velocity = np.array(
+            [
+                (math.nan,) * 3
+                if message.angular_velocity_covariance[0] == -1.0  # the convention of sensor_msgs
+                else (message.angular_velocity.x, message.angular_velocity.y, message.angular_velocity.z)
+                for message in messages.decoded
+            ],
+            dtype=float,
+        ).reshape(-1, 3)
+        rate = np.full(len(velocity), np.nan)
+        return TurnRateRows(messages.robot, messages.stamp_ns, velocity, rate, messages.arrival_ns)
+
+    def measure(self, rows: TurnRateRows) -> TurnRateRows:
+        """Select finite turn rates of robots with an IMU, turned to the vertical."""
+        rows = rows._replace(rate=np.sum(self._vertical[rows.robot] * rows.velocity, axis=1))
         reasons = {
             "imu_non_finite": ~np.isfinite(rows.rate),
             "imu_absurd": ~(np.abs(rows.rate) <= _MAX_RATE),
         }
-        good = drops.screen(rows.robot, reasons)
+        good = self.drops.screen(rows.robot, reasons)
         return rows if good.all() else select(rows, good)
 
-    return valid
-
-
-def _has_imu(robot: Robot) -> bool:
-    return robot.imu.is_used
-
-
-_OWN = InputKind(
-    "imu", "imu", IMU, lambda n, _: EachReader(n, decode_imu), _columns, _has_imu, only_expected=True
-)
-TURN_RATES = Sensor("imu", NO_TURN_RATES, (_OWN,), _create_converter, unit=None)
-"""The sensor, see `registry.SENSORS`."""
+    @classmethod
+    def expected_of(cls, robot: Robot) -> bool:
+        """Whether the description says that the robot has an IMU."""
+        return robot.imu.is_used

@@ -8,18 +8,18 @@ of arrival does not matter, and a lost matrix loses only its own information.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import BRIGHTNESS as MESSAGE_TYPE
-from swarm_loc_estimator.common.messages.detections import BrightnessMessage, decode_brightness
-from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
+from swarm_loc_estimator.common.messages.detections import decode_brightness
+from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, Measurements, concatenate, select
 from swarm_loc_estimator.filter.models import MODELS, POLAR
 from swarm_loc_estimator.infrared.closed_form import ClosedForm
@@ -29,8 +29,6 @@ from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     REJECT_REASONS,
     Change,
-    InputKind,
-    Known,
     Sensor,
     reject_reasons,
 )
@@ -293,50 +291,37 @@ def _reason(outcome: int, readings: FloatArray, saturation: FloatArray) -> str:
     return f"ir_{IrOutcome(outcome).name.lower()}"
 
 
-def _columns(
-    found: MessageColumns[BrightnessMessage], batch: MessageBatch, robot: IntArray, _known: Known
-) -> tuple[BrightnessRows, Mapping[str, int]]:
-    messages = found.messages
-    readings = np.empty(len(messages), dtype=object)
-    for k, message in enumerate(messages):
-        readings[k] = message.readings
+class BrightnessSensor(Sensor):
+    """Infrared boards of robots."""
 
-    def column(name: str) -> IntArray:
-        return np.array([getattr(message, name) for message in messages], dtype=np.int64)
+    name, topic, message_type = "brightness", "brightness", MESSAGE_TYPE
+    unit, keeps_units, accumulator = ("robot", "stamp_ns", "transmitter"), True, BrightnessConverter
 
-    rows = BrightnessRows(
-        robot=robot[found.valid],
-        stamp_ns=found.stamp_ns[found.valid],
-        receiver=column("receiver"),
-        transmitter=column("transmitter"),
-        n=column("n"),
-        power=column("power"),
-        saturation=column("saturation"),
-        readings=readings,
-        arrival_ns=batch.log_ns[found.valid],
-    )
-    return rows, {}
+    decode = staticmethod(decode_brightness)
 
+    @classmethod
+    def columns(cls, messages: Messages[Any]) -> BrightnessRows:
+        """Convert decoded messages (n,)."""
+        readings = np.empty(len(messages.decoded), dtype=object)
+        for k, message in enumerate(messages.decoded):
+            readings[k] = message.readings
 
-def _has_ir(robot: Robot) -> bool:
-    return robot.ir is not None
+        def column(name: str) -> IntArray:
+            return np.array([getattr(message, name) for message in messages.decoded], dtype=np.int64)
 
+        return BrightnessRows(
+            robot=messages.robot,
+            stamp_ns=messages.stamp_ns,
+            receiver=column("receiver"),
+            transmitter=column("transmitter"),
+            n=column("n"),
+            power=column("power"),
+            saturation=column("saturation"),
+            readings=readings,
+            arrival_ns=messages.arrival_ns,
+        )
 
-BRIGHTNESS = Sensor(
-    "brightness",
-    NO_BRIGHTNESS,
-    (
-        InputKind(
-            "brightness",
-            "brightness",
-            MESSAGE_TYPE,
-            lambda n, _: EachReader(n, decode_brightness),
-            _columns,
-            _has_ir,
-        ),
-    ),
-    create_accumulator=BrightnessConverter,
-    unit=("robot", "stamp_ns", "transmitter"),
-    keeps_units=True,
-)
-"""The sensor, see `registry.SENSORS`."""
+    @classmethod
+    def expected_of(cls, robot: Robot) -> bool:
+        """Whether the description says that the robot has a board."""
+        return robot.ir is not None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,13 +10,13 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.messages.cdr import LASER_SCAN
-from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
+from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, select
 from swarm_loc_estimator.filter.models import SCAN
-from swarm_loc_estimator.mapping.messages import ScanMessage, decode_scan
+from swarm_loc_estimator.mapping.messages import decode_scan
 from swarm_loc_estimator.mapping.sweeps import LidarSweep, read_sweep
 from swarm_loc_estimator.sensors.fix import about_robots
-from swarm_loc_estimator.sensors.sensor import NO_ROWS, Change, InputKind, Known, Sensor
+from swarm_loc_estimator.sensors.sensor import NO_ROWS, Change, Sensor
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 
@@ -85,35 +84,22 @@ class SweepStore:
         self.sweeps.clear()
 
 
-def _columns(
-    found: MessageColumns[ScanMessage], batch: MessageBatch, robot: IntArray, _known: Known
-) -> tuple[ScanRows, Mapping[str, int]]:
-    scans = np.empty(len(found.messages), dtype=object)
-    for k, message in enumerate(found.messages):
-        scans[k] = message
-    arrival_ns = batch.log_ns[found.valid]
-    return ScanRows(robot[found.valid], found.stamp_ns[found.valid], scans, arrival_ns), {}
+class ScanSensor(Sensor):
+    """Lidars of robots, in a swarm with a map."""
 
+    name, topic, message_type = "scans", "scan", LASER_SCAN
+    only_expected, needs_map, accumulator = True, True, SweepStore
 
-def _has_lidar(robot: Robot) -> bool:
-    return robot.lidar.is_used
+    decode = staticmethod(decode_scan)
 
+    @classmethod
+    def columns(cls, messages: Messages[Any]) -> ScanRows:
+        """Keep the decoded messages (n,)."""
+        scans = np.empty(len(messages.decoded), dtype=object)
+        scans[:] = messages.decoded
+        return ScanRows(messages.robot, messages.stamp_ns, scans, messages.arrival_ns)
 
-SCANS = Sensor(
-    "scans",
-    NO_SCANS,
-    (
-        InputKind(
-            "scans",
-            "scan",
-            LASER_SCAN,
-            lambda n, _: EachReader(n, decode_scan),
-            _columns,
-            _has_lidar,
-            only_expected=True,
-            needs_map=True,
-        ),
-    ),
-    create_accumulator=SweepStore,
-)
-"""The sensor, see `registry.SENSORS`."""
+    @classmethod
+    def expected_of(cls, robot: Robot) -> bool:
+        """Whether the description says that the robot has a lidar."""
+        return robot.lidar.is_used

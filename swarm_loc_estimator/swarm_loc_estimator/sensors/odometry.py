@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -13,17 +12,16 @@ from swarm_loc_estimator.common.messages.cdr import ODOMETRY as MESSAGE_TYPE
 from swarm_loc_estimator.common.messages.cdr import SWARM_ODOMETRY
 from swarm_loc_estimator.common.messages.detections import SharedMessage, decode_shared_numbers
 from swarm_loc_estimator.common.messages.poses import decode_odometry
-from swarm_loc_estimator.common.messages.streams import MessageBatch, PoseColumns, PoseReader
+from swarm_loc_estimator.common.messages.streams import PoseColumns, PoseReader
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
-    Converter,
     DropCounts,
-    InputKind,
     Known,
+    Reader,
     Sensor,
     SensorSettings,
-    shared_kind,
+    SharedTopic,
 )
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
@@ -51,41 +49,52 @@ class OdometryRows(NamedTuple):
 NO_ODOMETRY = OdometryRows.without_twist(NO_ROWS, NO_ROWS, np.zeros((0, 3)), NO_ROWS)
 
 
-def _columns(
-    found: PoseColumns, batch: MessageBatch, robot: IntArray, _known: Known
-) -> tuple[OdometryRows, Mapping[str, int]]:
-    rows = OdometryRows(robot, found.stamp_ns, found.pose, found.twist, batch.log_ns)
-    return rows if found.valid.all() else select(rows, found.valid), {}
-
-
 def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> OdometryRows:
     return OdometryRows.without_twist(message.robot, message.reading_ns, message.columns[0], arrival_ns)
 
 
-def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts) -> Converter:
-    """Create a filter for finite poses of plausible size, of robots with odometry."""
-    stands = np.array([robot.stands for robot in swarm.robots], dtype=bool)
+class OdometrySensor(Sensor):
+    """Odometry of robots; its readings are used unchanged."""
 
-    def valid(rows: OdometryRows) -> OdometryRows:
+    name, topic, message_type = "odometry", "odom", MESSAGE_TYPE
+    shared = SharedTopic(
+        "swarm/odom", SWARM_ODOMETRY, partial(decode_shared_numbers, widths=(3,)), _shared_rows
+    )
+    unit = None
+
+    def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
+        super().__init__(swarm, settings, drops)
+        self._stands = np.array([robot.stands for robot in swarm.robots], dtype=bool)
+
+    @classmethod
+    def create_reader(cls, topics: int, _known: Known) -> Reader:
+        """Create a reader that decodes all messages of a batch at once."""
+        return PoseReader(topics, decode_odometry, names=2)
+
+    @classmethod
+    def nothing(cls) -> OdometryRows:
+        """Empty readings."""
+        return NO_ODOMETRY
+
+    @classmethod
+    def columns(cls, messages: PoseColumns) -> OdometryRows:
+        """Convert decoded messages (n,)."""
+        rows = OdometryRows(
+            messages.robot, messages.stamp_ns, messages.pose, messages.twist, messages.arrival_ns
+        )
+        return rows if messages.valid.all() else select(rows, messages.valid)
+
+    def measure(self, rows: OdometryRows) -> OdometryRows:
+        """Select finite poses of plausible size, of robots with odometry."""
         reasons = {
-            "no_odometry": stands[rows.robot],
+            "no_odometry": self._stands[rows.robot],
             "odometry_non_finite": ~np.isfinite(rows.pose).all(axis=1),
             "odometry_absurd": ~(np.abs(rows.pose).max(axis=1) <= _MAX_DISTANCE_M),
         }
-        good = drops.screen(rows.robot, reasons)
+        good = self.drops.screen(rows.robot, reasons)
         return rows if good.all() else select(rows, good)
 
-    return valid
-
-
-def _moves(robot: Robot) -> bool:
-    return not robot.stands
-
-
-_OWN = InputKind(
-    "odometry", "odom", MESSAGE_TYPE, lambda n, _: PoseReader(n, decode_odometry, names=2), _columns, _moves
-)
-_decode_shared = partial(decode_shared_numbers, widths=(3,))
-_SHARED = shared_kind(_OWN, "swarm/odom", SWARM_ODOMETRY, _decode_shared, _shared_rows, NO_ODOMETRY)
-ODOMETRY = Sensor("odometry", NO_ODOMETRY, (_OWN, _SHARED), _create_converter, unit=None)
-"""The sensor, see `registry.SENSORS`."""
+    @classmethod
+    def expected_of(cls, robot: Robot) -> bool:
+        """Whether the robot moves."""
+        return not robot.stands

@@ -7,27 +7,17 @@ and the other one is not, both change places and the sign. See doc/uwb.md.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import RANGES as MESSAGE_TYPE
-from swarm_loc_estimator.common.messages.cdr import Rows, decode, nanoseconds
-from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, MessageColumns
+from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, select
 from swarm_loc_estimator.filter.models import MODELS, RANGE, RANGE_DIFFERENCE
-from swarm_loc_estimator.sensors.sensor import (
-    NO_ROWS,
-    Converter,
-    DropCounts,
-    InputKind,
-    Known,
-    Sensor,
-    SensorSettings,
-)
+from swarm_loc_estimator.sensors.sensor import NO_ROWS, DropCounts, Sensor, SensorSettings
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm, UwbDevice
 
 
@@ -47,43 +37,12 @@ _NO_ADDRESSES = np.zeros(0, dtype=np.uint64)
 NO_RANGES = RangeRows(NO_ROWS, NO_ROWS, _NO_ADDRESSES, _NO_ADDRESSES, np.zeros(0), np.zeros(0), NO_ROWS)
 
 
-class RangeArrayMessage(NamedTuple):
-    """swarm_loc_msgs/RangeArray: `ranges` has the fields of swarm_loc_msgs/Range."""
-
-    stamp_ns: int
-    frame_id: str
-    ranges: Rows
-
-
-def decode_ranges(data: bytes) -> RangeArrayMessage:
-    """Read a swarm_loc_msgs/RangeArray.
-
-    Raises:
-        CdrError: The bytes are not one whole message.
-    """
-    message = decode(data, MESSAGE_TYPE)
-    return RangeArrayMessage(nanoseconds(message.header.stamp), message.header.frame_id, message.ranges)
-
-
-def _columns(
-    found: MessageColumns[RangeArrayMessage], batch: MessageBatch, robot: IntArray, _known: Known
-) -> tuple[RangeRows, Mapping[str, int]]:
-    if not found.messages:
-        return NO_RANGES, {}
-    counts = [message.ranges.size for message in found.messages]
-    ranges = np.concatenate([message.ranges for message in found.messages])
-    columns = (robot[found.valid], found.stamp_ns[found.valid], batch.log_ns[found.valid])
-    robots, stamps_ns, arrivals_ns = (np.repeat(column, counts) for column in columns)
-    device, reference, value, variance = (ranges[name].copy() for name in ranges.dtype.names or ())
-    return RangeRows(robots, stamps_ns, device, reference, value, variance, arrivals_ns), {}
-
-
 class _Devices(NamedTuple):
     """All radios by ascending address (d,), the first one is none."""
 
     address: NDArray[np.uint64]  # (d,) uint64
     robot: IntArray  # (d,) index of its robot; -1: an anchor
-    landmark: IntArray  # (d,) field `landmark` of measurements; 0: a robot
+    landmark: IntArray  # (d,) column `landmark` of measurements
     place: FloatArray  # (d, 3) antenna x, y, z in base_link or in `map`
     bias: FloatArray  # (d,) of its ranges [m]
     variance: FloatArray  # (d,) of x and of y of an anchor [m^2]
@@ -111,45 +70,76 @@ class _Devices(NamedTuple):
         return np.where(self.address[place] == address, place, 0)
 
 
-def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts) -> Converter:
-    devices = _Devices.of(swarm)
-    radios = [robot.uwb or UwbDevice(0) for robot in swarm.robots]
-    own_address = np.array([radio.address for radio in radios], dtype=np.uint64)
-    antenna = np.array([(radio.x, radio.y, radio.z) for radio in radios]).reshape(-1, 3)
-    sigma = np.array([(radio.range_sigma, radio.difference_sigma) for radio in radios]).reshape(-1, 2)
-    scale, bias = (np.array([getattr(r, name) for r in radios]) for name in ("range_scale", "range_bias"))
-    gate = MODELS[RANGE].gate([radio.gate_probability for radio in radios])
+class RangeSensor(Sensor):
+    """UWB radios of robots."""
 
-    def convert(rows: RangeRows) -> Measurements:
+    name, topic, message_type = "ranges", "ranges", MESSAGE_TYPE
+    only_expected = True
+
+    def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
+        super().__init__(swarm, settings, drops)
+        self._devices = _Devices.of(swarm)
+        radios = [robot.uwb or UwbDevice(0) for robot in swarm.robots]
+        self._own_address = np.array([radio.address for radio in radios], dtype=np.uint64)
+        self._antenna = np.array([(radio.x, radio.y, radio.z) for radio in radios]).reshape(-1, 3)
+        sigma = [(radio.range_sigma, radio.difference_sigma) for radio in radios]
+        self._sigma = np.array(sigma).reshape(-1, 2)
+        self._scale = np.array([radio.range_scale for radio in radios])
+        self._bias = np.array([radio.range_bias for radio in radios])
+        self._gate = MODELS[RANGE].gate([radio.gate_probability for radio in radios])
+
+    @classmethod
+    def columns(cls, messages: Messages[Any]) -> RangeRows:
+        """Convert decoded messages (n,)."""
+        if not messages.decoded:
+            return NO_RANGES
+        counts = [message.ranges.size for message in messages.decoded]
+        ranges = np.concatenate([message.ranges for message in messages.decoded])
+        robot, stamp_ns, arrival_ns = (
+            np.repeat(column, counts) for column in (messages.robot, messages.stamp_ns, messages.arrival_ns)
+        )
+        device, reference, value, variance = (ranges[name].copy() for name in ranges.dtype.names or ())
+        return RangeRows(robot, stamp_ns, device, reference, value, variance, arrival_ns)
+
+    def measure(self, rows: RangeRows) -> Measurements:
+        """Convert ranges and range differences (k,)."""
+        devices = self._devices
         device, reference = devices.find(rows.device), devices.find(rows.reference)
-        rows, device, reference = _usable(rows, device, reference)
+        usable = self._usable(rows, device, reference)
+        rows, device, reference = select(rows, usable), device[usable], reference[usable]
+        # Subtract the biases of both ends.
         is_difference = rows.reference > 0
         value = rows.range - devices.bias[device]
-        value += np.where(is_difference, devices.bias[reference], -bias[rows.robot])
-        # the reference must be fixed: change places where only the other device is
+        value += np.where(is_difference, devices.bias[reference], -self._bias[rows.robot])
+        # The reference must be fixed: change places where only the other device is.
         swapped = is_difference & (devices.robot[reference] >= 0)
         value[swapped] *= -1.0
         device, reference = np.where(swapped, reference, device), np.where(swapped, device, reference)
-        out = Measurements.empty(rows.robot.size)
-        out.stamp_ns[:], out.gate[:], out.arrival_ns[:] = rows.stamp_ns, gate[rows.robot], rows.arrival_ns
+        # Fill the columns.
+        out, scale = Measurements.empty(rows.robot.size), self._scale[rows.robot]
+        out.stamp_ns[:], out.gate[:], out.arrival_ns[:] = (
+            rows.stamp_ns,
+            self._gate[rows.robot],
+            rows.arrival_ns,
+        )
         out.received_from[:] = out.observer[:] = rows.robot
         out.model[:] = np.where(is_difference, RANGE_DIFFERENCE, RANGE)
         out.target[:], out.landmark[:] = devices.robot[device], devices.landmark[device]
         out.reading[:] = device + devices.address.size * reference
-        out.sensor[:, :2], out.marker[:, :2] = antenna[rows.robot, :2], devices.place[device, :2]
-        out.height[:] = np.column_stack([antenna[rows.robot, 2], devices.place[device, 2]])
+        antenna, place = self._antenna[rows.robot], devices.place[device]
+        out.sensor[:, :2], out.marker[:, :2] = antenna[:, :2], place[:, :2]
+        out.height[:] = np.column_stack([antenna[:, 2], place[:, 2]])
         out.reference[:] = devices.place[reference]
-        out.value[:, 0] = value / scale[rows.robot]
-        described = np.square(sigma[rows.robot, is_difference.astype(np.int64)])
-        noise = np.where(rows.variance == 0.0, described, rows.variance) / np.square(scale[rows.robot])
+        out.value[:, 0] = value / scale
+        described = np.square(self._sigma[rows.robot, is_difference.astype(np.int64)])
+        noise = np.where(rows.variance == 0.0, described, rows.variance) / np.square(scale)
         out.covariance[:, 0, 0] = noise + devices.variance[reference]
         return out
 
-    def _usable(
-        rows: RangeRows, device: IntArray, reference: IntArray
-    ) -> tuple[RangeRows, IntArray, IntArray]:
-        own, is_difference = own_address[rows.robot], rows.reference > 0
-        on_robots = (devices.robot[device] >= 0) & (devices.robot[reference] >= 0)
+    def _usable(self, rows: RangeRows, device: IntArray, reference: IntArray) -> BoolArray:
+        """Which readings (k,) of devices and references (k,) can be used; the others are counted."""
+        own, is_difference = self._own_address[rows.robot], rows.reference > 0
+        on_robots = (self._devices.robot[device] >= 0) & (self._devices.robot[reference] >= 0)
         reasons = {
             "no_uwb": own == 0,
             "uwb_own_address": (rows.device == own) | (is_difference & (rows.reference == own)),
@@ -159,23 +149,9 @@ def _create_converter(swarm: Swarm, _settings: SensorSettings, drops: DropCounts
             "uwb_negative_range": ~is_difference & (rows.range < 0.0),
             "bad_covariance": rows.variance < 0.0,
         }
-        usable = drops.screen(rows.robot, reasons)
-        return select(rows, usable), device[usable], reference[usable]
+        return self.drops.screen(rows.robot, reasons)
 
-    return convert
-
-
-def _has_radio(robot: Robot) -> bool:
-    return robot.uwb is not None
-
-
-_OWN = InputKind(
-    "ranges",
-    "ranges",
-    MESSAGE_TYPE,
-    lambda n, _: EachReader(n, decode_ranges),
-    _columns,
-    _has_radio,
-    only_expected=True,
-)
-RANGES = Sensor("ranges", NO_RANGES, (_OWN,), _create_converter)  # The sensor, see `registry.SENSORS`
+    @classmethod
+    def expected_of(cls, robot: Robot) -> bool:
+        """Whether the description says that the robot has a radio."""
+        return robot.uwb is not None

@@ -13,20 +13,21 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.filter.measurements import Measurements, select
-from swarm_loc_estimator.sensors.aerial import AERIAL
-from swarm_loc_estimator.sensors.camera import DETECTIONS
-from swarm_loc_estimator.sensors.fix import FIXES
-from swarm_loc_estimator.sensors.imu import TURN_RATES
-from swarm_loc_estimator.sensors.infrared import BRIGHTNESS
-from swarm_loc_estimator.sensors.lidar import SCANS
-from swarm_loc_estimator.sensors.odometry import ODOMETRY
-from swarm_loc_estimator.sensors.ranges import RANGES
+from swarm_loc_estimator.filter.models import MODELS, MeasurementModel
+from swarm_loc_estimator.filter.models import register as register_model
+from swarm_loc_estimator.sensors.aerial import AerialSensor
+from swarm_loc_estimator.sensors.camera import CameraSensor
+from swarm_loc_estimator.sensors.fix import FixSensor
+from swarm_loc_estimator.sensors.imu import TurnRateSensor
+from swarm_loc_estimator.sensors.infrared import BrightnessSensor
+from swarm_loc_estimator.sensors.lidar import ScanSensor
+from swarm_loc_estimator.sensors.odometry import OdometrySensor
+from swarm_loc_estimator.sensors.ranges import RangeSensor
 from swarm_loc_estimator.sensors.sensor import (
     BAD_MEASUREMENT,
     REJECT_REASONS,
     VALID,
     Accumulator,
-    Converter,
     DropCounts,
     Guard,
     InputKind,
@@ -37,18 +38,47 @@ from swarm_loc_estimator.sensors.sensor import (
 )
 from swarm_loc_estimator.swarm.swarm import Swarm
 
-SENSORS: dict[str, Sensor] = {
+SENSORS: dict[str, type[Sensor]] = {
     sensor.name: sensor
-    for sensor in (ODOMETRY, TURN_RATES, DETECTIONS, BRIGHTNESS, FIXES, RANGES, SCANS, AERIAL)
+    for sensor in (
+        OdometrySensor,
+        TurnRateSensor,
+        CameraSensor,
+        BrightnessSensor,
+        FixSensor,
+        RangeSensor,
+        ScanSensor,
+        AerialSensor,
+    )
 }
 """All sensors by name. Simultaneous measurements are fused in this order."""
+_FIRST_OWN_MODEL = 1000  # Number of the first model of a sensor that is registered
+
+
+def register(sensor: type[Sensor]) -> type[Sensor]:
+    """Add a sensor, and its model if it has one; may be used as a decorator of its class.
+
+    Raises:
+        ValueError: There is a sensor of its name, or it gates other than 1, 2 or 3 components.
+    """
+    if sensor.name in SENSORS:
+        raise ValueError(f"there is a sensor '{sensor.name}' already")
+    if sensor.components:
+        sensor.model = max([_FIRST_OWN_MODEL, *(number + 1 for number in MODELS)])
+        names, gated = sensor.components, len(sensor.components)
+        angles = sensor.is_angle[:gated]
+        model = MeasurementModel(sensor.name, sensor.model, names, angles, gated, sensor.predict)
+        register_model(model)
+    SENSORS[sensor.name] = sensor
+    return sensor
+
 
 THE_SWARM = -1  # Robot index of topics about the whole swarm
 
 
 def kinds() -> dict[str, InputKind]:
     """All kinds of topics by name, shared topics last."""
-    found = [kind for sensor in SENSORS.values() for kind in sensor.kinds]
+    found = [kind for sensor in SENSORS.values() for kind in sensor.kinds()]
     return {kind.name: kind for kind in sorted(found, key=lambda kind: bool(kind.stands_for))}
 
 
@@ -128,14 +158,15 @@ class Batch:
         for name, given in rows.items():
             if name not in SENSORS:
                 raise TypeError(f"there is no sensor '{name}', only {', '.join(SENSORS)}")
-            columns = type(SENSORS[name].nothing)
+            columns = type(SENSORS[name].nothing())
             if not isinstance(given, columns) or len({len(column) for column in given}) != 1:
                 raise TypeError(f"{name} must be {columns.__name__} with columns of equal length")
         return cls(begin_ns, end_ns, rows)
 
     def __getitem__(self, sensor: str) -> Any:
         """The readings of a sensor."""
-        return self.rows.get(sensor, SENSORS[sensor].nothing)
+        rows = self.rows.get(sensor)
+        return SENSORS[sensor].nothing() if rows is None else rows
 
     def until_each(self, stamps_ns: IntArray) -> Iterator[Batch]:
         """Split at instants (s,) into s + 1 parts by arrival time."""
@@ -168,15 +199,11 @@ class InputConverter:
     def __init__(self, swarm: Swarm, settings: SensorSettings) -> None:
         self.drops = DropCounts(len(swarm.sources))
         self.accumulators: dict[str, Accumulator] = {
-            name: sensor.create_accumulator(swarm)
+            name: sensor.accumulator(swarm)
             for name, sensor in SENSORS.items()
-            if sensor.create_accumulator is not None
+            if sensor.accumulator is not None
         }
-        self._converters: dict[str, Converter] = {
-            name: sensor.create_converter(swarm, settings, self.drops)
-            for name, sensor in SENSORS.items()
-            if sensor.create_converter is not None
-        }
+        self._sensors = {name: sensor(swarm, settings, self.drops) for name, sensor in SENSORS.items()}
         self._future_ns = round(settings.future_tolerance_s * 1e9)
         self._robots, self._landmarks = len(swarm.robots), len(swarm.surveyed)
 
@@ -193,7 +220,7 @@ class InputConverter:
                 self.drops.add("future_stamp", rows.robot[late])
                 rows = select(rows, ~late)
             with Guard(name, rows.robot.size, self.drops.total):
-                found = self._converters[name](rows) if name in self._converters else rows
+                found = self._sensors[name].measure(rows)
                 kept[name] = self._valid(found) if isinstance(found, Measurements) else found
         return replace(batch, rows=kept, dropped={}, is_converted=True)
 

@@ -1,11 +1,8 @@
-"""Sensor record: topics, columns, validation and conversion to measurements.
+"""The seam for sensors: a class of two or three methods, from decoded messages to measurements.
 
-Readings of a sensor are a NamedTuple of columns of equal length, sorted by arrival. The first column is
-`robot`, the last `arrival_ns`; one is `stamp_ns`.
-
-Validation of measurements: finite values of plausible size, valid covariances.
-
-Decoding of messages with readings of many robots; an invalid reading does not affect the others.
+A sensor derives from `Sensor` and is registered by `registry.register`. The base class reads bytes, headers
+and topics, validates measurements and counts what is dropped. Readings are a NamedTuple of columns of equal
+length, sorted by arrival. The first column is `robot`, the last `arrival_ns`; one is `stamp_ns`.
 """
 
 from __future__ import annotations
@@ -16,19 +13,19 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.messages.cdr import CdrError
+from swarm_loc_estimator.common.messages.cdr import CdrError, decode, nanoseconds
 from swarm_loc_estimator.common.messages.detections import SharedMessage
-from swarm_loc_estimator.common.messages.streams import MessageBatch
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, Messages
 from swarm_loc_estimator.common.small_matrix import cholesky3
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, concatenate, select
-from swarm_loc_estimator.filter.models import MODELS
+from swarm_loc_estimator.filter.models import MODELS, Prediction
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 Rows = TypeVar("Rows", bound="tuple[Any, ...]")
@@ -61,16 +58,6 @@ class Reader(Protocol):
         Returns:
             Decoded messages, with `stamp_ns` (n,) and `valid` (n,), True if complete and of the right type.
         """
-
-
-def of_every(_: Robot) -> bool:
-    """A topic that is expected of every robot."""
-    return True
-
-
-def of_none(_: Robot) -> bool:
-    """A topic that is optional."""
-    return False
 
 
 class DropCounts:
@@ -143,7 +130,7 @@ class InputKind:
     #: Converts decoded messages (n,), the messages and the robots (n,) of their topics to readings; also
     #: returns the number of unused valid readings by reason
     columns_of: Callable[[Any, MessageBatch, IntArray, Known], tuple[Any, Mapping[str, int]]]
-    expected_of: Callable[[Robot], bool] = of_every  #: True if a missing topic of the robot is an error
+    expected_of: Callable[[Robot], bool]  #: True if a missing topic of the robot is an error
     of_each: bool = True  #: True if each robot has its own topic
     only_expected: bool = False  #: True if robots of which it is not expected have no such topic
     of_cameras: bool = False  #: True if each fixed camera has such a topic, too
@@ -210,26 +197,129 @@ class SensorSettings(Protocol):
         """Standard deviation of the heading of aerial detections without covariance [rad]."""
 
 
-Converter = Callable[[Any], Any]
-"""Converts readings to `Measurements`, or filters valid readings for odometry and accumulators."""
+class SharedTopic(NamedTuple):
+    """Topic with readings of many robots, which replaces their own topics."""
+
+    topic: str  #: Full name
+    message_type: str
+    decode: Callable[[bytes], SharedMessage]  #: Decodes a message
+    rows_of: Callable[[SharedMessage, IntArray], Any]  #: Converts a message and arrivals (n,) to readings
 
 
-@dataclass(frozen=True)
 class Sensor:
-    """Sensor on the robots or an overhead camera; `registry.SENSORS` lists all."""
+    """A sensor on robots, or overhead; `registry.SENSORS` lists all.
 
-    name: str  #: Name of its readings in a batch
-    nothing: tuple[NDArray[Any], ...]  #: Empty readings
-    kinds: tuple[InputKind, ...]  #: Kinds of its topics
-    #: Creates a converter for a swarm, which counts dropped readings by reason; if None, readings are used
-    #: unchanged
-    create_converter: Callable[[Swarm, SensorSettings, DropCounts], Converter] | None = None
-    #: Creates an accumulator for a sensor that combines several readings into one measurement; None for other
-    #: sensors
-    create_accumulator: Callable[[Swarm], Accumulator] | None = None
-    #: Columns that group readings: a group is used or dropped as a whole. None: never dropped.
-    unit: tuple[str, ...] | None = ()
-    keeps_units: bool = False  #: True if readings of one group may arrive in several batches
+    A sensor of your own says its names and defines `columns` and `measure`, and for a model of its own
+    `components`, `is_angle` and `predict`. An object of it is created for each swarm.
+
+    Args:
+        swarm: Robots with their sensors.
+        settings: Default noise of sensors.
+        drops: Where readings that cannot be used are counted.
+    """
+
+    name: ClassVar[str]  #: Name of its readings in a batch
+    topic: ClassVar[str]  #: Name relative to the robot's namespace, or full name of a topic of the swarm
+    message_type: ClassVar[str]  #: Message type, such as nav_msgs/msg/Odometry
+    shared: ClassVar[SharedTopic | None] = None  #: Topic with its readings of many robots, if there is one
+
+    of_each: ClassVar[bool] = True  #: True if each robot has its own topic
+    only_expected: ClassVar[bool] = False  #: True if robots of which it is not expected have no such topic
+    of_cameras: ClassVar[bool] = False  #: True if each fixed camera has such a topic, too
+    in_map: ClassVar[bool] = False  #: True if messages must be in the frame `map`
+    needs_map: ClassVar[bool] = False  #: True if there are such topics only for a swarm with a map
+
+    #: Columns that group readings: a group is used or dropped as a whole. None: never dropped
+    unit: ClassVar[tuple[str, ...] | None] = ()
+    keeps_units: ClassVar[bool] = False  #: True if readings of one group may arrive in several batches
+    #: Class of an `Accumulator`, which combines several readings into one measurement; None: not needed
+    accumulator: ClassVar[Any] = None
+
+    components: ClassVar[tuple[str, ...]] = ()  #: Names and units of the components of its own model
+    is_angle: ClassVar[tuple[bool, ...]] = (False, False, False)  #: Which of them are angles
+    gate_probability: ClassVar[float] = 0.999  #: Share of good measurements that pass the gate
+    model: ClassVar[int]  #: Number of its own model, set by `registry.register`
+
+    def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
+        self.swarm, self.settings, self.drops = swarm, settings, drops
+
+    @classmethod
+    def columns(cls, messages: Any) -> Any:
+        """Convert decoded messages (n,) to readings; with no message, to empty columns.
+
+        Args:
+            messages: `Messages`, all of them valid, or what a reader of its own returned for all.
+        """
+        raise NotImplementedError
+
+    def measure(self, rows: Any) -> Any:
+        """Convert readings to `Measurements`; odometry and accumulators get the valid readings."""
+        return rows
+
+    @staticmethod
+    def predict(one: Measurements, observer: FloatArray, target: FloatArray) -> Prediction:
+        """Predict a row of measurements from poses (3,), see `MeasurementModel.predict`."""
+        raise NotImplementedError
+
+    @classmethod
+    def decode(cls, data: bytes) -> Any:
+        """Decode a message; the result has `stamp_ns` and `frame_id`.
+
+        Raises:
+            ValueError: The bytes are not one whole message; a LookupError or struct.error says this, too.
+        """
+        message = decode(data, cls.message_type)
+        message.stamp_ns, message.frame_id = nanoseconds(message.header.stamp), message.header.frame_id
+        return message
+
+    @classmethod
+    def expected_of(cls, _robot: Robot) -> bool:
+        """Whether a missing topic of the robot is an error."""
+        return True
+
+    @classmethod
+    def fault_of(cls, message: Any, map_frame: str) -> str:
+        """Reason to drop a message, "" if there is none."""
+        return f"{cls.topic.partition('/')[0]}_frame" if cls.in_map and message.frame_id != map_frame else ""
+
+    def measurements(self, rows: Any) -> Measurements:
+        """Create a measurement per reading, by its robot at its stamp, with the gate of its own model."""
+        out = Measurements.empty(rows.robot.size)
+        out.stamp_ns[:], out.arrival_ns[:] = rows.stamp_ns, rows.arrival_ns
+        out.received_from[:] = out.observer[:] = rows.robot
+        out.model[:], out.gate[:] = self.model, MODELS[self.model].gate(self.gate_probability)
+        return out
+
+    @classmethod
+    def create_reader(cls, topics: int, _known: Known) -> Reader:
+        """Create a reader of the messages of a number of topics."""
+        return EachReader(topics, cls.decode)
+
+    @classmethod
+    def nothing(cls) -> Any:
+        """Empty readings."""
+        return cls.columns(Messages(NO_ROWS, NO_ROWS > 0, []))
+
+    @classmethod
+    def kinds(cls) -> tuple[InputKind, ...]:
+        """Kinds of its topics."""
+        own = InputKind(
+            cls.name, cls.topic, cls.message_type, cls.create_reader, cls._read, cls.expected_of, cls.of_each,
+            cls.only_expected, cls.of_cameras, cls.in_map, cls.needs_map,
+        )  # fmt: skip
+        return (own,) if cls.shared is None else (own, _shared_kind(own, cls.shared, cls.nothing()))
+
+    @classmethod
+    def _read(cls, found: Any, batch: MessageBatch, robot: IntArray, known: Known) -> Any:
+        """Convert what the reader returned for messages (n,) to readings, and count what is dropped."""
+        found = replace(found, robot=robot, arrival_ns=batch.log_ns)
+        if not isinstance(found, Messages):
+            return cls.columns(found), {}
+        faults = [cls.fault_of(message, known.map_frame) for message in found.decoded]
+        kept = np.flatnonzero(found.valid)[np.array([not fault for fault in faults], dtype=bool)]
+        decoded = [one for one, fault in zip(found.decoded, faults, strict=True) if not fault]
+        read = Messages(found.stamp_ns[kept], found.valid[kept], decoded, robot[kept], batch.log_ns[kept])
+        return cls.columns(read), Counter(fault for fault in faults if fault)
 
 
 VALID = 0
@@ -314,7 +404,7 @@ OTHER_SWARM = "other_swarm"  # Reason to drop readings of a sender with another 
 UNKNOWN_ROBOT = "unknown_robot"  # Reason to drop a reading with an invalid robot index
 BAD_STAMP = "bad_stamp"  # Reason to drop a reading with 10^9 or more nanoseconds in its stamp
 
-FOREIGN_FRAME = "fix_frame"  # Reason to drop a reading that is not in the frame `map`
+FOREIGN_FRAME = "fix_frame"  # Reason to drop shared readings that are not in the frame `map`
 
 
 class SharedColumns(NamedTuple):
@@ -391,40 +481,18 @@ class SharedReader:
         return select(rows, ~(unknown | unstamped))
 
 
-def _shared_columns(
-    found: SharedColumns, _batch: MessageBatch, _robot: IntArray, _known: Known
-) -> tuple[Any, Mapping[str, int]]:
-    """Readings and drop counts of a `SharedReader`."""
-    return found.rows, found.dropped
-
-
-def shared_kind(
-    own: InputKind,
-    topic: str,
-    message_type: str,
-    decode: Callable[[bytes], SharedMessage],
-    rows_of: Callable[[SharedMessage, IntArray], Any],
-    nothing: Any,
-) -> InputKind:
-    """Create the kind of a topic with readings of many robots, which replaces their own topics.
-
-    Args:
-        own: Kind of the replaced topics.
-        topic: Full name of the topic.
-        message_type: Message type.
-        decode: Decodes a message.
-        rows_of: Converts a message and arrivals (n,) to readings.
-        nothing: Empty readings.
-    """
+def _shared_kind(own: InputKind, shared: SharedTopic, nothing: Any) -> InputKind:
+    """Kind of a topic with readings of many robots, which replaces their own topics."""
+    reader = partial(
+        SharedReader, decode=shared.decode, rows_of=shared.rows_of, nothing=nothing, in_map=own.in_map
+    )
     return replace(
         own,
         name=f"swarm_{own.name}",
-        topic=topic,
-        message_type=message_type,
-        create_reader=partial(
-            SharedReader, decode=decode, rows_of=rows_of, nothing=nothing, in_map=own.in_map
-        ),
-        columns_of=_shared_columns,
+        topic=shared.topic,
+        message_type=shared.message_type,
+        create_reader=reader,
+        columns_of=lambda found, *_: (found.rows, found.dropped),
         of_each=False,
         of_cameras=False,
         stands_for=own.name,

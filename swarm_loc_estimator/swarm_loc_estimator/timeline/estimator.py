@@ -23,11 +23,11 @@ from swarm_loc_estimator.filter.state import IN_MAP
 from swarm_loc_estimator.identification.memory import Identities, Outcome
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.fix import about_robots
-from swarm_loc_estimator.sensors.imu import TURN_RATES, TurnRateRows
-from swarm_loc_estimator.sensors.lidar import SCANS, SweepStore
-from swarm_loc_estimator.sensors.odometry import ODOMETRY, OdometryRows
+from swarm_loc_estimator.sensors.imu import TurnRateRows, TurnRateSensor
+from swarm_loc_estimator.sensors.lidar import ScanSensor, SweepStore
+from swarm_loc_estimator.sensors.odometry import OdometryRows, OdometrySensor
 from swarm_loc_estimator.sensors.registry import Batch, InputConverter
-from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, reject_reasons
+from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, Accumulator, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.contradictions import ConstantOdometry, Contradiction, contradictions
 from swarm_loc_estimator.timeline.estimate import Estimate, Status, TrackedLimits, estimate_at
@@ -64,7 +64,7 @@ class Estimator:
         self._limits = TrackedLimits.of(swarm, self.settings)
         self._tracks = OdometryTracks(swarm.robots)
         self._converter = InputConverter(swarm, self.settings)
-        self._sweeps = cast(SweepStore, self._converter.accumulators[SCANS.name])
+        self._sweeps = cast(SweepStore, self._converter.accumulators[ScanSensor.name])
         self._fusion = Fusion(swarm, self.settings, self._tracks, self._sweeps.sweeps)
         grouped_s = self.settings.state_period_s + self.settings.fusion_period_s
         self._lookback_ns = self._tracks.lookback_ns + round(
@@ -76,6 +76,7 @@ class Estimator:
         self._horizon_ns = round(self.settings.horizon_s * 1e9)
         self._jump_back_ns = round(self.settings.jump_back_s * 1e9)
         self.time_jumps = 0
+        self._gathering: dict[str, Accumulator] = {}  # those that have data
         self._begin()
 
     def _begin(self) -> None:
@@ -122,12 +123,13 @@ class Estimator:
                 self._timeline.add(rows)
             elif not rows.robot.size:
                 continue
-            elif name == ODOMETRY.name:
+            elif name == OdometrySensor.name:
                 self._odometry.append(rows)
-            elif name == TURN_RATES.name:
+            elif name == TurnRateSensor.name:
                 self._turn_rates.append(rows)
             else:
-                change = self._converter.accumulators[name].take(rows)
+                accumulator = self._gathering[name] = self._converter.accumulators[name]
+                change = accumulator.take(rows)
                 self._timeline.add(change.added)
                 self._timeline.withdraw(change.withdrawn)
 
@@ -240,7 +242,7 @@ class Estimator:
         if fuse:
             self._timeline.advance(newest_ns, has_budget)
             needed_ns = min([oldest_ns, *self._timeline.measurements.stamp_ns[:1].tolist()])
-            for accumulator in self._converter.accumulators.values():
+            for accumulator in self._gathering.values():
                 accumulator.forget_before(needed_ns if accumulator is self._sweeps else oldest_ns)
         return self._estimate(now_ns)
 

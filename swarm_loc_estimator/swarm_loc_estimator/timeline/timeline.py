@@ -13,14 +13,13 @@ from __future__ import annotations
 import math
 from bisect import insort
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
+from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
 from swarm_loc_estimator.filter.measurements import (
     Command,
@@ -34,13 +33,6 @@ from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.timeline.settings import Settings, end_of_period, middle_of_period
 
 _FIRST_CAPACITY = 1024
-
-
-class Merged(NamedTuple):
-    """Result of `MeasurementBuffer.merge`."""
-
-    first_ns: int | None  # Stamp of the first new measurement; None if there is none
-    duplicates: int  # Number of duplicates
 
 
 class MeasurementBuffer:
@@ -76,12 +68,12 @@ class MeasurementBuffer:
         """(m,) to be written."""
         return self._nis[self._begin : self._end]
 
-    def merge(self, new: Measurements) -> Merged:
-        """Insert measurements (k,)."""
+    def merge(self, new: Measurements) -> tuple[int, int | None]:
+        """Insert measurements (k,); return how many were no duplicates, and the stamp of the first."""
         self._make_room(new.size)
         count, first_ns = _merge(self._columns, self._verdicts, self._nis, self._begin, self._end, new)
         self._end += count
-        return Merged(first_ns if count else None, new.size - count)
+        return count, first_ns if count else None
 
     def remove(self, gone: Measurements) -> int | None:
         """Remove measurements (k,); return the stamp of the first one found, None if none was found."""
@@ -109,11 +101,12 @@ class MeasurementBuffer:
         """Reserve space for `count` rows: reuse that of removed rows, or double the capacity."""
         if self._end + count <= self._verdicts.size:
             return
-        size, old = len(self), (self.measurements, self.verdicts, self.nis)
-        kept = [column.copy() for column in (*old[0], *old[1:])]
+        size = len(self)
+        kept: list[Any] = [one.copy() for one in (*self.measurements, self.verdicts, self.nis)]
         if 2 * (size + count) > self._verdicts.size:
             self._allocate(4 * (size + count))
-        for column, values in zip((*self._columns, self._verdicts, self._nis), kept, strict=True):
+        columns: list[Any] = [*self._columns, self._verdicts, self._nis]
+        for column, values in zip(columns, kept, strict=True):
             column[:size] = values
         self._begin, self._end = 0, size
 
@@ -262,14 +255,6 @@ _FORGOTTEN_AT_ONCE = 4
 _BEFORE_ALL, _AFTER_ALL = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 
-@dataclass(frozen=True)
-class _Checkpoint:
-    """State after the step `key`."""
-
-    key: int
-    state: SwarmState
-
-
 class Timeline:
     """Buffered measurements with their verdicts, and the newest state.
 
@@ -301,7 +286,8 @@ class Timeline:
         self.state = self._ahead = state
         self.is_busy = False
         self._head_key = _BEFORE_ALL
-        self._checkpoints = [_Checkpoint(_BEFORE_ALL, state.copy())]
+        # The step after which a state was copied, by the last stamp that belongs to it, and the copy.
+        self._checkpoints = [(_BEFORE_ALL, state.copy())]
         self._new: list[Measurements] = []
         self._withdrawn: list[Measurements] = []
         self._new_commands: list[Command] = []
@@ -413,10 +399,10 @@ class Timeline:
         count, new = self.waiting, self._not_older(self._new, oldest_ns)
         self._new = []
         self.too_old += count - new.size
-        merged = self._buffer.merge(new)
-        self.duplicates += merged.duplicates
-        if merged.first_ns is not None:
-            self._redo_from(merged.first_ns)
+        inserted, first_ns = self._buffer.merge(new)
+        self.duplicates += new.size - inserted
+        if first_ns is not None:
+            self._redo_from(first_ns)
 
     def _order(self, oldest_ns: int) -> None:
         """Insert new commands by their stamps."""
@@ -452,10 +438,10 @@ class Timeline:
     def _go_back(self, key: int) -> None:
         """Roll back to the last checkpoint before step `key`, unless `key` is ahead."""
         if key <= self._head_key:
-            while self._checkpoints[-1].key >= key:
+            while self._checkpoints[-1][0] >= key:
                 self._checkpoints.pop()
-            self._head_key = self._checkpoints[-1].key
-            self._ahead = self._checkpoints[-1].state.copy()
+            self._head_key = self._checkpoints[-1][0]
+            self._ahead = self._checkpoints[-1][1].copy()
 
     def _compute(self, due_ns: int, has_budget: HasBudget) -> bool:
         """Compute steps that end until `due_ns` within the budget; return whether all are done."""
@@ -479,21 +465,21 @@ class Timeline:
             measurements = select(buffer.measurements, rows)
             self._step(self._ahead, measurements, commands, buffer.verdicts[rows], buffer.nis[rows])
             self._head_key = key
-            if key - max(self._checkpoints[-1].key, -(2**62)) >= self._spacing_ns:
-                self._checkpoints.append(_Checkpoint(key, self._ahead.copy()))
+            if key - max(self._checkpoints[-1][0], -(2**62)) >= self._spacing_ns:
+                self._checkpoints.append((key, self._ahead.copy()))
             if end < len(buffer) and not has_budget():
                 return False
 
     def _forget_before(self, key: int) -> None:
         """Drop data before step `key`, except one checkpoint and the measurements after it."""
         older = 0
-        while older < len(self._checkpoints) and self._checkpoints[older].key < key:
+        while older < len(self._checkpoints) and self._checkpoints[older][0] < key:
             older += 1
         if older < _FORGOTTEN_AT_ONCE:
             return
         del self._checkpoints[: older - 1]
-        passed = self._count_until(self._checkpoints[0].key)
-        self._commands = [one for one in self._commands if one.stamp_ns > self._checkpoints[0].key]
+        passed = self._count_until(self._checkpoints[0][0])
+        self._commands = [one for one in self._commands if one.stamp_ns > self._checkpoints[0][0]]
         self.settled += np.bincount(self.verdicts[:passed], minlength=len(Verdict))
         self._buffer.drop_first(passed)
 

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 import struct
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, Protocol, TypeVar
 
 from numpy.typing import NDArray
@@ -181,6 +181,10 @@ _ODOMETRY_NUMBERS = 8 * (POSE_DOUBLES + 36 + 6 + 36)
 """Size of these numbers [byte]; of other messages with a pose it is less."""
 
 
+def _not_known() -> IntArray:
+    return np.zeros(0, dtype=np.int64)
+
+
 class _Models(NamedTuple):
     """Per topic what its messages have in common that only differ in stamp and numbers."""
 
@@ -214,6 +218,8 @@ class PoseColumns:
     # (n, 3) forward and left [m/s] and turn rate [rad/s] of nav_msgs/Odometry; NaN for other types
     twist: FloatArray
     valid: NDArray[np.bool_]  # (n,) whether the bytes were a whole message of the type
+    robot: IntArray = field(default_factory=_not_known)  # (n,) see `Messages`
+    arrival_ns: IntArray = field(default_factory=_not_known)  # (n,) arrival times
 
 
 class PoseReader:
@@ -275,6 +281,8 @@ class DetectionColumns:
     count: IntArray  # (n,) detections per message
     detection: NDArray[np.void]  # (d,) of `DETECTION_DTYPE`
     valid: NDArray[np.bool_]  # (n,) whether the bytes were a whole message of the type
+    robot: IntArray = field(default_factory=_not_known)  # (n,) see `Messages`
+    arrival_ns: IntArray = field(default_factory=_not_known)  # (n,) arrival times
 
 
 class DetectionReader:
@@ -325,12 +333,16 @@ class DetectionReader:
 
 
 @dataclass(frozen=True)
-class MessageColumns(Generic[Message]):
+class Messages(Generic[Message]):
     """Messages (n,) read whole."""
 
-    stamp_ns: IntArray  # (n,)
-    valid: NDArray[np.bool_]  # (n,) whether the bytes were a whole message of the type
-    messages: list[Message]  # The valid ones
+    stamp_ns: IntArray  #: (n,) stamps of their headers
+    valid: NDArray[np.bool_]  #: (n,) whether the bytes were a whole message of the type
+    decoded: list[Message]  #: The valid ones
+    robot: IntArray = field(
+        default_factory=_not_known
+    )  #: (n,) index of the topic's robot, or N plus that of the camera; -1: swarm
+    arrival_ns: IntArray = field(default_factory=_not_known)  #: (n,) arrival times
 
 
 class EachReader(Generic[Message]):
@@ -348,7 +360,7 @@ class EachReader(Generic[Message]):
         self.frame_ids = [""] * topics
         self._decode: Callable[[bytes], Message] = decode
 
-    def read(self, batch: MessageBatch) -> MessageColumns[Message]:
+    def read(self, batch: MessageBatch) -> Messages[Message]:
         """Read messages whose topics are numbered from 0 to `topics`."""
         stamp_ns, valid = np.zeros(batch.size, dtype=np.int64), np.ones(batch.size, dtype=bool)
         messages: list[Message] = []
@@ -360,7 +372,7 @@ class EachReader(Generic[Message]):
                 continue
             stamp_ns[k], self.frame_ids[topic] = message.stamp_ns, message.frame_id
             messages.append(message)
-        return MessageColumns(stamp_ns, valid, messages)
+        return Messages(stamp_ns, valid, messages, arrival_ns=batch.log_ns)
 
 
 def _behind_string(data: bytes, offset: int) -> int:
