@@ -263,6 +263,7 @@ _INDEPENDENT_NS = 100_000_000  # Measurements of a pair that follow each other f
 def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
     """All fault scores zero, no pair known."""
     return IntegrityArrays(
+        # pairs of observer and source
         source=np.full((robots, _SOURCES), -1),
         source_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
         counted_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
@@ -273,6 +274,7 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         whitened=np.zeros((robots, _SOURCES, 2)),
         squares=np.zeros((robots, _SOURCES)),
         looks=np.zeros((robots, _SOURCES), dtype=np.int64),
+        # robots and landmarks
         fault_score=np.zeros(robots + landmarks),
         confirmations=np.zeros(robots, dtype=np.int64),
         confirmed_ns=np.full(robots, NEVER_NS // 2),
@@ -282,6 +284,7 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         gated_fixes=np.zeros(robots, dtype=np.int64),
         gated_fix_ns=np.full(robots, NEVER_NS // 2),
         noise_inflation=np.zeros(robots),
+        # the scale of a robot's process noise
         drift_ns=np.full((robots, WINDOWS), NEVER_NS // 2),
         drift_transform=np.zeros((robots, WINDOWS, 3)),
         drift_noise=np.zeros((robots, WINDOWS, 3, 3)),
@@ -289,6 +292,7 @@ def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
         motion_likelihood=np.zeros((robots, LOG_SCALES.size)),
         motion_scale=np.ones(robots),
         motion_explained=np.zeros(robots, dtype=bool),
+        # errors that repeat
         excess=np.zeros((robots, 3, 3)),
         repeated=np.zeros((robots, _SOURCES, 2, 3, 3)),
         repeated_at=np.zeros((robots, _SOURCES, 2)),

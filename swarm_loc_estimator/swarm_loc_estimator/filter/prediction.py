@@ -104,10 +104,12 @@ def _add_evidence(
         for j in range(3):
             before = state.drift_noise[robot, window, i, j]
             difference[i, j] = belief.preintegrated_covariance[robot, i, j] - before
+    # Described process noise of the window, s Q with s = 1.
     carry(now, difference, noise)
     of_position, of_heading = _at(noise, pose)
     if not of_position > _STATIONARY_M2 or not of_heading > 0.0:
         return
+    # Correction by measurements: how far T has moved at the robot's pose.
     back = between(begin[0], begin[1], begin[2], 0.0, 0.0, 0.0)
     moved = composed(now[0], now[1], now[2], back[0], back[1], back[2])
     x, y, theta = between(moved[0], moved[1], moved[2], pose[0], pose[1], pose[2])
@@ -119,6 +121,7 @@ def _add_evidence(
         max(was_position - position, 0.0) + _POSE_SHARE * position,
         max(was_heading - heading, 0.0) + _POSE_SHARE * heading,
     )
+    # Likelihood of each scale s: the correction is normal with variance s Q + P_begin - P_end.
     kept, likelihood = math.exp(-since_s / _MEMORY_S), state.motion_likelihood[robot]
     total, mean, best = 0.0, 0.0, -math.inf
     for k in range(likelihood.size):
@@ -129,6 +132,7 @@ def _add_evidence(
         likelihood[k] -= math.log(along) + 0.5 * squared[0] / along
         likelihood[k] -= 0.5 * math.log(turned) + 0.5 * squared[1] / turned
         best = max(best, likelihood[k] - _PRIOR * abs(LOG_SCALES[k]))
+    # The scale is its mean, never below 1.
     for k in range(likelihood.size):
         weight = math.exp(likelihood[k] - _PRIOR * abs(LOG_SCALES[k]) - best)
         total += weight
@@ -330,6 +334,7 @@ def _block(
 @cached_njit
 def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
     """Apply the drift to T, to its covariances with all states and to the turn bias."""
+    # Mean: T drifts by the parameters.
     drift = _new_drift(belief, robot, to)
     _move(drift.twist, belief.transform[robot])
     for begin in belief.integrity.drift_transform[robot]:  # this is no correction by measurements
@@ -338,6 +343,7 @@ def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
     size = p.shape[0]
     columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
     rows, block = np.zeros((3, size)), np.empty((3, 3))
+    # Covariances of the pose with all states, F P, and of the pose, F P F^T.
     count = _own(belief, robot, drift, columns, weight)
     _block(p, columns, weight, count, drift, block)
     for i in range(3):
@@ -346,6 +352,7 @@ def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
                 rows[i, j] += weight[i, a] * p[columns[a], j]
     if not belief.is_dense:
         _note_transition(belief, robot, drift)
+    # The turn bias decays, and gains process noise.
     bias = own_column(belief, robot, 3 + TURN_BIAS)
     if bias >= 0:
         belief.parameter[robot, TURN_BIAS] *= drift.left

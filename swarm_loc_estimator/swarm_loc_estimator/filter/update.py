@@ -233,15 +233,8 @@ def fuse(
                 row = i - k
                 whitened = (work.whitened[row, 0], work.whitened[row, 1])
                 if has_kernel(measurements, i):
-                    source = assess(
-                        measurements,
-                        i,
-                        belief,
-                        limits.max_fault_score,
-                        work.distance[row],
-                        whitened,
-                        work.cause[row],
-                    )
+                    distance, cause, limit = work.distance[row], work.cause[row], limits.max_fault_score
+                    source = assess(measurements, i, belief, limit, distance, whitened, cause)
                     if source >= 0 and not together:
                         return k, CONTRADICTED, source, 0
                     if source >= 0:
@@ -405,25 +398,13 @@ def _evaluate(
     work: Innovations,
     row: int,
 ) -> None:
-    """Linearize measurement k about the belief and gate it; of two planar solutions, use the likelier one.
-
-    Args:
-        measurements: (m,).
-        k: Index of the measurement.
-        belief: Not changed.
-        work: Input: `pose`, `motion` and, for a sparse filter, `cross_covariance`. Output: the others.
-        row: Row of `work`.
-    """
+    """Linearize measurement k about the belief and gate it: stages 2 and 3; write the row of `work`."""
     columns, jacobian, innovation = work.columns[row], work.jacobian[row], work.innovation[row]
     pose, motion, noise = work.pose[row], work.motion[row], work.noise[row]
     bodies = body_columns(measurements, k, belief)
     camera, camera_columns = _camera(belief, measurements.observer[k])
-    predicted, value_jacobian, s, variances = (
-        work.predicted,
-        work.value_jacobian,
-        work.innovation_covariance,
-        work.variances,
-    )
+    predicted, value_jacobian = work.predicted, work.value_jacobian
+    s, variances = work.innovation_covariance, work.variances
     # Linearize: predicted value, Jacobian, noise.
     predict_one(measurements, k, pose[0], pose[1], camera, predicted, value_jacobian)
     _write_jacobian(value_jacobian, bodies, camera_columns, columns, jacobian)
@@ -436,15 +417,8 @@ def _evaluate(
     assign_matrix(s, noise)
     if belief.is_dense:
         _read_cross_covariance(belief.covariance, bodies, camera_columns, work.cross_covariance[row])
-    _add_uncertainty(
-        belief,
-        bodies,
-        camera_columns,
-        value_jacobian,
-        work.cross_covariance[row],
-        work.relative_covariance,
-        s,
-    )
+    cross, relative = work.cross_covariance[row], work.relative_covariance
+    _add_uncertainty(belief, bodies, camera_columns, value_jacobian, cross, relative, s)
     for i in range(3):
         variances[i] = s[i, i] - noise[i, i]
     # Innovation, eq. (11), of the likelier solution.
@@ -501,15 +475,7 @@ def relative_motion(
 ) -> None:
     """Write the rate of change of xi_target - xi_observer (3,) of measurement k by driving [1/s].
 
-    Zero for an exact stamp, where the rate is not needed.
-
-    Args:
-        measurements: (m,).
-        k: Index of the measurement.
-        tracks: Odometry.
-        belief: Not changed.
-        pose: (2, 3) of observer and target in `map`.
-        motion: Written.
+    Zero for an exact stamp, where the rate is not needed. `pose` (2, 3) is that of observer and target.
     """
     motion.fill(0.0)
     if stamp_variance(measurements, k, belief) == 0.0:
@@ -565,25 +531,15 @@ def _add_stamp_noise(
     value_jacobian: FloatArray, motion: FloatArray, variance: float, noise: FloatArray
 ) -> None:
     """Add the covariance due to the stamp's variance [s^2] at the rate `motion` (3,) to `noise` (3, 3)."""
+    h, (x, y, turn) = value_jacobian, (motion[0], motion[1], motion[2])
     change = (
-        _along(value_jacobian, 0, motion),
-        _along(value_jacobian, 1, motion),
-        _along(value_jacobian, 2, motion),
+        h[0, 0] * x + h[0, 1] * y + h[0, 2] * turn,
+        h[1, 0] * x + h[1, 1] * y + h[1, 2] * turn,
+        h[2, 0] * x + h[2, 1] * y + h[2, 2] * turn,
     )
     for i in range(3):
         for j in range(3):
             noise[i, j] += variance * change[i] * change[j]
-
-
-@inlined_njit
-def _along(value_jacobian: FloatArray, row: int, motion: FloatArray) -> float:
-    """Rate of change of one component of the value."""
-    speed: float = (
-        value_jacobian[row, 0] * motion[0]
-        + value_jacobian[row, 1] * motion[1]
-        + value_jacobian[row, 2] * motion[2]
-    )
-    return speed
 
 
 @inlined_njit
@@ -621,16 +577,8 @@ def _add_uncertainty(
 ) -> None:
     """Add H P H^T (3, 3), eq. (13) of the e-puck paper, where H is `value_jacobian`.
 
-    The covariance of xi_target - xi_observer is computed first, which saves two thirds of the work.
-
-    Args:
-        belief: Not changed.
-        bodies: First columns of the observer and of the target; -1: none.
-        camera: Columns of the camera's parameters; -1: none.
-        value_jacobian: (3, 5).
-        cross_covariance: (3, 5) of the observer, the target and the camera, see `Innovations`.
-        relative: (3, 3) buffer.
-        s: (3, 3) sum to add to.
+    The covariance of xi_target - xi_observer is computed first, in `relative` (3, 3), which saves two thirds
+    of the work. Columns of bodies and of the camera's parameters are -1 where there are none.
     """
     o, t = max(bodies[0], 0), max(bodies[1], 0)
     of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0
@@ -682,17 +630,10 @@ def evaluate_link(
     joint: JointFilter,
     work: Innovations,
 ) -> None:
-    """Evaluate a measurement whose model has no compiled kernel: stages 2 and 3 of `fuse`.
+    """Evaluate a row of measurements whose model has no compiled kernel: stages 2 and 3; write row k of `work`.
 
-    Missing components get zero rows and unit noise.
-
-    Args:
-        one: A row of measurements, between localized robots.
-        k: Row of `work`.
-        tracks: Odometry.
-        belief: Predicted belief.
-        joint: Its filter, prepared for an update with this measurement.
-        work: Input: `pose` and, for a sparse filter, `cross_covariance`; output: the other fields.
+    Its sides are localized and predicted, the filter is prepared. Components that its model lacks get zero
+    rows and unit noise.
     """
     # Predict.
     model, stamp_ns = MODELS[int(one.model)], int(one.stamp_ns)
@@ -754,10 +695,5 @@ def _motion(tracks: TrackArrays, robot: int, stamp_ns: int, pose: FloatArray) ->
     """Right-invariant velocity twist (3,) of a robot at a pose (3,) in `map` [1/s]."""
     forward, left, turn = rate_at(tracks, robot, stamp_ns)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    return np.array(
-        [
-            cos * forward - sin * left + turn * pose[1],
-            sin * forward + cos * left - turn * pose[0],
-            turn,
-        ]
-    )
+    x, y = cos * forward - sin * left, sin * forward + cos * left
+    return np.array([x + turn * pose[1], y - turn * pose[0], turn])

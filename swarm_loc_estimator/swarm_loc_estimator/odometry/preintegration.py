@@ -60,11 +60,13 @@ def fault_of_step(
     agreed, fastest = tracks.agreed[robot, row], tracks.fastest[robot, row]
     for i in range(2):
         agreed[i], fastest[i] = tracks.agreed[robot, row - 1, i], tracks.fastest[robot, row - 1, i]
+    # A step beyond the limits of the robot is a jump; one to the origin is a restart.
     fault = NO_FAULT
     if _is_beyond_limits(tracks, robot, step, duration_s):
         fault = JUMP
     elif _is_restart(tracks, robot, row, duration_s):
         fault = RESET
+    # The twist, where it is known, says how far the step may be.
     earlier, later = tracks.twist[robot, row - 1], tracks.twist[robot, row]
     known = math.isfinite(earlier[0] + earlier[1] + earlier[2] + later[0] + later[1] + later[2])
     if not known or duration_s > model.timeout_s:
@@ -80,6 +82,7 @@ def fault_of_step(
     away = _outside(arc, speeds[0] * duration_s, speeds[1] * duration_s)  # some drivers turn the velocity
     turned = _outside(step[2], earlier[2] * duration_s, later[2] * duration_s)
     moves = (speeds[0] + speeds[1] > 0.0 and arc > 0.0), (rates[0] + rates[1] > 0.0 and step[2] != 0.0)
+    # A step that contradicts a twist that has agreed before is a reset.
     for i, contradicts in enumerate((away > slack, turned > turn_slack)):
         if contradicts:
             if agreed[i] >= _AGREED_ENOUGH and fault == NO_FAULT:
@@ -349,6 +352,7 @@ def integrate(tracks: TrackArrays, oldest_ns: int, rows: NewRows, changed_from_n
         if row and stamps_ns[k] <= tracks.stamp_ns[robot, row - 1]:
             duplicates += 1
             continue
+        # Append the row.
         tracks.stamp_ns[robot, row] = stamps_ns[k]
         assign(tracks.raw[robot, row], raw[k])
         assign(tracks.twist[robot, row], twist[k])
@@ -363,7 +367,7 @@ def integrate(tracks: TrackArrays, oldest_ns: int, rows: NewRows, changed_from_n
             assign(tracks.begin_pose[robot], raw[k])
             tracks.begin_ns[robot] = tracks.known_ns[robot, 0] = stamps_ns[k]
             tracks.jump_ns[robot, 0, 0] = tracks.jump_ns[robot, 0, 1] = BEFORE_ALL_NS // 2
-        else:
+        else:  # integrate the step to it, and those before whose twist counts from now on
             before = tracks.raw[robot, row - 1, 2]
             tracks.raw[robot, row, 2] = before + wrap(raw[k, 2] - before)
             first = row

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DETECTIONS
 from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, AnonymousMessage, decode_anonymous
 from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
-from swarm_loc_estimator.filter.models import ANONYMOUS
+from swarm_loc_estimator.filter.models import ANONYMOUS, MODELS
 from swarm_loc_estimator.sensors.fix import about_robots, take_out_headings
 from swarm_loc_estimator.sensors.sensor import DropCounts, Sensor, SensorSettings
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
@@ -37,6 +38,7 @@ class AerialSensor(Sensor):
 
     name, topic, message_type = "aerial", "aerial/detections", ANONYMOUS_DETECTIONS
     of_each, in_map = False, True
+    optional = MappingProxyType({"covariance": _UNKNOWN_VARIANCE})
     unit = ("robot", "stamp_ns")  # a partial image would imply missing robots
 
     decode = staticmethod(decode_anonymous)
@@ -45,6 +47,7 @@ class AerialSensor(Sensor):
         super().__init__(swarm, settings, drops)
         sigma, heading_sigma = settings.aerial_position_sigma, settings.aerial_heading_sigma
         self._noise = np.diag(np.square([sigma, sigma, heading_sigma]))
+        self._gate = float(MODELS[ANONYMOUS].gate(settings.aerial_gate_probability))
 
     @classmethod
     def fault_of(cls, message: AnonymousMessage, map_frame: str) -> str:
@@ -70,6 +73,7 @@ class AerialSensor(Sensor):
         """Convert detections (d,)."""
         shown = about_robots(NOBODY, rows.stamp_ns, rows.pose, rows.covariance, ANONYMOUS)
         shown.reading[:], shown.arrival_ns[:] = rows.number, rows.arrival_ns
+        shown.gate[:] = self._gate
         shown.covariance[rows.covariance[:, 0, 0] == _UNKNOWN_VARIANCE] = self._noise
         take_out_headings(shown, np.isnan(rows.pose[:, 2]))
         return shown

@@ -22,8 +22,9 @@ Kernels that convert camera detections to measurements, see `camera`.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import fields
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,11 +135,13 @@ def cast(
     Returns:
         CAST; or FACE_DOWN or NOT_FLAT, and nothing is written.
     """
+    # Does it lie face up in its plane?
     middle, axes = np.dot(level, position), np.dot(level, rotation)
     if not axes[2, 2] > 0.0:
         return FACE_DOWN
     if not _lies(level, middle, axes, spread, height):
         return NOT_FLAT
+    # Cast rays through its corners to the plane of its height, with their Jacobians.
     ahead, aside, slopes = 0.0, 0.0, np.zeros((3, 6))
     along, across = np.zeros(6), np.zeros(6)
     value[0], value[1] = 0.0, 0.0
@@ -368,6 +371,7 @@ def _outcome(
     detections: NDArray[np.void], k: int, cameras: Cameras, markers: Markers, camera: int, place: int
 ) -> int:
     """Outcome of detection k with the marker at index `place`: valid, or a reason to drop it."""
+    # Whose marker is it, and does the camera see it?
     if place < 0 or markers.id[place] != detections[k].id:
         return _UNKNOWN_ID
     if markers.owner[place] == camera:
@@ -376,6 +380,7 @@ def _outcome(
         return _NO_CAMERA
     if camera >= cameras.robots and markers.owner[place] == NOBODY:
         return _FIXED_ON_FIXED
+    # Is its content known and finite?
     content = detections[k].content
     if not CONTENT_POSITION <= content <= CONTENT_BEARING or (
         content == CONTENT_BEARING and markers.lies[place]
@@ -466,6 +471,7 @@ def _write_spread(sensor: SensorModel, content: int, published: FloatArray, spre
         spread[i, i] = sensor.heading_sigma**2
 
 
+_UNKNOWN_VARIANCE = -1.0  # First element of an unknown covariance
 FROM_OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Rotation from the optical frame to x forward, y left, z up."""
 
@@ -504,6 +510,7 @@ class SightingConverter:
 
     def __init__(self, swarm: Swarm, drops: DropCounts | None = None) -> None:
         self._drops = drops or DropCounts(len(swarm.sources))
+        # Cameras: mounts, calibration, gates; fixed ones have errors of their poses.
         fixed, robots = swarm.cameras, swarm.robots
         mounts: list[CameraMount | FixedCamera] = [robot.camera or CameraMount() for robot in robots]
         mounts += fixed
@@ -522,6 +529,7 @@ class SightingConverter:
             bearing_gate=MODELS[BEARING].gate([model.gate_probability for model in models]),
             variance=np.square([(position, position, yaw) for position, yaw in sigmas]).reshape(-1, 3),
         )
+        # Markers by id: on whom, where, how large.
         owners = sorted(swarm.owner_of.items())
         markers = [owner.marker for _, owner in owners]
         number = {mark.id: k for k, mark in enumerate(swarm.landmarks)}
@@ -585,6 +593,26 @@ class CameraSensor(Sensor):
     def create_reader(cls, topics: int, _known: Known) -> Reader:
         """Create a reader that decodes all messages of a batch at once."""
         return DetectionReader(topics)
+
+    @classmethod
+    def rows(cls, columns: Mapping[str, Any]) -> DetectionRows:
+        """Create readings from columns: those of `DetectionRows`, or the fields of a detection.
+
+        `id` and `position` are needed; without `orientation` a detection is a position, and without
+        `covariance` its noise is that of the camera.
+        """
+        if "detection" in columns:
+            as_given: DetectionRows = super().rows(columns)
+            return as_given
+        detection = np.zeros(len(columns["robot"]), dtype=DETECTION_DTYPE)
+        detection["content"] = CONTENT_POSE if "orientation" in columns else CONTENT_POSITION
+        detection["orientation"][:, 3], detection["covariance"][:, 0, 0] = 1.0, _UNKNOWN_VARIANCE
+        fields = {*columns} & {*(detection.dtype.names or ())}
+        for name in fields:
+            detection[name] = columns[name]
+        others = {name: columns[name] for name in {*columns} - fields}
+        made: DetectionRows = super().rows({**others, "detection": detection})
+        return made
 
     @classmethod
     def nothing(cls) -> DetectionRows:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from functools import partial
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -96,6 +97,7 @@ class FixSensor(Sensor):
         "swarm/fixes", SWARM_FIXES, partial(decode_shared_numbers, widths=(3, 9)), _shared_rows
     )
     in_map = True
+    optional = MappingProxyType({"covariance": 0.0})
 
     decode = staticmethod(decode_fix)
 
@@ -105,6 +107,7 @@ class FixSensor(Sensor):
         sigmas = [(one.position_sigma, one.position_sigma, one.heading_sigma) for one in models]
         self._default = np.array(sigmas).reshape(-1, 3, 1) ** 2 * np.eye(3)
         self._share = np.array([one.systematic_share for one in models])
+        self._gate = MODELS[CARTESIAN].gate([one.gate_probability for one in models])
 
     @classmethod
     def columns(cls, messages: Messages[Any]) -> FixRows:
@@ -126,6 +129,7 @@ class FixSensor(Sensor):
             rows = select(rows, ~unknown)
         fixes = about_robots(rows.robot, rows.stamp_ns, rows.pose, rows.covariance, CARTESIAN)
         fixes.systematic_share[:], fixes.arrival_ns[:] = self._share[rows.robot][:, None], rows.arrival_ns
+        fixes.gate[:] = self._gate[rows.robot]
         take_out_headings(fixes, np.isnan(rows.pose[:, 2]))
         return fixes
 

@@ -7,6 +7,7 @@ accelerations say nothing about a robot that drives on a floor.
 from __future__ import annotations
 
 import math
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -40,6 +41,7 @@ class TurnRateSensor(Sensor):
 
     name, topic, message_type = "imu", "imu", IMU
     only_expected, unit = True, None
+    optional = MappingProxyType({"rate": math.nan})
 
     def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
         super().__init__(swarm, settings, drops)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from functools import partial
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -61,6 +63,7 @@ class OdometrySensor(Sensor):
         "swarm/odom", SWARM_ODOMETRY, partial(decode_shared_numbers, widths=(3,)), _shared_rows
     )
     unit = None
+    optional = MappingProxyType({"twist": math.nan})
 
     def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
         super().__init__(swarm, settings, drops)

@@ -7,6 +7,7 @@ and the other one is not, both change places and the sign. See doc/uwb.md.
 
 from __future__ import annotations
 
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -75,6 +76,7 @@ class RangeSensor(Sensor):
 
     name, topic, message_type = "ranges", "ranges", MESSAGE_TYPE
     only_expected = True
+    optional = MappingProxyType({"reference": 0, "variance": 0.0})
 
     def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
         super().__init__(swarm, settings, drops)

@@ -163,6 +163,47 @@ class Batch:
                 raise TypeError(f"{name} must be {columns.__name__} with columns of equal length")
         return cls(begin_ns, end_ns, rows)
 
+    @classmethod
+    def of_columns(
+        cls, swarm: Swarm, begin_ns: int, now_ns: int, readings: Mapping[str, Mapping[str, Any]]
+    ) -> Batch:
+        """Create a batch from columns by sensor, see `Estimator.step`.
+
+        Args:
+            swarm: Gives the indices of robots and fixed cameras.
+            begin_ns: Instant before which nothing can arrive any more.
+            now_ns: Latest arrival; readings without `arrival_ns` arrive at their stamps, but not later.
+            readings: Columns by the names of sensors.
+
+        Raises:
+            TypeError: There is no such sensor, robot or column, or a column has another length or shape.
+        """
+        names = [one.name for one in swarm.robots] + [one.name for one in swarm.cameras]
+        index = {name: k for k, name in enumerate(names)}
+        rows = {}
+        for name, given in readings.items():
+            if name not in SENSORS:
+                raise TypeError(f"there is no sensor '{name}', only {', '.join(SENSORS)}")
+            columns = dict(given)
+            if "stamp_s" in columns:
+                columns["stamp_ns"] = np.round(1e9 * np.asarray(columns.pop("stamp_s"))).astype(np.int64)
+            if "stamp_ns" not in columns:
+                raise TypeError(f"{name}: the column 'stamp_s' or 'stamp_ns' is missing")
+            stamp_ns = columns["stamp_ns"] = np.atleast_1d(np.asarray(columns["stamp_ns"], dtype=np.int64))
+            robots = -1 if name == AerialSensor.name else columns["robot"]
+            robots = np.broadcast_to(np.asarray(robots), stamp_ns.shape).tolist()
+            unknown = [one for one in robots if isinstance(one, str) and one not in index]
+            if unknown:
+                raise TypeError(f"{name}: there is no robot or camera '{unknown[0]}'")
+            columns["robot"] = np.array(
+                [index[one] if isinstance(one, str) else one for one in robots], dtype=np.int64
+            )
+            columns.setdefault("arrival_ns", np.clip(stamp_ns, begin_ns, now_ns))
+            made = SENSORS[name].rows(columns)
+            rows[name] = select(made, np.argsort(made.arrival_ns, kind="stable"))
+        arrivals_ns = [int(one.arrival_ns[0]) for one in rows.values() if one.robot.size]
+        return cls(min([now_ns, *arrivals_ns]), now_ns, rows)
+
     def __getitem__(self, sensor: str) -> Any:
         """The readings of a sensor."""
         rows = self.rows.get(sensor)

@@ -193,6 +193,10 @@ class SensorSettings(Protocol):
         """Standard deviation of the position of aerial detections without covariance [m]."""
 
     @property
+    def aerial_gate_probability(self) -> float:
+        """Share of good aerial detections that must pass the gate."""
+
+    @property
     def aerial_heading_sigma(self) -> float:
         """Standard deviation of the heading of aerial detections without covariance [rad]."""
 
@@ -229,6 +233,7 @@ class Sensor:
     in_map: ClassVar[bool] = False  #: True if messages must be in the frame `map`
     needs_map: ClassVar[bool] = False  #: True if there are such topics only for a swarm with a map
 
+    optional: ClassVar[Mapping[str, Any]] = {}  #: Values of columns that `rows` may lack
     #: Columns that group readings: a group is used or dropped as a whole. None: never dropped
     unit: ClassVar[tuple[str, ...] | None] = ()
     keeps_units: ClassVar[bool] = False  #: True if readings of one group may arrive in several batches
@@ -299,6 +304,35 @@ class Sensor:
     def nothing(cls) -> Any:
         """Empty readings."""
         return cls.columns(Messages(NO_ROWS, NO_ROWS > 0, []))
+
+    @classmethod
+    def rows(cls, columns: Mapping[str, Any]) -> Any:
+        """Create readings (k,) from columns in any form that NumPy reads.
+
+        Args:
+            columns: By name; `robot`, `stamp_ns` and `arrival_ns` (k,) are arrays. A number stands for all.
+
+        Raises:
+            TypeError: A column is missing or unknown, or has another length or shape.
+        """
+        nothing, count = cls.nothing(), len(columns["robot"])
+        unknown = [name for name in columns if name not in nothing._fields]
+        missing = [name for name in nothing._fields if name not in {*columns, *cls.optional}]
+        if unknown or missing:
+            wrong = f"no column '{unknown[0]}'" if unknown else f"the column '{missing[0]}' is missing"
+            raise TypeError(f"{cls.name}: {wrong}; columns are {', '.join(nothing._fields)}")
+        made = []
+        for name, empty in zip(nothing._fields, nothing, strict=True):
+            column = np.empty((count, *empty.shape[1:]), dtype=empty.dtype)
+            given = columns.get(name, cls.optional.get(name))
+            if empty.dtype == object:
+                column[:] = [*given]
+            elif np.shape(given) not in {(), column.shape} and name in columns:
+                raise TypeError(f"{cls.name}: {name} has shape {np.shape(given)}, not {column.shape}")
+            else:
+                column[:] = given
+            made.append(column)
+        return type(nothing)(*made)
 
     @classmethod
     def kinds(cls) -> tuple[InputKind, ...]:

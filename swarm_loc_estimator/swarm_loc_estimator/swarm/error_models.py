@@ -277,3 +277,6 @@ class FixModel:
     )
     position_sigma: float = number(0.0, "m", 0.0, 1e3, "of x and y, for fixes without covariance; 0: dropped")
     heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "of the heading, for such fixes; 0: it is not used")
+    gate_probability: float = number(
+        0.9999, "1", 0.5, 1.0, "share of good fixes that must pass the gate; 1 passes all"
+    )

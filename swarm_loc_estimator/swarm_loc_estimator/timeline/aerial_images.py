@@ -34,7 +34,6 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.settings import Settings
 
-_GATE = float(gate_threshold(0.9999))
 _MAX_FREE = 200  # Maximum number of unassigned detections among which robots are searched
 _MOVED = 6.0  # Minimum motion of a robot to be searched, in standard deviations; half of it for a turn
 _MAX_DRIFT_M, _MAX_DRIFT_RAD = 0.3, 0.5
@@ -56,6 +55,7 @@ class PictureFusion:
     def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks) -> None:
         self._tracks = tracks
         self._settings = settings
+        self._gate = float(gate_threshold(settings.aerial_gate_probability))
         self._moves = np.array([not robot.stands for robot in swarm.robots], dtype=bool)
         self._limits = TrackedLimits.of(swarm, settings)
         self._miss = min(3.0, -math.log1p(-settings.aerial_detection_probability))
@@ -73,7 +73,7 @@ class PictureFusion:
         robots = np.flatnonzero(state.tracked)
         poses, covariances = estimate.poses[robots], estimate.covariances[robots]
         state.images.see(picture.pose[:, :2], stamp_ns)
-        ratios = log_ratios(poses, covariances, picture, _log_density(picture), _GATE)
+        ratios = log_ratios(poses, covariances, picture, _log_density(picture), self._gate)
         found = assign(ratios, self._settings.aerial_detection_probability, self._settings.aerial_probability)
         sigma = np.sqrt(np.maximum(covariances[:, 0, 0], covariances[:, 1, 1]))
         unseen, in_view = found.place == UNSEEN, state.images.is_in_view(poses[:, :2], 3.0 * sigma)

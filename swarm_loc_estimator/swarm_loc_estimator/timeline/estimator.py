@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -37,7 +37,17 @@ from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.sightings import Recent
 from swarm_loc_estimator.timeline.timeline import HasBudget, Timeline
 
-__all__ = ["Estimate", "Estimator", "Status"]
+__all__ = ["Estimate", "Estimator", "Status", "Step"]
+
+_PARTS = 8  # Into how many parts `step` splits the readings of a horizon
+_LONG_AGO_NS = np.iinfo(np.int64).min // 2
+
+
+class Step(NamedTuple):
+    """What `Estimator.step` returns."""
+
+    estimate: Estimate  #: Poses of all robots at the instant
+    dropped: dict[str, int]  #: Number of readings and measurements that this step did not use, by reason
 
 
 class Estimator:
@@ -245,6 +255,42 @@ class Estimator:
             for accumulator in self._gathering.values():
                 accumulator.forget_before(needed_ns if accumulator is self._sweeps else oldest_ns)
         return self._estimate(now_ns)
+
+    def step(
+        self,
+        now_s: float | None = None,
+        *,
+        now_ns: int | None = None,
+        **readings: Mapping[str, Any],
+    ) -> Step:
+        """Take readings as columns and return the estimate at an instant, for scripts and notebooks.
+
+        Readings may be of any time span: they are received and fused part by part, in order of their
+        arrival, as live. Those without `arrival_ns` arrive at their stamps, or late ones at the last step.
+
+        Args:
+            now_s: The instant [s].
+            now_ns: The same in nanoseconds; one of both must be given.
+            readings: Columns by the names of sensors: `robot` (k,) names or indices, or one for all;
+                `stamp_s` [s] or `stamp_ns` (k,); and the columns of the sensor, such as
+                `odometry={"robot": "r1", "stamp_s": [0.0, 0.1], "pose": [[0, 0, 0], [0.02, 0, 0]]}`.
+
+        Raises:
+            TypeError: Not one instant is given, or a sensor, robot or column is wrong; it says which.
+        """
+        if (now_s is None) == (now_ns is None):
+            raise TypeError("step needs either now_s or now_ns")
+        end_ns = round(1e9 * now_s) if now_s is not None else int(now_ns or 0)
+        before, begin_ns = Counter(self.drops), min(end_ns if self._now_ns is None else self._now_ns, end_ns)
+        first_ns = begin_ns if self._now_ns is not None else _LONG_AGO_NS
+        batch = self.convert(Batch.of_columns(self.swarm, first_ns, end_ns, readings))
+        pauses_ns = np.arange(batch.begin_ns, batch.end_ns, self._horizon_ns // _PARTS)
+        *parts, last = batch.until_each(pauses_ns)
+        for part in parts:
+            self.receive(part)
+            self.tick(part.end_ns)
+        self.receive(last)
+        return Step(self.tick(end_ns), dict(Counter(self.drops) - before))
 
     def _check_clock(self, now_ns: int) -> int:
         """Reset if the clock jumped back, as when a bag loops; return the newest time since the reset."""

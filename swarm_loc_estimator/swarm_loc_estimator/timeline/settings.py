@@ -141,6 +141,9 @@ class Settings:
     aerial_detection_probability: float = number(
         0.95, "1", 0.1, 0.999, "probability that a robot in an aerial image is detected"
     )
+    aerial_gate_probability: float = number(
+        0.9999, "1", 0.5, 1.0, "share of good aerial detections that must pass the gate; 1 passes all"
+    )
     aerial_scale_sigma: float = number(
         0.02, "1", 1e-4, 1.0, "relative standard deviation of the scale of aerial images"
     )
