@@ -17,27 +17,13 @@ from scipy.stats import chi2
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.streams import (
-    EachReader,
-    MessageBatch,
-    MessageColumns,
-    SerializedMessage,
-)
+from swarm_loc_estimator.common.messages.streams import MessageBatch, Messages, SerializedMessage
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
 from swarm_loc_estimator.filter.models import MODELS, SCAN, MeasurementModel, Prediction, register
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import SENSORS
-from swarm_loc_estimator.sensors.sensor import (
-    NO_ROWS,
-    Converter,
-    DropCounts,
-    InputKind,
-    Known,
-    Sensor,
-    SensorSettings,
-)
-from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.sensors.sensor import Sensor
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Policy, Settings
@@ -77,45 +63,28 @@ class RangeRows(NamedTuple):
     arrival_ns: IntArray
 
 
-def columns(
-    found: MessageColumns[Range], batch: MessageBatch, robot: IntArray, _known: Known
-) -> tuple[RangeRows, dict[str, int]]:
-    target = np.array([one.target for one in found.messages], dtype=np.int64)
-    distance = np.array([one.distance for one in found.messages], dtype=float)
-    stamp_ns, arrival_ns = found.stamp_ns[found.valid], batch.log_ns[found.valid]
-    return RangeRows(robot[found.valid], stamp_ns, target, distance, arrival_ns), {}
+class RangeSensor(Sensor):
+    """Takes the place of the sensor of this name."""
 
+    name, topic, message_type, model = "ranges", "ranges", "my_msgs/msg/Range", RANGE.number
 
-def create_converter(swarm: Swarm, _settings: SensorSettings, _drops: DropCounts) -> Converter:
-    anchors = np.array([(mark.x, mark.y, 0.0) for mark in swarm.landmarks])
+    @classmethod
+    def decode(cls, data: bytes) -> Range:
+        return Range(*LAYOUT.unpack(data))
 
-    def convert(rows: RangeRows) -> Measurements:
-        out, anchor = Measurements.empty(rows.robot.size), -1 - rows.target
-        out.stamp_ns[:], out.model[:], out.gate[:] = rows.stamp_ns, RANGE.number, RANGE.gate(0.999)
-        out.received_from[:] = out.observer[:] = rows.robot
+    @classmethod
+    def columns(cls, messages: Messages[Range]) -> RangeRows:
+        target = np.array([one.target for one in messages.decoded], dtype=np.int64)
+        distance = np.array([one.distance for one in messages.decoded], dtype=float)
+        return RangeRows(messages.robot, messages.stamp_ns, target, distance, messages.arrival_ns)
+
+    def measure(self, rows: RangeRows) -> Measurements:
+        out, anchor = self.measurements(rows), -1 - rows.target
+        anchors = np.array([(mark.x, mark.y, 0.0) for mark in self.swarm.landmarks])
         out.target[:], out.landmark[:] = np.maximum(rows.target, NOBODY), np.maximum(anchor, NOBODY)
         out.marker[:] = np.where(rows.target[:, None] < 0, anchors[anchor], 0.0)
         out.value[:, 0], out.covariance[:] = rows.distance, np.diag([SIGMA_M**2, 1.0, 1.0])
-        out.arrival_ns[:] = rows.arrival_ns
         return out
-
-    return convert
-
-
-RANGES = Sensor(
-    "ranges",
-    RangeRows(NO_ROWS, NO_ROWS, NO_ROWS, np.zeros(0), NO_ROWS),
-    (
-        InputKind(
-            "ranges",
-            "ranges",
-            "my_msgs/msg/Range",
-            lambda n, _: EachReader(n, lambda data: Range(*LAYOUT.unpack(data))),
-            columns,
-        ),
-    ),
-    create_converter,
-)
 
 
 def ranges(world: World, seed: int, outliers: float = 0.0) -> list[tuple[int, Range]]:
@@ -142,7 +111,7 @@ ALL = pytest.mark.parametrize("settings", [IN_ORDER, TOGETHER, SPARSE], ids=["or
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(MODELS, RANGE.number, RANGE)
-    monkeypatch.setitem(SENSORS, RANGES.name, RANGES)
+    monkeypatch.setitem(SENSORS, RangeSensor.name, RangeSensor)
 
 
 def world_of(seed: int) -> World:
@@ -258,32 +227,29 @@ def test_malformed_messages_are_counted_and_the_others_are_read() -> None:
     assert part.rows["ranges"].robot.size == 0
 
 
-@pytest.mark.parametrize("place", ["decoder", "columns", "converter", "measurements"])
+@pytest.mark.parametrize("place", ["decode", "columns", "measure", "measurements"])
 def test_an_error_of_a_sensor_costs_its_own_readings_only_and_is_named(
     place: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> Any:
         raise ZeroDivisionError("by my sensor")
 
-    def create(*_: object) -> Converter:
-        nothing: Any = [None] * len(Measurements._fields)
-        return fail if place == "converter" else lambda _: Measurements(*nothing)
+    class Broken(RangeSensor):
+        pass
 
-    (kind,) = RANGES.kinds
-    if place == "decoder":
-        broken = replace(RANGES, kinds=(replace(kind, create_reader=lambda n, _: EachReader(n, fail)),))
-    elif place == "columns":
-        broken = replace(RANGES, kinds=(replace(kind, columns_of=fail),))
+    if place == "measurements":
+        nothing: Any = [None] * len(Measurements._fields)
+        monkeypatch.setattr(Broken, "measure", lambda *_: Measurements(*nothing))
     else:
-        broken = replace(RANGES, create_converter=create)
-    monkeypatch.setitem(SENSORS, RANGES.name, broken)
+        monkeypatch.setattr(Broken, place, fail)
+    monkeypatch.setitem(SENSORS, RangeSensor.name, Broken)
     world = world_of(960)
     measured = ranges(world, 5)
     error = "AttributeError" if place == "measurements" else "ZeroDivisionError"
     with pytest.warns(RuntimeWarning, match=f"the code of the sensor 'ranges' raised {error}"):
         estimator, estimates = run(world, measured, IN_ORDER)
     assert estimator.drops == {f"ranges_{error}": len(measured)}
-    monkeypatch.setitem(SENSORS, RANGES.name, RANGES)
+    monkeypatch.setitem(SENSORS, RangeSensor.name, RangeSensor)
     np.testing.assert_array_equal(estimates[-1].poses, run(world, [], IN_ORDER)[1][-1].poses)
 
 
@@ -315,19 +281,15 @@ def test_a_sensor_without_any_message_in_a_bag_is_named() -> None:
 def test_measurements_that_no_model_can_use_are_dropped_and_counted(
     field: str, value: float | str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def create(swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> Converter:
-        convert = create_converter(swarm, settings, drops)
-
-        def spoiled(rows: RangeRows) -> Measurements:
-            found: Measurements = convert(rows)
+    class Spoiled(RangeSensor):
+        def measure(self, rows: RangeRows) -> Measurements:
+            found = super().measure(rows)
             getattr(found, field)[:] = getattr(found, value) if isinstance(value, str) else value
             return found
 
-        return spoiled
-
     world = world_of(940)
     measured = ranges(world, 4)
-    monkeypatch.setitem(SENSORS, RANGES.name, replace(RANGES, create_converter=create))
+    monkeypatch.setitem(SENSORS, RangeSensor.name, Spoiled)
     estimator, estimates = run(world, measured, IN_ORDER)
     assert estimator.drops["bad_measurement"] == len(measured)
     np.testing.assert_array_equal(estimates[-1].poses, run(world, [], IN_ORDER)[1][-1].poses)
