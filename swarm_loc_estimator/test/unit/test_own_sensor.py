@@ -70,15 +70,18 @@ class RangeSensor(Sensor):
 
     @classmethod
     def decode(cls, data: bytes) -> Range:
+        """Read a message."""
         return Range(*LAYOUT.unpack(data))
 
     @classmethod
     def columns(cls, messages: Messages[Range]) -> RangeRows:
+        """Messages in columns."""
         target = np.array([one.target for one in messages.decoded], dtype=np.int64)
         distance = np.array([one.distance for one in messages.decoded], dtype=float)
         return RangeRows(messages.robot, messages.stamp_ns, target, distance, messages.arrival_ns)
 
     def measure(self, rows: RangeRows) -> Measurements:
+        """A measurement per range."""
         out, anchor = self.measurements(rows), -1 - rows.target
         anchors = np.array([(mark.x, mark.y, 0.0) for mark in self.swarm.landmarks])
         out.target[:], out.landmark[:] = np.maximum(rows.target, NOBODY), np.maximum(anchor, NOBODY)
