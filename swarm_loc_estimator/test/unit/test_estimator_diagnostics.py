@@ -8,8 +8,7 @@ import pytest
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
 from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE
-from swarm_loc_estimator.filter.measurements import Loss
+from swarm_loc_estimator.filter.measurements import Loss, Measurements, Verdict
 from swarm_loc_estimator.nodes.estimator_diagnostics import Diagnostics, Recent, TickCost, load_report
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.ingest import Ingest
@@ -17,7 +16,6 @@ from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.contradictions import LossReport
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
-from swarm_loc_estimator.timeline.verdicts import Verdict
 
 SECOND = 1_000_000_000
 SWARM = Swarm((Robot("a", odometry=OdometryModel(timeout_s=1.0)), Robot("b", camera=None)))
@@ -90,8 +88,8 @@ def estimate(now_ns: int, *status: Status) -> Estimate:
 
 def recent(*rows: tuple[int, Verdict, float]) -> Recent:
     """Measurements: who sent it, what was thought of it, its NIS."""
-    measurements = np.zeros(len(rows), MEASUREMENT_DTYPE)
-    measurements["received_from"] = [row[0] for row in rows]
+    measurements = Measurements.empty(len(rows))
+    measurements.received_from[:] = [row[0] for row in rows]
     return (
         measurements,
         np.array([row[1] for row in rows], np.uint8),

@@ -17,34 +17,13 @@ from scipy.stats import chi2
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.messages.streams import (
-    EachReader,
-    MessageBatch,
-    MessageColumns,
-    SerializedMessage,
-)
-from swarm_loc_estimator.filter.measurement_model import (
-    MEASUREMENT_DTYPE,
-    MODELS,
-    NOBODY,
-    MeasurementArray,
-    MeasurementModel,
-    Prediction,
-    register,
-)
+from swarm_loc_estimator.common.messages.streams import MessageBatch, Messages, SerializedMessage
+from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
+from swarm_loc_estimator.filter.models import MODELS, SCAN, MeasurementModel, Prediction, register
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.sensors.ingest import Ingest
 from swarm_loc_estimator.sensors.registry import SENSORS
-from swarm_loc_estimator.sensors.sensor import (
-    NO_ROWS,
-    Converter,
-    DropCounts,
-    InputKind,
-    Known,
-    Sensor,
-    SensorSettings,
-)
-from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.sensors.sensor import Sensor
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Policy, Settings
@@ -53,15 +32,15 @@ BAG = Path(__file__).parents[3] / "bags" / "eight_one_robot_slow"
 SIGMA_M = 0.03
 
 
-def predict_range(one: MeasurementArray, observer: FloatArray, target: FloatArray) -> Prediction:
-    (sx, sy, _), (mx, my, _) = se2.compose(observer, one["sensor"][0]), se2.compose(target, one["marker"][0])
+def predict_range(one: Measurements, observer: FloatArray, target: FloatArray) -> Prediction:
+    (sx, sy, _), (mx, my, _) = se2.compose(observer, one.sensor), se2.compose(target, one.marker)
     distance = np.hypot(mx - sx, my - sy)
     toward = np.array([[mx - sx, my - sy]]) / distance
     moved_observer, moved_target = ([[1.0, 0.0, -y], [0.0, 1.0, x]] for x, y in ((sx, sy), (mx, my)))
     return Prediction(np.array([distance]), -toward @ moved_observer, toward @ moved_target)
 
 
-RANGE = MeasurementModel("range", 100, 1, predict_range, lambda one, value: one["value"][0, :1] - value)
+RANGE = MeasurementModel("range", 100, ("distance [m]",), (False,), 1, predict_range)
 LAYOUT = struct.Struct("<qqd")
 
 
@@ -84,44 +63,31 @@ class RangeRows(NamedTuple):
     arrival_ns: IntArray
 
 
-def columns(
-    found: MessageColumns[Range], batch: MessageBatch, robot: IntArray, _known: Known
-) -> tuple[RangeRows, dict[str, int]]:
-    target = np.array([one.target for one in found.messages], dtype=np.int64)
-    distance = np.array([one.distance for one in found.messages], dtype=float)
-    stamp_ns, arrival_ns = found.stamp_ns[found.valid], batch.log_ns[found.valid]
-    return RangeRows(robot[found.valid], stamp_ns, target, distance, arrival_ns), {}
+class RangeSensor(Sensor):
+    """Takes the place of the sensor of this name."""
 
+    name, topic, message_type, model = "ranges", "ranges", "my_msgs/msg/Range", RANGE.number
 
-def create_converter(swarm: Swarm, _settings: SensorSettings, _drops: DropCounts) -> Converter:
-    anchors = np.array([(mark.x, mark.y, 0.0) for mark in swarm.landmarks])
+    @classmethod
+    def decode(cls, data: bytes) -> Range:
+        """Read a message."""
+        return Range(*LAYOUT.unpack(data))
 
-    def convert(rows: RangeRows) -> Measured:
-        out, anchor = np.zeros(rows.robot.size, dtype=MEASUREMENT_DTYPE), -1 - rows.target
-        out["stamp_ns"], out["kind"], out["gate"] = rows.stamp_ns, RANGE.number, RANGE.gate(0.999)
-        out["observer"], out["target"] = rows.robot, np.maximum(rows.target, NOBODY)
-        out["landmark"] = np.maximum(anchor + 1, 0)
-        out["marker"] = np.where(rows.target[:, None] < 0, anchors[anchor], 0.0)
-        out["value"][:, 0], out["covariance"] = rows.distance, np.diag([SIGMA_M**2, 1.0, 1.0])
-        return Measured(out, rows.arrival_ns)
+    @classmethod
+    def columns(cls, messages: Messages[Range]) -> RangeRows:
+        """Messages in columns."""
+        target = np.array([one.target for one in messages.decoded], dtype=np.int64)
+        distance = np.array([one.distance for one in messages.decoded], dtype=float)
+        return RangeRows(messages.robot, messages.stamp_ns, target, distance, messages.arrival_ns)
 
-    return convert
-
-
-RANGES = Sensor(
-    "ranges",
-    RangeRows(NO_ROWS, NO_ROWS, NO_ROWS, np.zeros(0), NO_ROWS),
-    (
-        InputKind(
-            "ranges",
-            "ranges",
-            "my_msgs/msg/Range",
-            lambda n, _: EachReader(n, lambda data: Range(*LAYOUT.unpack(data))),
-            columns,
-        ),
-    ),
-    create_converter,
-)
+    def measure(self, rows: RangeRows) -> Measurements:
+        """A measurement per range."""
+        out, anchor = self.measurements(rows), -1 - rows.target
+        anchors = np.array([(mark.x, mark.y, 0.0) for mark in self.swarm.landmarks])
+        out.target[:], out.landmark[:] = np.maximum(rows.target, NOBODY), np.maximum(anchor, NOBODY)
+        out.marker[:] = np.where(rows.target[:, None] < 0, anchors[anchor], 0.0)
+        out.value[:, 0], out.covariance[:] = rows.distance, np.diag([SIGMA_M**2, 1.0, 1.0])
+        return out
 
 
 def ranges(world: World, seed: int, outliers: float = 0.0) -> list[tuple[int, Range]]:
@@ -148,7 +114,7 @@ ALL = pytest.mark.parametrize("settings", [IN_ORDER, TOGETHER, SPARSE], ids=["or
 @pytest.fixture(autouse=True)
 def registered(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(MODELS, RANGE.number, RANGE)
-    monkeypatch.setitem(SENSORS, RANGES.name, RANGES)
+    monkeypatch.setitem(SENSORS, RangeSensor.name, RangeSensor)
 
 
 def world_of(seed: int) -> World:
@@ -236,9 +202,9 @@ def test_outliers_are_gated_with_the_one_degree_of_freedom_of_the_sensor(setting
 def test_a_model_that_fails_is_gated_and_leaves_poses_finite(
     settings: Settings, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def predict(one: MeasurementArray, observer: FloatArray, target: FloatArray) -> Prediction:
+    def predict(one: Measurements, observer: FloatArray, target: FloatArray) -> Prediction:
         found = predict_range(one, observer, target)
-        return found if one["landmark"][0] else found._replace(value=np.array([np.nan]))
+        return found if one.landmark >= 0 else found._replace(value=np.array([np.nan]))
 
     world = world_of(930)
     monkeypatch.setitem(MODELS, RANGE.number, replace(RANGE, predict=predict))
@@ -264,31 +230,29 @@ def test_malformed_messages_are_counted_and_the_others_are_read() -> None:
     assert part.rows["ranges"].robot.size == 0
 
 
-@pytest.mark.parametrize("place", ["decoder", "columns", "converter", "measurements"])
+@pytest.mark.parametrize("place", ["decode", "columns", "measure", "measurements"])
 def test_an_error_of_a_sensor_costs_its_own_readings_only_and_is_named(
     place: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object) -> Any:
         raise ZeroDivisionError("by my sensor")
 
-    def create(*_: object) -> Converter:
-        return fail if place == "converter" else lambda rows: Measured(None, rows.arrival_ns)  # type: ignore[arg-type]
+    class Broken(RangeSensor):
+        pass
 
-    (kind,) = RANGES.kinds
-    if place == "decoder":
-        broken = replace(RANGES, kinds=(replace(kind, create_reader=lambda n, _: EachReader(n, fail)),))
-    elif place == "columns":
-        broken = replace(RANGES, kinds=(replace(kind, columns_of=fail),))
+    if place == "measurements":
+        nothing: Any = [None] * len(Measurements._fields)
+        monkeypatch.setattr(Broken, "measure", lambda *_: Measurements(*nothing))
     else:
-        broken = replace(RANGES, create_converter=create)
-    monkeypatch.setitem(SENSORS, RANGES.name, broken)
+        monkeypatch.setattr(Broken, place, fail)
+    monkeypatch.setitem(SENSORS, RangeSensor.name, Broken)
     world = world_of(960)
     measured = ranges(world, 5)
-    error = "TypeError" if place == "measurements" else "ZeroDivisionError"
+    error = "AttributeError" if place == "measurements" else "ZeroDivisionError"
     with pytest.warns(RuntimeWarning, match=f"the code of the sensor 'ranges' raised {error}"):
         estimator, estimates = run(world, measured, IN_ORDER)
     assert estimator.drops == {f"ranges_{error}": len(measured)}
-    monkeypatch.setitem(SENSORS, RANGES.name, RANGES)
+    monkeypatch.setitem(SENSORS, RangeSensor.name, RangeSensor)
     np.testing.assert_array_equal(estimates[-1].poses, run(world, [], IN_ORDER)[1][-1].poses)
 
 
@@ -304,13 +268,13 @@ def test_a_sensor_without_any_message_in_a_bag_is_named() -> None:
 @pytest.mark.parametrize(
     ("field", "value"),
     [
-        ("kind", 77),
+        ("model", 77),
         ("observer", 99),
         ("observer", -2),
         ("target", "observer"),
         ("target", 99),
         ("landmark", 99),
-        ("landmark", -1),
+        ("landmark", -2),
         ("sensor", np.nan),
         ("marker", np.inf),
         ("stamp_variance", -1.0),
@@ -320,40 +284,42 @@ def test_a_sensor_without_any_message_in_a_bag_is_named() -> None:
 def test_measurements_that_no_model_can_use_are_dropped_and_counted(
     field: str, value: float | str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def create(swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> Converter:
-        convert = create_converter(swarm, settings, drops)
-
-        def spoiled(rows: RangeRows) -> Measured:
-            found: Measured = convert(rows)
-            found.measurements[field] = found.measurements[value] if isinstance(value, str) else value
+    class Spoiled(RangeSensor):
+        def measure(self, rows: RangeRows) -> Measurements:
+            found = super().measure(rows)
+            getattr(found, field)[:] = getattr(found, value) if isinstance(value, str) else value
             return found
-
-        return spoiled
 
     world = world_of(940)
     measured = ranges(world, 4)
-    monkeypatch.setitem(SENSORS, RANGES.name, replace(RANGES, create_converter=create))
+    monkeypatch.setitem(SENSORS, RangeSensor.name, Spoiled)
     estimator, estimates = run(world, measured, IN_ORDER)
     assert estimator.drops["bad_measurement"] == len(measured)
     np.testing.assert_array_equal(estimates[-1].poses, run(world, [], IN_ORDER)[1][-1].poses)
 
 
-@pytest.mark.parametrize("number", [*MODELS, RANGE.number])
+@pytest.mark.parametrize("number", [*(one.number for one in MODELS.values() if one.predict), RANGE.number])
 @pytest.mark.parametrize("seed", range(3))
 def test_jacobians_of_all_models_agree_with_finite_differences(number: int, seed: int) -> None:
     model, rng, step = MODELS[number], np.random.default_rng(seed), 1e-6
-    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
-    one["kind"], one["observer"], one["target"], one["has_heading"] = number, 0, 1, 1
-    one["sensor"], one["marker"], poses = *rng.normal(size=(2, 1, 3)), rng.normal(size=(2, 3))
-    predicted = model.predict(one, *poses)
-    assert 1 <= model.degrees_of_freedom <= predicted.value.size <= 3
+    many = Measurements.empty(1)
+    many.model[:], many.observer[:], many.target[:], many.has_heading[:] = number, 0, 1, True
+    many.sensor[:], many.marker[:], poses = *rng.normal(size=(2, 1, 3)), rng.normal(size=(2, 3))
+    many.height[:], many.reference[:] = rng.normal(size=2), rng.normal(size=3)
+    one = many.row(0)
+    predicted = model.predicted(one, *poses)
+    assert 1 <= model.gated <= predicted.value.size <= 3
     for side, jacobian in enumerate((predicted.observer_jacobian, predicted.target_jacobian)):
         for j in range(3):
             moved = poses.copy()
             moved[side] = se2.compose(se2.exp(step * np.eye(3)[j]), moved[side])
-            one["value"][0, : predicted.value.size] = model.predict(one, *moved).value
-            slope = model.innovation(one, predicted.value) / step
+            slope = model.innovation(model.predicted(one, *moved).value, predicted.value) / step
             np.testing.assert_allclose(jacobian[:, j], slope, atol=2e-5)
+
+
+def test_a_model_whose_measurements_become_others_has_no_prediction() -> None:
+    with pytest.raises(ValueError, match="measurements of the model 'scan' have no prediction"):
+        MODELS[SCAN].predicted(Measurements.empty(1).row(0), np.zeros(3), np.zeros(3))
 
 
 def test_a_number_stands_for_one_model() -> None:
@@ -361,7 +327,7 @@ def test_a_number_stands_for_one_model() -> None:
         register(RANGE)
 
 
-@pytest.mark.parametrize("degrees", [0, 4])
-def test_a_model_has_one_to_three_degrees_of_freedom(degrees: int) -> None:
-    with pytest.raises(ValueError, match=f"'range' has {degrees} degrees of freedom but must have 1, 2 or 3"):
-        register(replace(RANGE, number=101, degrees_of_freedom=degrees))
+@pytest.mark.parametrize("gated", [0, 4])
+def test_a_model_gates_one_to_three_components(gated: int) -> None:
+    with pytest.raises(ValueError, match=f"'range' gates {gated} components but must gate 1, 2 or 3"):
+        register(replace(RANGE, number=101, gated=gated))

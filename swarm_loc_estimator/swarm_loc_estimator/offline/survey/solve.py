@@ -266,9 +266,7 @@ def _by_robots(problem: SurveyProblem, start: Start, robot: int) -> list[FloatAr
     """Transforms of a robot's track by sightings with heading, between it and placed robots."""
     sightings = problem.sightings
     placed = np.isfinite(start.transform[:, 0])
-    seen_by = np.flatnonzero(
-        (sightings.target == robot) & placed[sightings.observer] & sightings.has_heading
-    )
+    seen_by = np.flatnonzero((sightings.target == robot) & placed[sightings.observer] & sightings.has_heading)
     observers = se2.compose(start.transform[sightings.observer[seen_by]], problem.tracks[0, seen_by])
     markers = _seen_at(problem, seen_by, observers)
     bodies = se2.compose(markers, se2.inverse(sightings.marker[seen_by]))
