@@ -26,7 +26,7 @@ from swarm_loc_estimator.common.messages.poses import SwarmPosesEncoder
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import save_map
-from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.swarm.error_models import LidarModel
 from swarm_loc_estimator.swarm.swarm import Anchor, Robot, Swarm, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

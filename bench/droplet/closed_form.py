@@ -19,8 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.numerics import wrap
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.infrared.brightness import curve_at, distance_at, expected_brightness
 from swarm_loc_estimator.infrared.search import DARKEST, IrOutcome, IrSolutions, checked, no_solutions
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains

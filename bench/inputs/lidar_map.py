@@ -41,9 +41,9 @@ from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.messages import decode_scan
 from swarm_loc_estimator.offline.metrics import is_misleading, nees
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.sensors.lidar import ScanRows
 from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimate import Status

@@ -23,7 +23,7 @@ from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.offline.calibration.recording import Recording
 from swarm_loc_estimator.offline.metrics import Errors, compare
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.sensors.registry import InputConverter
+from swarm_loc_estimator.sensors.inputs import InputConverter
 from swarm_loc_estimator.swarm.calibration_states import TURN_BIAS
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm

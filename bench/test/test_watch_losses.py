@@ -12,7 +12,7 @@ from playwright.sync_api import Browser
 
 from bench.watch.browser import WatchedPage
 from bench.watch.watched_swarm import WatchedSwarm
-from swarm_loc_estimator.filter.measurements import Loss
+from swarm_loc_estimator.filter.measurements import LossReason
 from swarm_loc_estimator.offline.report.report import recorded
 from swarm_loc_estimator.watch.page import page as page_of
 
@@ -22,7 +22,7 @@ MESSAGE = "document.getElementById('message').textContent"
 
 @pytest.mark.parametrize("why", CAUSES, ids=lambda why: why.name.lower())
 def test_the_page_says_why_a_robot_is_lost(
-    page: WatchedPage, swarm: WatchedSwarm, why: Loss, tmp_path: Path
+    page: WatchedPage, swarm: WatchedSwarm, why: LossReason, tmp_path: Path
 ) -> None:
     page.page.click("#counts button:has-text('waiting')")
     page.until(f"watch.selected === {WAITING}")
@@ -39,7 +39,7 @@ def test_the_page_says_why_a_robot_is_lost(
 
 
 @pytest.mark.parametrize("why", CAUSES, ids=lambda why: why.name.lower())
-def test_a_recording_says_why_a_robot_is_lost(browser: Browser, why: Loss, tmp_path: Path) -> None:
+def test_a_recording_says_why_a_robot_is_lost(browser: Browser, why: LossReason, tmp_path: Path) -> None:
     lost = lose(why, tmp_path)
     file = tmp_path / "run.html"
     file.write_text(page_of(recorded(lost.result)), encoding="utf-8")

@@ -14,7 +14,7 @@ from swarm_loc_drivers.sim.render.rigs import Arena
 from swarm_loc_drivers.sim.run import START_NS, Trajectories
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.sensors.camera import DetectionRows
-from swarm_loc_estimator.sensors.registry import Batch
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, located

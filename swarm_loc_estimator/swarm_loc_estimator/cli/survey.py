@@ -32,7 +32,7 @@ from swarm_loc_estimator.doctor.evidence import Evidence
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
 from swarm_loc_estimator.offline.recorded_bag import same_type
 from swarm_loc_estimator.offline.survey.survey import draw, survey
-from swarm_loc_estimator.sensors.registry import kinds
+from swarm_loc_estimator.sensors.inputs import kinds
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
 _LIVE_S = 180.0

@@ -27,11 +27,10 @@ from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.offline.recorded_bag import same_type
 from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
+from swarm_loc_estimator.sensors.inputs import SENSORS
 from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.sensors.registry import SENSORS
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot
-from swarm_loc_estimator.timeline.contradictions import Contradicted, Contradiction
-from swarm_loc_estimator.timeline.estimate import Status
+from swarm_loc_estimator.timeline.estimate import Contradicted, Contradiction, Status
 
 CAMERA_INFO, IMAGE, COMPRESSED_IMAGE = (
     f"sensor_msgs/msg/{name}" for name in ("CameraInfo", "Image", "CompressedImage")

@@ -21,7 +21,7 @@ from swarm_loc_estimator.doctor.contents import (
 from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, Message
 from swarm_loc_estimator.doctor.topics import DIAGNOSTICS, check_clocks, check_frames, check_topics
 from swarm_loc_estimator.offline.recorded_bag import Progress, renamed_topics, same_type
-from swarm_loc_estimator.sensors.registry import input_topics, kinds
+from swarm_loc_estimator.sensors.inputs import input_topics, kinds
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 CHECKS = (check_topics, check_clocks, check_frames, check_pictures, check_motion, check_contents)

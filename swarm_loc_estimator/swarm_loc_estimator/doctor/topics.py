@@ -13,8 +13,7 @@ from swarm_loc_estimator.common.messages.cdr import TRANSFORMS
 from swarm_loc_estimator.doctor.evidence import SETTINGS, Evidence, Finding, Heard, decoded
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.offline.recorded_bag import same_type
-from swarm_loc_estimator.sensors.ingest import CLOCKS_APART_S
-from swarm_loc_estimator.sensors.registry import InputTopic
+from swarm_loc_estimator.sensors.inputs import CLOCKS_APART_S, InputTopic
 
 _HOUR_S = 3600.0
 _AHEAD_S = 0.05

@@ -62,21 +62,22 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.se2_scalar import between, composed, wrap
-from swarm_loc_estimator.common.small_matrix import (
+from swarm_loc_estimator.common.numerics import (
     add_scaled,
     assign,
     assign_matrix,
+    between,
     cholesky3,
+    composed,
     factor_numbers,
+    wrap,
 )
-from swarm_loc_estimator.filter.belief import BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.filter.integrity import find_pair
 from swarm_loc_estimator.filter.measurements import Measurements
 from swarm_loc_estimator.filter.models import POLAR
+from swarm_loc_estimator.filter.state import PAIR_ROWS, BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.odometry.track_arrays import OdometrySample
 
-PAIR_ROWS = 10  # Rows of three numbers stored per pair
 _MEAN, _OBSERVER, _TARGET, _FUSED, _VARIANCE, _RANDOM, _SYSTEMATIC, _NOISE = 0, 1, 2, 3, 6, 7, 8, 9
 """The mean z; the poses of both robots on their tracks; the rows of L; the variances of their relative pose
 after the update; w; s; the accumulated variances of the two tracks, and an unused number."""

@@ -31,10 +31,9 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays, covariance_within
-from swarm_loc_estimator.filter.measurements import Loss, Measurements
+from swarm_loc_estimator.filter.measurements import LossReason, Measurements
 from swarm_loc_estimator.filter.models import POLAR, has_kernel
-from swarm_loc_estimator.filter.prediction import LOG_SCALES, WINDOWS
+from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, IntegrityArrays, covariance_within
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW
 from swarm_loc_estimator.swarm.error_models import SensorModel
 
@@ -181,7 +180,7 @@ def source_of(measurements: Measurements, k: int, belief: BeliefArrays) -> int:
 
 _POSITION_SIGMA, _BEARING_SIGMA, _HEADING_SIGMA, _STAMP_SIGMA = 0.004, 0.01, 0.03, 0.03
 """One unit of inflation [m], [rad], [rad], [s]."""
-_SUSPECT_UNITS, MAX_UNITS = 2.0, 5.0
+MAX_UNITS = 5.0
 
 
 @inlined_njit
@@ -214,11 +213,6 @@ def inflate_noise(belief: BeliefArrays, observer: int) -> bool:
     return raised
 
 
-def inflate_all_noise(state: IntegrityArrays) -> None:
-    """Inflate the noise of all robots, because their description has proved wrong."""
-    np.maximum(state.noise_inflation, _SUSPECT_UNITS, out=state.noise_inflation)
-
-
 def with_noise_inflation(sensor: SensorModel, units: float) -> SensorModel:
     """A sensor model with the noise inflation included."""
     unit_of = {
@@ -238,7 +232,6 @@ def with_noise_inflation(sensor: SensorModel, units: float) -> SensorModel:
 
 _SUSPECT = 7.5  # Fault score from which a robot is not reported as tracked
 
-_SOURCES = 16
 _OUTLIER = 6.0
 _MAX_WEIGHT = 3.0
 _UNEXPLAINED_WEIGHT = 2.0
@@ -257,45 +250,6 @@ _INLIER_WEIGHT = 0.25
 _ONE_IMAGE_NS = 20_000_000
 _REPORTED_NS = 3_000_000_000
 _INDEPENDENT_NS = 100_000_000  # Measurements of a pair that follow each other faster share their errors
-
-
-def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
-    """All fault scores zero, no pair known."""
-    return IntegrityArrays(
-        # pairs of observer and source
-        source=np.full((robots, _SOURCES), -1),
-        source_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
-        counted_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
-        outlier=np.zeros((robots, _SOURCES), dtype=bool),
-        unexplained=np.zeros((robots, _SOURCES), dtype=bool),
-        trending=np.zeros((robots, _SOURCES), dtype=bool),
-        evidence=np.zeros((robots, _SOURCES)),
-        whitened=np.zeros((robots, _SOURCES, 2)),
-        squares=np.zeros((robots, _SOURCES)),
-        looks=np.zeros((robots, _SOURCES), dtype=np.int64),
-        # robots and landmarks
-        fault_score=np.zeros(robots + landmarks),
-        confirmations=np.zeros(robots, dtype=np.int64),
-        confirmed_ns=np.full(robots, NEVER_NS // 2),
-        gated_in_a_row=np.zeros(robots, dtype=np.int64),
-        gated_source=np.full(robots, -1),
-        gated_ns=np.full(robots, NEVER_NS // 2),
-        gated_fixes=np.zeros(robots, dtype=np.int64),
-        gated_fix_ns=np.full(robots, NEVER_NS // 2),
-        noise_inflation=np.zeros(robots),
-        # the scale of a robot's process noise
-        drift_ns=np.full((robots, WINDOWS), NEVER_NS // 2),
-        drift_transform=np.zeros((robots, WINDOWS, 3)),
-        drift_noise=np.zeros((robots, WINDOWS, 3, 3)),
-        drift_covariance=np.zeros((robots, WINDOWS, 3, 3)),
-        motion_likelihood=np.zeros((robots, LOG_SCALES.size)),
-        motion_scale=np.ones(robots),
-        motion_explained=np.zeros(robots, dtype=bool),
-        # errors that repeat
-        excess=np.zeros((robots, 3, 3)),
-        repeated=np.zeros((robots, _SOURCES, 2, 3, 3)),
-        repeated_at=np.zeros((robots, _SOURCES, 2)),
-    )
 
 
 @inlined_njit
@@ -494,7 +448,7 @@ def noise_of_frequent_looks(measurements: Measurements, k: int, belief: BeliefAr
     return _INDEPENDENT_NS / since_ns if 0 < since_ns < _INDEPENDENT_NS else 1.0
 
 
-_GATED, _OFF_FIXES = int(Loss.GATED), int(Loss.OFF_FIXES)
+_GATED, _OFF_FIXES = int(LossReason.GATED), int(LossReason.OFF_FIXES)
 CONFIRMED = 2  # Number of agreeing sightings after which an assumed pose counts as known
 WELL_CONFIRMED = 12
 _SUSPECT_SCORE = 2.0

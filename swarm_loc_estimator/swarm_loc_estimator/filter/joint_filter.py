@@ -14,7 +14,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.small_matrix import assign_matrix, cholesky3, invert_positive, solve3
+from swarm_loc_estimator.common.numerics import assign_matrix, cholesky3, invert_positive, solve3
 from swarm_loc_estimator.swarm.calibration_states import BLOCKS, DRIVES, ParameterTable
 
 

@@ -32,9 +32,20 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.se2_scalar import adjoint_of, between, carry, composed, moved_by_twist, wrap
-from swarm_loc_estimator.common.small_matrix import assign, assign_matrix, factor_numbers
-from swarm_loc_estimator.filter.belief import (
+from swarm_loc_estimator.common.numerics import (
+    adjoint_of,
+    assign,
+    assign_matrix,
+    between,
+    carry,
+    composed,
+    factor_numbers,
+    moved_by_twist,
+    wrap,
+)
+from swarm_loc_estimator.filter.state import (
+    LOG_SCALES,
+    WINDOWS,
     BeliefArrays,
     covariance_within,
     own_column,
@@ -43,14 +54,8 @@ from swarm_loc_estimator.filter.belief import (
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, DRIVES, TURN_BIAS
 
-WINDOWS = 2
 _WINDOW_NS = (2_000_000_000, 8_000_000_000)
 _LONGEST = 4.0  # A window that no measurement has ended after this many of its lengths says nothing
-LOG_SCALES = math.log(2.0) * np.arange(-1.0, 7.5, 0.5)
-"""Logarithms of the scales of the process noise, from one half to 128.
-
-Those below 1 take up what chance adds: without them, the mean of a robot as described would exceed 1.
-"""
 _PRIOR = 3.0  # Decrease of the log-likelihood per factor of e from scale 1
 _MEMORY_S = 30.0  # Time constant with which likelihoods are forgotten
 _POSE_SHARE = 0.25

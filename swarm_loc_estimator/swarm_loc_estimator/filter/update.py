@@ -30,16 +30,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
-from swarm_loc_estimator.filter.belief import (
-    BeliefArrays,
-    correct,
-    covariance_within,
-    own_within,
-    to_map,
-)
+from swarm_loc_estimator.common.numerics import assign, assign_matrix
 from swarm_loc_estimator.filter.correlated_noise import (
-    PAIR_ROWS,
     count_repeated,
     inflate_fix,
     record_pair,
@@ -60,7 +52,7 @@ from swarm_loc_estimator.filter.integrity import (
     stamp_variance,
 )
 from swarm_loc_estimator.filter.joint_filter import JointFilter, update_one
-from swarm_loc_estimator.filter.measurements import Loss, Measurements, Verdict
+from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.filter.models import (
     MODELS,
     NO_HEADING,
@@ -74,6 +66,14 @@ from swarm_loc_estimator.filter.models import (
     write_innovation,
 )
 from swarm_loc_estimator.filter.prediction import learn, new_scratch, predict
+from swarm_loc_estimator.filter.state import (
+    PAIR_ROWS,
+    BeliefArrays,
+    correct,
+    covariance_within,
+    own_within,
+    to_map,
+)
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.track_arrays import (
     OdometrySample,
@@ -88,7 +88,7 @@ from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YA
 DEPENDS_ON = 8
 """Filter columns per measurement: three of the observer, three of the target, camera yaw and camera scale."""
 _USED, _GATED = int(Verdict.USED), int(Verdict.GATED)
-_UNCERTAIN, _REFUTED = int(Loss.UNCERTAIN), int(Loss.REFUTED)
+_UNCERTAIN, _REFUTED = int(LossReason.UNCERTAIN), int(LossReason.REFUTED)
 PREDICT, EVALUATE, ATTRIBUTE, SETTLE = 1, 2, 4, 7  # Stages at which `fuse` is begun or resumed
 FINISHED, LEFT_OUT, LOST, CONTRADICTED = 0, 1, 2, 3
 """Why `fuse` returns: all is fused; a measurement of a robot that is not localized; a robot is lost; a robot
@@ -118,7 +118,7 @@ class Innovations(NamedTuple):
     cause: IntArray  # (m,) possible cause of the innovation, see `integrity.cause_of`
     accepted: BoolArray  # (m,) True if the innovation passes the gate
     nis: FloatArray  # (m,) normalized innovation squared
-    lost: IntArray  # (N + 1,) why a robot is lost (`Loss`), 0: it is not; the last element is NOBODY
+    lost: IntArray  # (N + 1,) why a robot is lost (`LossReason`), 0: it is not; the last element is NOBODY
     contradicted: BoolArray  # (N + L,) True for robots and landmarks that are contradicted
     predicted: FloatArray  # (3,) value
     other: FloatArray  # (3,) innovation of the second solution
@@ -200,7 +200,7 @@ def fuse(
 
     Returns:
         Index of the measurement at which it returns, why, the robot or landmark concerned, and why a robot is
-        lost (`Loss`).
+        lost (`LossReason`).
     """
     together, sample, scratch = together_ns >= 0, new_sample(2), new_scratch()
     k = begin

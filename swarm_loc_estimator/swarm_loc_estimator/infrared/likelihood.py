@@ -15,8 +15,15 @@ from numpy.typing import ArrayLike
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit
-from swarm_loc_estimator.common.se2_scalar import wrap
-from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
+from swarm_loc_estimator.common.numerics import assign, assign_matrix, wrap
+from swarm_loc_estimator.infrared.brightness import (
+    StartTable,
+    add_spread,
+    blurred,
+    compress,
+    find_starts,
+    start_table,
+)
 from swarm_loc_estimator.infrared.cost import DARK, MEASURED, Pair, with_stray_light, write_costs
 from swarm_loc_estimator.infrared.search import (
     TABLE_STARTS,
@@ -30,14 +37,6 @@ from swarm_loc_estimator.infrared.search import (
     no_solutions,
     pose_covariance,
     search,
-)
-from swarm_loc_estimator.infrared.start_table import (
-    StartTable,
-    add_spread,
-    blurred,
-    compress,
-    find_starts,
-    start_table,
 )
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 

@@ -17,8 +17,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit
-from swarm_loc_estimator.common.se2_scalar import wrap
-from swarm_loc_estimator.common.small_matrix import assign_matrix
+from swarm_loc_estimator.common.numerics import assign_matrix, wrap
+from swarm_loc_estimator.infrared.brightness import (
+    Float32Array,
+    StartTable,
+    StartWorkspace,
+    compress,
+    new_start_workspace,
+)
 from swarm_loc_estimator.infrared.cost import (
     MEASURED,
     MISSING,
@@ -30,13 +36,6 @@ from swarm_loc_estimator.infrared.cost import (
     new_cost_workspace,
     new_costs,
     stabilized,
-)
-from swarm_loc_estimator.infrared.start_table import (
-    Float32Array,
-    StartTable,
-    StartWorkspace,
-    compress,
-    new_start_workspace,
 )
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 

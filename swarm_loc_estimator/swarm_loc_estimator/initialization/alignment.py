@@ -14,13 +14,20 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.numerics import (
+    assign,
+    assign_matrix,
+    carry,
+    cholesky3,
+    composed,
+    moved_by_twist,
+    solve3,
+    wrap,
+)
 from swarm_loc_estimator.common.se2 import adjoint
-from swarm_loc_estimator.common.se2_scalar import carry, composed, moved_by_twist, wrap
-from swarm_loc_estimator.common.small_matrix import assign, assign_matrix, cholesky3, solve3
-from swarm_loc_estimator.filter.belief import BeliefArrays, covariance_within
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
 from swarm_loc_estimator.filter.models import POLAR, gate_threshold
-from swarm_loc_estimator.filter.state import InitialPose
+from swarm_loc_estimator.filter.state import BeliefArrays, InitialPose, covariance_within
 
 CONSTRAINT_DTYPE = np.dtype(
     [

@@ -25,7 +25,7 @@ import numpy as np
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.filter.integrity import CONFIRMED, WELL_CONFIRMED
-from swarm_loc_estimator.filter.measurements import NOBODY, Loss, Measurements, select
+from swarm_loc_estimator.filter.measurements import NOBODY, LossReason, Measurements, select
 from swarm_loc_estimator.filter.models import MODELS, locates_alone
 from swarm_loc_estimator.filter.prediction import new_scratch, predict
 from swarm_loc_estimator.filter.state import IN_MAP, InitialPose, Meetings, Starts, SwarmState
@@ -394,6 +394,6 @@ class LocalFrame:
         """Deinitialize all robots of a local frame."""
         state.origin = IN_MAP
         for other in np.flatnonzero(state.tracked).tolist():
-            state.deinitialize(other, Loss.FRAME, stamp_ns)
+            state.deinitialize(other, LossReason.FRAME, stamp_ns)
         state.constraints.clear()
         state.windows.clear()

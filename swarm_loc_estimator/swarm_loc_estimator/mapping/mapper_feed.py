@@ -19,9 +19,15 @@ from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.se2 import between, compose
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.mapping.messages import ScanMessage, decode_laser, decode_lights, decode_scan
+from swarm_loc_estimator.mapping.messages import (
+    LidarSweep,
+    ScanMessage,
+    decode_laser,
+    decode_lights,
+    decode_scan,
+    read_sweep,
+)
 from swarm_loc_estimator.mapping.scans import UNSEEN, LightSightings, Readings, Scan, ScanStop
-from swarm_loc_estimator.mapping.sweeps import LidarSweep, read_sweep
 from swarm_loc_estimator.swarm.error_models import LidarModel
 from swarm_loc_estimator.swarm.swarm import Robot
 

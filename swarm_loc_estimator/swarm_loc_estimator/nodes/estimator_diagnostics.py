@@ -15,10 +15,9 @@ from swarm_loc_estimator.common.health import Level, Report, drop_values, level_
 from swarm_loc_estimator.filter.measurements import Measurements, Verdict
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
-from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
-from swarm_loc_estimator.sensors.registry import InputTopic
+from swarm_loc_estimator.sensors.inputs import Ingest, InputStatistics, InputTopic
 from swarm_loc_estimator.swarm.swarm import FixedCamera, Robot, Swarm
-from swarm_loc_estimator.timeline.contradictions import Contradiction, LossReport
+from swarm_loc_estimator.timeline.estimate import Contradiction, LossReport
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
 
 _FULL_LOAD = 0.95

@@ -46,8 +46,7 @@ from swarm_loc_estimator.nodes.estimator_topics import (
 from swarm_loc_estimator.nodes.load import SHED_REASONS, FusionPace, Shedding, Thinning
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.precompile import precompile, size_of
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import live_topics
+from swarm_loc_estimator.sensors.inputs import Ingest, live_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.sensors.registry import SENSORS, Batch
+from swarm_loc_estimator.sensors.inputs import SENSORS, Batch
 from swarm_loc_estimator.sensors.sensor import Sensor
-from swarm_loc_estimator.timeline.settings import end_of_period
+from swarm_loc_estimator.timeline.timeline import end_of_period
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # Fractional part of the golden ratio in units of 2^-64
 _SILVER = np.uint64(0x6A09E667F3BCC909)

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit, norefcount_njit
-from swarm_loc_estimator.common.se2_scalar import wrap
-from swarm_loc_estimator.common.small_matrix import add_scaled, assign, assign_matrix
+from swarm_loc_estimator.common.numerics import add_scaled, assign, assign_matrix, wrap
 from swarm_loc_estimator.odometry.track_arrays import (
     BEFORE_ALL_NS,
     LATEST_NS,

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
+from swarm_loc_estimator.common.numerics import assign, assign_matrix
 from swarm_loc_estimator.swarm.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
 from swarm_loc_estimator.swarm.error_models import ImuModel, OdometryModel
 

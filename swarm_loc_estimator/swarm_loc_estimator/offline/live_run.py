@@ -48,7 +48,7 @@ from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.offline.recorded_bag import TruthReader
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.sensors.registry import input_topics, kinds
+from swarm_loc_estimator.sensors.inputs import input_topics, kinds
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.settings import Settings

@@ -40,8 +40,7 @@ from swarm_loc_estimator.common.parameters import UserError, number, number_spec
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.offline.result import RecordedMap, Spool
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import Batch, kinds
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest, kinds
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 

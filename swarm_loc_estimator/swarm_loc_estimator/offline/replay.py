@@ -25,11 +25,10 @@ from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.offline.recorded_bag import NOTHING_LOST, Loss, Progress, read_bag, unwatched
 from swarm_loc_estimator.offline.result import AerialImage, ReplayResult, Spool
 from swarm_loc_estimator.sensors.aerial import AerialRows
-from swarm_loc_estimator.sensors.ingest import MAX_PAUSE_NS
-from swarm_loc_estimator.sensors.registry import Batch
+from swarm_loc_estimator.sensors.inputs import MAX_PAUSE_NS, Batch
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.timeline.contradictions import Contradicted, LossReport
+from swarm_loc_estimator.timeline.estimate import Contradicted, LossReport
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.self_calibration import swapped_signs
 from swarm_loc_estimator.timeline.settings import Settings

@@ -19,12 +19,11 @@ import numpy.typing as npt
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.filter.measurements import Loss
+from swarm_loc_estimator.filter.measurements import LossReason
 from swarm_loc_estimator.mapping.messages import GridMessage, decode_occupancy_grid
 from swarm_loc_estimator.offline.metrics import Errors, ErrorSummary, compare, pool, summarise
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline.contradictions import LossReport
-from swarm_loc_estimator.timeline.estimate import Status
+from swarm_loc_estimator.timeline.estimate import LossReport, Status
 from swarm_loc_estimator.timeline.sightings import Sightings
 
 _COPY_BYTES = 1 << 20
@@ -138,7 +137,7 @@ class ReplayResult:
         """One sentence for each robot that was lost, with causes and times since the first output."""
         begin_ns = int(self.stamp_ns[0]) if self.stamp_ns.size else 0
         found: dict[int, dict[str, list[str]]] = {}
-        for one in (one for one in self.losses if one.why is not Loss.FRAME):
+        for one in (one for one in self.losses if one.why is not LossReason.FRAME):
             times = found.setdefault(one.robot, {}).setdefault(one.cause, [])
             times.append(f"{max(0, one.stamp_ns - begin_ns) * 1e-9:.1f} s")
         remarks = []

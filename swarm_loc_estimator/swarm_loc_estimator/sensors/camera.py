@@ -31,7 +31,7 @@ from swarm_loc_estimator.common.messages.detections import (
     decode_shared_detections,
 )
 from swarm_loc_estimator.common.messages.streams import DetectionColumns, DetectionReader
-from swarm_loc_estimator.common.small_matrix import assign
+from swarm_loc_estimator.common.numerics import assign
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, select
 from swarm_loc_estimator.filter.models import BEARING, MODELS, POLAR, gate_threshold
 from swarm_loc_estimator.sensors.sensor import (

@@ -169,6 +169,7 @@ class BrightnessConverter:
         self._validator = MatrixScreening(swarm)
         self._ir = self._validator.boards
         self._gate = {robot: float(MODELS[POLAR].gate(ir.gate_probability)) for robot, ir in self._ir.items()}
+        self._gains = {robot: ir.believed_gains for robot, ir in self._ir.items()}
         self._dropped: Counter[str] = Counter()
         self._measured = 0
         self._exchanges: dict[ExchangeKey, _Exchange] = {}
@@ -233,7 +234,7 @@ class BrightnessConverter:
         ir = self._ir[keys[0].receiver]
         exchanges = [self._exchanges[key] for key in keys]
         readings, limits = self._validator.together(keys[0].receiver, [one.readings for one in exchanges])
-        sides = [[self._ir[key[side]].believed_gains for key in keys] for side in (1, 2)]
+        sides = [[self._gains[key[side]] for key in keys] for side in (1, 2)]
         solutions = _estimator(ir.platform).solve(readings, PairGains.of(*sides), limits)
         measurements = self._measurements(keys, solutions)
         faults = reject_reasons(measurements)

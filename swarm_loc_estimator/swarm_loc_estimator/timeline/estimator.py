@@ -9,35 +9,37 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from swarm_loc_estimator.filter.belief import NEVER_NS
 from swarm_loc_estimator.filter.measurements import (
     Command,
     CommandKind,
-    Loss,
+    LossReason,
     Measurements,
     Verdict,
     concatenate,
     drops_by_reason,
 )
 from swarm_loc_estimator.filter.models import CARTESIAN
-from swarm_loc_estimator.filter.state import IN_MAP
+from swarm_loc_estimator.filter.state import IN_MAP, NEVER_NS
 from swarm_loc_estimator.identification.memory import Identities, Outcome
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.sensors.imu import TurnRateRows, TurnRateSensor
+from swarm_loc_estimator.sensors.inputs import Batch, InputConverter
 from swarm_loc_estimator.sensors.lidar import ScanSensor, SweepStore
 from swarm_loc_estimator.sensors.odometry import OdometryRows, OdometrySensor
-from swarm_loc_estimator.sensors.registry import Batch, InputConverter
 from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, Accumulator, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline.contradictions import (
+from swarm_loc_estimator.timeline.estimate import (
     ConstantOdometry,
     Contradiction,
+    Estimate,
     LossReport,
+    Status,
+    TrackedLimits,
     contradictions,
+    estimate_at,
     last_loss,
 )
-from swarm_loc_estimator.timeline.estimate import Estimate, Status, TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.fusion import Fusion
 from swarm_loc_estimator.timeline.self_calibration import learned, learns
 from swarm_loc_estimator.timeline.settings import Settings
@@ -203,10 +205,11 @@ class Estimator:
         }
         for accumulator in self._converter.accumulators.values():
             others |= accumulator.counters
-        outcomes = self._timeline.state.images.outcomes
-        others |= {f"identities {one.name.lower().replace('_', ' ')}": int(outcomes[one]) for one in Outcome}
+        if images := self._timeline.state.images:
+            names = {one: one.name.lower().replace("_", " ") for one in Outcome}
+            others |= {f"identities {names[one]}": int(images.outcomes[one]) for one in Outcome}
         losses = self._timeline.state.losses
-        others |= {f"lost: {why.name.lower().replace('_', ' ')}": int(losses[why]) for why in Loss}
+        others |= {f"lost: {why.name.lower().replace('_', ' ')}": int(losses[why]) for why in LossReason}
         return {"measurements used": self.used} | {name: count for name, count in others.items() if count}
 
     def recent(self) -> Recent:
@@ -216,7 +219,8 @@ class Estimator:
     @property
     def identities(self) -> Identities | None:
         """Identities in the newest aerial image; None before the first image."""
-        return self._timeline.state.images.newest
+        images = self._timeline.state.images
+        return images.newest if images else None
 
     def contradictions(self, now_ns: int) -> list[Contradiction]:
         """Contradicted robots and landmarks at an instant, robots first."""

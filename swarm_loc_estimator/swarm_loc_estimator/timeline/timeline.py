@@ -4,6 +4,9 @@ Measurements wait in a buffer sorted by stamp, into which late ones are merged. 
 are stored as checkpoints. A late measurement rolls the filter back to the last checkpoint before it, and all
 later steps are repeated; the result equals that of in-order arrival.
 
+A large swarm fuses the measurements of a fusion period as one batch. A period is closed at its end, (t, t +
+T]: a measurement at the instant of fusion belongs to the period that ends then.
+
 The order does not depend on the order of arrival: measurements with equal stamps are sorted by all their
 columns but the arrival. Measurements equal in all of them are duplicates.
 """
@@ -13,14 +16,14 @@ from __future__ import annotations
 import math
 from bisect import insort
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
+from swarm_loc_estimator.common.numerics import assign, assign_matrix
 from swarm_loc_estimator.filter.measurements import (
     Command,
     Measurements,
@@ -30,9 +33,28 @@ from swarm_loc_estimator.filter.measurements import (
 )
 from swarm_loc_estimator.filter.models import ANONYMOUS
 from swarm_loc_estimator.filter.state import SwarmState
-from swarm_loc_estimator.timeline.settings import Settings, end_of_period, middle_of_period
+from swarm_loc_estimator.timeline.settings import Settings
+
+Stamps = TypeVar("Stamps", int, IntArray)
 
 _FIRST_CAPACITY = 1024
+
+
+def end_of_period(stamp_ns: Stamps, period_ns: int) -> Stamps:
+    """End of the period of a stamp, or of stamps (m,): the next multiple of its length."""
+    return -(-stamp_ns // period_ns) * period_ns
+
+
+_end_of_period = cached_njit(end_of_period)
+
+
+@cached_njit
+def middle_of_period(stamp_ns: int, period_ns: int) -> int:
+    """Instant to which robots are predicted for all measurements of the period of a stamp.
+
+    It does not depend on the measurements, so late measurements of the period use the same prediction.
+    """
+    return _end_of_period(stamp_ns, period_ns) - period_ns + period_ns // 2
 
 
 class MeasurementBuffer:

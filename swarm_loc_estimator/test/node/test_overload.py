@@ -15,7 +15,7 @@ from nav_msgs.msg import Odometry
 from node_world import TRUE_POSES, Ros, detection_bytes, odometry_bytes, overrides, sight
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
-from swarm_loc_estimator.sensors.registry import Batch
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.timeline import HasBudget
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses

@@ -15,8 +15,8 @@ from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, DETE
 from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.sensors.fix import FixRows
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.timeline.estimator import Estimator
 
 SECOND = 10**9

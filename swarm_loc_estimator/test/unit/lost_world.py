@@ -17,28 +17,28 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import Report
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.filter.measurements import Loss
+from swarm_loc_estimator.filter.measurements import LossReason
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.nodes.estimator_diagnostics import Diagnostics
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.offline.replay import PeriodicSchedule, Runner
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.fix import FixRows
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import Batch
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 
 CAUSES = {
-    Loss.UNCERTAIN: "its standard deviation exceeded 0.05 m (lost_sigma) or 0.3 rad (lost_heading_sigma)",
-    Loss.REFUTED: "a measurement contradicted its pose before 2 had confirmed it",
-    Loss.GATED: "7 measurements in a row were gated",
-    Loss.OFF_FIXES: "several absolute fixes in a row were gated",
-    Loss.KIDNAPPED: "its measurements can only mean that it is elsewhere",
-    Loss.OFF_MAP: "its scans contradict the map",
-    Loss.NOT_IN_IMAGE: "aerial images do not show it where it should be",
-    Loss.COMMAND: "a command removed it",
+    LossReason.UNCERTAIN: "its standard deviation exceeded 0.05 m (lost_sigma)"
+    " or 0.3 rad (lost_heading_sigma)",
+    LossReason.REFUTED: "a measurement contradicted its pose before 2 had confirmed it",
+    LossReason.GATED: "7 measurements in a row were gated",
+    LossReason.OFF_FIXES: "several absolute fixes in a row were gated",
+    LossReason.KIDNAPPED: "its measurements can only mean that it is elsewhere",
+    LossReason.OFF_MAP: "its scans contradict the map",
+    LossReason.NOT_IN_IMAGE: "aerial images do not show it where it should be",
+    LossReason.COMMAND: "a command removed it",
 }
 """What users read of each reason."""
 TICK_NS = 100_000_000
@@ -90,7 +90,7 @@ class _Alone:
         return ""
 
 
-def lose(why: Loss, folder: Path) -> LostRobot:
+def lose(why: LossReason, folder: Path) -> LostRobot:
     """Run the story of a reason until robot 0 is lost; a map lies in the folder."""
     story = _STORIES[why](folder)
     estimator = Estimator(story.swarm, story.settings)
@@ -100,7 +100,7 @@ def lose(why: Loss, folder: Path) -> LostRobot:
         runner.take(batch)
         if estimator.loss_of(0) is not None:
             break
-    if why is Loss.COMMAND:
+    if why is LossReason.COMMAND:
         estimator.forget(0, now_ns)
     runner.finish(now_ns)
     result = runner.result("a run", (begin_ns, now_ns), {}, {})
@@ -201,13 +201,13 @@ def _command(_folder: Path) -> Story:
     return Story(FIXED, fixes[:30])
 
 
-_STORIES: dict[Loss, Callable[[Path], Story]] = {
-    Loss.UNCERTAIN: _uncertain,
-    Loss.REFUTED: _refuted,
-    Loss.GATED: _gated,
-    Loss.OFF_FIXES: _off_fixes,
-    Loss.KIDNAPPED: _kidnapped,
-    Loss.OFF_MAP: _off_map,
-    Loss.NOT_IN_IMAGE: _not_in_image,
-    Loss.COMMAND: _command,
+_STORIES: dict[LossReason, Callable[[Path], Story]] = {
+    LossReason.UNCERTAIN: _uncertain,
+    LossReason.REFUTED: _refuted,
+    LossReason.GATED: _gated,
+    LossReason.OFF_FIXES: _off_fixes,
+    LossReason.KIDNAPPED: _kidnapped,
+    LossReason.OFF_MAP: _off_map,
+    LossReason.NOT_IN_IMAGE: _not_in_image,
+    LossReason.COMMAND: _command,
 }

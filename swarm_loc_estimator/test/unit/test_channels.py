@@ -16,8 +16,7 @@ from swarm_loc_estimator.common.messages.cdr import BRIGHTNESS, POSE_WITH_COVARI
 from swarm_loc_estimator.common.messages.detections import decode_brightness, encode_brightness
 from swarm_loc_estimator.common.messages.poses import decode_fix, encode_fix, encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import Batch, InputConverter
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest, InputConverter
 from swarm_loc_estimator.swarm.error_models import FixModel, OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator, Status

@@ -12,15 +12,10 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.correlated_noise import (
-    PAIR_ROWS,
-    record_constraint,
-    record_pair,
-    use_mean,
-)
-from swarm_loc_estimator.filter.measurements import Loss, Measurements, concatenate
+from swarm_loc_estimator.filter.correlated_noise import record_constraint, record_pair, use_mean
+from swarm_loc_estimator.filter.measurements import LossReason, Measurements, concatenate
 from swarm_loc_estimator.filter.models import POLAR
-from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.filter.state import PAIR_ROWS, SwarmState
 from swarm_loc_estimator.odometry.track_arrays import new_sample
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.ir_board import RobotIr, load_ir_platform
@@ -247,7 +242,7 @@ def test_a_pair_is_forgotten_when_either_robot_is_lost_or_others_take_its_place(
     for lost in (0, 1):
         state = pairs()
         used(state, Exchange(1.0), SURE)
-        state.deinitialize(lost, Loss.COMMAND, 0)
+        state.deinitialize(lost, LossReason.COMMAND, 0)
         np.testing.assert_allclose(noise_of(state, Exchange(1.0), SURE), new)
     state = pairs(places=2)
     for transmitter, stamp_ns in ((1, 1), (2, 2), (3, 3)):

@@ -8,13 +8,13 @@ import pytest
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
 from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.filter.measurements import Loss, Measurements, Verdict
+from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.nodes.estimator_diagnostics import Diagnostics, Recent, TickCost, load_report
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
-from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.timeline.contradictions import LossReport
+from swarm_loc_estimator.timeline.estimate import LossReport
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
 
 SECOND = 1_000_000_000
@@ -146,7 +146,7 @@ def test_a_robot_is_told_apart_as_waiting_lost_silent_or_in_a_foreign_frame() ->
     assert (b.warning, b.message) == (True, "waiting for a sighting or a fix that locates it")
     assert whole.values == {"dropped: gated": 3}
     world.reports(0, estimate(0, Status.TRACKED, Status.TRACKED), recent(), {})
-    losses = [None, LossReport(1, Loss.OFF_MAP, -3 * SECOND, "its scans contradict the map")]
+    losses = [None, LossReport(1, LossReason.OFF_MAP, -3 * SECOND, "its scans contradict the map")]
     waiting = estimate(0, Status.TRACKED, Status.WAITING)
     _, b, _ = world.reports(0, waiting, recent(), {}, losses=losses)
     assert (b.warning, b.message) == (True, "lost 3.0 s ago: its scans contradict the map")

@@ -20,8 +20,7 @@ from swarm_loc_estimator.filter.models import CARTESIAN, predict
 from swarm_loc_estimator.nodes.estimator_diagnostics import _CAUSES, Diagnostics
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.camera import DetectionRows, SightingConverter
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import Batch, live_topics
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest, live_topics
 from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.error_models import RandomWalk, SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Landmark, Robot, Swarm

@@ -21,8 +21,8 @@ from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
-from swarm_loc_estimator.timeline.settings import Policy, Settings, end_of_period, middle_of_period
-from swarm_loc_estimator.timeline.timeline import Timeline
+from swarm_loc_estimator.timeline.settings import Policy, Settings
+from swarm_loc_estimator.timeline.timeline import Timeline, end_of_period, middle_of_period
 
 PERIOD_NS = SECOND // 5
 SMALLEST_LARGE = Policy().delay_from

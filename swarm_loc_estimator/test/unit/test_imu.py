@@ -20,7 +20,7 @@ from swarm_loc_estimator.common.messages.streams import MessageBatch, Serialized
 from swarm_loc_estimator.odometry.track_arrays import OdometrySample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.imu import TurnRateRows, TurnRateSensor
-from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
 from swarm_loc_estimator.swarm.error_models import ImuModel, OdometryModel

@@ -12,10 +12,9 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.belief import BeliefArrays
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
 from swarm_loc_estimator.filter.models import CARTESIAN, POLAR
-from swarm_loc_estimator.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.filter.state import BeliefArrays, InitialPose, SwarmState
 from swarm_loc_estimator.initialization import alignment, initializer
 from swarm_loc_estimator.initialization.alignment import (
     CONSTRAINT_DTYPE,

@@ -15,12 +15,12 @@ from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.health import Level
 from swarm_loc_estimator.common.messages.cdr import ODOMETRY, POSE_WITH_COVARIANCE
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_fix, encode_odometry
-from swarm_loc_estimator.filter.measurements import Loss
+from swarm_loc_estimator.filter.measurements import LossReason
 from swarm_loc_estimator.offline.replay import PeriodicSchedule, Runner, replay
 from swarm_loc_estimator.offline.report.report import html_report, text_report
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.timeline.contradictions import LOSS_CAUSES, LossReport
+from swarm_loc_estimator.timeline.estimate import LOSS_CAUSES, LossReport
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 
 LATE = {1.2: 1.2, 1.5: 2.2, 1.8: 1.8, 2.1: 2.1}
@@ -28,12 +28,12 @@ LATE = {1.2: 1.2, 1.5: 2.2, 1.8: 1.8, 2.1: 2.1}
 
 
 def test_every_reason_has_words_and_a_story() -> None:
-    assert {*LOSS_CAUSES} == {*Loss}
-    assert {*CAUSES} == {*Loss} - {Loss.FRAME}
+    assert {*LOSS_CAUSES} == {*LossReason}
+    assert {*CAUSES} == {*LossReason} - {LossReason.FRAME}
 
 
 @pytest.mark.parametrize("why", CAUSES, ids=lambda why: why.name.lower())
-def test_a_lost_robot_is_named_with_the_reason(why: Loss, tmp_path: Path) -> None:
+def test_a_lost_robot_is_named_with_the_reason(why: LossReason, tmp_path: Path) -> None:
     lost = lose(why, tmp_path)
     estimator, cause = lost.estimator, CAUSES[why]
     loss = estimator.loss_of(0)
@@ -95,7 +95,7 @@ def test_a_loss_that_late_data_move_back_is_listed_once() -> None:
 
 
 def test_many_losses_are_listed_in_few_words() -> None:
-    losses = tuple(LossReport(k % 30, Loss.GATED, k * SECOND, "gated") for k in range(600))
+    losses = tuple(LossReport(k % 30, LossReason.GATED, k * SECOND, "gated") for k in range(600))
     swarm = Swarm(tuple(Robot(f"r{k}") for k in range(30)))
     none, waiting = np.zeros((1, 30, 3)), np.zeros((1, 30), dtype=np.uint8)
     result = ReplayResult("many", swarm, np.array([0]), none, none[..., None], waiting, losses=losses)
@@ -105,7 +105,7 @@ def test_many_losses_are_listed_in_few_words() -> None:
 
 
 def test_the_end_of_a_local_frame_is_no_fault_in_the_report() -> None:
-    ended = (LossReport(0, Loss.FRAME, 0, LOSS_CAUSES[Loss.FRAME]),)
+    ended = (LossReport(0, LossReason.FRAME, 0, LOSS_CAUSES[LossReason.FRAME]),)
     none, waiting = np.zeros((1, 1, 3)), np.zeros((1, 1), dtype=np.uint8)
     result = ReplayResult("x", FIXED, np.array([0]), none, none[..., None], waiting, losses=ended)
     assert result.loss_remarks == []

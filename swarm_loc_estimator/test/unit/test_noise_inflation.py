@@ -8,7 +8,6 @@ import pytest
 from swarm_loc_estimator.filter.integrity import (
     MAX_UNITS,
     add_noise_inflation,
-    inflate_all_noise,
     inflate_noise,
     stamp_variance,
     with_noise_inflation,
@@ -50,7 +49,7 @@ def test_each_unit_adds_noise_up_to_a_limit_and_to_its_observer_only() -> None:
 def test_a_description_that_has_proved_wrong_makes_all_noise_doubtful_but_lowers_none() -> None:
     state = SwarmState(ParameterTable.of(ROBOTS))
     state.integrity.noise_inflation[0] = 4.0
-    inflate_all_noise(state.integrity)
+    state.augment_all(np.zeros((2, 3)))
     assert state.integrity.noise_inflation[0] == 4.0
     assert 0.0 < state.integrity.noise_inflation[1] < 4.0
 

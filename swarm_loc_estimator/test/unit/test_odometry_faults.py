@@ -20,9 +20,8 @@ from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.offline.replay import PeriodicSchedule, Runner
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.sensors.camera import CameraSensor
-from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest
 from swarm_loc_estimator.sensors.odometry import OdometrySensor
-from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm

@@ -21,8 +21,7 @@ from swarm_loc_estimator.common.messages.streams import MessageBatch, Messages, 
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
 from swarm_loc_estimator.filter.models import MODELS, SCAN, MeasurementModel, Prediction, register
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import SENSORS
+from swarm_loc_estimator.sensors.inputs import SENSORS, Ingest
 from swarm_loc_estimator.sensors.sensor import Sensor
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator

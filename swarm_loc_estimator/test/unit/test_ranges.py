@@ -24,7 +24,7 @@ from swarm_loc_estimator.common.messages.streams import MessageBatch, Serialized
 from swarm_loc_estimator.filter.measurements import Measurements, Verdict, select
 from swarm_loc_estimator.filter.models import MODELS, RANGE, RANGE_DIFFERENCE
 from swarm_loc_estimator.precompile import size_of
-from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.swarm.swarm import Anchor, Robot, Swarm, UwbDevice
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.settings import Policy, Settings

@@ -23,8 +23,7 @@ from swarm_loc_estimator.common.messages.detections import (
 )
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import Batch, live_topics
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest, live_topics
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 SWARM = Swarm(tuple(Robot(name) for name in "abc"))

@@ -11,7 +11,7 @@ import pytest
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.filter.joint_filter import Robots
-from swarm_loc_estimator.filter.measurements import NOBODY, Loss, Measurements
+from swarm_loc_estimator.filter.measurements import NOBODY, LossReason, Measurements
 from swarm_loc_estimator.filter.prediction import new_scratch, predict
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
@@ -182,7 +182,7 @@ def play(both: Both, step: int) -> tuple[FloatArray, FloatArray]:
                 state.augment(source, both.poses[source % 6])
     if step == 12:
         for state in both.states:
-            state.deinitialize(2, Loss.COMMAND, both.now_ns)
+            state.deinitialize(2, LossReason.COMMAND, both.now_ns)
     if step == 16:
         both.start(2, np.array([0, 3]))
     there = np.flatnonzero(both.states[0].tracked)

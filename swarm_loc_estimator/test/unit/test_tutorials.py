@@ -16,7 +16,7 @@ from swarm_loc_estimator.common.messages.cdr import IMU
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
 from swarm_loc_estimator.filter.models import MODELS
 from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.sensors.registry import SENSORS
+from swarm_loc_estimator.sensors.inputs import SENSORS
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 ROOT = Path(__file__).parents[3]

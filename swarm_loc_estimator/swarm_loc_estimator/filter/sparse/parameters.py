@@ -21,7 +21,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.small_matrix import cholesky3, solve3
+from swarm_loc_estimator.common.numerics import cholesky3, solve3
 from swarm_loc_estimator.filter.sparse.ordering import Order, Pattern
 from swarm_loc_estimator.swarm.calibration_states import BLOCKS, DRIVES, ParameterTable
 

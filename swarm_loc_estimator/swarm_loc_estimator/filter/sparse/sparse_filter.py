@@ -22,7 +22,7 @@ import scipy
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, reassociated_njit
-from swarm_loc_estimator.common.small_matrix import invert_factor
+from swarm_loc_estimator.common.numerics import invert_factor
 from swarm_loc_estimator.filter.joint_filter import Robots
 from swarm_loc_estimator.filter.sparse.factor import (
     EMPTY,

@@ -51,7 +51,7 @@ from swarm_loc_estimator.offline.calibration.robust import spread
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.sensors.ingest import MAX_PAUSE_NS
+from swarm_loc_estimator.sensors.inputs import MAX_PAUSE_NS
 from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel, SensorModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 

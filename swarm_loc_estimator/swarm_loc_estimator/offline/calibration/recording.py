@@ -23,9 +23,9 @@ from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.fix import NO_FIXES, FixRows
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.infrared import NO_BRIGHTNESS, BrightnessRows
+from swarm_loc_estimator.sensors.inputs import Batch, InputConverter
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.ranges import NO_RANGES, RangeRows
-from swarm_loc_estimator.sensors.registry import Batch, InputConverter
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings

@@ -31,7 +31,7 @@ from swarm_loc_estimator.common.messages.detections import encode_brightness
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_pose_stamped
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.sensors.registry import kinds
+from swarm_loc_estimator.sensors.inputs import kinds
 from swarm_loc_estimator.swarm.error_models import RandomWalk
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm

@@ -39,10 +39,9 @@ from scipy.special import bdtrc, fdtrc
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.infrared.brightness import expected_brightness
+from swarm_loc_estimator.infrared.brightness import expected_brightness, start_table
 from swarm_loc_estimator.infrared.gains import Exchanges
 from swarm_loc_estimator.infrared.search import DARKEST
-from swarm_loc_estimator.infrared.start_table import start_table
 from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 FALSE_ALARM = 0.01  # Probability of a false alarm for any element: that it is dead, or that it saturates
