@@ -282,9 +282,10 @@ def _as_gains(
     factors = np.clip(np.exp(logs), *GAIN_RANGE)
     gains = []
     for k, (sensor, emitter) in enumerate(zip(*factors.tolist(), strict=True)):
-        of_robot = IrGains(tuple(sensor), tuple(emitter), max(float(own[k]), _MIN_SIGMA), float(shared[k]))
-        is_better = max(own[k], shared[k]) < platform.element_sigma
-        gains.append(of_robot if is_better else IrGains.unknown(platform))
+        is_surer = max(own[k], shared[k]) < platform.element_sigma
+        sigma, common_sigma = max(float(own[k]), _MIN_SIGMA), float(shared[k])
+        found = (tuple(sensor), tuple(emitter), sigma, common_sigma)
+        gains.append(IrGains(*found) if is_surer else IrGains.unknown(platform))
     return tuple(gains)
 
 
