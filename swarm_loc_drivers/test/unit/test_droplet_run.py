@@ -17,9 +17,9 @@ from swarm_loc_drivers.sim.scenarios.droplets import (
 )
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.messages.detections import decode_brightness
 from swarm_loc_estimator.common.messages.poses import decode_fix
 from swarm_loc_estimator.infrared.brightness import expected_brightness
+from swarm_loc_estimator.sensors.infrared import BrightnessSensor
 from swarm_loc_estimator.swarm.ir_board import PairGains
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
@@ -94,7 +94,8 @@ def test_the_bag_holds_what_was_published_late_and_not_all_of_it(run: DropletRun
     assert names == {f"droplet{k}/{kind}" for k in robots for kind in kinds} | {
         f"droplet{k}/fix" for k in (1, SETTINGS.robots)
     }
-    matrices = [(log_ns, decode_brightness(data)) for name, _, log_ns, data in messages if "bright" in name]
+    decode = BrightnessSensor.decode
+    matrices = [(log_ns, decode(data)) for name, _, log_ns, data in messages if "bright" in name]
     assert 0.8 * len(run.matrices) < len(matrices) < len(run.matrices)
     late_s = np.array([log_ns - one.stamp_ns for log_ns, one in matrices]) * 1e-9
     assert late_s.min() > 0.2

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import BRIGHTNESS as MESSAGE_TYPE
-from swarm_loc_estimator.common.messages.detections import decode_brightness
 from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, Measurements, concatenate, select
 from swarm_loc_estimator.filter.models import MODELS, POLAR
@@ -290,8 +289,6 @@ class BrightnessSensor(Sensor):
 
     name, topic, message_type = "brightness", "brightness", MESSAGE_TYPE
     unit, keeps_units, accumulator = ("robot", "stamp_ns", "transmitter"), True, BrightnessConverter
-
-    decode = staticmethod(decode_brightness)
 
     @classmethod
     def columns(cls, messages: Messages[Any]) -> BrightnessRows:

@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.cdr import BRIGHTNESS, POSE_WITH_COVARIANCE, CdrError
-from swarm_loc_estimator.common.messages.detections import decode_brightness, encode_brightness
+from swarm_loc_estimator.common.messages.detections import encode_brightness
 from swarm_loc_estimator.common.messages.poses import decode_fix, encode_fix, encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
+from swarm_loc_estimator.sensors.infrared import BrightnessSensor
 from swarm_loc_estimator.sensors.inputs import Batch, Ingest, InputConverter
 from swarm_loc_estimator.swarm.error_models import FixModel, OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
@@ -59,7 +60,7 @@ def test_matrices_read_as_the_type_store_writes_them(
 ) -> None:
     readings = np.arange(n * n, dtype=np.int32).reshape(n, n) - 5
     data = encode_brightness(frame, stamp_ns, pair, readings, power, saturation)
-    one = decode_brightness(big_endian(data, BRIGHTNESS) if swapped else data)
+    one = BrightnessSensor.decode(big_endian(data, BRIGHTNESS) if swapped else data)
     assert (one.stamp_ns, one.frame_id, one.receiver, one.transmitter) == (stamp_ns, frame, *pair)
     assert (one.n, one.power, one.saturation) == (n, power, saturation)
     assert one.readings.dtype == np.int32
@@ -77,11 +78,11 @@ def test_fixes_read_as_the_type_store_writes_them(
     np.testing.assert_array_equal(one.covariance, COVARIANCE)
 
 
-@pytest.mark.parametrize("decode", [decode_brightness, decode_fix])
+@pytest.mark.parametrize("decode", [BrightnessSensor.decode, decode_fix])
 def test_damaged_bytes_are_refused(decode: Any) -> None:
     good = (
         encode_brightness("a", 5, (1, 2), np.ones((6, 6)))
-        if decode is decode_brightness
+        if decode is not decode_fix
         else encode_fix("map", 5, (0.0, 0.0, 0.0), COVARIANCE)
     )
     decode(good)
@@ -98,7 +99,7 @@ def test_a_matrix_that_promises_more_than_it_holds_is_no_message() -> None:
     place = good.index(np.uint32(36).tobytes())
     good[place : place + 4] = b"\xff" * 4
     with pytest.raises(CdrError, match="cut off"):
-        decode_brightness(bytes(good))
+        BrightnessSensor.decode(bytes(good))
 
 
 def test_every_kind_of_input_comes_in_columns_of_its_own() -> None:

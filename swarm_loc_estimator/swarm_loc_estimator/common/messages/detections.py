@@ -73,19 +73,6 @@ class AnonymousMessage(NamedTuple):
     detections: Rows
 
 
-class BrightnessMessage(NamedTuple):
-    """swarm_loc_msgs/BrightnessMatrix, see there; `readings` (k,) need not have the promised size."""
-
-    stamp_ns: int
-    frame_id: str
-    receiver: int
-    transmitter: int
-    n: int
-    readings: NDArray[np.int32]
-    power: int
-    saturation: int
-
-
 class SharedMessage(NamedTuple):
     """Readings (n,) of many robots."""
 
@@ -117,13 +104,6 @@ def decode_anonymous(data: bytes) -> AnonymousMessage:
     message = decode(data, ANONYMOUS_DETECTIONS)
     rows = message.detections.view(ANONYMOUS_DTYPE)
     return AnonymousMessage(nanoseconds(message.header.stamp), message.header.frame_id, rows)
-
-
-def decode_brightness(data: bytes) -> BrightnessMessage:
-    """Read a swarm_loc_msgs/BrightnessMatrix; raises CdrError unless the bytes are a whole one."""
-    message = decode(data, BRIGHTNESS)
-    header, *values = vars(message).values()
-    return BrightnessMessage(nanoseconds(header.stamp), header.frame_id, *values)
 
 
 def encode_detections(frame_id: str, stamp_ns: int, detections: Rows) -> bytes:
