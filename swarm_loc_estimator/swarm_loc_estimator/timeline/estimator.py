@@ -284,8 +284,11 @@ class Estimator:
         before, begin_ns = Counter(self.drops), min(end_ns if self._now_ns is None else self._now_ns, end_ns)
         first_ns = begin_ns if self._now_ns is not None else _LONG_AGO_NS
         batch = self.convert(Batch.of_columns(self.swarm, first_ns, end_ns, readings))
-        pauses_ns = np.arange(batch.begin_ns, batch.end_ns, self._horizon_ns // _PARTS)
-        *parts, last = batch.until_each(pauses_ns)
+        part_ns = self._horizon_ns // _PARTS
+        arrivals_ns = np.concatenate([[batch.end_ns], *(one.arrival_ns for one in batch.rows.values())])
+        begins_ns = batch.begin_ns + (arrivals_ns - batch.begin_ns) // part_ns * part_ns
+        pauses_ns = np.unique([begins_ns, begins_ns + part_ns])
+        *parts, last = batch.until_each(pauses_ns[pauses_ns < batch.end_ns])
         for part in parts:
             self.receive(part)
             self.tick(part.end_ns)
