@@ -281,11 +281,14 @@ class InputConverter:
                 rows = select(rows, ~late)
             with Guard(name, rows.robot.size, self.drops.total):
                 found = self._sensors[name].measure(rows)
-                kept[name] = self._valid(found) if isinstance(found, Measurements) else found
+                is_measured = SENSORS[name].accumulator is None and SENSORS[name].unit is not None
+                kept[name] = self._valid(found) if is_measured else found
         return replace(batch, rows=kept, dropped={}, is_converted=True)
 
-    def _valid(self, found: Measurements) -> Measurements:
+    def _valid(self, found: Any) -> Measurements:
         """Select valid measurements; count the others in `drops`."""
+        if not isinstance(found, Measurements):
+            raise TypeError(f"measure must return Measurements, not {type(found).__name__}")
         reasons = reject_reasons(found)
         reasons[~is_about_swarm(found, self._robots, self._landmarks)] = BAD_MEASUREMENT
         for k in set(reasons[reasons != VALID].tolist()):
