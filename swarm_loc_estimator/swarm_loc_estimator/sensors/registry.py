@@ -271,7 +271,7 @@ class InputConverter:
         """Convert valid readings; count the others in `drops`."""
         self.drops.total.update(batch.dropped)
         kept: dict[str, Any] = {}
-        for name in SENSORS:
+        for name, sensor in SENSORS.items():
             rows = batch.rows.get(name)
             if rows is None or not rows.robot.size:
                 continue
@@ -281,7 +281,7 @@ class InputConverter:
                 rows = select(rows, ~late)
             with Guard(name, rows.robot.size, self.drops.total):
                 found = self._sensors[name].measure(rows)
-                is_measured = SENSORS[name].accumulator is None and SENSORS[name].unit is not None
+                is_measured = sensor.accumulator is None and sensor.unit is not None
                 kept[name] = self._valid(found) if is_measured else found
         return replace(batch, rows=kept, dropped={}, is_converted=True)
 
