@@ -31,7 +31,7 @@ def compass() -> Iterator[dict[str, Any]]:
     names: dict[str, Any] = {}
     exec(code, names)  # noqa: S102
     yield names
-    del SENSORS["compass"], MODELS[names["MODEL"].number]
+    del SENSORS["compass"], MODELS[names["Compass"].model]
 
 
 def with_compass(folder: Path, sigma: float) -> Path:
