@@ -94,7 +94,7 @@ def _prepare_docstring(
     if lines and lines[0].startswith("Alias for field number"):
         lines.clear()
     if what in {"attribute", "data", "property"}:
-        lines.insert(0, "")
+        lines.insert(0, r"\ ")  # shown as nothing; a colon behind it names no type
     if isinstance(obj, type) and is_dataclass(obj) and "Attributes:" not in lines:
         specs = [(one.name, one.metadata["spec"]) for one in fields(obj) if "spec" in one.metadata]
         numbers = [f"    {name}: {spec.doc}, in {spec.range_text}." for name, spec in specs]
