@@ -76,10 +76,11 @@ def _add_mermaid(app: Sphinx, *event: Any) -> None:
 
 
 def _shorten_signature(*event: Any) -> tuple[str | None, str | None]:
-    """Show a default without its own arguments, and a function or factory by its name."""
+    """Show a default without its own arguments, and a function or factory by its name if it has one."""
     signature, returned = event[-2:]
     if signature:
         signature = re.sub(r"= (\w+)\([^()]*\)", r"= \1()", signature)
+        signature = re.sub(r"<function [^<>]*<lambda>[^>]*>", "...", signature)
         signature = re.sub(r"= <(?:function )?(\w+)[^>]*>", r"= \1", signature)
     return signature, returned
 

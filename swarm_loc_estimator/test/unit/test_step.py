@@ -15,7 +15,7 @@ from swarm_loc_estimator.sensors.registry import SENSORS
 BAG = Path(__file__).parents[3] / "bags" / "eight_one_robot_slow"
 SECOND = 10**9
 T = np.arange(0.0, 5.0, 0.1)
-DRIVEN = {"robot": "r1", "stamp_s": T, "pose": np.column_stack([0.1 * T, 0.0 * T, 0.0 * T])}
+DRIVEN: dict[str, Any] = {"robot": "r1", "stamp_s": T, "pose": np.column_stack([0.1 * T, 0.0 * T, 0.0 * T])}
 SWARM = Swarm((Robot("r1", start=(0.0, 0.0, 0.0)),))
 
 
@@ -35,7 +35,7 @@ def test_five_seconds_in_one_call_give_the_poses_of_ticks_and_of_a_replay(
 ) -> None:
     swarm, parts, end_ns = recorded(5.0)
     stepped, ticking = Estimator(swarm), Estimator(swarm)
-    columns: dict[str, dict[str, Any]] = {}
+    columns: dict[str, Any] = {}
     for name in sensors:
         given = [part[name]._asdict() for part in parts]
         columns[name] = {key: np.concatenate([one[key] for one in given]) for key in given[0]}
@@ -127,7 +127,7 @@ def test_late_readings_count_up_to_the_horizon_and_what_was_dropped_is_returned(
 def test_what_is_wrong_is_named_and_nothing_is_taken(given: dict[str, Any], sentence: str) -> None:
     estimator = Estimator(SWARM)
     with pytest.raises(TypeError, match=f"^{sentence}"):
-        estimator.step(**{"now_s": 5.0, "odometry": DRIVEN} | given)
+        estimator.step(**dict[str, Any]({"now_s": 5.0, "odometry": DRIVEN} | given))
     assert estimator.drops == {}
     assert estimator.step(5.0, odometry=DRIVEN).dropped == {}
 
