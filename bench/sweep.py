@@ -34,6 +34,11 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
 BAGS = Path(__file__).resolve().parents[1] / "bags"
+PROGRAM = [
+    sys.executable,
+    "-c",
+    "import sys; from swarm_loc_estimator import start; sys.exit(start.swarm_loc())",
+]
 NAMES = ("eight_five_robots", "eight_five_robots_w2")
 GRID = """
 bags: [eight_five_robots, eight_five_robots_w2]
@@ -66,8 +71,7 @@ def prepare(work: Path, seconds: float) -> None:
 
 def command(work: Path, workers: int, out: str, *more: str) -> list[str]:
     """The command line of a sweep."""
-    start = [sys.executable, "-m", "swarm_loc_estimator.cli.sweep"]
-    return [*start, str(work / f"on{workers}.yaml"), "--out", str(work / out), *more]
+    return [*PROGRAM, "sweep", str(work / f"on{workers}.yaml"), "--out", str(work / out), *more]
 
 
 def run(work: Path, workers: int, out: str, *more: str) -> Run:
@@ -104,9 +108,8 @@ def on_ray(work: Path) -> Run:
 
 def evo_difference_m(bag: Path, work: Path) -> float:
     """Greatest difference, over the robots of a bag, of evo's position RMSE and ours [m]."""
-    start = [sys.executable, "-m", "swarm_loc_estimator.cli.replay", str(bag)]
     subprocess.run(
-        [*start, "--out", str(work / "report"), "--tum", str(work / "tum")],
+        [*PROGRAM, "replay", str(bag), "--out", str(work / "report"), "--tum", str(work / "tum")],
         check=True,
         stdout=subprocess.DEVNULL,
     )

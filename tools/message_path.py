@@ -26,7 +26,7 @@ from swarm_loc_estimator.common.messages.poses import SwarmPosesEncoder
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import save_map
-from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.swarm.error_models import LidarModel
 from swarm_loc_estimator.swarm.swarm import Anchor, Robot, Swarm, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -60,7 +60,8 @@ class Passed(NamedTuple):
     """What a message passes, in order of first use."""
 
     modules: list[str]  # Dotted names
-    containers: list[str]  # Module and name of each class of tuples or data that is constructed
+    # Module and name of each class of tuples or data that is constructed, but those of the estimator's state
+    containers: list[str]
 
 
 @cache
@@ -80,19 +81,29 @@ def passed(name: str) -> Passed:
     for topic, data, arrival_ns in messages:
         begin_ns = arrival_ns if begin_ns is None else begin_ns
         is_one = topic.endswith(f"/{kind.topic}") and arrival_ns > begin_ns + 1e9 * kind.warm_up_s
-        used, trace = estimator.used, _Trace()
+        idle, used, trace = _Trace(), estimator.used, _Trace()
+        if is_one:  # what a tick and a checkpoint construct without a message does not carry it
+            sys.setprofile(idle.note)
+            _publish(estimator, encoder, arrival_ns)
+            estimator._timeline.state.copy()  # noqa: SLF001
         message = SerializedMessage(ingest.handle_of[topic], data, arrival_ns)
         sys.setprofile(trace.note if is_one else None)
         try:
             for batch in ingest.read(MessageBatch.of([message])):
                 estimator.receive(batch)
-            e = estimator.tick(arrival_ns)
-            encoder.encode(e.stamp_ns, e.poses, e.covariances, e.fix_age_s, e.status)
+            _publish(estimator, encoder, arrival_ns)
         finally:
             sys.setprofile(None)
         if is_one and (name == "odometry" or estimator.used > used):
-            return trace.result()
+            found, of_state = trace.result(), set(idle.result().containers)
+            return found._replace(containers=[one for one in found.containers if one not in of_state])
     raise LookupError(f"no message of the kind {name} is used")
+
+
+def _publish(estimator: Estimator, encoder: SwarmPosesEncoder, now_ns: int) -> None:
+    """Encode the poses at an instant, as the node does."""
+    e = estimator.tick(now_ns)
+    encoder.encode(e.stamp_ns, e.poses, e.covariances, e.fix_age_s, e.status)
 
 
 class _Trace:

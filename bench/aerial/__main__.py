@@ -1,4 +1,4 @@
-"""Robots that find themselves among anonymous ones in images from above: success rates beside the paper's.
+"""Robots that find themselves among anonymous ones in images from above: success rates and the paper's.
 
 Paper (two robots): 96.9 % by turns, 84 % by straight ways, 82.2 % by random motion.
 """
@@ -15,7 +15,6 @@ from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
 _METHODS = {
     "angular": "angular.n{}.success",
     "linear": "linear.n{}.success",
-    "random, printed": "random.n{}.printed.success",
     "random": "random.n{}.success",
     "chained, 4 images": "chained4.n{}.success",
     "... scale unknown": "random.n{}.scale_unknown.success",

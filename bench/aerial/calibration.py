@@ -37,7 +37,7 @@ class Reliability(NamedTuple):
 
 
 def measure(results: Results, worlds: int, seed: int) -> Reliability:
-    """Best answers after each image but the first, by what the estimator assumes unless told otherwise."""
+    """Best answers after each image but the first, by what the estimator assumes by default."""
     rng = np.random.default_rng([seed, 7])
     probability, right = [], []
     for _ in range(worlds):

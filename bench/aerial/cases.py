@@ -1,6 +1,6 @@
 """The aerial detector on pictures of others: tall robots seen from the side, and moving ones.
 
-The pictures are no part of the workspace. They lie beside it, in `../shared/cases/aerial_*`, each with its
+The pictures are no part of the workspace. They lie next to it, in `../shared/cases/aerial_*`, each with its
 camera and control points, and all show the same robots at the same places.
 """
 
@@ -64,7 +64,7 @@ def measure() -> dict[str, float]:
         for path, score in zip(pictures, scores, strict=True)
     ]
     print(table(["picture", f"found of {len(_PLACES)}", "false", "rms [mm]", "CPU [ms]"], rows))
-    score = reduce(Score.joined, scores)
+    score = reduce(Score.concatenate, scores)
     return {
         "cases.recall": 1.0 - score.missed / score.robots,
         "cases.false_detections": float(score.false),

@@ -69,17 +69,17 @@ _LENS_SIGMA_PX = 0.01
 
 @dataclass(frozen=True)
 class Score:
-    """Detections beside the truth."""
+    """Detections compared with the truth."""
 
     robots: int  # How many there are
     missed: int  # Of them, not found
     false: int  # Detections of nothing
     position_m: FloatArray  # (F,) distances of those that were found
-    heading: FloatArray  # (H,) errors of headings that were told [rad]
+    heading: FloatArray  # (H,) errors of the headings found [rad]
     nees: FloatArray  # (F,) normalized squared errors of places; 2 is ideal
     seconds: float = 0.0  # CPU time
 
-    def joined(self, other: Score) -> Score:
+    def concatenate(self, other: Score) -> Score:
         """Both together."""
         return Score(
             self.robots + other.robots,
@@ -93,12 +93,12 @@ class Score:
 
 
 def score_picture(picture: Picture, found: AerialDetections, seconds: float = 0.0) -> Score:
-    """Detections beside a picture's truth."""
+    """Detections compared with a picture's truth."""
     return score_places(picture.poses, DIAMETER, found, seconds)
 
 
 def score_places(poses: FloatArray, diameter: float, found: AerialDetections, seconds: float) -> Score:
-    """Detections beside true poses (N, 3) of robots, each robot's nearest one."""
+    """Detections compared with true poses (N, 3) of robots, each robot's nearest one."""
     away = np.linalg.norm(found.place[:, None] - poses[None, :, :2], axis=2)
     pairs: dict[int, int] = {}
     for robot in range(len(poses)):
@@ -139,17 +139,25 @@ def measure(seed: int, seeds: int = SEEDS) -> dict[str, float]:
             if name not in LOOKS:
                 picture, settings = surveyed(picture, look, np.random.default_rng([seed + k, 1]))
             scores.append(_scored(picture, settings))
-        score = reduce(Score.joined, scores)
+        score = reduce(Score.concatenate, scores)
         values = _values(score, seeds)
-        told = {key: value for key, value in values.items() if math.isfinite(value)}
-        figures |= {f"detector.{name}.{key}": value for key, value in told.items()}
-        rows.append([name, *(told.get(key) for key in values)])
+        known = {key: value for key, value in values.items() if math.isfinite(value)}
+        figures |= {f"detector.{name}.{key}": value for key, value in known.items()}
+        rows.append([name, *(known.get(key) for key in values)])
     print()
     print(table([f"{seeds} pictures each", *_HEADERS], rows))
     return figures
 
 
-_HEADERS = ("recall", "false / picture", "rms [cm]", "heading [deg]", "headings told", "NEES (2)", "CPU [ms]")
+_HEADERS = (
+    "recall",
+    "false / picture",
+    "rms [cm]",
+    "heading [deg]",
+    "headings found",
+    "NEES (2)",
+    "CPU [ms]",
+)
 
 
 def _values(score: Score, pictures: int) -> dict[str, float]:

@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.aerial import printed
 from bench.aerial.paper_methods import identify_by_way, own_displacement, relation
 from bench.aerial.rates import SWARMS, Results
 from bench.aerial.worlds import PERIOD_NS, Conditions, World, picture_of, simulate
@@ -20,7 +19,7 @@ _PAPERS = ChainModel(detection_probability=0.999, absent=1e-3, entering=1e-3, fa
 _UNKNOWN = replace(_PAPERS, scale=Scale(1.0, 0.5))
 """The scale anywhere from a half to one and a half, more or less."""
 _ROBOTS_PER_WORLD = 5
-_DENSE = (7, 9, 13)  # Numbers of images of the dense arena; the last one is told as the figure
+_DENSE = (7, 9, 13)  # Numbers of images of the dense arena; the last one makes the figure
 
 
 def measure(results: Results, worlds: int, seed: int) -> None:
@@ -39,8 +38,8 @@ def measure(results: Results, worlds: int, seed: int) -> None:
 
 
 def _pairs(results: Results, n: int, worlds: int, rng: np.random.Generator) -> None:
-    """Two images: as printed, by the way alone, and with the scale unknown over four images."""
-    right = right_printed = trials = 0
+    """Two images, by the way alone."""
+    right = trials = 0
     for _ in range(worlds):
         world = simulate(Conditions(n, 2), rng)
         for robot in range(min(n, _ROBOTS_PER_WORLD)):
@@ -48,12 +47,8 @@ def _pairs(results: Results, n: int, worlds: int, rng: np.random.Generator) -> N
             own = complex(world.own[1, robot] - world.own[0, robot])
             true = (world.place_of(robot, 0), world.place_of(robot, 1))
             right += identify_by_way(first, second, own)[:2] == true
-            misfit = printed.angle_misfits(first, second, own, 1.0)
-            best = np.unravel_index(misfit.argmin(), misfit.shape)
-            right_printed += (int(best[0]), int(best[1])) == true
             trials += 1
     results.count(f"random.n{n}.success", right, trials)
-    results.count(f"random.n{n}.printed.success", right_printed, trials)
 
 
 def _chained(results: Results, n: int, worlds: int, rng: np.random.Generator) -> None:

@@ -286,7 +286,7 @@ class _Plan:
         window[:] = np.mean(exposures, axis=0)
 
     def light(self, look: Look, poses: FloatArray, tops: FloatArray, lift: float) -> None:
-        """Uneven light over all, shadows beside robots and of things that are not seen."""
+        """Uneven light over all, shadows next to robots and of things that are not seen."""
         rows, columns = self.image.shape
         if look.gradient < 1.0:
             angle = self._rng.uniform(-math.pi, math.pi)

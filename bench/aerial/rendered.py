@@ -1,6 +1,6 @@
 """Five e-pucks located by an overhead camera alone: rendered images, camera node, drivers, the whole graph.
 
-The robots drive an eight; nothing tells them apart, and the estimator is not told where they start. What
+The robots drive an eight; nothing tells them apart, and the estimator does not know where they start. What
 `simulate --aerial` starts runs as child processes.
 """
 
@@ -27,9 +27,9 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import NodeSpec
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.trajectory import interpolate
-from swarm_loc_estimator.offline.live.graph import LiveGraph
+from swarm_loc_estimator.offline.live_run import LiveGraph
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities
 
@@ -47,7 +47,7 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class AerialRun:
-    """What came of one run."""
+    """The result of one run."""
 
     # (N,) when each robot was located, after they began to drive [s]; infinite: it was not
     located: FloatArray
@@ -142,8 +142,8 @@ def run_aerial(
         seed: Of the world.
         duration_s: How long they drive [s].
         folder: Where descriptions and the nodes' log go; created.
-        say: Is told how far it is.
-        known_start: Whether the estimator is told where the robots start, for comparison.
+        say: Called with the progress.
+        known_start: Whether the estimator knows where the robots start, for comparison.
 
     Raises:
         LiveError: A node has ended, or nothing goes on.

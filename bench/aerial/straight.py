@@ -6,7 +6,6 @@ import time
 
 import numpy as np
 
-from bench.aerial import printed
 from bench.aerial.paper_methods import ComplexArray, identify_by_speeds
 from bench.aerial.rates import SWARMS, Results
 from bench.aerial.worlds import PERIOD_S
@@ -19,11 +18,11 @@ _ARENA = (30.0, 22.0)
 
 
 def measure(results: Results, trials: int, seed: int) -> None:
-    """Success rates with direction and scale, all three places right, and as printed the last one."""
+    """Success rates with direction and scale, all three places right."""
     rng = np.random.default_rng([seed, 2])
     for n in SWARMS:
         count = max(20, trials // max(1, n // 5))
-        right, right_printed, spent_s = 0, 0, 0.0
+        right, spent_s = 0, 0.0
         for _ in range(count):
             images, speeds = _simulated(rng, n)
             begin_s = time.process_time()
@@ -31,13 +30,8 @@ def measure(results: Results, trials: int, seed: int) -> None:
             answer = identify_by_speeds(images, way, _SIGMA, 1.0, _SCALE_SIGMA)
             spent_s += time.process_time() - begin_s
             right += answer == (0, 0, 0)
-            if n == 2:
-                misfit = printed.ratio_misfits(images, (speeds[0], speeds[1]))
-                right_printed += int(np.unravel_index(misfit.argmin(), misfit.shape)[2]) == 0
         results.count(f"linear.n{n}.success", right, count)
         results.values[f"linear.n{n}.us_per_robot_picture"] = spent_s / count / 3 * 1e6
-        if n == 2:
-            results.count("linear.n2.printed.success", right_printed, count)
 
 
 def _simulated(rng: np.random.Generator, robots: int) -> tuple[ComplexArray, FloatArray]:

@@ -6,7 +6,6 @@ import time
 
 import numpy as np
 
-from bench.aerial import printed
 from bench.aerial.paper_methods import identify_by_turns, turn_misfits
 from bench.aerial.rates import SWARMS, Results
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -18,7 +17,7 @@ _ROTATIONS = (2, 3, 4)
 
 
 def measure(results: Results, trials: int, seed: int) -> None:
-    """Success rates of one rotation for all swarms, of more for the largest one, and as printed for two."""
+    """Success rates of one rotation for all swarms, and of more for the largest one."""
     rng = np.random.default_rng([seed, 1])
     for n in SWARMS:
         headings, turns = _simulated(rng, trials, n, 1)
@@ -33,16 +32,6 @@ def measure(results: Results, trials: int, seed: int) -> None:
         found = turn_misfits(headings, turns).argmin(axis=-1)
         name = f"angular.n{SWARMS[-1]}.rotations{rotations}.success"
         results.count(name, int(np.sum(found == 0)), trials)
-    headings, turns = _simulated(rng, trials, 2, 1)
-    found = printed.turn_misfits(headings, turns[:, 0]).argmin(axis=-1)
-    results.count("angular.n2.printed.success", int(np.sum(found == 0)), trials)
-    which = rng.integers(0, 2, trials)
-    order = np.where(which == 0, 1, -1)  # so that the robot is the first as often as the last
-    literal = [
-        printed.algorithm_1(headings[k, 0, :: order[k]], headings[k, 1, :: order[k]], float(turns[k, 0]))
-        for k in range(trials)
-    ]
-    results.count("angular.n2.literal.success", int(np.sum(np.array(literal) == which)), trials)
 
 
 def _simulated(

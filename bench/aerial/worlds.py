@@ -50,7 +50,7 @@ class World:
     """What was simulated."""
 
     own: ComplexArray  # (k, n) where each robot is at each image by its own motion, complex [unit]
-    own_heading: FloatArray  # (k, n) likewise its heading, zero at first [rad]
+    own_heading: FloatArray  # (k, n) its heading, zero at first [rad]
     position: ComplexArray  # (k, n) where it truly is
     images: list[ComplexArray]  # Of each the detections (d,), complex
     robot: list[IntArray]  # Of each which robot (d,) every detection is; -1: none

@@ -39,12 +39,11 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
 from swarm_loc_estimator.offline.calibration.recording import read_recording
-from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph, read_poses
+from swarm_loc_estimator.offline.live_run import START_PATIENCE_S, LiveGraph, read_poses
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
 ROBOTS = 20
 DURATION_S, SETTLED_S = 90.0, 45.0

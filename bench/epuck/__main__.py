@@ -35,7 +35,7 @@ from bench.shared.simulated_run import errors_of, mean_nees, run_core, ticks
 from bench.vision import report as vision_report
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_drivers.sim.worlds import W0, W2, W2_FAST, ErrorModel
-from swarm_loc_estimator.offline.live.graph import LiveError
+from swarm_loc_estimator.offline.live_run import LiveError
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 

@@ -22,10 +22,10 @@ from swarm_loc_estimator.common.messages.detections import (
     encode_detections,
 )
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE
-from swarm_loc_estimator.offline.live.graph import LiveGraph, cpu_seconds
+from swarm_loc_estimator.offline.live_run import LiveGraph, cpu_seconds
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 WORLD = "w2"
 _SILENCE_PATIENCE_S = 120.0
@@ -101,6 +101,7 @@ def run_rendered(swarm: Swarm, seed: int, duration_s: float, folder: Path, say: 
     Raises:
         LiveError: A node has ended, or the graph has stopped.
     """
+    # the graph of simulated robots
     links = folder / "links"
     links.mkdir(parents=True)
     swarm_file, names = folder / "swarm.yaml", [robot.name for robot in swarm.robots]
@@ -109,6 +110,7 @@ def run_rendered(swarm: Swarm, seed: int, duration_s: float, folder: Path, say: 
     nodes = graph_of(options, swarm, str(links))
     with LiveGraph(nodes, folder / "nodes.log") as graph:
         listener = Listener(graph, names)
+        # drive, and look at pictures near the end
         begin_ns = listener.wait_until_they_drive(say)
         processes = {node.full_name: graph.process(node.full_name).pid for node in nodes}
         used_s = {name: cpu_seconds(pid) for name, pid in processes.items()}
@@ -123,6 +125,7 @@ def run_rendered(swarm: Swarm, seed: int, duration_s: float, folder: Path, say: 
 
         graph.wait_for(is_over, "go on driving", _SILENCE_PATIENCE_S)
         cpu_s = {name: cpu_seconds(pid) - used_s[name] for name, pid in processes.items()}
+    # bags of what was heard, and errors
     _write(listener, folder / "bag", with_noise=True)
     _write(listener, folder / "described_bag", with_noise=False)
     live, age_s = _lived(listener, swarm, begin_ns)

@@ -21,8 +21,7 @@ from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, ta
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.offline.metrics import ErrorSummary
 from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.offline.report.plots import plot_overview
-from swarm_loc_estimator.offline.report.style import INK, colour_of
+from swarm_loc_estimator.offline.report.plots import INK, colour_of, plot_overview
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.settings import Settings

@@ -53,12 +53,14 @@ def views_of(rig: CameraRig, robot: int, poses: FloatArray) -> Views:
         robot: Index of the robot.
         poses: (N, 3) of all robots in map.
     """
+    # all markers in the optical frame
     scene, camera = rig.scene, rig.cameras[robot]
     own = poses[camera.robot]
     of_robots = [camera.view(se2.between(own, pose)) for pose in poses]
     markers = _in_optical_frame(
         scene.boards, rig.faces, rig.ids, [camera.view(se2.inverse(own)), *of_robots], camera.robot
     )
+    # those that face the camera, in front of it
     centre = markers.corners[:, _SQUARE].mean(axis=1)
     right, down = (markers.corners[:, _SQUARE, k] - markers.corners[:, _SQUARE, 0] for k in (1, 3))
     normal = np.cross(down, right)
@@ -66,6 +68,7 @@ def views_of(rig: CameraRig, robot: int, poses: FloatArray) -> Views:
     cosine /= np.linalg.norm(centre, axis=1) * np.linalg.norm(normal, axis=1)
     kept = (cosine > 0.0) & (markers.corners[..., 2].min(axis=(1, 2)) > _CLOSEST)
     markers = _Seen(*(column[kept] for column in markers))
+    # hidden by a robot that is nearer
     pixels = _pixels(camera, markers.corners)
     outlines = {
         robot: _outline(camera, scene.robots[robot], of_robots[robot])
@@ -81,6 +84,7 @@ def views_of(rig: CameraRig, robot: int, poses: FloatArray) -> Views:
         )
         for owner, depth, sheet in zip(markers.owner, centre[kept][:, 2], pixels[:, _SHEET], strict=True)
     ]
+    # distance from the border of the image
     size = np.array([camera.model.width, camera.model.height])
     sheet = pixels[:, _SHEET]
     margin = np.minimum(sheet + 0.5, size - 0.5 - sheet).min(axis=(1, 2))

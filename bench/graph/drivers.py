@@ -32,9 +32,9 @@ from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.world import EpuckWorldParameters, SimulatedEpuck, make_world
 from swarm_loc_drivers.sim.link_host import FirmwareHost
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue
-from swarm_loc_estimator.offline.live.graph import LiveGraph, Recorder, cpu_seconds
+from swarm_loc_estimator.offline.live_run import LiveGraph, Recorder, cpu_seconds
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 SIZES = (50, 100, 200)
 MULTICAST, SERVER = "multicast", "server"
@@ -122,11 +122,13 @@ def measure(robots: int, discovery: str, duration_s: float) -> dict[str, float]:
         with _emulated(work) as robots_answer, _server() if discovery == SERVER else nullcontext():
             began_s = time.time()
             with LiveGraph(_nodes(robots, work), log) as graph:
+                # start until every robot is heard
                 counts = Counts(graph.recorder, robots)
                 graph.wait_for(counts.are_all_heard, "receive odometry of every robot", _PATIENCE_S)
                 before = _settled(graph, counts, robots_answer)
                 pids = [graph.process(name).pid for name in ("estimator", "epuck1/epuck_driver")]
                 cpu_s = [cpu_seconds(pid) for pid in pids]
+                # drive, and count what arrives
                 measured_s = time.monotonic()
                 robots_answer.send(True)
                 until_s = measured_s + duration_s
@@ -135,6 +137,7 @@ def measure(robots: int, discovery: str, duration_s: float) -> dict[str, float]:
                 measured_s = time.monotonic() - measured_s
                 after = _settled(graph, counts, robots_answer)
                 robots_answer.send(True)
+    # figures
     sent, received = np.subtract(after, before).tolist()
     connected_s = max(float(match[1]) for match in _CONNECTED.finditer(log.read_text(encoding="utf-8")))
     figures = (

@@ -24,7 +24,7 @@ from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.nodes.load import SHED_REASONS
-from swarm_loc_estimator.offline.live.run import play_live
+from swarm_loc_estimator.offline.live_run import play_live
 
 SIZES = (100, 300, 1000)
 DURATION_S = 30.0

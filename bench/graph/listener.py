@@ -19,7 +19,7 @@ from swarm_loc_drivers.sim.worlds import ErrorModel
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY, POSE_STAMPED, nanoseconds
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveError, LiveGraph
+from swarm_loc_estimator.offline.live_run import START_PATIENCE_S, LiveError, LiveGraph
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_msgs.msg import MarkerDetectionArray
 

@@ -21,7 +21,7 @@ from bench.shared.bags import copy_part
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.offline.datasets.mrclam import Delay, convert, read_dataset
-from swarm_loc_estimator.offline.live.run import Agreement, LiveRun, compare_with_replay, play_live
+from swarm_loc_estimator.offline.live_run import Agreement, LiveRun, compare_with_replay, play_live
 
 ROOT = OUT.parent
 DEMO_BAG = ROOT / "bags" / "eight_five_robots"

@@ -7,13 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.shared.bags import encode_shared_detections, encode_shared_numbers
+from bench.shared.bags import SharedHead, encode_shared_detections, encode_shared_numbers
 from swarm_loc_drivers.sim.run import SimulatedRun
 from swarm_loc_drivers.sim.scenarios.bags import Stream, as_detections, truth_stream, write_streams
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.messages.cdr import SWARM_DETECTIONS, SWARM_ODOMETRY
 from swarm_loc_estimator.common.messages.detections import (
-    SharedHead,
     swarm_key,
 )
 

@@ -22,7 +22,9 @@ import numpy as np
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import GraphOptions, graph_nodes
-from swarm_loc_estimator.offline.live.graph import (
+from swarm_loc_estimator.offline.live_run import (
+    ESTIMATOR,
+    PLAYER,
     START_PATIENCE_S,
     LiveGraph,
     Recorder,
@@ -30,7 +32,6 @@ from swarm_loc_estimator.offline.live.graph import (
     read_poses,
     resident_mb,
 )
-from swarm_loc_estimator.offline.live.run import ESTIMATOR, PLAYER
 
 BAG = OUT.parent / "bags" / "eight_five_robots"
 COLUMNS = ("second", "memory_mb", "core", "lost", "pose_age_s")

@@ -18,7 +18,7 @@ from bench.vision.comparison import MARKERS, solved_by_opencv
 from bench.vision.peers import FAMILY, Found, all_peers, as_found, own_detector
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS, decode
-from swarm_loc_vision.markers.camera_detector import detection_rows
+from swarm_loc_vision.markers.detector import detection_rows
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.foreign_markers import ForeignMarkers, ForeignParameters
 
@@ -42,6 +42,7 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
     own, others = own_detector(family), {name: peers[name] for name in _OTHERS if name in peers}
     errors: dict[str, list[FloatArray]] = {name: [] for name in ("whole", "own", *others, "solvePnP")}
     depths: list[float] = []
+    # the same images for all detectors, ids that are there twice left out
     for seed in seeds:
         rng = np.random.default_rng([7, seed])
         for frame in range(FRAMES):
@@ -61,6 +62,7 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
             for name, markers in found.items():
                 by_bridge = _by_bridge(markers, truths, _SIGMA_PX[name])
                 errors[name] += [by_bridge(truth) - truth.position for truth in truths]
+    # errors of markers that all have found
     norms = {name: np.linalg.norm(np.array(values), axis=1) for name, values in errors.items()}
     seen = np.isfinite(list(norms.values())).all(axis=0)
     error = {name: rms(values[seen]) for name, values in norms.items()}

@@ -36,6 +36,7 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
     found: dict[str, list[tuple[FloatArray, FloatArray]]] = {
         name: [] for name in ("with", "without", "pose", "twist")
     }
+    # estimate with and without gyroscopes, by poses and by twists
     for seed in seeds:
         say(f"seed {seed}")
         blind = _blind(seed)
@@ -47,6 +48,7 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
         for robot in range(len(run.swarm.robots)):
             run = twist_only(run, robot)
         found["twist"].append(_settled(_estimate(run)))
+    # errors at the end, and misleading poses
     figures: dict[str, float] = {}
     for name in ("with", "without"):
         last = [(error[-10:], covariance[-10:]) for error, covariance in found[name]]

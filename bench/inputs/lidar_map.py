@@ -41,9 +41,9 @@ from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.messages import decode_scan
 from swarm_loc_estimator.offline.metrics import is_misleading, nees
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.sensors.lidar import ScanRows
 from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
@@ -173,6 +173,7 @@ def drive(
         blocked: Share of the beams that meet what is not in the map.
         start_shift: Added to the start in the description.
     """
+    # a robot whose start is known about, and its estimator
     rng = np.random.default_rng(seed)
     pose = np.array([*plan.starts[0], rng.uniform(-math.pi, math.pi)])
     body = LidarBody(plan, pose.copy(), PushBotNoise(slip=LIDAR_SLIPS[seed % len(LIDAR_SLIPS)]), rng)
@@ -181,6 +182,7 @@ def drive(
     lidar = replace(LIDAR, map_sigma=map_sigma)
     robot = Robot(NAME, start=start, start_sigma=_START, lidar=lidar, odometry=_ODOMETRY)
     estimator = Estimator(Swarm((robot,), map=swarm_map))
+    # drive, and compare at each sweep
     zero = np.zeros(1, dtype=np.int64)
     errors, covariances, tracked, cpu_s, sweeps = [], [], [], 0.0, 0
     for step in range(round(until_s / PERIOD_S) + 1):

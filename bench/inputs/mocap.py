@@ -20,9 +20,7 @@ from swarm_loc_drivers.sim.run import CAMERA_LATENESS, START_NS, arrival_ns
 from swarm_loc_estimator import FixRows, OdometryRows, Robot, Swarm
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.health import Health
-from swarm_loc_estimator.nodes.localizer_robots import LocalizedRobots
-from swarm_loc_estimator.nodes.localizer_sources import SOURCES
-from swarm_loc_estimator.nodes.parameters import BridgeParameters
+from swarm_loc_estimator.nodes.localizer_robots import SOURCES, BridgeParameters, LocalizedRobots
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import OdometryModel

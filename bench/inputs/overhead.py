@@ -182,6 +182,7 @@ def _rms_of(errors: FloatArray) -> FloatArray:
 
 def _draw(run: OverheadRun, found: Tracked) -> None:
     """The arena with true and estimated paths, and errors over time."""
+    # the arena
     figure, (arena, errors) = new_plot(2, width=6.4, height=4.8)
     truth = run.truth.all_at(found.stamp_ns)
     for robot in range(ROBOTS):
@@ -192,6 +193,7 @@ def _draw(run: OverheadRun, found: Tracked) -> None:
     arena.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="four ceiling cameras")
     arena.set(xlim=(-0.55 * ARENA[0], 0.55 * ARENA[0]), ylim=(-0.55 * ARENA[1], 0.55 * ARENA[1]))
     arena.legend(loc="lower right")
+    # errors over time, and jumps where another camera takes over
     seconds = (found.stamp_ns - START_NS) * 1e-9
     distance = 100.0 * np.linalg.norm(found.errors[..., :2], axis=2)
     heading = np.degrees(np.abs(found.errors[..., 2]))

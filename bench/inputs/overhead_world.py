@@ -15,12 +15,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.sim.render.ceiling import CeilingRig
+from bench.vision.ceiling import CeilingRig
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena
 from swarm_loc_drivers.sim.run import CAMERA_LATENESS, START_NS, LivedRun, Trajectories, arrival_ns
+from swarm_loc_drivers.sim.scenarios.bags import places, wander
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, drive_robots
-from swarm_loc_drivers.sim.scenarios.wandering import places, wander
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.swarm.error_models import SensorModel
@@ -29,8 +29,7 @@ from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, located
 from swarm_loc_vision.aerial.locate_camera import fixed_camera
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.markers.bodies import robot_body, up_of
-from swarm_loc_vision.markers.camera_detector import detection_rows
-from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
+from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector, detection_rows
 from swarm_loc_vision.markers.families import family_named
 
 ROBOTS, PERIOD_NS = 20, 100_000_000
@@ -65,6 +64,7 @@ class OverheadRun(LivedRun):
 
 def simulate_overhead(seed: int, duration_s: float, say: Callable[[str], None]) -> OverheadRun:
     """Drive, render and detect."""
+    # robots that drive around, with a marker on top
     rng = np.random.default_rng(seed)
     settings = EightSettings(seed, duration_s, ROBOTS, start_known=False)
     start = places(rng, ROBOTS, ARENA)
@@ -72,6 +72,7 @@ def simulate_overhead(seed: int, duration_s: float, say: Callable[[str], None]) 
     robots = tuple(
         replace(robot, camera=None, faces=(replace(TOP, id=k),)) for k, robot in enumerate(driven.robots)
     )
+    # cameras where they hang, and where locate_camera finds them
     hidden = tuple(_hung(f"ceiling{k + 1}", x, y, rng) for k, (x, y) in enumerate(PLACES))
     floor = [FloorMarker(_FIRST_FLOOR_ID + k, x, y, size=0.12) for k, (x, y) in enumerate(_FLOOR)]
     arena, begin_ns = Arena(ARENA, FAMILY), START_NS + PERIOD_NS
@@ -83,6 +84,7 @@ def simulate_overhead(seed: int, duration_s: float, say: Callable[[str], None]) 
     detectors = [_detector(swarm, camera) for camera in swarm.cameras]
     for detector in detectors[:1]:
         detector.detect(picture)  # compiled or loaded
+    # images and what is detected in them
     phases = rng.integers(0, PERIOD_NS, len(cameras))
     end_ns = int(truth.stamp_ns[-1])
     for tick_ns in range(begin_ns, end_ns - 2 * PERIOD_NS, PERIOD_NS):
@@ -97,6 +99,7 @@ def simulate_overhead(seed: int, duration_s: float, say: Callable[[str], None]) 
             if rng.random() >= _LOSS:
                 parts.append(found)
                 stamps.append((ROBOTS + k, stamp_ns))
+    # detections in order of arrival
     source, stamp_ns_of = np.array(stamps).T
     arrivals_ns = arrival_ns(rng, stamp_ns_of, CAMERA_LATENESS)
     order = [k for k in np.argsort(arrivals_ns, kind="stable").tolist() if arrivals_ns[k] <= end_ns]

@@ -45,6 +45,7 @@ class _Case(NamedTuple):
 
 def measure(seeds: Sequence[int], say: ProgressLine) -> dict[str, float]:
     """Figures of all cases; draws errors over time."""
+    # simulate and run all cases
     cases = {}
     plans = {"anchors4": _ANCHORS, "robots_only": _AMONG_ROBOTS, "unknown_start": _UNKNOWN_START}
     for name, plan in {**plans, "nlos20": _NLOS}.items():
@@ -55,6 +56,7 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> dict[str, float]:
             results.append(run(worlds[-1]))
         squared = [np.square(result.error[..., :2]).sum(axis=-1) for result in results]
         cases[name] = _Case(worlds, results, squared)
+    # errors compared with the bound, and with a batch solution
     figures: dict[str, float] = {}
     bound_of = {}
     for name in ("anchors4", "robots_only"):
@@ -69,6 +71,7 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> dict[str, float]:
     figures["uwb.anchors4.gtsam_batch_cm"] = 100.0 * rms(batches)
     same = [squared[_BATCH_TICKS] for squared in cases["anchors4"].squared]
     figures["uwb.anchors4.position_cm_where_batch"] = 100.0 * rms(same)
+    # located starts, and ranges through obstacles
     unknown, nlos = cases["unknown_start"], cases["nlos20"]
     right = [
         (result.status[-1] == Status.TRACKED) & (squared[-1] < _RIGHT_M**2)
@@ -115,6 +118,7 @@ def _batch(world: UwbWorld) -> FloatArray:
     for tick in world.tick_steps[_BATCH_TICKS].tolist():
         arrived = ranges.arrival_ns <= START_NS + tick * STEP_NS
         for robot in range(plan.robots):
+            # the start
             graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
             mine = np.flatnonzero(arrived & (ranges.robot == robot))
             steps = np.unique([0, *ranges.step[mine].tolist(), tick])
@@ -122,6 +126,7 @@ def _batch(world: UwbWorld) -> FloatArray:
             sigma = world.swarm.robots[robot].start_sigma
             noise = gtsam.noiseModel.Gaussian.Covariance(np.diag(np.square([sigma.x, sigma.y, sigma.theta])))
             graph.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*start), noise))
+            # odometry between the steps with ranges
             report = world.odometry[steps, robot]
             begin = se2.compose(se2.compose(start, se2.inverse(report[0])), report)
             for key, pose in enumerate(begin.tolist()):
@@ -131,6 +136,7 @@ def _batch(world: UwbWorld) -> FloatArray:
                 covariance = motion_noise(world, robot, first, last)
                 model = gtsam.noiseModel.Gaussian.Covariance(covariance)
                 graph.add(gtsam.BetweenFactorPose2(key, key + 1, gtsam.Pose2(*moves[key]), model))
+            # fixed anchors, and ranges
             for k, place in enumerate(places):
                 x, y, _ = place.tolist()
                 fixed, at = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6), gtsam.Pose2(x, y, 0.0)

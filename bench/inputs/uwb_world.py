@@ -16,7 +16,7 @@ from swarm_loc_estimator.common.messages.cdr import RANGES, encode
 from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.filter.measurements import concatenate, select
-from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Anchor, Robot, StartSigma, Swarm, UwbDevice
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
@@ -83,6 +83,7 @@ class UwbWorld:
 
 def simulate(plan: Plan, seed: int) -> UwbWorld:
     """Robots that drive arcs within a square, the anchors in its corners."""
+    # drive: wheels slip in truth, and odometry does not know
     rng = np.random.default_rng(seed)
     steps, n = round(plan.duration_s * 1e9 / STEP_NS), plan.robots
     truth, odometry = np.zeros((2, steps + 1, n, 3))
@@ -100,6 +101,7 @@ def simulate(plan: Plan, seed: int) -> UwbWorld:
         odometry[k + 1] = _arc(odometry[k], path, turn)
         slipped = turn + (slip[0] - slip[1]) / _ODOMETRY.wheel_separation
         truth[k + 1] = _arc(truth[k], path + slip.mean(axis=0), slipped)
+    # the description, with uncertain starts
     sigma = np.array([_START_SIGMA.x, _START_SIGMA.y, _START_SIGMA.theta])
     start = truth[0] + sigma * rng.standard_normal((n, 3))
     swarm = Swarm(

@@ -20,9 +20,9 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.detections import decode_detections
 from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
-from swarm_loc_estimator.offline.live.graph import LiveGraph, read_poses
+from swarm_loc_estimator.offline.live_run import LiveGraph, read_poses
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 from swarm_loc_vision.markers.detector import precompile
 

@@ -13,7 +13,7 @@ from bench.shared.common import rms
 from bench.shared.simulated_run import errors_of, estimates_of, inputs_of, ticks
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.offline.metrics import is_misleading, nees
-from swarm_loc_estimator.timeline.contradictions import Contradicted
+from swarm_loc_estimator.timeline.estimate import Contradicted
 from swarm_loc_estimator.timeline.estimator import Status
 
 _RIGHT_M = 0.05

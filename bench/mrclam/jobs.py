@@ -25,8 +25,7 @@ from swarm_loc_estimator.offline.calibration.recording import Recording, rerun
 from swarm_loc_estimator.offline.metrics import Errors, pool
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
 MODELS = ("plain", "calibrated")
 ONLINE = "landmarks_robots"  # The column with landmarks and robots

@@ -17,17 +17,13 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.filter.measurement_model import (
-    MeasurementArray,
-    MeasurementColumns,
-    predict_one,
-    write_innovation,
-)
+from swarm_loc_estimator.filter.measurements import Measurements, select
+from swarm_loc_estimator.filter.models import predict_one, write_innovation
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.offline.calibration.recording import Recording
 from swarm_loc_estimator.offline.metrics import Errors, compare
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.sensors.registry import InputConverter
+from swarm_loc_estimator.sensors.inputs import InputConverter
 from swarm_loc_estimator.swarm.calibration_states import TURN_BIAS
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
@@ -87,7 +83,7 @@ def _smooth(recording: Recording, online: ReplayResult) -> Mapping[str, Errors]:
     swarm = online.swarm
     tracks, measured = _tracks_and_measurements(recording, swarm)
     estimates = [online.track(index) for index in range(len(swarm.robots))]
-    measured = measured[_within(measured, estimates)]
+    measured = select(measured, _within(measured, estimates))
     nodes = _nodes(tracks, estimates, measured)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     for key, pose in enumerate(nodes.initial.tolist()):
@@ -97,7 +93,7 @@ def _smooth(recording: Recording, online: ReplayResult) -> Mapping[str, Errors]:
     return _errors(recording, swarm, nodes, _solved(graph, values), graph)
 
 
-def _tracks_and_measurements(recording: Recording, swarm: Swarm) -> tuple[OdometryTracks, MeasurementArray]:
+def _tracks_and_measurements(recording: Recording, swarm: Swarm) -> tuple[OdometryTracks, Measurements]:
     """All odometry, calibrated, and all sightings of known markers (m,)."""
     valid = InputConverter(swarm, Settings()).convert(recording.messages)
     tracks = OdometryTracks(swarm.robots)
@@ -137,23 +133,23 @@ def _scaled(step: gtsam.VectorValues, share: float) -> gtsam.VectorValues:
     return scaled
 
 
-def _within(measured: MeasurementArray, estimates: list[Trajectory]) -> NDArray[np.bool_]:
+def _within(measured: Measurements, estimates: list[Trajectory]) -> NDArray[np.bool_]:
     """Whether measurements (m,) were taken while both robots were located online."""
     inside = np.ones(measured.size, dtype=bool)
-    for name in ("observer", "target"):
+    for side in (measured.observer, measured.target):
         for robot, track in enumerate(estimates):
-            rows = measured[name] == robot
-            stamps = measured["stamp_ns"][rows]
+            rows = side == robot
+            stamps = measured.stamp_ns[rows]
             first_ns, last_ns = (track.stamp_ns[0], track.stamp_ns[-1]) if track.stamp_ns.size else (1, 0)
             inside[rows] &= (stamps >= first_ns) & (stamps <= last_ns)
     return inside
 
 
-def _nodes(tracks: OdometryTracks, estimates: list[Trajectory], measured: MeasurementArray) -> _Nodes:
+def _nodes(tracks: OdometryTracks, estimates: list[Trajectory], measured: Measurements) -> _Nodes:
     """Poses of each robot at all its stamps, initialized by odometry from the last online pose."""
     stamps_ns, compared, initial = [], [], [np.zeros((0, 3))]
     for robot, track in enumerate(estimates):
-        seen = [measured["stamp_ns"][measured[name] == robot] for name in ("observer", "target")]
+        seen = [measured.stamp_ns[side == robot] for side in (measured.observer, measured.target)]
         stamps = np.unique(np.concatenate([track.stamp_ns, *seen]))
         stamps_ns.append(stamps)
         compared.append(np.searchsorted(stamps, track.stamp_ns))
@@ -222,18 +218,17 @@ def _add_biases(
     return keys
 
 
-def _add_sightings(graph: gtsam.NonlinearFactorGraph, measured: MeasurementArray, nodes: _Nodes) -> None:
+def _add_sightings(graph: gtsam.NonlinearFactorGraph, measured: Measurements, nodes: _Nodes) -> None:
     """Add sightings at their stamps, with the measurement models of the estimator."""
-    columns = MeasurementColumns.of(measured)
-    observers = nodes.keys(measured["observer"], measured["stamp_ns"]).tolist()
-    targets = nodes.keys(measured["target"], measured["stamp_ns"]).tolist()
+    observers = nodes.keys(measured.observer, measured.stamp_ns).tolist()
+    targets = nodes.keys(measured.target, measured.stamp_ns).tolist()
     bend = gtsam.noiseModel.mEstimator.Cauchy.Create(_BEND)
-    size = 2 + measured["has_heading"]
+    size = 2 + measured.has_heading.astype(np.int64)
     for k in range(measured.size):
-        gaussian = gtsam.noiseModel.Gaussian.Covariance(measured["covariance"][k, : size[k], : size[k]])
+        gaussian = gtsam.noiseModel.Gaussian.Covariance(measured.covariance[k, : size[k], : size[k]])
         model = gtsam.noiseModel.Robust.Create(bend, gaussian)
         keys = [observers[k]] if targets[k] < 0 else [observers[k], targets[k]]
-        graph.add(gtsam.CustomFactor(model, keys, _Sighting(columns, k, int(size[k]))))
+        graph.add(gtsam.CustomFactor(model, keys, _Sighting(measured, k, int(size[k]))))
 
 
 class _Fading:
@@ -273,8 +268,8 @@ class _Drifting:
 class _Sighting:
     """Residual of a sighting, with Jacobians by the poses in their own frames."""
 
-    def __init__(self, columns: MeasurementColumns, k: int, size: int) -> None:
-        self._columns, self._k, self._size = columns, k, size
+    def __init__(self, measured: Measurements, k: int, size: int) -> None:
+        self._measured, self._k, self._size = measured, k, size
 
     def __call__(
         self, factor: gtsam.CustomFactor, values: gtsam.Values, jacobians: list[FloatArray] | None
@@ -283,8 +278,8 @@ class _Sighting:
         unmoved = (0.0, 0.0, 0.0)  # of a landmark as it was surveyed
         poses = np.array([*((pose.x(), pose.y(), pose.theta()) for pose in found), unmoved])
         value, jacobian, error = np.zeros(3), np.zeros((3, 5)), np.zeros(3)
-        predict_one(self._columns, self._k, poses[0], poses[1], (0.0, 0.0), value, jacobian)
-        write_innovation(self._columns, self._k, self._columns.value[self._k], value, error)
+        predict_one(self._measured, self._k, poses[0], poses[1], (0.0, 0.0), value, jacobian)
+        write_innovation(self._measured, self._k, self._measured.value[self._k], value, error)
         if jacobians is not None:
             signs = (-1.0, 1.0)
             for place, pose in enumerate(found):

@@ -36,7 +36,7 @@ class Calibrated(NamedTuple):
     found: LaserCalibration  # What the fit gives
     drive: Drive  # What it was fitted to
     hyperbola_cm: FloatArray  # (D,) errors of depths read by it from true rows
-    logarithm_cm: FloatArray  # Likewise by the logarithm of the paper
+    logarithm_cm: FloatArray  # The same by the logarithm of the paper
     window_cm: FloatArray  # (W,) errors of single windows, as the calibration reads them
 
 

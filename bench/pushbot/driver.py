@@ -13,8 +13,7 @@ from bench.shared.common import Cell, new_plot, save_plot, table
 from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE, TIMESTAMPS
 from swarm_loc_drivers.pushbot.parameters import PushbotParameters
 from swarm_loc_drivers.pushbot.session import PushbotSession
-from swarm_loc_drivers.sim.pushbot.board import EventRing
-from swarm_loc_drivers.sim.pushbot.console import PushbotFirmware
+from swarm_loc_drivers.sim.pushbot.firmware import EventRing, PushbotFirmware
 
 ROBOTS = (1, 2, 10)
 _CORES = 2

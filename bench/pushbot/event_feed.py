@@ -12,8 +12,8 @@ import numpy as np
 
 from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE
 from swarm_loc_drivers.sim.link_host import FirmwareHost
-from swarm_loc_drivers.sim.pushbot.console import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking
+from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 
 _STEP_S = 0.005
 _POLLS = 4  # A firmware hands on no more than two of its buffers at once

@@ -20,7 +20,7 @@ from rclpy.qos import QoSProfile
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import executable_path
-from swarm_loc_estimator.offline.live.graph import cpu_seconds
+from swarm_loc_estimator.offline.live_run import cpu_seconds
 
 RATE = 300_000  # Events of each robot [1/s]
 FIRST_PORT = 57_100

@@ -32,7 +32,7 @@ class MappingEffort:
     """How much is run."""
 
     seeds: int  # Of each hall with one robot; slips take turns
-    team_seeds: int  # Of runs with several robots, of other halls, of the paper's method, and at .3 px
+    team_seeds: int  # Of runs with several robots, of other halls, and at .3 px
     minutes: float  # Of a run of one robot; teams get half of it
     processes: int  # At a time
 
@@ -68,7 +68,6 @@ def planned(effort: MappingEffort) -> dict[str, list[RunSettings]]:
     jobs = {plan: seeds(effort.seeds, whole, plan) for plan in PLANS}
     jobs |= {plan: seeds(effort.team_seeds, whole, plan) for plan in UNSEEN}
     jobs |= {plan: seeds(effort.team_seeds, half, plan, robots=2, checks_covariances=True) for plan in WIDE}
-    jobs["corridor.printed"] = seeds(effort.team_seeds, whole, "corridor", printed=True)
     jobs["corridor.px3"] = seeds(effort.team_seeds, whole, "corridor", pixel=0.3)
     jobs["one_robot"] = seeds(effort.team_seeds, half, "corridor")
     jobs["two_robots"] = seeds(effort.team_seeds, half, "corridor", robots=2)

@@ -20,7 +20,6 @@ _SHOWN = (
     "bend",
     "atrium",
     "tee",
-    "corridor.printed",
     "two_robots",
     "five_robots",
 )

@@ -9,7 +9,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from bench.pushbot.lidar import LidarDrive
-from bench.pushbot.particle_mapper import ParticleMapper
 from swarm_loc_drivers.sim.pushbot.exploration import Arrival, Exploration, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan
 from swarm_loc_estimator.common import se2
@@ -37,7 +36,6 @@ class RunSettings:
     robots: int = 1  # How many
     pixel: float = 0.1  # Noise of the tracker [px]
     lights: bool = True  # Whether LEDs of other robots are seen
-    printed: bool = False  # Whether the paper's method makes the map
     checks_covariances: bool = False  # Whether poses are compared with their covariances at each arrival
     # Whether the robot has a lidar, see `bench.pushbot.lidar`, in place of a laser pointer
     lidar: bool = False
@@ -45,24 +43,24 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class RunResult:
-    """What came of a run; errors are against the truth, in the frame of the first robot's start."""
+    """The result of a run; errors are against the truth, in the frame of the first robot's start."""
 
     settings: RunSettings  # Of the run
     position_cm: float  # Error of the robots' last poses, mean over the robots
-    heading_deg: float  # Likewise
+    heading_deg: float  # Error of their headings, mean over the robots
     worst_cm: float  # Largest error of any pose after the last solution
-    online_position_cm: float  # Median error of poses at the time when they were told
+    online_position_cm: float  # Median error of poses when they were published
     online_worst_cm: float  # The largest of these
     aligned_cm: float  # RMS error of all poses after one rigid fit
     wall_cm: float  # Mean distance of occupied cells from a wall
-    wall_aligned_cm: float  # Likewise after the fit
+    wall_aligned_cm: float  # The same after the fit
     coverage: float  # Share of walls with an occupied cell nearby
-    coverage_90_s: float  # When this was nine tenths, as told at the time and after the fit; NaN: never
+    coverage_90_s: float  # When this was nine tenths, as published then and after the fit; NaN: never
     cpu_s_per_s: float  # Time that mapping took, per second
     bumps: int  # How often a robot hit something
     cells: FloatArray  # (n, 2) occupied cells [m]
     path: FloatArray  # (m, 3) robot, x, y of all poses [m]
-    # Share of poses off by more than 5 sigma and 2 cm when told; NaN: not compared
+    # Share of poses off by more than 5 sigma and 2 cm when published; NaN: not compared
     misleading_share: float = math.nan
     diverged_unreported: float = 0.0  # 1 if one was off by more than `DIVERGED_CM` and 3 sigma, else 0
     sweep_ms: float = math.nan  # CPU time per sweep of a lidar [ms]; NaN: it has none
@@ -74,7 +72,7 @@ class RunResult:
 
     @property
     def is_diverged_online(self) -> bool:
-        """Whether any pose was off by more than that when it was told."""
+        """Whether any pose was off by more than that when it was published."""
         return not self.online_worst_cm <= DIVERGED_CM
 
     @property
@@ -89,8 +87,7 @@ def run(settings: RunSettings) -> RunResult:
     rng = np.random.default_rng([settings.seed, round(1e3 * settings.slip), settings.robots])
     if settings.lidar:
         return _run_lidar(settings, plan, rng)
-    mapper: CooperativeMapper | ParticleMapper
-    mapper = ParticleMapper(rng.spawn(1)[0]) if settings.printed else CooperativeMapper()
+    mapper = CooperativeMapper()
     exploration = Exploration(plan, mapper, rng, use_lights=settings.lights)
     for number in range(settings.robots):
         share = 1.0 if settings.robots == 1 else 0.5 + 0.5 * number / (settings.robots - 1)
@@ -101,13 +98,13 @@ def run(settings: RunSettings) -> RunResult:
 
     def note(arrival: Arrival) -> None:
         places.append(_place(mapper, arrival))
-        if settings.checks_covariances and isinstance(mapper, CooperativeMapper):
+        if settings.checks_covariances:
             covariances.append(fix_covariance(mapper.covariance(arrival.robot)))
         covered.look(arrival.time_s)
 
     exploration.run(60.0 * settings.minutes, note)
     mapper.finish()
-    found = _score(settings, plan, exploration, mapper, _final(mapper, exploration, places), covered.since_s)
+    found = _score(settings, plan, exploration, mapper, _final(mapper, places), covered.since_s)
     return _compared(found, exploration, np.array(covariances)) if covariances else found
 
 
@@ -137,7 +134,7 @@ def _compared(result: RunResult, exploration: Exploration, covariances: FloatArr
 class _Covered:
     """Looks now and then whether walls are covered."""
 
-    def __init__(self, plan: FloorPlan, mapper: CooperativeMapper | ParticleMapper) -> None:
+    def __init__(self, plan: FloorPlan, mapper: CooperativeMapper) -> None:
         self._mapper = mapper
         self._points = wall_points(plan, 0.04)
         self._next_s = 0.0
@@ -172,22 +169,16 @@ def wall_distance_cm(cells: FloatArray, plan: FloorPlan) -> float:
     return 100.0 * float(cKDTree(wall_points(plan, 0.01)).query(cells)[0].mean()) if len(cells) else math.inf
 
 
-def _place(mapper: CooperativeMapper | ParticleMapper, arrival: Arrival) -> tuple[int, float]:
+def _place(mapper: CooperativeMapper, arrival: Arrival) -> tuple[int, float]:
     """Stop of an arrival in the graph, and the turn by odometry there until now."""
-    if isinstance(mapper, ParticleMapper):
-        return 0, 0.0
     node = mapper.newest_stop(arrival.robot)
     if node is None:
         raise RuntimeError("a robot has looked around and yet is not in the graph")
     return node, mapper.turned(arrival.robot)
 
 
-def _final(
-    mapper: CooperativeMapper | ParticleMapper, exploration: Exploration, places: list[tuple[int, float]]
-) -> FloatArray:
-    """Poses (n, 3) of all arrivals as the mapper believes in the end; a filter does not change its mind."""
-    if isinstance(mapper, ParticleMapper):
-        return np.array([one.online for one in exploration.arrivals])
+def _final(mapper: CooperativeMapper, places: list[tuple[int, float]]) -> FloatArray:
+    """Poses (n, 3) of all arrivals as the mapper believes in the end."""
     nodes, turns = np.array([node for node, _ in places]), np.array([turn for _, turn in places])
     poses: FloatArray = mapper.graph.states[nodes, :3].copy()
     poses[:, 2] += mapper.graph.states[nodes, 3] * turns
@@ -198,14 +189,14 @@ def _score(
     settings: RunSettings,
     plan: FloorPlan,
     exploration: Exploration | LidarDrive,
-    mapper: CooperativeMapper | ParticleMapper,
+    mapper: CooperativeMapper,
     final: FloatArray,
     coverage_90_s: float,
 ) -> RunResult:
     arrivals = exploration.arrivals
     truth, online = np.array([one.truth for one in arrivals]), np.array([one.online for one in arrivals])
     robots = np.array([one.robot for one in arrivals])
-    errors, told = (100.0 * np.hypot(*(poses - truth)[:, :2].T) for poses in (final, online))
+    errors, online_errors = (100.0 * np.hypot(*(poses - truth)[:, :2].T) for poses in (final, online))
     last = [int(np.flatnonzero(robots == robot)[-1]) for robot in exploration.robots]
     heading = np.degrees(np.abs(se2.wrap_angle(final[last, 2] - truth[last, 2])))
     fit = se2.rigid_fit(final[:, :2], truth[:, :2])
@@ -217,8 +208,8 @@ def _score(
         position_cm=float(errors[last].mean()),
         heading_deg=float(heading.mean()),
         worst_cm=float(errors.max()),
-        online_position_cm=float(np.median(told)),
-        online_worst_cm=float(told.max()),
+        online_position_cm=float(np.median(online_errors)),
+        online_worst_cm=float(online_errors.max()),
         aligned_cm=100.0 * float(np.sqrt(np.square(aligned).sum(axis=1).mean())),
         wall_cm=wall_distance_cm(cells, plan),
         wall_aligned_cm=wall_distance_cm(se2.transform_points(fit, cells), plan),

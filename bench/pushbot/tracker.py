@@ -1,14 +1,12 @@
-"""Trackers of blinking lights on simulated events: how far off, how sure, how fast."""
+"""The tracker of blinking lights on simulated events: how far off, how sure, how fast."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
-from bench.pushbot.paper_tracker import PaperSettings, PaperTracker
 from bench.shared.common import Cell, new_plot, rms, save_plot, table
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraEvents, CameraNoise, EventCamera, Spot
 from swarm_loc_drivers.sim.pushbot.optics import spot_brightness
@@ -25,16 +23,6 @@ _STEP_US, _STEPS = 5_000, 200
 _LASER, _LED = Blinking(2222, 1111), Blinking(1000, 500)
 SOURCES = (LightSource(450.0, is_above=False), LightSource(1000.0, is_above=True))
 _SKIPPED = 5  # Windows in which a light is found at first
-
-MakeTracker = Callable[[], LightTracker]
-TRACKERS: dict[str, MakeTracker] = {
-    "printed": lambda: PaperTracker(SOURCES, SIZE, TrackerSettings(), PaperSettings()),
-    "product": lambda: PaperTracker(SOURCES, SIZE, TrackerSettings(), PaperSettings(is_product=True)),
-    "product, eta .02": lambda: PaperTracker(
-        SOURCES, SIZE, TrackerSettings(), PaperSettings(eta=0.02, is_product=True)
-    ),
-    "centroid": lambda: LightTracker(SOURCES, SIZE, TrackerSettings()),
-}
 
 
 class Scene(NamedTuple):
@@ -72,15 +60,16 @@ def packet(seen: CameraEvents) -> Events:
 
 
 class Score(NamedTuple):
-    """How a tracker did on a scene: rms per axis [px], NEES (ideal 2), share of windows with the spot."""
+    """How the tracker did on a scene: rms per axis [px], NEES (ideal 2), share of windows with the spot."""
 
     rms: float
     nees: float
     seen: float
 
 
-def score(tracker: LightTracker, seen: Scene) -> Score:
+def score(seen: Scene) -> Score:
     """Track a scene and hold the laser's places against the truth at their stamps."""
+    tracker = LightTracker(SOURCES, SIZE, TrackerSettings())
     errors, nees, windows = [], [], 0
     for one in seen.events:
         for report in tracker.track(packet(one)):
@@ -119,32 +108,24 @@ def measure_tracker(seeds: int) -> dict[str, float]:
     Args:
         seeds: Scenes of each kind.
     """
-    by_noise: dict[str, list[Score]] = {name: [] for name in TRACKERS}
-    for noise in NOISES:
-        scenes = [scene(noise, 0.77, seed) for seed in range(seeds)]
-        for name, make in TRACKERS.items():
-            by_noise[name].append(_pooled([score(make(), one) for one in scenes]))
+    by_noise = [_pooled([score(scene(noise, 0.77, seed)) for seed in range(seeds)]) for noise in NOISES]
     by_depth = [
-        _pooled([score(TRACKERS["centroid"](), scene(BAR_NOISE, depth, 100 + seed)) for seed in range(seeds)])
-        for depth in DEPTHS_M
+        _pooled([score(scene(BAR_NOISE, depth, 100 + seed)) for seed in range(seeds)]) for depth in DEPTHS_M
     ]
     rates = {
         count: float(np.median([throughput(seed, count) for seed in range(seeds)])) for count in (1, 2, 11)
     }
-    rows: list[list[Cell]] = [
-        [name, *(one.rms for one in scores), scores[-2].nees] for name, scores in by_noise.items()
-    ]
-    print(table(["rms [px] at noise/s/pixel", *(f"{one:g}" for one in NOISES), "NEES (ideal 2)"], rows))
+    rows: list[list[Cell]] = [[noise, *one] for noise, one in zip(NOISES, by_noise, strict=True)]
+    print(table(["noise/s/pixel, 0.77 m", "rms [px]", "NEES (ideal 2)", "share seen"], rows))
     depth_rows: list[list[Cell]] = [[d, *one] for d, one in zip(DEPTHS_M, by_depth, strict=True)]
     print(table(["depth [m], 15 noise/s/pixel", "rms [px]", "NEES (ideal 2)", "share seen"], depth_rows))
     rate_rows: list[list[Cell]] = [[count, 1e-6 * rate] for count, rate in rates.items()]
     print(table(["lights", "M events/s"], rate_rows))
     _draw(by_noise, by_depth)
-    at_bar = NOISES.index(BAR_NOISE)
+    at_bar = by_noise[NOISES.index(BAR_NOISE)]
     return {
-        "tracker.printed.rms_px": by_noise["printed"][at_bar].rms,
-        "tracker.rms_px": by_noise["centroid"][at_bar].rms,
-        "tracker.nees": by_noise["centroid"][at_bar].nees,
+        "tracker.rms_px": at_bar.rms,
+        "tracker.nees": at_bar.nees,
         "tracker.worst_depth_rms_px": max(one.rms for one in by_depth),
         "tracker.events_per_s": rates[2],
         "tracker.events_per_s.lights11": rates[11],
@@ -157,13 +138,11 @@ def _pooled(scores: list[Score]) -> Score:
     return Score(float(np.sqrt(np.nanmean(rms**2))), float(np.nanmean(nees)), float(seen.mean()))
 
 
-def _draw(by_noise: dict[str, list[Score]], by_depth: list[Score]) -> None:
+def _draw(by_noise: list[Score], by_depth: list[Score]) -> None:
     figure, (left, right) = new_plot(2)
-    for name, scores in by_noise.items():
-        left.plot(NOISES, [one.rms for one in scores], marker="o", label=name)
+    left.plot(NOISES, [one.rms for one in by_noise], marker="o")
     left.axhline(0.15, color="k", ls=":")
     left.set(xlabel="noise events of a pixel [1/s]", ylabel="rms per axis [px]", yscale="log")
-    left.legend()
     right.plot(DEPTHS_M, [one.rms for one in by_depth], marker="o")
     right.axhline(0.15, color="k", ls=":")
     right.set(xlabel="distance of the wall [m]", ylabel="rms per axis [px]", title="15 noise events/s/pixel")

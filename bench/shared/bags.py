@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.reader import BagReader, BagTopic
 from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import (
@@ -18,10 +18,9 @@ from swarm_loc_estimator.common.messages.cdr import (
     encode,
     stamp_rows,
 )
-from swarm_loc_estimator.common.messages.detections import SharedHead
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.offline.ground_truth import TruthReader
+from swarm_loc_estimator.offline.recorded_bag import TruthReader
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 
@@ -72,6 +71,16 @@ def read_truth(swarm: Swarm, messages: Mapping[str, Sequence[bytes]]) -> dict[st
     topics = ((swarm.index_of[name], data) for name, all_of in messages.items() for data in all_of)
     reader.add(MessageBatch.of([SerializedMessage(topic, data, 0) for topic, data in topics]))
     return reader.tracks()
+
+
+class SharedHead(NamedTuple):
+    """The beginning of a message of many robots; see `SharedMessage`."""
+
+    stamp_ns: int
+    frame_id: str
+    swarm: int
+    robot: IntArray
+    reading_ns: IntArray
 
 
 def encode_shared_numbers(head: SharedHead, *columns: FloatArray) -> bytes:

@@ -15,8 +15,8 @@ from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.replay import ListedSchedule, Runner
 from swarm_loc_estimator.sensors.camera import DetectionRows
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.timeline.estimator import Estimator
 
 if TYPE_CHECKING:

@@ -1,53 +1,16 @@
-"""The paper's printed forms fail as they must; the benchmark's worlds, rates and figures are sound."""
+"""The benchmark's worlds, rates and figures are sound."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from bench.aerial import calibration, driving, printed, straight, turning
-from bench.aerial.paper_methods import ComplexArray, identify_by_turns, identify_by_way
+from bench.aerial import calibration, driving, straight, turning
 from bench.aerial.rates import Rate, Results
 from bench.aerial.worlds import Conditions, simulate
 from swarm_loc_estimator.identification.chain import ChainModel
 
 SEED = 77
-
-
-@pytest.mark.parametrize("robot", [0, 1, 2])
-def test_algorithm_1_as_printed_always_answers_the_last_robot(robot: int) -> None:
-    first, turned = np.array([0.1, 1.0, -2.0]), np.array([0.2, 0.7, 1.2])
-    second = first + turned
-    assert printed.algorithm_1(first, second, float(turned[robot])) == 2
-    assert identify_by_turns(np.array([first, second]), turned[[robot]]) == robot
-
-
-def test_absolute_differences_confuse_left_and_right() -> None:
-    headings = np.array([[[0.0, 0.0], [-0.5, 0.5]]])
-    misfit = printed.turn_misfits(headings, np.array([0.5]))[0]
-    assert misfit[0] == pytest.approx(misfit[1])
-    assert identify_by_turns(headings[0], np.array([0.5])) == 1
-
-
-def test_ratios_do_not_know_directions() -> None:
-    images = np.array([[0.0, 5.0], [1.0, 6.0], [3.0, 6.0 + 2.0j]])
-    misfit = printed.ratio_misfits(images, (1.0, 2.0))
-    assert misfit[0, 0, 0] == pytest.approx(misfit[1, 1, 1])
-
-
-def test_headings_from_x_and_y_agree_where_the_way_is_right_and_have_no_solution_beyond_noise() -> None:
-    own, first = 2.0 + 0.0j, np.array([0.0j], dtype=np.complex128)
-    exact = printed.angle_misfits(first, _away([0.4, 2.0, -2.5]), own, 1.0)
-    assert exact.max() < 1e-7
-    noisy = np.array([2.01 + 0.0j])
-    assert np.isinf(printed.angle_misfits(first, noisy, own, 1.0)).all()
-    assert identify_by_way(first, noisy, own)[:2] == (0, 0)
-
-
-def _away(angles: list[float]) -> ComplexArray:
-    """Two units away, in some directions."""
-    there: ComplexArray = np.asarray(2.0 * np.exp(1j * np.array(angles)), dtype=np.complex128)
-    return there
 
 
 def test_a_world_is_what_its_robots_did() -> None:

@@ -9,7 +9,7 @@ import pytest
 from bench.integrity.late_start import run_late_start
 from bench.integrity.scenarios import SCENARIOS
 from bench.integrity.scoring import score
-from swarm_loc_estimator.timeline.contradictions import Contradicted
+from swarm_loc_estimator.timeline.estimate import Contradicted
 
 SEED = 23
 

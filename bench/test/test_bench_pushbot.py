@@ -12,9 +12,7 @@ from bench.pushbot.driver import robots_on_two_cores
 from bench.pushbot.event_flow import RATE, Measured
 from bench.pushbot.mapping import MappingEffort, figures_of, planned
 from bench.pushbot.runs import RunResult, RunSettings, coverage, run, wall_distance_cm, wall_points
-from bench.pushbot.tracker import BAR_NOISE, TRACKERS, packet, scene, score
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
-from swarm_loc_estimator.common.messages.event_encoding import Events
 
 
 def test_walls_are_covered_by_cells_on_them() -> None:
@@ -95,37 +93,7 @@ def test_a_lidar_maps_a_hall_with_wheels_that_slip() -> None:
     assert figures["lidar.office.worst_wall_cm"] == found.wall_cm
 
 
-def test_the_printed_tracker_is_moved_by_noise_and_the_product_of_weights_is_not() -> None:
-    """The paper's equation (1) sums its weights: at 15 noise events/s/pixel it is pixels off."""
-    scenes = [scene(BAR_NOISE, 0.77, seed) for seed in (1, 2, 3)]
-    rms = {
-        name: np.sqrt(np.mean([score(TRACKERS[name](), one).rms ** 2 for one in scenes]))
-        for name in ("printed", "product")
-    }
-    assert rms["printed"] > 1.0
-    assert rms["product"] < 0.8
-
-
-def test_the_printed_tracker_gives_the_same_reports_for_packets_of_any_size() -> None:
-    parts = [packet(one) for one in scene(BAR_NOISE, 0.77, 1).events[:40]]
-    together = Events._make(np.concatenate(column) for column in zip(*parts, strict=True))
-    whole, cut = TRACKERS["printed"]().track(together), TRACKERS["printed"]()
-    found = [report for part in parts for report in cut.track(part)]
-    assert [(one.stamp_ns, [s[:4] for s in one.sightings]) for one in found] == [
-        (one.stamp_ns, [s[:4] for s in one.sightings]) for one in whole
-    ]
-
-
 def test_the_logarithm_of_the_paper_is_tens_of_centimetres_off() -> None:
     one = calibrate(1)
     assert np.sqrt(np.mean(one.hyperbola_cm**2)) < 1.0
     assert np.sqrt(np.mean(one.logarithm_cm**2)) > 20.0
-
-
-@pytest.mark.parametrize("kind", ["pointer", "lidar"])
-def test_gtsam_takes_the_same_step_and_has_the_same_covariances(kind: str) -> None:
-    peer = pytest.importorskip("bench.pushbot.gtsam_graph", exc_type=ImportError)
-    found = peer.compared(peer.mapped(kind, 1, 0.5).graph)
-    assert found["stops"] > 3
-    assert found["step_difference_m"] < 1e-9
-    assert found["sigma_ratio_difference"] < 1e-6

@@ -10,8 +10,9 @@ import pytest
 from calibration_world import World, record, robot
 
 from bench.mrclam.jobs import Job, smoothed
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, Kind, MeasurementColumns
-from swarm_loc_estimator.offline.calibration.noise import with_noise
+from swarm_loc_estimator.filter.measurements import Measurements
+from swarm_loc_estimator.filter.models import POLAR
+from swarm_loc_estimator.offline.calibration.fit import with_noise
 from swarm_loc_estimator.offline.calibration.recording import rerun, started_at_truth
 from swarm_loc_estimator.offline.metrics import pool, summarise
 from swarm_loc_estimator.swarm.swarm import Robot
@@ -29,13 +30,13 @@ NOISE = {
 """As the world errs."""
 
 
-def sighting() -> MeasurementColumns:
+def sighting() -> Measurements:
     """Robot 0 sees robot 1."""
-    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
-    one["target"], one["kind"] = 1, Kind.POLAR
-    one["sensor"], one["marker"] = [0.1, -0.05, 0.2], [0.02, 0.03, 0.0]
-    one["value"] = [1.8, 0.4, 0.0]
-    return MeasurementColumns.of(one)
+    one = Measurements.empty(1)
+    one.observer[:], one.target[:], one.model[:] = 0, 1, POLAR
+    one.sensor[:], one.marker[:] = [0.1, -0.05, 0.2], [0.02, 0.03, 0.0]
+    one.value[:] = [1.8, 0.4, 0.0]
+    return one
 
 
 def test_jacobians_are_those_of_finite_differences() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.offline.sweep.grid import read_sweep
+from swarm_loc_estimator.offline.sweep.sweep import read_sweep
 
 sweep = pytest.importorskip("bench.sweep", exc_type=ImportError)
 

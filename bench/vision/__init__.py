@@ -1,1 +1,1 @@
-"""What the marker detector achieves, beside cv2.aruco and pupil-apriltags; run by `bench.epuck`, too."""
+"""The marker detector, compared with cv2.aruco and pupil-apriltags; `bench.epuck` runs it, too."""

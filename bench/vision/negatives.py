@@ -38,7 +38,7 @@ def random_family(rng: np.random.Generator) -> Family:
 
 
 def black_squares(count: int) -> dict[str, int]:
-    """How many of so many black squares with a speck are read as an id, by family and number of ids."""
+    """How many of black squares with a speck are read as an id, by family and number of ids."""
     rng = np.random.default_rng(98)
     images = [black_square(rng) for _ in range(count)]
     return {

@@ -41,10 +41,9 @@ from swarm_loc_estimator.common.launch import (
     start,
     stop,
 )
-from swarm_loc_estimator.offline.live.graph import START_PATIENCE_S, LiveGraph, cpu_seconds
-from swarm_loc_estimator.offline.live.run import ESTIMATOR, PLAYER
+from swarm_loc_estimator.offline.live_run import ESTIMATOR, PLAYER, START_PATIENCE_S, LiveGraph, cpu_seconds
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_estimator.watch.server import free_port
 
 SIZES = (5, 300, 1000)
@@ -205,6 +204,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if executable is None:
         print("There is no Chromium here: apt-get install chromium.", file=sys.stderr)
         return 1
+    # measure pages of all sizes, and the load of the estimator
     OUT.mkdir(parents=True, exist_ok=True)
     progress, samples, results = ProgressLine("watch"), {}, {}
     with tempfile.TemporaryDirectory() as work, running_browser(executable) as browser:
@@ -219,6 +219,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             bag, figures = bag_of(robots, Path(work)), results.setdefault(robots, {})
             figures["estimator_core_alone"] = estimator_core(bag, None, options.seconds)
             figures["estimator_core_watched"] = estimator_core(bag, browser, options.seconds)
+    # table and figures
     print()
     names = list(dict.fromkeys(name for figures in results.values() for name in figures))
     columns = [*results.values(), estimated]

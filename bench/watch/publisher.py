@@ -38,6 +38,7 @@ def homes(robots: int) -> FloatArray:
 
 def main() -> None:
     """Publish until a signal ends the process."""
+    # the topics of an estimator
     names = [robot.name for robot in load_swarm(Path(sys.argv[1])).robots]
     rclpy.init()
     node = rclpy.create_node("estimator")
@@ -45,6 +46,7 @@ def main() -> None:
     sightings = node.create_publisher(SwarmSightings, "swarm/sightings", QoSProfile(depth=10))
     diagnostics = node.create_publisher(DiagnosticArray, "/diagnostics", QoSProfile(depth=10))
     encoder, places, n = SwarmPosesEncoder(names, "map"), homes(len(names)), len(names)
+    # robots on circles, and what stays as it is
     random = np.random.default_rng(1)
     phase, speed = random.uniform(-math.pi, math.pi, n), random.uniform(0.2, 0.6, n)
     covariance = np.tile(np.diag([4e-4, 1e-4, 1e-3]), (n, 1, 1))
@@ -57,6 +59,7 @@ def main() -> None:
         np.full(2 * n, 0.2, np.float32),
     )
     report = serialized_diagnostics(names)
+    # publish at a fixed rate
     began_s, count = time.monotonic(), 0
     while rclpy.ok():
         count += 1

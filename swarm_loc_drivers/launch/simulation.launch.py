@@ -7,7 +7,7 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
-from swarm_loc_drivers.sim.link_folder import link_folder
+from swarm_loc_drivers.sim.link_host import link_folder
 from swarm_loc_drivers.sim.simulation import ROBOT_TYPES, SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_estimator.common.launch import argument_texts, node_action, options_from
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from swarm_loc_estimator.common.command_line import Program
 
-droplet_driver_node = Program("swarm_loc_drivers.droplet.droplet_driver_node")
-droplet_fleet_node = Program("swarm_loc_drivers.droplet.droplet_fleet_node")
-droplet_steering_node = Program("swarm_loc_drivers.sim.scenarios.droplet_steering_node")
+droplet_driver_node = Program("swarm_loc_drivers.droplet.droplet_nodes", "run_droplet_driver")
+droplet_fleet_node = Program("swarm_loc_drivers.droplet.droplet_nodes", "run_droplet_fleet")
+droplet_steering_node = Program("swarm_loc_drivers.sim.scenarios.steering_nodes", "run_droplet_steering")
 droplet_world_node = Program("swarm_loc_drivers.sim.droplet.droplet_world_node")
-eight_steering_node = Program("swarm_loc_drivers.sim.scenarios.eight_steering_node")
+eight_steering_node = Program("swarm_loc_drivers.sim.scenarios.steering_nodes", "run_eight_steering")
 epuck_driver_node = Program("swarm_loc_drivers.epuck.epuck_driver_node")
 epuck_world_node = Program("swarm_loc_drivers.sim.epuck.epuck_world_node")
 exploration_node = Program("swarm_loc_drivers.pushbot.exploration_node")

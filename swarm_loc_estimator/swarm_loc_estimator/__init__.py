@@ -42,11 +42,11 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.sensors.fix import FixRows as FixRows
     from swarm_loc_estimator.sensors.imu import TurnRateRows as TurnRateRows
     from swarm_loc_estimator.sensors.infrared import BrightnessRows as BrightnessRows
+    from swarm_loc_estimator.sensors.inputs import Batch as Batch
+    from swarm_loc_estimator.sensors.inputs import register as register
     from swarm_loc_estimator.sensors.lidar import ScanRows as ScanRows
     from swarm_loc_estimator.sensors.odometry import OdometryRows as OdometryRows
     from swarm_loc_estimator.sensors.ranges import RangeRows as RangeRows
-    from swarm_loc_estimator.sensors.registry import Batch as Batch
-    from swarm_loc_estimator.sensors.registry import register as register
     from swarm_loc_estimator.sensors.sensor import Sensor as Sensor
     from swarm_loc_estimator.swarm.swarm import Anchor as Anchor
     from swarm_loc_estimator.swarm.swarm import CameraMount as CameraMount
@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.swarm.swarm import Swarm as Swarm
     from swarm_loc_estimator.swarm.swarm import UwbDevice as UwbDevice
     from swarm_loc_estimator.swarm.swarm_file import load_swarm as load_swarm
-    from swarm_loc_estimator.swarm.swarm_writer import save_swarm as save_swarm
+    from swarm_loc_estimator.swarm.swarm_file import save_swarm as save_swarm
     from swarm_loc_estimator.timeline.estimate import Estimate as Estimate
     from swarm_loc_estimator.timeline.estimate import Status as Status
     from swarm_loc_estimator.timeline.estimator import Estimator as Estimator
@@ -89,7 +89,7 @@ _MODULES = {
     "swarm_loc_estimator.sensors.lidar": ("ScanRows",),
     "swarm_loc_estimator.sensors.odometry": ("OdometryRows",),
     "swarm_loc_estimator.sensors.ranges": ("RangeRows",),
-    "swarm_loc_estimator.sensors.registry": ("Batch", "register"),
+    "swarm_loc_estimator.sensors.inputs": ("Batch", "register"),
     "swarm_loc_estimator.sensors.sensor": ("Sensor",),
     "swarm_loc_estimator.swarm.swarm": (
         "Anchor",
@@ -101,8 +101,7 @@ _MODULES = {
         "Swarm",
         "UwbDevice",
     ),
-    "swarm_loc_estimator.swarm.swarm_file": ("load_swarm",),
-    "swarm_loc_estimator.swarm.swarm_writer": ("save_swarm",),
+    "swarm_loc_estimator.swarm.swarm_file": ("load_swarm", "save_swarm"),
     "swarm_loc_estimator.timeline.estimate": ("Estimate", "Status"),
     "swarm_loc_estimator.timeline.estimator": ("Estimator", "Step"),
     "swarm_loc_estimator.timeline.settings": ("Settings",),

@@ -26,11 +26,10 @@ from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE_TWO, CONTENT_POSITION
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import OdometryModel
-from swarm_loc_estimator.swarm.ir_board import IrMethod, RobotIr
+from swarm_loc_estimator.swarm.ir_board import RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.fusion import Fusion
@@ -100,9 +99,7 @@ def _swarm(*, infrared: bool) -> Swarm:
     robots.append(Robot("c", odometry=calibrated, faces=(Face("front", 2, yaw=0.0),), start=(0.0, 0.0, 0.0)))
     if infrared:
         droplet = load_ir_platform("droplet")
-        # one reads by likelihood, the next by the closed form
-        boards = (RobotIr(1 + k, droplet, "droplet", list(IrMethod)[k % 2]) for k in range(len(robots)))
-        robots = [replace(robot, ir=board) for robot, board in zip(robots, boards, strict=True)]
+        robots = [replace(robot, ir=RobotIr(1 + k, droplet, "droplet")) for k, robot in enumerate(robots)]
     places = range(_LANDMARKS)
     marks = tuple(Landmark(_FIRST_LANDMARK + k, x=1.0, y=0.2 * k, yaw=3.1) for k in places)
     return Swarm(tuple(robots), marks)

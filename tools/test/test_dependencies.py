@@ -113,11 +113,10 @@ def test_of_the_estimator_others_import_only_common_swarm_and_the_public_api(nam
 
 
 @pytest.mark.parametrize(
-    "node",
-    ["epuck.epuck_driver", "droplet.droplet_driver", "droplet.droplet_fleet", "pushbot.pushbot_driver"],
+    "module", ["epuck.epuck_driver_node", "droplet.droplet_nodes", "pushbot.pushbot_driver_node"]
 )
-def test_a_driver_loads_neither_the_filter_nor_what_pages_and_plots_need(node: str) -> None:
-    module = f"swarm_loc_drivers.{node}_node"
+def test_a_driver_loads_neither_the_filter_nor_what_pages_and_plots_need(module: str) -> None:
+    module = f"swarm_loc_drivers.{module}"
     command = [sys.executable, "-c", f"import sys, {module}; print(*sys.modules)"]
     loaded = set(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
     assert module in loaded
@@ -127,7 +126,7 @@ def test_a_driver_loads_neither_the_filter_nor_what_pages_and_plots_need(node: s
 
 NODES = [
     ".".join(path.relative_to(ROOT).with_suffix("").parts[1:])
-    for path in sorted(ROOT.glob("swarm_loc_*/swarm_loc_*/**/*_node.py"))
+    for path in sorted(ROOT.glob("swarm_loc_*/swarm_loc_*/**/*_node*.py"))
 ]
 LIVE = {
     *NODES,

@@ -59,7 +59,7 @@ def test_the_path_of_a_message_keeps_its_limits(kind: str) -> None:
 def test_a_detection_passes_reading_converting_fusing_and_encoding() -> None:
     passed = message_path.passed("detection")
     expected = [
-        "swarm_loc_estimator.sensors.ingest",
+        "swarm_loc_estimator.sensors.inputs",
         "swarm_loc_estimator.sensors.camera",
         "swarm_loc_estimator.timeline.estimator",
         "swarm_loc_estimator.filter.prediction",  # compiled

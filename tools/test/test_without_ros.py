@@ -1,8 +1,8 @@
 """Only nodes need ROS; all other modules can be imported without it.
 
-These may need it: modules named `*_node.py`; in the estimator `common/node.py`, all of `nodes/`, `watch/`
-and `offline/live/`, `doctor/listener.py`, and the command `demo`; in the drivers what publishes for
-nodes, named `*_diagnostics.py`, `*_messages.py`, `*_output.py` or `*_steering.py`.
+These may need it: modules named `*_node.py` or `*_nodes.py`; in the estimator `common/node.py`, all of
+`nodes/` and `watch/`, `offline/live_run.py`, `doctor/listener.py`, and the command `demo`; in the drivers
+what publishes for nodes, named `*_diagnostics.py`, `*_messages.py` or `*_output.py`.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ IMPORT_ALL_WITHOUT_ROS = """
 import importlib, pathlib, re, sys
 
 WITH_ROS = re.compile(
-    r"_node$|^swarm_loc_estimator\\.(common\\.(node|lifecycle|ros_parameters)$|nodes\\.|watch\\.)"
-    r"|^swarm_loc_estimator\\.(offline\\.live\\.|doctor\\.listener$|cli\\.demo$)"
-    r"|^swarm_loc_drivers\\..*_(diagnostics|messages|output|steering)$"
+    r"_nodes?$|^swarm_loc_estimator\\.(common\\.node$|nodes\\.|watch\\.)"
+    r"|^swarm_loc_estimator\\.(offline\\.live_run$|doctor\\.listener$|cli\\.demo$)"
+    r"|^swarm_loc_drivers\\..*_(diagnostics|messages|output)$"
 )
 
 class NoRos:

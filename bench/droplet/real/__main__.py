@@ -21,15 +21,14 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.droplet.closed_form import ClosedForm, IrEstimator
 from bench.droplet.real import firmware, graph
 from bench.droplet.real.recordings import Recorded, read_folder
 from bench.shared.common import OUT, Cell, ProgressLine, table, write_figures
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.command_line import exit_with_message
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.infrared.closed_form import ClosedForm
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.search import IrEstimator
 from swarm_loc_estimator.offline.calibration.infrared.board import (
     MAX_RANGE,
     BoardCalibration,
@@ -39,8 +38,7 @@ from swarm_loc_estimator.offline.calibration.infrared.board import (
     turned,
     without_dead,
 )
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrPlatform
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, load_ir_platform
 
 DEFAULT_FOLDER = OUT.parent.parent / "shared" / "data" / "droplet_2016"
 METHODS = ("firmware", "closed_form", "stock", "board")

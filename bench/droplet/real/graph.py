@@ -22,14 +22,12 @@ from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.offline.calibration.infrared.board import GAIN_SIGMA, BoardCalibration, without_dead
-from swarm_loc_estimator.offline.live.run import compare_with_replay, play_live
+from swarm_loc_estimator.offline.live_run import compare_with_replay, play_live
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.swarm.board_file import save_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains
+from swarm_loc_estimator.swarm.ir_board import IrGains, save_ir_platform
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 from swarm_loc_estimator.timeline.settings import Settings
 

@@ -11,7 +11,7 @@ from bench.shared.common import ProgressLine
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.offline.calibration.infrared.board import BoardReadings, BoardRecording, read_board
 from swarm_loc_estimator.offline.calibration.recording import read_recording
-from swarm_loc_estimator.offline.datasets.droplets_bag import ImportSettings, import_recording
+from swarm_loc_estimator.offline.datasets.droplets import ImportSettings, import_recording
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 

@@ -88,7 +88,6 @@ class DropletDriver(RobotDriver[DropletSession]):
         session.abandon(self._clock())
 
     def _serve(self, session: DropletSession) -> None:
-        """Pass on requests and publish odometry."""
         if not session.connected:
             return
         if self._requested.is_set():

@@ -154,7 +154,7 @@ class PollingExchange:
         self._skips.clear()
         self._requested = len(self._partners)
 
-    def note(self, said: Said) -> None:
+    def observe(self, said: Said) -> None:
         """Process a printed line."""
         if isinstance(said.event, SendAborted):
             self._counts["busy_sends"] += 1
@@ -196,7 +196,8 @@ class PollingExchange:
                 self._note_failure(partner)
                 return
             ones.append(one)
-        if len(ones) == 2 and not _differ(*ones):
+        # if the far matrix is not brighter, the command to change the power had no effect
+        if len(ones) == 2 and not ones[1].readings.sum() > _BRIGHTER * ones[0].readings.sum():
             self._counts["equal_powers"] += 1
             return
         self._counts["exchanges"] += 1
@@ -252,8 +253,3 @@ class PollingExchange:
             return self._answer
         finally:
             self._asked = None
-
-
-def _differ(near: Brightness, far: Brightness) -> bool:
-    """Whether the far matrix is brighter; otherwise the command to change the power had no effect."""
-    return bool(far.readings.sum() > _BRIGHTER * near.readings.sum())

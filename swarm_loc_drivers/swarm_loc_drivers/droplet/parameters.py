@@ -106,7 +106,6 @@ class DropletParameters(DropletTraits):
         return found
 
     def _exchanges(self) -> PollingSettings | TdmaSettings:
-        """Settings of the exchanges."""
         partners = self._partner_ids()
         far, near = self.far_power, self.near_power
         if near >= far:

@@ -154,7 +154,6 @@ class DropletSession:
         return not self.ending
 
     def _on_said(self, said: Said) -> None:
-        """Process a printed line."""
         event = said.event
         if isinstance(event, Identity):
             self._exchanging.validator.robot = event.robot
@@ -165,7 +164,7 @@ class DropletSession:
         elif isinstance(event, MoveStarted):
             self._note_move(event)
         else:
-            self._exchanging.note(said)
+            self._exchanging.observe(said)
 
     def _note_move(self, started: MoveStarted) -> None:
         """A command to move, from here or by infrared."""

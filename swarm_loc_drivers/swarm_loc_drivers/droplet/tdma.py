@@ -78,7 +78,7 @@ class TdmaExchange:
     def request(self) -> None:
         """Does nothing: robots are not asked."""
 
-    def note(self, said: Said) -> None:
+    def observe(self, said: Said) -> None:
         """Process a printed line."""
         if not isinstance(said.event, Matrix):
             return

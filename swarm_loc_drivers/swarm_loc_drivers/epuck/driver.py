@@ -1,24 +1,180 @@
-"""Driver of one e-puck: link, wheel commands and odometry, without ROS."""
+"""Driver of one e-puck: link, wheel commands and odometry from its step counters, without ROS.
+
+The counters count commanded steps, so a change that the commands since the last reading cannot explain means
+that a reading has lost bytes or that the robot has restarted. After a gap between readings, delayed readings
+may arrive: for a while the commands of the whole gap are taken into account.
+"""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections import Counter, deque
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.link import Link, open_link
-from swarm_loc_drivers.common.odometry import OdometryState
+from swarm_loc_drivers.common.odometry import DeadReckoning, OdometryState, WheelGeometry
 from swarm_loc_drivers.common.robot_driver import RobotDriver
 from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
-from swarm_loc_drivers.epuck.odometry import WheelOdometry
+from swarm_loc_drivers.epuck.hardware import as_counter, unwrapped_difference
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.serial_session import SerialSession
 from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession
 from swarm_loc_drivers.epuck.wifi_session import WifiSession
+
+Rates = tuple[float, float]
+
+# Checked by test_epuck_motion.py and by the bad links of test_epuck_sessions.py.
+_TIMING_SLACK_S = 0.15
+"""Further uncertainty of a stamp, beyond that known to the session: stamps are those of the computer."""
+_DELAY_NS = 500_000_000  # Longest delay of a command to the robot, and of a reading from it
+_MIN_PERIOD_NS = 4_000_000
+"""No robot answers faster: readings that arrive closer together were delayed in transit."""
+_ROUNDING_STEPS = 2
+
+
+class _RateLimits(NamedTuple):
+    """Limits of the rates of the left and the right wheel [steps/s] from an instant [ns] on."""
+
+    since_ns: int
+    slowest: Rates
+    fastest: Rates
+
+
+class WheelOdometry:
+    """Integrates steps to a pose, and checks them against the commands.
+
+    Args:
+        geometry: Geometry of the wheels.
+        wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
+        counts: Counts `implausible_counters`, `counter_restarts`, `reversed_counters` and `time_jumps`.
+    """
+
+    def __init__(self, geometry: WheelGeometry, wheel_noise: float, counts: Counter[str]) -> None:
+        self._geometry = geometry
+        self._counts = counts
+        self._reckoning = DeadReckoning(geometry, wheel_noise)
+        self._last: tuple[int, int, int] | None = None
+        self._last_doubt_ns = 0
+        self._rates: Rates = (0.0, 0.0)
+        self._held: Rates = (0.0, 0.0)  # at the last reading; the robot keeps them during a gap
+        self._limits_since = deque([_RateLimits(0, self._rates, self._rates)])
+        self._gap_ns = (0, 0)
+        self._right_sign = 1
+        self._doubtful = False
+
+    def note_rates(self, now_ns: int, left: float, right: float) -> None:
+        """The wheels turn at these commanded rates [steps/s] from now on."""
+        self._rates = (left, right)
+        self._note(_RateLimits(now_ns, self._rates, self._rates))
+
+    def doubt_rates(self, now_ns: int, max_rate: float) -> None:
+        """The rates are unknown, up to `max_rate` [steps/s], until the next command."""
+        self._note(_RateLimits(now_ns, (-max_rate, -max_rate), (max_rate, max_rate)))
+
+    def _note(self, limits: _RateLimits) -> None:
+        newest = self._limits_since[-1]
+        if (limits.slowest, limits.fastest) != (newest.slowest, newest.fastest):
+            self._limits_since.append(limits)
+
+    def update(self, stamp_ns: int, left: int, right: int, *, doubt_ns: int = 0) -> OdometryState | None:
+        """Take counters of 16 bits, read at `stamp_ns` with an uncertainty of `doubt_ns`.
+
+        Returns:
+            The state; None if the reading is too close to the last one or impossible.
+        """
+        right, last = as_counter(self._right_sign * right), self._last
+        # the first reading, and those that come too early
+        if last is None:
+            self._restart(stamp_ns, doubt_ns, left, right)
+            return self._reckoning.state(stamp_ns, 0.0, 0.0, 0.0)
+        if 0 <= stamp_ns - last[0] < _MIN_PERIOD_NS:
+            return None
+        # the longest time in which the wheels may have turned
+        has_jumped = stamp_ns < last[0]
+        if has_jumped:
+            self._counts["time_jumps"] += 1
+        elapsed_s = 0.0 if has_jumped else (stamp_ns - last[0]) * 1e-9
+        if elapsed_s > _TIMING_SLACK_S:
+            self._gap_ns = self._since_ns(last[0]), stamp_ns
+        longest_s = max(elapsed_s, (stamp_ns - self._since_ns(stamp_ns)) * 1e-9)
+        longest_s += _TIMING_SLACK_S + (self._last_doubt_ns + doubt_ns) * 1e-9
+        # steps that the commands can explain, also if the right counter runs backwards
+        steps = self._steps(left, right, elapsed_s)
+        mirrored = self._steps(left, right, elapsed_s, right_sign=-1)
+        paths = 0.0, 0.0
+        if self._possible(steps, longest_s):
+            paths = self._advance(*steps)
+        elif self._doubtful and self._possible(mirrored, longest_s):
+            self._counts["reversed_counters"] += 1
+            self._right_sign, right = -self._right_sign, as_counter(-right)
+            paths = self._advance(*mirrored)
+        elif self._doubtful or has_jumped:
+            self._counts["counter_restarts"] += 1
+            self._forget_motion(longest_s)
+        else:  # a single reading may have lost bytes
+            self._counts["implausible_counters"] += 1
+            self._doubtful = True
+            return None
+        self._restart(stamp_ns, doubt_ns, left, right)
+        return self._reckoning.state(stamp_ns, *paths, elapsed_s)
+
+    def _steps(self, left: int, right: int, elapsed_s: float, right_sign: int = 1) -> tuple[int, int]:
+        """Steps since the last reading: those possible by the counters that are closest to the commands."""
+        _, last_left, last_right = self._last or (0, left, right)
+        expected_left, expected_right = (rate * elapsed_s for rate in self._held)
+        return (
+            unwrapped_difference(last_left, left, expected_left),
+            unwrapped_difference(right_sign * last_right, right_sign * right, expected_right),
+        )
+
+    def _restart(self, stamp_ns: int, doubt_ns: int, left: int, right: int) -> None:
+        """Make this the last reading."""
+        self._last, self._last_doubt_ns = (stamp_ns, left, right), doubt_ns
+        self._held = self._rates
+        first_ns, last_ns = self._since_ns(stamp_ns) - _DELAY_NS, stamp_ns + _DELAY_NS
+        while len(self._limits_since) > 1 and not first_ns < self._limits_since[1].since_ns <= last_ns:
+            self._limits_since.popleft()
+        self._doubtful = False
+
+    def _since_ns(self, stamp_ns: int) -> int:
+        """Start of the time that a reading may cover: soon after a gap, the start of the gap."""
+        begin_ns, end_ns = self._gap_ns
+        return begin_ns if 0 <= stamp_ns - end_ns <= _DELAY_NS else stamp_ns
+
+    def _limits(self) -> tuple[Rates, Rates]:
+        """Slowest and fastest rates since the last reading; zero is always possible."""
+        slowest = [(0.0, 0.0), *(one.slowest for one in self._limits_since)]
+        fastest = [(0.0, 0.0), *(one.fastest for one in self._limits_since)]
+        return (
+            (min(left for left, _ in slowest), min(right for _, right in slowest)),
+            (max(left for left, _ in fastest), max(right for _, right in fastest)),
+        )
+
+    def _possible(self, steps: tuple[int, int], longest_s: float) -> bool:
+        """Whether the commands allow these steps within `longest_s`."""
+        ranges = zip(steps, *self._limits(), strict=True)
+        return all(
+            slowest * longest_s - _ROUNDING_STEPS <= done <= fastest * longest_s + _ROUNDING_STEPS
+            for done, slowest, fastest in ranges
+        )
+
+    def _advance(self, left_steps: int, right_steps: int) -> tuple[float, float]:
+        """Move by steps of the wheels; returns their paths [m]."""
+        left, right = (steps * self._geometry.metres_per_step for steps in (left_steps, right_steps))
+        self._reckoning.advance(left, right)
+        return left, right
+
+    def _forget_motion(self, longest_s: float) -> None:
+        """The motion is unknown, at most as fast as commanded."""
+        rate = max(abs(rate) for limit in self._limits() for rate in limit)
+        self._reckoning.forget_motion(rate * self._geometry.metres_per_step * longest_s)
+
 
 _MAX_IDLE_S = 0.5
 """Longest wait for a tick, for instance while simulated time stands still; then the robot is asked [s]."""

@@ -106,7 +106,6 @@ def _proximity_frames(prefix: str) -> list[str]:
 
 
 def _proximity_transforms(stamp_ns: int, base_frame: str, prefix: str) -> list[TransformStamped]:
-    """Transforms of the proximity sensors."""
     header = Header(stamp=stamp_message(stamp_ns), frame_id=base_frame)
     transforms = []
     for frame, bearing in zip(_proximity_frames(prefix), PROXIMITY_BEARINGS, strict=True):

@@ -263,7 +263,7 @@ class SerialSession(TalkSession):
         return None
 
     def _timeout_s(self, bytes_in_all: int) -> float:
-        """How long an exchange of so many bytes may take [s]."""
+        """How long an exchange of bytes may take [s]."""
         return self._params.reply_timeout_s + 20.0 * bytes_in_all / self._params.baud_rate
 
     def _set_camera(self, camera: CameraSettings) -> Talk[None]:

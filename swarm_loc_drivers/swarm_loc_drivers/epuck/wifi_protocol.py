@@ -2,7 +2,7 @@
 
 A message of the robot is an id byte and a payload of fixed length, without checksum. A position in the stream
 is accepted as the beginning of a message if the id is known, the sensor values are plausible, and the bytes
-behind it can begin a message, too. An image, whose bytes are arbitrary, is accepted if a message follows it
+after it can begin a message, too. An image, whose bytes are arbitrary, is accepted if a message follows it
 and none lies within it.
 """
 

@@ -18,6 +18,7 @@ from swarm_loc_drivers.pushbot.hardware import TIMESTAMPS
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.jit import cached_njit, note_precompiled
 
+# Checked by lost bytes in test_pushbot_events.py.
 CONFIRMATIONS = 8  # Consecutive events that confirm a jump of time
 MAX_LINE = 256  # Longer lines are dropped
 _MAX_HELD = 1024  # Most bytes that wait for the confirmation of a jump; then it is accepted
@@ -63,9 +64,9 @@ class EventParser:
     def feed(self, data: bytes) -> Parsed:
         """Take bytes; the events and lines that are complete and confirmed."""
         buffer = np.frombuffer(self._rest + data, np.uint8)
-        room = len(buffer) // 2 + 1
-        columns = np.empty((3, room), np.uint8)
-        times = np.empty(room, np.int64)
+        capacity = len(buffer) // 2 + 1
+        columns = np.empty((3, capacity), np.uint8)
+        times = np.empty(capacity, np.int64)
         spans = np.empty((len(buffer) + 1, 3), np.int64)
         tally = np.zeros(len(_COUNTS), np.int64)
         used, events, lines = _parse(buffer, self._stamp_bytes, self._state, columns, times, spans, tally)
@@ -92,6 +93,7 @@ def _parse(
     run_at, run_events, run_lines = -1, 0, 0  # where an unconfirmed jump of time began
     before, tally_before = state.copy(), tally.copy()
     while at < len(data):
+        # a line of text, up to its newline
         if data[at] < _HIGH:
             end, verdict = _line_end(data, at)
             if verdict == 0:
@@ -109,6 +111,7 @@ def _parse(
             tally[_LONG if verdict == 3 else _SKIPPED] += 1 if verdict == 3 else end - at
             at = end
             continue
+        # an event: its stamp must follow plausibly, or begins a run that others must confirm
         size, stamp = _stamp(data, at, stamp_bytes)
         if size == 0:
             break
@@ -123,7 +126,7 @@ def _parse(
                 events, state[:] = run_events, before
                 elapsed = _elapsed(stamp, state, stamp_bytes)
                 if state[_STARTED] == 0 or not _is_plausible(elapsed, stamp_bytes):
-                    at, lines, run_at = run_at + 1, run_lines, -1  # no boundary: search behind it
+                    at, lines, run_at = run_at + 1, run_lines, -1  # no boundary: search after it
                     tally[_SKIPPED] += 1
                     continue
                 run_at = -1
@@ -133,6 +136,7 @@ def _parse(
                 tally_before[:] = tally
             state[_TIME] += elapsed
             state[_RAW], state[_STARTED] = stamp, 1
+        # take the event
         columns[0, events], columns[1, events] = data[at + 1] & 0x7F, data[at] & 0x7F
         columns[2, events] = data[at + 1] >> 7
         times[events] = state[_TIME]

@@ -18,7 +18,6 @@ from geometry_msgs.msg import Pose, PoseStamped, PoseWithCovarianceStamped, Twis
 from nav_msgs.msg import Odometry
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
-from swarm_loc_drivers.common.velocity_command import Velocity
 from swarm_loc_drivers.pushbot.parameters import ExplorationParameters, driven_robots
 from swarm_loc_drivers.pushbot.stop_and_go import MapGoal, StopAndGo, StopAndGoSettings
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -48,9 +47,9 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("exploration", ExplorationParameters, **node_arguments)
-        chosen = self.params
-        self._names = driven_robots(chosen, load_swarm(Path(chosen.swarm_file)))
-        self._robots = [_Robot(chosen.settings) for _ in self._names]
+        params = self.params
+        self._names = driven_robots(params, load_swarm(Path(params.swarm_file)))
+        self._robots = [_Robot(params.settings) for _ in self._names]
         self._commands = [self.create_publisher(Twist, f"{name}/cmd_vel", 1) for name in self._names]
         for index, name in enumerate(self._names):
             self.create_subscription(Odometry, f"{name}/odom", partial(self._on_odometry, index), _QOS)
@@ -60,7 +59,7 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
             )
             self.create_subscription(PoseStamped, f"{name}/goal", partial(self._on_goal, index), _LATCHED)
         self.start_diagnostics(self._on_diagnostics)
-        self.get_logger().info(f"ready: {len(self._names)} robots of '{chosen.swarm_file}'")
+        self.get_logger().info(f"ready: {len(self._names)} robots of '{params.swarm_file}'")
 
     def destroy_node(self) -> None:
         """Stop the robots first."""
@@ -77,7 +76,8 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
         if stamp_ns < 0 or not np.isfinite(pose).all():
             self.health.drop("bad_odometry")
             return
-        self._command(index, robot.motion.command(stamp_ns, pose))
+        forward, _, rate = robot.motion.command(stamp_ns, pose)
+        self._commands[index].publish(Twist(linear=Vector3(x=forward), angular=Vector3(z=rate)))
 
     def _can_begin(self, name: str) -> bool:
         """Whether all nodes that produce and use a robot's distances run, so that none is lost."""
@@ -107,10 +107,6 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
             self.health.drop("bad_goal")
         elif not robot.motion.take_goal(MapGoal(stamp_ns, pose, position)):
             self.health.drop("goal_of_another_time")
-
-    def _command(self, index: int, velocity: Velocity) -> None:
-        forward, _, rate = velocity
-        self._commands[index].publish(Twist(linear=Vector3(x=forward), angular=Vector3(z=rate)))
 
     def _on_diagnostics(self) -> None:
         self.health.warn_of_drops()

@@ -26,6 +26,7 @@ from swarm_loc_drivers.pushbot.hardware import FirmwareGeneration
 from swarm_loc_drivers.pushbot.parameters import PushbotParameters
 from swarm_loc_estimator.common.arrays import IntArray
 
+# Clocks: checked by test_pushbot_clock.py; stops below: by test_pushbot_session.py.
 _WINDOW_NS = 2_000_000_000  # Window of the smallest delay; the clocks drift by less than 0.1 ms within it
 _MAX_AHEAD_US = 250_000  # Longest time that one of the board's 4092 buffered events waits [us]
 _LEAK = 1e-4  # Share by which periods are shortened, so that a late estimate recovers
@@ -309,5 +310,4 @@ class PushbotSession(TalkSession):
 
 
 def _tick_period_ms(params: PushbotParameters) -> int:
-    """Period of the wheel ticks [ms]."""
     return max(1, round(1e3 * params.tick_period_s))

@@ -19,6 +19,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import number
 from swarm_loc_estimator.common.se2 import wrap_angle
 
+# Checked by test_stop_and_go.py.
 _SLOW_TURN = 0.5 * math.pi  # Beginning of the first scan, which defines the heading of the whole map [rad]
 _SLOW_SHARE, _FIRST_SHARE = 1.0 / 6.0, 0.5
 """Shares of the turn rate at that beginning and in the rest of the first scan."""

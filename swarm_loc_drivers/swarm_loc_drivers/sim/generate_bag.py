@@ -14,7 +14,7 @@ In place of detections,
     droplets writes <robot>/brightness and <robot>/fix
     aerial writes aerial/detections
     pushbots writes map, <robot>/laser, <robot>/lights, <robot>/fix and <robot>/goal, with --events also
-        <robot>/events, and beside the bag walls.csv and the calibrations of the lasers
+        <robot>/events, and next to the bag walls.csv and the calibrations of the lasers
 The same arguments give the same bytes.
 """
 
@@ -29,6 +29,7 @@ from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.scenarios.bags import (
+    simulate_wandering,
     write_aerial_bag,
     write_bag,
     write_droplet_bag,
@@ -38,7 +39,6 @@ from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, simulat
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight, simulate_eight_images
 from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.pushbot_bag import PushbotBagSettings, write_pushbot_bag
-from swarm_loc_drivers.sim.scenarios.wandering import simulate_wandering
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
 
@@ -111,9 +111,9 @@ def _pushbots(options: argparse.Namespace, comment: str) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     swarms = parser.add_subparsers(dest="swarm", required=True, metavar="SWARM")
+    # e-pucks on the eight
     eight = _swarm(swarms, "eight", "e-pucks that drive along an eight among wall markers", 5, 9, 54.0)
     eight.set_defaults(write=_eight)
     images = _swarm(swarms, "pictures", "the same, with images in place of detections", 2, 9, 9.0)
@@ -127,6 +127,7 @@ def _parser() -> argparse.ArgumentParser:
         )
         one.add_argument("--speed", type=number_in(0.001, 0.12, "m/s"), default=0.06, help="[m/s]")
         one.add_argument("--start-unknown", action="store_true", help="leave start poses out of swarm.yaml")
+    # Droplets
     droplets = _swarm(swarms, "droplets", "Droplets that measure each other by infrared", 20, 1000, 90.0)
     droplets.set_defaults(write=_droplets)
     droplets.add_argument(
@@ -140,9 +141,11 @@ def _parser() -> argparse.ArgumentParser:
     droplets.add_argument(
         "--boards", type=_ANY_SEED, help="seed of the elements' gains (default: that of --seed)"
     )
+    # e-pucks seen from above
     aerial = _swarm(swarms, "aerial", "e-pucks that move at random under an overhead camera", 5, 20, 60.0)
     aerial.set_defaults(write=_aerial)
     aerial.add_argument("--start-known", action="store_true", help="write start poses to swarm.yaml")
+    # PushBots
     pushbots = _swarm(swarms, "pushbots", "PushBots that map a hall", 1, 5, 300.0)
     pushbots.set_defaults(write=_pushbots)
     pushbots.add_argument(
@@ -159,6 +162,7 @@ def _parser() -> argparse.ArgumentParser:
         default=0.0,
         help="length of the events at the beginning [s]",
     )
+    # the grid
     grid = _swarm(swarms, "grid", "many robots, each in its cell of a grid", 100, 10_000, 20.0)
     grid.set_defaults(write=_grid)
     return parser

@@ -1,6 +1,7 @@
-"""Pseudo-terminals and TCP ports behind which emulated firmware answers.
+"""Pseudo-terminals and TCP ports at which emulated firmware answers, and a temporary folder for their names.
 
-Everything happens in the thread that calls `poll`, so a world that steps its bodies there needs no locks.
+Everything happens in the thread that calls `poll`, so a world that steps its bodies there needs no locks. The
+folder is removed even after a kill.
 """
 
 from __future__ import annotations
@@ -10,12 +11,57 @@ import fcntl
 import os
 import pty
 import selectors
+import shutil
 import socket
+import tempfile
 import tty
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
 from typing_extensions import Self
+
+_PREFIX = "swarm_loc-"
+
+
+@contextmanager
+def link_folder() -> Iterator[str]:
+    """Create a folder and remove it at the end; also remove those that killed processes have left."""
+    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
+        if (lock := _lock(folder)) is not None:
+            _remove(folder, lock)
+    while (lock := _lock(folder := Path(tempfile.mkdtemp(prefix=_PREFIX)))) is None:
+        pass  # another process that cleans up has locked it
+    try:
+        yield str(folder)
+    finally:
+        _remove(folder, lock)
+
+
+def _lock(folder: Path) -> int | None:
+    """Lock a folder until this process ends; the handle of the lock.
+
+    None if another process holds the lock, or if this user has no such folder.
+    """
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    except OSError:
+        return None
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if folder.stat().st_uid == os.getuid():
+            return handle
+    except OSError:
+        pass
+    os.close(handle)
+    return None
+
+
+def _remove(folder: Path, lock: int) -> None:
+    shutil.rmtree(folder, ignore_errors=True)
+    os.close(lock)
+
 
 _CHUNK = 4096
 _MAX_CLIENTS = 9
@@ -41,7 +87,7 @@ class _Port(Protocol):
 
 
 class ConsoleFirmware(Protocol):
-    """A firmware behind a serial port."""
+    """A firmware at a serial port."""
 
     def receive(self, data: bytes) -> bytes:
         """Process received bytes; returns the immediate answer."""
@@ -51,7 +97,7 @@ class ConsoleFirmware(Protocol):
 
 
 class StreamFirmware(ConsoleFirmware, Protocol):
-    """A firmware behind a TCP port, which answers as it streams."""
+    """A firmware at a TCP port, which answers as it streams."""
 
     def disconnect(self) -> None:
         """Handle a disconnected client."""
@@ -188,7 +234,7 @@ class FirmwareHost:
         self._ports: list[_Port] = []
 
     def serve_pty(self, firmware: ConsoleFirmware, link: Path | None = None, *, waits: bool = False) -> Path:
-        """Put a firmware behind a pseudo-terminal.
+        """Put a firmware at a pseudo-terminal.
 
         Args:
             firmware: Who answers.
@@ -203,7 +249,7 @@ class FirmwareHost:
         return link or port.path
 
     def serve_tcp(self, firmware: StreamFirmware, host: str = "127.0.0.1", port: int = 0) -> int:
-        """Put a firmware behind a TCP port, 0 for any that is free; returns the port."""
+        """Put a firmware at a TCP port, 0 for any that is free; returns the port."""
         server = _TcpPort(firmware, host, port, self._selector)
         self._add(server)
         return server.port

@@ -2,7 +2,7 @@
 
 Sensor data is kept as flat structured arrays, because a run of a thousand robots has a million entries.
 `stamp_ns` is the time of measurement, `arrival_ns` the time of reception; data is sorted by arrival.
-Ground truth is separate and for evaluation only.
+Ground truth is separate and only for evaluation.
 """
 
 from __future__ import annotations

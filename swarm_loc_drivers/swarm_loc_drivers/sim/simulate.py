@@ -15,7 +15,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from swarm_loc_drivers.sim.link_folder import link_folder
+from swarm_loc_drivers.sim.link_host import link_folder
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
 from swarm_loc_drivers.sim.simulation import (
     ROBOT_TYPES,
@@ -42,6 +42,7 @@ def parse(arguments: Sequence[str] | None) -> SimulationOptions:
         default=defaults.world,
         help="error model of robots and sensors (default: w2 for e-pucks, d1 for Droplets)",
     )
+    # one option for each number of SimulationOptions
     for name, spec in number_specs(SimulationOptions).items():
         default = getattr(defaults, name)
         kind = type(default)

@@ -26,8 +26,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, check_parameter_file
 from swarm_loc_estimator.common.parameters import ParameterError, number
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_vision.aerial.ground_file import save_ground
 
 Parameters = dict[str, ParameterValue]
@@ -61,7 +60,7 @@ class SimulationOptions:
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
     )
     plan: str = "corridor"  # The hall of PushBots, see `floor_plan`
-    # Whether e-pucks are located by an overhead camera only, which cannot tell them apart
+    # Whether e-pucks are located only by an overhead camera, which cannot tell them apart
     aerial: bool = False
     parameter_file: str | None = None  # Path of a ROS parameter file for all nodes, None for none
 
@@ -141,7 +140,7 @@ def placed(options: SimulationOptions, swarm: Swarm) -> Swarm:
     """The swarm with a start for each robot; who has none stands where its world puts it, off the others.
 
     Raises:
-        UserError: The world has no place for so many robots.
+        UserError: The world has no place for this number of robots.
     """
     described = [robot.start for robot in swarm.robots if robot.start is not None]
     if len(described) == len(swarm.robots):

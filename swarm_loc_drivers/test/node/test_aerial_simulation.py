@@ -11,8 +11,9 @@ from node_world import stamp_ns
 
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
-from swarm_loc_estimator.offline.live.graph import LiveGraph, Poses
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.common.messages.poses import EstimateMessage
+from swarm_loc_estimator.offline.live_run import LiveGraph
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 
 PATIENCE_S = 100.0
@@ -47,7 +48,7 @@ def test_robots_are_located_by_a_camera_that_cannot_tell_them_apart(tmp_path: Pa
 
             recorder.create_subscription(PoseStamped, f"{name}/ground_truth", on_truth, 1000)
 
-        def tracked() -> list[Poses]:
+        def tracked() -> list[EstimateMessage]:
             """Poses at which all robots are tracked, and where the truth is known."""
             if not all(truth.values()):
                 return []

@@ -19,10 +19,10 @@ from node_world import Program, Ros, overrides, stamp_ns, values_of
 from std_srvs.srv import Trigger
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_drivers.droplet.droplet_driver_node import DropletDriverNode
+from swarm_loc_drivers.droplet.droplet_nodes import DropletDriverNode
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import load_ir_platform
 from swarm_loc_msgs.msg import BrightnessMatrix
 
 
@@ -80,7 +80,7 @@ def test_a_droplet_walks_measures_and_stands_at_the_end(
     first = np.array(robots.truth())
     assert (np.array(robots.truth()) == first).all()
     moved = se2.between(TRIANGLE[0], first[0])
-    # what it went until it stood is told until then
+    # what it went until it stood is published until then
     ros.until(lambda: odometry[-1].pose.pose.position.x == pytest.approx(moved[0], abs=4e-3))
     assert (first[1:] == TRIANGLE[1:]).all()
 

@@ -13,8 +13,8 @@ from node_world import stamp_ns
 from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, describe_droplets, starts
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.offline.live.graph import LiveGraph
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.offline.live_run import LiveGraph
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 
 ROBOTS, SEED, PATIENCE_S = 4, 2, 150.0

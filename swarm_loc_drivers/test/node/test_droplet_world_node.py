@@ -14,10 +14,10 @@ from nav_msgs.msg import Odometry
 from node_world import Program, Ros, overrides, stamp_ns
 from rosgraph_msgs.msg import Clock
 
-from swarm_loc_drivers.droplet.droplet_fleet_node import DropletFleetNode
+from swarm_loc_drivers.droplet.droplet_nodes import DropletFleetNode
 from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, describe_droplets, starts
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_msgs.msg import BrightnessMatrix
 
 ROBOTS = 3

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from bench.shared.parameter_table import markdown_table
-from swarm_loc_drivers.sim.scenarios.droplet_steering_node import DropletSteeringParameters
-from swarm_loc_drivers.sim.scenarios.eight_steering_node import SteeringParameters
+from swarm_loc_drivers.sim.scenarios.steering_nodes import DropletSteeringParameters, SteeringParameters
 
 DOC = Path(__file__).parents[2] / "doc"
 

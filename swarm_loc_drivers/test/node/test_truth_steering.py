@@ -1,4 +1,4 @@
-"""Robots are steered from when all of them have told odometry."""
+"""Robots are steered from when all of them have sent odometry."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 
 from swarm_loc_drivers.common.velocity_command import Velocity
-from swarm_loc_drivers.sim.truth_steering import TruthSteering
+from swarm_loc_drivers.sim.scenarios.steering_nodes import TruthSteering
 from swarm_loc_estimator.common.arrays import FloatArray
 
 NAMES = ("epuck1", "epuck2")

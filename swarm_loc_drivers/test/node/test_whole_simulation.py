@@ -11,8 +11,9 @@ from node_world import stamp_ns
 
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
-from swarm_loc_estimator.offline.live.graph import LiveGraph, Poses
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.common.messages.poses import EstimateMessage
+from swarm_loc_estimator.offline.live_run import LiveGraph
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
@@ -51,7 +52,7 @@ def test_robots_are_located_by_what_their_cameras_see(tmp_path: Path) -> None:
         graph.wait_for(has_driven, "drive", PATIENCE_S)
         driven_ns = max(truth)
 
-        def tracked() -> list[Poses]:
+        def tracked() -> list[EstimateMessage]:
             """Poses from then on at which all robots are tracked, and where the truth is known."""
             newest_ns = next(reversed(truth))
             return [

@@ -18,7 +18,7 @@ from sensor_msgs.msg import CameraInfo, Image
 
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 SECOND = 1_000_000_000
 SIZE = {"width": 320, "height": 240}
@@ -26,7 +26,7 @@ SPEED = 0.06
 RATE = 0.5
 """Simulated seconds per second: on a busy machine, too, commands come before the robots have gone far."""
 AT_PLACE, COMMANDS = 0.05, 10
-"""A robot that is told again and again to be so little faster or slower is where it should be, to 6 mm."""
+"""A robot that is commanded to be this little faster or slower is where it should be, to 6 mm."""
 
 
 @pytest.fixture

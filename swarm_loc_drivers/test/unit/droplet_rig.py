@@ -25,7 +25,7 @@ from swarm_loc_drivers.sim.droplet.world import (
     run,
 )
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import load_ir_platform
 
 SECOND = 1_000_000_000
 START_NS = 1_000 * SECOND

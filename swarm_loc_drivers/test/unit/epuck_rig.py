@@ -113,7 +113,7 @@ class Bench:
                 assert time.monotonic() < end_s, (self.driver.trouble, self.driver.counts)
 
     def until_count(self, items: Sequence[object], count: int) -> None:
-        """Wait for so many."""
+        """Wait for this number."""
         self.until(lambda: len(items) >= count)
 
     def drive(self, legs: Sequence[tuple[float, float, float]]) -> None:

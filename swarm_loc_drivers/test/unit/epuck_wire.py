@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.session import SessionError
+from swarm_loc_drivers.epuck.driver import WheelOdometry
 from swarm_loc_drivers.epuck.hardware import EpuckModel
-from swarm_loc_drivers.epuck.odometry import WheelOdometry
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.serial_session import SerialSession
 from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession, Reading

@@ -15,8 +15,8 @@ from swarm_loc_drivers.pushbot.event_packets import EventPacket
 from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE, FirmwareGeneration
 from swarm_loc_drivers.pushbot.parameters import PushbotParameters
 from swarm_loc_drivers.pushbot.session import PushbotSession, WheelTicks
-from swarm_loc_drivers.sim.pushbot.console import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
+from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, outline
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldParameters, SimulatedPushbot
 from swarm_loc_estimator.common import se2
@@ -35,8 +35,8 @@ class PushbotWire:
     """The two ends, and what each has said.
 
     Attributes:
-        velocities: What the robot is told [ticks per 21 ms].
-        hears: Whether the robot's bytes arrive; likewise `is_heard` those of the host.
+        velocities: What the robot is commanded [ticks per 21 ms].
+        hears: Whether the robot's bytes arrive; `is_heard`: those of the host.
     """
 
     def __init__(

@@ -8,21 +8,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.sim.render.ceiling import CeilingRig
+from bench.vision.ceiling import CeilingRig
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena
 from swarm_loc_drivers.sim.run import START_NS, Trajectories
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.sensors.camera import DetectionRows
-from swarm_loc_estimator.sensors.registry import Batch
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, located
 from swarm_loc_vision.aerial.locate_camera import fixed_camera
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.markers.bodies import robot_body
-from swarm_loc_vision.markers.camera_detector import detection_rows
-from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
+from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector, detection_rows
 from swarm_loc_vision.markers.families import family_named
 
 FAMILY = family_named("aruco_mip_36h12")

@@ -56,7 +56,7 @@ class Emulator:
 
 
 class Desk:
-    """A driver, what it reports, and the velocity that it is told again and again."""
+    """A driver, what it reports, and the velocity that it is commanded again and again."""
 
     def __init__(self, params: DropletParameters, clock: Callable[[], int]) -> None:
         self.states: dict[str, list[OdometryState]] = {name: [] for name in (OWN, *params.relayed_ids)}

@@ -88,8 +88,8 @@ def test_counts_end_where_the_converter_does_and_ambient_light_is_taken_off() ->
 def test_a_robot_in_between_casts_a_shadow() -> None:
     line = np.array([[0.0, 0.0, 0.0], [0.2, 0.0, 0.5]])
     free = exchange(world_of(line))[1]
-    beside = np.vstack([line, [0.1, 0.03, 0.0]])
-    partly = exchange(world_of(beside))[1]
+    next_to_it = np.vstack([line, [0.1, 0.03, 0.0]])
+    partly = exchange(world_of(next_to_it))[1]
     hidden = partly == 0.0
     assert hidden[free > 5.0].any()
     assert (partly[~hidden] == free[~hidden]).all()

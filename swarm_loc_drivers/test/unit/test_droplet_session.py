@@ -31,7 +31,7 @@ from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, DropletErrors, Simul
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import load_ir_platform
 
 PLATFORM = load_ir_platform("droplet")
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.velocity_command import STANDING_CLOCK_S, STILL, Velocity, VelocityCommand
+from swarm_loc_drivers.epuck.driver import WheelOdometry
 from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2, as_counter
-from swarm_loc_drivers.epuck.odometry import WheelOdometry
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.error_models import OdometryModel

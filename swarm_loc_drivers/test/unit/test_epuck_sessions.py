@@ -99,7 +99,7 @@ def test_a_serial_wire_that_loses_bytes(seed: int) -> None:
     wire.firmware.share = 0.0
     wire.drive(SQUARE[4:5])
     assert wire.counts["missed_replies"] + wire.counts["stray_bytes"] > 0
-    # a twisted command may preset the counters; else they tell also of motion that nobody asked for
+    # counters that are not continuous were read wrong; else they also show motion that nobody asked for
     if not wire.counts["counter_restarts"]:
         position, heading = wire.error()
         assert position <= 0.02

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_drivers.sim.link_folder import link_folder
+from swarm_loc_drivers.sim.link_host import link_folder
 
 HOLD = """
 import sys
-from swarm_loc_drivers.sim.link_folder import link_folder
+from swarm_loc_drivers.sim.link_host import link_folder
 with link_folder() as links:
     print(links, flush=True)
     sys.stdin.read()

@@ -19,8 +19,7 @@ from swarm_loc_drivers.sim.worlds import ErrorModel
 from swarm_loc_estimator.cli.new import main, start_lines
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.error_models import OdometryModel
-from swarm_loc_estimator.swarm.new_swarm import SwarmPlan
-from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS
+from swarm_loc_estimator.swarm.new_swarm import KNOWN_ROBOTS, SwarmPlan
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 ROOT = Path(__file__).parents[3]

@@ -50,7 +50,7 @@ def test_time_lost_with_differences_is_learnt_again() -> None:
 
 
 def test_a_silence_longer_than_the_timestamps_is_seen_by_the_computers_clock() -> None:
-    """Of 16 bits, which begin anew every 65.5 ms, as the parser unwraps them."""
+    """Of 16 bits, which begin again every 65.5 ms, as the parser unwraps them."""
     clock = EventClock(1 << 16)
     clock.stamps(np.array([1000]), 10**9)
     silence_us = 5 * 65_536 + 2_000

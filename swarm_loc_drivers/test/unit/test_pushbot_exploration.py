@@ -118,7 +118,7 @@ def test_lights_are_seen_in_front_and_not_behind_walls() -> None:
     seen = body.lights(body.rest(0.1, [other]).stamp_ns, {7: other})
     assert (seen.target == 7).all()
     assert len(seen.stamp_ns) == 5
-    assert np.allclose(seen.bearing, 0.2, atol=0.05)  # one of two lights beside its middle
+    assert np.allclose(seen.bearing, 0.2, atol=0.05)  # one of two lights off its middle
     away = robot(EXACT, -math.pi / 2)
     assert not len(away.lights(away.rest(0.1, [other]).stamp_ns, {7: other}).stamp_ns)
 
@@ -138,7 +138,7 @@ def test_lights_are_seen_where_robots_were_at_the_time() -> None:
         own, other = traces[robot][steps], traces[1 - robot][steps]
         way = (other - own)[:, :2]
         off = wrap_angle(np.arctan2(way[:, 1], way[:, 0]) - own[:, 2] - sightings.bearing)
-        assert (np.hypot(*way.T) * np.abs(np.sin(off)) < 0.046).all()  # a light beside the middle
+        assert (np.hypot(*way.T) * np.abs(np.sin(off)) < 0.046).all()  # a light off the middle
 
 
 @pytest.mark.parametrize(("plan", "seed"), [("corridor", 1), ("tee", 2)])
@@ -156,7 +156,7 @@ def test_two_robots_explore_a_hall(plan: str, seed: int) -> None:
 
 
 def test_five_robots_whose_starts_are_hardly_known_all_find_their_places() -> None:
-    """The fifth is told to start 20 cm and 5 deg off; the nearest robot sees little of what it does."""
+    """The fifth is described to start 20 cm and 5 deg off; the nearest robot sees little of what it does."""
     mapper = CooperativeMapper()
     exploration = Exploration(floor_plan("corridor"), mapper, np.random.default_rng([4, 20, 5]))
     for number in range(5):
@@ -184,7 +184,7 @@ def test_a_bag_gives_the_same_map_twice(tmp_path: Path) -> None:
 
 
 def test_the_events_of_a_bag_show_the_distances_of_the_bag(tmp_path: Path) -> None:
-    """The tracker, with the calibration beside the bag, reads from the events what `laser` says."""
+    """The tracker, with the calibration next to the bag, reads from the events what `laser` says."""
     bag = tmp_path / "bag"
     write_pushbot_bag(PushbotBagSettings(3, 10.0, 2, "corridor", 0.02, events_s=2.0), bag, "Of a test.")
     calibration = load_laser(bag / "pushbot1.yaml")

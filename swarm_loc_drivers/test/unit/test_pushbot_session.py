@@ -105,12 +105,7 @@ def test_wheels_stand_at_the_end(generation: FirmwareGeneration) -> None:
 
 def deaf_to_stops(wire: PushbotWire) -> None:
     """Let a robot ignore duty cycles."""
-    drive = wire.firmware.board.drive
-
-    def drive_only(motor: int, value: int, unit: str, *, decays: bool) -> bool:
-        return unit != "velocity" or drive(motor, value, "velocity", decays=decays)
-
-    wire.firmware.board.drive = drive_only  # type: ignore[method-assign]
+    wire.firmware.board.set_duty = lambda _motor, _percent: True  # type: ignore[assignment, method-assign]
 
 
 @pytest.mark.parametrize("generation", [FIRST_FIRMWARE, SECOND_FIRMWARE], ids=lambda one: one.name)
@@ -241,7 +236,7 @@ def test_a_robot_that_was_reset_is_set_up_anew() -> None:
     wire.velocities = (0, 0)
     wire.run(1.0)
     assert wire.session.connected
-    # what it rolled out while its ticks began anew is all that is missing
+    # what it rolled out while its ticks began again is all that is missing
     assert np.linalg.norm(wire.states[-1].pose - before) < 0.03
 
 
@@ -282,7 +277,8 @@ def test_a_long_stall_blocks_the_robot_and_the_driver_resets_it() -> None:
 
 def test_lines_that_are_no_ticks_are_counted() -> None:
     wire = streaming()
-    wire.firmware.receive(b"!X\nx\n?S1\n")
+    wire.firmware.receive(b"!X\nx\n")
+    wire.firmware.board.say("-S0 7400\n")
     wire.run(0.1)
     assert wire.counts["refused_commands"] == 2
     assert wire.counts["other_lines"] == 1

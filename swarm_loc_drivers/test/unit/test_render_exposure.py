@@ -62,7 +62,7 @@ def test_an_edge_is_blurred_as_far_as_it_moves_and_stays_where_it_is_on_average(
     assert abs(still_shift) < 0.01
     assert abs(shift) < 0.01
     assert still == pytest.approx(1.0 / 6.0, abs=0.02)  # mean over pixels, and over places in a pixel
-    drawn = blur_px**2 * (1.0 - 1.0 / instants**2) / 12.0  # of so many instants
+    drawn = blur_px**2 * (1.0 - 1.0 / instants**2) / 12.0  # of the instants
     faster = (1.0 + (0.5 * LANDMARK_SIZE * 10 / 8 / 0.3) ** 2) ** 2  # it is not in the middle of the image
     assert spread - still == pytest.approx(faster * drawn, rel=0.02, abs=0.01)
 

@@ -29,7 +29,7 @@ BEND_PX = (
 places = st.tuples(
     st.floats(0.15, 1.0),  # ahead [m]
     st.floats(-0.5, 0.5),  # across, as a share of that
-    st.floats(-0.35, 0.35),  # below, likewise
+    st.floats(-0.35, 0.35),  # below, as large
     st.floats(-1.1, 1.1),  # turned away [rad]
 )
 mounts = st.builds(

@@ -1,4 +1,4 @@
-"""A driver's link: what breaks it is told, whatever it is."""
+"""A driver's link: what breaks it is reported, whatever it is."""
 
 from __future__ import annotations
 

@@ -5,20 +5,22 @@ import numpy as np
 from swarm_loc_drivers.sim.scenarios.bags import as_detections
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.sensors.camera import SightingConverter
+from swarm_loc_estimator.sensors.camera import DetectionRows, SightingConverter
+from swarm_loc_estimator.sensors.sensor import DropCounts
 
 
 def test_the_estimator_reads_what_was_simulated() -> None:
     run = simulate_eight(EightSettings(duration_s=5.0))
     robots = np.repeat(run.frames["robot"], run.frames["count"]).astype(np.int64)
     stamps_ns = np.repeat(run.frames["stamp_ns"], run.frames["count"])
-    conversion = SightingConverter(run.swarm).convert(robots, stamps_ns, as_detections(run))
-    assert not conversion.dropped
-    measured = conversion.measurements
-    assert len(measured) == len(run.sightings) > 0
-    order = np.lexsort((measured["marker_id"], measured["observer"], measured["stamp_ns"]))
+    drops = DropCounts(len(run.swarm.robots))
+    rows = DetectionRows(robots, stamps_ns, as_detections(run), stamps_ns)
+    measured = SightingConverter(run.swarm, drops).convert(rows)
+    assert not drops.total
+    assert measured.size == len(run.sightings) > 0
+    order = np.lexsort((measured.reading, measured.observer, measured.stamp_ns))
     expected = np.lexsort((run.sightings["marker_id"], robots, stamps_ns))
-    value = measured["value"][order]
+    value = measured.value[order]
     np.testing.assert_allclose(value[:, :2], run.sightings["value"][expected, :2], atol=1e-12)
     np.testing.assert_allclose(
         se2.wrap_angle(value[:, 2] - run.sightings["value"][expected, 2]), 0.0, atol=1e-12

@@ -23,8 +23,7 @@ from swarm_loc_drivers.sim.worlds import WORLDS, WorldError
 from swarm_loc_estimator.cli import new
 from swarm_loc_estimator.common.parameters import ParameterError, parameter_specs
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_vision.aerial.parameters import AerialParameters
 
 BAGS = Path(__file__).parents[3] / "bags"

@@ -18,7 +18,7 @@ SETTINGS = StopAndGoSettings()
 
 
 class Robot:
-    """Wheels that do as they are told, and slip in turns."""
+    """Wheels that do as they are commanded, and slip in turns."""
 
     def __init__(self, pose: FloatArray, slip: float = 0.0) -> None:
         self.motion = StopAndGo(SETTINGS)
@@ -28,7 +28,7 @@ class Robot:
         self.turned = 0.0
 
     def step(self) -> bool:
-        """One message of odometry; whether the robot is told to move."""
+        """One message of odometry; whether the robot is commanded to move."""
         self.now_ns += round(1e9 * PERIOD_S)
         reported = np.array([*self.odometry[:2], wrap_angle(self.odometry[2])])
         velocity = self.motion.command(self.now_ns, reported)

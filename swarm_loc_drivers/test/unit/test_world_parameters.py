@@ -12,7 +12,7 @@ from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, EightSteering, describe
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.parameters import ParameterError, parameter_specs
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 START = np.array([[0.1, 0.2, 0.3], [0.5, -0.2, 1.0]])
 

@@ -3,14 +3,13 @@
     calibrate bags/mrclam1 --out calibrated.yaml
     calibrate recording.mcap --swarm swarm.yaml --out calibrated.yaml --plain
 
-The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. Beside --out a
-picture of the same name shows the errors before and after.
+The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. A
+picture of the same name as --out shows the errors before and after.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 
 from swarm_loc_estimator.common.command_line import (
@@ -28,8 +27,7 @@ from swarm_loc_estimator.offline.calibration.fit import EVALUATIONS, Options, ca
 from swarm_loc_estimator.offline.calibration.plots import draw, text_of
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
 from swarm_loc_estimator.offline.export import read_truth
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
 
 @exit_with_message
@@ -56,7 +54,6 @@ def _unused(recording: Recording) -> list[str]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     add_bag(parser, " with <robot>/ground_truth, or with --truth")
     add_remap(parser)
@@ -75,7 +72,3 @@ def _parser() -> argparse.ArgumentParser:
         help=f"runs of the estimator to fit the noise (default {EVALUATIONS})",
     )
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -6,14 +6,13 @@
 
 The bag holds <robot>/brightness. <robot>/ground_truth is used if present; without it
 the poses are estimated together with the gains. The description is the `swarm.yaml` inside the bag's folder
-unless --swarm names another. Robots are calibrated with those of the same platform. Beside --out a picture of
-the same name shows the residuals before and after, and the gains.
+unless --swarm names another. Robots are calibrated with those of the same platform. A picture of
+the same name as --out shows the residuals before and after, and the gains.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 
 from swarm_loc_estimator.common.command_line import (
@@ -27,12 +26,11 @@ from swarm_loc_estimator.common.command_line import (
 )
 from swarm_loc_estimator.offline.calibration.infrared.board import calibrate_from, with_board
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
-from swarm_loc_estimator.offline.calibration.infrared.plots import board_text, draw, draw_board, text_of
+from swarm_loc_estimator.offline.calibration.plots import board_text, draw_board, draw_gains, gains_text
 from swarm_loc_estimator.offline.calibration.recording import read_recording
-from swarm_loc_estimator.swarm.board_file import save_ir_platform
+from swarm_loc_estimator.swarm.ir_board import save_ir_platform
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
 
 @exit_with_message
@@ -46,8 +44,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         recording = read_recording(options.bag, swarm, progress, options.remap)
         done = calibrate_infrared(recording, swarm, progress, with_truth=not options.without_truth)
     save_swarm(done.swarm, options.out, f"Infrared gains calibrated with {options.bag.name}.")
-    print("\n".join([text_of(done), *recording.sentences()]))
-    print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
+    print("\n".join([gains_text(done), *recording.sentences()]))
+    print(f"{options.out} written, picture: {draw_gains(done, options.out.with_suffix('.png'))}")
     return 0
 
 
@@ -66,7 +64,6 @@ def _board(options: argparse.Namespace, swarm: Swarm) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     add_bag(parser, " with <robot>/brightness")
     add_remap(parser)
@@ -83,7 +80,3 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--without-truth", action="store_true", help="do as if there were no ground truth")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -30,13 +30,14 @@ from swarm_loc_estimator.common.command_line import (
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.nodes.playback import clock_step_ns
-from swarm_loc_estimator.offline.live.graph import Recorder, read_poses
-from swarm_loc_estimator.offline.live.run import (
+from swarm_loc_estimator.offline.live_run import (
     Agreement,
     BagContent,
     LiveRun,
+    Recorder,
     compare_with_replay,
     play_live,
+    read_poses,
 )
 from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -47,7 +48,7 @@ from swarm_loc_estimator.watch.server import free_port
 BAG = Path("bags/eight_five_robots")
 RATE = 3.0
 
-# What a sound estimator reaches on the bag with room to spare; it is at 3 mm, 1.2 degrees and NEES 3.
+# Limits of the bag of the demo, where the errors are 3 mm, 1.2 degrees and NEES 3.
 _POSITION_M = 0.010
 _HEADING_DEG = 3.0
 _NEES = (1.5, 6.0)
@@ -178,7 +179,6 @@ class _Progress:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     parser.add_argument("bag", nargs="?", type=Path, default=BAG, help=f"what to play (default: {BAG})")
     parser.add_argument(
@@ -186,7 +186,3 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--out", type=folder_to_write, default="out/demo", help="folder for the report")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -9,8 +9,6 @@ anything is wrong.
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Sequence
 from importlib import import_module
 
@@ -31,7 +29,9 @@ _LIVE_S, _BAG_S = 20.0, 120.0
 @exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
+    parser = command_parser(__doc__)
+    add_live_or_bag(parser, f"how long to look (default: {_LIVE_S:g} s live, {_BAG_S:g} s of a bag)")
+    options = parser.parse_args(arguments)
     live = is_live(options)
     swarm = load_swarm(described(options))
     seconds = options.seconds or (_LIVE_S if live else _BAG_S)
@@ -53,14 +53,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"Note: only the first {seconds:g} s of the bag were looked at; --seconds takes more.")
     print("\n".join(f"- {line}" for line in lines_of(findings)) or "Nothing is wrong.")
     return 1 if findings else 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    """The command line."""
-    parser = command_parser(__doc__)
-    add_live_or_bag(parser, f"how long to look (default: {_LIVE_S:g} s live, {_BAG_S:g} s of a bag)")
-    return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

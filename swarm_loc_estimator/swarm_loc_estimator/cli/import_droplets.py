@@ -10,13 +10,11 @@ the camera are corrected: misread ids, orientations wrong by quarter turns, robo
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
 from swarm_loc_estimator.common.command_line import ProgressLine, command_parser, exit_with_message, number_in
-from swarm_loc_estimator.offline.datasets.droplets_bag import (
+from swarm_loc_estimator.offline.datasets.droplets import (
     METRES_PER_PIXEL,
     ImportSettings,
     import_recording,
@@ -27,23 +25,6 @@ from swarm_loc_estimator.offline.datasets.droplets_bag import (
 @exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
-    settings = ImportSettings(options.platform, options.metres_per_pixel)
-    with ProgressLine() as progress:
-        done = import_recording(options.recording, options.bag, settings, progress)
-    for remark in done.remarks:
-        print(remark)
-    turned = ", ".join(
-        f"{name_of(robot)} {turn * 57.29578:+.0f}" for robot, turn in sorted(done.fiducials.turn_of.items())
-    )
-    mirrored = "" if done.fiducials.handedness == 1 else "; the image is mirrored"
-    print(f"fiducials sit turned by [deg]: {turned}{mirrored}")
-    print(f"{done.exchanges} exchanges, {done.with_truth} with ground truth, written to {options.bag}")
-    return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     parser.add_argument("recording", type=Path, help="text file, one exchange a line")
     parser.add_argument("bag", type=Path, help="bag folder to create")
@@ -56,8 +37,16 @@ def _parser() -> argparse.ArgumentParser:
         default=METRES_PER_PIXEL,
         help="of the camera's image (default: robots of 44 mm that touch are 42 pixels apart)",
     )
-    return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    options = parser.parse_args(arguments)
+    settings = ImportSettings(options.platform, options.metres_per_pixel)
+    with ProgressLine() as progress:
+        done = import_recording(options.recording, options.bag, settings, progress)
+    for remark in done.remarks:
+        print(remark)
+    turned = ", ".join(
+        f"{name_of(robot)} {turn * 57.29578:+.0f}" for robot, turn in sorted(done.fiducials.turn_of.items())
+    )
+    mirrored = "" if done.fiducials.handedness == 1 else "; the image is mirrored"
+    print(f"fiducials sit turned by [deg]: {turned}{mirrored}")
+    print(f"{done.exchanges} exchanges, {done.with_truth} with ground truth, written to {options.bag}")
+    return 0

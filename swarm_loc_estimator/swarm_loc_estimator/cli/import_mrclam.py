@@ -8,8 +8,6 @@ The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.
 
 from __future__ import annotations
 
-import argparse
-import sys
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,7 +22,17 @@ if TYPE_CHECKING:
 @exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
-    parser = _parser()
+    parser = command_parser(__doc__)
+    parser.add_argument("folder", type=Path, help="folder with Robot*_Odometry.dat and the other files")
+    parser.add_argument("bag", type=Path, help="bag folder to create")
+    parser.add_argument(
+        "--delay-ms",
+        nargs=3,
+        type=int,
+        default=(0, 0, 0),
+        metavar=("LO", "HI", "SEED"),
+        help="detections arrive evenly between LO and HI milliseconds late (default: at once)",
+    )
     options = parser.parse_args(arguments)
     low_ms, high_ms, seed = options.delay_ms
     if not 0 <= low_ms <= high_ms or seed < 0:
@@ -41,23 +49,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     took_s = time.monotonic() - began
     print(f"{done.message_count} messages of {names} written to {options.bag} in {took_s:.1f} s")
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    """The command line."""
-    parser = command_parser(__doc__)
-    parser.add_argument("folder", type=Path, help="folder with Robot*_Odometry.dat and the other files")
-    parser.add_argument("bag", type=Path, help="bag folder to create")
-    parser.add_argument(
-        "--delay-ms",
-        nargs=3,
-        type=int,
-        default=(0, 0, 0),
-        metavar=("LO", "HI", "SEED"),
-        help="detections arrive evenly between LO and HI milliseconds late (default: at once)",
-    )
-    return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

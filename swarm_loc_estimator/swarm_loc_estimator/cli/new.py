@@ -4,14 +4,13 @@
     new epucks.yaml --yes --type epuck2 --robots 5 --arena 2.4x1.6            # asks nothing
 
 Options answer questions in advance; --yes takes the default for all others. Marker ids are given so that none
-appears twice. A JSON Schema is written beside the description, with which editors complete it.
+appears twice. A JSON Schema is written to the same folder, with which editors complete it.
 """
 
 from __future__ import annotations
 
 import argparse
 import shlex
-import sys
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -20,12 +19,10 @@ from typing import TypeVar
 
 from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.swarm.new_swarm import FAMILY_IDS, SwarmPlan, planned_swarm
-from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS, SENSORS
-from swarm_loc_estimator.swarm.schema import SCHEMA_FILE, schema_text
+from swarm_loc_estimator.swarm.new_swarm import FAMILY_IDS, KNOWN_ROBOTS, SENSORS, SwarmPlan, planned_swarm
+from swarm_loc_estimator.swarm.schema import schema_text
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_file import MAX_NAME, MAX_ROBOTS, NAME
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import MAX_NAME, MAX_ROBOTS, NAME, SCHEMA_FILE, save_swarm
 
 Answer = TypeVar("Answer")
 QUESTIONS = {
@@ -44,12 +41,7 @@ _LENGTH = number_in(0.001, 10.0, "m")
 
 
 class Dialog:
-    """Takes each answer from an option, from the defaults, or from the terminal, until it can be used.
-
-    Args:
-        given: Answers of options, by name.
-        asks: Whether to ask for what was not given.
-    """
+    """Takes each answer from an option, from the defaults, or from the terminal, until it can be used."""
 
     def __init__(self, given: Mapping[str, str], *, asks: bool) -> None:
         self._given, self._asks = dict(given), asks
@@ -127,17 +119,20 @@ def start_lines(plan: SwarmPlan, file: str) -> list[str]:
     sheets = f"{plan.prefix.rstrip('_')}_markers"
     sees = bool(sensors & {"robots", "landmarks"})
     lines = []
+    # markers to print
     if sees or "aerial" in sensors:
         board = " --board 3x4" if "aerial" in sensors else ""
         lines.append(
             f"./run swarm_loc_vision print_markers {file} --family {plan.family}{board} --out {sheets}.pdf"
         )
+    # drivers, or what others must publish
     if known.driver:
         lines.append(f"./run swarm_loc_drivers {known.driver.format(robot=robot, file=file)}")
     needs = [] if known.driver or known.odometry is None else [("odom", "nav_msgs/Odometry")]
     needs += [("imu", "sensor_msgs/Imu")] if "imu" in sensors else []
     needs += [(f"{known.image}image_raw, camera_info", "calibrated images")] if sees else []
     lines += [f"# another node must publish {robot}/{topic}: {kind}" for topic, kind in needs]
+    # what detects, localizes and maps on or for each robot
     if sees:
         names = ("image_raw", "camera_info") if known.image else ()
         remapped = "".join(f" -r {name}:={known.image}{name}" for name in names)
@@ -161,6 +156,7 @@ def start_lines(plan: SwarmPlan, file: str) -> list[str]:
         lines.append(
             f"# the lines with {robot} are needed for {plan.prefix}2 to {plan.prefix}{plan.robots}, too"
         )
+    # what runs once for the swarm
     if "aerial" in sensors:
         lines.append(
             "./run swarm_loc_vision aerial_camera_node --ros-args -r __ns:=/aerial"
@@ -210,7 +206,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     parser.add_argument(
         "swarm_file", type=Path, nargs="?", default=Path("swarm.yaml"), help="file to write (swarm.yaml)"
@@ -267,7 +262,3 @@ def _arena(text: str) -> tuple[float, float]:
         raise argparse.ArgumentTypeError(
             f"'{text}' must be two lengths in [0.1, 1000] m, such as 2.4x1.6"
         ) from None
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -42,8 +42,7 @@ from swarm_loc_estimator.offline.export import read_truth, write_mcap, write_tum
 from swarm_loc_estimator.offline.replay import TICK_S, TICKS_S, replay
 from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_estimator.timeline.self_calibration import swapped_signs
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -60,6 +59,7 @@ _COLUMNS = ("stamp_ns", "robot", "x_m", "y_m", "theta_rad", *_COVARIANCE)
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
+    # replay, and write all files
     settings = parameters_of(Settings, options.set)
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
     with ProgressLine() as progress:
@@ -80,6 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             write_mcap(result, options.mcap)
         if options.tum:
             write_tum(result, options.tum)
+    # write what was learned, unless there is nothing or it cannot be right
     if options.learned:
         if not result.self_calibrated:
             print(_NOTHING_TO_LEARN, file=sys.stderr)
@@ -88,6 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print("\n".join([*swapped, f"{options.learned} was not written."]), file=sys.stderr)
             return 1
         save_swarm(result.self_calibrated, options.learned, f"Learned from {result.title}.")
+    # say what was found
     print(files.text.read_text(encoding="utf-8"))
     print(f"Report:  {files.page}\nPicture: {files.overview}")
     if not np.isfinite(result.poses).all(axis=2).any():
@@ -111,7 +113,6 @@ def write_poses(result: ReplayResult, path: Path) -> None:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     add_bag(parser)
     add_remap(parser)
@@ -137,7 +138,3 @@ def _parser() -> argparse.ArgumentParser:
     )
     add_set(parser, "parameter of the estimator")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

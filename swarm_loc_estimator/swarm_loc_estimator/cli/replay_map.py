@@ -40,7 +40,7 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
 class WallsError(UserError):
-    """An invalid file of walls; the message is one sentence."""
+    """An invalid file of walls."""
 
 
 @exit_with_message
@@ -112,7 +112,3 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--led", action="append", default=[], metavar="ROBOT=HZ", help="frequency of LEDs")
     add_set(parser, "a number of the mapper; may be given several times")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -2,12 +2,11 @@
 
     schema > swarm.schema.json
 
-A description beside this file names it in its first line: # yaml-language-server: $schema=swarm.schema.json
+A description in the same folder names it in its first line: # yaml-language-server: $schema=swarm.schema.json
 """
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 
 from swarm_loc_estimator.common.command_line import command_parser, exit_with_message
@@ -20,7 +19,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command_parser(__doc__).parse_args(arguments)
     print(schema_text(), end="")
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -7,13 +7,13 @@ The swarm description has the robots; that of a bag is the `swarm.yaml` inside i
 another. Every marker that belongs to no robot is a landmark, and every such radio an anchor. Described
 landmarks are known places and give the frame, as starts of robots do; described anchors and fixed cameras
 stay. --all surveys all of them, too. Yaw and scale of cameras and the scales of odometry are corrected where
-the recording shows that they are wrong. Beside --out a picture of the same name shows the arena.
+the recording shows that they are wrong. A picture of the same name as --out
+shows the arena.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from importlib import import_module
@@ -28,12 +28,12 @@ from swarm_loc_estimator.common.command_line import (
     yaml_to_write,
 )
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.doctor.evidence import Evidence, same_type
+from swarm_loc_estimator.doctor.evidence import Evidence
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
+from swarm_loc_estimator.offline.recorded_bag import same_type
 from swarm_loc_estimator.offline.survey.survey import draw, survey
-from swarm_loc_estimator.sensors.registry import kinds
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.sensors.inputs import kinds
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
 _LIVE_S = 180.0
 _SENSORS = ("odometry", "imu", "detections", "ranges")
@@ -83,7 +83,6 @@ def _heard(evidence: Evidence) -> Recording:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     add_live_or_bag(parser, f"how long to listen to a live graph (default: {_LIVE_S:g} s, or until Ctrl-C)")
     parser.add_argument("--out", type=yaml_to_write, required=True, help="swarm description to write")
@@ -91,7 +90,3 @@ def _parser() -> argparse.ArgumentParser:
         "--all", action="store_true", help="survey landmarks, anchors and cameras that are described, too"
     )
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -13,7 +13,6 @@ the best values, by optuna.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -25,16 +24,19 @@ from swarm_loc_estimator.common.command_line import (
     folder_to_write,
 )
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.offline.sweep.fit import Best, run_fit
-from swarm_loc_estimator.offline.sweep.grid import read_sweep
-from swarm_loc_estimator.offline.sweep.jobs import NAMES, Backend, Line, run_sweep
 from swarm_loc_estimator.offline.sweep.report import rows_of, write_results
+from swarm_loc_estimator.offline.sweep.sweep import NAMES, Backend, Best, Line, read_sweep, run_fit, run_sweep
 
 
 @exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
+    parser = command_parser(__doc__)
+    parser.add_argument("file", metavar="SWEEP_FILE", type=Path, help="what is replayed")
+    parser.add_argument("--out", type=folder_to_write, default="out/sweep", help="folder for the results")
+    parser.add_argument("--backend", choices=NAMES, default=NAMES[0], help="what runs the replays")
+    parser.add_argument("--cluster", metavar="ADDRESS", help="a running cluster of Ray or Dask")
+    options = parser.parse_args(arguments)
     if options.cluster and options.backend == "loky":
         raise UserError("--cluster is for --backend ray or dask; loky has the processes of this machine.")
     sweep = read_sweep(options.file)
@@ -64,17 +66,3 @@ def _text_of(best: Best) -> str:
     options = "".join(f" --set {name}={value:.6g}" for name, value in best.values.items())
     before = "" if best.mean_before is None else f", {best.mean_before:.6g} with the defaults"
     return f"Best: {options}\n       mean {best.minimized} {best.mean:.6g}{before}"
-
-
-def _parser() -> argparse.ArgumentParser:
-    """The command line."""
-    parser = command_parser(__doc__)
-    parser.add_argument("file", metavar="SWEEP_FILE", type=Path, help="what is replayed")
-    parser.add_argument("--out", type=folder_to_write, default="out/sweep", help="folder for the results")
-    parser.add_argument("--backend", choices=NAMES, default=NAMES[0], help="what runs the replays")
-    parser.add_argument("--cluster", metavar="ADDRESS", help="a running cluster of Ray or Dask")
-    return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

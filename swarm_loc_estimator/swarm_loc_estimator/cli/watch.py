@@ -9,7 +9,6 @@ The page loads nothing from other hosts. --address allows access from other mach
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -79,11 +78,7 @@ def parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--rate", type=number_in(0.01, 1000.0), default=1.0, help="speed of the bag (default: 1)"
     )
-    parser.add_argument("--loop", action="store_true", help="play the bag for ever")
+    parser.add_argument("--loop", action="store_true", help="play the bag again and again")
     parser.add_argument("--teleop", action="store_true", help="let pages drive robots by <robot>/cmd_vel")
     parser.add_argument("--use-sim-time", action="store_true", help="take time from /clock without a bag")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

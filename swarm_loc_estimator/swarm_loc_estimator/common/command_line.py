@@ -42,19 +42,20 @@ _FOR_BAGS = ("lz4", "mcap", "rosbags", "zstandard")
 
 @dataclass(frozen=True)
 class Program:
-    """An entry point that imports a module only when it is called, and then runs its `main`.
+    """An entry point that imports a module only when it is called, and then runs its function.
 
     A signal during the import ends the process with status 128 + n and without a traceback, a missing package
     of others with one sentence and status 1.
     """
 
     module: str  # Full name of the module
+    function: str = "main"  # The one to run
 
     def __call__(self) -> int:
         """Run the program; returns its exit status."""
         handlers = {number: signal.signal(number, lambda n, _: os._exit(128 + n)) for number in _SIGNALS}
         try:
-            main: Callable[[], int] = import_module(self.module).main
+            main: Callable[[], int] = getattr(import_module(self.module), self.function)
             for number, handler in handlers.items():
                 signal.signal(number, handler)
             return main()
@@ -146,7 +147,7 @@ yaml_to_write = file_to_write(".yaml", ".yml")
 def add_bag(parser: argparse.ArgumentParser, content: str = "") -> None:
     """Add the arguments of a command that reads a bag: the bag itself, and its swarm description."""
     parser.add_argument("bag", type=Path, help=f"rosbag2 folder, .mcap or .db3 file{content}")
-    parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
+    parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml next to the bag)")
 
 
 def add_remap(parser: argparse.ArgumentParser) -> None:
@@ -180,7 +181,7 @@ def add_live_or_bag(parser: argparse.ArgumentParser, seconds: str) -> None:
         seconds: What --seconds says.
     """
     parser.add_argument("source", metavar="SWARM_FILE|BAG", type=Path, help="swarm description, or a bag")
-    parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
+    parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml next to the bag)")
     parser.add_argument("--seconds", type=number_in(1.0, 3600.0, "s"), help=seconds)
     parser.add_argument("--namespace", default="", help="namespace of the whole swarm, such as lab")
     parser.add_argument("--use-sim-time", action="store_true", help="take time from /clock")
@@ -205,7 +206,7 @@ def is_live(options: argparse.Namespace) -> bool:
 
 
 def described(options: argparse.Namespace) -> Path:
-    """Path of the swarm description: --swarm, the source itself, or the one beside the bag."""
+    """Path of the swarm description: --swarm, the source itself, or the one next to the bag."""
     live = _is_description(options.source)
     return options.swarm or (options.source if live else swarm_beside(options.source))
 
@@ -216,7 +217,7 @@ def _is_description(source: Path) -> bool:
 
 
 def swarm_beside(bag: Path) -> Path:
-    """Path of the swarm description beside a bag; raises UserError if there is no bag."""
+    """Path of the swarm description next to a bag; raises UserError if there is no bag."""
     if not bag.exists():
         raise UserError(f"There is no bag '{bag}'.")
     return (bag if bag.is_dir() else bag.parent) / "swarm.yaml"

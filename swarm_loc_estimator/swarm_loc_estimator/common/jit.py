@@ -322,9 +322,7 @@ def _mark(precompile: Callable[[], None]) -> Path:
         if name not in modules:
             modules[name] = sys.modules[name]
             used = [getattr(value, "__module__", None) for value in vars(modules[name]).values()]
-            used += [
-                value.__name__ for value in vars(modules[name]).values() if isinstance(value, ModuleType)
-            ]
+            used += [one.__name__ for one in vars(modules[name]).values() if isinstance(one, ModuleType)]
             left += [one for one in used if str(one).startswith("swarm_loc_") and one in sys.modules]
     functions = [function for module in modules.values() for function in _functions_of(module)]
     codegen = _core.registry.cpu_target.target_context.codegen()
@@ -332,7 +330,6 @@ def _mark(precompile: Callable[[], None]) -> Path:
 
 
 def _functions_of(module: ModuleType) -> Iterator[Any]:
-    """All functions and methods that a module defines."""
     for value in vars(module).values():
         if getattr(value, "__module__", None) == module.__name__:
             for member in vars(value).values() if isinstance(value, type) else [value]:

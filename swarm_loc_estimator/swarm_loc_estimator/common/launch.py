@@ -39,7 +39,7 @@ os.execv(sys.argv[1], sys.argv[1:])
 
 
 class GraphError(UserError):
-    """A graph that cannot start; the message is one sentence."""
+    """A graph that cannot start."""
 
 
 @dataclass(frozen=True)
@@ -146,11 +146,7 @@ def _value(option: Field[Any], text: str) -> object:
 
 
 def check_parameter_file(path: str | None) -> None:
-    """Make sure that a file, if one is given, has ROS parameters.
-
-    Raises:
-        UserError: It cannot be read, or has none.
-    """
+    """Raise UserError if a file is given that cannot be read or has no ROS parameters."""
     if path is not None and not _has_parameters(read_tree(Path(path))):
         raise ParameterError(f"argument params_file = '{path}' has no ros__parameters.")
 
@@ -185,11 +181,7 @@ def node_action(spec: NodeSpec) -> Any:
 
 
 def executable_path(package: str, executable: str) -> Path:
-    """Path of a package's executable.
-
-    Raises:
-        GraphError: The package or the executable is missing.
-    """
+    """Path of a package's executable; raises GraphError if the package or the executable is missing."""
     from ament_index_python.packages import (  # noqa: PLC0415 - graphs can be described without ROS
         PackageNotFoundError,
         get_package_prefix,
@@ -205,11 +197,7 @@ def executable_path(package: str, executable: str) -> Path:
 
 
 def node_command(node: NodeSpec) -> list[str]:
-    """Program and arguments of a node.
-
-    Raises:
-        GraphError: The executable is missing.
-    """
+    """Program and arguments of a node; raises GraphError if the executable is missing."""
     return [str(executable_path(node.package, node.executable)), *node.ros_arguments()]
 
 

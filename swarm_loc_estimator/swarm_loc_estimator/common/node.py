@@ -1,4 +1,7 @@
-"""Shared parts of all nodes: start and stop, diagnostics, ticks and clocks, publishers of topics."""
+"""Shared parts of all nodes: parameters, start and stop, diagnostics, ticks and clocks, lifecycle.
+
+Managed nodes have the states, services and events of ROS 2's lifecycle, see `doc/lifecycle.md`.
+"""
 
 from __future__ import annotations
 
@@ -9,8 +12,8 @@ import signal
 import sys
 import threading
 import traceback
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, suppress
 from functools import partial
 from importlib import import_module
 from types import FrameType
@@ -18,13 +21,17 @@ from typing import Any, Generic, TypeVar
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from lifecycle_msgs.srv import ChangeState
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
 from rclpy.exceptions import ParameterException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from rclpy.task import Task
@@ -32,12 +39,79 @@ from rclpy.time import Time
 from rclpy.time_source import TimeSource
 from rosgraph_msgs.msg import Clock as ClockMessage
 
-from swarm_loc_estimator.common.health import Health, Report
+from swarm_loc_estimator.common.health import Health, Level, Report
 from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS
-from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.common.ros_parameters import declare_parameters, read_parameters
+from swarm_loc_estimator.common.parameters import (
+    ParameterError,
+    ParameterSpec,
+    UserError,
+    Value,
+    from_values,
+    parameter_specs,
+)
 
 Parameters = TypeVar("Parameters")
+
+
+def declare_parameters(node: Node, cls: type) -> None:
+    """Declare the parameters of a dataclass, which may have any value until they are read."""
+    node.add_on_set_parameters_callback(_refuse_clock_change)
+    for spec in parameter_specs(cls):
+        node.declare_parameter(spec.name, spec.default, ParameterDescriptor(dynamic_typing=True))
+
+
+def read_parameters(node: Node, cls: type[Parameters], *, read_only: bool = True) -> Parameters:
+    """The values of declared parameters, which are checked; see `read_parameter`."""
+    specs = parameter_specs(cls)
+    values = {spec.name: read_parameter(node, spec, read_only=read_only) for spec in specs}
+    return from_values(cls, values)
+
+
+def _refuse_clock_change(parameters: Sequence[Parameter]) -> SetParametersResult:
+    """Refuse a change of use_sim_time: stamps of the two clocks are not comparable."""
+    changed = any(parameter.name == "use_sim_time" for parameter in parameters)
+    reason = "use_sim_time is read at the start only: restart the node." if changed else ""
+    return SetParametersResult(successful=not changed, reason=reason)
+
+
+def read_parameter(node: Node, spec: ParameterSpec, *, read_only: bool) -> Value:
+    """The value of a declared parameter, which has its type and descriptor from now on.
+
+    rclpy would refuse a value with a traceback that lacks the unit. So the value is checked here, while the
+    parameter still has a dynamic type; then it gets its descriptor.
+
+    Raises:
+        ParameterError: The value has the wrong type or is out of range.
+    """
+    value = spec.checked(node.get_parameter(spec.name).value)
+    node.set_parameters([Parameter(spec.name, _TYPES[type(spec.default)], value)])
+    node.set_descriptor(spec.name, _descriptor(spec, read_only=read_only))
+    return value
+
+
+_TYPES = {
+    bool: Parameter.Type.BOOL,
+    int: Parameter.Type.INTEGER,
+    float: Parameter.Type.DOUBLE,
+    str: Parameter.Type.STRING,
+    tuple: Parameter.Type.STRING_ARRAY,
+}
+
+
+def _descriptor(spec: ParameterSpec, *, read_only: bool) -> ParameterDescriptor:
+    """The descriptor that `ros2 param describe` prints."""
+    kind = _TYPES[type(spec.default)].value
+    descriptor = ParameterDescriptor(type=kind, description=spec.doc, read_only=read_only)
+    descriptor.additional_constraints = spec.range_text
+    number = spec.number
+    if number is None:
+        return descriptor
+    if isinstance(spec.default, int):
+        descriptor.integer_range = [IntegerRange(from_value=int(number.low), to_value=int(number.high))]
+    else:
+        descriptor.floating_point_range = [FloatingPointRange(from_value=number.low, to_value=number.high)]
+    return descriptor
+
 
 BACKWARDS = JumpThreshold(min_forward=None, min_backward=Duration(nanoseconds=-1), on_clock_change=False)
 """Threshold for any backward jump of the clock."""
@@ -77,11 +151,11 @@ def message_class(message_type: str) -> Any:
 
 
 class MessageTypeError(UserError):
-    """A message type that is not installed; the message is one sentence."""
+    """A message type that is not installed."""
 
 
 class RosArgumentsError(UserError):
-    """The command line has ROS arguments that rcl cannot parse; the message is one sentence."""
+    """The command line has ROS arguments that rcl cannot parse."""
 
 
 class Stop:
@@ -346,3 +420,179 @@ def end_at_task_errors() -> None:
 def _end(_task: Task, error: Exception) -> None:
     traceback.print_exception(error)
     raise SystemExit(1) from error
+
+
+class ManagedNode(LifecycleNodeMixin, ConfiguredNode[Parameters]):
+    """A node that reads its parameters when it is configured, and works while it is active.
+
+    What a transition has made, attributes as well as publishers, subscriptions and timers, exists until the
+    opposite transition. So an activation starts from scratch. An executor may still handle events that it
+    had queued before: callbacks that need what is gone ask `is_active`.
+
+    Args:
+        name: Default name of the node.
+        parameters: The dataclass, which has the flag `autostart`.
+        node_arguments: Further arguments of `rclpy.node.Node`.
+
+    Raises:
+        UserError: The parameter `autostart` cannot be used.
+    """
+
+    def __init__(self, name: str, parameters: type[Parameters], **node_arguments: Any) -> None:
+        ConfiguredNode.__init__(self, name, parameters, reads_parameters=False, **node_arguments)
+        self._cls = parameters
+        self._specs = {spec.name: spec for spec in parameter_specs(parameters)}
+        self._starts_itself = read_parameter(self, self._specs["autostart"], read_only=False)
+        LifecycleNodeMixin.__init__(self)
+        self._made: list[ExitStack] = []
+        self._mistake: Exception | None = None
+        self._answer = self._service_change_state.callback
+        self._service_change_state.callback = self._on_change_state
+        self.add_on_set_parameters_callback(self._check_parameters)
+        self.start_diagnostics(self._on_diagnostics)
+
+    def prepare(self) -> None:
+        """Read what the parameters name, and compile; called when the node is configured."""
+        raise NotImplementedError
+
+    def begin(self) -> None:
+        """Subscribe and publish; called when the node is activated."""
+        raise NotImplementedError
+
+    def report(self) -> None:
+        """Publish diagnostics; called once per second while the node is active."""
+        raise NotImplementedError
+
+    def at_end(self, callback: Callable[[], object]) -> None:
+        """Call back when what the present transition makes is taken back."""
+        self._made[-1].callback(callback)
+
+    @property
+    def state(self) -> str:
+        """Name of the present state."""
+        return str(self._state_machine.current_state[1])
+
+    @property
+    def is_active(self) -> bool:
+        """Whether the node works."""
+        return self.state == "active"
+
+    def autostart(self) -> None:
+        """Configure and activate, unless the parameter says to wait.
+
+        Raises:
+            UserError: A parameter, or a file that it names, cannot be used.
+            ParameterException: A parameter of rclpy cannot be used.
+        """
+        if not self._starts_itself:
+            self.get_logger().info("unconfigured: waiting for a lifecycle manager")
+            return
+        for change in (self.trigger_configure, self.trigger_activate):
+            change()
+            if self._mistake is not None:
+                self.destroy_node()  # nobody else can: there is no node to the caller
+                raise self._mistake
+        self._starts_itself = False
+
+    def destroy_node(self) -> None:
+        """Destroy the node; its state machine, which rclpy leaves, would keep its name for `/rosout`."""
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
+    def on_configure(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Read the parameters and prepare."""
+        return self._make(self._configure)
+
+    def on_activate(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Begin with nothing from before."""
+        self.health = Health(self.get_logger().warning)
+        return self._make(self.begin)
+
+    def on_deactivate(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Take back what the activation has made."""
+        return self._take_back(1)
+
+    def on_cleanup(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Take back what the configuration has made."""
+        return self._take_back(0)
+
+    def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:
+        """Take back everything."""
+        return self._take_back(0)
+
+    def _configure(self) -> None:
+        self.params = read_parameters(self, self._cls, read_only=False)
+        self.prepare()
+
+    def _make(self, step: Callable[[], None]) -> TransitionCallbackReturn:
+        """Run a step, and undo it where it fails by a mistake of the user."""
+        level = len(self._made)
+        self._made.append(ExitStack())
+        self.at_end(self._removal())
+        try:
+            step()
+        except (UserError, ParameterException) as error:
+            self._take_back(level)
+            self._mistake = error
+            if not self._starts_itself:
+                self.get_logger().error(str(error))
+            return TransitionCallbackReturn.FAILURE
+        except Exception as error:
+            traceback.print_exception(error)
+            raise SystemExit(1) from error  # rclpy would swallow the error itself
+        self._mistake = None
+        return TransitionCallbackReturn.SUCCESS
+
+    def _take_back(self, level: int) -> TransitionCallbackReturn:
+        """Undo all steps except the first `level`."""
+        while len(self._made) > level:
+            self._made.pop().close()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _removal(self) -> Callable[[], None]:
+        """Removes what the node has got since now."""
+        names, entities = set(vars(self)), set(self._entities())
+
+        def remove() -> None:
+            for entity in set(self._entities()) - entities:
+                for destroy in (self.destroy_publisher, self.destroy_subscription, self.destroy_timer):
+                    destroy(entity)  # which ignores those of other kinds
+            for name in set(vars(self)) - names:
+                delattr(self, name)
+
+        return remove
+
+    def _entities(self) -> Iterator[Any]:
+        yield from self.publishers
+        yield from Node.subscriptions.__get__(self)  # a node may keep some of them from its executor
+        yield from self.timers
+
+    def _check_parameters(self, parameters: Sequence[Parameter]) -> SetParametersResult:
+        """Refuse wrong values, and any while the node would not read them."""
+        known = [parameter for parameter in parameters if parameter.name in self._specs]
+        if known and self.state not in {"unconfigured", "configuring"}:
+            reason = f"parameter {known[0].name} cannot be set while the node is {self.state}."
+            return SetParametersResult(successful=False, reason=reason)
+        try:
+            for parameter in known:
+                self._specs[parameter.name].checked(parameter.value)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _on_change_state(
+        self, request: ChangeState.Request, response: ChangeState.Response
+    ) -> ChangeState.Response:
+        """Refuse a transition that the present state does not have; rclpy lets its error end the node."""
+        try:
+            return self._answer(request, response)
+        except rclpy_implementation.RCLError as error:
+            self.get_logger().error(f"{self.state}: {str(error).splitlines()[0]}")
+            response.success = False
+            return response
+
+    def _on_diagnostics(self) -> None:
+        if self.is_active:
+            self.report()
+        else:
+            self.publish_reports(Report(self.status_name, f"{self.state}: nothing is published", Level.WARN))

@@ -1,6 +1,6 @@
 """Parameters with default, unit, range and documentation, and the base class of users' errors.
 
-A frozen dataclass is filled from ROS parameters (`common.ros_parameters`), checks a swarm file
+A frozen dataclass is filled from ROS parameters (`common/node.py`), checks a swarm file
 or the settings, and gives the tables under doc/. A field with the metadata `numbers_of` holds a
 dataclass of numbers, each of which is a parameter; a field with `is_internal` is not a parameter.
 """
@@ -21,7 +21,7 @@ class UserError(ValueError):
 
 
 class ParameterError(UserError):
-    """A parameter that cannot be used; the message is one sentence."""
+    """A parameter that cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -50,16 +50,19 @@ class NumberSpec:
         return f"{'(' if self.above else '['}{self.low:g}, {self.high:g}]{unit}"
 
 
-def number(
-    default: float | None, unit: str, low: float, high: float, doc: str, *, above: bool = False
-) -> Any:
-    """A dataclass field that carries its `NumberSpec`; a default of None says that None is allowed."""
-    return field(default=default, metadata={"spec": NumberSpec(unit, low, high, above, doc, default is None)})
+def number(value: float | None, unit: str, low: float, high: float, doc: str, *, above: bool = False) -> Any:
+    """A dataclass field with its default and `NumberSpec`; a default of None says that None is allowed."""
+    return field(default=value, metadata={"spec": NumberSpec(unit, low, high, above, doc, value is None)})
 
 
 def number_specs(cls: type) -> dict[str, NumberSpec]:
     """The numbers of a dataclass: field name -> what it may be, in the order of definition."""
     return {f.name: f.metadata["spec"] for f in fields(cls) if "spec" in f.metadata}
+
+
+def number_values(holder: Any) -> dict[str, Any]:
+    """The values of these numbers of an object."""
+    return {name: getattr(holder, name) for name in number_specs(type(holder))}
 
 
 @dataclass(frozen=True)
@@ -89,21 +92,16 @@ class ParameterSpec:
         if isinstance(self.default, tuple) and isinstance(value, list | tuple):
             value = tuple(str(item) for item in value)
         if type(value) is not type(self.default):
-            raise ParameterError(f"parameter {self.name} = {value!r} must be {self._type_text}.")
+            texts = {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}
+            wanted = texts.get(type(self.default), "a list of texts")
+            raise ParameterError(f"parameter {self.name} = {value!r} must be {wanted}.")
         if self.number is not None and isinstance(value, int | float) and not self.number.allows(value):
             raise ParameterError(f"parameter {self.name} = {value} must lie in {self.number.range_text}.")
         if self.choices and value not in self.choices:
             raise ParameterError(f"parameter {self.name} = '{value}' must be one of {self.range_text}.")
         if self.required and value == "":
             raise ParameterError(f"parameter {self.name} is not set: {self.doc}.")
-        checked: Value = value
-        return checked
-
-    @property
-    def _type_text(self) -> str:
-        return {bool: "true or false", int: "a whole number", float: "a number", str: "a text"}.get(
-            type(self.default), "a list of texts"
-        )
+        return value
 
 
 def text(default: str, doc: str, *, required: bool = False) -> Any:
@@ -122,7 +120,7 @@ def flag(default: bool, doc: str) -> Any:
 
 
 def autostart() -> Any:
-    """The flag that the parameters of each managed node have, see `common/lifecycle.py`."""
+    """The flag that the parameters of each managed node have, see `common/node.py`."""
     return flag(True, "configure and activate at the start; false: wait for a lifecycle manager")
 
 

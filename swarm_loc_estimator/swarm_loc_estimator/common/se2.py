@@ -109,18 +109,14 @@ def error_to_pose_jacobian(pose: ArrayLike) -> FloatArray:
 def pose_covariance(pose: ArrayLike, error_covariance: ArrayLike) -> FloatArray:
     """Covariances (..., 3, 3) of x, y, theta from those of the right-invariant error."""
     jacobian = error_to_pose_jacobian(pose)
-    covariance: FloatArray = (
-        jacobian @ np.asarray(error_covariance, dtype=float) @ np.swapaxes(jacobian, -1, -2)
-    )
-    return covariance
+    return np.asarray(jacobian @ np.asarray(error_covariance, dtype=float) @ np.swapaxes(jacobian, -1, -2))
 
 
 def error_covariance(pose: ArrayLike, covariance: ArrayLike) -> FloatArray:
     """Covariances (..., 3, 3) of the right-invariant error from those of x, y, theta."""
     jacobian = error_to_pose_jacobian(pose)
     jacobian[..., :2, 2] *= -1.0  # the inverse: a shear with the opposite sign
-    error: FloatArray = jacobian @ np.asarray(covariance, dtype=float) @ np.swapaxes(jacobian, -1, -2)
-    return error
+    return np.asarray(jacobian @ np.asarray(covariance, dtype=float) @ np.swapaxes(jacobian, -1, -2))
 
 
 def _arc_coefficients(phi: FloatArray) -> tuple[FloatArray, FloatArray]:

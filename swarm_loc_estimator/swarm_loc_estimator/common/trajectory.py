@@ -14,7 +14,7 @@ DEFAULT_GAP_NS = 500_000_000  # Ground truth is not interpolated over longer gap
 
 
 class TrajectoryError(ValueError):
-    """Inconsistent stamps and poses; the message is one sentence."""
+    """Inconsistent stamps and poses."""
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,13 @@ from swarm_loc_estimator.doctor.contents import (
     IMAGE,
     check_contents,
     check_estimate,
+    check_motion,
     check_pictures,
 )
-from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, Message, same_type
-from swarm_loc_estimator.doctor.motion import check_motion
+from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, Message
 from swarm_loc_estimator.doctor.topics import DIAGNOSTICS, check_clocks, check_frames, check_topics
-from swarm_loc_estimator.offline.recorded_bag import Progress, renamed_topics
-from swarm_loc_estimator.sensors.registry import input_topics, kinds
+from swarm_loc_estimator.offline.recorded_bag import Progress, renamed_topics, same_type
+from swarm_loc_estimator.sensors.inputs import input_topics, kinds
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 CHECKS = (check_topics, check_clocks, check_frames, check_pictures, check_motion, check_contents)
@@ -61,15 +61,7 @@ def evidence_of_bag(
     remap: Mapping[str, str] = MappingProxyType({}),
     namespace: str = "",
 ) -> Evidence:
-    """The first seconds of a bag.
-
-    Args:
-        bag: rosbag2 folder, .mcap or .db3 file.
-        swarm: The description.
-        seconds: How much of it is read [s].
-        progress: Called now and then.
-        remap: Expected topic -> topic of the bag, see `renamed_topics`.
-        namespace: Of the whole swarm, "" for none.
+    """The first `seconds` of a bag; `remap` as in `renamed_topics`, `namespace` of the whole swarm or "".
 
     Raises:
         BagError: Nothing in the bag can be read, or a topic cannot be mapped.

@@ -16,20 +16,21 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.filter.measurements import concatenate
+from swarm_loc_estimator.offline.recorded_bag import same_type
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
-from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
-from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
-from swarm_loc_estimator.sensors.registry import (
+from swarm_loc_estimator.sensors.inputs import (
     SENSORS,
     Batch,
+    Ingest,
     InputConverter,
+    InputStatistics,
     InputTopic,
     live_topics,
 )
+from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.timeline.contradictions import Contradicted, Contradiction
-from swarm_loc_estimator.timeline.estimate import Status
+from swarm_loc_estimator.timeline.estimate import Contradicted, Contradiction, Status
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -125,7 +126,7 @@ class Evidence:
         return parts, ingest.statistics, ingest
 
     def rows(self, sensor: str) -> Any:
-        """All readings of a sensor, see `sensors/registry.py`."""
+        """All readings of a sensor, see `sensors/inputs.py`."""
         return self._joined[sensor]
 
     @cached_property
@@ -195,11 +196,6 @@ class Evidence:
     def source_name(self, index: int) -> str:
         """Name of a robot or a fixed camera."""
         return self.swarm.sources[index].name
-
-
-def same_type(one: str, other: str) -> bool:
-    """Whether two names of types are the same; some writers of bags leave /msg/ out."""
-    return one.replace("/msg/", "/") == other.replace("/msg/", "/")
 
 
 def decoded(heard: Heard) -> tuple[list[Any], int]:

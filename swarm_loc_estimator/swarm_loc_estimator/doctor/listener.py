@@ -26,13 +26,9 @@ _OWN = ("parameter_events", "rosout")
 
 
 class Listener(Node):
-    """Subscribes to the topics of a swarm.
+    """Subscribes to the topics of a swarm in a namespace ("": none), and keeps messages of wanted types.
 
-    Args:
-        swarm: The description.
-        namespace: Of the whole swarm, "" for none.
-        is_wanted: Whether messages of a type are kept.
-        use_sim_time: Whether arrivals are by /clock.
+    Arrivals are by /clock if `use_sim_time`.
     """
 
     def __init__(

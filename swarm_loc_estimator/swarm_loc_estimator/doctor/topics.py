@@ -1,9 +1,4 @@
-"""Topics: missing ones, other types and names, publishers, rates.
-
-Stamps and clocks: stamps beside the time of arrival.
-
-Frames: of odometry, and of transforms, where each frame must have one parent.
-"""
+"""Topics, clocks and frames: missing and other topics, publishers, rates, stamps, trees of transforms."""
 
 from __future__ import annotations
 
@@ -15,10 +10,10 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.messages.cdr import TRANSFORMS
-from swarm_loc_estimator.doctor.evidence import SETTINGS, Evidence, Finding, Heard, decoded, same_type
+from swarm_loc_estimator.doctor.evidence import SETTINGS, Evidence, Finding, Heard, decoded
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
-from swarm_loc_estimator.sensors.ingest import CLOCKS_APART_S
-from swarm_loc_estimator.sensors.registry import InputTopic
+from swarm_loc_estimator.offline.recorded_bag import same_type
+from swarm_loc_estimator.sensors.inputs import CLOCKS_APART_S, InputTopic
 
 _HOUR_S = 3600.0
 _AHEAD_S = 0.05
@@ -151,6 +146,7 @@ def check_topics(evidence: Evidence) -> Iterator[Finding]:
     """Every expected topic has messages of its type, from one publisher, often enough."""
     statistics = evidence.read[1]
     lone = _lone(evidence)
+    # expected topics: their types, messages and rates
     for topic, counted in zip(evidence.inputs, statistics, strict=True):
         heard = evidence.topics.get(topic.name)
         if heard is not None and evidence.usable(topic) is None:
@@ -167,6 +163,7 @@ def check_topics(evidence: Evidence) -> Iterator[Finding]:
             )
         elif heard is not None and counted.received and topic.kind.rows in _PERIODIC:
             yield from _rate(topic, heard, evidence.end_ns)
+    # topics of robots that are not described, unless a wrong name explains a missing topic
     expected = {
         topic.name for topic in evidence.inputs if topic.expected and topic.name not in evidence.topics
     }
@@ -176,6 +173,7 @@ def check_topics(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(
                 name, "belongs to no robot of the description", "Describe that robot, or stop its nodes"
             )
+    # publishers, and what other nodes report
     yield from _publishers(evidence)
     for name, heard in evidence.topics.items():
         if same_type(heard.type, DIAGNOSTICS):

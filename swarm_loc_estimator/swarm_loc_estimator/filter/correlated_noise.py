@@ -16,8 +16,8 @@ has already fused z with the information L, so the exchange adds
 
 This holds whatever other measurements of the two robots are fused in between; but it is linearised about an
 estimate that is worst at first, when pairs have most information. So the noise r is inflated where the
-predicted variance e is not small beside it, by e^2 / (e + r); the information held back enters with the next
-exchange. For the same reason a measurement counts by two thirds when it initializes a robot.
+predicted variance e is not small compared with it, by e^2 / (e + r); the information held back enters with
+the next exchange. For the same reason a measurement counts by two thirds when it initializes a robot.
 
 A new mean starts where the robots have moved, because odometry is uncertain. The fused information of the old
 mean decays as the predicted variance of their relative pose grows. It does not count after turns, which use
@@ -62,21 +62,22 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.se2_scalar import between, composed, wrap
-from swarm_loc_estimator.common.small_matrix import (
+from swarm_loc_estimator.common.numerics import (
     add_scaled,
     assign,
     assign_matrix,
+    between,
     cholesky3,
+    composed,
     factor_numbers,
+    wrap,
 )
-from swarm_loc_estimator.filter.belief import BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.filter.integrity import find_pair
 from swarm_loc_estimator.filter.measurements import Measurements
 from swarm_loc_estimator.filter.models import POLAR
+from swarm_loc_estimator.filter.state import PAIR_ROWS, BeliefArrays, IntegrityArrays
 from swarm_loc_estimator.odometry.track_arrays import OdometrySample
 
-PAIR_ROWS = 10  # Rows of three numbers stored per pair
 _MEAN, _OBSERVER, _TARGET, _FUSED, _VARIANCE, _RANDOM, _SYSTEMATIC, _NOISE = 0, 1, 2, 3, 6, 7, 8, 9
 """The mean z; the poses of both robots on their tracks; the rows of L; the variances of their relative pose
 after the update; w; s; the accumulated variances of the two tracks, and an unused number."""
@@ -243,7 +244,7 @@ def _covariance(before: FloatArray, now: FloatArray, weight: float, pair: FloatA
 
 @cached_njit
 def _hold_back(noise: FloatArray, pair: FloatArray) -> None:
-    """Inflate the noise (3, 3) of a pair where the predicted variances are not small beside it."""
+    """Inflate the noise (3, 3) of a pair where the predicted variances are not small compared with it."""
     for i in range(3):
         expected = pair[_VARIANCE, i]
         noise[i, i] += expected * expected / (expected + noise[i, i])

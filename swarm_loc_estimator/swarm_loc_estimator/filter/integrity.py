@@ -1,25 +1,24 @@
-"""Loss of track: confirmation of assumed poses, reported uncertainty, and when a robot is lost.
+"""Integrity: which measurements are wrong, whose fault that is, and when a robot is lost.
 
-Pairs of observer and source: evidence against each, trends of its innovations, and links without a kernel.
+**Faults.** A measurement is an outlier when the squared Mahalanobis distance of its position exceeds a
+threshold that one good measurement in twenty exceeds, or when the whitened innovations of its last few have a
+trend. An outlier raises the fault score of whichever of observer and source has the larger share of outliers
+among its pairs. A robot whose camera was turned disagrees with all that it sees; a landmark that was moved
+disagrees with all that see it. Either is contradicted once its fault score reaches a limit. If both agree
+with others, the outlier is evidence against the pair alone, and the pair is excluded. Inliers lower scores
+and evidence.
 
-Where measurements of models without a kernel contradict, such as ranges by radio, their link is wrong more
-often than one of its ends: a wall between two radios lengthens ranges for seconds. They are evidence against
-their pair only, which is counted apart from that of other sensors, and which also inflates their noise.
+**Links.** Where measurements of models without a kernel contradict, such as ranges by radio, their link is
+wrong more often than one of its ends: a wall between two radios lengthens ranges for seconds. They are
+evidence against their pair only, which is counted apart from that of other sensors, and which also inflates
+their noise.
 
-Noise inflation: measurements that scatter more than described get more noise, in units per robot.
+**Noise inflation.** A robot whose measurements still contradict the estimate although all its parameters are
+states has more noise than described: its markers are mounted inexactly, its images are stamped inexactly.
+Each time its measurements are contradicted, their noise grows by one unit.
 
-A robot whose measurements still contradict the estimate although all its parameters are states has more
-noise than described: its markers are mounted inexactly, its images are stamped inexactly. Each time its
-measurements are contradicted, their noise grows by one unit.
-
-Fault detection and exclusion: outliers are attributed to an observer, to a source, or to their pair.
-
-A measurement is an outlier when the squared Mahalanobis distance of its position exceeds a threshold that one
-good measurement in twenty exceeds, or when the whitened innovations of its last few have a trend. An outlier
-raises the fault score of whichever of observer and source has the larger share of outliers among its pairs.
-A robot whose camera was turned disagrees with all that it sees; a landmark that was moved disagrees with all
-that see it. Either is contradicted once its fault score reaches a limit. If both agree with others, the
-outlier is evidence against the pair alone, and the pair is excluded. Inliers lower scores and evidence.
+**Loss.** An assumed pose is confirmed by measurements that agree, or refuted. A robot is lost that is too
+uncertain, or with too many gated measurements in a row.
 """
 
 from __future__ import annotations
@@ -32,10 +31,9 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays, covariance_within
-from swarm_loc_estimator.filter.measurements import Loss, Measurements
+from swarm_loc_estimator.filter.measurements import LossReason, Measurements
 from swarm_loc_estimator.filter.models import POLAR, has_kernel
-from swarm_loc_estimator.filter.prediction import LOG_SCALES, WINDOWS
+from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, IntegrityArrays, covariance_within
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW
 from swarm_loc_estimator.swarm.error_models import SensorModel
 
@@ -182,7 +180,7 @@ def source_of(measurements: Measurements, k: int, belief: BeliefArrays) -> int:
 
 _POSITION_SIGMA, _BEARING_SIGMA, _HEADING_SIGMA, _STAMP_SIGMA = 0.004, 0.01, 0.03, 0.03
 """One unit of inflation [m], [rad], [rad], [s]."""
-_SUSPECT_UNITS, MAX_UNITS = 2.0, 5.0
+MAX_UNITS = 5.0
 
 
 @inlined_njit
@@ -215,11 +213,6 @@ def inflate_noise(belief: BeliefArrays, observer: int) -> bool:
     return raised
 
 
-def inflate_all_noise(state: IntegrityArrays) -> None:
-    """Inflate the noise of all robots, because their description has proved wrong."""
-    np.maximum(state.noise_inflation, _SUSPECT_UNITS, out=state.noise_inflation)
-
-
 def with_noise_inflation(sensor: SensorModel, units: float) -> SensorModel:
     """A sensor model with the noise inflation included."""
     unit_of = {
@@ -239,7 +232,6 @@ def with_noise_inflation(sensor: SensorModel, units: float) -> SensorModel:
 
 _SUSPECT = 7.5  # Fault score from which a robot is not reported as tracked
 
-_SOURCES = 16
 _OUTLIER = 6.0
 _MAX_WEIGHT = 3.0
 _UNEXPLAINED_WEIGHT = 2.0
@@ -258,41 +250,6 @@ _INLIER_WEIGHT = 0.25
 _ONE_IMAGE_NS = 20_000_000
 _REPORTED_NS = 3_000_000_000
 _INDEPENDENT_NS = 100_000_000  # Measurements of a pair that follow each other faster share their errors
-
-
-def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
-    """All fault scores zero, no pair known."""
-    return IntegrityArrays(
-        source=np.full((robots, _SOURCES), -1),
-        source_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
-        counted_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
-        outlier=np.zeros((robots, _SOURCES), dtype=bool),
-        unexplained=np.zeros((robots, _SOURCES), dtype=bool),
-        trending=np.zeros((robots, _SOURCES), dtype=bool),
-        evidence=np.zeros((robots, _SOURCES)),
-        whitened=np.zeros((robots, _SOURCES, 2)),
-        squares=np.zeros((robots, _SOURCES)),
-        looks=np.zeros((robots, _SOURCES), dtype=np.int64),
-        fault_score=np.zeros(robots + landmarks),
-        confirmations=np.zeros(robots, dtype=np.int64),
-        confirmed_ns=np.full(robots, NEVER_NS // 2),
-        gated_in_a_row=np.zeros(robots, dtype=np.int64),
-        gated_source=np.full(robots, -1),
-        gated_ns=np.full(robots, NEVER_NS // 2),
-        gated_fixes=np.zeros(robots, dtype=np.int64),
-        gated_fix_ns=np.full(robots, NEVER_NS // 2),
-        noise_inflation=np.zeros(robots),
-        drift_ns=np.full((robots, WINDOWS), NEVER_NS // 2),
-        drift_transform=np.zeros((robots, WINDOWS, 3)),
-        drift_noise=np.zeros((robots, WINDOWS, 3, 3)),
-        drift_covariance=np.zeros((robots, WINDOWS, 3, 3)),
-        motion_likelihood=np.zeros((robots, LOG_SCALES.size)),
-        motion_scale=np.ones(robots),
-        motion_explained=np.zeros(robots, dtype=bool),
-        excess=np.zeros((robots, 3, 3)),
-        repeated=np.zeros((robots, _SOURCES, 2, 3, 3)),
-        repeated_at=np.zeros((robots, _SOURCES, 2)),
-    )
 
 
 @inlined_njit
@@ -491,7 +448,7 @@ def noise_of_frequent_looks(measurements: Measurements, k: int, belief: BeliefAr
     return _INDEPENDENT_NS / since_ns if 0 < since_ns < _INDEPENDENT_NS else 1.0
 
 
-_GATED, _OFF_FIXES = int(Loss.GATED), int(Loss.OFF_FIXES)
+_GATED, _OFF_FIXES = int(LossReason.GATED), int(LossReason.OFF_FIXES)
 CONFIRMED = 2  # Number of agreeing sightings after which an assumed pose counts as known
 WELL_CONFIRMED = 12
 _SUSPECT_SCORE = 2.0

@@ -2,13 +2,8 @@
 
 A filter operates on columns and Jacobians, not on robots or sensors. It does not hold the mean: an update
 returns the correction, which the caller applies on the manifold. Columns 3i..3i+2 are the error twist of
-body i; columns of parameters follow those of the robots.
-
-Inverses of covariance and information matrices.
-
-Joint filter with a full covariance matrix.
-
-Implements `JointFilter` of `joint_filter.py`.
+body i; columns of parameters follow those of the robots. `DenseFilter` holds a full covariance matrix, the
+sparse implementation is in `sparse/`.
 """
 
 from __future__ import annotations
@@ -19,7 +14,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.small_matrix import assign_matrix, cholesky3, invert_positive, solve3
+from swarm_loc_estimator.common.numerics import assign_matrix, cholesky3, invert_positive, solve3
 from swarm_loc_estimator.swarm.calibration_states import BLOCKS, DRIVES, ParameterTable
 
 

@@ -129,7 +129,7 @@ def drops_by_reason(counts: IntArray) -> dict[str, int]:
     return {reason: int(counts[verdict]) for reason, verdict in _DROPS.items()}
 
 
-class Loss(IntEnum):
+class LossReason(IntEnum):
     """Why a robot was deinitialized; 0: it was not."""
 
     UNCERTAIN = 1  # its standard deviation exceeds lost_sigma or lost_heading_sigma

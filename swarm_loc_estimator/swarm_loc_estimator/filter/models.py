@@ -32,8 +32,7 @@ from numpy.typing import ArrayLike
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.se2_scalar import composed, wrap
-from swarm_loc_estimator.common.small_matrix import factor_numbers
+from swarm_loc_estimator.common.numerics import composed, factor_numbers, wrap
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
 
 _STUDENT_DOF = 4.0

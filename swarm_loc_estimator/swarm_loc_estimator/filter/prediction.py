@@ -10,14 +10,13 @@ which is F. So a common motion of all robots and landmarks stays unobservable. T
 first-order Gauss-Markov process: it decays, and between the two instants its mean over this interval is
 used. So may be the yaw of a camera, which does not act on the motion.
 
-Adaptive process noise: the scale of a robot's odometry noise is learned from what measurements correct.
-
-Over a window, measurements move the transform T from `map` to a robot's odometry track by the drift of its
-odometry. In a consistent filter this correction is normal with variance s Q + P_begin - P_end, where Q is the
-described process noise of the window, P the variance of the pose, and s the scale of the noise, which is 1 as
-described. A robot that slips drifts by much more. Each window gives a likelihood of s; they are multiplied
-for a grid of scales and forgotten with a time constant. The scale that is used is never below 1: a minute on
-a good floor says little of the next metre.
+The scale of a robot's process noise is learned from what measurements correct. Over a window, measurements
+move the transform T from `map` to a robot's odometry track by the drift of its odometry. In a consistent
+filter this correction is normal with variance s Q + P_begin - P_end, where Q is the described process noise
+of the window, P the variance of the pose, and s the scale of the noise, which is 1 as described. A robot that
+slips drifts by much more. Each window gives a likelihood of s; they are multiplied for a grid of scales and
+forgotten with a time constant. The scale that is used is never below 1: a minute on a good floor says little
+of the next metre.
 
 Two windows run in parallel: the short one reacts fast, the long one sees slow drifts. While nothing measures
 a robot, its scale stays. Robots whose scales of distance or turn are estimated by description keep scale 1:
@@ -33,9 +32,20 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.se2_scalar import adjoint_of, between, carry, composed, moved_by_twist, wrap
-from swarm_loc_estimator.common.small_matrix import assign, assign_matrix, factor_numbers
-from swarm_loc_estimator.filter.belief import (
+from swarm_loc_estimator.common.numerics import (
+    adjoint_of,
+    assign,
+    assign_matrix,
+    between,
+    carry,
+    composed,
+    factor_numbers,
+    moved_by_twist,
+    wrap,
+)
+from swarm_loc_estimator.filter.state import (
+    LOG_SCALES,
+    WINDOWS,
     BeliefArrays,
     covariance_within,
     own_column,
@@ -44,14 +54,8 @@ from swarm_loc_estimator.filter.belief import (
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, DRIVES, TURN_BIAS
 
-WINDOWS = 2
 _WINDOW_NS = (2_000_000_000, 8_000_000_000)
 _LONGEST = 4.0  # A window that no measurement has ended after this many of its lengths says nothing
-LOG_SCALES = math.log(2.0) * np.arange(-1.0, 7.5, 0.5)
-"""Logarithms of the scales of the process noise, from one half to 128.
-
-Those below 1 take up what chance adds: without them, the mean of a robot as described would exceed 1.
-"""
 _PRIOR = 3.0  # Decrease of the log-likelihood per factor of e from scale 1
 _MEMORY_S = 30.0  # Time constant with which likelihoods are forgotten
 _POSE_SHARE = 0.25
@@ -104,10 +108,12 @@ def _add_evidence(
         for j in range(3):
             before = state.drift_noise[robot, window, i, j]
             difference[i, j] = belief.preintegrated_covariance[robot, i, j] - before
+    # Described process noise of the window, s Q with s = 1.
     carry(now, difference, noise)
     of_position, of_heading = _at(noise, pose)
     if not of_position > _STATIONARY_M2 or not of_heading > 0.0:
         return
+    # Correction by measurements: how far T has moved at the robot's pose.
     back = between(begin[0], begin[1], begin[2], 0.0, 0.0, 0.0)
     moved = composed(now[0], now[1], now[2], back[0], back[1], back[2])
     x, y, theta = between(moved[0], moved[1], moved[2], pose[0], pose[1], pose[2])
@@ -119,6 +125,7 @@ def _add_evidence(
         max(was_position - position, 0.0) + _POSE_SHARE * position,
         max(was_heading - heading, 0.0) + _POSE_SHARE * heading,
     )
+    # Likelihood of each scale s: the correction is normal with variance s Q + P_begin - P_end.
     kept, likelihood = math.exp(-since_s / _MEMORY_S), state.motion_likelihood[robot]
     total, mean, best = 0.0, 0.0, -math.inf
     for k in range(likelihood.size):
@@ -129,6 +136,7 @@ def _add_evidence(
         likelihood[k] -= math.log(along) + 0.5 * squared[0] / along
         likelihood[k] -= 0.5 * math.log(turned) + 0.5 * squared[1] / turned
         best = max(best, likelihood[k] - _PRIOR * abs(LOG_SCALES[k]))
+    # The scale is its mean, never below 1.
     for k in range(likelihood.size):
         weight = math.exp(likelihood[k] - _PRIOR * abs(LOG_SCALES[k]) - best)
         total += weight
@@ -330,6 +338,7 @@ def _block(
 @cached_njit
 def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
     """Apply the drift to T, to its covariances with all states and to the turn bias."""
+    # Mean: T drifts by the parameters.
     drift = _new_drift(belief, robot, to)
     _move(drift.twist, belief.transform[robot])
     for begin in belief.integrity.drift_transform[robot]:  # this is no correction by measurements
@@ -338,6 +347,7 @@ def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
     size = p.shape[0]
     columns, weight = np.empty(3 + DRIVES, dtype=np.int64), np.empty((3, 3 + DRIVES))
     rows, block = np.zeros((3, size)), np.empty((3, 3))
+    # Covariances of the pose with all states, F P, and of the pose, F P F^T.
     count = _own(belief, robot, drift, columns, weight)
     _block(p, columns, weight, count, drift, block)
     for i in range(3):
@@ -346,6 +356,7 @@ def _drive(belief: BeliefArrays, robot: int, to: Preintegrated) -> None:
                 rows[i, j] += weight[i, a] * p[columns[a], j]
     if not belief.is_dense:
         _note_transition(belief, robot, drift)
+    # The turn bias decays, and gains process noise.
     bias = own_column(belief, robot, 3 + TURN_BIAS)
     if bias >= 0:
         belief.parameter[robot, TURN_BIAS] *= drift.left

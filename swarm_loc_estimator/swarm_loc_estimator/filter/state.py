@@ -1,20 +1,20 @@
-"""Complete filter state at one instant; a copy is a checkpoint."""
+"""Complete filter state at one instant, whose copy is a checkpoint, and its arrays for compiled code."""
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
+from swarm_loc_estimator.common.numerics import composed, moved_by_twist, wrap
 from swarm_loc_estimator.common.se2 import error_covariance
-from swarm_loc_estimator.filter.belief import NEVER_NS, BeliefArrays, IntegrityArrays
-from swarm_loc_estimator.filter.correlated_noise import PAIR_ROWS
-from swarm_loc_estimator.filter.integrity import inflate_all_noise, new_integrity
 from swarm_loc_estimator.filter.joint_filter import DenseFilter, JointFilter
-from swarm_loc_estimator.filter.measurements import NOBODY, Loss
+from swarm_loc_estimator.filter.measurements import NOBODY, LossReason
 from swarm_loc_estimator.identification.memory import IdentityMemory
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.swarm.calibration_states import (
@@ -24,12 +24,190 @@ from swarm_loc_estimator.swarm.calibration_states import (
     ParameterTable,
 )
 
+NEVER_NS = np.iinfo(np.int64).min
+PAIR_ROWS = 10  # Rows of three numbers stored per pair, see `correlated_noise.py`
+_SOURCES = 16  # Most recent sources of a robot whose innovations are remembered
+WINDOWS = 2  # Windows in which the drift of odometry is observed, see `prediction.py`
+LOG_SCALES = math.log(2.0) * np.arange(-1.0, 7.5, 0.5)
+"""Logarithms of the scales of the process noise, from one half to 128.
+
+Those below 1 take up what chance adds: without them, the mean of a robot as described would exceed 1.
+"""
+_SUSPECT_UNITS = 2.0
+"""Noise inflation of all robots once their description has proved wrong, in units of `integrity.py`."""
 _DOUBTED_POSE_SIGMA = (0.02, 0.02, 0.03)
 """Standard deviation added to the pose of a contradicted robot [m], [m], [rad]."""
 _REOPENED_POSE_SIGMA = (0.06, 0.06, 0.12)
 """Standard deviation of poses after all parameters are reset to their priors [m], [m], [rad]."""
 _ALONE: IntArray = np.zeros(0, dtype=np.int64)
 _NO_SHARES: FloatArray = np.zeros((0, 3, 3))
+
+
+class IntegrityArrays(NamedTuple):
+    """Statistics of recent innovations for fault detection; see `integrity.py`.
+
+    A source is a measured object: robot i has index i, landmark l has index N + l. Measurements of models
+    without a kernel have sources of their own, with indices that are larger by N + L.
+    """
+
+    source: IntArray  # (N, S) sources measured most recently by each robot; -1: none
+    source_ns: IntArray  # (N, S) stamp of the last measurement of the pair
+    counted_ns: IntArray  # (N, S) stamp of the last measurement counted as evidence
+    outlier: BoolArray  # (N, S) True if the last measurement was an outlier
+    unexplained: BoolArray  # (N, S) True if no parameter error could explain it
+    trending: BoolArray  # (N, S) True if the last innovations had a trend
+    evidence: FloatArray  # (N, S) evidence against the pair
+    whitened: FloatArray  # (N, S, 2) sum of whitened innovations since the last test for a trend
+    squares: FloatArray  # (N, S) sum of their squares
+    looks: IntArray  # (N, S) number of these innovations
+    fault_score: FloatArray  # (N + L,) of each robot and landmark
+    confirmations: IntArray  # (N,) number of sightings that agree with the robot's initial pose
+    confirmed_ns: IntArray  # (N,) stamp of the last counted confirmation
+    gated_in_a_row: IntArray  # (N,) counted gated measurements since the last accepted one; not quick repeats
+    gated_source: IntArray  # (N,) source of the last gated measurement
+    gated_ns: IntArray  # (N,) stamp of the last gated measurement
+    gated_fixes: IntArray  # (N,) absolute fixes gated since the last accepted fix or landmark sighting
+    gated_fix_ns: IntArray  # (N,) stamp of the last counted gated fix
+    # (N,) level of noise inflation of each robot's measurements, see `filter/integrity.py`
+    noise_inflation: FloatArray
+    # (N, W) begin of each window in which the drift of odometry is observed, see `filter/prediction.py`
+    drift_ns: IntArray
+    drift_transform: FloatArray  # (N, W, 3) T at that time
+    drift_noise: FloatArray  # (N, W, 3, 3) preintegrated covariance of the track at that time
+    drift_covariance: FloatArray  # (N, W, 3, 3) of the error of T at that time
+    motion_likelihood: FloatArray  # (N, scales) log-likelihood of each scale of the process noise
+    motion_scale: FloatArray  # (N,) scale of the process noise of each robot
+    # (N,) True if it stays 1, as scales of the robot's motion are described as estimated
+    motion_explained: BoolArray
+    # (N, 3, 3) covariance of each robot's error beyond that of the filter, see `filter/correlated_noise.py`
+    excess: FloatArray
+    # (N, S, 2, 3, 3) covariance of the errors of observer and target with the repeated error of their pair
+    repeated: FloatArray
+    repeated_at: FloatArray  # (N, S, 2) place of the target, as the observer saw it last [m]
+
+
+class BeliefArrays(NamedTuple):
+    """Views of the arrays of a `SwarmState` and its `JointFilter`, which describe them."""
+
+    transform: FloatArray
+    covariance: FloatArray
+    marginal: FloatArray
+    transition: FloatArray
+    parameter: FloatArray
+    landmark: FloatArray
+    table: ParameterTable
+    predicted_to_ns: IntArray
+    preintegrated_covariance: FloatArray
+    preintegrated_jacobian: FloatArray
+    tracked: BoolArray
+    last_fix_ns: IntArray
+    integrity: IntegrityArrays
+    pair_robot: IntArray
+    pair_stamp_ns: IntArray
+    pair_history: FloatArray
+    is_dense: bool
+
+
+@cached_njit
+def own_covariance(belief: BeliefArrays, robot: int) -> FloatArray:
+    """Writable covariance matrix that `own_column` indexes: joint, or the robot's marginal."""
+    if belief.is_dense:
+        return belief.covariance
+    own: FloatArray = belief.marginal[robot]
+    return own
+
+
+@inlined_njit
+def own_column(belief: BeliefArrays, robot: int, which: int) -> int:
+    """Column of `own_covariance`: `which` 0 to 2 for the pose, from 3 on for parameters; -1: none."""
+    column: int = 3 * robot + which if which < 3 else belief.table.column[robot, which - 3]
+    if not belief.is_dense and column >= 0:
+        column = which
+    return column
+
+
+@inlined_njit
+def covariance_within(belief: BeliefArrays, column: int, i: int, j: int) -> float:
+    """Element (i, j) of the covariance (3, 3) of the body with this first column."""
+    whole, own = belief.covariance, belief.marginal
+    within: float = whole[column + i, column + j] if belief.is_dense else own[column // 3, i, j]
+    return within
+
+
+@inlined_njit
+def own_within(belief: BeliefArrays, robot: int, i: int, j: int) -> float:
+    """Element of the covariance of a robot's pose and parameters, indexed as by `own_column`."""
+    whole, own = belief.covariance, belief.marginal
+    if belief.is_dense:
+        within: float = whole[own_column(belief, robot, i), own_column(belief, robot, j)]
+        return within
+    alone: float = own[robot, i, j]
+    return alone
+
+
+@inlined_njit
+def to_map(belief: BeliefArrays, robot: int, pose: FloatArray) -> None:
+    """Transform a pose (3,) from the robot's track to `map`, in place."""
+    t = belief.transform[robot]
+    pose[0], pose[1], theta = composed(t[0], t[1], t[2], pose[0], pose[1], pose[2])
+    pose[2] = wrap(theta)
+
+
+@cached_njit
+def correct(belief: BeliefArrays, correction: FloatArray) -> None:
+    """Apply a filter's correction (n,) to localized robots, their parameters and landmarks."""
+    for i in range(belief.tracked.size):
+        if belief.tracked[i]:
+            t, c = belief.transform[i], correction[3 * i : 3 * i + 3]
+            t[0], t[1], t[2] = moved_by_twist(c[0], c[1], c[2], t[0], t[1], t[2])
+            for m in range(PARAMETERS):
+                column = belief.table.column[i, m]
+                if column >= 0:
+                    belief.parameter[i, m] += correction[column]
+    for i in range(belief.table.survey_column.size):
+        first = belief.table.survey_column[i]
+        if first >= 0:
+            mark, c = belief.landmark[i], correction[first : first + 3]
+            mark[0], mark[1], mark[2] = moved_by_twist(c[0], c[1], c[2], mark[0], mark[1], mark[2])
+
+
+def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
+    """All fault scores zero, no pair known."""
+    return IntegrityArrays(
+        # pairs of observer and source
+        source=np.full((robots, _SOURCES), -1),
+        source_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
+        counted_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
+        outlier=np.zeros((robots, _SOURCES), dtype=bool),
+        unexplained=np.zeros((robots, _SOURCES), dtype=bool),
+        trending=np.zeros((robots, _SOURCES), dtype=bool),
+        evidence=np.zeros((robots, _SOURCES)),
+        whitened=np.zeros((robots, _SOURCES, 2)),
+        squares=np.zeros((robots, _SOURCES)),
+        looks=np.zeros((robots, _SOURCES), dtype=np.int64),
+        # robots and landmarks
+        fault_score=np.zeros(robots + landmarks),
+        confirmations=np.zeros(robots, dtype=np.int64),
+        confirmed_ns=np.full(robots, NEVER_NS // 2),
+        gated_in_a_row=np.zeros(robots, dtype=np.int64),
+        gated_source=np.full(robots, -1),
+        gated_ns=np.full(robots, NEVER_NS // 2),
+        gated_fixes=np.zeros(robots, dtype=np.int64),
+        gated_fix_ns=np.full(robots, NEVER_NS // 2),
+        noise_inflation=np.zeros(robots),
+        # the scale of a robot's process noise
+        drift_ns=np.full((robots, WINDOWS), NEVER_NS // 2),
+        drift_transform=np.zeros((robots, WINDOWS, 3)),
+        drift_noise=np.zeros((robots, WINDOWS, 3, 3)),
+        drift_covariance=np.zeros((robots, WINDOWS, 3, 3)),
+        motion_likelihood=np.zeros((robots, LOG_SCALES.size)),
+        motion_scale=np.ones(robots),
+        motion_explained=np.zeros(robots, dtype=bool),
+        # errors that repeat
+        excess=np.zeros((robots, 3, 3)),
+        repeated=np.zeros((robots, _SOURCES, 2, 3, 3)),
+        repeated_at=np.zeros((robots, _SOURCES, 2)),
+    )
 
 
 IN_MAP = -1  # Origin of poses in `map`
@@ -93,13 +271,13 @@ class SwarmState:
         next_attempt_ns: (N,) earliest instant of the next attempt to initialize the robot.
         windows: Stored measurements of one degree of freedom per such robot (see `window.py`).
         next_window_ns: (N,) earliest instant of the next attempt with them.
-        images: Memory of aerial images.
+        images: Memory of aerial images; None before the first.
         origin: Robot whose pose was the origin when a local frame began, see `initializer.py`; IN_MAP: none.
         frame_moves: How often all poses have moved from a local frame to `map`.
         meetings: Robots that have met while nobody was located.
-        lost_why: (N,) why the robot was deinitialized last, of `Loss`; 0: it never was.
+        lost_why: (N,) why the robot was deinitialized last, of `LossReason`; 0: it never was.
         lost_ns: (N,) stamp of the measurement or command that showed it.
-        losses: (len(Loss) + 1,) how often robots were deinitialized, by reason.
+        losses: (len(LossReason) + 1,) how often robots were deinitialized, by reason.
     """
 
     def __init__(self, table: ParameterTable, pairs: int = 0, joint: JointFilter | None = None) -> None:
@@ -128,18 +306,19 @@ class SwarmState:
         self.next_attempt_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.windows: dict[int, Any] = {}  # of `window.Window`
         self.next_window_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
-        self.images = IdentityMemory()
+        self.images: IdentityMemory | None = None
         self.origin, self.frame_moves, self.meetings = IN_MAP, 0, Meetings()
         self.lost_why: IntArray = np.zeros(robots, dtype=np.int64)
         self.lost_ns: IntArray = np.full(robots, NEVER_NS)
-        self.losses: IntArray = np.zeros(len(Loss) + 1, dtype=np.int64)
+        self.losses: IntArray = np.zeros(len(LossReason) + 1, dtype=np.int64)
 
     def copy(self) -> SwarmState:
         """Return an independent copy."""
         other = SwarmState.__new__(SwarmState)
         for name, value in vars(self).items():
-            # tuples and numbers are immutable; arrays in dictionaries are replaced, never written to
-            setattr(other, name, value if isinstance(value, tuple | int) else value.copy())
+            # arrays in dictionaries are replaced, never written to
+            is_immutable = value is None or isinstance(value, tuple | int)
+            setattr(other, name, value if is_immutable else value.copy())
         other.integrity = IntegrityArrays(*(column.copy() for column in self.integrity))
         return other
 
@@ -230,7 +409,7 @@ class SwarmState:
         self._restart_drift(tracked)
         self.integrity.excess[:], self.integrity.repeated[:] = 0.0, 0.0
 
-    def deinitialize(self, robot: int, why: Loss, stamp_ns: int) -> None:
+    def deinitialize(self, robot: int, why: LossReason, stamp_ns: int) -> None:
         """Remove the robot from the estimate until a fix initializes it.
 
         Args:
@@ -291,7 +470,7 @@ class SwarmState:
         self.filter.set_body_priors(np.arange(robots), covariances)
         self._set_described_priors()
         self.integrity.fault_score[:], self.integrity.evidence[:] = 0.0, 0.0
-        inflate_all_noise(self.integrity)
+        np.maximum(self.integrity.noise_inflation, _SUSPECT_UNITS, out=self.integrity.noise_inflation)
         self._restart_drift(np.arange(robots))
 
     def _restart_drift(self, robots: int | IntArray) -> None:

@@ -30,16 +30,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
-from swarm_loc_estimator.filter.belief import (
-    BeliefArrays,
-    correct,
-    covariance_within,
-    own_within,
-    to_map,
-)
+from swarm_loc_estimator.common.numerics import assign, assign_matrix
 from swarm_loc_estimator.filter.correlated_noise import (
-    PAIR_ROWS,
     count_repeated,
     inflate_fix,
     record_pair,
@@ -60,7 +52,7 @@ from swarm_loc_estimator.filter.integrity import (
     stamp_variance,
 )
 from swarm_loc_estimator.filter.joint_filter import JointFilter, update_one
-from swarm_loc_estimator.filter.measurements import Loss, Measurements, Verdict
+from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.filter.models import (
     MODELS,
     NO_HEADING,
@@ -74,6 +66,14 @@ from swarm_loc_estimator.filter.models import (
     write_innovation,
 )
 from swarm_loc_estimator.filter.prediction import learn, new_scratch, predict
+from swarm_loc_estimator.filter.state import (
+    PAIR_ROWS,
+    BeliefArrays,
+    correct,
+    covariance_within,
+    own_within,
+    to_map,
+)
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.track_arrays import (
     OdometrySample,
@@ -88,7 +88,7 @@ from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YA
 DEPENDS_ON = 8
 """Filter columns per measurement: three of the observer, three of the target, camera yaw and camera scale."""
 _USED, _GATED = int(Verdict.USED), int(Verdict.GATED)
-_UNCERTAIN, _REFUTED = int(Loss.UNCERTAIN), int(Loss.REFUTED)
+_UNCERTAIN, _REFUTED = int(LossReason.UNCERTAIN), int(LossReason.REFUTED)
 PREDICT, EVALUATE, ATTRIBUTE, SETTLE = 1, 2, 4, 7  # Stages at which `fuse` is begun or resumed
 FINISHED, LEFT_OUT, LOST, CONTRADICTED = 0, 1, 2, 3
 """Why `fuse` returns: all is fused; a measurement of a robot that is not localized; a robot is lost; a robot
@@ -118,7 +118,7 @@ class Innovations(NamedTuple):
     cause: IntArray  # (m,) possible cause of the innovation, see `integrity.cause_of`
     accepted: BoolArray  # (m,) True if the innovation passes the gate
     nis: FloatArray  # (m,) normalized innovation squared
-    lost: IntArray  # (N + 1,) why a robot is lost (`Loss`), 0: it is not; the last element is NOBODY
+    lost: IntArray  # (N + 1,) why a robot is lost (`LossReason`), 0: it is not; the last element is NOBODY
     contradicted: BoolArray  # (N + L,) True for robots and landmarks that are contradicted
     predicted: FloatArray  # (3,) value
     other: FloatArray  # (3,) innovation of the second solution
@@ -200,7 +200,7 @@ def fuse(
 
     Returns:
         Index of the measurement at which it returns, why, the robot or landmark concerned, and why a robot is
-        lost (`Loss`).
+        lost (`LossReason`).
     """
     together, sample, scratch = together_ns >= 0, new_sample(2), new_scratch()
     k = begin
@@ -233,15 +233,8 @@ def fuse(
                 row = i - k
                 whitened = (work.whitened[row, 0], work.whitened[row, 1])
                 if has_kernel(measurements, i):
-                    source = assess(
-                        measurements,
-                        i,
-                        belief,
-                        limits.max_fault_score,
-                        work.distance[row],
-                        whitened,
-                        work.cause[row],
-                    )
+                    distance, cause, limit = work.distance[row], work.cause[row], limits.max_fault_score
+                    source = assess(measurements, i, belief, limit, distance, whitened, cause)
                     if source >= 0 and not together:
                         return k, CONTRADICTED, source, 0
                     if source >= 0:
@@ -405,25 +398,13 @@ def _evaluate(
     work: Innovations,
     row: int,
 ) -> None:
-    """Linearize measurement k about the belief and gate it; of two planar solutions, use the likelier one.
-
-    Args:
-        measurements: (m,).
-        k: Index of the measurement.
-        belief: Not changed.
-        work: Input: `pose`, `motion` and, for a sparse filter, `cross_covariance`. Output: the others.
-        row: Row of `work`.
-    """
+    """Linearize measurement k about the belief and gate it: stages 2 and 3; write the row of `work`."""
     columns, jacobian, innovation = work.columns[row], work.jacobian[row], work.innovation[row]
     pose, motion, noise = work.pose[row], work.motion[row], work.noise[row]
     bodies = body_columns(measurements, k, belief)
     camera, camera_columns = _camera(belief, measurements.observer[k])
-    predicted, value_jacobian, s, variances = (
-        work.predicted,
-        work.value_jacobian,
-        work.innovation_covariance,
-        work.variances,
-    )
+    predicted, value_jacobian = work.predicted, work.value_jacobian
+    s, variances = work.innovation_covariance, work.variances
     # Linearize: predicted value, Jacobian, noise.
     predict_one(measurements, k, pose[0], pose[1], camera, predicted, value_jacobian)
     _write_jacobian(value_jacobian, bodies, camera_columns, columns, jacobian)
@@ -436,15 +417,8 @@ def _evaluate(
     assign_matrix(s, noise)
     if belief.is_dense:
         _read_cross_covariance(belief.covariance, bodies, camera_columns, work.cross_covariance[row])
-    _add_uncertainty(
-        belief,
-        bodies,
-        camera_columns,
-        value_jacobian,
-        work.cross_covariance[row],
-        work.relative_covariance,
-        s,
-    )
+    cross, relative = work.cross_covariance[row], work.relative_covariance
+    _add_uncertainty(belief, bodies, camera_columns, value_jacobian, cross, relative, s)
     for i in range(3):
         variances[i] = s[i, i] - noise[i, i]
     # Innovation, eq. (11), of the likelier solution.
@@ -501,15 +475,7 @@ def relative_motion(
 ) -> None:
     """Write the rate of change of xi_target - xi_observer (3,) of measurement k by driving [1/s].
 
-    Zero for an exact stamp, where the rate is not needed.
-
-    Args:
-        measurements: (m,).
-        k: Index of the measurement.
-        tracks: Odometry.
-        belief: Not changed.
-        pose: (2, 3) of observer and target in `map`.
-        motion: Written.
+    Zero for an exact stamp, where the rate is not needed. `pose` (2, 3) is that of observer and target.
     """
     motion.fill(0.0)
     if stamp_variance(measurements, k, belief) == 0.0:
@@ -565,25 +531,15 @@ def _add_stamp_noise(
     value_jacobian: FloatArray, motion: FloatArray, variance: float, noise: FloatArray
 ) -> None:
     """Add the covariance due to the stamp's variance [s^2] at the rate `motion` (3,) to `noise` (3, 3)."""
+    h, (x, y, turn) = value_jacobian, (motion[0], motion[1], motion[2])
     change = (
-        _along(value_jacobian, 0, motion),
-        _along(value_jacobian, 1, motion),
-        _along(value_jacobian, 2, motion),
+        h[0, 0] * x + h[0, 1] * y + h[0, 2] * turn,
+        h[1, 0] * x + h[1, 1] * y + h[1, 2] * turn,
+        h[2, 0] * x + h[2, 1] * y + h[2, 2] * turn,
     )
     for i in range(3):
         for j in range(3):
             noise[i, j] += variance * change[i] * change[j]
-
-
-@inlined_njit
-def _along(value_jacobian: FloatArray, row: int, motion: FloatArray) -> float:
-    """Rate of change of one component of the value."""
-    speed: float = (
-        value_jacobian[row, 0] * motion[0]
-        + value_jacobian[row, 1] * motion[1]
-        + value_jacobian[row, 2] * motion[2]
-    )
-    return speed
 
 
 @inlined_njit
@@ -621,16 +577,8 @@ def _add_uncertainty(
 ) -> None:
     """Add H P H^T (3, 3), eq. (13) of the e-puck paper, where H is `value_jacobian`.
 
-    The covariance of xi_target - xi_observer is computed first, which saves two thirds of the work.
-
-    Args:
-        belief: Not changed.
-        bodies: First columns of the observer and of the target; -1: none.
-        camera: Columns of the camera's parameters; -1: none.
-        value_jacobian: (3, 5).
-        cross_covariance: (3, 5) of the observer, the target and the camera, see `Innovations`.
-        relative: (3, 3) buffer.
-        s: (3, 3) sum to add to.
+    The covariance of xi_target - xi_observer is computed first, in `relative` (3, 3), which saves two thirds
+    of the work. Columns of bodies and of the camera's parameters are -1 where there are none.
     """
     o, t = max(bodies[0], 0), max(bodies[1], 0)
     of_observer, of_target = 1.0 if bodies[0] >= 0 else 0.0, 1.0 if bodies[1] >= 0 else 0.0
@@ -649,15 +597,15 @@ def _add_uncertainty(
                 own = own_within(belief, o // 3, a, 3 + CAMERA_YAW + k)
                 relative[a, 0] = of_target * cross_covariance[a, 3 + k] - of_observer * own
             for i in range(3):
-                beside = value_jacobian[i, 0] * relative[0, 0] + value_jacobian[i, 1] * relative[1, 0]
-                beside += value_jacobian[i, 2] * relative[2, 0]
+                shared = value_jacobian[i, 0] * relative[0, 0] + value_jacobian[i, 1] * relative[1, 0]
+                shared += value_jacobian[i, 2] * relative[2, 0]
                 for other in range(2):  # its own variance, and its covariance with the other parameter
                     if camera[other] >= 0:
                         both = own_within(belief, o // 3, 3 + CAMERA_YAW + other, 3 + CAMERA_YAW + k)
-                        beside += 0.5 * value_jacobian[i, 3 + other] * both
+                        shared += 0.5 * value_jacobian[i, 3 + other] * both
                 for j in range(3):
-                    s[i, j] += beside * value_jacobian[j, 3 + k]
-                    s[j, i] += beside * value_jacobian[j, 3 + k]
+                    s[i, j] += shared * value_jacobian[j, 3 + k]
+                    s[j, i] += shared * value_jacobian[j, 3 + k]
 
 
 @inlined_njit
@@ -682,17 +630,10 @@ def evaluate_link(
     joint: JointFilter,
     work: Innovations,
 ) -> None:
-    """Evaluate a measurement whose model has no compiled kernel: stages 2 and 3 of `fuse`.
+    """Evaluate a measurement whose model has no compiled kernel: stages 2 and 3; write row k of `work`.
 
-    Missing components get zero rows and unit noise.
-
-    Args:
-        one: A row of measurements, between localized robots.
-        k: Row of `work`.
-        tracks: Odometry.
-        belief: Predicted belief.
-        joint: Its filter, prepared for an update with this measurement.
-        work: Input: `pose` and, for a sparse filter, `cross_covariance`; output: the other fields.
+    Its sides are localized and predicted, the filter is prepared. Components that its model lacks get zero
+    rows and unit noise.
     """
     # Predict.
     model, stamp_ns = MODELS[int(one.model)], int(one.stamp_ns)
@@ -754,10 +695,5 @@ def _motion(tracks: TrackArrays, robot: int, stamp_ns: int, pose: FloatArray) ->
     """Right-invariant velocity twist (3,) of a robot at a pose (3,) in `map` [1/s]."""
     forward, left, turn = rate_at(tracks, robot, stamp_ns)
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    return np.array(
-        [
-            cos * forward - sin * left + turn * pose[1],
-            sin * forward + cos * left - turn * pose[0],
-            turn,
-        ]
-    )
+    x, y = cos * forward - sin * left, sin * forward + cos * left
+    return np.array([x + turn * pose[1], y - turn * pose[0], turn])

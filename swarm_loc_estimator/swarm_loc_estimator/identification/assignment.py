@@ -24,7 +24,9 @@ class Assignment(NamedTuple):
 
     place: IntArray  # (r,) the detection of each robot, or UNSEEN or AMBIGUOUS
     robot: IntArray  # (n,) the robot of each detection, as an index below r, or UNSEEN or AMBIGUOUS
-    probability: FloatArray  # (r,) that the assignment of a robot is right, beside the best one without it
+    probability: (
+        FloatArray  # (r,) that the assignment of a robot is right, compared with the best one without it
+    )
 
 
 def log_ratios(

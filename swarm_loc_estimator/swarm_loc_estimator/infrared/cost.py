@@ -96,22 +96,11 @@ def reading_cost(
         near = cost < BELIEVED
         if more < 0.0:
             cost, pull, weight = _of_bright(errors, reading - expected, cost, pull, weight)
-        else:
-            cost, pull, weight = _of_outlier(cost, pull, weight, limit)
+        elif not near:  # it may be blocked: a robust loss, whose cost saturates at the limit
+            seen = math.exp((BELIEVED - cost) / limit)
+            cost, pull, weight = BELIEVED + limit * (1.0 - seen), seen * pull, seen * weight
         return cost, pull, weight, near and two_sided, systematic, square
     return cost, pull, weight, True, systematic, square
-
-
-@cached_njit
-def _of_outlier(cost: float, pull: float, weight: float, limit: float) -> tuple[float, float, float]:
-    """The cost of a reading that may be blocked, and its derivatives by the expected reading.
-
-    The loss is robust: the weight decreases with the residual, and the cost saturates at a limit.
-    """
-    if cost < BELIEVED:
-        return cost, pull, weight
-    seen = math.exp((BELIEVED - cost) / limit)
-    return BELIEVED + limit * (1.0 - seen), seen * pull, seen * weight
 
 
 @cached_njit
@@ -371,7 +360,10 @@ def _add_others(errors: ReadingErrors, pair: Pair, work: CostWorkspace) -> float
             tally[0], tally[1] = tally[0] + 2.0 * cost, tally[1] + (1.0 if kind == MEASURED else 0.0)
         work.pulls[f], work.weights[f] = factor * pull, factor * factor * weight
         if systematic > 0.0:
-            _add_systematic(systematic * work.weights[f], work.slopes[:, f], work.systematic)
+            for p in range(3):
+                for q in range(3):
+                    information = systematic * work.weights[f] * work.slopes[p, f] * work.slopes[q, f]
+                    work.systematic[p, q] += information
     return total
 
 
@@ -439,11 +431,3 @@ def _add_prior(pair: Pair, at: FloatArray, gradient: FloatArray, hessian: FloatA
             for q in range(first, p):
                 hessian[p, q] -= weight * common
     return cost
-
-
-@norefcount_njit
-def _add_systematic(weight: float, slopes: FloatArray, systematic: FloatArray) -> None:
-    """Add the information of a reading, weighted by the systematic share of its noise."""
-    for p in range(3):
-        for q in range(3):
-            systematic[p, q] += weight * slopes[p] * slopes[q]

@@ -15,8 +15,15 @@ from numpy.typing import ArrayLike
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit
-from swarm_loc_estimator.common.se2_scalar import wrap
-from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
+from swarm_loc_estimator.common.numerics import assign, assign_matrix, wrap
+from swarm_loc_estimator.infrared.brightness import (
+    StartTable,
+    add_spread,
+    blurred,
+    compress,
+    find_starts,
+    start_table,
+)
 from swarm_loc_estimator.infrared.cost import DARK, MEASURED, Pair, with_stray_light, write_costs
 from swarm_loc_estimator.infrared.search import (
     TABLE_STARTS,
@@ -31,22 +38,15 @@ from swarm_loc_estimator.infrared.search import (
     pose_covariance,
     search,
 )
-from swarm_loc_estimator.infrared.start_table import (
-    StartTable,
-    add_spread,
-    blurred,
-    compress,
-    find_starts,
-    start_table,
-)
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
+# The constants of the likelihood are checked by `make bench-droplet` and, for outliers, test_ir_outliers.py.
 _WORSE = 2.0  # Maximum misfit of a start relative to that of the best start
 _LOOSE, _STILL = 0.1, 1e-4
 """Minimum predicted decrease of the cost per step, for the blurred and for the exact model."""
 _SAME = 0.02  # Maximum difference in cost of two searches that reached the same minimum
 _SUSPICIOUS = 1.3  # Threshold of the misfit above which a minimum may be wrong
-_FEWEST = 9
+_FEWEST = 9  # Minimum number of measured readings
 _FAINTEST = 6.0  # Minimum excess of the readings' sum of squares over noise [sigma]
 _FAINTEST_OF_OUTLIERS = 3.0
 """The same for platforms with bright outliers, where the posterior over all poses also rejects noise."""
@@ -60,7 +60,7 @@ _ASIDE = np.array([(0.0, 0.1, 0.3), (0.0, -0.1, -0.3), *((0.0, b, h) for b, h in
 """Offsets (range [m], bearing, heading [rad]) of additional starts: two from the best minimum, near which the
 second-best often is, the others from the table's best start."""
 _OF_SECOND = 2  # Number of these offsets that start from the best minimum
-_MIN_ODDS = 1e-4
+_MIN_ODDS = 1e-4  # Minimum odds of a second pose that is reported
 _WORTH_WEIGHING = 8.0  # Maximum difference in cost of two minima compared by the probability around them
 _NO_MINIMUM = np.full(4, math.inf)
 _EXACT = 1e-4  # Standard deviation of each log-gain where only the common log-gain is uncertain
@@ -81,7 +81,17 @@ class MaximumLikelihood:
     def solve(
         self, readings: ArrayLike, gains: PairGains | None = None, saturation: ArrayLike | None = None
     ) -> IrSolutions:
-        """Relative poses of k pairs, see `solution.IrEstimator`."""
+        """Relative poses of k pairs.
+
+        Args:
+            readings: (k, modes, n, n) [count], [mode, sensor, emitter], NaN where not measured.
+            gains: Of the k pairs; None: never calibrated.
+            saturation: (k, modes) minimum of saturated readings, which are only lower bounds [count];
+                None: the platform's.
+
+        Raises:
+            ReadingsError: They have another shape.
+        """
         values, known, limits = checked(self._platform, readings, gains, saturation)
         flat = values.reshape(len(values), math.prod(values.shape[1:]))
         return _solve_all(self._models, flat, known, limits)
@@ -118,7 +128,6 @@ def _solve_at(
     out: IrSolutions,
     k: int,
 ) -> None:
-    """Solve pair k."""
     pair = Pair(
         readings[k],
         work.cut,
@@ -131,18 +140,12 @@ def _solve_at(
         models.table.ranges[0],
         2.0 * models.table.ranges[-1],
     )
-    _write_prior(gains.sigma[k], pair.sensor.size, work.prior)
+    for side in range(2):  # the information of the prior on the log-gains of sensors, and of emitters
+        own, common = max(gains.sigma[k, 2 * side], _EXACT) ** 2, gains.sigma[k, 2 * side + 1] ** 2
+        work.prior[side, 0], work.prior[side, 1] = 1.0 / own, common / (own + pair.sensor.size * common)
     exact = with_stray_light(models.exact, pair.readings)
     soft = with_stray_light(models.blurred, pair.readings)
     out.outcomes[k] = _solve_one(Models(exact, soft, models.table), saturation[k], pair, work, out, k)
-
-
-@norefcount_njit
-def _write_prior(sigma: FloatArray, n: int, prior: FloatArray) -> None:
-    """Write `Pair.prior` for the standard deviations (4,) of `PairGains`."""
-    for side in range(2):
-        own, common = max(sigma[2 * side], _EXACT) ** 2, sigma[2 * side + 1] ** 2
-        prior[side, 0], prior[side, 1] = 1.0 / own, common / (own + n * common)
 
 
 @norefcount_njit
@@ -150,6 +153,7 @@ def _solve_one(
     models: Models, saturation: FloatArray, pair: Pair, work: Workspace, out: IrSolutions, k: int
 ) -> int:
     """Solve one pair; returns the outcome."""
+    # enough readings, and brighter than noise
     measured, saturated, bright = classify(models.exact, saturation, pair)
     if measured < _FEWEST:
         return _UNDETERMINED if saturated > 0 else _TOO_FEW
@@ -157,11 +161,13 @@ def _solve_one(
     faintest = _FAINTEST_OF_OUTLIERS if two_sided else _FAINTEST
     if bright < measured + faintest * math.sqrt(2.0 * measured):
         return _TOO_WEAK
+    # the best two minima of the negative log likelihood
     write_costs(models.exact.errors, pair)
     _find_minima(models, pair, work, measured)
     if two_sided:
         _weigh_minima(models.exact, pair, work)
     best, other = work.minima[0], work.minima[1]
+    # the covariance at the best one, and whether it explains the readings
     covariance, odds = work.covariance, math.exp(best[3] - other[3])
     determined = pose_covariance(models.exact, pair, work.best, work.full, covariance)
     misfit = work.full.tally[0] / max(work.full.tally[1], 1.0)
@@ -169,6 +175,7 @@ def _solve_one(
         return _MISFIT
     if not determined:
         return _UNDETERMINED
+    # larger where the fit is bad, or where the pose may be the other minimum, or any other one
     share = 0.0 if two_sided else odds / (1.0 + odds)
     for p in range(3):
         for q in range(3):
@@ -179,6 +186,7 @@ def _solve_one(
             return _UNDETERMINED
     elif max(covariance[1, 1], covariance[2, 2]) > models.exact.scale * _WIDEST * _WIDEST:
         return _UNDETERMINED
+    # write the solution
     out.misfits[k], out.odds[k] = misfit, odds
     assign(out.systematic_share[k], work.full.of_gains)
     assign_matrix(out.covariances[k], covariance)
@@ -309,16 +317,7 @@ def _search_blurred(model: IrModel, pair: Pair, work: Workspace, start: FloatArr
     """Write the minimum of the blurred model as the first start."""
     p = pair
     soft = Pair(
-        p.readings,
-        p.cut,
-        p.stable,
-        p.kinds,
-        work.soft,
-        p.sensor,
-        p.emitter,
-        p.prior,
-        p.nearest,
-        p.farthest,
+        p.readings, p.cut, p.stable, p.kinds, work.soft, p.sensor, p.emitter, p.prior, p.nearest, p.farthest
     )
     write_costs(model.errors, soft)
     search(model, soft, start, _LOOSE, work.plain, work.minima[0])

@@ -10,15 +10,21 @@ from __future__ import annotations
 
 import math
 from enum import IntEnum
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, norefcount_njit
-from swarm_loc_estimator.common.se2_scalar import wrap
-from swarm_loc_estimator.common.small_matrix import assign_matrix
+from swarm_loc_estimator.common.numerics import assign_matrix, wrap
+from swarm_loc_estimator.infrared.brightness import (
+    Float32Array,
+    StartTable,
+    StartWorkspace,
+    compress,
+    new_start_workspace,
+)
 from swarm_loc_estimator.infrared.cost import (
     MEASURED,
     MISSING,
@@ -30,13 +36,6 @@ from swarm_loc_estimator.infrared.cost import (
     new_cost_workspace,
     new_costs,
     stabilized,
-)
-from swarm_loc_estimator.infrared.start_table import (
-    Float32Array,
-    StartTable,
-    StartWorkspace,
-    compress,
-    new_start_workspace,
 )
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
@@ -67,15 +66,10 @@ class IrSolutions(NamedTuple):
     # readings
     misfits: FloatArray
 
-    @classmethod
-    def none(cls, count: int) -> IrSolutions:
-        """Solutions of `count` pairs, all without a pose."""
-        return no_solutions(count)
-
 
 @cached_njit
 def no_solutions(count: int) -> IrSolutions:
-    """Solutions of `count` pairs, all without a pose; also for compiled code."""
+    """Solutions of `count` pairs, all without a pose."""
     return IrSolutions(
         np.full((count, 3), np.nan),
         np.full((count, 3, 3), np.nan),
@@ -88,26 +82,7 @@ def no_solutions(count: int) -> IrSolutions:
 
 
 class ReadingsError(ValueError):
-    """Readings that do not belong to the platform; the message is one sentence."""
-
-
-class IrEstimator(Protocol):
-    """One of `ClosedForm` and `MaximumLikelihood`."""
-
-    def solve(
-        self, readings: ArrayLike, gains: PairGains | None = None, saturation: ArrayLike | None = None
-    ) -> IrSolutions:
-        """Relative poses of k pairs.
-
-        Args:
-            readings: (k, modes, n, n) [count], [mode, sensor, emitter], NaN where not measured.
-            gains: Of the k pairs; None: never calibrated.
-            saturation: (k, modes) minimum of saturated readings, which are only lower bounds [count];
-                None: the platform's.
-
-        Raises:
-            ReadingsError: They have another shape.
-        """
+    """Readings that do not belong to the platform."""
 
 
 def checked(
@@ -142,42 +117,25 @@ TABLE_STARTS = 3  # Maximum number of starts from the table
 
 
 class Workspace(NamedTuple):
-    """Memory of one search, reused for all pairs.
+    """Memory of one search, reused for all pairs."""
 
-    Attributes:
-        plain: Workspace for a search over the pose only.
-        full: Workspace that includes the gains where they are unknown, else `plain`.
-        start: Workspace of the search for starts.
-        starts: (S, 4) range, bearing, heading, misfit.
-        pattern: (F,) compressed readings.
-        present: (F,) 1 where there is a reading, else 0.
-        cut, stable, kinds: (F,) of `Pair`.
-        exact, soft: Likelihoods of the readings for the exact and the blurred model.
-        prior: (2, 2) of `Pair`.
-        minima: (2, 4) range, bearing, heading and cost of the best two distinct minima.
-        best: (P,) the best minimum with its gains.
-        found: (P,) another minimum.
-        first: (4,) the table's best start.
-        covariance: (3, 3) pose covariance at a minimum.
-    """
-
-    plain: CostWorkspace
-    full: CostWorkspace
-    start: StartWorkspace
-    starts: FloatArray
-    pattern: Float32Array
-    present: Float32Array
-    cut: FloatArray
-    stable: FloatArray
-    kinds: NDArray[np.int8]
-    exact: Costs
-    soft: Costs
-    prior: FloatArray
-    minima: FloatArray
-    best: FloatArray
-    found: FloatArray
-    first: FloatArray
-    covariance: FloatArray
+    plain: CostWorkspace  # For a search over only the pose
+    full: CostWorkspace  # Includes the gains where they are unknown, else `plain`
+    start: StartWorkspace  # Of the search for starts
+    starts: FloatArray  # (S, 4) range, bearing, heading, misfit
+    pattern: Float32Array  # (F,) compressed readings
+    present: Float32Array  # (F,) 1 where there is a reading, else 0
+    cut: FloatArray  # (F,) of `Pair`
+    stable: FloatArray  # (F,) of `Pair`
+    kinds: NDArray[np.int8]  # (F,) of `Pair`
+    exact: Costs  # Likelihoods of the readings for the exact model
+    soft: Costs  # Likelihoods of the readings for the blurred model
+    prior: FloatArray  # (2, 2) of `Pair`
+    minima: FloatArray  # (2, 4) range, bearing, heading and cost of the best two distinct minima
+    best: FloatArray  # (P,) the best minimum with its gains
+    found: FloatArray  # (P,) another minimum
+    first: FloatArray  # (4,) the table's best start
+    covariance: FloatArray  # (3, 3) pose covariance at a minimum
 
 
 @cached_njit
@@ -250,9 +208,10 @@ def classify(model: IrModel, saturation: FloatArray, pair: Pair) -> tuple[int, i
     return measured, saturated, bright
 
 
-_ROUNDS = 40
-_FIRST_DAMPING = 1e-3
-_MAX_DAMPING = 1e8
+# The constants of the search are checked by `make bench-droplet`, errors relative to the Cramer-Rao bound.
+_ROUNDS = 40  # Maximum number of steps
+_FIRST_DAMPING = 1e-3  # Relative increase of the Hessian's diagonal
+_MAX_DAMPING = 1e8  # Damping at which the search gives up
 _LONGEST_TURN = 0.4  # Maximum change of bearing and heading per step [rad]
 _LONGEST_SHARE = 0.4  # Maximum relative change of range per step
 _BESIDE = 0.03  # Distance from a known minimum [rad, relative in range] within which a search ends early

@@ -1,9 +1,7 @@
 """Alignment of a robot's track with the map: the transform on which most constraints agree, if it is unique.
 
-The parts are compiled because every waiting robot tries repeatedly; they are not inlined, which would
-lengthen compilation.
-
-Constraints by sightings on the pose of the odometry track of a robot that is not localized.
+Constraints are sightings by or of a robot that is not localized. The parts are compiled because every waiting
+robot tries repeatedly; they are not inlined, which would lengthen compilation.
 """
 
 from __future__ import annotations
@@ -16,13 +14,20 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.numerics import (
+    assign,
+    assign_matrix,
+    carry,
+    cholesky3,
+    composed,
+    moved_by_twist,
+    solve3,
+    wrap,
+)
 from swarm_loc_estimator.common.se2 import adjoint
-from swarm_loc_estimator.common.se2_scalar import carry, composed, moved_by_twist, wrap
-from swarm_loc_estimator.common.small_matrix import assign, assign_matrix, cholesky3, solve3
-from swarm_loc_estimator.filter.belief import BeliefArrays, covariance_within
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
 from swarm_loc_estimator.filter.models import POLAR, gate_threshold
-from swarm_loc_estimator.filter.state import InitialPose
+from swarm_loc_estimator.filter.state import BeliefArrays, InitialPose, covariance_within
 
 CONSTRAINT_DTYPE = np.dtype(
     [
@@ -181,6 +186,7 @@ def _describe(
     """Write the constraint (1,) of a row of measurements, see `with_constraint`."""
     constraint = constraints[0]
     value, covariance, sensor, marker = one.value, one.covariance, one.sensor, one.marker
+    # Sensor and marker on the track and in map, with the estimated errors of the camera.
     sees, track = one.observer == waiting.robot, waiting.pose
     on_track, on_map = (sensor, marker) if sees else (marker, sensor)
     lx, ly, ltheta = composed(track[0], track[1], track[2], on_track[0], on_track[1], on_track[2])
@@ -190,6 +196,7 @@ def _describe(
         ltheta += camera[0]
     else:
         mtheta += camera[0]
+    # The measured point and its covariance, turned to the frame of the side that sees.
     x, y, angle = value[0], value[1], ltheta if sees else mtheta
     xx, xy, yy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     if one.model == POLAR:  # along and across the line of sight
@@ -208,6 +215,7 @@ def _describe(
     constraint.local_xx, constraint.local_xy, constraint.local_yy = local * xx, local * xy, local * yy
     constraint.map_x, constraint.map_y = mx + there * x, my + there * y
     constraint.map_xx, constraint.map_xy, constraint.map_yy = there * xx, there * xy, there * yy
+    # Headings of the transform, also by a second solution.
     constraint.turn = constraint.other_turn = math.nan
     if one.has_heading:
         constraint.turn = mtheta - ltheta - sign * value[2]
@@ -230,6 +238,7 @@ def refreshed(constraints: ConstraintArray, belief: BeliefArrays) -> ConstraintA
     count = 0
     none, drift, shared, spread = np.zeros((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
     for k in range(constraints.size):
+        # Keep it, unless its other side was lost.
         robot, mark, constraint = constraints[k].other, constraints[k].landmark, out[count]
         if robot >= 0 and not belief.tracked[robot]:
             continue
@@ -240,6 +249,7 @@ def refreshed(constraints: ConstraintArray, belief: BeliefArrays) -> ConstraintA
         constraint.column = column
         if column < 0:
             continue
+        # Move it to the present estimate of the other side.
         now = belief.transform[robot] if robot >= 0 else belief.landmark[mark]
         turn = _move(constraint, now)
         for i in range(3):
@@ -248,6 +258,7 @@ def refreshed(constraints: ConstraintArray, belief: BeliefArrays) -> ConstraintA
                 drift[i, j] = 0.0
                 if robot >= 0:
                     drift[i, j] = constraint.frame_noise[i, j] - belief.preintegrated_covariance[robot, i, j]
+        # Add the error of the other side and the drift of its track since.
         sign = 1.0 if drift[0, 0] + drift[1, 1] + drift[2, 2] > 0.0 else -1.0
         carry(now, drift, spread)
         for i in range(3):
@@ -482,6 +493,7 @@ def _refine(
     assign(transform, begin)
     squared, agreeing = 0.0, 0
     for iteration in range(_REFINEMENTS):
+        # Normal equations of the points and headings that agree now.
         x, y, heading = transform[0], transform[1], transform[2]
         cos, sin = math.cos(heading), math.sin(heading)
         squared, agreeing = 0.0, 0
@@ -510,10 +522,12 @@ def _refine(
             if math.isfinite(turn):
                 gradient[2] += turn / constraint.turn_variance
                 information[2, 2] += 1.0 / constraint.turn_variance
+        # Gauss-Newton step on the manifold.
         factor = cholesky3(information)
         solve3(factor, gradient, step)
         x, y, heading = moved_by_twist(step[0], step[1], step[2], x, y, heading)
         transform[0], transform[1], transform[2] = x, y, heading
+    # Covariance, wider where residuals exceed what is described.
     excess = max(1.0, squared / max(1, 2 * agreeing - 3))
     for i in range(3):
         for j in range(3):

@@ -6,11 +6,7 @@ the transform in closed form (a rigid alignment); a sighting with heading determ
 it has a mirrored solution. The transform on which most constraints agree is refined by least squares. It is
 accepted when its covariance is small enough and no other transform explains the constraints about as well.
 A whole pose by a mapper locates a robot alone: it is an estimate, which its next poses would not confirm.
-Measurements of one degree of freedom are collected apart, see `window.py`.
-
-Initialization of robots at the start poses of the swarm description.
-
-A frame without a map: that of the best connected robot, until something absolute is measured.
+Measurements of one component are collected apart, see `window.py`. Robots with a described start begin there.
 
 Robots that only see each other can be located relative to one of them. It becomes the origin when nobody has
 a start and nothing absolute has been measured for a while: no landmark, no fix, no aerial image. Others are
@@ -29,7 +25,7 @@ import numpy as np
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.filter.integrity import CONFIRMED, WELL_CONFIRMED
-from swarm_loc_estimator.filter.measurements import NOBODY, Loss, Measurements, select
+from swarm_loc_estimator.filter.measurements import NOBODY, LossReason, Measurements, select
 from swarm_loc_estimator.filter.models import MODELS, locates_alone
 from swarm_loc_estimator.filter.prediction import new_scratch, predict
 from swarm_loc_estimator.filter.state import IN_MAP, InitialPose, Meetings, Starts, SwarmState
@@ -398,6 +394,6 @@ class LocalFrame:
         """Deinitialize all robots of a local frame."""
         state.origin = IN_MAP
         for other in np.flatnonzero(state.tracked).tolist():
-            state.deinitialize(other, Loss.FRAME, stamp_ns)
+            state.deinitialize(other, LossReason.FRAME, stamp_ns)
         state.constraints.clear()
         state.windows.clear()

@@ -87,26 +87,22 @@ class OccupancyMap:
     @property
     def occupied(self) -> BoolArray:
         """(nx, ny) True where occupied."""
-        occupied: BoolArray = self.log_odds > _OCCUPIED
-        return occupied
+        return self.log_odds > _OCCUPIED
 
     @property
     def free(self) -> BoolArray:
         """(nx, ny) True where free."""
-        free: BoolArray = self.log_odds < _FREE
-        return free
+        return self.log_odds < _FREE
 
     @property
     def percent(self) -> FloatArray:
         """Occupancy probability of each cell [%]; -1 where unknown."""
         probability = 100.0 / (1.0 + np.exp(-self.log_odds))
-        known: FloatArray = np.where(self.log_odds == 0.0, -1.0, probability)
-        return known
+        return np.where(self.log_odds == 0.0, -1.0, probability)
 
-    def centres(self, chosen: BoolArray) -> FloatArray:
-        """Centres (n, 2) of the cells where `chosen` (nx, ny) is True [m]."""
-        centres: FloatArray = self.corner + (np.argwhere(chosen) + 0.5) * self.cell
-        return centres
+    def centres(self, cells: BoolArray) -> FloatArray:
+        """Centres (n, 2) of the cells where `cells` (nx, ny) is True [m]."""
+        return self.corner + (np.argwhere(cells) + 0.5) * self.cell
 
     def index(self, points: FloatArray) -> IntArray:
         """Cells (n, 2) of points (n, 2) [m], which may lie outside."""

@@ -13,22 +13,23 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import between, wrap_angle
 from swarm_loc_estimator.mapping.matching import Lattice, accumulate, agreement, search_offsets
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
-from swarm_loc_estimator.mapping.scans import LightSightings
-from swarm_loc_estimator.mapping.stops import ScanStop
+from swarm_loc_estimator.mapping.scans import LightSightings, ScanStop
 
-_TARGETS, _MIN_OVERLAP = 7, 0.2
-_START_TARGETS, _MIN_START_OVERLAP = 8, 0.08
-_FINAL_TARGETS, _MIN_FINAL_OVERLAP = 9, 0.35
-_GATE = 0.06
+# The constants of localization are checked by `make bench-pushbot`: corridor, office and ring, 20 seeds each.
+_TARGETS, _MIN_OVERLAP = 7, 0.2  # Maximum number of stops that a stop is matched with; minimum share of beams
+_START_TARGETS, _MIN_START_OVERLAP = 8, 0.08  # The same for a first scan
+_FINAL_TARGETS, _MIN_FINAL_OVERLAP = 9, 0.35  # The same for the final solution
+_GATE = 0.06  # Maximum distance of a matched beam from its line before a stop is aligned [m]
 _MAX_SHIFT, _MAX_SHIFT_PER_METRE, _MAX_TURN = 0.10, 0.08, math.radians(5.0)
 """Maximum correction by alignment; larger ones are rejected in favour of odometry."""
 _SOLVE_ALL_EVERY = 4
 """Number of stops between solutions; solving at every stop increases errors of closed loops by half."""
-_RECENT = 8
+_RECENT = 8  # Number of newest stops per robot that are solved in between
 _START_SEARCH = Lattice(0.3, 0.05, math.radians(12.0), math.radians(1.5))
 _START_RADIUS, _START_AGAINST, _MIN_START_SCORE = 2.5, 48, 0.35
 """Radius [m], maximum number of targets (a first scan has ten parts), and minimum score of a start search."""
 _MAX_START_SIGMAS, _LEAST_START_SHIFT = 4.0, 0.02
+"""Maximum shift of a start pose: standard deviations, and in addition [m, rad]."""
 
 
 def align(graph: PoseGraph, stop: int, path: float) -> bool:
@@ -52,7 +53,7 @@ def align(graph: PoseGraph, stop: int, path: float) -> bool:
 
 
 def _align_alone(graph: PoseGraph, stop: int, path: float) -> bool:
-    """Align the newest stop only; restores it if the shift exceeds the limits."""
+    """Align only the newest stop; restores it if the shift exceeds the limits."""
     predicted, slip = graph.states[stop].copy(), graph.slip.copy()
     graph.solve(4, [stop], _GATE)
     shift, turn = np.hypot(*(graph.states[stop] - predicted)[:2]), graph.states[stop, 2] - predicted[2]
@@ -161,14 +162,16 @@ def _misfit(graph: PoseGraph, begin: int, stop: int) -> tuple[float, int]:
 
 
 _RADIUS, _MIN_AGE, _MIN_STOPS = 1.8, 10, 12
-_REACH, _MIN_REACH, _SIGMAS = 0.55, 0.15, 3.5
+"""Loops: maximum distance [m] and minimum age in stops of an old stop, and minimum number of stops."""
+_REACH, _MIN_REACH, _SIGMAS = 0.55, 0.15, 3.5  # Search: maximum and minimum reach [m], standard deviations
 _TURN_REACH, _MIN_TURN_REACH = math.radians(9.0), math.radians(3.0)
 _STEP, _TURN_STEP = 0.06, math.radians(1.5)
-_MIN_SCORE, _MAX_OTHER = 0.35, 0.9
+_MIN_SCORE, _MAX_OTHER = 0.35, 0.9  # Minimum score, and maximum score of another place relative to it
 _MIN_FIT, _MAX_SIGMA, _MAX_SIGMAS = 0.5, 0.03, 4.0
+"""Minimum share of matched beams, maximum sigma of the position [m], and maximum shift in sigmas."""
 _TIE_SIGMA = np.array([0.03, 0.03, 0.012])
 _LOOP_TARGETS, _MIN_LOOP_OVERLAP = 9, 0.2
-_LOOP_GATE = 0.05
+_LOOP_GATE = 0.05  # Maximum distance of a matched beam from its line [m]
 _SWEEP_HOPS = 6
 """Matches in a row that connect two sweeps, which are closer together than stops of laser pointers."""
 

@@ -1,4 +1,4 @@
-"""Maps as files: an image and a YAML beside it, by the convention of ROS's map_server."""
+"""Maps as files: an image and a YAML file next to it, by the convention of ROS's map_server."""
 
 from __future__ import annotations
 
@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError
-from swarm_loc_estimator.common.yaml_tree import read_file, read_tree, tree_text
+from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, TreeChecks, read_file, read_tree, tree_text
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
-from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
@@ -30,15 +29,11 @@ _PLACE = NumberSpec("m", -1e6, 1e6, False, "of the lower left corner")
 
 
 class MapFileError(UserError):
-    """A map file that cannot be used or written; the message is one sentence."""
+    """A map file that cannot be used or written."""
 
 
 def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
-    """Write PATH.yaml and PATH.pgm; returns both.
-
-    Raises:
-        MapFileError: They cannot be written.
-    """
+    """Write PATH.yaml and PATH.pgm; returns both, raises MapFileError if they cannot be written."""
     from PIL import Image  # noqa: PLC0415 - an estimator without a map starts without it
 
     image_path, yaml_path = path.with_suffix(".pgm"), path.with_suffix(".yaml")
@@ -77,9 +72,8 @@ def load_map(path: Path, cell: float | None = None) -> OccupancyMap:
     checks = TreeChecks(path, MapFileError)
     about = checks.mapping(read_tree(path), WHOLE_FILE, required=("image", "origin", *_NUMBERS))
     numbers = {name: checks.number(about[name], name, spec) or 0.0 for name, spec in _NUMBERS.items()}
-    origin = [
-        checks.number(value, "origin", _PLACE) or 0.0 for value in checks.items(about["origin"], "origin")
-    ]
+    places = checks.items(about["origin"], "origin")
+    origin = [checks.number(value, "origin", _PLACE) or 0.0 for value in places]
     if len(origin) != 3 or origin[2] != 0.0:
         raise checks.error("origin", about["origin"], "must be x, y and a yaw of 0")
     mode, negate = about.get("mode", "trinary"), about.get("negate", 0)
@@ -95,11 +89,10 @@ def load_map(path: Path, cell: float | None = None) -> OccupancyMap:
     log_odds = _log_odds(shade, mode, free, occupied)[pixels]
     if mode == "scale":
         log_odds[~seen] = 0.0
+    own = numbers["resolution"]
     if cell is None:
-        return OccupancyMap(
-            np.array(origin[:2]), numbers["resolution"], np.ascontiguousarray(log_odds[::-1].T)
-        )
-    scale = cell / numbers["resolution"]
+        return OccupancyMap(np.array(origin[:2]), own, np.ascontiguousarray(log_odds[::-1].T))
+    scale = cell / own
     if not math.isclose(scale, 1.0, rel_tol=1e-3):
         log_odds = _resampled(log_odds, scale, checks)
     corner = np.round(np.array(origin[:2]) / cell) * cell
@@ -131,8 +124,7 @@ def _resampled(log_odds: FloatArray, scale: float, checks: TreeChecks) -> FloatA
         np.minimum(((np.arange(count) + 0.5) * scale).astype(np.int64), size - 1)
         for count, size in zip((height, width), log_odds.shape, strict=True)
     )
-    resampled: FloatArray = log_odds[::-1][rows][::-1][:, columns]
-    return resampled
+    return np.asarray(log_odds[::-1][rows][::-1][:, columns])
 
 
 def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:

@@ -19,10 +19,15 @@ from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.se2 import between, compose
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
-from swarm_loc_estimator.mapping.messages import ScanMessage, decode_laser, decode_lights, decode_scan
-from swarm_loc_estimator.mapping.scans import UNSEEN, LightSightings, Readings, Scan
-from swarm_loc_estimator.mapping.stops import ScanStop
-from swarm_loc_estimator.mapping.sweeps import LidarSweep, read_sweep
+from swarm_loc_estimator.mapping.messages import (
+    LidarSweep,
+    ScanMessage,
+    decode_laser,
+    decode_lights,
+    decode_scan,
+    read_sweep,
+)
+from swarm_loc_estimator.mapping.scans import UNSEEN, LightSightings, Readings, Scan, ScanStop
 from swarm_loc_estimator.swarm.error_models import LidarModel
 from swarm_loc_estimator.swarm.swarm import Robot
 
@@ -105,11 +110,10 @@ class ReadingPairer(OdometryQueue):
         poses, known = self.poses_at(stamps)
         if not known.all():
             self.drops["laser_without_odometry"] += int((~known).sum())
-        return Readings(stamps[known], poses[known], inverses[known], self._sigma()) if known.any() else None
-
-    def _sigma(self) -> float:
-        """Median standard deviation of recent inverse distances; NaN if there are none."""
-        return float(np.median(self._sigmas)) if self._sigmas else math.nan
+        if not known.any():
+            return None
+        sigma = float(np.median(self._sigmas)) if self._sigmas else math.nan
+        return Readings(stamps[known], poses[known], inverses[known], sigma)
 
 
 class SweepPairer(OdometryQueue):
@@ -215,7 +219,7 @@ def inputs_of(robot: Robot, *, lights: bool = False) -> tuple[MapperInput, ...]:
 
 
 class MapperInputError(UserError):
-    """The mapper cannot start with these robots; the message is one sentence."""
+    """The mapper cannot start with these robots."""
 
 
 class MapperFeed:

@@ -15,10 +15,9 @@ from swarm_loc_estimator.common.health import Level, Report, drop_values, level_
 from swarm_loc_estimator.filter.measurements import Measurements, Verdict
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
-from swarm_loc_estimator.sensors.ingest import Ingest, InputStatistics
-from swarm_loc_estimator.sensors.registry import InputTopic
+from swarm_loc_estimator.sensors.inputs import Ingest, InputStatistics, InputTopic
 from swarm_loc_estimator.swarm.swarm import FixedCamera, Robot, Swarm
-from swarm_loc_estimator.timeline.contradictions import Contradiction
+from swarm_loc_estimator.timeline.estimate import Contradiction, LossReport
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
 
 _FULL_LOAD = 0.95
@@ -95,26 +94,14 @@ class Graph(Protocol):
 
 
 class Diagnostics:
-    """Creates the diagnostic reports of an interval.
-
-    Args:
-        swarm: The robots.
-        ingest: The inputs; each of its topics should have one publisher.
-        parameters: Expected frames of the odometry.
-        graph: Publishers of topics.
-        sole: Other topics that should have one publisher.
+    """Creates the diagnostic reports of an interval; inputs and `sole` topics should have one publisher each.
 
     Attributes:
         duplicate_publishers: One sentence for each topic that has more publishers, at the newest reports.
     """
 
     def __init__(
-        self,
-        swarm: Swarm,
-        ingest: Ingest,
-        parameters: EstimatorParameters,
-        graph: Graph,
-        sole: Sequence[str],
+        self, swarm: Swarm, ingest: Ingest, parameters: EstimatorParameters, graph: Graph, sole: Sequence[str]
     ) -> None:
         self.duplicate_publishers: list[str] = []
         self._swarm = swarm
@@ -128,7 +115,6 @@ class Diagnostics:
         for handle, topic in enumerate(ingest.topics):
             inputs = self._inputs_of[topic.robot] if topic.kind.of_each else self._of_swarm
             inputs.append((handle, topic))
-        self._was_located = np.zeros(len(swarm.robots), dtype=bool)
         self._received = [0] * len(ingest.topics)
         self._dropped: list[Mapping[str, int]] = [{} for _ in self._sources]
         self._reported_ns: int | None = None
@@ -153,6 +139,7 @@ class Diagnostics:
         recent: Recent,
         drops: Mapping[str, int],
         drops_of: Sequence[Mapping[str, int]] = (),
+        losses: Sequence[LossReport | None] = (),
     ) -> list[Report]:
         """Reports of robots, of fixed cameras, of the swarm's inputs and drops; begins a new interval.
 
@@ -162,6 +149,7 @@ class Diagnostics:
             recent: The estimator's measurements with verdicts and normalized innovations squared.
             drops: Data not used, by reason.
             drops_of: The same of each robot and fixed camera.
+            losses: Of each robot, why it is not located; None for others.
         """
         elapsed_s = (now_ns - self._reported_ns) * 1e-9 if self._reported_ns is not None else 0.0
         self._reported_ns = now_ns
@@ -171,15 +159,16 @@ class Diagnostics:
         self.duplicate_publishers = common.copy()
         reports, clocks_apart = [], self._ingest.clocks_apart()
         for index, source in enumerate(self._sources):
-            lost = self._drop_troubles(index, drops_of[index]) if drops_of else []
+            loss = losses[index] if index < len(losses) else None
+            known = [loss.text(now_ns)] if loss is not None else []
+            known += self._drop_troubles(index, drops_of[index]) if drops_of else []
             if index in clocks_apart:
-                lost.append(clocks_apart[index].problem)
-            report = self._source_report(index, source, estimate, now_ns, elapsed_s, lost)
+                known.append(clocks_apart[index].problem)
+            report = self._source_report(index, source, estimate, now_ns, elapsed_s, known)
             report.values |= drop_values(drops_of[index]) if drops_of else {}
             report.values["measurements used"] = str(used[index])
             report.values["NIS mean"] = _figure(nis[index])
             reports.append(report)
-        self._was_located |= estimate.status != Status.WAITING
         troubles = [*common, *filter(None, [self.missing_text()])]
         values = drop_values(drops)
         for handle, topic in self._of_swarm:
@@ -214,13 +203,13 @@ class Diagnostics:
         estimate: Estimate,
         now_ns: int,
         elapsed_s: float,
-        dropped: Sequence[str],
+        known: Sequence[str],
     ) -> Report:
-        """State and inputs of one robot, or inputs of a fixed camera, with sentences about dropped data."""
+        """State and inputs of one robot, or inputs of a fixed camera, with troubles known before."""
         robot = source if isinstance(source, Robot) else None
         duplicates = self._duplicates_on([topic.name for _, topic in self._inputs_of[index]])
         self.duplicate_publishers += duplicates
-        troubles = [*duplicates, *dropped]
+        troubles = [*duplicates, *known]
         values: dict[str, object] = {}
         for handle, topic in self._inputs_of[index]:
             troubles += self._input_troubles(handle, topic, robot, now_ns)
@@ -230,8 +219,7 @@ class Diagnostics:
             return Report(source.name, "; ".join(troubles) or "seeing", level_of(troubles), values)
         status = Status(int(estimate.status[index]))
         if status is Status.WAITING and not troubles:
-            lost = "lost, " if self._was_located[index] else ""
-            troubles.append(f"{lost}waiting for a sighting or a fix that locates it")
+            troubles.append("waiting for a sighting or a fix that locates it")
         if status is Status.STALE and not troubles:
             troubles.append("its odometry is silent")
         sigma = np.sqrt(np.diagonal(estimate.covariances[index]))
@@ -290,14 +278,7 @@ class Diagnostics:
 
 
 def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period_s: float) -> Report:
-    """Report of the ticks' durations, with advice if they are too long.
-
-    Args:
-        cost: The ticks of the interval.
-        elapsed_s: Length of the interval by the wall clock.
-        period_s: Parameter tick_period_s.
-        fusion_period_s: The fusion period in force [s].
-    """
+    """Report of the ticks in `elapsed_s` by the wall clock, with advice if they take too long."""
     load = cost.sum_s / elapsed_s if elapsed_s > 0.0 else 0.0
     values: dict[str, object] = {
         "ticks": str(cost.count),
@@ -315,11 +296,7 @@ def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period
 
 
 def shedding_report(cost: TickCost) -> Report:
-    """Report of the share of measurements dropped under overload.
-
-    Args:
-        cost: The ticks of the interval.
-    """
+    """Report of the share of measurements dropped under overload."""
     share = cost.shed / cost.sightings if cost.sightings else 0.0
     values: dict[str, object] = {"sightings left out [1]": _figure(share)}
     if not cost.shed:
@@ -327,15 +304,6 @@ def shedding_report(cost: TickCost) -> Report:
     dropped = f"{cost.shed} of {cost.sightings} measurements"
     sentence = f"overload: dropped {dropped} ({100.0 * share:.0f} %), uniformly over robots"
     return Report("shedding", sentence, Level.WARN, values)
-
-
-def overload_report(count: int) -> Report:
-    """A warning about messages that the middleware dropped from full queues.
-
-    Args:
-        count: Number of dropped messages in the interval.
-    """
-    return Report("overload", f"overload: {count} messages were lost in full queues", Level.WARN)
 
 
 def merged(reports: Sequence[Report], name: str) -> Report:

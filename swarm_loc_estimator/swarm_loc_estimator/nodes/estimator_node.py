@@ -24,9 +24,8 @@ from std_srvs.srv import Trigger
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Level, Report
 from swarm_loc_estimator.common.jit import is_precompiled
-from swarm_loc_estimator.common.lifecycle import ManagedNode
 from swarm_loc_estimator.common.messages.streams import MessageBatch
-from swarm_loc_estimator.common.node import BACKWARDS, Ticks, run_node
+from swarm_loc_estimator.common.node import BACKWARDS, ManagedNode, Ticks, run_node
 from swarm_loc_estimator.nodes.estimator_diagnostics import (
     Diagnostics,
     TickCost,
@@ -34,7 +33,6 @@ from swarm_loc_estimator.nodes.estimator_diagnostics import (
     add_identities,
     load_report,
     merged,
-    overload_report,
     shedding_report,
 )
 from swarm_loc_estimator.nodes.estimator_topics import (
@@ -48,8 +46,7 @@ from swarm_loc_estimator.nodes.estimator_topics import (
 from swarm_loc_estimator.nodes.load import SHED_REASONS, FusionPace, Shedding, Thinning
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.precompile import precompile, size_of
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import live_topics
+from swarm_loc_estimator.sensors.inputs import Ingest, live_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
@@ -84,9 +81,7 @@ CreateEstimator = Callable[[Swarm, Settings], Estimator]
 class EstimatorNode(ManagedNode[EstimatorParameters]):
     """Takes messages, runs the estimator once per tick and publishes the estimate.
 
-    Args:
-        create_estimator: Creates the estimator; tests pass another one.
-        node_arguments: Further arguments of `rclpy.node.Node`.
+    Tests pass another function that creates the estimator.
     """
 
     def __init__(self, create_estimator: CreateEstimator = Estimator, **node_arguments: Any) -> None:
@@ -118,7 +113,8 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._shedding = Shedding(self.params.fusion_load, self.params.settings.horizon_s)
         self._thinning = self._create_thinning()
         self._cost = TickCost()
-        self._diagnostics = self._create_diagnostics()
+        sole = ["swarm/poses", *(["/clock"] if self.get_clock().ros_time_is_active else [])]
+        self._diagnostics = Diagnostics(self._swarm, self._ingest, self.params, self, sole)
         self._outputs = EstimateOutputs(self, self._swarm, self.params)
         self._reported_s = time.monotonic()
         self._lost = 0
@@ -144,10 +140,6 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         is_large = robots >= settings.sparse_from
         return Thinning(robots, round(settings.fusion_period_s * 1e9) if is_large else 0)
 
-    def _create_diagnostics(self) -> Diagnostics:
-        sole = ["swarm/poses", *(["/clock"] if self.get_clock().ros_time_is_active else [])]
-        return Diagnostics(self._swarm, self._ingest, self.params, self, sole)
-
     def _start_ticks(self) -> None:
         self.at_end(Ticks(self, self.params.tick_period_s, self._on_tick).stop)
         # messages received before a backward jump must not be stamped after it
@@ -157,8 +149,8 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             f"ready: {len(self._swarm.robots)} robots and {len(self._swarm.landmarks)} landmarks"
             f" of '{self.params.swarm_file}'"
         )
-        if note := self._estimator.note:
-            self.get_logger().warning(note)
+        if hint := self._estimator.hint:
+            self.get_logger().warning(hint)
 
     def _on_tick(self) -> None:
         begin_s = time.perf_counter()
@@ -168,7 +160,9 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._receive(partial(newest_time_ns, self))
         now_ns = self._time_ns()
         self._estimate, fusing_s = self._estimate_at(now_ns, begin_s)
-        self._log_time_jumps()
+        if self._estimator.time_jumps != self._jumps:
+            self._jumps = self._estimator.time_jumps
+            self.get_logger().warning("clock jumped back; estimator reset")
         self._follow_frame()
         self._outputs.publish(self._estimate)
         self._outputs.publish_identities(self._estimator.identities)
@@ -205,12 +199,6 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             thinned = self._thinning.thin(messages, self._shedding.share)
             self._cost.note_sightings(thinned.measurements, thinned.shed)
             self._estimator.receive(thinned.messages)
-
-    def _log_time_jumps(self) -> None:
-        """Log each backward jump of the clock, at which the estimator has reset itself."""
-        if self._estimator.time_jumps != self._jumps:
-            self._jumps = self._estimator.time_jumps
-            self.get_logger().warning("clock jumped back; estimator reset")
 
     def _follow_frame(self) -> None:
         """Publish in the frame that the poses are in: `map_frame`, or that of the origin of a local frame."""
@@ -262,7 +250,9 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             return [merged(causes, "estimator")]
         now_ns = self._time_ns()
         own = [self._estimator.drops_of(source) for source in range(len(self._swarm.sources))]
-        reports = self._diagnostics.reports(now_ns, self._estimate, self._estimator.recent(), drops, own)
+        losses = [self._estimator.loss_of(robot) for robot in range(len(self._swarm.robots))]
+        recent = self._estimator.recent()
+        reports = self._diagnostics.reports(now_ns, self._estimate, recent, drops, own, losses)
         contradictions = self._estimator.contradictions(now_ns)
         add_contradictions(reports, contradictions)
         add_identities(reports, self._estimator.identities)
@@ -271,7 +261,9 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         whole.values |= {"time jumps": self._estimator.time_jumps, **frames, **self._estimator.counters}
         foreign = self._static_transforms.foreign
         lost, self._lost = drops.get("overload", 0) - self._lost, drops.get("overload", 0)
-        causes += [overload_report(lost)] if lost else []
+        if lost:
+            text = f"overload: {lost} messages were lost in full queues"
+            causes.append(Report("overload", text, Level.WARN))
         causes += [Report("transforms", text, Level.WARN) for text in foreign]
         self.health.warn_of(
             "publishers", {text: text for text in [*self._diagnostics.duplicate_publishers, *foreign]}

@@ -1,6 +1,6 @@
 """Topics of the estimator: raw inputs, which are queued until the next tick, and published estimates.
 
-Set the poses of robots by the service `set_robot_pose` and the topics `<robot>/initialpose`.
+Users set poses of robots by the service `set_robot_pose` and the topics `<robot>/initialpose`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from swarm_loc_estimator.common.messages.streams import SerializedMessage
 from swarm_loc_estimator.common.node import message_class
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
-from swarm_loc_estimator.sensors.registry import InputTopic
+from swarm_loc_estimator.sensors.inputs import InputTopic
 from swarm_loc_estimator.swarm.swarm import StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.sightings import encode_sightings, newest_sightings
@@ -52,15 +52,13 @@ REFUSALS = {
 
 
 class SetPoseError(ValueError):
-    """A pose that cannot be set; the message is one sentence."""
+    """A pose that cannot be set."""
 
 
 def planar_pose(pose: PoseWithCovariance, start_sigma: StartSigma) -> tuple[FloatArray, FloatArray]:
-    """The pose (3,) x [m], y [m], theta [rad] and its covariance (3, 3).
+    """The pose (3,) in map, x [m], y [m], theta [rad], and its covariance (3, 3).
 
-    Args:
-        pose: In map.
-        start_sigma: Used if the covariance is zero.
+    A covariance of zeros is replaced by `start_sigma`.
 
     Raises:
         SetPoseError: A number is not finite, or the quaternion is invalid.
@@ -78,12 +76,7 @@ def planar_pose(pose: PoseWithCovariance, start_sigma: StartSigma) -> tuple[Floa
 class PoseCommands:
     """Sets the pose of a robot, or deinitializes it until the next fix, at the user's request.
 
-    Args:
-        node: Owns the subscriptions.
-        swarm: The robots.
-        estimator: Executes the commands.
-        map_frame: Required frame of the poses.
-        by_topics: Whether to subscribe to a topic for each robot, too.
+    Poses must be in `map_frame`. Users ask by a service and, if `by_topics`, by a topic for each robot.
     """
 
     def __init__(
@@ -112,7 +105,6 @@ class PoseCommands:
         return response
 
     def _obey(self, request: SetRobotPose.Request) -> str:
-        """Execute the request and log it."""
         robot = self._swarm.index_of.get(request.robot)
         if robot is None:
             raise SetPoseError(f"there is no robot '{request.robot}' in the swarm description.")
@@ -137,7 +129,6 @@ class PoseCommands:
             raise SetPoseError(f"the pose is in frame '{frame}' but must be in '{self._map_frame}'.")
 
     def _set_pose(self, robot: int, wanted: PoseWithCovariance) -> str:
-        """Set the present pose of a robot and log it."""
         pose, covariance = planar_pose(wanted, self._swarm.robots[robot].start_sigma)
         fault = self._estimator.set_pose(robot, self._now_ns(), pose, covariance)
         if fault:
@@ -158,7 +149,7 @@ DEPTH = 1000  # Queue length of a topic, which is emptied at each tick: enough f
 _SHARED_DEPTH = 500  # The same for a topic with the readings of many robots, whose messages are large
 _MAX_PER_TAKE = 5000  # Limit of messages per tick over all topics
 _MIN_PER_TOPIC = 100
-"""Least limit per topic: the messages of the usual horizon. With less, an estimator that has fallen behind
+"""Least limit per topic: the messages of the usual horizon. With less, an estimator that is late
 would get ever older data, which cost more to fuse, and never catch up."""
 
 _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
@@ -166,7 +157,7 @@ _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: 
 _TF_STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _MAX_FRAME_LENGTH = 64  # Longer names of foreign frames are cut
 _RELIABLE = QoSProfile(depth=10)
-_SIGHTINGS_PERIOD_NS = 180_000_000  # Publishing period of swarm/sightings, which are for display only
+_SIGHTINGS_PERIOD_NS = 180_000_000  # Publishing period of swarm/sightings, which are only for display
 _TF = QoSProfile(depth=100)  # what tf2's own broadcaster offers
 
 
@@ -174,12 +165,8 @@ class EstimatorInputs:
     """Takes all inputs as raw bytes: building message objects would cost more than estimating.
 
     Messages wait in the middleware, which keeps the newest of each topic, and not in the executor, whose
-    queue is unbounded. Lost messages are detected by the publishers' sequence numbers.
-
-    Args:
-        node: Has the subscriptions, which no executor may handle.
-        topics: What to subscribe to; their index is their handle.
-        drop: Called with reason and count of lost messages.
+    queue is unbounded; no executor may handle the subscriptions. Lost messages are detected by the
+    publishers' sequence numbers. The index of a topic is its handle.
     """
 
     def __init__(self, node: Node, topics: Sequence[InputTopic], drop: Callable[[str, int], None]) -> None:
@@ -194,9 +181,8 @@ class EstimatorInputs:
     def take(self, time_ns: Callable[[], int]) -> list[SerializedMessage]:
         """Messages as handle, bytes and arrival in order of arrival; those above the limit remain queued.
 
-        Args:
-            time_ns: Returns the node's time [ns]. It is called after the messages are taken, since an earlier
-                time could be before their stamps. In simulated time, all arrive at that time.
+        `time_ns` returns the node's time. It is called after the messages are taken, since an earlier time
+        could be before their stamps. In simulated time, all arrive at that time.
         """
         taken = []
         for handle, subscription in enumerate(self._subscriptions):
@@ -280,13 +266,7 @@ def _children_by_topic(swarm: Swarm, parameters: EstimatorParameters) -> dict[st
 
 
 class StaticTransforms:
-    """Listens for static transforms into the estimator's own frames, which tf2 would accept.
-
-    Args:
-        node: Has the subscriptions.
-        swarm: Names of the robots.
-        parameters: Frames, and topics of transforms.
-    """
+    """Listens for static transforms into the estimator's own frames, which tf2 would accept."""
 
     def __init__(self, node: Node, swarm: Swarm, parameters: EstimatorParameters) -> None:
         self._parents: dict[tuple[str, str], str] = {}
@@ -319,13 +299,7 @@ class _Transforms(NamedTuple):
 
 
 class EstimateOutputs:
-    """Publishes estimates.
-
-    Args:
-        node: Owns the publishers.
-        swarm: Names of the robots.
-        parameters: Frames, and which topics to publish.
-    """
+    """Publishes estimates."""
 
     def __init__(self, node: Node, swarm: Swarm, parameters: EstimatorParameters) -> None:
         names = [robot.name for robot in swarm.robots]
@@ -354,7 +328,7 @@ class EstimateOutputs:
         ]
 
     def publish(self, estimate: Estimate) -> None:
-        """Publish all poses; robots that are not localized are in `swarm/poses` only, with status waiting."""
+        """Publish all poses; robots that are not localized are only in `swarm/poses`, with status waiting."""
         e = estimate
         located = e.status != Status.WAITING
         self._swarm_poses.publish(

@@ -1,13 +1,12 @@
 """Limit the load of a live estimator: fuse less often, then drop a share of the measurements. No ROS here.
 
-Under overload, drop measurements uniformly over all robots and pairs.
-
-Each source (a robot's camera, infrared board or fixes, an overhead camera) has the same maximum number of
-used measurements, so those that send most lose measurements first (max-min fairness; D. Bertsekas, R.
-Gallager: Data Networks, 6.5.2). Measurement k of a source is used if the fractional part of k times the
-golden ratio is below the share. This sequence is uniform over any interval and over every n-th number (H.
-Weyl: Ueber die Gleichverteilung von Zahlen mod. Eins, 1916), so a robot that sends its detections always in
-the same order does not lose the same neighbour each time.
+Under overload, measurements are dropped uniformly over all robots and pairs. Each source (a robot's camera,
+infrared board or fixes, an overhead camera) has the same maximum number of used measurements, so those that
+send most lose measurements first (max-min fairness; D. Bertsekas, R. Gallager: Data Networks, 6.5.2).
+Measurement k of a source is used if the fractional part of k times the golden ratio is below the share. This
+sequence is uniform over any interval and over every n-th number (H. Weyl: Ueber die Gleichverteilung von
+Zahlen mod. Eins, 1916), so a robot that sends its detections always in the same order does not lose the same
+neighbour each time.
 
 A large swarm fuses the measurements of a fusion period as one batch, whose cost hardly depends on their
 number. So whole periods are used or dropped: period k by the same rule.
@@ -24,9 +23,9 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.sensors.registry import SENSORS, Batch
+from swarm_loc_estimator.sensors.inputs import SENSORS, Batch
 from swarm_loc_estimator.sensors.sensor import Sensor
-from swarm_loc_estimator.timeline.settings import end_of_period
+from swarm_loc_estimator.timeline.timeline import end_of_period
 
 _GOLDEN = np.uint64(0x9E3779B97F4A7C15)  # Fractional part of the golden ratio in units of 2^-64
 _SILVER = np.uint64(0x6A09E667F3BCC909)
@@ -50,11 +49,8 @@ class Thinning:
     """Thins out measurements, but never odometry, which all predictions need.
 
     The result is deterministic. All matrices of an infrared exchange are used or none, and all detections of
-    an aerial image or none: a partial image would imply missing robots.
-
-    Args:
-        robots: Number of robots.
-        period_ns: Fusion period of a large swarm, to drop whole periods [ns]; 0: drop per source.
+    an aerial image or none: a partial image would imply missing robots. `period_ns` is the fusion period of a
+    large swarm, to drop whole periods; 0: measurements are dropped per source.
     """
 
     def __init__(self, robots: int, period_ns: int = 0) -> None:
@@ -131,7 +127,7 @@ class _Units(NamedTuple):
     robot: IntArray  # (u,) robot index
     stamp_ns: IntArray  # (u,) time of measurement
     of_row: IntArray  # (k,) group of each row
-    exchange: Sequence[tuple[int, ...]] = ()  # Robot, stamp and transmitter of each group; infrared only
+    exchange: Sequence[tuple[int, ...]] = ()  # Robot, stamp and transmitter of each group of infrared
 
 
 def _units(sensor: type[Sensor], rows: Any) -> _Units:
@@ -145,6 +141,7 @@ def _units(sensor: type[Sensor], rows: Any) -> _Units:
     return _Units(robot, stamp_ns, of_row.reshape(-1), exchanges)
 
 
+# Checked by test_shedding.py and test_fusion_pace.py, and on live swarms by make bench-large_swarms.
 MIN_SHARE = 0.01
 """Least share, however busy the node is: without any measurements, robots would be lost for good."""
 _WINDOW_S = 0.5  # Least time over which the load is measured, since fusing comes in bursts
@@ -152,7 +149,7 @@ _BUSY = 0.9  # Load above which a node may not keep up
 _MAX_WAIT = 0.5  # Share of the horizon; data that wait longer to be fused would soon be too old
 _AT_EASE = 0.6  # Load below which the share grows. Between the two limits it stays.
 _SMOOTHING = 0.2  # Smoothing factor of the time that fusing takes, an average over about five windows
-_AIM = 0.75
+_AIM = 0.75  # Load to which a cut leads
 _MIN_CUT, _MAX_CUT = 0.5, 0.125  # Limits of the factor by which the share is cut per window
 _GROWTH = 1.3
 """Growth of the share per window at low load; it is too small to lead from one load limit past the other."""
@@ -160,15 +157,11 @@ _LONGEST_WAIT = 0.25  # Share of the horizon that data may wait to be fused
 
 
 class Shedding:
-    """Cuts the share of measurements used while fusing falls behind, and lets it grow again.
+    """Cuts the share of measurements used while fusing cannot keep up, and lets it grow again.
 
     A node that is busy for a while and catches up again, as at its start, drops nothing. Using less saves
-    only the time of fusing: where fusing takes no more than its guaranteed share of a core, the share is not
-    cut further; where it takes less than half of that, the share grows.
-
-    Args:
-        fusion_load: That guaranteed share of a core.
-        horizon_s: Data older than this are dropped [s].
+    only the time of fusing: where fusing takes no more than its guaranteed share of a core, `fusion_load`,
+    the share is not cut further; where it takes less than half of that, the share grows.
 
     Attributes:
         share: Share of the measurements to use, in [MIN_SHARE, 1].
@@ -201,11 +194,11 @@ class Shedding:
 
     def _adapt(self, elapsed_s: float, waited_s: float) -> None:
         load, fusing_load = self._busy_s / elapsed_s, self._fusing_s / elapsed_s
-        is_behind = load >= _BUSY and waited_s >= self._max_wait_s
+        is_late = load >= _BUSY and waited_s >= self._max_wait_s
         self._fusing_load += _SMOOTHING * (fusing_load - self._fusing_load)
         if load < _AT_EASE or self._fusing_load < 0.5 * self._fusion_load:
             self.share = min(1.0, _GROWTH * self.share)
-        elif is_behind and self._may_cut and fusing_load > self._fusion_load:
+        elif is_late and self._may_cut and fusing_load > self._fusion_load:
             self._may_cut = False
             cut = _AIM * self._handled_s / self._busy_s  # longer ticks are an overload
             self.share = max(MIN_SHARE, self.share * min(max(cut, _MAX_CUT), _MIN_CUT))
@@ -221,12 +214,7 @@ class Shedding:
 
 
 class FusionPace:
-    """Limits fusing to a share of a core, unless data would grow too old meanwhile.
-
-    Args:
-        load: Share of a core.
-        horizon_s: Data older than this are dropped [s].
-    """
+    """Limits fusing to a share `load` of a core, unless data would grow too old for `horizon_s` meanwhile."""
 
     def __init__(self, load: float, horizon_s: float) -> None:
         self._load = load
@@ -235,12 +223,7 @@ class FusionPace:
         self._fused_ns: int | None = None
 
     def is_due(self, wall_s: float, now_ns: int) -> bool:
-        """Whether to fuse now.
-
-        Args:
-            wall_s: A steady clock, that of the core.
-            now_ns: The node's time, that of the data.
-        """
+        """Whether to fuse now, by a steady clock (`wall_s`) and the node's time, that of the data."""
         if wall_s >= self._rested_s or self._fused_ns is None:
             return True
         return not 0 <= now_ns - self._fused_ns < self._longest_ns

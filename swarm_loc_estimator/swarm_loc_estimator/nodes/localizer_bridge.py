@@ -20,9 +20,13 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of, listed
 from swarm_loc_estimator.common.messages.poses import encode_pose_stamped, encode_poses
 from swarm_loc_estimator.common.node import ConfiguredNode, message_class, run_node
-from swarm_loc_estimator.nodes.localizer_robots import LocalizedRobots, RobotPose
-from swarm_loc_estimator.nodes.localizer_sources import BODY, SOURCES
-from swarm_loc_estimator.nodes.parameters import BridgeParameters
+from swarm_loc_estimator.nodes.localizer_robots import (
+    BODY,
+    SOURCES,
+    BridgeParameters,
+    LocalizedRobots,
+    RobotPose,
+)
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 _INPUT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)

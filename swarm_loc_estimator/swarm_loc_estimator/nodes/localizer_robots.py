@@ -1,21 +1,148 @@
-"""Poses of tracked bodies as poses of the robots that carry them. No ROS here."""
+"""Poses of tracked bodies, by motion capture and other localisers, as poses of the robots that carry them.
+
+Messages may be those of rclpy or of `common.messages.cdr`, whose fields have the same names. No ROS here.
+"""
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import Health
-from swarm_loc_estimator.common.parameters import ParameterError
-from swarm_loc_estimator.nodes.localizer_sources import BODY, SOURCES, BodyPose
-from swarm_loc_estimator.nodes.parameters import BridgeParameters
+from swarm_loc_estimator.common.messages.cdr import (
+    ODOMETRY,
+    POSE_STAMPED,
+    POSE_WITH_COVARIANCE,
+    TRANSFORMS,
+    nanoseconds,
+)
+from swarm_loc_estimator.common.messages.poses import PLANE, yaw_of
+from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text, texts
 from swarm_loc_estimator.sensors.fix import HEADING_UNKNOWN, has_heading, is_unknown
+
+BODY = "<body>"  # Stands for the name of a body in a topic
+_UNKNOWN: FloatArray = np.zeros((3, 3))
+
+
+class BodyPose(NamedTuple):
+    """Pose of a body."""
+
+    name: str  # Its name in the message; "": the message is about the body of its topic
+    frame_id: str  # Frame of the pose
+    stamp_ns: int  # Stamp of the message
+    pose: tuple[float, float, float]  # x [m], y [m] and yaw [rad], NaN if it was not measured
+    tilt: float  # Angle between the z axes of the body and of the frame [rad]; 0 without orientation
+    covariance: FloatArray = _UNKNOWN  # (3, 3) of the pose; zeros: unknown
+
+
+@dataclass(frozen=True)
+class LocalizerSource:
+    """Kind of messages of localisers."""
+
+    message_type: str  # Such as geometry_msgs/msg/PoseStamped
+    topic: str  # Default topic; contains `BODY` if each body has its own
+    bodies: Callable[[Any], Iterable[BodyPose]]  # Reads the poses of a message
+
+
+def _body(name: str, header: Any, place: Any, turn: Any, covariance: FloatArray = _UNKNOWN) -> BodyPose:
+    """A body at a geometry_msgs/Point or Vector3 with a Quaternion."""
+    x, y, z, w = turn.x, turn.y, turn.z, turn.w
+    norm = x * x + y * y + z * z + w * w
+    yaw, tilt = math.nan, 0.0
+    if math.isfinite(norm) and norm > 0.0:  # zeros or NaN: bodies that are tracked without orientation
+        yaw, tilt = yaw_of(x, y, z, w), math.acos(max(1.0 - 2.0 * (x * x + y * y) / norm, -1.0))
+    return BodyPose(
+        name, header.frame_id, nanoseconds(header.stamp), (place.x, place.y, yaw), tilt, covariance
+    )
+
+
+def _of_pose(message: Any) -> Iterator[BodyPose]:
+    yield _body("", message.header, message.pose.position, message.pose.orientation)
+
+
+def _of_pose_with_covariance(message: Any) -> Iterator[BodyPose]:
+    pose, covariance = message.pose.pose, np.reshape(message.pose.covariance, (6, 6))[PLANE]
+    yield _body("", message.header, pose.position, pose.orientation, covariance)
+
+
+def _of_transforms(message: Any) -> Iterator[BodyPose]:
+    for one in message.transforms:
+        yield _body(one.child_frame_id, one.header, one.transform.translation, one.transform.rotation)
+
+
+def _of_named_poses(message: Any) -> Iterator[BodyPose]:
+    for one in message.poses:
+        yield _body(one.name, message.header, one.pose.position, one.pose.orientation)
+
+
+def _of_rigid_bodies(message: Any) -> Iterator[BodyPose]:
+    for one in message.rigidbodies:
+        yield _body(one.rigid_body_name, message.header, one.pose.position, one.pose.orientation)
+
+
+SOURCES: Mapping[str, LocalizerSource] = {
+    "pose": LocalizerSource(POSE_STAMPED, f"/vrpn_mocap/{BODY}/pose", _of_pose),
+    "pose_with_covariance": LocalizerSource(
+        POSE_WITH_COVARIANCE, f"{BODY}/amcl_pose", _of_pose_with_covariance
+    ),
+    "odometry": LocalizerSource(ODOMETRY, f"{BODY}/odometry/global", _of_pose_with_covariance),
+    "tf": LocalizerSource(TRANSFORMS, "/tf", _of_transforms),
+    "named_poses": LocalizerSource(
+        "motion_capture_tracking_interfaces/msg/NamedPoseArray", "/poses", _of_named_poses
+    ),
+    "rigid_bodies": LocalizerSource("mocap4r2_msgs/msg/RigidBodies", "/rigid_bodies", _of_rigid_bodies),
+}
+"""Kinds of messages by name."""
+
+
+@dataclass(frozen=True)
+class BridgeParameters:
+    """Parameters of `localizer_bridge`."""
+
+    swarm_file: str = text("", "path of the swarm description", required=True)
+    source: str = choice("pose", tuple(SOURCES), "kind of messages, see the table of sources")
+    topic: str = text(
+        "",
+        "topic of the messages, with <body> in place of the body's name; empty: that of the table of sources",
+    )
+    output: str = choice(
+        "fix",
+        ("fix", "ground_truth"),
+        "<robot>/fix for the estimator, or <robot>/ground_truth to evaluate it",
+    )
+    bodies: tuple[str, ...] = texts(
+        "tracked bodies, such as cf1=epuck1, or epuck2 for a body with the robot's name;"
+        " empty: each robot has a body of its own name"
+    )
+    offsets: tuple[str, ...] = texts(
+        "poses of bodies in base_link, such as epuck1=0.01,0,1.5708 [m, m, rad];"
+        " the body of a robot not named here is at base_link"
+    )
+    source_frame: str = text("", "frame that the poses must be in; empty: map_frame or world")
+    map_frame: str = text("map", "frame of the published poses", required=True)
+    latency_s: float = number(
+        0.0, "s", 0.0, 2.0, "time from the exposure to the stamp of a message, subtracted from the stamp"
+    )
+    stamp_on_arrival: bool = flag(
+        False, "take the time of arrival in place of stamps, for a source with another clock or none"
+    )
+    position_sigma: float = number(
+        0.001, "m", 0.0, 10.0, "noise of x and of y, for poses without covariance", above=True
+    )
+    heading_sigma: float = number(
+        0.005, "rad", 0.0, 3.0, "noise of the heading, for poses without covariance", above=True
+    )
+    max_tilt: float = number(
+        0.35, "rad", 0.0, 3.1416, "largest angle between the z axes of a body and of the frame"
+    )
+
 
 _IN_TOPICS = re.compile(r"[A-Za-z0-9_/]+")
 _MAX_OFFSET_M = 10.0
@@ -41,12 +168,7 @@ class _UnusableError(Exception):
 
 
 class LocalizedRobots:
-    """Converts poses of bodies to poses of robots.
-
-    Args:
-        parameters: Of `localizer_bridge`.
-        robots: Names of the robots of the swarm.
-        health: Counts what is dropped, and records when bodies were seen.
+    """Converts poses of bodies to poses of robots; what was dropped and seen goes to `health`.
 
     Raises:
         ParameterError: A parameter cannot be used.
@@ -62,11 +184,13 @@ class LocalizedRobots:
 
     def __init__(self, parameters: BridgeParameters, robots: Collection[str], health: Health) -> None:
         self._parameters, self._health = parameters, health
+        # which body is which robot, and where on it
         self.robot_of = _robots_of_bodies(parameters.bodies, robots)
         offsets = _offsets(parameters.offsets, self.robot_of.values())
         self._to_robot = {
             robot: se2.inverse(offsets.get(robot, np.zeros(3))) for robot in self.robot_of.values()
         }
+        # what poses must be in, and the topics that they come on
         self._frames = (
             [parameters.source_frame] if parameters.source_frame else [parameters.map_frame, "world"]
         )
@@ -87,6 +211,7 @@ class LocalizedRobots:
                 raise ParameterError(
                     f"parameter bodies: '{body}' cannot be part of a topic; name the body as its topic does."
                 )
+        # what is counted, and the noise of poses without covariance
         self.strangers: set[str] = set()
         self.used = 0
         self._variances = np.diag(
@@ -94,12 +219,9 @@ class LocalizedRobots:
         )
 
     def convert(self, bodies: Iterable[BodyPose], of_topic: str, arrival_ns: int) -> Iterator[RobotPose]:
-        """The poses of robots by those of bodies; what cannot be used is counted.
+        """The poses of robots by those of the bodies of one message; what cannot be used is counted.
 
-        Args:
-            bodies: Of one message.
-            of_topic: The body that its topic is about, "" if it names bodies itself.
-            arrival_ns: Time of arrival.
+        `of_topic` is the body that its topic is about, "" if it names bodies itself.
         """
         for body in bodies:
             name = body.name or of_topic
@@ -123,6 +245,7 @@ class LocalizedRobots:
 
     def _robot_pose(self, name: str, body: BodyPose, arrival_ns: int) -> RobotPose:
         parameters, robot, frames = self._parameters, self.robot_of[name], self._frames
+        # refuse what cannot be used
         if body.frame_id not in frames:
             raise _UnusableError(
                 "foreign_frame",
@@ -140,6 +263,7 @@ class LocalizedRobots:
         covariance = self._variances if is_unknown(body.covariance[None])[0] else body.covariance
         if not (np.isfinite(body.pose[:2]).all() and np.isfinite(covariance).all()):
             raise _UnusableError("not_finite", f"a number in the poses of body '{name}' is NaN or infinite")
+        # without heading, only a body at base_link tells where its robot is
         pose, to_robot = np.array(body.pose), self._to_robot[robot]
         if math.isnan(pose[2]) or not has_heading(covariance[None])[0]:
             if to_robot.any() or parameters.output == "ground_truth":
@@ -149,8 +273,9 @@ class LocalizedRobots:
             pose, covariance = np.array([*pose[:2], 0.0]), covariance.copy()
             covariance[2, :], covariance[:, 2] = 0.0, 0.0
             covariance[2, 2] = _NO_HEADING
+        # from the body to base_link; the lever between them turns with the heading
         placed = se2.compose(pose, to_robot)
-        by_heading = np.eye(3)  # the lever between robot and body turns with the heading
+        by_heading = np.eye(3)
         by_heading[:2, 2] = pose[1] - placed[1], placed[0] - pose[0]
         return RobotPose(
             robot,

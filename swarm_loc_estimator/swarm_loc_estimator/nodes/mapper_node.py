@@ -19,19 +19,17 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from nav_msgs.msg import OccupancyGrid
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
-from rclpy.time import Time
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of, listed
 from swarm_loc_estimator.common.jit import is_precompiled
-from swarm_loc_estimator.common.messages.poses import PLANE, planar_covariance
+from swarm_loc_estimator.common.messages.poses import encode_fix, encode_pose_stamped
 from swarm_loc_estimator.common.node import BACKWARDS, ConfiguredNode, message_class, run_node
-from swarm_loc_estimator.mapping.exploration import Goal
 from swarm_loc_estimator.mapping.grid import CELL, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import MapFileError, load_map, save_map
-from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper, Located
 from swarm_loc_estimator.mapping.mapper_feed import (
     MapperFeed,
     MapperInput,
@@ -40,12 +38,8 @@ from swarm_loc_estimator.mapping.mapper_feed import (
     inputs_of,
 )
 from swarm_loc_estimator.mapping.messages import led_frequencies
-from swarm_loc_estimator.mapping.track import Located
 from swarm_loc_estimator.nodes.mapper_precompile import precompile
-from swarm_loc_estimator.nodes.parameters import (
-    MapperParameters,
-    chosen_robots,
-)
+from swarm_loc_estimator.nodes.parameters import MapperParameters, chosen_robots
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -55,9 +49,6 @@ _OUTPUT_QOS = QoSProfile(depth=10)
 
 class MapperNode(ConfiguredNode[MapperParameters]):
     """Converts the inputs, calls the mapper and publishes its map, goals and fixes.
-
-    Args:
-        node_arguments: Further arguments of `rclpy.node.Node`.
 
     Attributes:
         feed: Converts the inputs and counts what was dropped.
@@ -121,9 +112,12 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self._located[robot] = located
         frame, goal = self.params.map_frame, self._mapper.goal(number)
         covariance = fix_covariance(self._mapper.covariance(number))
-        self._fixes[robot].publish(fix_message(located, covariance, frame))
+        self._fixes[robot].publish(encode_fix(frame, located.stamp_ns, located.pose, covariance))
         if goal is not None:
-            self._goals[robot].publish(goal_message(goal, frame))
+            # with the heading of the straight line from the present position
+            way = goal.position - goal.pose[:2]
+            pose = np.array([[*goal.position, np.arctan2(way[1], way[0])]])
+            self._goals[robot].publish(encode_pose_stamped(frame, np.array([goal.stamp_ns]), pose)[0])
 
     def _publish_map(self) -> None:
         """Publish the map and the visits if the map has changed."""
@@ -132,8 +126,10 @@ class MapperNode(ConfiguredNode[MapperParameters]):
             return
         self._published = occupancy
         header = Header(frame_id=self.params.map_frame, stamp=self.get_clock().now().to_msg())
-        self._map.publish(occupancy_message(occupancy, header))
-        self._visitation.publish(visitation_message(occupancy, self._mapper.visits.on(occupancy), header))
+        # probability of each cell [%], -1 if unknown, and its number of visits by robots, at most 100
+        visits = np.minimum(self._mapper.visits.on(occupancy), 100).astype(float)
+        self._map.publish(_grid(occupancy, occupancy.percent, header))
+        self._visitation.publish(_grid(occupancy, visits, header))
 
     def _on_jump(self, _jump: object) -> None:
         self._clear()
@@ -141,10 +137,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         self._clear()
-        response.success, response.message = (
-            True,
-            "The map has been reset.",
-        )
+        response.success, response.message = (True, "The map has been reset.")
         return response
 
     def _on_save(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -180,16 +173,6 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         return f"{topic}{self.why_missing(topic, kind.message_type)}"
 
 
-def occupancy_message(occupancy: OccupancyMap, header: Header) -> OccupancyGrid:
-    """The occupancy grid: probability of each cell [%], -1 if unknown."""
-    return _grid(occupancy, occupancy.percent, header)
-
-
-def visitation_message(occupancy: OccupancyMap, visits: IntArray, header: Header) -> OccupancyGrid:
-    """Number of robot visits of each cell, at most 100."""
-    return _grid(occupancy, np.minimum(visits, 100).astype(float), header)
-
-
 def _grid(occupancy: OccupancyMap, values: FloatArray, header: Header) -> OccupancyGrid:
     message = OccupancyGrid(header=header)
     message.info.map_load_time = header.stamp
@@ -199,34 +182,6 @@ def _grid(occupancy: OccupancyMap, values: FloatArray, header: Header) -> Occupa
     message.info.origin.orientation.w = 1.0
     message.data = array.array("b", np.ascontiguousarray(np.round(values).astype(np.int8).T).tobytes())
     return message
-
-
-def goal_message(goal: Goal, frame: str) -> PoseStamped:
-    """Next stop of a robot, with the heading of the straight line from its present position."""
-    message = PoseStamped()
-    message.header.frame_id = frame
-    message.header.stamp = Time(nanoseconds=goal.stamp_ns).to_msg()
-    way = goal.position - goal.pose[:2]
-    _set_pose(message.pose, np.array([*goal.position, np.arctan2(way[1], way[0])]))
-    return message
-
-
-def fix_message(located: Located, covariance: FloatArray, frame: str) -> PoseWithCovarianceStamped:
-    """Pose of a robot at a scan, with a covariance (3, 3); see `fix_covariance`."""
-    message = PoseWithCovarianceStamped()
-    message.header.frame_id = frame
-    message.header.stamp = Time(nanoseconds=located.stamp_ns).to_msg()
-    _set_pose(message.pose.pose, located.pose)
-    full = planar_covariance(0.0, 0.0, 0.0)
-    full[PLANE] = covariance
-    message.pose.covariance = full.ravel()
-    return message
-
-
-def _set_pose(pose: object, planar: FloatArray) -> None:
-    position, orientation = pose.position, pose.orientation  # type: ignore[attr-defined]  # geometry_msgs/Pose
-    position.x, position.y = float(planar[0]), float(planar[1])
-    orientation.z, orientation.w = float(np.sin(0.5 * planar[2])), float(np.cos(0.5 * planar[2]))
 
 
 main = partial(run_node, "mapper_node", MapperNode)

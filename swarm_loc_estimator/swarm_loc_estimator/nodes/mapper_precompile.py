@@ -1,4 +1,4 @@
-"""Compile the mapper before data arrive, so that it does not fall behind the robots. No ROS here."""
+"""Compile the mapper before data arrive, so that it keeps up with the robots. No ROS here."""
 
 from __future__ import annotations
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass, field
 
-from swarm_loc_estimator.common.parameters import ParameterError, autostart, choice, flag, number, text, texts
+from swarm_loc_estimator.common.parameters import ParameterError, autostart, flag, number, text, texts
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.nodes.localizer_sources import SOURCES
 from swarm_loc_estimator.timeline.settings import Settings
 
 
@@ -35,10 +34,9 @@ class EstimatorParameters:
     transform_tolerance_s: float = number(
         0.0, "s", 0.0, 10.0, "time by which transforms are post-dated, as by AMCL"
     )
-    publish_robot_poses: bool = flag(True, "publish <robot>/pose beside swarm/poses, unless shared_topics")
+    publish_robot_poses: bool = flag(True, "publish <robot>/pose, too, unless shared_topics")
     shared_topics: bool = flag(
-        False,
-        "listen to swarm/odom, swarm/detections and swarm/fixes in place of topics of each robot",
+        False, "listen to swarm/odom, swarm/detections and swarm/fixes in place of topics of each robot"
     )
     settings: Settings = field(default_factory=Settings, metadata={"numbers_of": Settings})
 
@@ -119,45 +117,3 @@ class MarkersParameters:
 
     swarm_file: str = text("", "path of the swarm description", required=True)
     rate: float = number(10.0, "Hz", 0.1, 100.0, "how often markers are published, at most")
-
-
-@dataclass(frozen=True)
-class BridgeParameters:
-    """Parameters of `localizer_bridge`."""
-
-    swarm_file: str = text("", "path of the swarm description", required=True)
-    source: str = choice("pose", tuple(SOURCES), "kind of messages, see the table of sources")
-    topic: str = text(
-        "",
-        "topic of the messages, with <body> in place of the body's name; empty: that of the table of sources",
-    )
-    output: str = choice(
-        "fix",
-        ("fix", "ground_truth"),
-        "<robot>/fix for the estimator, or <robot>/ground_truth to evaluate it",
-    )
-    bodies: tuple[str, ...] = texts(
-        "tracked bodies, such as cf1=epuck1, or epuck2 for a body with the robot's name;"
-        " empty: each robot has a body of its own name"
-    )
-    offsets: tuple[str, ...] = texts(
-        "poses of bodies in base_link, such as epuck1=0.01,0,1.5708 [m, m, rad];"
-        " the body of a robot not named here is at base_link"
-    )
-    source_frame: str = text("", "frame that the poses must be in; empty: map_frame or world")
-    map_frame: str = text("map", "frame of the published poses", required=True)
-    latency_s: float = number(
-        0.0, "s", 0.0, 2.0, "time from the exposure to the stamp of a message, subtracted from the stamp"
-    )
-    stamp_on_arrival: bool = flag(
-        False, "take the time of arrival in place of stamps, for a source with another clock or none"
-    )
-    position_sigma: float = number(
-        0.001, "m", 0.0, 10.0, "noise of x and of y, for poses without covariance", above=True
-    )
-    heading_sigma: float = number(
-        0.005, "rad", 0.0, 3.0, "noise of the heading, for poses without covariance", above=True
-    )
-    max_tilt: float = number(
-        0.35, "rad", 0.0, 3.1416, "largest angle between the z axes of a body and of the frame"
-    )

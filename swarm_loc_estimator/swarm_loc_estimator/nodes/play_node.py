@@ -86,7 +86,8 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
         self._wait_for_subscribers(stop)
         while not stop.requested:
             played_before = self.so_far.messages
-            self._play_once(stop)
+            messages = takewhile(lambda _: not stop.requested, self._reader.messages(self._publisher_of))
+            play(messages, self._begin_ns, self.params.rate, self, self.so_far)
             if not self.params.loop or self.so_far.messages == played_before:
                 break
         self._wait_for_acknowledgements(stop)
@@ -123,10 +124,6 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
             return
         qos = playing_qos(topic.name, self._reader.offered_qos.get(topic.name, ()))
         self._publisher_of[topic.name] = self.create_publisher(publishes, topic.name, qos)
-
-    def _play_once(self, stop: Stop) -> None:
-        messages = takewhile(lambda _: not stop.requested, self._reader.messages(self._publisher_of))
-        play(messages, self._begin_ns, self.params.rate, self, self.so_far)
 
     def publish(self, message: RawMessage) -> None:
         """Publish a message of the bag."""
@@ -190,12 +187,9 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
 
 
 def playing_qos(topic: str, recorded: Sequence[Qos]) -> QoSProfile:
-    """The profile to publish a topic with.
+    """The profile to publish a topic with, by the recorded profiles of its publishers.
 
-    Args:
-        topic: Its name in the bag.
-        recorded: Profiles of its publishers. If these differ or none is known, the result is reliable, and
-            latched for topics that are latched by convention.
+    If these differ or none is known, it is reliable, and latched for topics that are latched by convention.
     """
     profiles = [_profile(one) for one in recorded]
     if profiles and all(one == profiles[0] for one in profiles):

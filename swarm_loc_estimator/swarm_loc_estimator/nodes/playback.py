@@ -1,4 +1,4 @@
-"""Playback schedule: publish messages of a bag in time, each after a /clock not behind it. No ROS here."""
+"""Playback schedule: publish messages of a bag in time, each after its /clock. No ROS here."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Protocol
 from swarm_loc_estimator.common.bags.bag_file import RawMessage
 
 _SECOND = 1_000_000_000
-STEP_S = 0.005  # Wall time of a playback step [s]; the messages of a step follow a /clock not behind them
+STEP_S = 0.005  # Wall time of a playback step [s]; the messages of a step follow a /clock that is not earlier
 LONGEST_STEP_NS = 20_000_000  # Longest bag time of a step, at any rate and lag
 
 
@@ -45,7 +45,7 @@ class Output(Protocol):
         """Publish a message."""
 
     def publish_clock(self, now_ns: int) -> None:
-        """Publish /clock; every message follows a /clock that is not behind it."""
+        """Publish /clock; every message follows a /clock that is not earlier."""
 
     def now_s(self) -> float:
         """The steady clock."""

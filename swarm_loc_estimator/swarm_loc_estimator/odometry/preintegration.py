@@ -1,12 +1,10 @@
 """Preintegration of odometry: calibrated poses along a track, with their covariance and Jacobian.
 
-Checks of odometry steps: jumps, resets, and odometry whose pose is constant while its twist is not.
-
-A step is compared with what the robot can do between two stamps, and with the twists at both ends. Drivers
-report the twist of the step before, of the step after or of the instant, so the mean twist of a step lies
-between the two; while it does not, or the twist is not filled, it proves nothing.
-
-Turn rates of gyroscopes, integrated to the turns of odometry steps.
+Steps are checked for jumps, resets, and a pose that is constant while the twist is not. A step is compared
+with what the robot can do between two stamps, and with the twists at both ends. Drivers report the twist of
+the step before, of the step after or of the instant, so the mean twist of a step lies between the two; while
+it does not, or the twist is not filled, it proves nothing. Where there is a gyroscope, its turn rate is
+integrated to the turn.
 """
 
 from __future__ import annotations
@@ -19,8 +17,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit, norefcount_njit
-from swarm_loc_estimator.common.se2_scalar import wrap
-from swarm_loc_estimator.common.small_matrix import add_scaled, assign, assign_matrix
+from swarm_loc_estimator.common.numerics import add_scaled, assign, assign_matrix, wrap
 from swarm_loc_estimator.odometry.track_arrays import (
     BEFORE_ALL_NS,
     LATEST_NS,
@@ -60,11 +57,13 @@ def fault_of_step(
     agreed, fastest = tracks.agreed[robot, row], tracks.fastest[robot, row]
     for i in range(2):
         agreed[i], fastest[i] = tracks.agreed[robot, row - 1, i], tracks.fastest[robot, row - 1, i]
+    # A step beyond the limits of the robot is a jump; one to the origin is a restart.
     fault = NO_FAULT
     if _is_beyond_limits(tracks, robot, step, duration_s):
         fault = JUMP
     elif _is_restart(tracks, robot, row, duration_s):
         fault = RESET
+    # The twist, where it is known, says how far the step may be.
     earlier, later = tracks.twist[robot, row - 1], tracks.twist[robot, row]
     known = math.isfinite(earlier[0] + earlier[1] + earlier[2] + later[0] + later[1] + later[2])
     if not known or duration_s > model.timeout_s:
@@ -80,6 +79,7 @@ def fault_of_step(
     away = _outside(arc, speeds[0] * duration_s, speeds[1] * duration_s)  # some drivers turn the velocity
     turned = _outside(step[2], earlier[2] * duration_s, later[2] * duration_s)
     moves = (speeds[0] + speeds[1] > 0.0 and arc > 0.0), (rates[0] + rates[1] > 0.0 and step[2] != 0.0)
+    # A step that contradicts a twist that has agreed before is a reset.
     for i, contradicts in enumerate((away > slack, turned > turn_slack)):
         if contradicts:
             if agreed[i] >= _AGREED_ENOUGH and fault == NO_FAULT:
@@ -250,7 +250,7 @@ def turn_by_gyro(tracks: TrackArrays, robot: int, begin_ns: int, end_ns: int, is
 
 @inlined_njit
 def _angle_at(tracks: TrackArrays, robot: int, k: int, stamp_ns: int) -> float:
-    """Integral of the turn rate until an instant beside measurement k; the rate is linear in between."""
+    """Integral of the turn rate until an instant next to measurement k; the rate is linear in between."""
     stamps, rates = tracks.gyro_ns[robot], tracks.gyro_rate[robot]
     angle: float = tracks.gyro_angle[robot, k]
     if stamps[k] == stamp_ns:
@@ -349,6 +349,7 @@ def integrate(tracks: TrackArrays, oldest_ns: int, rows: NewRows, changed_from_n
         if row and stamps_ns[k] <= tracks.stamp_ns[robot, row - 1]:
             duplicates += 1
             continue
+        # Append the row.
         tracks.stamp_ns[robot, row] = stamps_ns[k]
         assign(tracks.raw[robot, row], raw[k])
         assign(tracks.twist[robot, row], twist[k])
@@ -363,7 +364,7 @@ def integrate(tracks: TrackArrays, oldest_ns: int, rows: NewRows, changed_from_n
             assign(tracks.begin_pose[robot], raw[k])
             tracks.begin_ns[robot] = tracks.known_ns[robot, 0] = stamps_ns[k]
             tracks.jump_ns[robot, 0, 0] = tracks.jump_ns[robot, 0, 1] = BEFORE_ALL_NS // 2
-        else:
+        else:  # integrate the step to it, and those before whose twist counts from now on
             before = tracks.raw[robot, row - 1, 2]
             tracks.raw[robot, row, 2] = before + wrap(raw[k, 2] - before)
             first = row
@@ -380,7 +381,7 @@ def integrate(tracks: TrackArrays, oldest_ns: int, rows: NewRows, changed_from_n
 
 @cached_njit
 def integrate_again(tracks: TrackArrays, from_ns: IntArray, changed_from_ns: IntArray) -> None:
-    """Integrate the rows of each robot behind an instant (N,) again; lower `changed_from_ns` (N,)."""
+    """Integrate the rows of each robot after an instant (N,) again; lower `changed_from_ns` (N,)."""
     for robot in range(from_ns.size):
         stamps = tracks.stamp_ns[robot, : tracks.filled[robot]]
         first = max(1, np.searchsorted(stamps, from_ns[robot], side="right"))

@@ -1,9 +1,4 @@
-"""Rows and models of odometry tracks, as arrays for compiled code.
-
-Process noise of odometry steps and gaps.
-
-Interpolation and extrapolation of odometry tracks.
-"""
+"""Odometry tracks as arrays for compiled code: process noise, interpolation, extrapolation."""
 
 from __future__ import annotations
 
@@ -16,7 +11,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
+from swarm_loc_estimator.common.numerics import assign, assign_matrix
 from swarm_loc_estimator.swarm.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
 from swarm_loc_estimator.swarm.error_models import ImuModel, OdometryModel
 

@@ -229,6 +229,7 @@ class OdometryTracks:
     def _allocated(self, capacity: int, rates: int) -> TrackArrays:
         shape, gyro_shape = (self._robots, capacity), (self._robots, rates)
         arrays = TrackArrays(
+            # rows of odometry
             filled=np.zeros(self._robots, dtype=np.int64),
             stamp_ns=np.zeros(shape, dtype=np.int64),
             raw=np.zeros((*shape, 3)),
@@ -244,6 +245,7 @@ class OdometryTracks:
             jump_ns=np.zeros((*shape, 2), dtype=np.int64),
             twist_from_ns=np.full(self._robots, LATEST_NS),
             twist_until_ns=np.full(self._robots, LATEST_NS),
+            # description of the robots
             delay_ns=self._delay_ns,
             model=self._model,
             response=self._response[0],
@@ -253,6 +255,7 @@ class OdometryTracks:
             begin_pose=np.zeros((self._robots, 3)),
             is_stationary=self._is_stationary,
             imu=self._imu,
+            # turn rates of gyroscopes
             gyro_filled=np.zeros(self._robots, dtype=np.int64),
             gyro_ns=np.zeros(gyro_shape, dtype=np.int64),
             gyro_rate=np.zeros(gyro_shape),

@@ -1,7 +1,4 @@
-"""Write a run as MCAP for viewers.
-
-Trajectories as text in the format of TUM, as evo uses it: `seconds x y z qx qy qz qw` per line.
-"""
+"""Write a run as MCAP for viewers, or as text in the format of TUM, which evo uses; read ground truth."""
 
 from __future__ import annotations
 
@@ -43,18 +40,14 @@ _MAX_S = 9_000_000_000
 
 
 class TumError(UserError):
-    """Files of trajectories that cannot be used; the message is one sentence."""
+    """Files of trajectories that cannot be used."""
 
 
 def write_tum(result: ReplayResult, folder: Path) -> None:
-    """Write the trajectories of a run, in `map`.
+    """Write the trajectories of a run, in `map`, to a folder; files of the same names are replaced.
 
     `<robot>.tum` has the estimated poses, `<robot>.truth.tum` the ground truth at the same instants, as far
     as it is known there. So evo, which pairs the nearest stamps, finds the errors of the report.
-
-    Args:
-        result: The run.
-        folder: Created if missing; files of the same names are replaced.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for index, robot in enumerate(result.swarm.robots):
@@ -141,10 +134,6 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
     """Write the file, replacing an existing one.
 
     Transforms lead from map directly to `<robot>/base_link`; the file holds no odom frames.
-
-    Args:
-        result: The run.
-        path: Such as run.mcap.
 
     Raises:
         BagError: It cannot be written.

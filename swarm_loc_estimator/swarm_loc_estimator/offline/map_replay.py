@@ -21,7 +21,7 @@ from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, inputs_of
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.offline.ground_truth import TruthReader
+from swarm_loc_estimator.offline.recorded_bag import TruthReader
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 _REPORT_EVERY = 1000

@@ -17,7 +17,7 @@ MISLEADING_SIGMAS, MISLEADING_M = 5.0, 0.02
 
 
 class MetricsError(ValueError):
-    """Arrays whose sizes do not match; the message is one sentence."""
+    """Arrays whose sizes do not match."""
 
 
 @dataclass(frozen=True)
@@ -98,29 +98,16 @@ def compare(
 
 
 def is_misleading(error: FloatArray, covariance: FloatArray) -> BoolArray:
-    """Whether positions are wrong by more than 5 sigma and 2 cm.
-
-    Args:
-        error: (N, 3).
-        covariance: (N, 3, 3).
-
-    Returns:
-        (N,) False where the covariance is unknown.
-    """
+    """Whether errors (N, 3) of positions exceed 5 sigma and 2 cm; False where the covariance is unknown."""
     far = np.hypot(error[:, 0], error[:, 1]) > MISLEADING_M
     wrong: BoolArray = far & (nees(error[:, :2], covariance[:, :2, :2]) > MISLEADING_SIGMAS**2)
     return wrong
 
 
 def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Normalised squared errors.
+    """Normalised squared errors (N,) of errors (N, d) with covariances (N, d, d).
 
-    Args:
-        error: (N, d).
-        covariance: (N, d, d).
-
-    Returns:
-        (N,) infinite where the covariance is not positive definite, NaN where it is unknown.
+    They are infinite where the covariance is not positive definite, NaN where it is unknown.
     """
     result = np.full(len(error), np.nan)
     known = np.isfinite(covariance).all(axis=(1, 2))

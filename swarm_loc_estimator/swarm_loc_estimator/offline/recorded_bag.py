@@ -1,28 +1,135 @@
-"""Read a bag of a swarm once: inputs in order of arrival, ground truth, maps and goals."""
+"""Read a bag of a swarm once: inputs in order of arrival, ground truth, maps and goals.
+
+Ground truth is used only by evaluation and calibration.
+"""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
+from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.reader import BagError, BagReader, BagTopic
 from swarm_loc_estimator.common.health import listed
-from swarm_loc_estimator.common.messages.cdr import CdrError
-from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
-from swarm_loc_estimator.common.messages.streams import MessageBatch
+from swarm_loc_estimator.common.messages.cdr import (
+    ODOMETRY,
+    POSE_STAMPED,
+    POSE_WITH_COVARIANCE,
+    TRANSFORM_STAMPED,
+    CdrError,
+    decode,
+    nanoseconds,
+)
+from swarm_loc_estimator.common.messages.poses import (
+    FixMessage,
+    OdometryMessage,
+    PoseMessage,
+    decode_fix,
+    decode_odometry,
+    decode_pose_stamped,
+    yaw_of,
+)
+from swarm_loc_estimator.common.messages.streams import MessageBatch, PoseReader
 from swarm_loc_estimator.common.parameters import UserError, number, number_specs
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
-from swarm_loc_estimator.offline.ground_truth import TruthReader, truth_topics
-from swarm_loc_estimator.offline.result import RecordedMap
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import Batch, kinds
+from swarm_loc_estimator.offline.result import RecordedMap, Spool
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest, kinds
 from swarm_loc_estimator.swarm.swarm import Swarm
+
+
+def _decode_transform(data: bytes) -> PoseMessage:
+    message = decode(data, TRANSFORM_STAMPED)
+    place, turn = message.transform.translation, message.transform.rotation
+    pose = place.x, place.y, yaw_of(turn.x, turn.y, turn.z, turn.w)
+    return PoseMessage(nanoseconds(message.header.stamp), message.header.frame_id, pose)
+
+
+_READ: Mapping[str, tuple[Callable[[bytes], OdometryMessage | PoseMessage | FixMessage], int]] = {
+    POSE_STAMPED: (decode_pose_stamped, 1),
+    POSE_WITH_COVARIANCE: (decode_fix, 1),
+    ODOMETRY: (decode_odometry, 2),
+    TRANSFORM_STAMPED: (_decode_transform, 2),
+}
+"""Type of a message -> its reader, and the number of frame names before its pose."""
+
+
+def truth_topics(swarm: Swarm) -> list[str]:
+    """The topic of the ground truth of each robot."""
+    return [f"{robot.name}/ground_truth" for robot in swarm.robots]
+
+
+class TruthReader:
+    """Collects `<robot>/ground_truth`: PoseStamped, PoseWithCovarianceStamped, Odometry or TransformStamped.
+
+    The recorded topics declare the types.
+
+    Attributes:
+        topics: The index of a topic is its number in a batch.
+    """
+
+    def __init__(self, swarm: Swarm, recorded: Iterable[BagTopic]) -> None:
+        self.topics = truth_topics(swarm)
+        self._names = [robot.name for robot in swarm.robots]
+        declared = {topic.name: topic.type for topic in recorded}
+        self._types = [declared.get(topic, "") for topic in self.topics]
+        count = len(self.topics)
+        self._readers = {name: PoseReader(count, *_READ[name]) for name in {*self._types} & {*_READ}}
+        self._spool = Spool()
+        self._malformed: Counter[int] = Counter()
+
+    def add(self, batch: MessageBatch) -> None:
+        """Add messages."""
+        for message_type, reader in self._readers.items():
+            typed = np.array([name == message_type for name in self._types])
+            part = batch.chosen(typed[batch.topic])
+            if part.size:
+                self._add(part, reader)
+
+    def tracks(self) -> dict[str, Trajectory]:
+        """Robot name -> ground truth, for robots that have any; may be called once."""
+        return {name: track for index, name in enumerate(self._names) if (track := self._track(index))}
+
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences for the user."""
+        return (
+            *(
+                f"{topic} has the type {found}, which is no ground truth; allowed are {', '.join(_READ)}."
+                for topic, found in zip(self.topics, self._types, strict=True)
+                if found and found not in _READ
+            ),
+            *(
+                f"{count} messages on {self.topics[index]} are malformed: no {self._types[index]} of ROS 2."
+                for index, count in sorted(self._malformed.items())
+            ),
+        )
+
+    def _add(self, batch: MessageBatch, reader: PoseReader) -> None:
+        columns = reader.read(batch)
+        self._malformed.update(batch.topic[~columns.valid].tolist())
+        usable = np.flatnonzero(columns.valid & np.isfinite(columns.pose).all(axis=1))
+        robot = batch.topic[usable]
+        order = usable[np.lexsort([columns.stamp_ns[usable], robot])]
+        ends = np.searchsorted(batch.topic[order], np.arange(len(self.topics) + 1))
+        for index in np.flatnonzero(np.diff(ends)).tolist():
+            rows = order[ends[index] : ends[index + 1]]
+            self._spool.append((index, "stamp_ns"), columns.stamp_ns[rows])
+            self._spool.append((index, "pose"), columns.pose[rows])
+
+    def _track(self, index: int) -> Trajectory | None:
+        stamp_ns: IntArray = self._spool.array((index, "stamp_ns"), np.int64)
+        pose = self._spool.array((index, "pose"), np.float64, 3)
+        if np.any(stamp_ns[1:] < stamp_ns[:-1]):
+            order = np.argsort(stamp_ns, kind="stable")
+            stamp_ns, pose = stamp_ns[order], pose[order]
+        return Trajectory(stamp_ns, pose) if stamp_ns.size else None
+
 
 Progress = Callable[[float, str], None]
 """Called with the completed share, 0 to 1, and the name of the present step."""
@@ -33,7 +140,7 @@ def unwatched(_share: float, _what: str) -> None:
 
 
 class LossError(UserError):
-    """A loss that cannot be used; the message is one sentence."""
+    """A loss that cannot be used."""
 
 
 @dataclass(frozen=True)
@@ -41,7 +148,7 @@ class Loss:
     """Messages that are dropped at random before the estimator, as on a bad network.
 
     Whether a message is lost depends on the seed, its topic and its place among the messages of this topic;
-    with a greater share the same messages are lost and others beside them.
+    with a greater share the same messages are lost, and more.
 
     Raises:
         LossError: A number is out of range.
@@ -60,11 +167,7 @@ NOTHING_LOST = Loss()
 
 
 class Network:
-    """Passes on the messages that are not lost.
-
-    Args:
-        loss: Which are.
-        topics: Names; the index is the number in a batch.
+    """Passes on the messages that are not lost; the index of a topic is its number in a batch.
 
     Attributes:
         lost: Number of messages.
@@ -109,15 +212,10 @@ def read_bag(
     remap: Mapping[str, str] = MappingProxyType({}),
     loss: Loss = NOTHING_LOST,
 ) -> BagSummary:
-    """Read a bag once.
+    """Read a bag once: a rosbag2 folder, .mcap or .db3 file.
 
-    Args:
-        bag: rosbag2 folder, .mcap or .db3 file.
-        swarm: Robots whose messages are read.
-        take: Called with the inputs, in order of arrival.
-        progress: Called now and then.
-        remap: Expected topic -> topic of the bag, see `renamed_topics`.
-        loss: Inputs that are not passed on; ground truth, maps and goals are complete.
+    `take` is called with the inputs, in order of arrival, less those that `loss` drops; ground truth, maps
+    and goals are complete. `remap` is as in `renamed_topics`.
 
     Raises:
         BagError: Nothing in the bag can be read, or a topic cannot be mapped.
@@ -158,13 +256,10 @@ def _from(batch: MessageBatch, first: int) -> MessageBatch:
 
 
 def renamed_topics(remap: Mapping[str, str], swarm: Swarm, known: Collection[str]) -> dict[str, str]:
-    """Topic of a bag -> the topic as which it is read.
+    """Topic of a bag -> the topic as which it is read, by rules expected topic -> topic of the bag.
 
-    Args:
-        remap: Expected topic -> topic of the bag, such as robot1/odom -> /robot1/odometry/filtered;
-            `<robot>` in both stands for each robot.
-        swarm: The robots.
-        known: Expected topics.
+    An example is robot1/odom -> /robot1/odometry/filtered; `<robot>` in both stands for each robot. `known`
+    are the expected topics.
 
     Raises:
         BagError: An expected topic is unknown, or two of them have the same topic of the bag.
@@ -181,8 +276,8 @@ def renamed_topics(remap: Mapping[str, str], swarm: Swarm, known: Collection[str
     return renamed
 
 
-def _same_type(one: str, other: str) -> bool:
-    """Whether two names of types are the same; some writers leave /msg/ out."""
+def same_type(one: str, other: str) -> bool:
+    """Whether two names of types are the same; some writers of bags leave /msg/ out."""
     return one.replace("/msg/", "/") == other.replace("/msg/", "/")
 
 
@@ -192,7 +287,7 @@ def _foreign(topics: Sequence[BagTopic], ingest: Ingest) -> dict[str, str]:
     return {
         topic.name: f"{topic.name} has the type {topic.type}, expected is {expected[topic.name]}: not read."
         for topic in topics
-        if topic.type and topic.name in expected and not _same_type(topic.type, expected[topic.name])
+        if topic.type and topic.name in expected and not same_type(topic.type, expected[topic.name])
     }
 
 
@@ -230,7 +325,7 @@ def _unusable(topics: Sequence[BagTopic], ingest: Ingest, swarm: Swarm) -> tuple
         others = [
             topic
             for topic in topics
-            if _same_type(topic.type, kind.message_type)
+            if same_type(topic.type, kind.message_type)
             and topic.name not in ingest.handle_of
             and not topic.name.endswith("/ground_truth")
         ]
@@ -269,10 +364,6 @@ MAX_GOALS = 20_000  # Maximum number of stored goals per robot
 
 class MapReader:
     """Collects the maps and goals of a bag for display; the estimator does not see them.
-
-    Args:
-        swarm: The robots.
-        max_bytes: Limit of all maps together.
 
     Attributes:
         topics: The index of a topic is its number in a batch.

@@ -25,11 +25,10 @@ from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.offline.recorded_bag import NOTHING_LOST, Loss, Progress, read_bag, unwatched
 from swarm_loc_estimator.offline.result import AerialImage, ReplayResult, Spool
 from swarm_loc_estimator.sensors.aerial import AerialRows
-from swarm_loc_estimator.sensors.ingest import MAX_PAUSE_NS
-from swarm_loc_estimator.sensors.registry import Batch
+from swarm_loc_estimator.sensors.inputs import MAX_PAUSE_NS, Batch
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.timeline.contradictions import Contradicted
+from swarm_loc_estimator.timeline.estimate import Contradicted, LossReport
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.self_calibration import swapped_signs
 from swarm_loc_estimator.timeline.settings import Settings
@@ -56,7 +55,7 @@ def replay(
 
     Args:
         bag: rosbag2 folder, .mcap or .db3 file.
-        swarm: Robots and landmarks; None: those of the `swarm.yaml` beside the bag.
+        swarm: Robots and landmarks; None: those of the `swarm.yaml` in its folder.
         settings: Of the estimator.
         tick_s: Time between two outputs [s].
         stamp_ns: (T,) increasing; outputs at these instants instead, such as those of a live run.
@@ -98,11 +97,12 @@ def replay(
         remarks.append("Poses before the first landmark or fix are relative to a robot, without errors.")
     if result.self_calibrated:
         remarks += swapped_signs(result.self_calibrated)
+    remarks += result.loss_remarks
     return replace(result, remarks=tuple(remarks), maps=summary.maps, goals=summary.goals)
 
 
 class ScheduleError(UserError):
-    """Outputs that cannot be scheduled; the message is one sentence."""
+    """Outputs that cannot be scheduled."""
 
 
 def _period_ns(tick_s: object) -> int:
@@ -127,6 +127,9 @@ _TICKS_AT_ONCE = 256
 _SIGHTINGS_PERIOD_NS = 500_000_000
 _MAX_SIGHTINGS = 500_000
 """Maximum number of sightings stored for display; later ones of a long run are not stored."""
+
+_MAX_LOSSES = 100_000
+"""Maximum number of losses of robots that are stored; later ones of a long run are not stored."""
 
 
 class Schedule(Protocol):
@@ -198,13 +201,7 @@ class ListedSchedule:
 
 
 class Runner:
-    """Feeds an estimator, ticks it, and keeps its estimates in a temporary file: memory does not grow.
-
-    Args:
-        estimator: Fed by this runner only.
-        schedule: Schedule of its ticks.
-        keep_sightings: Whether sightings and aerial images are kept for display, too.
-    """
+    """Feeds an estimator, ticks it, and keeps its estimates in a temporary file: memory does not grow."""
 
     def __init__(self, estimator: Estimator, schedule: Schedule, *, keep_sightings: bool = False) -> None:
         self._estimator = estimator
@@ -220,6 +217,8 @@ class Runner:
         self._sightings_left = _MAX_SIGHTINGS if keep_sightings else 0
         self._sightings: list[tuple[int, Sightings]] = []
         self._images = AerialImages() if keep_sightings else None
+        self._losses: dict[int, list[LossReport]] = {}
+        self._losses_left = _MAX_LOSSES
         self._filled = 0
 
     def take(self, inputs: Batch) -> None:
@@ -246,14 +245,7 @@ class Runner:
         truth: Mapping[str, Trajectory],
         received: Mapping[str, int],
     ) -> ReplayResult:
-        """The poses of all ticks beside ground truth; may be called once.
-
-        Args:
-            title: Name of the recording.
-            range_ns: First and last arrival.
-            truth: Robot name -> ground truth.
-            received: Messages by topic.
-        """
+        """The poses of all ticks with ground truth, between first and last arrival; may be called once."""
         self._flush()
         estimator, robots = self._estimator, len(self._estimator.swarm.robots)
         return ReplayResult(
@@ -265,6 +257,7 @@ class Runner:
             covariances=self._spool.array("covariance", np.float64, robots, 3, 3),
             status=self._spool.array("status", np.uint8, robots),
             sightings=tuple(self._sightings),
+            losses=tuple(one for _, losses in sorted(self._losses.items()) for one in losses),
             images=self._images.images() if self._images is not None else (),
             self_calibrated=estimator.learned() if estimator.is_self_calibrated else None,
             truth=truth,
@@ -282,6 +275,7 @@ class Runner:
         k, self._filled = self._filled, self._filled + 1
         self._stamp_ns[k], self._pose[k], self._covariance[k] = now_ns, estimate.poses, estimate.covariances
         self._status[k], self._is_local[k] = estimate.status, bool(self._estimator.origin)
+        self._note_losses()
         if self._images is not None:
             self._images.note(self._estimator.identities)
         if self._sightings_left > 0 and now_ns % _SIGHTINGS_PERIOD_NS == 0:
@@ -290,6 +284,16 @@ class Runner:
             self._sightings_left -= len(seen.observer)
         if self._filled == _TICKS_AT_ONCE:
             self._flush()
+
+    def _note_losses(self) -> None:
+        """Store the newest losses; one that late data move back replaces those after it."""
+        for one in self._estimator.losses:
+            mine = self._losses.setdefault(one.robot, [])
+            while mine and mine[-1].stamp_ns > one.stamp_ns:
+                mine.pop()
+            if self._losses_left and (not mine or mine[-1].stamp_ns < one.stamp_ns):
+                mine.append(one)
+                self._losses_left -= 1
 
     def _flush(self) -> None:
         """Move the ticks in memory to the temporary file."""

@@ -1,6 +1,6 @@
 """Result of a run of the estimator: poses, covariances, errors against ground truth, counters.
 
-Arrays that grow in a temporary file and are memory-mapped at the end.
+Long arrays grow in a temporary file and are memory-mapped at the end.
 """
 
 from __future__ import annotations
@@ -17,14 +17,17 @@ import numpy as np
 import numpy.typing as npt
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.filter.measurements import LossReason
 from swarm_loc_estimator.mapping.messages import GridMessage, decode_occupancy_grid
 from swarm_loc_estimator.offline.metrics import Errors, ErrorSummary, compare, pool, summarise
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline.estimate import Status
+from swarm_loc_estimator.timeline.estimate import LossReport, Status
 from swarm_loc_estimator.timeline.sightings import Sightings
 
 _COPY_BYTES = 1 << 20
+_MAX_LOST = 20  # Maximum number of robots whose losses are listed
 
 
 class Spool:
@@ -122,14 +125,32 @@ class ReplayResult:
     goals: Mapping[str, Trajectory] = field(default_factory=dict)
     #: (T,) True while poses are relative to a robot instead of in map, and have no errors; empty: never
     is_local: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    losses: tuple[LossReport, ...] = ()  #: Losses of robots, as known at the stamps; robot by robot
 
     @property
     def speed_factor(self) -> float:
         """Duration of the data divided by that of the replay."""
         return self.data_s / self.wall_s if self.wall_s > 0.0 else float("nan")
 
+    @property
+    def loss_remarks(self) -> list[str]:
+        """One sentence for each robot that was lost, with causes and times since the first output."""
+        begin_ns = int(self.stamp_ns[0]) if self.stamp_ns.size else 0
+        found: dict[int, dict[str, list[str]]] = {}
+        for one in (one for one in self.losses if one.why is not LossReason.FRAME):
+            times = found.setdefault(one.robot, {}).setdefault(one.cause, [])
+            times.append(f"{max(0, one.stamp_ns - begin_ns) * 1e-9:.1f} s")
+        remarks = []
+        for robot, times_of in list(found.items())[:_MAX_LOST]:
+            count = sum(map(len, times_of.values()))
+            causes = "; ".join(f"{cause} (at {listed(times)})" for cause, times in times_of.items())
+            often = "once" if count == 1 else f"{count} times"
+            remarks.append(f"{self.swarm.robots[robot].name} was lost {often}: {causes}.")
+        more = len(found) - _MAX_LOST
+        return [*remarks, f"{more} more robots were lost."] if more > 0 else remarks
+
     def select(self, rows: npt.NDArray[np.bool_]) -> ReplayResult:
-        """The result with the poses at some of the stamps (T,) only."""
+        """The result with only the poses at some of the stamps (T,)."""
         return replace(
             self,
             stamp_ns=self.stamp_ns[rows],

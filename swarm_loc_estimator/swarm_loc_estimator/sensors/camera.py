@@ -5,18 +5,10 @@ a measurement in the planar sensor frame: at the camera's position on the robot 
 `map`, rotated by its yaw, with the mount's pitch and roll removed. A fixed camera has no observer, and the
 error of its pose is the systematic share of its measurements.
 
-Measurement model of the direction of a marker; it is evaluated by its record.
-
-Vectors and orientations in the optical frame of a camera, for compiled code.
-
-Pose in the plane of a marker that lies flat, by casting its corners onto the plane of its height.
-
 The tilt and the distance of a small marker in an image are uncertain, and the error of one is that of the
 other. But a marker that lies flat has neither: its corners, projected by its measured pose into the image and
 from there onto the plane in which it lies, tell its position and the direction of its x axis. These depend on
 the pixels only, whichever of the two mirrored poses was measured.
-
-Kernels that convert camera detections to measurements, see `camera`.
 """
 
 from __future__ import annotations
@@ -39,7 +31,7 @@ from swarm_loc_estimator.common.messages.detections import (
     decode_shared_detections,
 )
 from swarm_loc_estimator.common.messages.streams import DetectionColumns, DetectionReader
-from swarm_loc_estimator.common.small_matrix import assign
+from swarm_loc_estimator.common.numerics import assign
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, select
 from swarm_loc_estimator.filter.models import BEARING, MODELS, POLAR, gate_threshold
 from swarm_loc_estimator.sensors.sensor import (
@@ -136,11 +128,13 @@ def cast(
     Returns:
         CAST; or FACE_DOWN or NOT_FLAT, and nothing is written.
     """
+    # Does it lie face up in its plane?
     middle, axes = np.dot(level, position), np.dot(level, rotation)
     if not axes[2, 2] > 0.0:
         return FACE_DOWN
     if not _lies(level, middle, axes, spread, height):
         return NOT_FLAT
+    # Cast rays through its corners to the plane of its height, with their Jacobians.
     ahead, aside, slopes = 0.0, 0.0, np.zeros((3, 6))
     along, across = np.zeros(6), np.zeros(6)
     value[0], value[1] = 0.0, 0.0
@@ -370,6 +364,7 @@ def _outcome(
     detections: NDArray[np.void], k: int, cameras: Cameras, markers: Markers, camera: int, place: int
 ) -> int:
     """Outcome of detection k with the marker at index `place`: valid, or a reason to drop it."""
+    # Whose marker is it, and does the camera see it?
     if place < 0 or markers.id[place] != detections[k].id:
         return _UNKNOWN_ID
     if markers.owner[place] == camera:
@@ -378,6 +373,7 @@ def _outcome(
         return _NO_CAMERA
     if camera >= cameras.robots and markers.owner[place] == NOBODY:
         return _FIXED_ON_FIXED
+    # Is its content known and finite?
     content = detections[k].content
     if not CONTENT_POSITION <= content <= CONTENT_BEARING or (
         content == CONTENT_BEARING and markers.lies[place]
@@ -507,6 +503,7 @@ class SightingConverter:
 
     def __init__(self, swarm: Swarm, drops: DropCounts | None = None) -> None:
         self._drops = drops or DropCounts(len(swarm.sources))
+        # Cameras: mounts, calibration, gates; fixed ones have errors of their poses.
         fixed, robots = swarm.cameras, swarm.robots
         mounts: list[CameraMount | FixedCamera] = [robot.camera or CameraMount() for robot in robots]
         mounts += fixed
@@ -525,6 +522,7 @@ class SightingConverter:
             bearing_gate=MODELS[BEARING].gate([model.gate_probability for model in models]),
             variance=np.square([(position, position, yaw) for position, yaw in sigmas]).reshape(-1, 3),
         )
+        # Markers by id: on whom, where, how large.
         owners = sorted(swarm.owner_of.items())
         markers = [owner.marker for _, owner in owners]
         number = {mark.id: k for k, mark in enumerate(swarm.landmarks)}

@@ -8,7 +8,7 @@ of arrival does not matter, and a lost matrix loses only its own information.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -22,9 +22,8 @@ from swarm_loc_estimator.common.messages.detections import decode_brightness
 from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, Measurements, concatenate, select
 from swarm_loc_estimator.filter.models import MODELS, POLAR
-from swarm_loc_estimator.infrared.closed_form import ClosedForm
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.search import IrEstimator, IrOutcome, IrSolutions
+from swarm_loc_estimator.infrared.search import IrOutcome, IrSolutions
 from swarm_loc_estimator.sensors.sensor import (
     NO_ROWS,
     REJECT_REASONS,
@@ -32,13 +31,8 @@ from swarm_loc_estimator.sensors.sensor import (
     Sensor,
     reject_reasons,
 )
-from swarm_loc_estimator.swarm.ir_board import IrMethod, IrPlatform, PairGains, RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-
-_METHODS: dict[IrMethod, Callable[[IrPlatform], IrEstimator]] = {
-    IrMethod.LIKELIHOOD: MaximumLikelihood,
-    IrMethod.CLOSED_FORM: ClosedForm,
-}
 
 
 class BrightnessRows(NamedTuple):
@@ -159,9 +153,9 @@ class _Exchange:
 
 
 @lru_cache(maxsize=64)
-def _estimator(platform: IrPlatform, method: IrMethod) -> IrEstimator:
-    """Estimator of a method for a board; cached, because its preparation is expensive."""
-    return _METHODS[method](platform)
+def _estimator(platform: IrPlatform) -> MaximumLikelihood:
+    """Estimator for a board; cached, because its preparation is expensive."""
+    return MaximumLikelihood(platform)
 
 
 class BrightnessConverter:
@@ -175,11 +169,12 @@ class BrightnessConverter:
         self._validator = MatrixScreening(swarm)
         self._ir = self._validator.boards
         self._gate = {robot: float(MODELS[POLAR].gate(ir.gate_probability)) for robot, ir in self._ir.items()}
+        self._gains = {robot: ir.believed_gains for robot, ir in self._ir.items()}
         self._dropped: Counter[str] = Counter()
         self._measured = 0
         self._exchanges: dict[ExchangeKey, _Exchange] = {}
         for ir in self._ir.values():
-            _estimator(ir.platform, ir.estimator)  # prepare now, so that the first message is not delayed
+            _estimator(ir.platform)  # prepare now, so that the first message is not delayed
 
     @property
     def drops(self) -> Counter[str]:
@@ -228,11 +223,10 @@ class BrightnessConverter:
         self._measured += sum(exchange.measurement.size for exchange in gone)
 
     def _alike(self, keys: Iterable[ExchangeKey]) -> Iterable[list[ExchangeKey]]:
-        """Group exchanges by board and estimator."""
-        groups: dict[IrEstimator, list[ExchangeKey]] = {}
+        """Group exchanges by board."""
+        groups: dict[MaximumLikelihood, list[ExchangeKey]] = {}
         for key in keys:
-            ir = self._ir[key.receiver]
-            groups.setdefault(_estimator(ir.platform, ir.estimator), []).append(key)
+            groups.setdefault(_estimator(self._ir[key.receiver].platform), []).append(key)
         return groups.values()
 
     def _solved(self, keys: list[ExchangeKey]) -> list[tuple[_Exchange, Measurements]]:
@@ -240,8 +234,8 @@ class BrightnessConverter:
         ir = self._ir[keys[0].receiver]
         exchanges = [self._exchanges[key] for key in keys]
         readings, limits = self._validator.together(keys[0].receiver, [one.readings for one in exchanges])
-        sides = [[self._ir[key[side]].believed_gains for key in keys] for side in (1, 2)]
-        solutions = _estimator(ir.platform, ir.estimator).solve(readings, PairGains.of(*sides), limits)
+        sides = [[self._gains[key[side]] for key in keys] for side in (1, 2)]
+        solutions = _estimator(ir.platform).solve(readings, PairGains.of(*sides), limits)
         measurements = self._measurements(keys, solutions)
         faults = reject_reasons(measurements)
         changed = []

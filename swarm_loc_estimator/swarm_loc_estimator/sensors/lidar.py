@@ -13,8 +13,7 @@ from swarm_loc_estimator.common.messages.cdr import LASER_SCAN
 from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, select
 from swarm_loc_estimator.filter.models import SCAN
-from swarm_loc_estimator.mapping.messages import decode_scan
-from swarm_loc_estimator.mapping.sweeps import LidarSweep, read_sweep
+from swarm_loc_estimator.mapping.messages import LidarSweep, decode_scan, read_sweep
 from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.sensors.sensor import NO_ROWS, Change, Sensor
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm

@@ -23,7 +23,7 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.cdr import CdrError, decode, nanoseconds
 from swarm_loc_estimator.common.messages.detections import SharedMessage
 from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, Messages
-from swarm_loc_estimator.common.small_matrix import cholesky3
+from swarm_loc_estimator.common.numerics import cholesky3
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, concatenate, select
 from swarm_loc_estimator.filter.models import MODELS, Prediction
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm

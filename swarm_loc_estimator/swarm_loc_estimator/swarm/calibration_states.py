@@ -101,9 +101,7 @@ class ParameterTable(NamedTuple):
             column[new] = self.filter_size + np.arange(new.sum())
             return self._replace(column=column)
         first = self.block_columns
-        begun = np.stack([new[:, block == _BLOCK].any(axis=1) for block in range(BLOCKS)], axis=1) & (
-            first < 0
-        )
+        begun = np.stack([new[:, k == _BLOCK].any(axis=1) for k in range(BLOCKS)], axis=1) & (first < 0)
         first[begun] = self.filter_size + DRIVES * np.arange(begun.sum())
         column[new] = (first[:, _BLOCK] + _SLOT)[new]
         return self._replace(column=column)

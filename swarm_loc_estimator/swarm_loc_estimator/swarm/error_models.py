@@ -13,7 +13,7 @@ from swarm_loc_estimator.common.parameters import number
 
 
 class MotionResponseError(ValueError):
-    """An inconsistent response; the message is one sentence."""
+    """An inconsistent response."""
 
 
 @dataclass(frozen=True)
@@ -66,12 +66,8 @@ class OdometryModel:
     """
 
     wheel_separation: float = number(0.053, "m", 0.001, 10.0, "distance between the two wheels")
-    wheel_noise: float = number(
-        2e-4, "m", 0.0, 1.0, "variance of each wheel's path per metre it rolls [m^2/m]"
-    )
-    distance_noise: float = number(
-        0.0, "m", 0.0, 1.0, "additional variance of the path per metre driven [m^2/m]"
-    )
+    wheel_noise: float = number(2e-4, "m", 0.0, 1.0, "variance of a wheel's path per metre it rolls [m^2/m]")
+    distance_noise: float = number(0.0, "m", 0.0, 1.0, "added variance of the path per metre driven [m^2/m]")
     distance_turn_noise: float = number(
         0.0, "m^2/rad", 0.0, 1.0, "additional variance of the path per radian turned"
     )
@@ -97,21 +93,15 @@ class OdometryModel:
     turn_bias_sigma: float = number(
         0.0, "rad/s", 0.0, 10.0, "standard deviation of the variable part of turn_bias, estimated; 0: none"
     )
-    turn_bias_time_s: float = number(
-        60.0, "s", 0.1, 1e6, "time constant of this variable part (Gauss-Markov)"
-    )
-    course_offset: float = number(
-        0.0, "rad", -math.pi, math.pi, "direction of motion against base_link's x axis"
-    )
+    turn_bias_time_s: float = number(60.0, "s", 0.1, 1e6, "time constant of that part (Gauss-Markov)")
+    course_offset: float = number(0.0, "rad", -math.pi, math.pi, "course relative to base_link's x axis")
     axle_offset: float = number(0.0, "m", -1.0, 1.0, "base_link ahead of the wheels' axle")
     delay_s: float = number(0.0, "s", -2.0, 2.0, "the motion happens this much after its stamp")
     lag_s: float = number(0.0, "s", 0.0, 10.0, "time constant with which the motion follows the report")
     timeout_s: float = number(1.0, "s", 0.01, 60.0, "time without messages after which the motion is unknown")
     max_speed: float = number(1.0, "m/s", 0.001, 100.0, "steps that imply more are dropped")
     max_turn_rate: float = number(10.0, "rad/s", 0.01, 1000.0, "steps that imply more are dropped")
-    speed_change: float = number(
-        0.1, "m/s/s^0.5", 0.0, 100.0, "random walk of the speed past the newest message"
-    )
+    speed_change: float = number(0.1, "m/s/s^0.5", 0.0, 100.0, "random walk of speed past the newest message")
     turn_rate_change: float = number(
         2.0, "rad/s/s^0.5", 0.0, 1000.0, "random walk of the turn rate past the newest message"
     )
@@ -136,9 +126,7 @@ class ImuModel:
     turn_bias_sigma: float = number(
         0.0, "rad/s", 0.0, 10.0, "standard deviation of the variable part of turn_bias, estimated; 0: none"
     )
-    turn_bias_time_s: float = number(
-        600.0, "s", 0.1, 1e6, "time constant of this variable part (Gauss-Markov)"
-    )
+    turn_bias_time_s: float = number(600.0, "s", 0.1, 1e6, "time constant of that part (Gauss-Markov)")
     roll: float = number(
         0.0,
         "rad",
@@ -172,7 +160,11 @@ class LidarModel:
         12.0, "m", 0.2, 50.0, "where range_max is greater or missing: space is free up to here", above=True
     )
     map_sigma: float = number(
-        0.02, "m", 0.0, 1.0, "error of the walls of the map in which it localizes, beside that of its cells"
+        0.02,
+        "m",
+        0.0,
+        1.0,
+        "error of the walls of the map for localization, in addition to that of its cells",
     )
 
     @property
@@ -229,19 +221,11 @@ class SensorModel:
     )
     heading_sigma: float = number(0.1, "rad", 0.0, 10.0, "noise of the marker's heading", above=True)
     residual_position_sigma: float = number(
-        0.0,
-        "m",
-        0.0,
-        10.0,
-        "additional error forward and left, such as of calibration",
+        0.0, "m", 0.0, 10.0, "additional error forward and left, such as of calibration"
     )
     residual_heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "additional error of the marker's heading")
-    range_sigma: float = number(
-        0.15, "m", 0.0, 10.0, "noise of the range, sightings without heading", above=True
-    )
-    range_sigma_per_m: float = number(
-        0.0, "1", 0.0, 10.0, "growth of the range noise with distance [m per m]"
-    )
+    range_sigma: float = number(0.15, "m", 0.0, 10.0, "noise of range, sightings without heading", above=True)
+    range_sigma_per_m: float = number(0.0, "1", 0.0, 10.0, "growth of range noise with distance [m per m]")
     bearing_sigma: float = number(
         0.05, "rad", 0.0, 10.0, "noise of the bearing, sightings without heading", above=True
     )
@@ -260,9 +244,7 @@ class SensorModel:
     bearing_offset: float = number(0.0, "rad", -TURN, TURN, "added to the scaled bearing")
     bearing_scale: float = number(1.0, "1", 0.1, 10.0, "true bearing per logged bearing")
     time_offset_s: float = number(0.0, "s", -2.0, 2.0, "exposure time minus stamp of the image")
-    time_sigma_s: float = number(
-        0.0, "s", 0.0, 2.0, "noise of the stamp of an image, common to its detections"
-    )
+    time_sigma_s: float = number(0.0, "s", 0.0, 2.0, "noise of an image's stamp, common to its detections")
     gate_probability: float = number(
         0.9999, "1", 0.5, 1.0, "share of good sightings that must pass the gate; 1 passes all"
     )
@@ -270,7 +252,7 @@ class SensorModel:
 
 @dataclass(frozen=True)
 class FixModel:
-    """Error model of a robot's absolute fixes, beside or in place of the covariance of each."""
+    """Error model of a robot's absolute fixes, in addition to or in place of the covariance of each."""
 
     systematic_share: float = number(
         0.0, "1", 0.0, 1.0, "share of a fix's variance that earlier fixes have, too; 1: fixes of a mapper"

@@ -1,33 +1,43 @@
-"""Infrared boards as data: arrangement, curves and errors of the elements.
+"""Infrared boards: arrangement, curves and errors of the elements, and their files.
 
 Sensor and emitter of the same number are side by side on a circle about the origin of base_link, both facing
 outwards. There are at least three of each.
 
-Response curves of sensors, emitters and distance: the models S, E and A of a board.
+The curves S of sensors and E of emitters over an angle are data, either pieces of sums of powers, as the
+Droplet paper prints (19) and (20), or a table. Both are sampled once into piecewise cubics with exact joints,
+which are fast to evaluate and have the exact one-sided slopes at a kink.
 
-Angle curves are data, either pieces of sums of powers, as the Droplet paper prints (19) and (20), or a table.
-Both are sampled once into piecewise cubics with exact joints, which are fast to evaluate and have the exact
-one-sided slopes at a kink.
+config/ir/*.yaml of this package show the format of a board's file. `IrSection` reads the section `ir` of a
+swarm description, a robot's board.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import numpy as np
 import scipy
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.parameters import number, number_specs
+from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number, number_specs, number_values
+from swarm_loc_estimator.common.yaml_tree import (
+    WHOLE_FILE,
+    Tree,
+    TreeChecks,
+    YamlTreeError,
+    read_tree,
+    shown,
+    write_tree,
+)
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
-from dataclasses import replace
-from enum import Enum
-from functools import cached_property
 
 _CELLS = 128  # Number of cubics per piece; the error for the curves of the Droplet is 2e-6
 _TABLE_CELLS = 720  # Number of cubics of a tabulated curve, which has no kinks: half a degree each
@@ -39,11 +49,7 @@ class IrPlatformError(ValueError):
 
 
 def check_numbers(holder: DataclassInstance, prefix: str = "") -> None:
-    """Check that the numbers of a dataclass lie in their declared ranges.
-
-    Raises:
-        IrPlatformError: A number is out of range.
-    """
+    """Raise IrPlatformError if a number of a dataclass is not in its declared range."""
     for name, spec in number_specs(type(holder)).items():
         value = getattr(holder, name)
         if not spec.allows(value):
@@ -100,15 +106,10 @@ class PowerCurve:
         edges = np.array([0.0, *(piece.below for piece in self.pieces)])
         half = [
             _cubics(*_powers(piece.terms, np.linspace(begin, piece.below, _CELLS + 1)), piece.below - begin)
-            for begin, piece in self._spans()
+            for begin, piece in zip(edges[:-1].tolist(), self.pieces, strict=True)
         ]
         mirror = [cubics[::-1] @ _BACKWARDS for cubics in half[::-1]]
         return CurveTable.of(np.concatenate([-edges[:0:-1], edges]), np.array([*mirror, *half]))
-
-    def _spans(self) -> list[tuple[float, PowerPiece]]:
-        """The start of each piece [rad], and the piece."""
-        begins = [0.0, *(piece.below for piece in self.pieces[:-1])]
-        return list(zip(begins, self.pieces, strict=True))
 
 
 @dataclass(frozen=True)
@@ -361,13 +362,12 @@ class IrGains:
                 f"gains have {len(self.sensor)} sensors and {len(self.emitter)} emitters"
                 " but must have as many of both."
             )
+        low, high = GAIN_RANGE
         for name in ("sensor", "emitter"):
-            for value in getattr(self, name):
-                low, high = GAIN_RANGE
-                if not low <= value <= high:
-                    raise IrPlatformError(
-                        f"gains.{name} has {value:g} but factors must lie in [{low:g}, {high:g}]."
-                    )
+            if wild := [value for value in getattr(self, name) if not low <= value <= high]:
+                raise IrPlatformError(
+                    f"gains.{name} has {wild[0]:g} but factors must lie in [{low:g}, {high:g}]."
+                )
         for name in ("dead_sensors", "dead_emitters"):
             if wrong := [k for k in getattr(self, name) if not 0 <= k < len(self.sensor)]:
                 raise IrPlatformError(
@@ -407,13 +407,6 @@ def _without(factors: FloatArray, dead: list[tuple[int, ...]]) -> FloatArray:
     return factors
 
 
-class IrMethod(Enum):
-    """Method to estimate a relative pose from brightness."""
-
-    LIKELIHOOD = "likelihood"  # maximum likelihood over all readings of all powers
-    CLOSED_FORM = "closed_form"  # eqs (9)-(18) of the Droplet paper, corrected
-
-
 @dataclass(frozen=True)
 class RobotIr:
     """The infrared board of one robot."""
@@ -421,7 +414,6 @@ class RobotIr:
     id: int  #: Id in its exchanges, 1 to 65535, unique in the swarm
     platform: IrPlatform  #: Model of the board
     source: str  #: Name of a packaged platform, or absolute path of its file
-    estimator: IrMethod = IrMethod.LIKELIHOOD  #: Method to estimate poses
     gains: IrGains | None = None  #: Calibrated gains of its elements; None: never calibrated
     dead_sensors: tuple[int, ...] = ()  #: Numbers of sensors to ignore
     dead_emitters: tuple[int, ...] = ()  #: Numbers of emitters to ignore
@@ -434,3 +426,242 @@ class RobotIr:
         """Gains of the description, or unknown gains, with the dead elements."""
         gains = self.gains or IrGains.unknown(self.platform)
         return replace(gains, dead_sensors=self.dead_sensors, dead_emitters=self.dead_emitters)
+
+
+_SECTION_NUMBERS = number_specs(RobotIr)
+DEAD = ("dead_sensors", "dead_emitters")
+_LAYER = ("platform", "gains", *DEAD, *_SECTION_NUMBERS)
+GAIN_LISTS = ("sensor", "emitter")
+_GAIN_NUMBERS = number_specs(IrGains)
+MAX_BOARD_ID = 2**16 - 1
+
+Values = dict[str, Any]
+
+
+class IrSection:
+    """Reads the section of one file.
+
+    Args:
+        checks: Checks of the file.
+        folder: Folder of the file, to which platform paths are relative.
+    """
+
+    def __init__(self, checks: TreeChecks, folder: Path) -> None:
+        self._checks = checks
+        self._folder = folder
+        self._platforms: dict[str, IrPlatform] = {}
+
+    def layer(self, tree: Tree, key: str, *, of_robot: bool) -> Values | None:
+        """The values of one layer (defaults, type or robot); only a robot has an id. None: no board."""
+        if tree is None:
+            return None
+        if isinstance(tree, dict) and "estimator" in tree:
+            raise self._checks.said(
+                f"{key}.estimator is no longer an option: poses are always estimated by likelihood; remove it"
+            )
+        mapping = self._checks.mapping(tree, key, ("id", *_LAYER) if of_robot else _LAYER)
+        readers: dict[str, Callable[[Tree, str], Any]] = {
+            "id": partial(self._checks.address, high=MAX_BOARD_ID),
+            "platform": self._platform,
+            "gains": self._gains,
+            **dict.fromkeys(DEAD, self._elements),
+        }
+        return {
+            name: readers[name](value, f"{key}.{name}")
+            if name in readers
+            else self._checks.number(value, f"{key}.{name}", _SECTION_NUMBERS[name])
+            for name, value in mapping.items()
+        }
+
+    def board(self, values: Values | None, key: str) -> RobotIr | None:
+        """The board of a robot from the merged values of its layers."""
+        if values is None or not values:
+            return None
+        if "platform" not in values:
+            raise self._checks.said(f"{key} lacks platform, the name of a packaged one or the path of a file")
+        if "id" not in values:
+            raise self._checks.said(f"{key} lacks id, a whole number in [1, {MAX_BOARD_ID}]")
+        source = values["platform"]
+        platform, gains = self._platforms[source], values.get("gains")
+        if gains is not None and len(gains.sensor) != platform.n:
+            raise self._checks.said(
+                f"{key}.gains has {len(gains.sensor)} sensors and emitters"
+                f" but must have the {platform.n} of its platform"
+            )
+        for name in DEAD:
+            if wrong := [k for k in values.get(name, ()) if k >= platform.n]:
+                raise self._checks.said(
+                    f"{key}.{name} has {wrong[0]} but elements are numbered 0 to {platform.n - 1}"
+                )
+        rest = {name: value for name, value in values.items() if name not in ("platform", "gains")}
+        return RobotIr(platform=platform, source=source, gains=gains, **rest)
+
+    def _platform(self, value: Tree, key: str) -> str:
+        """The source of a platform; also loads the platform."""
+        if not isinstance(value, str):
+            raise self._checks.error(key, value, "must be the name of a packaged one or the path of a file")
+        is_path = value.endswith((".yaml", ".yml"))
+        source = str((self._folder / value).resolve()) if is_path else value
+        try:
+            self._platforms[source] = self._platforms.get(source) or load_ir_platform(source)
+        except IrPlatformFileError as error:
+            raise self._checks.said(f"{key}: {str(error).removesuffix('.')}") from error
+        return source
+
+    def _elements(self, value: Tree, key: str) -> tuple[int, ...]:
+        numbers = self._checks.list_of_numbers(value, key)
+        if any(number != int(number) or number < 0 for number in numbers):
+            raise self._checks.error(key, value, "must be a list of numbers of elements, from 0 on")
+        return tuple(int(number) for number in numbers)
+
+    def _gains(self, tree: Tree, key: str) -> IrGains | None:
+        """Factors of all elements; null: never calibrated."""
+        if tree is None:
+            return None
+        mapping = self._checks.mapping(tree, key, required=GAIN_LISTS)
+        values: Values = {**self._checks.numbers(tree, key, _GAIN_NUMBERS, others=GAIN_LISTS)}
+        for name in GAIN_LISTS:
+            values[name] = self._checks.list_of_numbers(mapping[name], f"{key}.{name}")
+        try:
+            return IrGains(**values)
+        except IrPlatformError as error:
+            raise self._checks.said(f"{key.removesuffix('gains')}{str(error).removesuffix('.')}") from error
+
+
+FILE_VERSION = 1
+_FOLDER = Path(__file__).parents[1] / "config" / "ir"
+_NUMBERS = number_specs(IrPlatform)
+_PARTS = ("fileversion", "angles", "sensor", "emitter", "powers")
+_TABLE = ("angles", "values")
+_BELOW = NumberSpec("rad", 0.0, math.pi, True, "where the next piece begins")
+
+Made = TypeVar("Made")
+
+
+class IrPlatformFileError(UserError):
+    """An invalid platform file; the message is one sentence with file, key and value."""
+
+
+def packaged_platforms() -> tuple[str, ...]:
+    """Names of the platforms in this package."""
+    return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
+
+
+def load_ir_platform(name: str, folder: Path | None = None) -> IrPlatform:
+    """Read and check a platform.
+
+    Args:
+        name: Of a packaged platform, such as "droplet", or the path of a file (it ends in .yaml).
+        folder: Base of a relative path; None: the working folder.
+
+    Raises:
+        IrPlatformFileError: One sentence with file, key, value and what is allowed.
+    """
+    if name.endswith((".yaml", ".yml")):
+        path = (folder or Path()) / name
+    elif name in packaged_platforms():
+        path = _FOLDER / f"{name}.yaml"
+    else:
+        raise IrPlatformFileError(
+            f"{shown(name)} is no packaged infrared platform ({', '.join(packaged_platforms())})"
+            " and no path of a .yaml file."
+        )
+    try:
+        return _Reader(path, IrPlatformFileError).platform(read_tree(path))
+    except YamlTreeError as error:
+        raise IrPlatformFileError(str(error)) from error
+
+
+def save_ir_platform(platform: IrPlatform, path: Path, comment: str = "") -> None:
+    """Write a board that `load_ir_platform` reads back equal.
+
+    Args:
+        platform: Board to write.
+        path: The file; replaced when it exists, its folder created when missing.
+        comment: Comment lines for the top of the file.
+    """
+    laws = dict(zip(platform.powers, platform.amplitudes, strict=True))
+    tree = {
+        "fileversion": FILE_VERSION,
+        "angles": list(platform.angles),
+        "sensor": _curve_tree(platform.sensor),
+        "emitter": _curve_tree(platform.emitter),
+        "powers": {name: number_values(law) for name, law in laws.items()},
+        **number_values(platform),
+    }
+    write_tree(tree, path, comment.splitlines())
+
+
+class _Reader(TreeChecks):
+    """Converts the tree of one file to a platform, and checks it."""
+
+    def platform(self, tree: Tree) -> IrPlatform:
+        """The whole file."""
+        keys = self.mapping(tree, WHOLE_FILE, (*_PARTS, *_NUMBERS), _PARTS)
+        if keys["fileversion"] != FILE_VERSION or isinstance(keys["fileversion"], bool):
+            raise self.error("fileversion", keys["fileversion"], f"must be {FILE_VERSION}")
+        return self._made(
+            "",
+            IrPlatform,
+            angles=self.list_of_numbers(keys["angles"], "angles"),
+            sensor=self._curve(keys["sensor"], "sensor"),
+            emitter=self._curve(keys["emitter"], "emitter"),
+            amplitudes=self._amplitudes(keys["powers"]),
+            **{name: self.number(keys[name], name, spec) for name, spec in _NUMBERS.items() if name in keys},
+        )
+
+    def _curve(self, tree: Tree, key: str) -> AngleCurve:
+        """S or E, as pieces or as a table."""
+        keys = self.mapping(tree, key, ("pieces", "angles", "values"))
+        if "pieces" not in keys:
+            self.mapping(tree, key, required=_TABLE)
+            lists = {name: self.list_of_numbers(keys[name], f"{key}.{name}") for name in _TABLE}
+            return self._made(f"{key}.", TabulatedCurve, **lists)
+        self.mapping(tree, key, ("pieces",))
+        *inner, last = self.items(keys["pieces"], f"{key}.pieces") or [None]
+        pieces = [self._piece(piece, f"{key}.pieces[{k}]") for k, piece in enumerate(inner)]
+        pieces.append(self._piece(last, f"{key}.pieces[{len(inner)}]", below=math.pi))
+        return self._made(f"{key}.", PowerCurve, pieces=tuple(pieces))
+
+    def _piece(self, tree: Tree, key: str, below: float | None = None) -> PowerPiece:
+        """One sum of powers; `below` is where the last one ends."""
+        known = ("terms",) if below is not None else ("below", "terms")
+        keys = self.mapping(tree, key, known, known)
+        terms = []
+        for k, item in enumerate(self.items(keys["terms"], f"{key}.terms")):
+            term = self.list_of_numbers(item, f"{key}.terms[{k}]")
+            if len(term) != 2:
+                raise self.error(f"{key}.terms[{k}]", item, "must be [coefficient, exponent]")
+            terms.append((term[0], term[1]))
+        if below is None:
+            below = self.number(keys["below"], f"{key}.below", _BELOW)
+        return PowerPiece(below or 0.0, tuple(terms))
+
+    def _amplitudes(self, tree: Tree) -> tuple[Amplitude, ...]:
+        keys = self.mapping(tree, "powers", POWERS, POWERS[:1])
+        specs = number_specs(Amplitude)
+        return tuple(
+            self._made(
+                f"powers.{name}.",
+                Amplitude,
+                **self.numbers(keys[name], f"powers.{name}", specs, required=("scale",)),
+            )
+            for name in POWERS[: len(keys)]
+        )
+
+    def _made(self, prefix: str, cls: Callable[..., Made], **arguments: Any) -> Made:
+        """Create an object; add file and key to the message of its error."""
+        try:
+            return cls(**arguments)
+        except IrPlatformError as error:
+            raise IrPlatformFileError(f"{self._path}: {prefix}{error}") from error
+
+
+def _curve_tree(curve: TabulatedCurve | PowerCurve) -> dict[str, object]:
+    if isinstance(curve, TabulatedCurve):
+        return {"angles": list(curve.angles), "values": list(curve.values)}
+    pieces: list[dict[str, object]] = [
+        {"below": piece.below, "terms": [list(term) for term in piece.terms]} for piece in curve.pieces
+    ]
+    del pieces[-1]["below"]
+    return {"pieces": pieces}

@@ -7,13 +7,14 @@ from dataclasses import fields
 from typing import Any
 
 from swarm_loc_estimator.common.parameters import NumberSpec, number_specs
-from swarm_loc_estimator.swarm.board_file import MAX_BOARD_ID, packaged_platforms
-from swarm_loc_estimator.swarm.ir_board import GAIN_RANGE, IrGains, IrMethod, RobotIr
-from swarm_loc_estimator.swarm.swarm import MAX_ADDRESS, Anchor, Face, FixedCamera, Landmark, UwbDevice
+from swarm_loc_estimator.common.yaml_tree import hexadecimal
+from swarm_loc_estimator.swarm.ir_board import GAIN_RANGE, MAX_BOARD_ID, IrGains, RobotIr, packaged_platforms
+from swarm_loc_estimator.swarm.swarm import Anchor, Face, FixedCamera, Landmark, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import (
     FILE_VERSION,
     LANDMARK_DEFAULTS,
     LAYER,
+    MAX_ADDRESS,
     MAX_ID,
     MAX_NAME,
     MAX_ROBOTS,
@@ -24,13 +25,9 @@ from swarm_loc_estimator.swarm.swarm_file import (
     RESPONSE,
     START,
 )
-from swarm_loc_estimator.swarm.tree_checks import hexadecimal
-
-SCHEMA_FILE = "swarm.schema.json"  # Name of the schema beside a description
-SCHEMA_COMMENT = f"yaml-language-server: $schema={SCHEMA_FILE}"
-"""First comment of a description, by which editors find the schema."""
 
 Schema = dict[str, Any]
+_PATTERN = f"^{NAME.pattern}$"  # Of names
 
 
 def schema_text() -> str:
@@ -43,6 +40,7 @@ def swarm_schema() -> Schema:
 
     Those are that marker ids are unique, that types and faces exist, and the sizes of tables.
     """
+    # a robot
     radio = _address(MAX_ADDRESS, "address in messages")
     of_robot = {name: {"$ref": f"#/definitions/{name}"} for name in LAYER}
     robot = {
@@ -52,9 +50,10 @@ def swarm_schema() -> Schema:
             "infrared board; null: none", {"id": _address(MAX_BOARD_ID, "id in exchanges"), **_board()}
         ),
         "uwb": _section("radio; null: none", {"address": radio, **_of_class(UwbDevice)}),
-        "ids": _section("marker id of each face", named={_pattern(): _whole(0, MAX_ID, "marker id")}),
+        "ids": _section("marker id of each face", named={_PATTERN: _whole(0, MAX_ID, "marker id")}),
         "start": _section("start pose in map; null: unknown", _numbers(START), required=list(START)),
     }
+    # what is fixed in map
     landmark = _section("marker with a fixed pose", _of_class(Landmark), required=["x", "y"])
     landmark["type"] = "object"
     shared = _section("what landmarks have where they say nothing else", _numbers(LANDMARK_DEFAULTS))
@@ -63,6 +62,7 @@ def swarm_schema() -> Schema:
     anchor = {"address": radio, **_of_class(Anchor)}
     anchor = _section("radio at a fixed place", anchor, required=["address", "x", "y"])
     camera["type"] = anchor["type"] = "object"
+    # the whole file
     names = {"maxLength": MAX_NAME}
     free_names = {**names, "not": {"enum": sorted(RESERVED_NAMES)}}
     return {
@@ -78,21 +78,18 @@ def swarm_schema() -> Schema:
                 {**of_robot, "landmark": shared},
             ),
             "types": {
-                **_section("types of robots", named={_pattern(): _section("a type", of_robot)}),
+                **_section("types of robots", named={_PATTERN: _section("a type", of_robot)}),
                 "propertyNames": names,
             },
             "robots": {
-                **_section("the robots", named={_pattern(): _section("a robot", robot)}),
+                **_section("the robots", named={_PATTERN: _section("a robot", robot)}),
                 "type": "object",
                 "minProperties": 1,
                 "maxProperties": MAX_ROBOTS,
                 "propertyNames": free_names,
             },
             "landmarks": _section("static markers, by marker id", named={"^[0-9]+$": landmark}),
-            "cameras": {
-                **_section("fixed cameras", named={_pattern(): camera}),
-                "propertyNames": free_names,
-            },
+            "cameras": {**_section("fixed cameras", named={_PATTERN: camera}), "propertyNames": free_names},
             "anchors": {"type": ["array", "null"], "items": anchor, "description": "fixed radios"},
             "map": {"type": ["string", "null"], "minLength": 1, "description": "map's .yaml; null: none"},
         },
@@ -104,21 +101,17 @@ def _other_sections() -> Schema:
     """Sections that are not only numbers."""
     numbers = {"type": "array", "items": {"type": "number"}}
     lists = dict(zip(RESPONSE, (numbers, numbers, *[{"type": "array", "items": numbers}] * 2), strict=True))
+    lies = {"type": "boolean", "description": "lies flat and looks up", "default": False}
+    face = _section("a marker", {**_of_class(Face), "lies": lies})
     return {
         "response": _section("ratios of true to reported motion", lists, required=list(RESPONSE)),
         "faces": {
-            **_section("markers on the body", named={_pattern(): _section("a marker", _face())}),
+            **_section("markers on the body", named={_PATTERN: face}),
             "propertyNames": {"maxLength": MAX_NAME},
         },
         "ir": _section("infrared board; null: none", _board()),
         "uwb": _section("radio; null: none", _of_class(UwbDevice)),
     }
-
-
-def _face() -> Schema:
-    """The entries of a marker on a robot."""
-    lies = {"type": "boolean", "description": "lies flat and looks up", "default": False}
-    return {**_of_class(Face), "lies": lies}
 
 
 def _address(high: int, said: str) -> Schema:
@@ -127,7 +120,6 @@ def _address(high: int, said: str) -> Schema:
 
 
 def _model(name: str) -> Schema:
-    """A section of numbers."""
     first = (MODELS[name].__doc__ or "").partition("\n")[0].rstrip(".")
     none = "; null: none" if name in MAY_BE_NONE else ""
     return _section(f"{first}{none}", _of_class(MODELS[name]))
@@ -142,16 +134,11 @@ def _board() -> Schema:
     platforms = f"one of {', '.join(packaged_platforms())}, or the path of a file"
     return {
         "platform": {"type": "string", "description": platforms},
-        "estimator": {"enum": [method.value for method in IrMethod]},
         "gains": _section("factors of the elements", gains, required=["sensor", "emitter"]),
         "dead_sensors": {**elements, "description": "sensors to ignore"},
         "dead_emitters": {**elements, "description": "emitters to ignore"},
         **_of_class(RobotIr),
     }
-
-
-def _pattern() -> str:
-    return f"^{NAME.pattern}$"
 
 
 def _section(
@@ -178,7 +165,6 @@ def _of_class(cls: type) -> Schema:
 
 
 def _numbers(specs: dict[str, NumberSpec]) -> Schema:
-    """Numbers with range, unit and meaning."""
     return {
         name: {
             "type": ["number", "null"] if spec.optional else "number",

@@ -3,20 +3,19 @@
 All classes are immutable; units are SI and radians. Each number has its default, unit and allowed range in
 one table for the reader of `swarm.yaml`, the documentation and the calibration; a new parameter is one line
 in one of these classes.
-
-UWB radios: devices on robots, anchors in `map`, and their sections of a swarm description.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from swarm_loc_estimator.common.parameters import number, number_specs
-from swarm_loc_estimator.common.yaml_tree import Tree
+from swarm_loc_estimator.common.parameters import number
 from swarm_loc_estimator.swarm.error_models import (
     TURN,
     ClockModel,
@@ -27,12 +26,8 @@ from swarm_loc_estimator.swarm.error_models import (
     RandomWalk,
     SensorModel,
 )
-from swarm_loc_estimator.swarm.tree_checks import TreeChecks
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
     from swarm_loc_estimator.swarm.error_models import MotionResponse
     from swarm_loc_estimator.swarm.ir_board import RobotIr
 
@@ -73,43 +68,6 @@ class Anchor:
         0.0, "m", 0.0, 100.0, "standard deviation of x and y; 0: exact, else estimated with the poses"
     )
     range_bias: float = number(0.0, "m", -10.0, 10.0, "added to each range to this anchor")
-
-
-MAX_ADDRESS = 2**64 - 1
-_ADDRESS = ("address",)
-_DEVICE, _ANCHOR = number_specs(UwbDevice), number_specs(Anchor)
-
-Values = dict[str, Any]
-
-
-def uwb_layer(checks: TreeChecks, tree: Tree, key: str, *, of_robot: bool) -> Values | None:
-    """The section `uwb` of one layer; only a robot has an address. None: no radio."""
-    if tree is None:
-        return None
-    values: Values = {**checks.numbers(tree, key, _DEVICE, others=_ADDRESS if of_robot else ())}
-    return values if "address" not in tree else {**values, **_address(checks, tree, key)}
-
-
-def uwb_device(checks: TreeChecks, values: Values | None, key: str) -> UwbDevice | None:
-    """The radio of a robot from the merged values of its layers."""
-    return UwbDevice(**{**values, **_address(checks, values, key)}) if values else None
-
-
-def read_anchors(checks: TreeChecks, tree: Tree) -> tuple[Anchor, ...]:
-    """The section `anchors`."""
-    anchors = []
-    for index, entry in enumerate(checks.items([] if tree is None else tree, "anchors")):
-        key = f"anchors[{index}]"
-        numbers: Values = {**checks.numbers(entry, key, _ANCHOR, ("x", "y"), _ADDRESS)}
-        anchors.append(Anchor(**numbers, **_address(checks, entry, key)))
-    return tuple(anchors)
-
-
-def _address(checks: TreeChecks, tree: Values, key: str) -> Values:
-    """The address of a section, which must be there."""
-    if "address" not in tree:
-        raise checks.said(f"{key} lacks address, a whole number in [1, {MAX_ADDRESS}]")
-    return {"address": checks.address(tree["address"], f"{key}.address", MAX_ADDRESS)}
 
 
 Pose2 = tuple[float, float, float]  # x [m], y [m], heading [rad]
@@ -253,7 +211,7 @@ class MarkerOwner:
 
 
 class SwarmError(ValueError):
-    """An inconsistent swarm; the message is one sentence."""
+    """An inconsistent swarm."""
 
 
 @dataclass(frozen=True)
@@ -275,9 +233,7 @@ class Swarm:
         names = Counter(one.name for one in self.sources)
         if twice := [name for name, count in names.items() if count > 1]:
             raise SwarmError(f"name '{twice[0]}' is given to two robots or cameras; names must be unique.")
-        faces = [
-            (f"face '{face.name}' of robot '{r.name}'", face.id) for r in self.robots for face in r.faces
-        ]
+        faces = [(f"face '{f.name}' of robot '{r.name}'", f.id) for r in self.robots for f in r.faces]
         marks = [(f"landmark {mark.id}", mark.id) for mark in self.landmarks]
         boards = [(f"robot '{r.name}'", r.ir.id) for r in self.robots if r.ir is not None]
         radios = [(f"robot '{r.name}'", r.uwb.address) for r in self.robots if r.uwb is not None]

@@ -1,4 +1,4 @@
-"""Reader of swarm descriptions: `swarm.yaml` to `Swarm`.
+"""Swarm descriptions: read `swarm.yaml` to a `Swarm`, and write one.
 
 ```yaml
 fileversion: 1
@@ -24,7 +24,6 @@ types:
     camera: null
     ir:                                     # its infrared board; null: it has none
       platform: droplet                     # a packaged one, or the path of a file, from here
-      estimator: likelihood                 # or closed_form
 robots:
   epuck1:                 # the same keys; what is not said comes from its type
     type: epuck
@@ -44,18 +43,29 @@ anchors:                  # UWB radios, see doc/uwb.md
 map: floor.yaml           # walls that lidars see, as of map_server, from here; null or left out: none
 ```
 Numbers, units, ranges and defaults are those of the classes in `swarm/swarm.py`.
+When a description is written, values common to all robots of a type are written with the type.
 """
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+import textwrap
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import asdict, dataclass
+from os.path import relpath
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from swarm_loc_estimator.common.parameters import UserError, number_specs
-from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
-from swarm_loc_estimator.swarm.board_file import IrSection, Values
+from swarm_loc_estimator.common.parameters import UserError, number_specs, number_values
+from swarm_loc_estimator.common.yaml_tree import (
+    Numbers,
+    Tree,
+    TreeChecks,
+    YamlTreeError,
+    nearest,
+    read_tree,
+    write_tree,
+)
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import (
     ClockModel,
@@ -68,26 +78,24 @@ from swarm_loc_estimator.swarm.error_models import (
     RandomWalk,
     SensorModel,
 )
+from swarm_loc_estimator.swarm.ir_board import DEAD, GAIN_LISTS, IrSection, RobotIr, Values
 from swarm_loc_estimator.swarm.swarm import (
+    Anchor,
     CameraMount,
     Face,
     FixedCamera,
     Landmark,
-    Pose2,
     Robot,
     StartSigma,
     Swarm,
     SwarmError,
-    read_anchors,
-    uwb_device,
-    uwb_layer,
+    UwbDevice,
 )
-from swarm_loc_estimator.swarm.tree_checks import Numbers, TreeChecks, nearest
-
-if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Mapping
 
 FILE_VERSION = 1
+SCHEMA_FILE = "swarm.schema.json"  # Name of the schema next to a description
+SCHEMA_COMMENT = f"yaml-language-server: $schema={SCHEMA_FILE}"
+"""First comment of a description, by which editors find the schema."""
 
 _SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors", "map")
 LAYER = (
@@ -115,32 +123,18 @@ START = {
 }
 LANDMARK_DEFAULTS = {name: number_specs(Landmark)[name] for name in ("size", "position_sigma", "yaw_sigma")}
 RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
-MAX_ID = 2**32 - 1
+MAX_ID, MAX_ADDRESS = 2**32 - 1, 2**64 - 1
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 MAX_NAME = 64  # Maximum length of a robot name; DDS limits the length of topic names
-RESERVED_NAMES = frozenset(
-    [
-        "aerial",
-        "clock",
-        "diagnostics",
-        "estimator",
-        "map",
-        "mapper",
-        "odom",
-        "parameter_events",
-        "player",
-        "rosout",
-        "swarm",
-        "tf",
-        "tf_static",
-        "visitation",
-        "watch",
-    ]
+_RESERVED = (
+    *("aerial", "clock", "diagnostics", "estimator", "map", "mapper", "odom", "parameter_events"),
+    *("player", "rosout", "swarm", "tf", "tf_static", "visitation", "watch"),
 )
+RESERVED_NAMES = frozenset(_RESERVED)
 """Names of topics, nodes and frames that a robot's namespace must not collide with."""
 MAX_ROBOTS = 5000  # Maximum number of robots; larger swarms have not been tested
 MAX_PARAMETERS = 10_000
-"""Maximum number of states beside the poses; the dense filter's covariance then has 800 MB per checkpoint."""
+"""Maximum number of states but the poses; the dense filter's covariance then has 800 MB per checkpoint."""
 
 
 class SwarmFileError(UserError):
@@ -192,6 +186,7 @@ class _Loader(TreeChecks):
         version = sections.get("fileversion")
         if version != FILE_VERSION or isinstance(version, bool):
             raise self.error("fileversion", version, f"must be {FILE_VERSION}")
+        # what robots have in common, then the robots
         defaults = self._layer(sections.get("defaults", {}), "defaults", _DEFAULTS)
         types = {
             name: self._layer(tree, f"types.{name}", LAYER)
@@ -203,12 +198,18 @@ class _Loader(TreeChecks):
         if len(named) > MAX_ROBOTS:
             raise self.said(f"robots names {len(named)} robots but must name at most {MAX_ROBOTS}")
         robots = tuple(self._robot(name, tree, defaults, types) for name, tree in named)
+        # what is fixed in map
         landmarks = self._landmarks(sections.get("landmarks", {}), sections.get("defaults", {}))
         fixed = self._named(sections.get("cameras", {}), "cameras")
         cameras = tuple(self._fixed_camera(name, tree) for name, tree in fixed)
-        anchors = read_anchors(self, sections.get("anchors"))
+        anchors = self._anchors(sections.get("anchors"))
+        name = sections.get("map")
+        if name is not None and (not isinstance(name, str) or not name):
+            raise self.error("map", name, "must be the path of a map's .yaml file, from here")
+        file = None if name is None else (self._folder / name).resolve()
+        # the swarm as a whole
         try:
-            swarm = Swarm(robots, landmarks, cameras, anchors, self._map(sections.get("map")))
+            swarm = Swarm(robots, landmarks, cameras, anchors, file)
         except SwarmError as error:
             raise self.said(str(error).removesuffix(".")) from error
         states = ParameterTable.of(swarm.robots, swarm.surveyed).filter_size - 3 * len(robots)
@@ -218,12 +219,6 @@ class _Loader(TreeChecks):
                 f" but must make at most {MAX_PARAMETERS}"
             )
         return swarm
-
-    def _map(self, name: Tree) -> Path | None:
-        """Parse the path of a map."""
-        if name is not None and (not isinstance(name, str) or not name):
-            raise self.error("map", name, "must be the path of a map's .yaml file, from here")
-        return None if name is None else (self._folder / name).resolve()
 
     def _robot(self, name: str, tree: Tree, defaults: _Layer, types: Mapping[str, _Layer]) -> Robot:
         """Parse one robot from its three layers."""
@@ -239,20 +234,23 @@ class _Loader(TreeChecks):
             section: None if (values := sections[section]) is None else cls(**values)
             for section, cls in MODELS.items()
         }
+        uwb, start = sections["uwb"], mapping.get("start")
+        if start is not None:  # else it is unknown
+            pose = self.numbers(start, f"{key}.start", START, required=tuple(START))
+            start = tuple(float(pose[axis] or 0.0) for axis in START)
         return Robot(
             name=name,
             type=type_name or "",
             response=next((layer.response for layer in reversed(layers) if layer.says_response), None),
             faces=self._faces(key, layers, mapping.get("ids", {})),
-            start=self._start(mapping.get("start"), f"{key}.start"),
+            start=start,
             stands=models["odometry"] is None,
             ir=self._ir.board(sections["ir"], f"{key}.ir"),
-            uwb=uwb_device(self, sections["uwb"], f"{key}.uwb"),
+            uwb=UwbDevice(**{**uwb, **self._address(uwb, f"{key}.uwb")}) if uwb else None,
             **{**models, "odometry": models["odometry"] or OdometryModel()},
         )
 
     def _layer(self, tree: Tree, key: str, known: Collection[str], *, of_robot: bool = False) -> _Layer:
-        """Parse the settings of one layer."""
         mapping = self.mapping(tree, key, known)
         sections: dict[str, Values | None] = {
             section: None
@@ -264,7 +262,7 @@ class _Loader(TreeChecks):
         if "ir" in mapping:
             sections["ir"] = self._ir.layer(mapping["ir"], f"{key}.ir", of_robot=of_robot)
         if "uwb" in mapping:
-            sections["uwb"] = uwb_layer(self, mapping["uwb"], f"{key}.uwb", of_robot=of_robot)
+            sections["uwb"] = self._radio(mapping["uwb"], f"{key}.uwb", of_robot=of_robot)
         faces = self._named(mapping.get("faces", {}), f"{key}.faces")
         return _Layer(
             sections,
@@ -273,8 +271,29 @@ class _Loader(TreeChecks):
             {name: None if face is None else self._face(face, f"{key}.faces.{name}") for name, face in faces},
         )
 
+    def _radio(self, tree: Tree, key: str, *, of_robot: bool) -> Values | None:
+        """Parse the radio of one layer; only a robot has an address. None: no radio."""
+        if tree is None:
+            return None
+        others = ("address",) if of_robot else ()
+        values: Values = {**self.numbers(tree, key, number_specs(UwbDevice), others=others)}
+        return values if "address" not in tree else {**values, **self._address(tree, key)}
+
+    def _anchors(self, tree: Tree) -> tuple[Anchor, ...]:
+        anchors, specs = [], number_specs(Anchor)
+        for index, entry in enumerate(self.items([] if tree is None else tree, "anchors")):
+            key = f"anchors[{index}]"
+            numbers: Values = {**self.numbers(entry, key, specs, ("x", "y"), ("address",))}
+            anchors.append(Anchor(**numbers, **self._address(entry, key)))
+        return tuple(anchors)
+
+    def _address(self, tree: Values, key: str) -> Values:
+        """Parse the address of a radio, which must be there."""
+        if "address" not in tree:
+            raise self.said(f"{key} lacks address, a whole number in [1, {MAX_ADDRESS}]")
+        return {"address": self.address(tree["address"], f"{key}.address", MAX_ADDRESS)}
+
     def _face(self, tree: Tree, key: str) -> Numbers:
-        """Parse the place of a marker on a robot."""
         specs = number_specs(Face)
         place = self.numbers(tree, key, specs, others=("lies",))
         if "lies" in self.mapping(tree, key):
@@ -284,7 +303,6 @@ class _Loader(TreeChecks):
         return place
 
     def _fixed_camera(self, name: str, tree: Tree) -> FixedCamera:
-        """Parse one fixed camera."""
         key, specs = f"cameras.{name}", number_specs(FixedCamera)
         pose: Any = self.numbers(tree, key, specs, ("x", "y", "z"), ("sensor",))
         sensor: Any = self.numbers(tree.get("sensor"), f"{key}.sensor", number_specs(SensorModel))
@@ -298,20 +316,12 @@ class _Loader(TreeChecks):
         for name in RESPONSE:
             if name not in mapping:
                 raise self.said(f"{key} lacks {name}, a list of numbers")
-        axes = {
-            name: self.list_of_numbers(mapping[name], f"{key}.{name}") for name in ("speeds", "turn_rates")
-        }
-        tables = {
-            name: tuple(
-                self.list_of_numbers(row, f"{key}.{name}[{index}]")
-                for index, row in enumerate(self.items(mapping[name], f"{key}.{name}"))
-            )
-            for name in ("speed_share", "turn_share")
-        }
+        lists: Values = {name: self.list_of_numbers(mapping[name], f"{key}.{name}") for name in RESPONSE[:2]}
+        for name in RESPONSE[2:]:
+            rows = enumerate(self.items(mapping[name], f"{key}.{name}"))
+            lists[name] = tuple(self.list_of_numbers(row, f"{key}.{name}[{index}]") for index, row in rows)
         try:
-            return MotionResponse(
-                axes["speeds"], axes["turn_rates"], tables["speed_share"], tables["turn_share"]
-            )
+            return MotionResponse(**lists)
         except MotionResponseError as error:
             raise self.said(f"{key.removesuffix('response')}{error}".removesuffix(".")) from error
 
@@ -336,7 +346,6 @@ class _Loader(TreeChecks):
         )
 
     def _landmarks(self, tree: Tree, defaults: Tree) -> tuple[Landmark, ...]:
-        """Parse all landmarks, in the order of the file."""
         shared_tree = self.mapping(defaults, "defaults").get("landmark", {})
         shared = self.numbers(shared_tree, "defaults.landmark", LANDMARK_DEFAULTS)
         result = []
@@ -346,15 +355,7 @@ class _Loader(TreeChecks):
             result.append(Landmark(self._marker_id(number, key), **{**shared, **numbers}))  # type: ignore[arg-type]
         return tuple(result)
 
-    def _start(self, tree: Tree, key: str) -> Pose2 | None:
-        """Parse a start pose; None if it is unknown."""
-        if tree is None:
-            return None
-        numbers = self.numbers(tree, key, START, required=tuple(START))
-        return (float(numbers["x"] or 0.0), float(numbers["y"] or 0.0), float(numbers["theta"] or 0.0))
-
     def _marker_id(self, value: Tree, key: str) -> int:
-        """Parse a marker id."""
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
             raise self.error(key, value, f"must be a marker id, a whole number in [0, {MAX_ID}]")
         return value
@@ -364,17 +365,13 @@ class _Loader(TreeChecks):
         mapping = self.mapping(tree, key)
         for name in mapping:
             if not isinstance(name, str) or not NAME.fullmatch(name):
-                raise self.error(
-                    f"a name in {key}",
-                    name,
-                    "must be letters, digits and underscores and start with a letter",
-                )
+                rule = "must be letters, digits and underscores and start with a letter"
+                raise self.error(f"a name in {key}", name, rule)
             if len(name) > MAX_NAME:
                 raise self.error(f"a name in {key}", name, f"must have at most {MAX_NAME} characters")
             if key in ("robots", "cameras") and name in RESERVED_NAMES:
-                rule = ", ".join(sorted(RESERVED_NAMES))
-                rule = f"must be none of {rule}, which topics, nodes and frames have"
-                raise self.error(f"a name in {key}", name, rule)
+                rule = f"must be none of {', '.join(sorted(RESERVED_NAMES))}"
+                raise self.error(f"a name in {key}", name, f"{rule}, which topics, nodes and frames have")
         return list(mapping.items())
 
 
@@ -386,3 +383,147 @@ def _said(layers: Iterable[_Layer], section: str) -> Values | None:
             said = layer.sections[section]
             values = None if said is None else {**(values or {}), **said}
     return values
+
+
+_WHOLE = frozenset({"camera", "faces", "response"})
+Entries = dict[Any, Any]
+
+
+def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
+    """Write a swarm description that `load_swarm` reads back equal.
+
+    Its first line names the JSON Schema if that lies next to it, so that editors complete its keys.
+
+    Args:
+        swarm: What to write.
+        path: The file; replaced when it exists, its folder created when missing.
+        comment: Comment lines for the top of the file.
+
+    Raises:
+        SwarmFileError: It has numbers that `load_swarm` refuses; nothing is written.
+    """
+    path = Path(path)
+    tree = _tree(swarm, path.parent)
+    parse_swarm(tree, path)
+    schema = [SCHEMA_COMMENT] if (path.parent / SCHEMA_FILE).is_file() else []
+    write_tree(tree, path, [*schema, *comment.splitlines(), *_units()])
+
+
+def _units() -> list[str]:
+    """One comment per group of numbers, with the unit of each."""
+    groups = {**MODELS, "uwb": UwbDevice, "faces": Face, "landmarks": Landmark}
+    groups |= {"cameras": FixedCamera, "anchors": Anchor}
+    lines = ["Units:"]
+    for name, cls in groups.items():
+        units = ", ".join(f"{key} [{spec.unit}]" for key, spec in number_specs(cls).items())
+        lines += textwrap.wrap(f"{name}: {units}", 100, initial_indent="  ", subsequent_indent="      ")
+    return lines
+
+
+def _tree(swarm: Swarm, folder: Path) -> Entries:
+    types: Entries = {}
+    for robot in swarm.robots:
+        if robot.type and robot.type not in types:
+            alike = [_layer(other, folder) for other in swarm.robots if other.type == robot.type]
+            types[robot.type] = _shared(alike)
+    robots = {robot.name: _robot(robot, types.get(robot.type, {}), folder) for robot in swarm.robots}
+    landmarks = {mark.id: _numbers(mark, keep=("x", "y")) for mark in swarm.landmarks}
+    defaults = _taken_out(LANDMARK_DEFAULTS, list(landmarks.values()))
+    anchors = [{"address": one.address, **_numbers(one, keep=("x", "y"))} for one in swarm.anchors]
+    cameras = {one.name: _numbers(one, keep=("x", "y", "z")) for one in swarm.cameras}
+    for one in swarm.cameras:
+        if sensor := _numbers(one.sensor):
+            cameras[one.name]["sensor"] = sensor
+    tree = {
+        "fileversion": FILE_VERSION,
+        "defaults": {"landmark": defaults} if defaults else {},
+        "types": types,
+        "robots": robots,
+        "landmarks": landmarks,
+        "cameras": cameras,
+        "anchors": anchors,
+        "map": None if swarm.map is None else relpath(swarm.map, folder),
+    }
+    return {key: value for key, value in tree.items() if value}
+
+
+def _taken_out(names: Iterable[str], entries: list[Entries]) -> Entries:
+    """Those of the named values that all entries share, taken out of them."""
+    shared = {name: entries[0][name] for name in names if entries and name in entries[0]}
+    shared = {name: value for name, value in shared.items() if all(e.get(name) == value for e in entries)}
+    for entry in entries:
+        for name in shared:
+            del entry[name]
+    return shared
+
+
+def _numbers(model: Any, keep: tuple[str, ...] = ()) -> Entries:
+    """The numbers of a dataclass that differ from its defaults."""
+    fields = type(model).__dataclass_fields__
+    return {n: v for n, v in number_values(model).items() if v != fields[n].default or n in keep}
+
+
+def _board(ir: RobotIr, folder: Path) -> Entries:
+    """An infrared board without its id."""
+    is_path = Path(ir.source).is_absolute()
+    board: Entries = {"platform": relpath(ir.source, folder.resolve()) if is_path else ir.source}
+    if ir.gains is not None:
+        board["gains"] = {name: list(getattr(ir.gains, name)) for name in GAIN_LISTS} | _numbers(ir.gains)
+    return board | {name: list(getattr(ir, name)) for name in DEAD if getattr(ir, name)} | _numbers(ir)
+
+
+def _layer(robot: Robot, folder: Path) -> Entries:
+    """Everything about a robot that a type can say, as far as it differs from the defaults."""
+    layer: Entries = {section: _numbers(getattr(robot, section)) for section in MODELS if section != "camera"}
+    response = {} if robot.response is None else asdict(robot.response)
+    layer["response"] = {name: _listed(value) for name, value in response.items()}
+    layer["camera"] = None if robot.camera is None else _numbers(robot.camera)
+    if robot.stands:
+        layer["odometry"] = None
+    layer["ir"] = {} if robot.ir is None else _board(robot.ir, folder)
+    layer["uwb"] = {} if robot.uwb is None else _numbers(robot.uwb)
+    layer["faces"] = {f.name: _numbers(f) | ({"lies": True} if f.lies else {}) for f in robot.faces}
+    return layer
+
+
+def _listed(value: Any) -> Any:
+    """Tuples as lists, which YAML has."""
+    return [_listed(item) for item in value] if isinstance(value, tuple) else value
+
+
+def _shared(layers: list[Entries]) -> Entries:
+    """What all robots of a type have in common; cameras and faces as a whole, the rest number by number."""
+    shared: Entries = {}
+    for section, first in layers[0].items():
+        if section in _WHOLE or any(layer[section] is None for layer in layers):
+            if all(layer[section] == first for layer in layers):
+                shared[section] = first
+        else:
+            shared[section] = {
+                name: value
+                for name, value in first.items()
+                if all(layer[section].get(name) == value for layer in layers)
+            }
+    return {section: value for section, value in shared.items() if value != {}}
+
+
+def _robot(robot: Robot, shared: Entries, folder: Path) -> Entries:
+    """A robot without what its type says."""
+    entry: Entries = {"type": robot.type} if robot.type else {}
+    for section, value in _layer(robot, folder).items():
+        rest = value
+        if section in shared:
+            same = value == shared[section]
+            whole = section in _WHOLE
+            rest = {} if same or whole else {k: v for k, v in value.items() if k not in shared[section]}
+        if rest != {}:
+            entry[section] = rest
+    if robot.ir is not None:
+        entry["ir"] = {"id": robot.ir.id, **entry.get("ir", {})}
+    if robot.uwb is not None:
+        entry["uwb"] = {"address": robot.uwb.address, **entry.get("uwb", {})}
+    if robot.faces:
+        entry["ids"] = {face.name: face.id for face in robot.faces}
+    if robot.start is not None:
+        entry["start"] = dict(zip(("x", "y", "theta"), robot.start, strict=True))
+    return entry

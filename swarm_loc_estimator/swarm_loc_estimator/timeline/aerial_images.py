@@ -14,7 +14,7 @@ import numpy as np
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.filter.integrity import CONFIRMED, count_missed, count_seen, is_contradicted
-from swarm_loc_estimator.filter.measurements import Loss, Measurements, select
+from swarm_loc_estimator.filter.measurements import LossReason, Measurements, select
 from swarm_loc_estimator.filter.models import CARTESIAN, gate_threshold
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.identification.anchors import Scale
@@ -26,7 +26,7 @@ from swarm_loc_estimator.identification.assignment import (
     log_ratios,
 )
 from swarm_loc_estimator.identification.chain import ChainModel, Chains, Identity
-from swarm_loc_estimator.identification.memory import Identities, Outcome
+from swarm_loc_estimator.identification.memory import Identities, IdentityMemory, Outcome
 from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gathered_between
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
@@ -72,12 +72,13 @@ class PictureFusion:
         estimate = estimate_at(state, self._tracks.arrays, self._limits, stamp_ns)
         robots = np.flatnonzero(state.tracked)
         poses, covariances = estimate.poses[robots], estimate.covariances[robots]
-        state.images.see(picture.pose[:, :2], stamp_ns)
+        _memory(state).see(picture.pose[:, :2], stamp_ns)
         ratios = log_ratios(poses, covariances, picture, _log_density(picture), self._gate)
         found = assign(ratios, self._settings.aerial_detection_probability, self._settings.aerial_probability)
         sigma = np.sqrt(np.maximum(covariances[:, 0, 0], covariances[:, 1, 1]))
-        unseen, in_view = found.place == UNSEEN, state.images.is_in_view(poses[:, :2], 3.0 * sigma)
-        before_ns = state.images.newest.stamp_ns if state.images.newest is not None else stamp_ns
+        unseen, in_view = found.place == UNSEEN, _memory(state).is_in_view(poses[:, :2], 3.0 * sigma)
+        newest = _memory(state).newest
+        before_ns = newest.stamp_ns if newest is not None else stamp_ns
         unseen &= state.last_fix_ns[robots] <= before_ns  # no other fix since the previous image
         for robot in robots[unseen & in_view].tolist():
             self._miss_robot(state, robot, stamp_ns)
@@ -92,7 +93,7 @@ class PictureFusion:
         place[robots], probability[robots] = found.place, found.probability
         known = found.robot >= 0
         robot = np.where(known, robots[np.where(known, found.robot, 0)] if robots.size else 0, found.robot)
-        state.images.newest = Identities(
+        _memory(state).newest = Identities(
             stamp_ns, np.where(place >= 0, _numbers(image, place), -1), probability
         )
         return Assignment(place, robot, probability)
@@ -102,7 +103,7 @@ class PictureFusion:
         unconfirmed = state.integrity.confirmations[robot] < CONFIRMED
         doubt = count_missed(state.integrity, robot, self._miss)
         if unconfirmed or doubt >= self._settings.max_fault_score:
-            state.deinitialize(robot, Loss.NOT_IN_IMAGE, stamp_ns)
+            state.deinitialize(robot, LossReason.NOT_IN_IMAGE, stamp_ns)
 
     def identify(self, state: SwarmState, image: Measurements, assignment: Assignment) -> bool:
         """Search an image for robots that are not localized or were not detected at their estimate.
@@ -115,7 +116,7 @@ class PictureFusion:
         Returns:
             Whether any robot was searched.
         """
-        images, stamp_ns = state.images, int(image.stamp_ns[0])
+        images, stamp_ns = _memory(state), int(image.stamp_ns[0])
         looking = self._moves & (~state.tracked | (assignment.place == UNSEEN))
         for robot in [robot for robot in images.chains if not looking[robot]]:
             if assignment.place[robot] != AMBIGUOUS:
@@ -148,15 +149,15 @@ class PictureFusion:
             return Outcome.NO_ODOMETRY, None
         sample = self._tracks.at(np.array([robot]), np.array([stamp_ns]))
         if sample.silence_s[0] > self._limits.timeout_s[robot]:
-            state.images.chains.pop(robot, None)
+            _memory(state).chains.pop(robot, None)
             return Outcome.NO_ODOMETRY, None
         point, picture = TrackPoint(sample.pose[0], sample.covariance[0]), picture_of(image)
-        chains = state.images.chains.get(robot)
+        chains = _memory(state).chains.get(robot)
         if chains is None or chains.point is None or _has_drifted(chains.point, point):
             chains = Chains(self._model)
         elif not _has_moved(chains.point, point, picture):
             return Outcome.NOT_MOVED, None
-        state.images.chains[robot] = chains = chains.advanced(picture, point, stamp_ns)
+        _memory(state).chains[robot] = chains = chains.advanced(picture, point, stamp_ns)
         answer = chains.answer() if chains.images > 1 else None
         believed = bool(state.tracked[robot]) and not is_contradicted(state.integrity, robot)
         sure = answer is not None and self._is_sure(answer, is_believed=believed)
@@ -179,7 +180,7 @@ class PictureFusion:
             robot, InitialPose(transform, se2.error_covariance(claim.pose, claim.covariance)), at
         )
         state.last_fix_ns[robot] = stamp_ns
-        state.images.chains.pop(robot, None)
+        _memory(state).chains.pop(robot, None)
 
     def _tell(
         self,
@@ -190,7 +191,7 @@ class PictureFusion:
         taken: Counter[int],
     ) -> None:
         """Record the results of the search among detections (n,)."""
-        newest = state.images.newest
+        newest = _memory(state).newest
         if newest is None or not looking.any():
             return
         place, probability = newest.place.copy(), newest.probability.copy()
@@ -199,11 +200,18 @@ class PictureFusion:
             if claim is not None and taken[claim.place] == 1:
                 place[robot], probability[robot] = int(image.reading[claim.place]), claim.probability
             else:
-                chains = state.images.chains.get(robot)
+                chains = _memory(state).chains.get(robot)
                 place[robot] = -1
                 best = chains.probabilities.max(initial=0.0) if chains is not None else 0.0
                 probability[robot] = min(float(best), self._settings.aerial_probability)
-        state.images.newest = newest._replace(place=place, probability=probability)
+        _memory(state).newest = newest._replace(place=place, probability=probability)
+
+
+def _memory(state: SwarmState) -> IdentityMemory:
+    """The state's memory of aerial images, which begins with the first."""
+    if state.images is None:
+        state.images = IdentityMemory()
+    return state.images
 
 
 def relieve_seen(state: SwarmState, robots: IntArray) -> None:

@@ -9,28 +9,37 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from swarm_loc_estimator.filter.belief import NEVER_NS
 from swarm_loc_estimator.filter.measurements import (
     Command,
     CommandKind,
+    LossReason,
     Measurements,
     Verdict,
     concatenate,
     drops_by_reason,
 )
 from swarm_loc_estimator.filter.models import CARTESIAN
-from swarm_loc_estimator.filter.state import IN_MAP
+from swarm_loc_estimator.filter.state import IN_MAP, NEVER_NS
 from swarm_loc_estimator.identification.memory import Identities, Outcome
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.sensors.imu import TurnRateRows, TurnRateSensor
+from swarm_loc_estimator.sensors.inputs import Batch, InputConverter
 from swarm_loc_estimator.sensors.lidar import ScanSensor, SweepStore
 from swarm_loc_estimator.sensors.odometry import OdometryRows, OdometrySensor
-from swarm_loc_estimator.sensors.registry import Batch, InputConverter
 from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, Accumulator, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.timeline.contradictions import ConstantOdometry, Contradiction, contradictions
-from swarm_loc_estimator.timeline.estimate import Estimate, Status, TrackedLimits, estimate_at
+from swarm_loc_estimator.timeline.estimate import (
+    ConstantOdometry,
+    Contradiction,
+    Estimate,
+    LossReport,
+    Status,
+    TrackedLimits,
+    contradictions,
+    estimate_at,
+    last_loss,
+)
 from swarm_loc_estimator.timeline.fusion import Fusion
 from swarm_loc_estimator.timeline.self_calibration import learned, learns
 from swarm_loc_estimator.timeline.settings import Settings
@@ -108,7 +117,7 @@ class Estimator:
         self._begin()
 
     @property
-    def note(self) -> str:
+    def hint(self) -> str:
         """Hint about the choice of filter for this swarm, one sentence; "" if there is none."""
         count, largest = len(self.swarm.robots), self.settings.sparse_from
         if count < largest or self._fusion.is_sparse:
@@ -203,14 +212,17 @@ class Estimator:
 
     @property
     def counters(self) -> dict[str, int]:
-        """Numbers of used data by name, since the last reset."""
+        """Numbers of used data by name, and of losses of robots by reason, since the last reset."""
         others = {
             "constraints kept": int(self._timeline.verdict_counts()[Verdict.CONSTRAINT]),
         }
         for accumulator in self._converter.accumulators.values():
             others |= accumulator.counters
-        outcomes = self._timeline.state.images.outcomes
-        others |= {f"identities {one.name.lower().replace('_', ' ')}": int(outcomes[one]) for one in Outcome}
+        if images := self._timeline.state.images:
+            names = {one: one.name.lower().replace("_", " ") for one in Outcome}
+            others |= {f"identities {names[one]}": int(images.outcomes[one]) for one in Outcome}
+        losses = self._timeline.state.losses
+        others |= {f"lost: {why.name.lower().replace('_', ' ')}": int(losses[why]) for why in LossReason}
         return {"measurements used": self.used} | {name: count for name, count in others.items() if count}
 
     def recent(self) -> Recent:
@@ -220,12 +232,25 @@ class Estimator:
     @property
     def identities(self) -> Identities | None:
         """Identities in the newest aerial image; None before the first image."""
-        return self._timeline.state.images.newest
+        images = self._timeline.state.images
+        return images.newest if images else None
 
     def contradictions(self, now_ns: int) -> list[Contradiction]:
         """Contradicted robots and landmarks at an instant, robots first."""
         unmoved = self._constant.contradicted(now_ns)
         return contradictions(self.swarm, self._timeline.state, self._tracks, unmoved, now_ns)
+
+    @property
+    def losses(self) -> list[LossReport]:
+        """The last loss of each robot that was lost since the last reset, located again or not."""
+        state = self._timeline.state
+        found = (last_loss(state, robot, self.settings) for robot in np.flatnonzero(state.lost_why).tolist())
+        return [one for one in found if one is not None]
+
+    def loss_of(self, robot: int) -> LossReport | None:
+        """Why a robot was lost that is not located now; None for a located one, and without a loss."""
+        state = self._timeline.state
+        return None if state.tracked[robot] else last_loss(state, robot, self.settings)
 
     @property
     def is_self_calibrated(self) -> bool:
@@ -264,7 +289,7 @@ class Estimator:
         self._use_odometry()
         if fuse:
             self._timeline.advance(newest_ns, has_budget)
-            needed_ns = min([oldest_ns, *self._timeline.measurements.stamp_ns[:1].tolist()])
+            needed_ns = min([oldest_ns, *self._timeline.stamp_ns[:1].tolist()])
             for accumulator in self._gathering.values():
                 accumulator.forget_before(needed_ns if accumulator is self._sweeps else oldest_ns)
         return self._estimate(now_ns)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.belief import correct
 from swarm_loc_estimator.filter.correlated_noise import (
     at_initialization,
     record_constraint,
@@ -21,7 +20,7 @@ from swarm_loc_estimator.filter.joint_filter import JointFilter, Robots
 from swarm_loc_estimator.filter.measurements import (
     Command,
     CommandKind,
-    Loss,
+    LossReason,
     Measurements,
     Verdict,
     select,
@@ -35,7 +34,7 @@ from swarm_loc_estimator.filter.models import (
     locates_alone,
 )
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
-from swarm_loc_estimator.filter.state import IN_MAP, InitialPose, Meetings, SwarmState
+from swarm_loc_estimator.filter.state import IN_MAP, InitialPose, Meetings, SwarmState, correct
 from swarm_loc_estimator.filter.update import (
     ATTRIBUTE,
     CONTRADICTED,
@@ -60,7 +59,8 @@ from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.aerial_images import PictureFusion, as_fixes, relieve_seen
 from swarm_loc_estimator.timeline.map_scans import MapScans, Sweeps
-from swarm_loc_estimator.timeline.settings import Settings, middle_of_period
+from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.timeline import middle_of_period
 
 _SURER_AT_FIRST = 1.5
 """`lost_heading_sigma` over the maximum standard deviation of the heading at initialization."""
@@ -187,11 +187,11 @@ class Fusion:
         assignment = self._pictures.assigned(state, image)
         known = assignment.robot >= 0
         if known.any():
-            fixes, fates = as_fixes(select(image, known), assignment.robot[known]), verdicts[known]
-            squares = nis[known]
-            self._fuse(state, fixes, fates, squares)
-            verdicts[known], nis[known] = fates, squares
-            relieve_seen(state, assignment.robot[known][fates == Verdict.USED])
+            fixes, outcome = as_fixes(select(image, known), assignment.robot[known]), verdicts[known]
+            own_nis = nis[known]
+            self._fuse(state, fixes, outcome, own_nis)
+            verdicts[known], nis[known] = outcome, own_nis
+            relieve_seen(state, assignment.robot[known][outcome == Verdict.USED])
         # The others may be robots that are not located.
         unknown = (
             Verdict.CONSTRAINT if self._pictures.identify(state, image, assignment) else Verdict.UNASSIGNED
@@ -228,9 +228,9 @@ class Fusion:
                 evaluate_link(measurements.row(k), 0, tracks, belief, state.filter, work)
                 stage = ATTRIBUTE
             elif why == LOST:
-                state.deinitialize(source, Loss(loss), int(measurements.stamp_ns[k]))
+                state.deinitialize(source, LossReason(loss), int(measurements.stamp_ns[k]))
                 # one that was not evaluated is fused again, as is a fix that locates the lost robot alone
-                if loss != Loss.UNCERTAIN and (
+                if loss != LossReason.UNCERTAIN and (
                     verdicts[k] == Verdict.USED or not locates_alone(measurements, k)
                 ):
                     k += 1
@@ -279,14 +279,14 @@ class Fusion:
             rows, before = select(rows, good), work
             work = new_innovations(rows.size, *self._sides)
             work.pose[:], work.motion[:] = before.pose[good], before.motion[good]
-        fates, squares = verdicts[good], nis[good]
+        outcome, own_nis = verdicts[good], nis[good]
         # Evaluate, links by their records, and attribute.
         belief = state.arrays()
         places = Robots(self._poses(state, newest_ns)[:, :2], state.tracked.copy())
         state.filter.prepare_update(related_columns(rows, belief), places, work.cross_covariance)
         stage, why = EVALUATE, IS_LINK
         while why == IS_LINK:
-            _, why, _, _ = fuse(rows, 0, stage, middle_ns, tracks, belief, limits, work, fates, squares)
+            _, why, _, _ = fuse(rows, 0, stage, middle_ns, tracks, belief, limits, work, outcome, own_nis)
             for k in np.flatnonzero(~is_compiled(rows.model)).tolist() if why == IS_LINK else ():
                 evaluate_link(rows.row(k), k, tracks, belief, state.filter, work)
             stage = ATTRIBUTE
@@ -297,22 +297,22 @@ class Fusion:
             correction = state.filter.update(work.columns[used], *evaluated)
             belief = state.arrays()  # the update may have reallocated them
             correct(belief, correction)
-        fuse(rows, 0, SETTLE, middle_ns, tracks, belief, limits, work, fates, squares)
+        fuse(rows, 0, SETTLE, middle_ns, tracks, belief, limits, work, outcome, own_nis)
         lost = work.lost > 0
         self._deinitialize(state, work, newest_ns)
         for source in np.flatnonzero(work.contradicted).tolist():
             self._augment(state, source, newest_ns)
         for k in np.flatnonzero(~work.accepted & lost[rows.target]).tolist():
             if locates_alone(rows, k) and not state.tracked[rows.target[k]]:
-                fates[k] = self._note(state, rows.row(k))
-        verdicts[good], nis[good] = fates, squares
+                outcome[k] = self._note(state, rows.row(k))
+        verdicts[good], nis[good] = outcome, own_nis
         return verdicts, nis
 
     @staticmethod
     def _deinitialize(state: SwarmState, work: Innovations, stamp_ns: int) -> None:
         """Deinitialize the robots that are marked as lost, and unmark them."""
         for robot in np.flatnonzero(work.lost).tolist():
-            state.deinitialize(robot, Loss(int(work.lost[robot])), stamp_ns)
+            state.deinitialize(robot, LossReason(int(work.lost[robot])), stamp_ns)
         work.lost[:] = 0
 
     def _poses(self, state: SwarmState, stamp_ns: int) -> FloatArray:
@@ -336,7 +336,7 @@ class Fusion:
         """Re-estimate the parameters of a contradicted robot or landmark; deinitialize a kidnapped robot."""
         robots = state.tracked.size
         if source < robots and is_kidnapped(state.integrity, source):
-            state.deinitialize(source, Loss.KIDNAPPED, stamp_ns)
+            state.deinitialize(source, LossReason.KIDNAPPED, stamp_ns)
             return
         poses = self._poses(state, stamp_ns)
         state.contradicted_ns[source] = stamp_ns
@@ -354,7 +354,7 @@ class Fusion:
         """Set the pose of a robot, or deinitialize it."""
         robot, stamp_ns = command.robot, command.stamp_ns
         if command.kind == CommandKind.FORGET:
-            state.deinitialize(robot, Loss.COMMAND, stamp_ns)
+            state.deinitialize(robot, LossReason.COMMAND, stamp_ns)
             return
         if not self._tracks.has_started(robot, stamp_ns):
             return

@@ -1,24 +1,14 @@
-"""Settings of the estimator.
-
-Fusion periods, and the swarm and batch sizes at which the fusion strategy changes.
-
-A large swarm fuses the measurements of a fusion period as one batch. A period is closed at its end, (t, t +
-T]: a measurement at the instant of fusion belongs to the period that ends then.
-"""
+"""Settings of the estimator, and the sizes of swarms and batches at which its strategy changes."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
-from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.parameters import UserError, number, number_specs
 
 if TYPE_CHECKING:
     from swarm_loc_estimator.swarm.swarm import Swarm
-
-Stamps = TypeVar("Stamps", int, IntArray)
 
 
 @dataclass(frozen=True)
@@ -41,23 +31,6 @@ class Policy:
     def fusion_period_s(self, calibrated: int) -> float:
         """Default fusion period for a number of robots with calibrated odometry [s]."""
         return next(period_s for count, period_s in self.fusion_periods_s if calibrated >= count)
-
-
-def end_of_period(stamp_ns: Stamps, period_ns: int) -> Stamps:
-    """End of the period of a stamp, or of stamps (m,): the next multiple of its length."""
-    return -(-stamp_ns // period_ns) * period_ns
-
-
-_end_of_period = cached_njit(end_of_period)
-
-
-@cached_njit
-def middle_of_period(stamp_ns: int, period_ns: int) -> int:
-    """Instant to which robots are predicted for all measurements of the period of a stamp.
-
-    It does not depend on the measurements, so late measurements of the period use the same prediction.
-    """
-    return _end_of_period(stamp_ns, period_ns) - period_ns + period_ns // 2
 
 
 class SettingsError(UserError):

@@ -4,6 +4,9 @@ Measurements wait in a buffer sorted by stamp, into which late ones are merged. 
 are stored as checkpoints. A late measurement rolls the filter back to the last checkpoint before it, and all
 later steps are repeated; the result equals that of in-order arrival.
 
+A large swarm fuses the measurements of a fusion period as one batch. A period is closed at its end, (t, t +
+T]: a measurement at the instant of fusion belongs to the period that ends then.
+
 The order does not depend on the order of arrival: measurements with equal stamps are sorted by all their
 columns but the arrival. Measurements equal in all of them are duplicates.
 """
@@ -13,14 +16,14 @@ from __future__ import annotations
 import math
 from bisect import insort
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.small_matrix import assign, assign_matrix
+from swarm_loc_estimator.common.numerics import assign, assign_matrix
 from swarm_loc_estimator.filter.measurements import (
     Command,
     Measurements,
@@ -30,9 +33,28 @@ from swarm_loc_estimator.filter.measurements import (
 )
 from swarm_loc_estimator.filter.models import ANONYMOUS
 from swarm_loc_estimator.filter.state import SwarmState
-from swarm_loc_estimator.timeline.settings import Settings, end_of_period, middle_of_period
+from swarm_loc_estimator.timeline.settings import Settings
+
+Stamps = TypeVar("Stamps", int, IntArray)
 
 _FIRST_CAPACITY = 1024
+
+
+def end_of_period(stamp_ns: Stamps, period_ns: int) -> Stamps:
+    """End of the period of a stamp, or of stamps (m,): the next multiple of its length."""
+    return -(-stamp_ns // period_ns) * period_ns
+
+
+_end_of_period = cached_njit(end_of_period)
+
+
+@cached_njit
+def middle_of_period(stamp_ns: int, period_ns: int) -> int:
+    """Instant to which robots are predicted for all measurements of the period of a stamp.
+
+    It does not depend on the measurements, so late measurements of the period use the same prediction.
+    """
+    return _end_of_period(stamp_ns, period_ns) - period_ns + period_ns // 2
 
 
 class MeasurementBuffer:
@@ -54,9 +76,14 @@ class MeasurementBuffer:
         return self._columns.stamp_ns[self._begin : self._end]
 
     @property
-    def measurements(self) -> Measurements:
-        """Measurements (m,), sorted."""
-        return select(self._columns, slice(self._begin, self._end))
+    def sides(self) -> tuple[IntArray, IntArray]:
+        """Observers and targets (m,)."""
+        rows = slice(self._begin, self._end)
+        return self._columns.observer[rows], self._columns.target[rows]
+
+    def part(self, begin: int, end: int) -> Measurements:
+        """Measurements from one index to another, sorted."""
+        return select(self._columns, slice(self._begin + begin, self._begin + end))
 
     @property
     def verdicts(self) -> NDArray[np.uint8]:
@@ -102,7 +129,7 @@ class MeasurementBuffer:
         if self._end + count <= self._verdicts.size:
             return
         size = len(self)
-        kept: list[Any] = [one.copy() for one in (*self.measurements, self.verdicts, self.nis)]
+        kept: list[Any] = [one.copy() for one in (*self.part(0, size), self.verdicts, self.nis)]
         if 2 * (size + count) > self._verdicts.size:
             self._allocate(4 * (size + count))
         columns: list[Any] = [*self._columns, self._verdicts, self._nis]
@@ -171,6 +198,7 @@ def _lower_bound(columns: Measurements, begin: int, end: int, new: Measurements,
 @cached_njit
 def _compared(a: Measurements, i: int, b: Measurements, j: int) -> int:
     """Compare row i of measurements with row j of others: -1 if it is less, 1 if greater, 0 if equal."""
+    # What tells most measurements apart.
     if a.stamp_ns[i] != b.stamp_ns[j]:
         return -1 if a.stamp_ns[i] < b.stamp_ns[j] else 1
     if a.observer[i] != b.observer[j]:
@@ -301,7 +329,12 @@ class Timeline:
     @property
     def measurements(self) -> Measurements:
         """Measurements (m,) within the horizon, sorted by stamp."""
-        return self._buffer.measurements
+        return self._buffer.part(0, len(self._buffer))
+
+    @property
+    def stamp_ns(self) -> IntArray:
+        """Stamps (m,) of the measurements."""
+        return self._buffer.stamp_ns
 
     @property
     def verdicts(self) -> NDArray[np.uint8]:
@@ -345,12 +378,10 @@ class Timeline:
         Args:
             changed_from_ns: (N,) instant after which each robot's track has changed.
         """
-        rows = self._buffer.measurements
-        first = _first_touched(
-            rows.stamp_ns, rows.observer, rows.target, changed_from_ns, self._fusion_period_ns
-        )
+        stamp_ns = self._buffer.stamp_ns
+        first = _first_touched(stamp_ns, *self._buffer.sides, changed_from_ns, self._fusion_period_ns)
         if first < len(self._buffer):
-            self._redo_from(int(rows.stamp_ns[first]))
+            self._redo_from(int(stamp_ns[first]))
         for command in self._commands:
             if command.stamp_ns > changed_from_ns[command.robot]:
                 self._redo_from(command.stamp_ns)
@@ -461,8 +492,7 @@ class Timeline:
             if key > due_ns:
                 return True
             # Fuse, and store a checkpoint if the last one is old.
-            rows = slice(begin, end)
-            measurements = select(buffer.measurements, rows)
+            rows, measurements = slice(begin, end), buffer.part(begin, end)
             self._step(self._ahead, measurements, commands, buffer.verdicts[rows], buffer.nis[rows])
             self._head_key = key
             if key - max(self._checkpoints[-1][0], -(2**62)) >= self._spacing_ns:

@@ -52,12 +52,7 @@ class _Marker(NamedTuple):
 
 
 class MarkersEncoder:
-    """Serializes the markers of a swarm.
-
-    Args:
-        swarm: Its description.
-        frame_id: Frame of the poses.
-    """
+    """Serializes the markers of a swarm."""
 
     def __init__(self, swarm: Swarm, frame_id: str) -> None:
         self._frame_id = frame_id
@@ -157,12 +152,7 @@ def _headings(pose: FloatArray, size: float) -> FloatArray:
 
 
 def ellipses(pose: FloatArray, covariance: FloatArray) -> FloatArray:
-    """Lines (n * 2 * corners, 3) around the 95 % ellipses of positions.
-
-    Args:
-        pose: (n, 3) in map.
-        covariance: (n, 3, 3), of which x and y count.
-    """
+    """Lines (n * 2 * corners, 3) around the 95 % ellipses of positions, of poses (n, 3) in map."""
     turn = 2.0 * np.pi * np.arange(_CORNERS + 1) / _CORNERS
     circle = np.stack([np.cos(turn), np.sin(turn)])
     values, vectors = np.linalg.eigh(covariance[:, :2, :2])

@@ -44,11 +44,7 @@ _UNKNOWN_TWIST = (0.0, 0.0, 0.0)
 
 
 class MarkersNode(ConfiguredNode[MarkersParameters]):
-    """Converts estimates while its topics have subscribers.
-
-    Args:
-        node_arguments: Further arguments of `rclpy.node.Node`.
-    """
+    """Converts estimates while its topics have subscribers."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("markers", MarkersParameters, **node_arguments)

@@ -1,6 +1,6 @@
-"""The page as one text, its initial data, and a recorded run inside it.
+"""The page as one text, its initial data, its binary messages, and a recorded run inside it.
 
-Frames, the binary messages to the page: a kind, an instant and columns of numbers; and their history.
+A frame, the binary message to the page, is a kind, an instant and columns of numbers:
 
     uint32 length of the header | header as JSON, blanks up to a multiple of 8 | columns, each padded as well
 
@@ -29,7 +29,7 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.sightings import Sightings
 
 _TYPES = {"float64": "f8", "float32": "f4", "int32": "i4", "uint8": "u1", "int8": "i1"}
-_COLUMN_ALIGNMENT = 8
+_ALIGNMENT = 8
 SPAN_NS = 180_000_000_000
 MAX_BYTES = 24_000_000
 _SPACING_NS = {"poses": 200_000_000, "truth": 200_000_000, "map": 5_000_000_000}
@@ -45,22 +45,18 @@ class Frame(NamedTuple):
 
 
 def pack(kind: str, stamp_ns: int, columns: Mapping[str, npt.NDArray[Any]], **extra: object) -> Frame:
-    """A frame of columns (float64, float32, int32, uint8 or int8).
+    """A frame of columns by name (float64, float32, int32, uint8 or int8), each flattened.
 
-    Args:
-        kind: See `Frame`.
-        stamp_ns: Time of the content [ns].
-        columns: By name; each is flattened.
-        extra: Further entries of the header.
+    `extra` are further entries of the header.
     """
     flat = {name: np.ascontiguousarray(column).reshape(-1) for name, column in columns.items()}
     listed = [[name, _TYPES[str(column.dtype)], column.size] for name, column in flat.items()]
     header = json.dumps({"kind": kind, "stamp": stamp_ns * 1e-6, "columns": listed, **extra}).encode()
-    header += b" " * (-(4 + len(header)) % _COLUMN_ALIGNMENT)
+    header += b" " * (-(4 + len(header)) % _ALIGNMENT)
     parts = [struct.pack("<I", len(header)), header]
     for column in flat.values():
         data = column.tobytes()
-        parts += [data, bytes(-len(data) % _COLUMN_ALIGNMENT)]
+        parts += [data, bytes(-len(data) % _ALIGNMENT)]
     return Frame(kind, stamp_ns, b"".join(parts))
 
 
@@ -71,7 +67,7 @@ def unpack(data: bytes) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
     at, columns = 4 + size, {}
     for name, kind, length in header["columns"]:
         columns[name] = np.frombuffer(data, f"<{kind}", length, at)
-        at += -(-columns[name].nbytes // _COLUMN_ALIGNMENT) * _COLUMN_ALIGNMENT
+        at += -(-columns[name].nbytes // _ALIGNMENT) * _ALIGNMENT
     return header, columns
 
 
@@ -140,12 +136,7 @@ def map_frame(stamp_ns: int, grid: GridMessage) -> Frame:
 
 
 class History:
-    """A ring of frames.
-
-    Args:
-        span_ns: Maximum age of a frame.
-        max_bytes: Maximum size; the oldest frames are dropped first.
-    """
+    """A ring of frames of at most `span_ns` and `max_bytes`; the oldest are dropped first."""
 
     def __init__(self, span_ns: int = SPAN_NS, max_bytes: int = MAX_BYTES) -> None:
         self._span_ns = span_ns
@@ -204,7 +195,6 @@ _SCRIPTS = (
     "panel.js",
     "actions.js",
 )
-_ALIGNMENT = 8
 _BODY_PER_WHEELS = 0.66  # Ratio of body radius to wheel separation, as of an e-puck
 
 
@@ -218,11 +208,7 @@ def _parts() -> tuple[str, str, str]:
 
 
 def page(data: str = "") -> str:
-    """The page.
-
-    Args:
-        data: A recorded run (see `recording`) to play; "": the page asks its server for a live one.
-    """
+    """The page, with a recorded run to play (see `recording`); "": it asks its server for a live one."""
     markup, style, script = _parts()
     body, end = markup.split("<!-- data -->")
     recorded = f'<script type="application/octet-stream" id="recording">{data}</script>' if data else ""
@@ -239,12 +225,7 @@ def content_security_policy() -> str:
 
 
 def recording(about: dict[str, Any], frames: Iterable[Frame]) -> str:
-    """The text: base64 of gzip of the length of a JSON text, that text, and the frames.
-
-    Args:
-        about: Initial data of the page, see `about`.
-        frames: In the order of their stamps.
-    """
+    """The text: base64 of gzip of the length of a JSON text (`about`), that text, and frames by stamp."""
     head = json.dumps(about).encode()
     head += b" " * (-(4 + len(head)) % _ALIGNMENT)
     whole = b"".join([struct.pack("<I", len(head)), head, *(frame.data for frame in frames)])
@@ -252,14 +233,7 @@ def recording(about: dict[str, Any], frames: Iterable[Frame]) -> str:
 
 
 def about(swarm: Swarm, title: str, *, teleop: bool = False, commands: bool = True) -> dict[str, Any]:
-    """Description of the swarm for the page.
-
-    Args:
-        swarm: Its description.
-        title: Heading of the page.
-        teleop: Whether robots may be driven.
-        commands: Whether poses may be set and the estimator reset.
-    """
+    """Description of the swarm for the page, and what its users may do."""
     landmarks: list[list[Any]] = [[mark.id, mark.x, mark.y, mark.yaw] for mark in swarm.landmarks]
     landmarks += [[camera.name, camera.x, camera.y, None] for camera in swarm.cameras]
     return {

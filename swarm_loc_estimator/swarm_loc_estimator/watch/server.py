@@ -1,8 +1,7 @@
 """The server of the page, in a thread of its own: HTML once, then frames over a WebSocket, and commands back.
 
-Passing a frame to the server never blocks, however many or slow the pages are.
-
-Access control of the page: browsers of this machine, and other clients only with the token.
+Passing a frame to the server never blocks, however many or slow the pages are. Browsers of this machine have
+access, other clients only with the token.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ import ipaddress
 import json
 import re
 import socket
-import socket as sockets
 import threading
 import time
 from collections import deque
@@ -37,7 +35,7 @@ _WRONG = "The token is missing or wrong: open the address that the log shows, wi
 
 
 class AccessError(UserError):
-    """An address or a token that cannot be used; the message is one sentence."""
+    """An address or a token that cannot be used."""
 
 
 class WrongTokens:
@@ -51,13 +49,7 @@ class WrongTokens:
         self._slots = [_Slot(0.0, 0)] * _SLOTS
 
     def refusal(self, client: str, given: str, token: str) -> str:
-        """Reason to refuse a token, one sentence; "" if it is right.
-
-        Args:
-            client: Address of the client.
-            given: The token that it sent; "" for none.
-            token: The right one.
-        """
+        """Reason to refuse what a client gave as token, "" for none, one sentence; "" if it is right."""
         place, guess = hash(client) % _SLOTS, hash((client, given))
         slot, now_s = self._slots[place], time.monotonic()
         if not given or guess == slot.guess:
@@ -79,11 +71,7 @@ class _Slot(NamedTuple):
 
 @dataclass(frozen=True)
 class Access:
-    """Decides which requests the server accepts.
-
-    Args:
-        address: Address on which the server listens.
-        token: Required token; "" for none, on a loopback address only.
+    """Decides which requests the server accepts; without a token, only on a loopback address.
 
     Raises:
         AccessError: The address is reachable from outside without a token, or the token is too short.
@@ -105,15 +93,10 @@ class Access:
             )
 
     def refusal(self, host: str, origin: str | None, token: str, client: str = "") -> str:
-        """Reason to refuse a request, one sentence; "" if it is accepted.
+        """Reason to refuse a request by its headers Host and Origin and its ?token=; "" if it is accepted.
 
-        Checks of Origin and Host prevent cross-site requests of the browser, and DNS rebinding.
-
-        Args:
-            host: Its Host header.
-            origin: Its Origin header, which browsers send with a WebSocket.
-            token: Its ?token=.
-            client: Address of the sender.
+        Checks of Origin, which browsers send with a WebSocket, and Host prevent cross-site requests of the
+        browser, and DNS rebinding.
         """
         parsed = _HOST.fullmatch(host.lower())
         if not parsed:
@@ -169,7 +152,7 @@ OnCommand = Callable[[Command, Answer], None]  # Receives a page's command; call
 
 
 class ServerError(UserError):
-    """The server cannot listen; the message is one sentence."""
+    """The server cannot listen."""
 
 
 class ServerLoad(NamedTuple):
@@ -185,12 +168,7 @@ class ServerLoad(NamedTuple):
 class WatchServer:
     """Serves the page.
 
-    Args:
-        about: Initial data of pages, see `page.about`.
-        access: Address to listen on, and access control.
-        port: Port to listen on, 0 for any free one.
-        rate: Maximum frames of a kind per second and page.
-        on_command: Called with each command.
+    Port 0 is any free one. A page gets at most `rate` frames of a kind per second.
 
     Raises:
         ServerError: The port is taken, or the address is not this machine's.
@@ -225,7 +203,7 @@ class WatchServer:
     @property
     def url(self) -> str:
         """URL of the page."""
-        host = self._access.address if is_loopback(self._access.address) else _own_name()
+        host = self._access.address if is_loopback(self._access.address) else socket.gethostname()
         host = f"[{host}]" if ":" in host else host
         return f"http://{host}:{self.port}/" + (f"?token={self._access.token}" if self._access.token else "")
 
@@ -252,12 +230,7 @@ class WatchServer:
         self._loop.call_soon_threadsafe(self._take, frame)
 
     def send_text(self, message: dict[str, Any], robot: int | None = None) -> None:
-        """Send a message to the pages; may be called from any thread.
-
-        Args:
-            message: The message.
-            robot: Only pages that show this robot get it.
-        """
+        """Send a message to the pages, or to those that show a robot; may be called from any thread."""
         self._loop.call_soon_threadsafe(self._note, message, robot)
 
     def close(self) -> None:
@@ -278,7 +251,6 @@ class WatchServer:
                 viewer.note(message)
 
     def _run(self, port: int) -> None:
-        """The thread."""
         asyncio.set_event_loop(self._loop)
         try:
             self._loop.run_until_complete(self._listen(port))
@@ -300,8 +272,7 @@ class WatchServer:
     def _close_slow_requests(self, known: Mapping[Connection, float]) -> None:
         """Close connections that have not become a WebSocket in time, now and once a second.
 
-        Args:
-            known: Pending connections, and when each was first seen [s].
+        `known` are pending connections, and when each was first seen [s].
         """
         now_s = self._loop.time()
         connections = self._runner.server.connections if self._runner.server else []
@@ -371,7 +342,7 @@ class WatchServer:
         try:
             await socket.send_str(json.dumps(self._about))
             await viewer.send_past(past)
-            await viewer.send_for_ever()
+            await viewer.keep_sending()
         except ConnectionError:
             await socket.close()
 
@@ -417,11 +388,6 @@ def read_command(text: str) -> Command | None:
     return command if is_valid else None
 
 
-def _own_name() -> str:
-    """Host name of this machine."""
-    return sockets.gethostname()
-
-
 class LeftOut(NamedTuple):
     """Numbers of messages dropped for a page."""
 
@@ -431,10 +397,6 @@ class LeftOut(NamedTuple):
 
 class Viewer:
     """Sends to one page; a slow page gets fewer frames, and its queues are bounded.
-
-    Args:
-        socket: The connection.
-        rate: Maximum frames of a kind per second.
 
     Attributes:
         selected: Index of the robot whose numbers the page shows; -1: none.
@@ -479,7 +441,7 @@ class Viewer:
             await self._send(frame)
         self._wake.set()
 
-    async def send_for_ever(self) -> None:
+    async def keep_sending(self) -> None:
         """Send until the connection breaks."""
         while True:
             await self._wake.wait()

@@ -9,48 +9,298 @@ It subscribes to `swarm/poses`, `swarm/sightings` (while a page is open), `/diag
 
 from __future__ import annotations
 
+import math
+import queue
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import OccupancyGrid
 from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
+from std_srvs.srv import Trigger
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
-from swarm_loc_estimator.common.messages.cdr import SWARM_POSES, CdrError
-from swarm_loc_estimator.common.messages.poses import SwarmPosesReader
+from swarm_loc_estimator.common.messages.cdr import SWARM_POSES, CdrError, nanoseconds
+from swarm_loc_estimator.common.messages.poses import SwarmPosesReader, decode_pose_stamped
 from swarm_loc_estimator.common.node import ConfiguredNode, run_node
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.nodes.parameters import WatchParameters
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.sightings import decode_sightings
-from swarm_loc_estimator.watch.page import Frame, about, map_frame, poses_frame, sightings_frame
-from swarm_loc_estimator.watch.robot_commands import RobotCommands
-from swarm_loc_estimator.watch.robot_places import AerialNames, NewestMessages, Places
-from swarm_loc_estimator.watch.server import Access, WatchServer
-from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities, SwarmPoses, SwarmSightings
+from swarm_loc_estimator.watch.page import (
+    Frame,
+    about,
+    aerial_frame,
+    map_frame,
+    places_frame,
+    poses_frame,
+    sightings_frame,
+)
+from swarm_loc_estimator.watch.server import Access, Answer, Command, WatchServer
+from swarm_loc_msgs.msg import (
+    AnonymousDetectionArray,
+    RobotIdentities,
+    RobotIdentity,
+    SwarmPoses,
+    SwarmSightings,
+)
+from swarm_loc_msgs.srv import SetRobotPose
+
+_MAX_WAITING = 64
+_DRIVEN_NS = 400_000_000  # Time without a command after which a driven robot is stopped
+
+
+class RobotCommands:
+    """Executes commands one after the other, in the node's thread; `now_ns` is a steady clock.
+
+    Attributes:
+        dropped: Number of commands dropped from the full queue.
+    """
+
+    def __init__(
+        self, node: Node, names: Sequence[str], parameters: WatchParameters, now_ns: Callable[[], int]
+    ) -> None:
+        self._node = node
+        self._names = names
+        self._parameters = parameters
+        self._now_ns = now_ns
+        self.dropped = 0
+        self._waiting: queue.Queue[tuple[Command, Answer]] = queue.Queue(_MAX_WAITING)
+        self._reset = node.create_client(Trigger, f"{parameters.estimator}/reset")
+        self._set_pose = node.create_client(SetRobotPose, f"{parameters.estimator}/set_robot_pose")
+        self._velocity: dict[int, Publisher] = {}
+        self._driven_until_ns: dict[int, int] = {}
+        self._obey: Mapping[str, Callable[[Command, Answer], None]] = {
+            "reset": self._on_reset,
+            "set_pose": self._on_set_pose,
+            "drive": self._on_drive,
+        }
+
+    def order(self, command: Command, answer: Answer) -> None:
+        """Queue a command; may be called from any thread."""
+        try:
+            self._waiting.put_nowait((command, answer))
+        except queue.Full:
+            self.dropped += 1
+            answer("Too many commands at once: this one was dropped.", ok=False)
+
+    def work(self) -> None:
+        """Execute queued commands, and stop robots whose last drive command is too old."""
+        while True:
+            try:
+                command, answer = self._waiting.get_nowait()
+            except queue.Empty:
+                break
+            refusal = self._refusal(command)
+            if refusal:
+                answer(refusal, ok=False)
+            else:
+                self._obey[command["do"]](command, answer)
+        for robot, until_ns in tuple(self._driven_until_ns.items()):
+            if self._now_ns() > until_ns:
+                del self._driven_until_ns[robot]
+                self._velocity[robot].publish(Twist())
+
+    def _refusal(self, command: Command) -> str:
+        """Reason to refuse a command, one sentence; "" if it is accepted."""
+        todo = command["do"]
+        if todo not in self._obey:
+            return f"There is no command '{todo}'."
+        if todo == "drive" and not self._parameters.teleop:
+            return "Driving is not allowed: parameter teleop is false."
+        if todo != "drive" and not self._parameters.commands:
+            return "Commands are not allowed: parameter commands is false."
+        return "" if command["robot"] >= 0 or todo == "reset" else "The command names no robot."
+
+    def _on_reset(self, _command: Command, answer: Answer) -> None:
+        self._call(self._reset, Trigger.Request(), answer)
+
+    def _on_set_pose(self, command: Command, answer: Answer) -> None:
+        pose = numbers(command.get("pose"), 3)
+        if pose is None:
+            answer("A pose is three finite numbers.", ok=False)
+            return
+        request = SetRobotPose.Request(robot=self._names[command["robot"]])
+        where = request.pose.pose
+        where.position.x, where.position.y = pose[:2]
+        where.orientation.z, where.orientation.w = math.sin(pose[2] / 2.0), math.cos(pose[2] / 2.0)
+        self._call(self._set_pose, request, answer)
+
+    def _on_drive(self, command: Command, answer: Answer) -> None:
+        ways = numbers([command.get("ahead"), command.get("left")], 2)
+        if ways is None or max(map(abs, ways)) > 1.0:
+            answer("Driving needs two shares from -1 to 1.", ok=False)
+            return
+        robot = command["robot"]
+        if robot not in self._velocity:
+            topic = f"{self._names[robot]}/cmd_vel"
+            self._velocity[robot] = self._node.create_publisher(Twist, topic, 1)
+        message = Twist()
+        message.linear.x = ways[0] * self._parameters.teleop_speed
+        message.angular.z = ways[1] * self._parameters.teleop_turn_rate
+        self._velocity[robot].publish(message)
+        self._driven_until_ns[robot] = self._now_ns() + _DRIVEN_NS
+
+    def _call(self, client: Any, request: Any, answer: Answer) -> None:
+        """Call a service whose response has `success` and `message`, and return these as answer."""
+        if not client.service_is_ready():
+            answer(f"Nobody offers {client.srv_name}: is the estimator running?", ok=False)
+            return
+
+        def on_done(future: Any) -> None:
+            response = future.result()
+            answer(response.message, ok=response.success)
+
+        client.call_async(request).add_done_callback(on_done)
+
+
+def numbers(values: object, count: int) -> list[float] | None:
+    """The given number of finite numbers from a page; None if invalid."""
+    if not isinstance(values, list) or len(values) != count:
+        return None
+    if not all(isinstance(one, int | float) and not isinstance(one, bool) for one in values):
+        return None
+    try:
+        found = [float(one) for one in values]
+    except OverflowError:  # a whole number of more than 308 digits
+        return None
+    return found if all(map(math.isfinite, found)) else None
+
+
+_OLD_NS = 500_000_000
+_IMAGES = 8
+_NEWEST_ONLY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
+"""Matches reliable and best-effort publishers, and never blocks one."""
+
+
+class Places:
+    """The newest place of each robot; with `keeps` it is valid until the next one, at any age."""
+
+    def __init__(self, kind: str, drop: Callable[[str], None], *, keeps: bool) -> None:
+        self._kind = kind
+        self._drop = drop
+        self._keeps = keeps
+        self._newest: dict[int, tuple[int, tuple[float, float, float]]] = {}
+        self._sent_ns = -1
+
+    def take(self, robot: int, data: bytes) -> None:
+        """Store a serialized PoseStamped of a robot."""
+        try:
+            message = decode_pose_stamped(data)
+        except CdrError:
+            self._drop("malformed")
+            return
+        if not np.isfinite(message.pose).all():
+            self._drop("not_finite")
+            return
+        self._newest[robot] = (message.stamp_ns, message.pose)
+
+    def frame(self) -> Frame | None:
+        """All places; None if none has changed since the last call."""
+        newest_ns = max((stamp_ns for stamp_ns, _ in self._newest.values()), default=-1)
+        if newest_ns == self._sent_ns:
+            return None
+        self._sent_ns = newest_ns
+        limit_ns = 0 if self._keeps else newest_ns - _OLD_NS
+        shown = {robot: pose for robot, (at_ns, pose) in self._newest.items() if at_ns >= limit_ns}
+        return places_frame(self._kind, newest_ns, [*shown], np.array([*shown.values()]).reshape(-1, 3))
+
+    def clear(self) -> None:
+        """Clear all places."""
+        self._newest.clear()
+        self._sent_ns = -1
+
+
+class AerialNames:
+    """Joins anonymous detections with their identities, by the stamp of their image."""
+
+    def __init__(self, index_of: dict[str, int]) -> None:
+        self._index_of = index_of
+        self._images: dict[int, AnonymousDetectionArray] = {}
+
+    def detections(self, message: AnonymousDetectionArray) -> Frame:
+        """The frame of an image without identities."""
+        stamp_ns = nanoseconds(message.header.stamp)
+        self._images[stamp_ns] = message
+        while len(self._images) > _IMAGES:
+            del self._images[next(iter(self._images))]
+        return self._frame(stamp_ns, ())
+
+    def identities(self, message: RobotIdentities) -> Frame | None:
+        """The frame of one of the newest images with identities; None for an older image."""
+        stamp_ns = nanoseconds(message.header.stamp)
+        if stamp_ns not in self._images:
+            return None
+        return self._frame(stamp_ns, message.identities)
+
+    def _frame(self, stamp_ns: int, identities: Iterable[RobotIdentity]) -> Frame:
+        seen = self._images[stamp_ns].detections
+        position = np.array([(one.x, one.y) for one in seen]).reshape(-1, 2)
+        robot, probability = np.full(len(seen), -1), np.zeros(len(seen))
+        for one in identities:
+            if 0 <= one.detection < len(seen) and one.name in self._index_of:
+                robot[one.detection] = self._index_of[one.name]
+                probability[one.detection] = one.probability
+        return aerial_frame(stamp_ns, position, robot, probability)
+
+
+class NewestMessages:
+    """Topics of one type, one per robot in their order; each is subscribed to once it has a publisher.
+
+    No executor may handle the subscriptions.
+    """
+
+    def __init__(self, node: Node, message_class: type, topics: Sequence[str]) -> None:
+        self._node = node
+        self._class = message_class
+        self._topics = {node.resolve_topic_name(topic): index for index, topic in enumerate(topics)}
+        self._subscriptions: dict[int, Subscription] = {}
+
+    def look_for_publishers(self, published: Mapping[str, object]) -> None:
+        """Subscribe to the topics that have a publisher by now."""
+        for topic, index in self._topics.items():
+            if index not in self._subscriptions and topic in published:
+                self._subscriptions[index] = self._node.create_subscription(
+                    self._class, topic, _unused, _NEWEST_ONLY, raw=True
+                )
+
+    @property
+    def subscriptions(self) -> frozenset[Subscription]:
+        """Subscriptions that no executor may handle."""
+        return frozenset(self._subscriptions.values())
+
+    def take(self, use: Callable[[int, bytes], None]) -> None:
+        """Return the newest message of each robot with a message since the last call."""
+        for index, subscription in self._subscriptions.items():
+            taken = subscription.handle.take_message(self._class, True)
+            if taken is not None:
+                use(index, taken[0])
+
+
+def _unused(_data: bytes) -> None:
+    """No executor calls back."""
+
 
 _FLEETING = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Matches every publisher; messages that arrive too fast are lost for this node only."""
+"""Matches every publisher; messages that arrive too fast are lost only for this node."""
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _WORK_S, _LOOK_S = 0.05, 1.0
 _PLACES_PERIOD_S = 0.1
 
 
 class WatchNode(ConfiguredNode[WatchParameters]):
-    """Converts messages to frames and passes them to the server.
-
-    Args:
-        node_arguments: Further arguments of `rclpy.node.Node`.
-    """
+    """Converts messages to frames and passes them to the server."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("watch", WatchParameters, **node_arguments)

@@ -20,7 +20,7 @@ from swarm_loc_estimator.common.messages.detections import encode_brightness
 from swarm_loc_estimator.common.messages.poses import encode_fix
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import load_ir_platform
 from swarm_loc_msgs.msg import BrightnessMatrix, SwarmPose, SwarmPoses
 
 SWARM_YAML = """

@@ -37,7 +37,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.health import Health
 from swarm_loc_estimator.nodes.estimator_diagnostics import TickCost
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
-from swarm_loc_estimator.sensors.registry import Batch
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.timeline.estimator import Estimate
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.timeline import HasBudget
@@ -312,7 +312,7 @@ class StandIn:
         self.counters: dict[str, int] = {}
         self.identities = None
         self.is_fusing = False
-        self.note = ""
+        self.hint = ""
         self.settings = Settings()
 
     def receive(self, messages: Batch) -> None:

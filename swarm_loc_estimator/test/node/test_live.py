@@ -16,9 +16,11 @@ from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.demo import main
 from swarm_loc_estimator.common.launch import GraphOptions, graph_nodes
 from swarm_loc_estimator.common.trajectory import interpolate
-from swarm_loc_estimator.offline.live.graph import LiveError, LiveGraph, Recorder
-from swarm_loc_estimator.offline.live.run import (
+from swarm_loc_estimator.offline.live_run import (
     ESTIMATOR,
+    LiveError,
+    LiveGraph,
+    Recorder,
     _settled,
     compare_with_replay,
     play_live,

@@ -15,7 +15,7 @@ from nav_msgs.msg import Odometry
 from node_world import TRUE_POSES, Ros, detection_bytes, odometry_bytes, overrides, sight
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
-from swarm_loc_estimator.sensors.registry import Batch, Measurements
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.timeline import HasBudget
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPose, SwarmPoses
@@ -34,12 +34,12 @@ class SlowEstimator(Estimator):
         self.odometry = 0
         self._waiting = 0
 
-    def convert(self, messages: Batch) -> Measurements:
+    def convert(self, batch: Batch) -> Batch:
         """Count what comes."""
-        self._waiting += messages["detections"].robot.size
-        self.taken += np.bincount(messages["detections"].robot, minlength=self.taken.size)
-        self.odometry += messages["odometry"].robot.size
-        return super().convert(messages)
+        self._waiting += batch["detections"].robot.size
+        self.taken += np.bincount(batch["detections"].robot, minlength=self.taken.size)
+        self.odometry += batch["odometry"].robot.size
+        return super().convert(batch)
 
     def tick(self, now_ns: int, *, fuse: bool = True, has_budget: HasBudget = lambda: True) -> Estimate:
         """Fuse slowly."""

@@ -22,9 +22,8 @@ from node_world import (
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
-from bench.shared.bags import encode_shared_detections, encode_shared_numbers
+from bench.shared.bags import SharedHead, encode_shared_detections, encode_shared_numbers
 from swarm_loc_estimator.common.messages.detections import (
-    SharedHead,
     swarm_key,
 )
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode

@@ -24,8 +24,7 @@ from visualization_msgs.msg import MarkerArray
 
 from swarm_loc_estimator.watch.markers_node import MarkersNode
 from swarm_loc_estimator.watch.page import unpack
-from swarm_loc_estimator.watch.robot_places import AerialNames
-from swarm_loc_estimator.watch.watch_node import WatchNode
+from swarm_loc_estimator.watch.watch_node import AerialNames, WatchNode
 from swarm_loc_msgs.msg import (
     AnonymousDetection,
     AnonymousDetectionArray,

@@ -15,8 +15,8 @@ from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, DETE
 from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.sensors.fix import FixRows
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.timeline.estimator import Estimator
 
 SECOND = 10**9
@@ -87,6 +87,11 @@ class Event:
 
 def give(estimator: Estimator, arrivals: Sequence[tuple[int, Event]]) -> None:
     """Hand in messages (arrival, event) in order of their arrivals, as a node does at a tick."""
+    estimator.receive(batch_of(arrivals))
+
+
+def batch_of(arrivals: Sequence[tuple[int, Event]]) -> Batch:
+    """Messages (arrival, event) in order of their arrivals."""
     moved = [(e.robot, e.stamp_ns, now_ns, e.pose) for now_ns, e in arrivals if e.pose is not None]
     seen = [(e.robot, e.stamp_ns, now_ns) for now_ns, e in arrivals for _ in range(e.detections.size)]
     rows: dict[str, Any] = {}
@@ -103,7 +108,7 @@ def give(estimator: Estimator, arrivals: Sequence[tuple[int, Event]]) -> None:
     images = [(now_ns, event) for now_ns, event in arrivals if event.aerial.size]
     if images:
         rows["aerial"] = _aerial_rows(images)
-    estimator.receive(Batch(arrivals[0][0], arrivals[-1][0], rows))
+    return Batch(arrivals[0][0], arrivals[-1][0], rows)
 
 
 def _aerial_rows(images: Sequence[tuple[int, Event]]) -> AerialRows:

@@ -7,9 +7,9 @@ from collections.abc import Container, Iterable
 from core_messages import SECOND, Event, give
 from core_world import World
 
+from swarm_loc_estimator.filter.measurements import Verdict
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.timeline import HasBudget
-from swarm_loc_estimator.timeline.verdicts import Verdict
 
 
 def play(

@@ -17,14 +17,13 @@ from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometr
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.sensors.fix import FixRows
 from swarm_loc_estimator.sensors.infrared import BrightnessRows
+from swarm_loc_estimator.sensors.inputs import Batch, kinds
 from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.sensors.registry import Batch, kinds
 from swarm_loc_estimator.sensors.sensor import InputKind
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.error_models import OdometryModel
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 

@@ -10,8 +10,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.cost import Pair, new_costs, write_costs
 from swarm_loc_estimator.infrared.search import classify
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
+from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains, load_ir_platform
 
 RHO = 0.022
 ANGLES = np.radians([-30.0, -90.0, -150.0, 150.0, 90.0, 30.0])

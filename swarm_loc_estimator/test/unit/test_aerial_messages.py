@@ -20,8 +20,7 @@ from swarm_loc_estimator.common.messages.detections import (
 )
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.sensors.aerial import MAX_ANONYMOUS
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import Batch
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 NAMES = st.sampled_from(["", "a", "map", "ab/base_link", "r\u00f6"])

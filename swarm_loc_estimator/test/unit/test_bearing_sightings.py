@@ -12,8 +12,8 @@ from core_world import Plan, World, simulate
 from scipy.stats import chi2
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MODELS
-from swarm_loc_estimator.sensors.camera import BEARING, CONTENT_BEARING
+from swarm_loc_estimator.filter.models import BEARING, MODELS
+from swarm_loc_estimator.sensors.camera import CONTENT_BEARING
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -63,7 +63,6 @@ def test_bearings_locate_a_robot_that_moves() -> None:
 
 @pytest.mark.parametrize("quarter", range(4))
 def test_a_bearing_wraps(quarter: int) -> None:
-    one = np.zeros(1, MEASUREMENT_DTYPE)
-    one["kind"], one["value"][0, 0] = BEARING, 0.5 * math.pi * quarter + 0.1
+    value = np.array([0.5 * math.pi * quarter + 0.1, 0.0, 0.0])
     predicted = np.array([0.5 * math.pi * quarter - 2.0 * math.pi])
-    assert MODELS[BEARING].innovation(one, predicted) == pytest.approx([0.1])
+    assert MODELS[BEARING].innovation(value, predicted) == pytest.approx([0.1])

@@ -18,8 +18,7 @@ from swarm_loc_estimator.offline.calibration.infrared.board import (
     turned,
     without_dead,
 )
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import PairGains
+from swarm_loc_estimator.swarm.ir_board import PairGains, load_ir_platform
 
 PLATFORM = load_ir_platform("droplet_2016")
 ROBOTS = 4

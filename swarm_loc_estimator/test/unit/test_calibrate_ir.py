@@ -20,11 +20,9 @@ from swarm_loc_estimator.common.messages.cdr import BRIGHTNESS, POSE_STAMPED
 from swarm_loc_estimator.common.messages.detections import encode_brightness
 from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
 from swarm_loc_estimator.offline.calibration.infrared.gains import MIN_EXCHANGES
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
 BEGIN_NS, STEP_NS = 1_700_000_000_000_000_000, 1_000_000_000
 SPREAD = 0.1

@@ -16,7 +16,17 @@ from swarm_loc_estimator.cli.calibrate import main
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.offline.calibration.fit import Options, calibrate, fit_models
+from swarm_loc_estimator.offline.calibration.fit import (
+    NEES_AIM,
+    TICK_S,
+    Options,
+    Score,
+    calibrate,
+    fit_models,
+    score,
+    thinned,
+    with_noise,
+)
 from swarm_loc_estimator.offline.calibration.motion import (
     Drive,
     Lateness,
@@ -25,14 +35,6 @@ from swarm_loc_estimator.offline.calibration.motion import (
     nodes_of,
     steps_of,
     true_motion,
-)
-from swarm_loc_estimator.offline.calibration.noise import (
-    NEES_AIM,
-    TICK_S,
-    Score,
-    score,
-    thinned,
-    with_noise,
 )
 from swarm_loc_estimator.offline.calibration.recording import (
     CalibrationError,

@@ -12,8 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
-from swarm_loc_estimator.filter.measurement_model import NOBODY, Kind, MeasurementArray
-from swarm_loc_estimator.sensors.camera import BEARING, CONTENT_BEARING, SightingConverter
+from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
+from swarm_loc_estimator.filter.models import BEARING, CARTESIAN, POLAR
+from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, DetectionRows, SightingConverter
+from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, Swarm
 
@@ -35,11 +37,12 @@ def swarm(mount: CameraMount | None = LEVEL, sensor: SensorModel | None = None) 
 
 def converted(
     detections: NDArray[np.void], swarm: Swarm, robot: int = 0
-) -> tuple[MeasurementArray, dict[str, int]]:
-    count = detections.size
+) -> tuple[Measurements, dict[str, int]]:
+    count, drops = detections.size, DropCounts(len(swarm.sources))
     received = np.frombuffer(detections.tobytes(), dtype=DETECTION_DTYPE)
-    result = SightingConverter(swarm).convert(np.full(count, robot), np.full(count, T0), received)
-    return result.measurements, {reason: robots.size for reason, robots in result.dropped.items()}
+    stamps = np.full(count, T0)
+    rows = DetectionRows(np.full(count, robot), stamps, received, stamps)
+    return SightingConverter(swarm, drops).convert(rows), dict(drops.total)
 
 
 def planar(mount: CameraMount, base: FloatArray, mark: FloatArray) -> FloatArray:
@@ -58,40 +61,38 @@ def test_a_rendered_landmark_comes_back_as_the_measurement_in_the_plane(
     mark = marker_frame(MARK.x, MARK.y, MARK.z, MARK.yaw or 0.0)
     measured, dropped = converted(detection(7, seen(base, mount, mark)), swarm(mount))
     expected = planar(mount, base, mark)
-    np.testing.assert_allclose(measured["value"][0], expected, atol=1e-12)
+    np.testing.assert_allclose(measured.value[0], expected, atol=1e-12)
     assert not dropped
-    assert measured["kind"][0] == Kind.CARTESIAN
-    assert (measured["observer"][0], measured["target"][0]) == (0, NOBODY)
-    np.testing.assert_allclose(measured["sensor"][0], [mount.x, mount.y, mount.yaw])
-    np.testing.assert_allclose(measured["marker"][0], [MARK.x, MARK.y, MARK.yaw or 0.0])
+    assert measured.model[0] == CARTESIAN
+    assert (measured.observer[0], measured.target[0]) == (0, NOBODY)
+    np.testing.assert_allclose(measured.sensor[0], [mount.x, mount.y, mount.yaw])
+    np.testing.assert_allclose(measured.marker[0], [MARK.x, MARK.y, MARK.yaw or 0.0])
     position, _ = converted(detection(7, seen(base, mount, mark), POSITION), swarm(mount))
     distance, bearing = math.hypot(expected[0], expected[1]), math.atan2(expected[1], expected[0])
-    np.testing.assert_allclose(position["value"][0, :2], [distance, bearing], atol=1e-12)
-    assert (position["kind"][0], position["has_heading"][0]) == (Kind.POLAR, 0)
+    np.testing.assert_allclose(position.value[0, :2], [distance, bearing], atol=1e-12)
+    assert (position.model[0], position.has_heading[0]) == (POLAR, 0)
     direction = detection(7, seen(base, mount, mark), CONTENT_BEARING)
     direction["position"] *= 1e4  # its length means nothing
     direction["orientation"] = np.nan
     towards, dropped = converted(direction, swarm(mount))
     assert not dropped
-    np.testing.assert_allclose(towards["value"][0, 0], bearing, atol=1e-12)
-    assert (towards["kind"][0], towards["has_heading"][0]) == (BEARING, 0)
-    assert towards["gate"] < position["gate"]
-    np.testing.assert_allclose(
-        towards["covariance"][0], np.diag([SensorModel().bearing_sigma ** 2, 1.0, 1.0])
-    )
+    np.testing.assert_allclose(towards.value[0, 0], bearing, atol=1e-12)
+    assert (towards.model[0], towards.has_heading[0]) == (BEARING, 0)
+    assert towards.gate < position.gate
+    np.testing.assert_allclose(towards.covariance[0], np.diag([SensorModel().bearing_sigma ** 2, 1.0, 1.0]))
     direction["position"] = 0.0
     assert converted(direction, swarm(mount))[1] == {"non_finite": 1}
 
 
 def test_a_face_is_seen_on_the_robot_that_carries_it() -> None:
     measured, _ = converted(detection(FACE.id, marker_frame(0, 0, 1, 0)), swarm())
-    assert (measured["observer"][0], measured["target"][0]) == (0, 1)
-    np.testing.assert_allclose(measured["marker"][0], [FACE.x, FACE.y, FACE.yaw or 0.0])
+    assert (measured.observer[0], measured.target[0]) == (0, 1)
+    np.testing.assert_allclose(measured.marker[0], [FACE.x, FACE.y, FACE.yaw or 0.0])
 
 
 def test_a_marker_that_shows_no_heading_gives_range_and_bearing_even_from_a_pose() -> None:
     measured, _ = converted(detection(8, marker_frame(0, 0, 1, 0)), swarm())
-    assert (measured["kind"][0], measured["has_heading"][0]) == (Kind.POLAR, 0)
+    assert (measured.model[0], measured.has_heading[0]) == (POLAR, 0)
 
 
 def test_the_second_solution_becomes_the_alternative() -> None:
@@ -102,9 +103,9 @@ def test_the_second_solution_becomes_the_alternative() -> None:
     one["alternative_position"] = mirrored[:3, 3]
     one["alternative_orientation"] = Rotation.from_matrix(mirrored[:3, :3]).as_quat()
     measured, _ = converted(one, swarm())
-    assert measured["has_alternative"][0] == 1
-    np.testing.assert_allclose(measured["value"][0], planar(LEVEL, np.zeros(3), mark), atol=1e-12)
-    np.testing.assert_allclose(measured["alternative"][0], planar(LEVEL, np.zeros(3), other), atol=1e-12)
+    assert measured.has_second[0]
+    np.testing.assert_allclose(measured.value[0], planar(LEVEL, np.zeros(3), mark), atol=1e-12)
+    np.testing.assert_allclose(measured.second[0], planar(LEVEL, np.zeros(3), other), atol=1e-12)
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -122,8 +123,8 @@ def test_a_published_covariance_is_carried_into_the_plane(mount: CameraMount) ->
     samples["orientation"] = (
         Rotation.from_rotvec(errors[:, 3:]) * Rotation.from_quat(samples["orientation"])
     ).as_quat()
-    spread = np.cov(converted(samples, swarm(mount))[0]["value"].T)
-    expected = measured["covariance"][0]
+    spread = np.cov(converted(samples, swarm(mount))[0].value.T)
+    expected = measured.covariance[0]
     np.testing.assert_allclose(spread, expected, atol=0.08 * np.abs(expected).max())
 
 
@@ -134,10 +135,10 @@ def test_without_a_covariance_the_sensor_s_noise_counts() -> None:
     sensor = replace(sensor, range_sigma_per_m=0.5)
     one = detection(7, marker_frame(0.0, 0.0, 2.0, 0.0))
     measured, _ = converted(one, swarm(LEVEL, sensor))
-    np.testing.assert_allclose(measured["covariance"][0], np.diag([0.09, 0.04, 0.01]))
+    np.testing.assert_allclose(measured.covariance[0], np.diag([0.09, 0.04, 0.01]))
     one["content"] = POSITION
     measured, _ = converted(one, swarm(LEVEL, sensor))
-    np.testing.assert_allclose(np.diag(measured["covariance"][0]), [(0.05 + 0.5 * 2.0) ** 2, 0.16, 1.0])
+    np.testing.assert_allclose(np.diag(measured.covariance[0]), [(0.05 + 0.5 * 2.0) ** 2, 0.16, 1.0])
 
 
 def test_calibration_corrects_range_bearing_and_time() -> None:
@@ -150,9 +151,9 @@ def test_calibration_corrects_range_bearing_and_time() -> None:
     measured, _ = converted(both, swarm(LEVEL, sensor))
     bearing, distance = math.atan2(0.6, 1.8), math.hypot(0.6, 1.8)
     expected = distance * math.exp(0.1 + 0.2 * bearing + 0.5 * bearing**2) - 0.03
-    np.testing.assert_allclose(measured["value"][:, 0], [expected, expected + 0.01])
-    np.testing.assert_allclose(measured["value"][:, 1], 1.1 * bearing + 0.3 * bearing**2 + 0.02)
-    np.testing.assert_array_equal(measured["stamp_ns"], T0 - 150_000_000)
+    np.testing.assert_allclose(measured.value[:, 0], [expected, expected + 0.01])
+    np.testing.assert_allclose(measured.value[:, 1], 1.1 * bearing + 0.3 * bearing**2 + 0.02)
+    np.testing.assert_array_equal(measured.stamp_ns, T0 - 150_000_000)
 
 
 def broken(name: str, value: float, content: int = POSE_TWO) -> NDArray[np.void]:
@@ -183,7 +184,7 @@ def test_what_cannot_be_used_is_dropped_with_a_reason(one: NDArray[np.void], rea
     measured, dropped = converted(joined([one, good]), swarm())
     assert dropped == {reason: 1}
     assert measured.size == 1
-    assert measured["marker_id"][0] == 7
+    assert measured.reading[0] == 7
 
 
 def test_numbers_that_the_content_does_not_promise_may_be_anything() -> None:

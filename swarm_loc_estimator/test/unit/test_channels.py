@@ -16,8 +16,7 @@ from swarm_loc_estimator.common.messages.cdr import BRIGHTNESS, POSE_WITH_COVARI
 from swarm_loc_estimator.common.messages.detections import decode_brightness, encode_brightness
 from swarm_loc_estimator.common.messages.poses import decode_fix, encode_fix, encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import Batch, InputConverter
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest, InputConverter
 from swarm_loc_estimator.swarm.error_models import FixModel, OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
@@ -144,15 +143,15 @@ def test_fixes_without_covariance_have_that_of_the_description(
     fixes = [encode_fix("map", T0 + k, (1.0, 2.0, 3.0), c) for k, c in enumerate((unset, COVARIANCE))]
     messages = [SerializedMessage(handle, data, T0 + 10) for data in fixes]
     (batch,) = ingest.read(MessageBatch.of(messages))
-    measured = converter.convert(batch).measurements
+    measured = converter.convert(batch).rows["fixes"]
     assert converter.drops.total == ({} if used else {"fix_without_covariance": 1})
-    *first, last = measured
-    np.testing.assert_array_equal(last["covariance"], COVARIANCE)
-    assert [bool(one["has_heading"]) for one in first] == {"": [], "position": [False], "all": [True]}[used]
+    *first, last = (measured.row(k) for k in range(measured.size))
+    np.testing.assert_array_equal(last.covariance, COVARIANCE)
+    assert [bool(one.has_heading) for one in first] == {"": [], "position": [False], "all": [True]}[used]
     for one in first:
         variance = [0.1**2, 0.1**2, 0.2**2 if used == "all" else 1.0]
-        np.testing.assert_allclose(one["covariance"], np.diag(variance))
-        np.testing.assert_allclose(one["value"], [1.0, 2.0, 3.0 if used == "all" else 0.0])
+        np.testing.assert_allclose(one.covariance, np.diag(variance))
+        np.testing.assert_allclose(one.value, [1.0, 2.0, 3.0 if used == "all" else 0.0])
 
 
 @pytest.mark.parametrize(

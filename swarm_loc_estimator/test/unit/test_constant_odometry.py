@@ -7,8 +7,7 @@ import pytest
 from core_messages import SECOND, T0
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.timeline.contradictions import ConstantOdometry
-from swarm_loc_estimator.timeline.estimate import Estimate, Status
+from swarm_loc_estimator.timeline.estimate import ConstantOdometry, Estimate, Status
 
 SIGMA = 0.01
 TENTH = SECOND // 10

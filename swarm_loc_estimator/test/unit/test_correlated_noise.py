@@ -12,23 +12,13 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.correlated_noise import (
-    PAIR_ROWS,
-    record_constraint,
-    record_pair,
-    use_mean,
-)
-from swarm_loc_estimator.filter.measurement_model import (
-    MEASUREMENT_DTYPE,
-    Kind,
-    MeasurementArray,
-    MeasurementColumns,
-)
-from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.filter.correlated_noise import record_constraint, record_pair, use_mean
+from swarm_loc_estimator.filter.measurements import LossReason, Measurements, concatenate
+from swarm_loc_estimator.filter.models import POLAR
+from swarm_loc_estimator.filter.state import PAIR_ROWS, SwarmState
 from swarm_loc_estimator.odometry.track_arrays import new_sample
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
-from swarm_loc_estimator.swarm.ir_board import RobotIr
+from swarm_loc_estimator.swarm.ir_board import RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Settings
@@ -48,20 +38,12 @@ class Exchange(NamedTuple):
     stamp_ns: int = 0
     size: float = 1.0  # of its variances
 
-    def row(self) -> MeasurementArray:
+    def columns(self) -> Measurements:
         """As the filter gets it."""
-        one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
-        one["stamp_ns"], one["target"], one["kind"], one["has_heading"] = (
-            self.stamp_ns,
-            self.transmitter,
-            Kind.POLAR,
-            1,
-        )
-        one["value"], one["systematic_share"], one["covariance"] = (
-            self.value,
-            self.systematic_share,
-            np.diag(VARIANCES * self.size),
-        )
+        one = Measurements.empty(1)
+        one.stamp_ns[:], one.observer[:], one.target[:] = self.stamp_ns, 0, self.transmitter
+        one.model[:], one.has_heading[:], one.value[:] = POLAR, True, self.value
+        one.systematic_share[:], one.covariance[:] = self.systematic_share, np.diag(VARIANCES * self.size)
         return one
 
 
@@ -99,8 +81,7 @@ def use_of(
     innovation = value - predicted
     innovation[1:] = se2.wrap_angle(innovation[1:])
     use = Use(innovation, np.diag(VARIANCES * exchange.size), np.zeros((PAIR_ROWS, 3)))
-    columns = MeasurementColumns.of(exchange.row())
-    use_mean(columns, 0, state.arrays(), poses, predicted, variances, *use)
+    use_mean(exchange.columns(), 0, state.arrays(), poses, predicted, variances, *use)
     return use
 
 
@@ -119,7 +100,7 @@ class Belief:
     def use(self, exchange: Exchange) -> None:
         """Let an exchange correct it."""
         use = use_of(self.state, exchange, self.variances, self.value, standing(VALUE))
-        record_pair(MeasurementColumns.of(exchange.row()), 0, self.state.arrays(), use.pair)
+        record_pair(exchange.columns(), 0, self.state.arrays(), use.pair)
         noise = np.diag(use.noise)
         self.value = self.value + self.variances / (self.variances + noise) * use.innovation
         self.variances = self.variances * noise / (self.variances + noise)
@@ -134,7 +115,7 @@ class Belief:
 def used(state: SwarmState, exchange: Exchange, variances: FloatArray) -> FloatArray:
     """Use it where it measured; returns the variances (3,) left."""
     use = use_of(state, exchange, variances)
-    record_pair(MeasurementColumns.of(exchange.row()), 0, state.arrays(), use.pair)
+    record_pair(exchange.columns(), 0, state.arrays(), use.pair)
     left: FloatArray = variances * np.diag(use.noise) / (variances + np.diag(use.noise))
     return left
 
@@ -221,7 +202,7 @@ def test_where_robots_may_have_moved_a_new_mean_begins(
     """What was measured elsewhere is no value to come back to; without odometry nobody knows of a move."""
     state, belief = pairs(), standing(VALUE)
     first = use_of(state, Exchange(share), UNSURE)
-    record_pair(MeasurementColumns.of(Exchange(share).row()), 0, state.arrays(), first.pair)
+    record_pair(Exchange(share).columns(), 0, state.arrays(), first.pair)
     belief[side] = se2.compose(belief[side], np.array(move))
     state.preintegrated_covariance[side] += sigma**2 * np.eye(3)
     value = np.array([0.16, 0.3, -1.9])
@@ -261,7 +242,7 @@ def test_a_pair_is_forgotten_when_either_robot_is_lost_or_others_take_its_place(
     for lost in (0, 1):
         state = pairs()
         used(state, Exchange(1.0), SURE)
-        state.deinitialize(lost)
+        state.deinitialize(lost, LossReason.COMMAND, 0)
         np.testing.assert_allclose(noise_of(state, Exchange(1.0), SURE), new)
     state = pairs(places=2)
     for transmitter, stamp_ns in ((1, 1), (2, 2), (3, 3)):
@@ -272,8 +253,8 @@ def test_a_pair_is_forgotten_when_either_robot_is_lost_or_others_take_its_place(
 
 def test_what_has_located_a_robot_counts_as_told() -> None:
     state = pairs()
-    exchange = MeasurementColumns.of(Exchange(1.0).row())
-    record_constraint(exchange, 0, state.arrays(), new_sample(2)._replace(pose=standing(VALUE)))
+    exchange = Exchange(1.0).columns().row(0)
+    record_constraint(exchange, state.arrays(), new_sample(2)._replace(pose=standing(VALUE)))
     told = np.diag(state.pair_history[0, 0, TOLD])
     assert (told > 0.4 / VARIANCES).all()  # not all of it
     assert (noise_of(state, Exchange(1.0), VARIANCES) > noise_of(pairs(), Exchange(1.0), VARIANCES)).all()
@@ -288,7 +269,7 @@ def test_a_pair_whose_relative_pose_is_known_exactly_tells_nothing(share: float)
         use = use_of(state, Exchange(share), variances)
         assert np.isfinite(use.innovation).all()
         assert (np.diag(use.noise) >= share * VARIANCES * (1.0 - 1e-6)).all()
-        record_pair(MeasurementColumns.of(Exchange(share).row()), 0, state.arrays(), use.pair)
+        record_pair(Exchange(share).columns(), 0, state.arrays(), use.pair)
         assert np.isfinite(state.pair_history).all()
 
 
@@ -311,8 +292,8 @@ class StandingPair:
 
     def hear(self, stamps_ns: Sequence[int], share: float) -> Estimate:
         """Fuse exchanges at instants, together; return the estimate at the last one."""
-        rows = np.concatenate([Exchange(share, stamp_ns=stamp_ns).row() for stamp_ns in stamps_ns])
-        rows["gate"] = 9.0
+        rows = concatenate([Exchange(share, stamp_ns=stamp_ns).columns() for stamp_ns in stamps_ns])
+        rows.gate[:] = 9.0
         self.estimator._timeline.add(rows)
         return self.estimator.tick(stamps_ns[-1])
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.small_matrix import cholesky3, solve3
+from swarm_loc_estimator.common.numerics import cholesky3, solve3
 from swarm_loc_estimator.filter.joint_filter import DenseFilter, update_one
 
 

@@ -21,9 +21,8 @@ from swarm_loc_estimator.cli import (
     watch,
 )
 from swarm_loc_estimator.common.parameters import number_specs
-from swarm_loc_estimator.offline.sweep.grid import KEYS, MINIMIZED, read_sweep
-from swarm_loc_estimator.offline.sweep.jobs import FIGURES
-from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS, SENSORS
+from swarm_loc_estimator.offline.sweep.sweep import FIGURES, KEYS, MINIMIZED, read_sweep
+from swarm_loc_estimator.swarm.new_swarm import KNOWN_ROBOTS, SENSORS
 from swarm_loc_estimator.swarm.swarm import Anchor, Face, FixedCamera, Landmark, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import MODELS, load_swarm
 

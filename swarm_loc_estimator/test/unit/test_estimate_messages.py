@@ -16,7 +16,8 @@ from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.cdr import MARKERS, MESSAGE_PACKAGE, CdrError
 from swarm_loc_estimator.common.messages.poses import EstimateMessage, SwarmPosesEncoder, SwarmPosesReader
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, Kind
+from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, Verdict
+from swarm_loc_estimator.filter.models import POLAR
 from swarm_loc_estimator.offline.export import write_mcap
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
@@ -27,7 +28,6 @@ from swarm_loc_estimator.timeline.sightings import (
     encode_sightings,
     newest_sightings,
 )
-from swarm_loc_estimator.timeline.verdicts import Verdict
 from swarm_loc_estimator.watch.markers import MarkersEncoder, ellipses
 
 SECOND = 1_000_000_000
@@ -97,10 +97,10 @@ def test_sightings_come_back_as_they_were(count: int, seed: int) -> None:
 )
 def test_of_each_pair_the_newest_measurement_is_published(measured: list[tuple[int, int, int, int]]) -> None:
     measured = sorted(measured)
-    rows = np.zeros(len(measured), dtype=MEASUREMENT_DTYPE)
-    for row, (at_ms, observer, target, _) in zip(rows, measured, strict=True):
-        row["stamp_ns"], row["observer"], row["kind"] = at_ms * 1_000_000, observer, Kind.POLAR
-        row["target"], row["landmark"] = (target, 0) if target >= 0 else (-1, -target)
+    rows = Measurements.empty(len(measured))
+    for k, (at_ms, observer, target, _) in enumerate(measured):
+        rows.stamp_ns[k], rows.observer[k], rows.model[k] = at_ms * 1_000_000, observer, POLAR
+        rows.target[k], rows.landmark[k] = (target, NOBODY) if target >= 0 else (NOBODY, -1 - target)
     verdicts = np.array([verdict for *_, verdict in measured], dtype=np.uint8)
     found = newest_sightings(Recent(rows, verdicts, np.ones(len(measured))), 3 * SECOND)
     expected = {(a, b): (at_ms, verdict) for at_ms, a, b, verdict in measured if at_ms >= 1000}

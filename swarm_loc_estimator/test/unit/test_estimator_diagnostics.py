@@ -8,14 +8,14 @@ import pytest
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
 from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE
+from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.nodes.estimator_diagnostics import Diagnostics, Recent, TickCost, load_report
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
-from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.timeline.estimate import LossReport
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
-from swarm_loc_estimator.timeline.verdicts import Verdict
 
 SECOND = 1_000_000_000
 SWARM = Swarm((Robot("a", odometry=OdometryModel(timeout_s=1.0)), Robot("b", camera=None)))
@@ -88,8 +88,8 @@ def estimate(now_ns: int, *status: Status) -> Estimate:
 
 def recent(*rows: tuple[int, Verdict, float]) -> Recent:
     """Measurements: who sent it, what was thought of it, its NIS."""
-    measurements = np.zeros(len(rows), MEASUREMENT_DTYPE)
-    measurements["received_from"] = [row[0] for row in rows]
+    measurements = Measurements.empty(len(rows))
+    measurements.received_from[:] = [row[0] for row in rows]
     return (
         measurements,
         np.array([row[1] for row in rows], np.uint8),
@@ -146,8 +146,10 @@ def test_a_robot_is_told_apart_as_waiting_lost_silent_or_in_a_foreign_frame() ->
     assert (b.warning, b.message) == (True, "waiting for a sighting or a fix that locates it")
     assert whole.values == {"dropped: gated": 3}
     world.reports(0, estimate(0, Status.TRACKED, Status.TRACKED), recent(), {})
-    _, b, _ = world.reports(0, estimate(0, Status.TRACKED, Status.WAITING), recent(), {})
-    assert b.message == "lost, waiting for a sighting or a fix that locates it"
+    losses = [None, LossReport(1, LossReason.OFF_MAP, -3 * SECOND, "its scans contradict the map")]
+    waiting = estimate(0, Status.TRACKED, Status.WAITING)
+    _, b, _ = world.reports(0, waiting, recent(), {}, losses=losses)
+    assert (b.warning, b.message) == (True, "lost 3.0 s ago: its scans contradict the map")
     now_ns = 5 * SECOND
     _, b, _ = world.reports(now_ns, estimate(now_ns, Status.TRACKED, Status.STALE), recent(), {})
     assert b.message == "b/odom is silent for 5.0 s"

@@ -15,18 +15,13 @@ from scipy.spatial.transform import Rotation
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.filter.measurement_model import (
-    MEASUREMENT_DTYPE,
-    NOBODY,
-    Kind,
-    MeasurementArray,
-    predict,
-)
+from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, NOBODY, Measurements
+from swarm_loc_estimator.filter.models import CARTESIAN, predict
 from swarm_loc_estimator.nodes.estimator_diagnostics import _CAUSES, Diagnostics
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.camera import DetectionRows, SightingConverter
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import Batch, live_topics
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest, live_topics
+from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.error_models import RandomWalk, SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Estimate
@@ -68,12 +63,16 @@ def looked(marker_id: int, pose: FloatArray, content: int = POSE) -> NDArray[np.
 
 def converted(
     detections: NDArray[np.void], camera: int = 0, swarm: Swarm = SWARM
-) -> tuple[MeasurementArray, dict[str, list[int]]]:
-    count = detections.size
+) -> tuple[Measurements, dict[str, list[int]]]:
+    count, drops = detections.size, DropCounts(len(swarm.sources))
     received = np.frombuffer(detections.tobytes(), dtype=DETECTION_DTYPE)
-    sources = np.full(count, len(swarm.robots) + camera)
-    result = SightingConverter(swarm).convert(sources, np.full(count, T0), received)
-    return result.measurements, {reason: robots.tolist() for reason, robots in result.dropped.items()}
+    sources, stamps = np.full(count, len(swarm.robots) + camera), np.full(count, T0)
+    found = SightingConverter(swarm, drops).convert(DetectionRows(sources, stamps, received, stamps))
+    dropped: dict[str, list[int]] = {reason: [] for reason in drops.total}
+    for source, counts in enumerate(drops.of_robot):
+        for reason, number in counts.items():
+            dropped[reason] += number * [source]
+    return found, dropped
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -83,11 +82,11 @@ def test_a_face_in_view_comes_back_as_the_robots_pose(face: Face, camera: int, s
     base = BASE + np.random.default_rng(seed).uniform(-0.2, 0.2, 3)
     one, dropped = converted(looked(face.id, in_view(face, CAMERAS[camera], base)), camera)
     assert dropped == {}
-    assert (one["observer"][0], one["target"][0], one["received_from"][0]) == (NOBODY, 0, 2 + camera)
-    assert one["kind"][0] == Kind.CARTESIAN
-    assert one["has_heading"][0] == (face is not MUTE)
+    assert (one.observer[0], one.target[0], one.received_from[0]) == (NOBODY, 0, 2 + camera)
+    assert one.model[0] == CARTESIAN
+    assert one.has_heading[0] == (face is not MUTE)
     predicted, _ = predict(one, np.zeros((1, 3)), base[None])
-    np.testing.assert_allclose(wrapped(one["value"] - predicted)[0, : 3 - (face is MUTE)], 0.0, atol=2e-9)
+    np.testing.assert_allclose(wrapped(one.value - predicted)[0, : 3 - (face is MUTE)], 0.0, atol=2e-9)
 
 
 @pytest.mark.parametrize("camera", range(3))
@@ -96,9 +95,9 @@ def test_a_position_alone_gives_the_place_on_the_plane(camera: int) -> None:
     near[:3, 3] *= 1.01  # the distance is not used
     one, _ = converted(looked(TOP.id, near, POSITION), camera)
     predicted, _ = predict(one, np.zeros((1, 3)), BASE[None])
-    np.testing.assert_allclose(one["value"][0, :2], predicted[0, :2], atol=1e-9)
-    assert one["has_heading"][0] == 0
-    assert one["covariance"][0, 2].tolist() == [0.0, 0.0, 1.0]
+    np.testing.assert_allclose(one.value[0, :2], predicted[0, :2], atol=1e-9)
+    assert one.has_heading[0] == 0
+    assert one.covariance[0, 2].tolist() == [0.0, 0.0, 1.0]
 
 
 def test_a_robots_camera_sees_lying_markers_of_others() -> None:
@@ -107,13 +106,12 @@ def test_a_robots_camera_sees_lying_markers_of_others() -> None:
     observer = np.array([0.0, 0.1, 0.5])
     x, y, theta = BASE
     tag = homogeneous(x, y, 0.0, theta) @ homogeneous(TOP.x, TOP.y, TOP.z, TOP.yaw or 0.0)
-    found = SightingConverter(swarm).convert(
-        np.array([1]), np.array([T0]), joined([looked(TOP.id, seen(observer, mount, tag))])
-    )
-    assert found.measurements["observer"][0] == 1
-    assert found.measurements["systematic_share"].tolist() == [[0.0, 0.0, 0.0]]
-    predicted, _ = predict(found.measurements, observer[None], BASE[None])
-    np.testing.assert_allclose(found.measurements["value"], predicted, atol=1e-9)
+    stamp, look = np.array([T0]), joined([looked(TOP.id, seen(observer, mount, tag))])
+    found = SightingConverter(swarm).convert(DetectionRows(np.array([1]), stamp, look, stamp))
+    assert found.observer[0] == 1
+    assert found.systematic_share.tolist() == [[0.0, 0.0, 0.0]]
+    predicted, _ = predict(found, observer[None], BASE[None])
+    np.testing.assert_allclose(found.value, predicted, atol=1e-9)
 
 
 def perturbed(pose: FloatArray, step: FloatArray) -> FloatArray:
@@ -128,7 +126,7 @@ def perturbed(pose: FloatArray, step: FloatArray) -> FloatArray:
 def test_the_covariance_is_that_of_the_pose_propagated(camera: int) -> None:
     pose, step = in_view(TOP, CAMERAS[camera]), 1e-6
     ends = [
-        [converted(looked(TOP.id, perturbed(pose, sign * axis)), camera)[0]["value"][0] for sign in (1, -1)]
+        [converted(looked(TOP.id, perturbed(pose, sign * axis)), camera)[0].value[0] for sign in (1, -1)]
         for axis in step * np.eye(6)
     ]
     slopes = np.array([wrapped(ahead - behind) / (2.0 * step) for ahead, behind in ends]).T
@@ -137,9 +135,9 @@ def test_the_covariance_is_that_of_the_pose_propagated(camera: int) -> None:
     position = TOP.position_sigma**2 + EXACT.residual_position_sigma**2 + fixed.position_sigma**2
     heading = EXACT.residual_heading_sigma**2 + fixed.yaw_sigma**2
     expected = slopes @ SPREAD @ slopes.T + np.diag([position, position, heading])
-    np.testing.assert_allclose(one["covariance"][0], expected, rtol=1e-5, atol=1e-10)
+    np.testing.assert_allclose(one.covariance[0], expected, rtol=1e-5, atol=1e-10)
     shares = np.square([fixed.position_sigma, fixed.position_sigma, fixed.yaw_sigma]) / np.diag(expected)
-    np.testing.assert_allclose(one["systematic_share"][0], shares, rtol=1e-5)
+    np.testing.assert_allclose(one.systematic_share[0], shares, rtol=1e-5)
 
 
 def test_tilt_and_distance_of_a_marker_move_its_place_by_no_more_than_its_pixels() -> None:
@@ -148,7 +146,7 @@ def test_tilt_and_distance_of_a_marker_move_its_place_by_no_more_than_its_pixels
     straight, _ = converted(looked(TOP.id, pose))
     tilted, dropped = converted(looked(TOP.id, perturbed(pose, np.array([0, 0, 0, 0.05, -0.03, 0.0]))))
     assert dropped == {}
-    off = wrapped(tilted["value"] - straight["value"])[0]
+    off = wrapped(tilted.value - straight.value)[0]
     assert np.abs(off[:2]).max() < 1e-4
     assert abs(off[2]) < math.radians(0.1)
 
@@ -161,9 +159,9 @@ def test_of_two_mirrored_poses_the_one_that_lies_is_used() -> None:
     ][0]
     found, dropped = converted(one, 1)
     assert dropped == {}
-    assert not found["has_alternative"][0]
+    assert not found.has_second[0]
     expected, _ = converted(looked(TOP.id, pose), 1)
-    np.testing.assert_allclose(found["value"], expected["value"], atol=1e-12)
+    np.testing.assert_allclose(found.value, expected.value, atol=1e-12)
 
 
 def turned_over(pose: FloatArray) -> FloatArray:
@@ -204,9 +202,9 @@ def test_a_covariance_that_is_not_known_is_that_of_the_description() -> None:
     one = detection(TOP.id, in_view(TOP, CAMERAS[0]))
     found, _ = converted(one)
     sensor, fixed = CAMERAS[0].sensor, CAMERAS[0]
-    heading = found["covariance"][0, 2, 2] - sensor.residual_heading_sigma**2 - fixed.yaw_sigma**2
+    heading = found.covariance[0, 2, 2] - sensor.residual_heading_sigma**2 - fixed.yaw_sigma**2
     assert math.sqrt(heading) == pytest.approx(sensor.heading_sigma, rel=0.05)
-    assert math.sqrt(found["covariance"][0, 0, 0]) == pytest.approx(sensor.left_sigma, rel=0.1)
+    assert math.sqrt(found.covariance[0, 0, 0]) == pytest.approx(sensor.left_sigma, rel=0.1)
 
 
 STANDING = Robot("a", camera=None, faces=(TOP, SIDE), stands=True, random_walk=RandomWalk(1e-10, 1e-10))
@@ -231,16 +229,16 @@ def test_a_single_sighting_locates_a_robot() -> None:
     np.testing.assert_allclose(wrapped(only.poses[0] - BASE), 0.0, atol=1e-9)
     one, _ = converted(looked(TOP.id, in_view(TOP, CAMERAS[1])), 1, swarm)
     # the same covariance by composition: of the marker in the sensor's frame to that of base_link in map
-    step, value, sensor = 1e-6, one["value"][0], one["sensor"][0]
+    step, value, sensor = 1e-6, one.value[0], one.sensor[0]
 
     def placed(at: FloatArray) -> FloatArray:
-        return pose_of(planar(sensor) @ planar(at) @ np.linalg.inv(planar(one["marker"][0])))
+        return pose_of(planar(sensor) @ planar(at) @ np.linalg.inv(planar(one.marker[0])))
 
     slopes = np.array(
         [wrapped(placed(value + axis) - placed(value - axis)) / (2.0 * step) for axis in step * np.eye(3)]
     ).T
     suspect = np.diag(np.square([0.03, 0.03, 0.06]))  # until others agree
-    expected = slopes @ one["covariance"][0] @ slopes.T
+    expected = slopes @ one.covariance[0] @ slopes.T
     np.testing.assert_allclose(only.covariances[0] - suspect, expected, rtol=1e-3)
 
 
@@ -297,7 +295,7 @@ def test_a_described_camera_has_a_topic_that_is_missed_and_its_drops_are_named()
     message = SerializedMessage(ingest.handle_of["straight/detections"], data, T0)
     list(ingest.read(MessageBatch.of([message])))
     (estimate,) = watched([(0, 1, looked(TOP.id, in_view(TOP, CAMERAS[1])))], swarm)
-    nothing = (np.zeros(0, dtype=MEASUREMENT_DTYPE), np.zeros(0, dtype=np.uint8), np.zeros(0))
+    nothing = (NO_MEASUREMENTS, np.zeros(0, dtype=np.uint8), np.zeros(0))
     drops: list[dict[str, int]] = [{}, {"not_flat": 3, "unknown_id": 2}, {}]
     _, straight, aslant, whole = diagnostics.reports(T0, estimate, nothing, {}, drops)
     assert straight.name == "straight"

@@ -8,7 +8,8 @@ from core_messages import SECOND, T0
 from core_run import play, ticks
 from core_world import Plan, simulate
 
-from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.filter.measurements import Measurements
+from swarm_loc_estimator.filter.models import CARTESIAN
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
@@ -24,14 +25,14 @@ def test_what_is_to_be_fused_again_is_not_forgotten_while_fusing_takes_several_t
     """Odometry changes what was measured, and until fusing ends this has grown too old."""
     stepped: list[int] = []
 
-    def step(_state: SwarmState, rows: MeasurementArray, _verdicts: object, _nis: object) -> None:
-        stepped.extend(rows["stamp_ns"].tolist())
+    def step(_state: SwarmState, rows: Measurements, *_: object) -> None:
+        stepped.extend(rows.stamp_ns.tolist())
 
     state = SwarmState(ParameterTable.of((Robot("a"),), ()))
     timeline = Timeline(Settings(fusion_period_s=1e-9 * PERIOD_NS, horizon_s=1.0), step, state, 0)
     stamp_ns = T0 + PERIOD_NS * np.arange(1, 6, dtype=np.int64)
     every = np.tile(np.eye(3), (stamp_ns.size, 1, 1))
-    timeline.add(about_robots(0, stamp_ns, np.zeros((stamp_ns.size, 3)), every, Kind.CARTESIAN))
+    timeline.add(about_robots(0, stamp_ns, np.zeros((stamp_ns.size, 3)), every, CARTESIAN))
     timeline.advance(int(stamp_ns[-1]), lambda: False)
     assert stepped == [stamp_ns[0]]
     timeline.invalidate(np.array([T0]))

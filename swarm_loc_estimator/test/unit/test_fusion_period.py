@@ -13,15 +13,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.arrays import IntArray
-from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
+from swarm_loc_estimator.filter.measurements import Measurements
+from swarm_loc_estimator.filter.models import CARTESIAN
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
-from swarm_loc_estimator.timeline.settings import Policy, Settings, end_of_period, middle_of_period
-from swarm_loc_estimator.timeline.timeline import Timeline
+from swarm_loc_estimator.timeline.settings import Policy, Settings
+from swarm_loc_estimator.timeline.timeline import Timeline, end_of_period, middle_of_period
 
 PERIOD_NS = SECOND // 5
 SMALLEST_LARGE = Policy().delay_from
@@ -54,9 +55,9 @@ class Fused:
         self._now_ns = now_ns
         self.timeline.advance(now_ns)
 
-    def _step(self, _state: SwarmState, rows: MeasurementArray, _verdicts: object, _nis: object) -> None:
-        assert np.unique(end_of_period(rows["stamp_ns"], PERIOD_NS)).size == 1
-        self.stamp_ns.extend(rows["stamp_ns"].tolist())
+    def _step(self, _state: SwarmState, rows: Measurements, *_: object) -> None:
+        assert np.unique(end_of_period(rows.stamp_ns, PERIOD_NS)).size == 1
+        self.stamp_ns.extend(rows.stamp_ns.tolist())
         self.at_ns.extend(rows.size * [self._now_ns])
 
 
@@ -122,9 +123,9 @@ def test_odometry_is_kept_for_what_waits_beyond_the_horizon() -> None:
     np.testing.assert_allclose(found.covariances, expected.covariances, atol=1e-9)
 
 
-def fixes(stamp_ns: IntArray) -> MeasurementArray:
+def fixes(stamp_ns: IntArray) -> Measurements:
     return about_robots(
-        0, stamp_ns, np.zeros((stamp_ns.size, 3)), np.tile(np.eye(3), (stamp_ns.size, 1, 1)), Kind.CARTESIAN
+        0, stamp_ns, np.zeros((stamp_ns.size, 3)), np.tile(np.eye(3), (stamp_ns.size, 1, 1)), CARTESIAN
     )
 
 

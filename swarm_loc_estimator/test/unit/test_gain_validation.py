@@ -16,8 +16,7 @@ from swarm_loc_estimator.offline.calibration.infrared.gains import (
     held_out_likelihoods,
     helpful_gains,
 )
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
+from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, load_ir_platform
 
 PAPER, REAL = droplet(0.1), load_ir_platform("droplet_2016")
 ROBOTS, N = 3, 6

@@ -9,13 +9,13 @@ from core_messages import SECOND, T0, give_fix
 from ir_swarm import DROPLET, Event, Place, exchange, messages
 
 from swarm_loc_estimator.filter.integrity import LossLimits, count_gated, is_contradicted
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, NOBODY, MeasurementColumns
+from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import RandomWalk
 from swarm_loc_estimator.swarm.ir_board import RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.timeline.contradictions import Contradicted
+from swarm_loc_estimator.timeline.estimate import Contradicted
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -31,9 +31,9 @@ HERE, THERE = np.array([0.1, 0.2, 0.3]), np.array([0.4, 0.0, 1.3])
 
 def looked(state: SwarmState, second: int, observer: int, passed: bool) -> int:
     """Count a fix of the root, or what another robot measures of it; returns who is lost."""
-    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
-    one["stamp_ns"], one["observer"], one["target"] = T0 + second * SECOND, observer, ROOT
-    lost: int = count_gated(MeasurementColumns.of(one), 0, state.arrays(), passed, LIMITS)
+    one = Measurements.empty(1)
+    one.stamp_ns[:], one.observer[:], one.target[:] = T0 + second * SECOND, observer, ROOT
+    lost, _ = count_gated(one, 0, state.arrays(), passed, LIMITS)
     return lost
 
 
@@ -65,9 +65,9 @@ def test_a_fix_that_is_wrong_is_forgiven_with_a_landmark_in_its_place() -> None:
     state = new_state()
     assert looked(state, 0, NOBODY, passed=False) == -1
     assert is_contradicted(state.integrity, ROOT)
-    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
-    one["stamp_ns"], one["observer"], one["target"] = T0 + SECOND, ROOT, NOBODY
-    assert count_gated(MeasurementColumns.of(one), 0, state.arrays(), True, LIMITS) == -1
+    one = Measurements.empty(1)
+    one.stamp_ns[:], one.observer[:], one.target[:] = T0 + SECOND, ROOT, NOBODY
+    assert count_gated(one, 0, state.arrays(), True, LIMITS)[0] == -1
     assert not is_contradicted(state.integrity, ROOT)
 
 

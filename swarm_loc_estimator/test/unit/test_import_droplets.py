@@ -14,19 +14,17 @@ from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.offline.calibration.infrared.board import read_board
 from swarm_loc_estimator.offline.calibration.recording import read_recording
 from swarm_loc_estimator.offline.datasets.droplets import (
+    METRES_PER_PIXEL,
     DropletRecordingError,
     Exchange,
+    ImportSettings,
     Sighting,
     clean,
-    parse_line,
-)
-from swarm_loc_estimator.offline.datasets.droplets_bag import (
-    METRES_PER_PIXEL,
-    ImportSettings,
     find_fiducials,
     import_recording,
+    parse_line,
 )
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import load_ir_platform
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 QUARTER = 0.5 * math.pi

@@ -19,8 +19,8 @@ from swarm_loc_estimator.common.messages.cdr import IMU, CdrError, encode
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.odometry.track_arrays import OdometrySample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.sensors.imu import TURN_RATES, TurnRateRows, decode_imu
-from swarm_loc_estimator.sensors.ingest import Ingest
+from swarm_loc_estimator.sensors.imu import TurnRateRows, TurnRateSensor
+from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.calibration_states import DISTANCE_SCALE, TURN_BIAS, TURN_SCALE
 from swarm_loc_estimator.swarm.error_models import ImuModel, OdometryModel
@@ -186,12 +186,11 @@ def test_messages_are_read_and_bad_ones_counted() -> None:
     (part,) = ingest.read(batch)
     assert part.dropped == {"bad_message": 1}
     drops = DropCounts(2)
-    assert TURN_RATES.create_converter is not None
-    rows = TURN_RATES.create_converter(swarm, Settings(), drops)(part["imu"])
+    rows = TurnRateSensor(swarm, Settings(), drops).measure(part["imu"])
     assert rows.rate.tolist() == [0.3]
     assert drops.total == Counter(imu_non_finite=2, imu_absurd=1)
     with pytest.raises(CdrError):
-        decode_imu(message((0.0, 0.0, 0.0))[:40])
+        TurnRateSensor.decode(message((0.0, 0.0, 0.0))[:40])
 
 
 @given(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
@@ -202,6 +201,6 @@ def test_the_mount_is_taken_into_account(roll: float, pitch: float, rate: float)
     velocity = mount.T @ [0.0, 0.0, rate]
     one = np.zeros(1, dtype=np.int64)
     rows = TurnRateRows(one, one + T0, velocity[None], np.full(1, np.nan), one + T0)
-    assert TURN_RATES.create_converter is not None
-    converted = TURN_RATES.create_converter(Swarm((Robot("r0", imu=imu),)), Settings(), DropCounts(1))(rows)
+    sensor = TurnRateSensor(Swarm((Robot("r0", imu=imu),)), Settings(), DropCounts(1))
+    converted = sensor.measure(rows)
     assert converted.rate[0] == pytest.approx(rate, abs=1e-9)

@@ -11,12 +11,12 @@ from ir_swarm import DROPLET, T0, Light, brightness_rows, calibrated, exchange
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementArray
-from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.infrared.search import IrOutcome, IrSolutions
+from swarm_loc_estimator.filter.measurements import Measurements, select
+from swarm_loc_estimator.filter.models import POLAR
+from swarm_loc_estimator.infrared.search import IrOutcome, IrSolutions, no_solutions
 from swarm_loc_estimator.sensors import infrared as brightness_sightings
 from swarm_loc_estimator.sensors.infrared import BrightnessConverter, BrightnessRows
-from swarm_loc_estimator.swarm.ir_board import IrMethod, IrPlatform, PairGains, RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 POSES = np.array([[0.0, 0.0, 0.3], [0.14, 0.08, -1.2], [-0.05, 0.1, 2.0]])
@@ -25,8 +25,8 @@ OTHER_BOARD = replace(DROPLET, radius=0.03)
 ONE_POWER = replace(DROPLET, amplitudes=DROPLET.amplitudes[:1])
 
 
-def swarm_of(platform: IrPlatform = DROPLET, method: IrMethod = IrMethod.LIKELIHOOD) -> Swarm:
-    board = RobotIr(1, platform, "droplet", method, calibrated(platform))
+def swarm_of(platform: IrPlatform = DROPLET) -> Swarm:
+    board = RobotIr(1, platform, "droplet", calibrated(platform))
     robots = [Robot(f"d{k}", ir=replace(board, id=k + 1)) for k in range(3)]
     return Swarm((*robots, Robot("blind"), Robot("other", ir=replace(board, id=9, platform=OTHER_BOARD))))
 
@@ -45,22 +45,29 @@ def relative(observer: int, target: int) -> FloatArray:
     return np.array([np.hypot(x, y), np.arctan2(y, x), heading])
 
 
-@pytest.mark.parametrize("method", IrMethod)
-def test_the_transmitter_lies_where_it_is_seen_from_the_receiver(method: IrMethod) -> None:
-    converter = BrightnessConverter(swarm_of(method=method))
+def in_bytes(measured: Measurements) -> list[bytes]:
+    """Each measurement, whenever it arrived."""
+    rows = (measured.row(k) for k in range(measured.size))
+    return [b"".join(part.tobytes() for part in row[:-1]) for row in rows]
+
+
+def test_the_transmitter_lies_where_it_is_seen_from_the_receiver() -> None:
+    converter = BrightnessConverter(swarm_of())
     change = converter.take(rows_of(*heard(noise=0.0)))
     measured = change.added
-    assert measured["observer"].tolist() == measured["received_from"].tolist() == [0, 2]
-    assert measured["target"].tolist() == [1, 1]
-    assert set(measured["kind"].tolist()) == {Kind.POLAR}
-    assert measured["has_heading"].all()
-    assert not measured["sensor"].any()
-    assert not measured["marker"].any()
-    limit = [0.01, 0.2, 0.3] if method is IrMethod.CLOSED_FORM else [1e-3, 0.01, 0.02]
-    for row in measured:
-        error = row["value"] - relative(row["observer"], 1)
+    assert measured.observer.tolist() == measured.received_from.tolist() == [0, 2]
+    assert measured.target.tolist() == [1, 1]
+    assert set(measured.model.tolist()) == {POLAR}
+    assert measured.has_heading.all()
+    assert not measured.sensor.any()
+    assert not measured.marker.any()
+    limit = [1e-3, 0.01, 0.02]
+    for observer, value, covariance in zip(
+        measured.observer.tolist(), measured.value, measured.covariance, strict=True
+    ):
+        error = value - relative(observer, 1)
         assert (np.abs([error[0], *se2.wrap_angle(error[1:])]) < limit).all()
-        assert (np.linalg.eigvalsh(row["covariance"]) > 0.0).all()
+        assert (np.linalg.eigvalsh(covariance) > 0.0).all()
     assert not converter.drops
 
 
@@ -74,10 +81,10 @@ def test_the_two_powers_of_an_exchange_make_one_measurement_in_any_order() -> No
         first = converter.take(rows_of(one))
         second = converter.take(rows_of(other))
         assert (first.added.size, first.withdrawn.size) == (1, 0)
-        assert second.withdrawn.tobytes() == first.added.tobytes()
-        assert second.added.tobytes() == both.tobytes()
-        assert first.added.tobytes() != both.tobytes()
-        assert both["covariance"][0, 0, 0] < first.added["covariance"][0, 0, 0]
+        assert in_bytes(second.withdrawn) == in_bytes(first.added)
+        assert in_bytes(second.added) == in_bytes(both)
+        assert in_bytes(first.added) != in_bytes(both)
+        assert both.covariance[0, 0, 0] < first.added.covariance[0, 0, 0]
 
 
 def test_a_repeated_matrix_counts_once_and_of_two_that_differ_the_same_one_in_any_order() -> None:
@@ -88,8 +95,8 @@ def test_a_repeated_matrix_counts_once_and_of_two_that_differ_the_same_one_in_an
         converter, measured = BrightnessConverter(swarm_of()), list[bytes]()
         for event in order:
             change = converter.take(rows_of(event))
-            measured = [row for row in measured if row not in [w.tobytes() for w in change.withdrawn]]
-            measured += [row.tobytes() for row in change.added]
+            measured = [row for row in measured if row not in in_bytes(change.withdrawn)]
+            measured += in_bytes(change.added)
         assert converter.drops == {"duplicate": 1}
         results.append(measured)
     assert len(results[0]) == 1
@@ -164,11 +171,10 @@ def test_what_cannot_be_used_has_a_reason(
     assert converter.take(rows).added.size == 1
 
 
-@pytest.mark.parametrize("method", IrMethod)
-def test_readings_below_zero_are_noise_around_it(method: IrMethod) -> None:
+def test_readings_below_zero_are_noise_around_it() -> None:
     events = heard()[:2]
     assert min(float(event.readings.min()) for event in events) < 0.0
-    assert BrightnessConverter(swarm_of(method=method)).take(rows_of(*events)).added.size == 1
+    assert BrightnessConverter(swarm_of()).take(rows_of(*events)).added.size == 1
 
 
 def test_a_matrix_that_is_useless_alone_is_counted_until_its_partner_makes_it_useful() -> None:
@@ -183,8 +189,7 @@ def test_a_matrix_that_is_useless_alone_is_counted_until_its_partner_makes_it_us
     assert not converter.drops
 
 
-@pytest.mark.parametrize("method", IrMethod)
-def test_what_is_read_in_the_dark_is_no_light(method: IrMethod) -> None:
+def test_what_is_read_in_the_dark_is_no_light() -> None:
     """Readings and the saturation of their matrix are both higher by it."""
     limit = 150
     for poses in (POSES, CLOSE):
@@ -193,9 +198,9 @@ def test_what_is_read_in_the_dark_is_no_light(method: IrMethod) -> None:
             board = replace(DROPLET, dark_level=dark)
             lifted = [replace(one, readings=np.minimum(one.readings + dark, limit + dark)) for one in events]
             told = with_column(saturation=limit + dark)(rows_of(*lifted))
-            results.append(BrightnessConverter(swarm_of(board, method)).take(told).added)
+            results.append(BrightnessConverter(swarm_of(board)).take(told).added)
         assert results[0].size
-        assert results[0].tobytes() == results[1].tobytes()
+        assert in_bytes(results[0]) == in_bytes(results[1])
 
 
 def test_measured_exchanges_are_those_since_the_last_restart() -> None:
@@ -216,9 +221,9 @@ def test_a_sensor_that_ends_early_tells_no_more_from_there_on() -> None:
     cut, told = replace(far, readings=np.minimum(far.readings, limit)), with_column(saturation=limit)
     converter, ignorant = BrightnessConverter(swarm_of()), BrightnessConverter(swarm_of())
     measured = converter.take(told(rows_of(cut))).added
-    assert measured["value"][0, 0] == pytest.approx(relative(0, 1)[0], abs=2e-3)
+    assert measured.value[0, 0] == pytest.approx(relative(0, 1)[0], abs=2e-3)
     wrong = ignorant.take(rows_of(cut)).added
-    assert not wrong.size or abs(wrong["value"][0, 0] - relative(0, 1)[0]) > 5e-3
+    assert not wrong.size or abs(wrong.value[0, 0] - relative(0, 1)[0]) > 5e-3
 
 
 def test_where_readings_end_is_each_matrixs_own_and_in_any_order_the_same() -> None:
@@ -229,19 +234,19 @@ def test_where_readings_end_is_each_matrixs_own_and_in_any_order_the_same() -> N
     repeated = [(one, limit) for one in events for limit in (limits[one.power], 4095)]
     results = set()
     for order in (repeated, repeated[::-1], repeated[1:] + repeated[:1]):
-        converter, last = BrightnessConverter(swarm_of()), b""
+        converter, last = BrightnessConverter(swarm_of()), list[bytes]()
         for event, limit in order:
             added = converter.take(with_column(saturation=limit)(rows_of(event))).added
-            last = added.tobytes() or last
+            last = in_bytes(added) or last
         assert converter.drops == {"duplicate": 2}
-        results.add(last)
+        results.add(b"".join(last))
     assert len(results) == 1
     told = [with_column(saturation=limits[one.power])(rows_of(one)) for one in events]
     converter = BrightnessConverter(swarm_of())
     converter.take(told[0])
     measured = converter.take(told[1]).added
-    error = measured["value"][0] - [np.hypot(*CLOSE[1, :2]), *relative(0, 1)[1:]]
-    assert np.sum(error * np.linalg.solve(measured["covariance"][0], error)) < 16.3  # one in a thousand
+    error = measured.value[0] - [np.hypot(*CLOSE[1, :2]), *relative(0, 1)[1:]]
+    assert np.sum(error * np.linalg.solve(measured.covariance[0], error)) < 16.3  # one in a thousand
 
 
 class Ambiguous:
@@ -257,7 +262,7 @@ class Ambiguous:
         assert gains is not None
         assert saturation is not None
         k = len(readings)
-        solutions = IrSolutions.none(k)
+        solutions = no_solutions(k)
         solutions.outcomes[:] = IrOutcome.FOUND
         solutions.poses[:] = [0.1, 0.2, 0.3]
         solutions.covariances[:] = np.eye(3)
@@ -269,13 +274,13 @@ class Ambiguous:
 def test_a_second_pose_becomes_the_alternative_and_no_covariance_is_no_measurement(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setitem(brightness_sightings._METHODS, IrMethod.LIKELIHOOD, Ambiguous)
+    monkeypatch.setattr(brightness_sightings, "MaximumLikelihood", Ambiguous)
     brightness_sightings._estimator.cache_clear()
     converter = BrightnessConverter(swarm_of())
-    measured: MeasurementArray = converter.take(rows_of(*heard())).added
+    measured = converter.take(rows_of(*heard())).added
     brightness_sightings._estimator.cache_clear()
-    assert (measured.size, measured["has_alternative"].tolist()) == (1, [1])
-    np.testing.assert_allclose(measured["alternative"][0], [0.11, 2.0, -1.0])
+    assert (measured.size, measured.has_second.tolist()) == (1, [True])
+    np.testing.assert_allclose(measured.second[0], [0.11, 2.0, -1.0])
     assert converter.drops == {"bad_covariance": 2}
 
 

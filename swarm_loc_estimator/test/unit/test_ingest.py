@@ -29,7 +29,7 @@ from swarm_loc_estimator.common.messages.streams import (
     PoseReader,
     SerializedMessage,
 )
-from swarm_loc_estimator.sensors.ingest import Ingest, WrongClock
+from swarm_loc_estimator.sensors.inputs import Ingest, WrongClock
 from swarm_loc_estimator.swarm.error_models import ClockModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 

@@ -12,14 +12,9 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.belief import BeliefArrays
-from swarm_loc_estimator.filter.measurement_model import (
-    MEASUREMENT_DTYPE,
-    NOBODY,
-    Kind,
-    MeasurementArray,
-)
-from swarm_loc_estimator.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
+from swarm_loc_estimator.filter.models import CARTESIAN, POLAR
+from swarm_loc_estimator.filter.state import BeliefArrays, InitialPose, SwarmState
 from swarm_loc_estimator.initialization import alignment, initializer
 from swarm_loc_estimator.initialization.alignment import (
     CONSTRAINT_DTYPE,
@@ -49,8 +44,8 @@ def any_pose(rng: np.random.Generator) -> FloatArray:
 
 
 def sighting(
-    rng: np.random.Generator, sees: bool, kind: Kind, camera: FloatArray
-) -> tuple[MeasurementArray, FloatArray]:
+    rng: np.random.Generator, sees: bool, model: int, camera: FloatArray
+) -> tuple[Measurements, FloatArray]:
     """What robot 0, at a random place, sees of a robot 1 at the origin, or is seen as; and where it is.
 
     The camera (2,) is turned and stretches distances.
@@ -60,19 +55,14 @@ def sighting(
     observer, target = (planar(robot), np.eye(3)) if sees else (np.eye(3), planar(robot))
     seen = pose_of(np.linalg.inv(observer @ planar(turned)) @ target @ planar(marker))
     seen[:2] *= 1.0 + camera[1]
-    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
-    one["observer"], one["target"] = (0, 1) if sees else (1, 0)
-    one["kind"], one["sensor"], one["marker"], one["stamp_ns"], one["has_heading"] = (
-        kind,
-        sensor,
-        marker,
-        T0,
-        1,
+    one = Measurements.empty(1)
+    one.observer[:], one.target[:] = (0, 1) if sees else (1, 0)
+    one.model[:], one.stamp_ns[:], one.has_heading[:] = model, T0, True
+    one.sensor[:], one.marker[:] = sensor, marker
+    one.value[:] = (
+        seen if model == CARTESIAN else [math.hypot(*seen[:2]), math.atan2(seen[1], seen[0]), seen[2]]
     )
-    one["value"] = (
-        seen if kind == Kind.CARTESIAN else [math.hypot(*seen[:2]), math.atan2(seen[1], seen[0]), seen[2]]
-    )
-    one["covariance"] = np.diag([4e-4, 1e-4, 1e-2])
+    one.covariance[:] = np.diag([4e-4, 1e-4, 1e-2])
     return one, robot
 
 
@@ -80,19 +70,20 @@ def sighting(
 @given(
     seed=SEEDS,
     sees=st.booleans(),
-    kind=st.sampled_from([Kind.CARTESIAN, Kind.POLAR]),
+    model=st.sampled_from([CARTESIAN, POLAR]),
     yaw=st.floats(-0.2, 0.2),
     stretch=st.floats(-0.2, 0.2),
 )
 def test_a_constraint_lies_on_the_map_where_the_true_transform_puts_it(
-    seed: int, sees: bool, kind: Kind, yaw: float, stretch: float
+    seed: int, sees: bool, model: int, yaw: float, stretch: float
 ) -> None:
     rng, camera = np.random.default_rng(seed), np.array([yaw, stretch])
-    one, robot = sighting(rng, sees, kind, camera)
+    one, robot = sighting(rng, sees, model, camera)
     transform = any_pose(rng)
     track = pose_of(np.linalg.inv(planar(transform)) @ planar(robot))
-    one["has_alternative"], one["alternative"] = 1, one["value"] + [0.0, 0.0, 0.7]
-    (constraint,) = with_constraint(NO_CONSTRAINTS, one, camera, Waiting(0, track, NO_NOISE), ORIGIN, LONG_NS)
+    one.has_second[:], one.second[:] = True, one.value + np.array([0.0, 0.0, 0.7])
+    waiting = Waiting(0, track, NO_NOISE)
+    (constraint,) = with_constraint(NO_CONSTRAINTS, one.row(0), camera, waiting, ORIGIN, LONG_NS)
     place = planar(transform) @ [constraint["local_x"], constraint["local_y"], 1.0]
     np.testing.assert_allclose(place[:2], [constraint["map_x"], constraint["map_y"]], atol=1e-9)
     off = np.array([constraint["turn"], constraint["other_turn"]]) - transform[2]
@@ -101,19 +92,19 @@ def test_a_constraint_lies_on_the_map_where_the_true_transform_puts_it(
 
 
 @pytest.mark.parametrize("sees", [True, False])
-@pytest.mark.parametrize("kind", [Kind.CARTESIAN, Kind.POLAR])
-def test_a_constraint_is_as_unsure_as_sampled_sightings_and_located_robots(kind: Kind, sees: bool) -> None:
-    rng = np.random.default_rng(int(kind) + 2 * sees)
+@pytest.mark.parametrize("model", [CARTESIAN, POLAR])
+def test_a_constraint_is_as_unsure_as_sampled_sightings_and_located_robots(model: int, sees: bool) -> None:
+    rng = np.random.default_rng(model + 2 * sees)
     camera = np.array([0.1, 0.3])
-    one, robot = sighting(rng, sees, kind, camera)
+    one, robot = sighting(rng, sees, model, camera)
     spread = np.diag([1e-4, 2e-4, 3e-4])
-    samples, value = [], one["value"].copy()
+    samples, value = [], one.value.copy()
     for _ in range(1500):
-        one["value"] = value + rng.multivariate_normal(np.zeros(3), one["covariance"][0])
+        one.value[:] = value + rng.multivariate_normal(np.zeros(3), one.covariance[0])
         base = rng.multivariate_normal(np.zeros(3), spread)
         other = OtherSide(1, -1, base, base, NO_NOISE)
         (constraint,) = refreshed(
-            with_constraint(NO_CONSTRAINTS, one, camera, Waiting(0, robot, NO_NOISE), other, LONG_NS),
+            with_constraint(NO_CONSTRAINTS, one.row(0), camera, Waiting(0, robot, NO_NOISE), other, LONG_NS),
             belief_of(base, spread),
         )
         samples.append([constraint[name] for name in ("local_x", "local_y", "map_x", "map_y")])
@@ -143,13 +134,13 @@ def test_a_constraint_moves_with_what_is_believed_of_the_robot_on_the_other_side
     """As if that had been known when it was noted; its track since makes it less sure."""
     rng = np.random.default_rng(3)
     then, now, spread, drift = any_pose(rng), any_pose(rng), np.diag([1e-4, 2e-4, 3e-4]), 1e-4 * np.eye(3)
-    one, robot = sighting(rng, True, Kind.CARTESIAN, EXACT)
+    one, robot = sighting(rng, True, CARTESIAN, EXACT)
     track = any_pose(rng)
     constraints = [
         refreshed(
             with_constraint(
                 NO_CONSTRAINTS,
-                one,
+                one.row(0),
                 EXACT,
                 Waiting(0, robot, NO_NOISE),
                 OtherSide(1, -1, se2.compose(transform, track), transform, noise),
@@ -168,8 +159,9 @@ def test_a_constraint_moves_with_what_is_believed_of_the_robot_on_the_other_side
 
 
 def test_constraints_of_a_robot_that_was_lost_do_not_count() -> None:
-    one, robot = sighting(np.random.default_rng(0), True, Kind.CARTESIAN, EXACT)
-    constraints = with_constraint(NO_CONSTRAINTS, one, EXACT, Waiting(0, robot, NO_NOISE), ORIGIN, LONG_NS)
+    one, robot = sighting(np.random.default_rng(0), True, CARTESIAN, EXACT)
+    waiting = Waiting(0, robot, NO_NOISE)
+    constraints = with_constraint(NO_CONSTRAINTS, one.row(0), EXACT, waiting, ORIGIN, LONG_NS)
     assert refreshed(constraints, SwarmState(ParameterTable.of([Robot("a"), Robot("b")])).arrays()).size == 0
 
 
@@ -206,18 +198,18 @@ def test_what_enters_errs_as_those_do_that_it_was_located_by(seed: int) -> None:
 
 def sight_of(
     rng: np.random.Generator, true: FloatArray, observer: int, noise: FloatArray, stamp_ns: int
-) -> MeasurementArray:
+) -> Measurements:
     """What a robot at true[observer] measures of the third, by range, bearing and heading."""
     x, y, heading = se2.between(true[observer], true[2]) + rng.multivariate_normal(np.zeros(3), noise)
-    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
-    one["stamp_ns"], one["observer"], one["target"] = stamp_ns, observer, 2
-    one["kind"], one["has_heading"] = Kind.POLAR, 1
+    one = Measurements.empty(1)
+    one.stamp_ns[:], one.observer[:], one.target[:] = stamp_ns, observer, 2
+    one.model[:], one.has_heading[:] = POLAR, True
     distance, bearing = math.hypot(x, y), math.atan2(y, x)
-    one["value"] = [distance, bearing, heading]
+    one.value[:] = [distance, bearing, heading]
     cos, sin = math.cos(bearing), math.sin(bearing)
     to_polar = np.array([[cos, sin, 0.0], [-sin / distance, cos / distance, 0.0], [0.0, 0.0, 1.0]])
-    one["covariance"] = to_polar @ noise @ to_polar.T
-    return one
+    one.covariance[:] = to_polar @ noise @ to_polar.T
+    return one.row(0)
 
 
 def constraints_of(
@@ -285,13 +277,14 @@ def test_one_heading_against_two_of_one_marker_leaves_the_robot_waiting(seed: in
 
 def many_constraints(stamps_s: FloatArray, markers: Sequence[int], window_s: float) -> ConstraintArray:
     """What is kept of sightings of all markers at each stamp."""
-    one, constraints = np.zeros(1, dtype=MEASUREMENT_DTYPE), NO_CONSTRAINTS
-    one["target"], one["covariance"] = NOBODY, np.eye(3)
+    one, constraints = Measurements.empty(1), NO_CONSTRAINTS
+    one.observer[:], one.target[:], one.covariance[:] = 0, NOBODY, np.eye(3)
     for seconds in stamps_s:
         for marker in markers:
-            one["stamp_ns"], one["marker_id"] = T0 + round(seconds * 1e9), marker
+            one.stamp_ns[:], one.reading[:] = T0 + round(seconds * 1e9), marker
+            waiting = Waiting(0, np.zeros(3), NO_NOISE)
             constraints = with_constraint(
-                constraints, one, EXACT, Waiting(0, np.zeros(3), NO_NOISE), THE_MAP, round(window_s * 1e9)
+                constraints, one.row(0), EXACT, waiting, THE_MAP, round(window_s * 1e9)
             )
     return constraints
 
@@ -322,11 +315,11 @@ def test_attempts_become_rarer_but_never_stop(monkeypatch: pytest.MonkeyPatch) -
         initializer, "align", lambda constraints, *_: attempts.append(int(constraints["stamp_ns"][-1]))
     )
     state, waiting = SwarmState(ParameterTable.of(robots)), initializer.Initializer(tracks, 20.0)
-    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
-    one["target"], one["covariance"] = NOBODY, np.eye(3)
+    one = Measurements.empty(1)
+    one.observer[:], one.target[:], one.covariance[:] = 0, NOBODY, np.eye(3)
     stamps = T0 + np.arange(0, 10 * SECOND, SECOND // 30)  # every fourth one is a constraint
-    for one["stamp_ns"][0] in stamps:
-        assert waiting.note(state, one)
+    for one.stamp_ns[0] in stamps:
+        assert waiting.note(state, one.row(0))
     assert attempts[0] == stamps[8]
     gaps_s = np.diff(attempts) * 1e-9
     assert gaps_s[:3].max() < 0.15
@@ -341,13 +334,14 @@ def test_a_landmark_that_is_estimated_is_where_the_belief_has_it() -> None:
     tracks, state = OdometryTracks([Robot("a")]), SwarmState(ParameterTable.of([Robot("a")], [mark]))
     tracks.extend(np.zeros(2, dtype=np.int64), np.array([T0, T0 + SECOND]), np.zeros((2, 3)))
     state.landmark[0] = moved = np.array([0.3, 0.1, 0.2])
-    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
-    one["target"], one["landmark"], one["marker"], one["has_heading"] = NOBODY, 1, [3.0, -2.0, 0.4], 1
-    one["covariance"] = np.diag([1e-6, 1e-6, 1e-4])
-    one["value"] = [1.0, 0.0, 0.0]
+    one = Measurements.empty(1)
+    one.observer[:], one.target[:], one.landmark[:] = 0, NOBODY, 0
+    one.marker[:], one.has_heading[:] = [3.0, -2.0, 0.4], True
+    one.covariance[:] = np.diag([1e-6, 1e-6, 1e-4])
+    one.value[:] = [1.0, 0.0, 0.0]
     waiting = initializer.Initializer(tracks, 20.0)
-    for one["stamp_ns"][0] in T0 + np.arange(20) * (SECOND // 20):
-        waiting.note(state, one)
+    for one.stamp_ns[0] in T0 + np.arange(20) * (SECOND // 20):
+        waiting.note(state, one.row(0))
     assert state.tracked[0]
     place = pose_of(planar(moved) @ planar(np.array([3.0, -2.0, 0.4])) @ planar(np.array([-1.0, 0.0, 0.0])))
     np.testing.assert_allclose(state.transform[0], place, atol=1e-3)

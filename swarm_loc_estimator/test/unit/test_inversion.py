@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.small_matrix import invert_factor
+from swarm_loc_estimator.common.numerics import invert_factor
 from swarm_loc_estimator.filter.joint_filter import DenseFilter, inverse
 
 
@@ -68,7 +68,7 @@ def test_an_update_done_again_from_a_copy_gives_the_same_bytes() -> None:
 
 
 def test_compiled_code_from_the_cache_finds_lapack(tmp_path: Path) -> None:
-    inverting = "import numpy as np\nfrom swarm_loc_estimator.common.small_matrix import invert_positive\n"
+    inverting = "import numpy as np\nfrom swarm_loc_estimator.common.numerics import invert_positive\n"
     inverting += "assert invert_positive(np.eye(90).reshape(-1), 90)"
     environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path)}
     for _ in ("compiled", "from the cache"):

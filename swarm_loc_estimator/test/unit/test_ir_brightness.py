@@ -7,8 +7,7 @@ import pytest
 from ir_world import droplet, droplet_matrix, random_poses
 
 from swarm_loc_estimator.infrared.brightness import expected_brightness, expected_with_slopes
-from swarm_loc_estimator.swarm.board_file import load_ir_platform, packaged_platforms
-from swarm_loc_estimator.swarm.ir_board import IrGains, PairGains
+from swarm_loc_estimator.swarm.ir_board import IrGains, PairGains, load_ir_platform, packaged_platforms
 
 
 def test_readings_are_those_of_the_corrected_equations() -> None:

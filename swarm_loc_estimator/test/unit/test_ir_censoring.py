@@ -13,14 +13,14 @@ from ir_world import droplet, nees, pair_of, pose_errors, random_poses, readings
 from scipy.integrate import quad
 from scipy.optimize import minimize
 
+from bench.droplet.closed_form import ClosedForm, IrEstimator
 from bench.droplet.cramer_rao import information
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.infrared.closed_form import ClosedForm
 from swarm_loc_estimator.infrared.cost import SATURATED, cost_of, new_cost_workspace
 from swarm_loc_estimator.infrared.gains import Exchanges, estimate_gains
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.search import IrEstimator, IrOutcome, ReadingsError
+from swarm_loc_estimator.infrared.search import IrOutcome, ReadingsError
 from swarm_loc_estimator.swarm.ir_board import PairGains
 
 LIMIT = 240.0

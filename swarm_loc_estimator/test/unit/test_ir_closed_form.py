@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from ir_world import ANGLES, RHO, droplet, emitter_20, random_poses, readings_of, sensor_19, units, wrapped
 
+from bench.droplet.closed_form import ClosedForm, IrEstimator
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.infrared.closed_form import ClosedForm
-from swarm_loc_estimator.infrared.search import IrEstimator, IrOutcome
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains, PairGains
+from swarm_loc_estimator.infrared.search import IrOutcome
+from swarm_loc_estimator.swarm.ir_board import IrGains, PairGains, load_ir_platform
 
 PRINTED = ("(1)", "(10)", "(11)", "(12)", "(18)", "wrap")
 

@@ -21,8 +21,7 @@ from swarm_loc_estimator.infrared.cost import (
     new_cost_workspace,
     reading_cost,
 )
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrModel
+from swarm_loc_estimator.swarm.ir_board import IrModel, load_ir_platform
 
 PLATFORMS = {
     "blocked": droplet(),

@@ -28,9 +28,14 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.cost import Pair, cost_of, new_cost_workspace
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.search import IrEstimator, IrOutcome, ReadingsError
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains, TabulatedCurve
+from swarm_loc_estimator.infrared.search import IrOutcome, ReadingsError
+from swarm_loc_estimator.swarm.ir_board import (
+    IrGains,
+    IrPlatform,
+    PairGains,
+    TabulatedCurve,
+    load_ir_platform,
+)
 
 ALIKE = MaximumLikelihood(droplet())
 DIFFERING = MaximumLikelihood(droplet(0.1))
@@ -323,7 +328,7 @@ ANY_READING = st.one_of(
 @settings(max_examples=150, deadline=None)
 @given(arrays(np.float64, (1, 2, 6, 6), elements=ANY_READING), st.booleans())
 def test_no_readings_whatsoever_give_a_pose_that_is_not_finite(readings: FloatArray, known: bool) -> None:
-    estimator: IrEstimator = ALIKE if known else DIFFERING
+    estimator = ALIKE if known else DIFFERING
     solutions = estimator.solve(readings)
     if solutions.outcomes[0] == IrOutcome.FOUND:
         assert np.isfinite(solutions.poses).all()

@@ -7,11 +7,11 @@ import pytest
 from ir_world import nees, pair_of, pose_errors, random_poses, readings_of
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.infrared.brightness import add_spread, new_start_workspace
 from swarm_loc_estimator.infrared.cost import cost_of, new_cost_workspace
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.search import IrOutcome
-from swarm_loc_estimator.infrared.start_table import add_spread, new_start_workspace
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import load_ir_platform
 
 BOARD = load_ir_platform("droplet_2016")
 ESTIMATOR = MaximumLikelihood(BOARD)

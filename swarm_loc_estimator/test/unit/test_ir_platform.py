@@ -18,19 +18,17 @@ from swarm_loc_estimator.infrared.brightness import (
     curves_at,
     distance_at,
 )
-from swarm_loc_estimator.swarm.board_file import (
-    IrPlatformFileError,
-    load_ir_platform,
-    packaged_platforms,
-)
 from swarm_loc_estimator.swarm.ir_board import (
     Amplitude,
     IrGains,
     IrPlatformError,
+    IrPlatformFileError,
     PairGains,
     PowerCurve,
     PowerPiece,
     TabulatedCurve,
+    load_ir_platform,
+    packaged_platforms,
 )
 
 DROPLET_FILE = Path(__file__).parents[2] / "swarm_loc_estimator" / "config" / "ir" / "droplet.yaml"

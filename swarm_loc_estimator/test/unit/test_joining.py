@@ -12,8 +12,10 @@ from core_run import on_time, play, settled, ticks
 from core_world import MOUNT, Plan, World, simulate
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.measurement_model import Kind, MeasurementColumns
+from swarm_loc_estimator.filter.measurements import select
+from swarm_loc_estimator.filter.models import CARTESIAN
 from swarm_loc_estimator.filter.state import InitialPose
+from swarm_loc_estimator.filter.update import PREDICT, fuse, new_innovations
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.fix import about_robots
@@ -192,9 +194,12 @@ def test_a_robot_unsure_at_one_of_many_measurements_is_lost_in_whatever_order_th
     steps = Fusion(swarm, limits, tracks, {})
     state = steps.new_state()
     state.initialize(0, InitialPose(np.zeros(3), np.diag([1e-6, 1e-6, 1.0])), Preintegrated.begin(T0))
-    fixes = about_robots(0, stamps_ns, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), Kind.CARTESIAN)
-    _, lost = steps._predict(state, MeasurementColumns.of(fixes[list(order)]), T0)
-    assert lost.tolist() == [True, False]
+    fixes = about_robots(0, stamps_ns, np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1)), CARTESIAN)
+    rows, work = select(fixes, np.array(order)), new_innovations(2, 1, 1)
+    results = np.zeros(2, dtype=np.uint8), np.zeros(2)
+    fuse(rows, 0, PREDICT, T0, tracks.arrays, state.arrays(), steps._limits, work, *results)
+    assert (work.lost > 0).tolist() == [True, False]
+    steps._deinitialize(state, work, T0)
     assert not state.tracked[0]
 
 

@@ -19,11 +19,10 @@ from swarm_loc_estimator.common.bags.writer import BagWriter
 from swarm_loc_estimator.common.messages.cdr import ODOMETRY, decode, encode
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.report.report import SELF_CALIBRATED
-from swarm_loc_estimator.sensors.camera import SightingConverter
+from swarm_loc_estimator.sensors.camera import DetectionRows, SightingConverter
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm, save_swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.self_calibration import learns
 from swarm_loc_estimator.timeline.settings import Settings
@@ -107,10 +106,9 @@ def test_a_distance_scale_is_taken_out_of_what_is_seen() -> None:
         far[:3, 3] *= scale
         robot = Robot("a", camera=MOUNT, sensor=replace(SENSOR, distance_scale=scale))
         swarm = Swarm((robot,), (Landmark(7, 1.0, 0.3, 0.1, 3.0),))
-        one = detection(7, far, POSE)
-        values.append(
-            SightingConverter(swarm).convert(np.zeros(1, np.int64), np.array([T0]), one).measurements["value"]
-        )
+        stamp = np.array([T0])
+        rows = DetectionRows(np.zeros(1, np.int64), stamp, detection(7, far, POSE), stamp)
+        values.append(SightingConverter(swarm).convert(rows).value)
     np.testing.assert_allclose(values[1], values[0], atol=1e-12)
 
 

@@ -20,10 +20,10 @@ from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput, SweepPairer
 from swarm_loc_estimator.mapping.messages import ScanMessage, decode_scan
-from swarm_loc_estimator.mapping.stops import ScanStop
+from swarm_loc_estimator.mapping.scans import ScanStop
 from swarm_loc_estimator.swarm.error_models import LidarModel
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 ODOMETRY_NS = 40_000_000
 TURTLE = Robot(

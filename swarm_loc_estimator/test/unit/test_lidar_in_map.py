@@ -18,12 +18,10 @@ from swarm_loc_estimator.common.messages.streams import MessageBatch, Serialized
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import input_topics
+from swarm_loc_estimator.sensors.inputs import Ingest, input_topics
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, StartSigma, Swarm
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
-from swarm_loc_estimator.timeline.contradictions import Contradicted
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
+from swarm_loc_estimator.timeline.estimate import Contradicted
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 
 CELL, ODOMETRY_NS = 0.05, 40_000_000

@@ -15,9 +15,7 @@ from swarm_loc_estimator.common.messages import cdr
 from swarm_loc_estimator.common.messages.cdr import decode, encode
 from swarm_loc_estimator.common.messages.poses import planar_covariance
 from swarm_loc_estimator.common.parameters import ParameterError
-from swarm_loc_estimator.nodes.localizer_robots import LocalizedRobots, RobotPose
-from swarm_loc_estimator.nodes.localizer_sources import SOURCES
-from swarm_loc_estimator.nodes.parameters import BridgeParameters
+from swarm_loc_estimator.nodes.localizer_robots import SOURCES, BridgeParameters, LocalizedRobots, RobotPose
 from swarm_loc_estimator.sensors.fix import HEADING_UNKNOWN
 
 ROBOTS = ["alpha", "beta"]

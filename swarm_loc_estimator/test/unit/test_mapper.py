@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 from mapping_world import ROOM, RoomRobot, distance_in_room
 
-from bench.pushbot.particle_mapper import ParticleMapper
-from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
-from swarm_loc_estimator.mapping.scans import LightSightings, Readings
+from swarm_loc_estimator.mapping.scans import LightSightings, MotionTracker, Readings, ScanStop
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.mapping.stops import MotionTracker, ScanStop
 
 START = (1.0, 1.0, 0.3)
 KNOWN = np.full(3, 1e-3)
@@ -27,12 +24,12 @@ def look_around(robot: RoomRobot) -> list[Readings]:
     return [robot.turn(angle, rate) for angle, rate in FIRST_TURNS]
 
 
-def feed(mapper: CooperativeMapper | ParticleMapper, number: int, parts: Sequence[Readings]) -> None:
+def feed(mapper: CooperativeMapper, number: int, parts: Sequence[Readings]) -> None:
     for part in parts:
         mapper.add_readings(number, part)
 
 
-def explore(mapper: CooperativeMapper | ParticleMapper, number: int, robot: RoomRobot, hops: int) -> None:
+def explore(mapper: CooperativeMapper, number: int, robot: RoomRobot, hops: int) -> None:
     """Look around, and go to so many goals."""
     feed(mapper, number, look_around(robot))
     for _ in range(hops):
@@ -259,18 +256,6 @@ def test_a_stop_without_end_is_bounded() -> None:
         stop.extend(Readings(np.arange(1000) + 1000 * k, np.zeros((1000, 3)), np.ones(1000), 0.016))
     assert len(stop.turn) <= 4096
     assert stop.stamp_ns[-1] == 19_999
-
-
-def test_the_printed_method_maps_with_its_tribes() -> None:
-    mapper = ParticleMapper(np.random.default_rng(7))
-    robot = RoomRobot(START, 0.0, np.random.default_rng(8))
-    explore(mapper, mapper.join(np.array(START), KNOWN), robot, 2)
-    pose: FloatArray | None = mapper.pose(0)
-    assert pose is not None
-    assert math.dist(pose[:2], robot.pose[:2]) < 0.5
-    values = mapper.occupancy().log_odds * (0.3 / 0.46)
-    assert values.max() == pytest.approx(1.0)  # the cap
-    assert values.min() == pytest.approx(-0.3)
 
 
 def test_the_room_is_as_it_should_be() -> None:

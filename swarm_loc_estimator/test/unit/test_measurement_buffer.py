@@ -7,9 +7,8 @@ import random
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE
+from swarm_loc_estimator.filter.measurements import Measurements
 from swarm_loc_estimator.timeline.timeline import MeasurementBuffer
 
 Row = tuple[int, int, int, float]
@@ -18,16 +17,16 @@ ROW = st.tuples(
 )
 
 
-def measurements(rows: list[Row]) -> NDArray[np.void]:
-    many = np.zeros(len(rows), dtype=MEASUREMENT_DTYPE)
-    for one, (stamp_ns, observer, marker_id, value) in zip(many, rows, strict=True):
-        one["stamp_ns"], one["observer"], one["marker_id"], one["value"][1] = (
-            stamp_ns,
-            observer,
-            marker_id,
-            value,
-        )
+def measurements(rows: list[Row]) -> Measurements:
+    many = Measurements.empty(len(rows))
+    for k, (stamp_ns, observer, reading, value) in enumerate(rows):
+        many.stamp_ns[k], many.observer[k], many.reading[k] = stamp_ns, observer, reading
+        many.value[k, 1] = value
     return many
+
+
+def in_bytes(measurements: Measurements) -> bytes:
+    return b"".join(column.tobytes() for column in measurements)
 
 
 @given(st.lists(st.lists(ROW, max_size=8), max_size=8), st.randoms())
@@ -36,18 +35,18 @@ def test_any_order_gives_the_same_each_once(parts: list[list[Row]], order: rando
     buffer, other = MeasurementBuffer(), MeasurementBuffer()
     known: set[Row] = set()
     for part in parts:
-        merged = buffer.merge(measurements(part))
+        count, first_ns = buffer.merge(measurements(part))
         new = set(part) - known
-        assert merged.duplicates == len(part) - len(new)
-        assert merged.first_ns == min((row[0] for row in new), default=None)
+        assert count == len(new)
+        assert first_ns == min((row[0] for row in new), default=None)
         known |= new
     order.shuffle(rows)
     for row in rows:
         other.merge(measurements([row]))
-    assert buffer.measurements.tobytes() == other.measurements.tobytes()
+    assert in_bytes(buffer.part(0, len(buffer))) == in_bytes(other.part(0, len(other)))
     assert len(buffer) == len(known)
     assert buffer.stamp_ns.tolist() == sorted(row[0] for row in known)
-    np.testing.assert_array_equal(buffer.measurements["stamp_ns"], buffer.stamp_ns)
+    np.testing.assert_array_equal(buffer.part(0, len(buffer)).stamp_ns, buffer.stamp_ns)
 
 
 @given(st.lists(st.lists(ROW, max_size=8), max_size=8))
@@ -57,12 +56,13 @@ def test_what_was_computed_goes_with_its_measurement(parts: list[list[Row]]) -> 
     computed: dict[bytes, tuple[int, float]] = {}
     for part in parts:
         buffer.merge(measurements(part))
-        for k, row in enumerate(buffer.measurements):
-            verdict, nis = computed.setdefault(row.tobytes(), (0, np.nan))
+        for k in range(len(buffer)):
+            row = in_bytes(buffer.part(k, k + 1).row(0))
+            verdict, nis = computed.setdefault(row, (0, np.nan))
             assert buffer.verdicts[k] == verdict
             np.testing.assert_equal(buffer.nis[k], nis)
             buffer.verdicts[k], buffer.nis[k] = 1 + len(computed) % 3, float(len(computed))
-            computed[row.tobytes()] = int(buffer.verdicts[k]), float(buffer.nis[k])
+            computed[row] = int(buffer.verdicts[k]), float(buffer.nis[k])
 
 
 def test_what_was_computed_stays_with_what_lies_before_and_space_is_used_again() -> None:
@@ -76,4 +76,4 @@ def test_what_was_computed_stays_with_what_lies_before_and_space_is_used_again()
             assert buffer.nis.tolist() == [float(k) for k in range(lap - 4, lap + 1) for _ in range(100)]
             assert buffer.verdicts.tolist() == [k % 3 for k in range(lap - 4, lap + 1) for _ in range(100)]
     assert buffer.stamp_ns.tolist() == [*range(19500, 20000)]
-    assert buffer._stamp_ns.size < 5000
+    assert buffer._columns.size < 5000

@@ -12,7 +12,7 @@ from core_run import on_time, play, ticks
 from core_world import ODOMETRY, Plan, World, simulate
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.prediction import LOG_SCALES
+from swarm_loc_estimator.filter.state import LOG_SCALES
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Policy, Settings
 

@@ -10,10 +10,16 @@ import pytest
 
 from swarm_loc_estimator.cli.new import main
 from swarm_loc_estimator.swarm.error_models import OdometryModel
-from swarm_loc_estimator.swarm.new_swarm import FAMILY_IDS, PlanError, SwarmPlan, planned_swarm
-from swarm_loc_estimator.swarm.robot_types import KNOWN_ROBOTS, SENSORS
-from swarm_loc_estimator.swarm.schema import SCHEMA_FILE, schema_text
-from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.swarm.new_swarm import (
+    FAMILY_IDS,
+    KNOWN_ROBOTS,
+    SENSORS,
+    PlanError,
+    SwarmPlan,
+    planned_swarm,
+)
+from swarm_loc_estimator.swarm.schema import schema_text
+from swarm_loc_estimator.swarm.swarm_file import SCHEMA_FILE, load_swarm
 
 
 def sensor_sets(name: str) -> list[tuple[str, ...]]:

@@ -8,17 +8,12 @@ import pytest
 from swarm_loc_estimator.filter.integrity import (
     MAX_UNITS,
     add_noise_inflation,
-    inflate_all_noise,
     inflate_noise,
     stamp_variance,
     with_noise_inflation,
 )
-from swarm_loc_estimator.filter.measurement_model import (
-    MEASUREMENT_DTYPE,
-    NOBODY,
-    Kind,
-    MeasurementColumns,
-)
+from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
+from swarm_loc_estimator.filter.models import POLAR
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import SensorModel
@@ -27,11 +22,11 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, Robot
 ROBOTS = (Robot("one", camera=CameraMount()), Robot("two", camera=CameraMount()))
 
 
-def measurements() -> MeasurementColumns:
+def measurements() -> Measurements:
     """Of the two robots and of nobody, the second a range and a bearing."""
-    rows = np.zeros(3, MEASUREMENT_DTYPE)
-    rows["observer"], rows["kind"][1] = [0, 1, NOBODY], Kind.POLAR
-    return MeasurementColumns.of(rows)
+    rows = Measurements.empty(3)
+    rows.observer[:], rows.model[1] = [0, 1, NOBODY], POLAR
+    return rows
 
 
 def test_each_unit_adds_noise_up_to_a_limit_and_to_its_observer_only() -> None:
@@ -54,7 +49,7 @@ def test_each_unit_adds_noise_up_to_a_limit_and_to_its_observer_only() -> None:
 def test_a_description_that_has_proved_wrong_makes_all_noise_doubtful_but_lowers_none() -> None:
     state = SwarmState(ParameterTable.of(ROBOTS))
     state.integrity.noise_inflation[0] = 4.0
-    inflate_all_noise(state.integrity)
+    state.augment_all(np.zeros((2, 3)))
     assert state.integrity.noise_inflation[0] == 4.0
     assert 0.0 < state.integrity.noise_inflation[1] < 4.0
 

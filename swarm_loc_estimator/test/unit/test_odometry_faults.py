@@ -19,10 +19,9 @@ from swarm_loc_estimator.odometry.tracks import OdometryTracks, TrackChange
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.offline.replay import PeriodicSchedule, Runner
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.sensors.camera import DETECTIONS
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.odometry import ODOMETRY
-from swarm_loc_estimator.sensors.registry import Batch
+from swarm_loc_estimator.sensors.camera import CameraSensor
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest
+from swarm_loc_estimator.sensors.odometry import OdometrySensor
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -187,7 +186,7 @@ def test_the_bags_have_no_fault(bag: str) -> None:
     with BagReader(BAGS / bag) as reader:
         for batch in reader.batches([topic.name for topic in ingest.topics]):
             for part in ingest.read(batch):
-                rows = part[ODOMETRY.name]
+                rows = part[OdometrySensor.name]
                 assert np.isfinite(rows.twist).all()
                 change = tracks.extend(rows.robot, rows.stamp_ns, rows.pose, rows.twist)
                 faults += change.jumps + change.resets
@@ -313,7 +312,7 @@ def test_a_heading_reset_of_an_unseen_robot_misleads_nobody(turn: float | None) 
 
     def change(batch: Batch, begin_ns: int) -> Batch:
         rows = dict(batch.rows)
-        odometry, seen = batch[ODOMETRY.name], batch[DETECTIONS.name]
+        odometry, seen = batch[OdometrySensor.name], batch[CameraSensor.name]
         late = (odometry.robot == who) & (odometry.stamp_ns >= begin_ns + 25 * SECOND)
         if late.any():
             if not first:
@@ -324,7 +323,7 @@ def test_a_heading_reset_of_an_unseen_robot_misleads_nobody(turn: float | None) 
         time_s = (seen.stamp_ns - begin_ns) * 1e-9
         own = np.isin(seen.detection["id"], [face.id for face in world.swarm.robots[who].faces])
         unseen = ((seen.robot == who) | own) & (time_s >= 24.5) & (time_s < 35.0)
-        rows |= {DETECTIONS.name: select(seen, ~unseen)} if seen.robot.size else {}
+        rows |= {CameraSensor.name: select(seen, ~unseen)} if seen.robot.size else {}
         return replace(batch, rows=rows)
 
     result, named = world.result(change)
@@ -340,7 +339,7 @@ def test_robots_with_twists_only_are_as_accurate_as_before(who: Sequence[int]) -
     world = Changed("eight_five_robots")
 
     def change(batch: Batch, _begin_ns: int) -> Batch:
-        odometry = batch[ODOMETRY.name]
+        odometry = batch[OdometrySensor.name]
         odometry.pose[np.isin(odometry.robot, who)] = 0.0
         return batch
 
@@ -356,7 +355,7 @@ def test_constant_odometry_without_twists_is_named_and_its_robots_are_not_tracke
     world = Changed("eight_five_robots")
 
     def change(batch: Batch, _begin_ns: int) -> Batch:
-        odometry = batch[ODOMETRY.name]
+        odometry = batch[OdometrySensor.name]
         frozen = np.isin(odometry.robot, who)
         odometry.pose[frozen], odometry.twist[frozen] = 0.0, np.nan
         return batch

@@ -24,8 +24,7 @@ from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, Verdic
 from swarm_loc_estimator.filter.models import MODELS, Prediction
 from swarm_loc_estimator.filter.models import register as register_model
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import SENSORS, register
+from swarm_loc_estimator.sensors.inputs import SENSORS, Ingest, register
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.settings import Policy, Settings

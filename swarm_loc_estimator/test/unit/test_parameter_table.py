@@ -16,8 +16,8 @@ from swarm_loc_estimator.common.parameters import (
     from_values,
     parameter_specs,
 )
+from swarm_loc_estimator.nodes.localizer_robots import BridgeParameters
 from swarm_loc_estimator.nodes.parameters import (
-    BridgeParameters,
     EstimatorParameters,
     MapperParameters,
     MarkersParameters,

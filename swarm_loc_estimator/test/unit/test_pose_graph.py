@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.mapping import constraints as model
-from swarm_loc_estimator.mapping.constraints import NormalEquations
-from swarm_loc_estimator.mapping.pose_graph import PoseGraph
+from swarm_loc_estimator.mapping import pose_graph
+from swarm_loc_estimator.mapping.pose_graph import NormalEquations, PoseGraph
 from swarm_loc_estimator.mapping.scans import Scan
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
@@ -20,20 +19,20 @@ STOPS = 4
 FIRST, SECOND = np.array([0, 1, 2]), np.array([1, 3, 0])
 
 
-def kinds(rng: np.random.Generator) -> dict[str, Callable[[FloatArray, FloatArray], model.Linearised]]:
+def kinds(rng: np.random.Generator) -> dict[str, Callable[[FloatArray, FloatArray], pose_graph.Linearised]]:
     """Each kind of constraint with numbers of its own, as a function of states (4, 4) and slips (2,)."""
     motion, turn = rng.normal(0.0, 0.6, (3, 3)), rng.normal(0.0, 2.0, 3)
     sigma, robot = rng.uniform(0.01, 0.2, (3, 3)), np.array([0, 0, 1, 1])
-    departures = model.Departures(FIRST, SECOND, turn, motion, sigma)
-    ties = model.Ties(FIRST, SECOND, motion, sigma)
-    bearings = model.Bearings(FIRST, SECOND, turn, motion[:, 2], sigma[:, 0])
+    departures = pose_graph.Departures(FIRST, SECOND, turn, motion, sigma)
+    ties = pose_graph.Ties(FIRST, SECOND, motion, sigma)
+    bearings = pose_graph.Bearings(FIRST, SECOND, turn, motion[:, 2], sigma[:, 0])
     return {
-        "odometry": lambda s, _: model.odometry(s, departures),
-        "ties": lambda s, _: model.ties(s, ties),
-        "bearings": lambda s, _: model.bearings(s, bearings),
-        "priors": lambda s, _: model.priors(s, FIRST, motion, sigma),
-        "ratios": lambda s, slip: model.ratios(s, slip, robot, np.full(STOPS, 0.01)),
-        "slips": lambda s, slip: model.slips(len(s), slip, 0.02, 0.03),
+        "odometry": lambda s, _: pose_graph.odometry(s, departures),
+        "ties": lambda s, _: pose_graph.ties(s, ties),
+        "bearings": lambda s, _: pose_graph.bearings(s, bearings),
+        "priors": lambda s, _: pose_graph.priors(s, FIRST, motion, sigma),
+        "ratios": lambda s, slip: pose_graph.ratios(s, slip, robot, np.full(STOPS, 0.01)),
+        "slips": lambda s, slip: pose_graph.slips(len(s), slip, 0.02, 0.03),
     }
 
 
@@ -44,7 +43,7 @@ def test_jacobians_are_those_of_finite_differences(kind: str, seed: int) -> None
     residuals = kinds(rng)[kind]
     unknowns = np.concatenate([rng.normal(0.0, 1.0, 4 * STOPS), rng.normal(0.0, 0.05, 2)])
 
-    def at(values: FloatArray) -> model.Linearised:
+    def at(values: FloatArray) -> pose_graph.Linearised:
         return residuals(values[: 4 * STOPS].reshape(STOPS, 4), values[4 * STOPS :])
 
     here, step = at(unknowns), 1e-6

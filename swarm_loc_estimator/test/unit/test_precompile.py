@@ -14,18 +14,16 @@ import numpy as np
 import pytest
 from compiled_code import compiled_since, printed_by_process, signatures
 
-from bench.shared.bags import encode_shared_detections, encode_shared_numbers
+from bench.shared.bags import SharedHead, encode_shared_detections, encode_shared_numbers
 from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,
-    SharedHead,
     swarm_key,
 )
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.nodes.load import Thinning
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.precompile import Size, precompile, size_of
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import Batch
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimator

@@ -5,6 +5,7 @@ import pytest
 from core_messages import SECOND, T0
 
 from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.filter.measurements import LossReason
 from swarm_loc_estimator.filter.prediction import new_scratch, predict, write_predicted
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
@@ -166,7 +167,7 @@ def test_losing_a_robot_keeps_what_was_learned_of_its_sensors_and_not_how_that_d
     to(state, tracks, 1.0)
     assert state.filter.covariance[:3, 6:].any()
     learned, variance = state.parameter[0].copy(), np.diag(state.filter.covariance)[6:].copy()
-    state.deinitialize(0)
+    state.deinitialize(0, LossReason.COMMAND, T0)
     assert not state.filter.covariance[:3, 6:].any()
     np.testing.assert_array_equal(state.parameter[0], learned)
     np.testing.assert_array_equal(np.diag(state.filter.covariance)[6:], variance)

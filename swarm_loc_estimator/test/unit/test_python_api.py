@@ -18,7 +18,7 @@ import swarm_loc_estimator
 from swarm_loc_estimator import Batch, Estimator, OdometryRows, ReplayResult, Robot, Swarm, replay
 from swarm_loc_estimator.offline.export import write_tum
 from swarm_loc_estimator.offline.report.report import text_report
-from swarm_loc_estimator.sensors.registry import SENSORS
+from swarm_loc_estimator.sensors.inputs import SENSORS
 
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "swarm_loc_estimator" / "doc" / "python_api.md"

@@ -21,14 +21,13 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import RANGES as MESSAGE_TYPE
 from swarm_loc_estimator.common.messages.cdr import encode
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MODELS, MeasurementArray
+from swarm_loc_estimator.filter.measurements import Measurements, Verdict, select
+from swarm_loc_estimator.filter.models import MODELS, RANGE, RANGE_DIFFERENCE
 from swarm_loc_estimator.precompile import size_of
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.ranges import RANGE, RANGE_DIFFERENCE
+from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.swarm.swarm import Anchor, Robot, Swarm, UwbDevice
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.settings import Policy, Settings
-from swarm_loc_estimator.timeline.verdicts import Verdict
 
 DOC = Path(__file__).parents[2] / "doc" / "uwb.md"
 SIGMA = 0.02
@@ -131,13 +130,13 @@ def errors(world: World, estimates: Sequence[Estimate]) -> FloatArray:
 # --- bytes to measurements
 
 
-def converted(swarm: Swarm, *measured: Measured) -> tuple[MeasurementArray, dict[str, int]]:
+def converted(swarm: Swarm, *measured: Measured) -> tuple[Measurements, dict[str, int]]:
     """Measurements of messages, and what was dropped."""
     ingest, estimator = Ingest(swarm), Estimator(swarm)
     handle = {k: ingest.handle_of[f"{r.name}/ranges"] for k, r in enumerate(swarm.robots) if r.uwb}
     batch = MessageBatch.of([SerializedMessage(handle[one.robot], one.data(), T0) for one in measured])
     (part,) = ingest.read(batch)
-    return estimator.convert(part).measurements, estimator.drops
+    return estimator.convert(part).rows["ranges"], estimator.drops
 
 
 TWO = Swarm(
@@ -167,7 +166,7 @@ TWO = Swarm(
 def test_a_useless_range_is_dropped_and_counted_by_its_reason(one: Measured, reason: str) -> None:
     found, drops = converted(TWO, one, Measured(1, T0, 100, 2.0))
     assert drops == {reason: 1}
-    assert found["value"][:, 0].tolist() == [2.0]
+    assert found.value[:, 0].tolist() == [2.0]
 
 
 def test_ranges_of_a_robot_without_a_radio_are_dropped() -> None:
@@ -190,14 +189,14 @@ def test_biases_and_scale_are_taken_out_and_the_variance_is_of_the_true_range() 
     swarm = replace(TWO, robots=(Robot("a", uwb=radio), *TWO.robots[1:]))
     measured = Measured(0, T0, HUGE, 2.9), Measured(0, T0, HUGE, 0.8, reference=100, variance=0.01)
     found, _ = converted(swarm, *measured)
-    np.testing.assert_allclose(found["value"][:, 0], [(2.9 - 0.3 - 0.1) / 1.25, (0.8 - 0.3) / 1.25])
-    np.testing.assert_allclose(found["covariance"][:, 0, 0], [(SIGMA / 1.25) ** 2, 0.01 / 1.25**2])
+    np.testing.assert_allclose(found.value[:, 0], [(2.9 - 0.3 - 0.1) / 1.25, (0.8 - 0.3) / 1.25])
+    np.testing.assert_allclose(found.covariance[:, 0, 0], [(SIGMA / 1.25) ** 2, 0.01 / 1.25**2])
 
 
 def test_a_reference_on_a_robot_changes_places_with_the_anchor() -> None:
     found, _ = converted(TWO, Measured(0, T0, 100, 0.5, reference=2), Measured(0, T0, 2, -0.5, reference=100))
-    assert found[0] == found[1]
-    assert found["target"].tolist() == [1, 1]
+    assert select(found, slice(0, 1)).equals(select(found, slice(1, 2)))
+    assert found.target.tolist() == [1, 1]
 
 
 def test_malformed_messages_are_counted() -> None:
@@ -218,44 +217,44 @@ def test_a_node_of_robots_with_radios_compiles_what_fuses_their_ranges() -> None
 POSES = st.tuples(*[st.floats(-5.0, 5.0)] * 2, st.floats(-3.0, 3.0)).map(np.array)
 
 
-def between_robots(kind: int, observer: int = 0, target: int = 1) -> MeasurementArray:
-    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
-    one["kind"], one["observer"], one["target"] = kind, observer, target
-    one["sensor"], one["marker"] = (0.1, -0.2, 0.3), (-0.3, 0.1, 0.5)
-    return one
+def between_robots(model: int, observer: int = 0, target: int = 1) -> Measurements:
+    many = Measurements.empty(1)
+    many.model[:], many.observer[:], many.target[:] = model, observer, target
+    many.sensor[:], many.marker[:], many.height[:] = (0.1, -0.2, 0.0), (-0.3, 0.1, 0.0), (0.3, 0.5)
+    return many.row(0)
 
 
 @given(POSES, POSES)
 def test_a_range_is_the_same_from_both_ends(a: FloatArray, b: FloatArray) -> None:
-    one, back = between_robots(RANGE.number), between_robots(RANGE.number)
-    back["sensor"], back["marker"] = one["marker"], one["sensor"]
-    there, here = RANGE.predict(one, a, b), RANGE.predict(back, b, a)
+    one = between_robots(RANGE)
+    back = one._replace(sensor=one.marker, marker=one.sensor, height=one.height[::-1])
+    there, here = MODELS[RANGE].predicted(one, a, b), MODELS[RANGE].predicted(back, b, a)
     np.testing.assert_allclose(there.value, here.value, atol=1e-12)
     np.testing.assert_allclose(there.observer_jacobian, here.target_jacobian, atol=1e-9)
 
 
-@pytest.mark.parametrize("number", [RANGE.number, RANGE_DIFFERENCE.number])
+@pytest.mark.parametrize("number", [RANGE, RANGE_DIFFERENCE])
 @given(POSES, POSES, POSES)
 def test_moving_the_map_changes_no_value(number: int, move: FloatArray, a: FloatArray, b: FloatArray) -> None:
     one, moved = between_robots(number), between_robots(number)
-    one["alternative"] = (1.0, 2.0, 0.7)
-    moved["alternative"][0, :2], moved["alternative"][0, 2] = se2.transform_points(move, [1.0, 2.0]), 0.7
-    value = MODELS[number].predict(one, a, b).value
-    again = MODELS[number].predict(moved, se2.compose(move, a), se2.compose(move, b)).value
+    one.reference[:] = (1.0, 2.0, 0.7)
+    moved.reference[:2], moved.reference[2] = se2.transform_points(move, [1.0, 2.0]), 0.7
+    value = MODELS[number].predicted(one, a, b).value
+    again = MODELS[number].predicted(moved, se2.compose(move, a), se2.compose(move, b)).value
     np.testing.assert_allclose(again, value, atol=1e-9)
 
 
 def test_a_common_move_of_both_robots_changes_no_range() -> None:
-    one = between_robots(RANGE.number)
-    found = RANGE.predict(one, np.array([1.0, 2.0, 0.3]), np.array([-2.0, 0.5, 1.0]))
+    one = between_robots(RANGE)
+    found = MODELS[RANGE].predicted(one, np.array([1.0, 2.0, 0.3]), np.array([-2.0, 0.5, 1.0]))
     np.testing.assert_allclose(found.observer_jacobian + found.target_jacobian, 0.0, atol=1e-12)
 
 
 def test_antennas_at_one_place_have_a_finite_model() -> None:
-    one = np.zeros(1, dtype=MEASUREMENT_DTYPE)
-    one["kind"], one["target"] = RANGE.number, 1
+    one = between_robots(RANGE)
+    one = one._replace(sensor=np.zeros(3), marker=np.zeros(3), height=np.zeros(2))
     for model in (RANGE, RANGE_DIFFERENCE):
-        for part in model.predict(one, np.zeros(3), np.zeros(3)):
+        for part in MODELS[model].predicted(one, np.zeros(3), np.zeros(3)):
             assert np.isfinite(part).all()
             np.testing.assert_array_equal(part, 0.0)
 

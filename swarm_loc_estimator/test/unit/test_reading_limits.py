@@ -11,13 +11,12 @@ from ir_world import random_poses
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import Exchanges
-from swarm_loc_estimator.offline.calibration.infrared.reading_limits import (
+from swarm_loc_estimator.offline.calibration.infrared.elements import (
     ReadingLimits,
     contradictions,
     find_reading_limits,
 )
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains, load_ir_platform
 
 ROBOTS, N = 3, 6
 NEVER = 1e8  # A saturation that nothing reaches [count]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from swarm_loc_estimator.offline.replay import ListedSchedule, PeriodicSchedule, Runner
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.sensors.registry import Batch
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.offline.calibration.fit import sway_of
-from swarm_loc_estimator.offline.calibration.noise import with_noise
+from swarm_loc_estimator.offline.calibration.fit import sway_of, with_noise
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 

@@ -15,10 +15,16 @@ from swarm_loc_estimator.cli import schema as command
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.common.yaml_tree import read_tree
 from swarm_loc_estimator.swarm import swarm_file
-from swarm_loc_estimator.swarm.schema import SCHEMA_FILE, schema_text, swarm_schema
+from swarm_loc_estimator.swarm.schema import schema_text, swarm_schema
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_file import MODELS, SwarmFileError, load_swarm, parse_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import (
+    MODELS,
+    SCHEMA_FILE,
+    SwarmFileError,
+    load_swarm,
+    parse_swarm,
+    save_swarm,
+)
 
 ROOT = Path(__file__).parents[3]
 WRITTEN = ROOT / "swarm_loc_estimator" / "doc" / SCHEMA_FILE
@@ -190,7 +196,6 @@ def test_null_is_valid_where_it_means_something(path: str) -> None:
         ("robots.droplet1.ir.gains", {"sensor": [1] * 6}),
         ("robots.droplet1.ir.gains.sensor", [0.01] * 6),
         ("types.droplet.ir.id", 4097),
-        ("types.droplet.ir.estimator", "guess"),
         ("types.droplet.ir.dead_sensors", None),
         ("types.droplet.random_walk.position", -1.0),
         ("types.epuck.odometry.wheel_separation", 0.0001),

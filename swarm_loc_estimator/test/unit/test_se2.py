@@ -7,7 +7,7 @@ from scipy.linalg import expm
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.se2_scalar import direction_of
+from swarm_loc_estimator.common.numerics import direction_of
 
 
 def poses(seed: int, *shape: int) -> FloatArray:

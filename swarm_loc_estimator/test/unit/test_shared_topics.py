@@ -10,13 +10,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.shared.bags import encode_shared_detections, encode_shared_numbers
+from bench.shared.bags import SharedHead, encode_shared_detections, encode_shared_numbers
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.cdr import SWARM_DETECTIONS, SWARM_FIXES, SWARM_ODOMETRY, CdrError
 from swarm_loc_estimator.common.messages.detections import (
     DETECTION_DTYPE,
-    SharedHead,
     decode_shared_detections,
     decode_shared_numbers,
     encode_detections,
@@ -24,8 +23,7 @@ from swarm_loc_estimator.common.messages.detections import (
 )
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.sensors.ingest import Ingest
-from swarm_loc_estimator.sensors.registry import Batch, live_topics
+from swarm_loc_estimator.sensors.inputs import Batch, Ingest, live_topics
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 SWARM = Swarm(tuple(Robot(name) for name in "abc"))

@@ -189,6 +189,6 @@ def test_what_is_contradicted_is_estimated() -> None:
 @pytest.mark.parametrize("yaw_sigma", [0.0, 0.01])
 def test_a_large_swarm_is_sparse_whether_it_is_calibrated_or_not(yaw_sigma: float) -> None:
     robots = tuple(Robot(f"r{k}", camera=CameraMount(yaw_sigma=yaw_sigma)) for k in range(3))
-    assert Estimator(Swarm(robots, ()), Settings(sparse_from=3)).note == ""
+    assert Estimator(Swarm(robots, ()), Settings(sparse_from=3)).hint == ""
     one_by_one = Settings(sparse_from=3, fusion_period_s=0.0)
-    assert "because fusion_period_s is 0" in Estimator(Swarm(robots, ()), one_by_one).note
+    assert "because fusion_period_s is 0" in Estimator(Swarm(robots, ()), one_by_one).hint

@@ -10,12 +10,12 @@ import pytest
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.filter.batch_update import related_columns
 from swarm_loc_estimator.filter.joint_filter import Robots
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns
+from swarm_loc_estimator.filter.measurements import NOBODY, LossReason, Measurements
 from swarm_loc_estimator.filter.prediction import new_scratch, predict
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.filter.update import related_columns
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.swarm.calibration_states import (
     CAMERA_SCALE,
@@ -96,11 +96,10 @@ class Both:
             Gaps of the corrections by the dense filter's columns, and of `cross_covariance` (m, 3, 5).
         """
         robots = len(self.poses)
-        fields = np.zeros(len(pairs), MEASUREMENT_DTYPE)
-        fields["observer"] = pairs[:, 0]
-        fields["target"] = np.where(pairs[:, 1] < robots, pairs[:, 1], -1)
-        fields["landmark"] = np.where(pairs[:, 1] < robots, 0, pairs[:, 1] - robots + 1)
-        columns = MeasurementColumns.of(fields)
+        columns = Measurements.empty(len(pairs))
+        columns.observer[:] = pairs[:, 0]
+        columns.target[:] = np.where(pairs[:, 1] < robots, pairs[:, 1], NOBODY)
+        columns.landmark[:] = np.where(pairs[:, 1] < robots, NOBODY, pairs[:, 1] - robots)
         chains = self.rng.normal(0.0, 1.0, (len(pairs), 3, 5))
         innovation = self.rng.normal(0.0, 0.02, (len(pairs), 3))
         related = [related_columns(columns, state.arrays()) for state in self.states]
@@ -183,7 +182,7 @@ def play(both: Both, step: int) -> tuple[FloatArray, FloatArray]:
                 state.augment(source, both.poses[source % 6])
     if step == 12:
         for state in both.states:
-            state.deinitialize(2)
+            state.deinitialize(2, LossReason.COMMAND, both.now_ns)
     if step == 16:
         both.start(2, np.array([0, 3]))
     there = np.flatnonzero(both.states[0].tracked)

@@ -10,14 +10,16 @@ from core_geometry import marker_frame, nees, wrapped
 from core_messages import POSITION, SECOND, T0, detection, joined
 from core_run import on_time, play, ticks
 from core_world import Plan, World, simulate
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.innovation import relative_motion
-from swarm_loc_estimator.filter.measurement_model import MEASUREMENT_DTYPE, MeasurementColumns, predict
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
+from swarm_loc_estimator.filter.models import predict
 from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.filter.update import relative_motion
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.sensors.camera import SightingConverter
+from swarm_loc_estimator.sensors.camera import DetectionRows, SightingConverter
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, Swarm
@@ -36,14 +38,19 @@ def with_time_sigma(swarm: Swarm, sigma_s: float) -> Swarm:
     return replace(swarm, robots=tuple(robots))
 
 
+def measured_of(swarm: Swarm, stamps: IntArray, seen: NDArray[np.void]) -> Measurements:
+    """What the first robot's camera measures."""
+    rows = DetectionRows(np.zeros(stamps.size, np.int64), stamps, seen, stamps)
+    return SightingConverter(swarm).convert(rows)
+
+
 def test_what_a_picture_shows_shares_the_error_of_its_stamp() -> None:
     seen = joined([detection(marker, marker_frame(1.0, 0.0, 0.0, 3.0)) for marker in (7, 3, 99, 7)])
     stamps = np.array([T0, T0, T0, T0 + SECOND])
-    robots = np.zeros(4, np.int64)
-    measured = SightingConverter(with_time_sigma(SWARM, 0.1)).convert(robots, stamps, seen).measurements
-    np.testing.assert_allclose(measured["stamp_variance"], [0.02, 0.02, 0.01])
-    measured = SightingConverter(SWARM).convert(robots, stamps, seen).measurements
-    assert (measured["stamp_variance"] == 0.0).all()
+    measured = measured_of(with_time_sigma(SWARM, 0.1), stamps, seen)
+    np.testing.assert_allclose(measured.stamp_variance, [0.02, 0.02, 0.01])
+    measured = measured_of(SWARM, stamps, seen)
+    assert (measured.stamp_variance == 0.0).all()
 
 
 def test_how_unsure_a_face_sits_adds_to_the_noise_of_its_sightings() -> None:
@@ -51,12 +58,11 @@ def test_how_unsure_a_face_sits_adds_to_the_noise_of_its_sightings() -> None:
         seen = joined(
             [detection(marker, marker_frame(distance, 0.0, 0.0, 3.0), content) for marker in (3, 4, 7)]
         )
-        place = np.zeros(3, np.int64)
-        measured = SightingConverter(SWARM).convert(place, place + T0, seen).measurements
-        sure, unsure = measured["covariance"][1], measured["covariance"][0]
-        away = 1.0 if content != POSITION else float(measured["value"][0, 0])
+        measured = measured_of(SWARM, np.full(3, T0), seen)
+        sure, unsure = measured.covariance[1], measured.covariance[0]
+        away = 1.0 if content != POSITION else float(measured.value[0, 0])
         np.testing.assert_allclose(unsure - sure, np.diag([9e-6, 9e-6 / away**2, 0.0]), atol=1e-15)
-        np.testing.assert_allclose(measured["covariance"][2], sure)
+        np.testing.assert_allclose(measured.covariance[2], sure)
 
 
 def test_what_is_left_of_systematic_errors_adds_to_the_noise_that_a_detection_tells() -> None:
@@ -64,12 +70,7 @@ def test_what_is_left_of_systematic_errors_adds_to_the_noise_that_a_detection_te
     known["covariance"] = np.diag([1e-6, 2e-6, 3e-6, 4e-6, 5e-6, 6e-6])
     sensor = replace(SEER.sensor, residual_position_sigma=0.01, residual_heading_sigma=0.02)
     seers = SWARM, replace(SWARM, robots=(replace(SEER, sensor=sensor), SWARM.robots[1]))
-    plain, more = (
-        SightingConverter(swarm)
-        .convert(np.zeros(2, np.int64), np.full(2, T0), joined([known, unknown]))
-        .measurements["covariance"]
-        for swarm in seers
-    )
+    plain, more = (measured_of(swarm, np.full(2, T0), joined([known, unknown])).covariance for swarm in seers)
     np.testing.assert_allclose(more[0] - plain[0], np.diag([1e-4, 1e-4, 4e-4]), atol=1e-15)
     np.testing.assert_array_equal(more[1], plain[1])
 
@@ -85,40 +86,40 @@ def test_relative_motion_is_the_rate_of_what_is_predicted(target: int) -> None:
         steps = path * np.column_stack([np.cos(heading + 0.5 * turn), np.sin(heading + 0.5 * turn)])
         place = np.cumsum(np.vstack([[[0.3, -0.8]], steps[:-1]]), axis=0)
         tracks.extend(np.full(300, robot), stamps, np.column_stack([place, heading]))
-    one = np.zeros(1, MEASUREMENT_DTYPE)
-    one["observer"], one["target"], one["has_heading"] = 0, target, 1
-    one["sensor"], one["marker"] = [0.04, 0.01, 0.2], [0.5, 0.3, -1.0]
-    one["stamp_ns"], one["stamp_variance"] = T0 + 1_504_000_000, 1.0
+    one = Measurements.empty(1)
+    one.observer[:], one.target[:], one.has_heading[:] = 0, target, True
+    one.sensor[:], one.marker[:] = [0.04, 0.01, 0.2], [0.5, 0.3, -1.0]
+    one.stamp_ns[:], one.stamp_variance[:] = T0 + 1_504_000_000, 1.0
 
     def predicted(shift_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        now = one["stamp_ns"] + shift_ns
+        now = one.stamp_ns + shift_ns
         poses = np.vstack([tracks.at(np.array([robot]), now).pose for robot in (0, 1)])
         value, jacobian = predict(one, poses[:1], poses[1:])
         return value[0], jacobian[0], poses
 
     motion = np.empty(3)
     _, jacobian, poses = predicted(0)
-    relative_motion(MeasurementColumns.of(one), 0, tracks.arrays, BELIEF, poses, motion)
+    relative_motion(one, 0, tracks.arrays, BELIEF, poses, motion)
     rate = wrapped((predicted(2_000_000)[0] - predicted(-2_000_000)[0])[None])[0] / 0.004
     np.testing.assert_allclose(jacobian[:, :3] @ motion, rate, rtol=0.01, atol=2e-3)
-    one["stamp_variance"] = 0.0
-    relative_motion(MeasurementColumns.of(one), 0, tracks.arrays, BELIEF, poses, motion)
+    one.stamp_variance[:] = 0.0
+    relative_motion(one, 0, tracks.arrays, BELIEF, poses, motion)
     assert (motion == 0.0).all()
 
 
 def test_a_robot_whose_motion_is_unknown_gives_no_rate() -> None:
     tracks = OdometryTracks([SEER])
-    one = np.zeros(1, MEASUREMENT_DTYPE)
-    one["target"], one["stamp_variance"], one["stamp_ns"] = -1, 1.0, T0
+    one = Measurements.empty(1)
+    one.observer[:], one.target[:], one.stamp_variance[:], one.stamp_ns[:] = 0, NOBODY, 1.0, T0
     motion = np.full(3, np.nan)
-    relative_motion(MeasurementColumns.of(one), 0, tracks.arrays, BELIEF, np.zeros((2, 3)), motion)
+    relative_motion(one, 0, tracks.arrays, BELIEF, np.zeros((2, 3)), motion)
     assert (motion == 0.0).all()  # nothing has come
     tracks.extend(
         np.zeros(2, np.int64), np.array([T0, T0 + SECOND // 10]), np.array([[0.0] * 3, [0.1, 0, 0]])
     )
     for after_s, expected in ((-1.0, 0.0), (0.05, -1.0), (0.3, -1.0), (5.0, 0.0)):
-        one["stamp_ns"] = T0 + round(after_s * SECOND)
-        relative_motion(MeasurementColumns.of(one), 0, tracks.arrays, BELIEF, np.zeros((2, 3)), motion)
+        one.stamp_ns[:] = T0 + round(after_s * SECOND)
+        relative_motion(one, 0, tracks.arrays, BELIEF, np.zeros((2, 3)), motion)
         np.testing.assert_allclose(motion, [expected, 0.0, 0.0], atol=1e-9)
 
 

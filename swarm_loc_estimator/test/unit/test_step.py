@@ -10,7 +10,7 @@ import pytest
 
 from swarm_loc_estimator import Batch, Estimator, Robot, Swarm, load_swarm, replay
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
-from swarm_loc_estimator.sensors.registry import SENSORS
+from swarm_loc_estimator.sensors.inputs import SENSORS
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_one_robot_slow"
 SECOND = 10**9

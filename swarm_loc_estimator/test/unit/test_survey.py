@@ -18,8 +18,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
-from swarm_loc_estimator.offline.survey.problem import problem_of, start_of
-from swarm_loc_estimator.offline.survey.solve import Solver
+from swarm_loc_estimator.offline.survey.solve import Solver, problem_of, start_of
 from swarm_loc_estimator.offline.survey.survey import survey
 from swarm_loc_estimator.sensors.camera import FROM_OPTICAL, NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
@@ -132,7 +131,7 @@ def test_wrong_ids_change_little() -> None:
     spoilt = replace(recording, detections=recording.detections._replace(detection=rows))
     done = survey(spoilt, unplaced(world.swarm))
     assert rms(errors(done.swarm, world.swarm)) < 1.5 * clean + 0.002
-    of_landmarks = done.problem.sightings["landmark"] > 0
+    of_landmarks = done.problem.sightings.landmark >= 0
     assert 0.04 < np.mean(done.solution.weight[of_landmarks] < 0.1) < 0.16
 
 
@@ -173,7 +172,7 @@ def test_a_robot_that_takes_no_part_or_stands_costs_nothing() -> None:
     for robot in (first, replace(first, stands=True)):
         swarm = replace(world.swarm, robots=(robot, *others), landmarks=())
         done = survey(absent, swarm)
-        assert not (done.problem.sides[done.problem.sightings["landmark"] == 0] < 0).any()
+        assert not (done.problem.sides[done.problem.sightings.landmark < 0] < 0).any()
         assert rms(errors(done.swarm, world.swarm)) < 0.02
     standing = replace(world.swarm, robots=(replace(first, stands=True), *others), landmarks=())
     done = survey(replace(absent, detections=seen), standing)  # what it sees has no pose to start from

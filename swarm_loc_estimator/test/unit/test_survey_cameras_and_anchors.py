@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.offline.calibration.recording import Recording
-from swarm_loc_estimator.offline.survey.cameras_and_anchors import Paths, Placed, place_fixed
+from swarm_loc_estimator.offline.survey.survey import Paths, Placed, place_fixed
 from swarm_loc_estimator.sensors.camera import FROM_OPTICAL, DetectionRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY
 from swarm_loc_estimator.sensors.ranges import RangeRows

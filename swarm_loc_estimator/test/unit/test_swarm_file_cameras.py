@@ -9,8 +9,7 @@ import pytest
 
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera
-from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm, save_swarm
 
 EXAMPLE = """\
 fileversion: 1

@@ -6,14 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from swarm_loc_estimator.swarm import board_file as ir_platform_file
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrMethod, RobotIr
+from swarm_loc_estimator.swarm import ir_board
+from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import Swarm
-from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm, save_swarm
 
-PACKAGED_DROPLET = Path(ir_platform_file.__file__).parents[1] / "config" / "ir" / "droplet.yaml"
+PACKAGED_DROPLET = Path(ir_board.__file__).parents[1] / "config" / "ir" / "droplet.yaml"
 IR = """\
 fileversion: 1
 types:
@@ -26,7 +24,7 @@ robots:
   two:
     type: droplet
     odometry: {wheel_noise: 0.01}
-    ir: {id: 7, estimator: closed_form, gains: {sensor: [1, 1, 1, 1, 1, 2], emitter: [1, 1, 1, 1, 1, 0.5]}}
+    ir: {id: 7, gains: {sensor: [1, 1, 1, 1, 1, 2], emitter: [1, 1, 1, 1, 1, 0.5]}}
   three: {type: droplet, ir: null}
   four: {ir: {id: 8, platform: board.yaml}}
 """
@@ -58,7 +56,7 @@ def test_infrared_boards_come_from_their_layers(tmp_path: Path) -> None:
     platform = load_ir_platform("droplet")
     assert one.ir == RobotIr(0xDF64, platform, "droplet", gate_probability=0.99)
     assert two.ir is not None
-    assert (two.ir.estimator, two.ir.gate_probability) == (IrMethod.CLOSED_FORM, 0.99)
+    assert two.ir.gate_probability == 0.99
     assert two.ir.believed_gains == IrGains((1, 1, 1, 1, 1, 2), (1, 1, 1, 1, 1, 0.5))
     assert one.ir.believed_gains == IrGains.unknown(platform)
     assert three.ir is None
@@ -102,11 +100,11 @@ def test_infrared_boards_are_written_and_read_back_also_elsewhere(tmp_path: Path
             "types.droplet.ir.platform is 5 but must be the name of a packaged one or the path of a file.",
         ),
         (
-            "estimator: closed_form",
-            "estimator: closed",
+            "id: 7",
+            "id: 7, estimator: closed_form",
             (
-                "robots.two.ir.estimator is 'closed' but must be one of the estimators;"
-                " the nearest one is 'closed_form'."
+                "robots.two.ir.estimator is no longer an option:"
+                " poses are always estimated by likelihood; remove it."
             ),
         ),
         (

@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 
 from swarm_loc_estimator.swarm.swarm import Anchor, UwbDevice
-from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm, save_swarm
 
 DOC = Path(__file__).parents[2] / "doc" / "uwb.md"
 HUGE = 2**64 - 1

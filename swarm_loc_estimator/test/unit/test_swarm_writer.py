@@ -10,7 +10,6 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.parameters import number_specs
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
 from swarm_loc_estimator.swarm.error_models import (
     ClockModel,
     FixModel,
@@ -19,10 +18,9 @@ from swarm_loc_estimator.swarm.error_models import (
     RandomWalk,
     SensorModel,
 )
-from swarm_loc_estimator.swarm.ir_board import IrGains, IrMethod, RobotIr
+from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, StartSigma, Swarm
-from swarm_loc_estimator.swarm.swarm_file import RESERVED_NAMES, load_swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import RESERVED_NAMES, load_swarm, save_swarm
 
 RESPONSE = MotionResponse(
     (0.0, 0.1), (0.0, 0.5, 1.0), ((1.0, 0.9, 0.9), (1.0, 0.8, 0.7)), ((1.0, 0.9, 0.8),) * 2
@@ -51,7 +49,6 @@ def boards(board_id: int) -> st.SearchStrategy[RobotIr]:
         st.just(board_id),
         st.just(DROPLET),
         st.just("droplet"),
-        st.sampled_from(IrMethod),
         st.none() | st.builds(IrGains, gain, gain, st.floats(0.0, 1.0), st.floats(0.0, 1.0)),
         gate_probability=st.floats(0.5, 1.0),
     )

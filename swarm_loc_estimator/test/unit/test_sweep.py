@@ -20,10 +20,9 @@ from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.offline.recorded_bag import Loss
 from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.offline.sweep import grid, jobs
-from swarm_loc_estimator.offline.sweep.grid import Job, SweepFileError, read_sweep
-from swarm_loc_estimator.offline.sweep.jobs import FIGURES, outcome
+from swarm_loc_estimator.offline.sweep import sweep as sweeping
 from swarm_loc_estimator.offline.sweep.report import Row, _span, write_results
+from swarm_loc_estimator.offline.sweep.sweep import FIGURES, Job, SweepFileError, outcome, read_sweep
 from swarm_loc_estimator.timeline.settings import Settings
 
 DEMO = Path(__file__).parents[3] / "bags" / "eight_one_robot_fast"
@@ -184,7 +183,7 @@ def test_what_cannot_be_run_is_one_sentence(
 
 
 def test_a_sweep_has_a_limit(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(grid, "MAX_JOBS", 5)
+    monkeypatch.setattr(sweeping, "MAX_JOBS", 5)
     with pytest.raises(SweepFileError, match="it makes 6 replays but must make at most 5"):
         read_sweep(written(folder, "bags: [short]\n" + GRID))
 
@@ -211,11 +210,11 @@ def counted(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The keys of the jobs that run from now on."""
     ran: list[str] = []
 
-    def watched(job: Job) -> jobs.Line:
+    def watched(job: Job) -> sweeping.Line:
         ran.append(job.key)
         return outcome(job)
 
-    monkeypatch.setattr(jobs, "outcome", watched)
+    monkeypatch.setattr(sweeping, "outcome", watched)
     return ran
 
 
@@ -264,7 +263,7 @@ def test_a_fault_of_the_program_ends_one_job(folder: Path, monkeypatch: pytest.M
     def faulty(*_: object, **__: object) -> None:
         raise ZeroDivisionError("by\nzero")
 
-    monkeypatch.setattr(jobs, "replay", faulty)
+    monkeypatch.setattr(sweeping, "replay", faulty)
     assert run(written(folder, "bags: [short]\nworkers: 1")) == 1
     assert table(folder).splitlines()[1].endswith(",ZeroDivisionError: by zero")
 
@@ -273,13 +272,13 @@ def test_ctrl_c_ends_a_sweep_with_what_is_finished(folder: Path, monkeypatch: py
     file = written(folder, "bags: [short]\n" + GRID)
     done: list[Job] = []
 
-    def interrupted(job: Job) -> jobs.Line:
+    def interrupted(job: Job) -> sweeping.Line:
         done.append(job)
         if len(done) > 2:
             raise KeyboardInterrupt
         return outcome(job)
 
-    monkeypatch.setattr(jobs, "outcome", interrupted)
+    monkeypatch.setattr(sweeping, "outcome", interrupted)
     assert run(file) == 130
     assert finished(folder).read_text(encoding="utf-8").count("\n") == 2
 
@@ -317,7 +316,7 @@ def test_a_fit_without_ground_truth_has_no_best_values(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip("optuna")
-    monkeypatch.setattr(jobs, "outcome", lambda job: {"key": job.key, "figures": dict.fromkeys(FIGURES)})
+    monkeypatch.setattr(sweeping, "outcome", lambda job: {"key": job.key, "figures": dict.fromkeys(FIGURES)})
     assert run(written(folder, "bags: [short]\n" + FIT)) == 1
     assert capsys.readouterr().err == "No trial has position_rmse_m of all its replays.\n"
 

@@ -16,9 +16,9 @@ from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.sensors.fix import FixRows
 from swarm_loc_estimator.sensors.infrared import BrightnessRows
+from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.sensors.odometry import OdometryRows
-from swarm_loc_estimator.sensors.registry import Batch
-from swarm_loc_estimator.timeline.settings import end_of_period
+from swarm_loc_estimator.timeline.timeline import end_of_period
 
 ROBOTS = 20
 SEEN = 4

@@ -14,9 +14,9 @@ from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
 from swarm_loc_estimator.common.messages.cdr import IMU
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
-from swarm_loc_estimator.filter.measurement_model import MODELS
+from swarm_loc_estimator.filter.models import MODELS
 from swarm_loc_estimator.offline.replay import replay
-from swarm_loc_estimator.sensors.registry import SENSORS
+from swarm_loc_estimator.sensors.inputs import SENSORS
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 ROOT = Path(__file__).parents[3]
@@ -31,7 +31,7 @@ def compass() -> Iterator[dict[str, Any]]:
     names: dict[str, Any] = {}
     exec(code, names)  # noqa: S102
     yield names
-    del SENSORS["compass"], MODELS[names["Compass"].model]
+    del MODELS[SENSORS.pop("compass").model]
 
 
 def with_compass(folder: Path, sigma: float) -> Path:

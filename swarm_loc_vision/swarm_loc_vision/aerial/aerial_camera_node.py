@@ -14,8 +14,8 @@ from typing import Any
 
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import AnonymousDetectionArray
-from swarm_loc_vision.aerial.aerial_camera import AerialCamera
 from swarm_loc_vision.aerial.control_points import PoseFit
+from swarm_loc_vision.aerial.detector import AerialCamera
 from swarm_loc_vision.aerial.ground_control import Ground
 from swarm_loc_vision.aerial.ground_file import load_ground
 from swarm_loc_vision.aerial.parameters import AerialParameters
@@ -68,7 +68,6 @@ class AerialCameraNode(CameraNode[AerialParameters]):
 
 
 def _pose_figures(fit: PoseFit | None) -> dict[str, str]:
-    """Diagnostics of the camera's pose."""
     if fit is None:
         return {"control points": "0"}
     worst = int(fit.residuals.argmax())

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.aerial.rectification import Brightness, Plain, logarithm
 
+# Shares and limits were chosen on the pictures of `make bench-aerial`, see `detector`.
 _NEAREST, _FARTHEST, _SAMPLES = 0.45, 1.6, 47
 SHARES = np.linspace(_NEAREST, _FARTHEST, _SAMPLES)  # Samples on a ray, over the length to the expected edge
 _SIDE = 5  # Number of samples compared on each side of an edge: an eighth of the diameter
@@ -80,8 +81,8 @@ def steepest(values: FloatArray, reach: FloatArray, polarity: float, edges: Edge
     steps = (2.0 * sums[..., _SIDE:-_SIDE] - sums[..., : -2 * _SIDE] - sums[..., 2 * _SIDE :]) / _SIDE
     between = np.clip(near, 1, steps.shape[2] - 2)
     for _ in range(_AWAY):  # uphill: a higher step farther away is another edge
-        beside = np.stack([np.take_along_axis(steps, between[..., None] + k, 2)[..., 0] for k in (-1, 0, 1)])
-        between = np.clip(between + np.argmax(beside, axis=0) - 1, 1, steps.shape[2] - 2)
+        around = np.stack([np.take_along_axis(steps, between[..., None] + k, 2)[..., 0] for k in (-1, 0, 1)])
+        between = np.clip(between + np.argmax(around, axis=0) - 1, 1, steps.shape[2] - 2)
     share = SHARES[0] + pitch * (between + _vertex(steps, between) + _SIDE - 0.5)
     size = np.take_along_axis(steps, between[..., None], axis=2)[..., 0]
     around = np.pad(np.where(edges.is_edge, size, 0.0), ((0, 0), (_NEIGHBOURS, _NEIGHBOURS)), mode="wrap")
@@ -90,7 +91,7 @@ def steepest(values: FloatArray, reach: FloatArray, polarity: float, edges: Edge
 
 
 def _vertex(steps: FloatArray, between: NDArray[np.int64]) -> FloatArray:
-    """(C, R) offset of the vertex of the parabola through steps (C, R, S) at and beside places (C, R)."""
+    """(C, R) offset of the vertex of the parabola through steps (C, R, S) at and next to places (C, R)."""
     rows = np.indices(between.shape)
     left, mid, right = (steps[rows[0], rows[1], between + k] for k in (-1, 0, 1))
     bend = left - 2.0 * mid + right
@@ -137,7 +138,8 @@ class Edges:
             for axis in ((1, 0), (0, 1))
         )
         slope = np.hypot(across, down)
-        slope[~_shrunk(seen)] = 0.0
+        # the rim of the valid area is no edge
+        slope[cv2.erode(seen.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0] = 0.0
         least = _EDGE_SHARE * contrast
         rows, columns = np.nonzero(slope > least)
         strength = slope[rows, columns]
@@ -172,11 +174,6 @@ def peaks(votes: Plain, diameter_px: float, most: int) -> FloatArray:
     return np.stack([columns[order], rows[order]], axis=1).astype(float)
 
 
-def _shrunk(seen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Erode the valid area: its rim is no edge."""
-    return np.asarray(cv2.erode(seen.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0)
-
-
 RAYS = 64
 _WIDEST = 0.3  # Largest relative difference of a rim from the expected radius
 _OFF = 0.12  # Largest distance of an edge from its circle, in radii
@@ -209,7 +206,7 @@ class Circles(NamedTuple):
     kind: NDArray[np.int64]  # (C,) `TOP`, `SIDES` or `PARTLY`: what the outline is
     soft: NDArray[np.bool_]  # (C,) whether the edges are taken for blurred ones
 
-    def chosen(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Circles:
+    def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Circles:
         """Some of the rows."""
         columns: list[NDArray[Any]] = [column[rows] for column in self]
         return Circles(*columns)

@@ -22,8 +22,8 @@ from swarm_loc_vision.common.camera import Camera
 
 MIN_POINTS = 4
 MAX_POINTS = 1000
+# Checked by test_control_points.py.
 _MIN_SPREAD = 0.02  # Least ratio of the extents of points; below it they count as on one line
-_GUESS_PX = 1.0
 _STEPS = 200
 _FAR = 1e4  # Residual of a point that a pose does not see [sigma]
 
@@ -43,7 +43,7 @@ class ControlPoints:
     def __len__(self) -> int:
         return len(self.names)
 
-    def joined(self, other: ControlPoints) -> ControlPoints:
+    def concatenate(self, other: ControlPoints) -> ControlPoints:
         """These points and others."""
         return ControlPoints(
             [*self.names, *other.names],

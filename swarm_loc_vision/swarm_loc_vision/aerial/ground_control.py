@@ -150,7 +150,7 @@ class GroundControl:
         if self._images < _SETTLING:
             markers.look(gray)
             if self.fit is None or self._images == _SETTLING - 1:
-                self._solve(self._ground.points.joined(markers.mean()))
+                self._solve(self._ground.points.concatenate(markers.mean()))
         elif self.fit is None or self._images % _LATER_EVERY == 0:
             seen = markers.look(gray)
             if self.fit is None or self._has_moved(self.fit, seen):
@@ -158,7 +158,7 @@ class GroundControl:
                 self._images = 0
                 markers.forget()
                 markers.look(gray)
-                self._solve(self._ground.points.joined(markers.mean()))
+                self._solve(self._ground.points.concatenate(markers.mean()))
 
     def _has_moved(self, fit: PoseFit, seen: ControlPoints) -> bool:
         """Whether most markers have moved in the image."""
@@ -168,7 +168,6 @@ class GroundControl:
         return not np.median(away) <= _MOVED * np.hypot(self._settings.control_sigma_px, fit.rms_px)
 
     def _solve(self, points: ControlPoints) -> None:
-        """Solve for the pose with points."""
         try:
             self.fit, self.trouble = _solved(self._camera, points, self._settings), ""
         except ControlPointError as error:
@@ -186,7 +185,7 @@ def located(ground: Ground, camera: Camera, pictures: Sequence[Gray], settings: 
         markers = FloorMarkers(ground.markers, ground.family, camera)
         for gray in pictures:
             markers.look(gray)
-        points = points.joined(markers.mean())
+        points = points.concatenate(markers.mean())
     return _solved(camera, points, settings)
 
 

@@ -8,8 +8,15 @@ from typing import Any
 import numpy as np
 
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number_specs
-from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree, tree_text
-from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks, nearest
+from swarm_loc_estimator.common.yaml_tree import (
+    WHOLE_FILE,
+    Tree,
+    TreeChecks,
+    YamlTreeError,
+    nearest,
+    read_tree,
+    tree_text,
+)
 from swarm_loc_vision.aerial.control_points import ControlPointError, ControlPoints, check_points
 from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground
 from swarm_loc_vision.common.camera import Camera, CameraError

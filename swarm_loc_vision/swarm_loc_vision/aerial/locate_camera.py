@@ -89,8 +89,8 @@ def floor_sigmas(ground: GroundCamera, height: float) -> tuple[float, float]:
 
     def seen(step: FloatArray) -> FloatArray:
         moved = GroundCamera(camera, ground.pose + step, ground.covariance)
-        place, beside = moved.places(pixels, height)
-        along = beside - place
+        place, next_to_it = moved.places(pixels, height)
+        along = next_to_it - place
         return np.column_stack([place, np.arctan2(along[:, 1], along[:, 0])])
 
     changes = np.stack([seen(step) - seen(-step) for step in _STEP * np.eye(POSE_SIZE)], axis=-1)
@@ -142,7 +142,6 @@ def _picture(path: Path, size: tuple[int, int]) -> Gray:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     parser.add_argument("name", help="the camera's name in the swarm description")
     parser.add_argument("control_points", type=Path, help="file of control points")

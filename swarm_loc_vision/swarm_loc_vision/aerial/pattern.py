@@ -24,6 +24,7 @@ def inside_mark(places: FloatArray) -> FloatArray:
     return np.asarray(np.minimum(MARK_RADIUS - np.linalg.norm(places, axis=-1), places[..., 0]))
 
 
+# Samples and limits of the mark were chosen on the pictures of `make bench-aerial`, see `detector`.
 _TURNS = 48
 _RINGS, _SPOKES, _OUTERMOST = 7, 48, 0.82
 _SOFTNESSES = (0.07, 0.14, 0.28)  # Candidates for the blur of the mark's edges, in radii of the disc
@@ -87,7 +88,8 @@ def find_marks(plain: Plain, centre: FloatArray, radius: FloatArray, polarity: f
     is_seen = (explained >= _MIN_EXPLAINED) & (
         -polarity * found.step >= _MIN_MARK * np.abs(_rim_steps(plain, centre, radius))
     )
-    information = _information(found, inside)
+    # of the headings, for noise of one count in each sample
+    information = np.maximum(np.sum(_slope(found, inside) ** 2, axis=1), 1e-12)
     # samples are closer than pixels and share their noise: about every fourth one is independent
     variance = 4.0 * found.variance / len(values[0]) * np.mean(inside.root**2) / information
     return Marks(
@@ -122,11 +124,6 @@ def _slope(found: Marks, inside: _Inside) -> FloatArray:
     theta, softness = found.theta[:, None], found.softness[:, None]
     ahead, behind = (_model(inside.places, theta + s * _TURN_STEP, softness) for s in (0.5, -0.5))
     return np.asarray(found.step[:, None] * inside.without_light((ahead - behind) / _TURN_STEP))
-
-
-def _information(found: Marks, inside: _Inside) -> FloatArray:
-    """(C,) information of the headings, for noise of one count in each sample."""
-    return np.asarray(np.maximum(np.sum(_slope(found, inside) ** 2, axis=1), 1e-12))
 
 
 def _refined(bare: FloatArray, inside: _Inside, theta: FloatArray, softness: FloatArray) -> Marks:

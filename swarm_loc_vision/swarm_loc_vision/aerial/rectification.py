@@ -108,6 +108,7 @@ def _visible(ground: GroundCamera, height: float) -> tuple[FloatArray, FloatArra
     return flat[good], scale[good]
 
 
+# Chosen on the pictures of `make bench-aerial`, see `detector`; strong noise: its look noise_16.
 _DARK = 10.0  # Counts added to brightness: without them the logarithm of dark pixels is mostly noise
 _SMOOTHING_SHARE, _MIN_SMOOTHING_PX = 0.035, 0.6
 _KERNEL = np.array([[1.0, -2.0, 1.0], [-2.0, 4.0, -2.0], [1.0, -2.0, 1.0]])

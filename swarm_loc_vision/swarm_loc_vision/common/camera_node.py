@@ -10,8 +10,7 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
-from swarm_loc_estimator.common.lifecycle import ManagedNode
-from swarm_loc_estimator.common.node import Parameters
+from swarm_loc_estimator.common.node import ManagedNode, Parameters
 from swarm_loc_vision.common.calibrated_camera import Calibration
 from swarm_loc_vision.common.camera import CameraError
 from swarm_loc_vision.common.images import TRANSPORTS, ImageError
@@ -69,11 +68,11 @@ class CameraNode(ManagedNode[Parameters]):
         )
 
     def figures(self) -> dict[str, str]:
-        """Values for the diagnostics beside images, cost and drops."""
+        """Values for the diagnostics in addition to images, cost and drops."""
         raise NotImplementedError
 
     def trouble(self) -> str:
-        """What is wrong beside missing topics, a sentence; empty: nothing. Called once per diagnostics."""
+        """What is wrong but missing topics, a sentence; empty: nothing. Called once per diagnostics."""
         raise NotImplementedError
 
     def _on_camera_info(self, message: CameraInfo) -> None:

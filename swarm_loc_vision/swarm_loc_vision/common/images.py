@@ -83,7 +83,7 @@ class _Compression:
     name: str  # Its name in error messages
     begin: bytes  # First bytes
     data: bytes  # Mark before pixel data; `end` must follow its last occurrence
-    end: bytes  # Mark behind all pixel data
+    end: bytes  # Mark after all pixel data
 
     def is_whole(self, data: bytes) -> bool:
         """Whether bytes are a whole image; cameras may append bytes."""

@@ -16,6 +16,7 @@ from swarm_loc_vision.common.camera import raw_pixel
 from swarm_loc_vision.common.images import Gray
 
 MAX_PROFILES = 40
+# Profiles: checked by the corners of small and blurred markers in `make bench-vision` and test_detector.py.
 _MIN_REACH_PX, _MAX_REACH_PX = 1.5, 6.0
 _STEP_PX = 0.5
 _MIN_SHARED_CELL_PX = 2.0
@@ -31,12 +32,6 @@ def _brightness(image: Gray, u: float, v: float) -> float:
     upper = image[j, i] + a * (float(image[j, i + 1]) - image[j, i])
     lower = image[j + 1, i] + a * (float(image[j + 1, i + 1]) - image[j + 1, i])
     return float(upper + b * (lower - upper))
-
-
-@cached_njit
-def _is_inside(image: Gray, u: float, v: float) -> bool:
-    """Whether `_brightness` is defined at a raw pixel; False for NaN."""
-    return bool(0.0 <= u < image.shape[1] - 1 and 0.0 <= v < image.shape[0] - 1)
 
 
 @cached_njit
@@ -66,6 +61,7 @@ def profile_crossings(
         reach = min(max(reaches[n], _MIN_REACH_PX), _MAX_REACH_PX)
         half = math.ceil(reach / _STEP_PX)
         taken = 0
+        # take the profiles of each side, clear of its corners
         for k in range(4):
             crossings[n, k, :, 2] = 0.0
             u, v = quads[n, k, 0], quads[n, k, 1]
@@ -88,8 +84,10 @@ def profile_crossings(
                     crossings[n, k, m, 0] = along
                     crossings[n, k, m, 2] = light[k, m] - dark[k, m]
                     taken += 1
+        # of a small marker all profiles share one level
         is_small = reach < _MIN_CLEAR_CELL_PX and taken > 0
         common = _common_level(crossings[n, :, :, 2], dark, light) if is_small else 0.0
+        # where each profile crosses its level
         for k in range(4):
             for m in range(MAX_PROFILES):
                 if crossings[n, k, m, 2] > 0.0:
@@ -127,7 +125,8 @@ def _profile(image: Gray, u: float, v: float, du: float, dv: float, half: int, p
     """Sample 2 half + 1 points around a raw pixel; False when they leave the image."""
     du, dv = _STEP_PX * du, _STEP_PX * dv
     for end in (-half, half):
-        if not _is_inside(image, u + end * du, v + end * dv):
+        x, y = u + end * du, v + end * dv
+        if not (0.0 <= x < image.shape[1] - 1 and 0.0 <= y < image.shape[0] - 1):  # also if NaN
             return False
     for j in range(2 * half + 1):
         profile[j] = _brightness(image, u + (j - half) * du, v + (j - half) * dv)

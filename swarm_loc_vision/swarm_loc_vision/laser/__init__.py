@@ -1,1 +1,1 @@
-"""Distances by a laser pointer beside an event camera."""
+"""Distances by a laser pointer next to an event camera."""

@@ -29,8 +29,14 @@ from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node
 from swarm_loc_estimator.common.parameters import ParameterError, number, text
 from swarm_loc_msgs.msg import LaserDistance
-from swarm_loc_vision.laser.calibration import CalibrationError, LaserCalibration, fit_hyperbola, save_laser
-from swarm_loc_vision.laser.drive import WallDrive, recorded_drive
+from swarm_loc_vision.laser.calibration import (
+    CalibrationError,
+    LaserCalibration,
+    WallDrive,
+    fit_hyperbola,
+    recorded_drive,
+    save_laser,
+)
 
 _QOS = QoSProfile(depth=10)
 _COMMAND_S = 0.05
@@ -59,13 +65,13 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("calibrate_laser", CalibrateLaserParameters, **node_arguments)
-        chosen = self.params
-        if chosen.stop_distance >= 0.5 * chosen.start_distance:
+        params = self.params
+        if params.stop_distance >= 0.5 * params.start_distance:
             raise ParameterError(
-                f"parameter stop_distance = {chosen.stop_distance} must be less than half of"
-                f" start_distance = {chosen.start_distance}."
+                f"parameter stop_distance = {params.stop_distance} must be less than half of"
+                f" start_distance = {params.start_distance}."
             )
-        self._drive = WallDrive(chosen.start_distance, chosen.stop_distance)
+        self._drive = WallDrive(params.start_distance, params.stop_distance)
         self._heard_s = {"odom": -math.inf, "laser": -math.inf}
         self._command = self.create_publisher(Twist, "cmd_vel", QoSProfile(depth=1))
         self.create_subscription(Odometry, "odom", self._on_odometry, _QOS)
@@ -89,7 +95,8 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
                 break
             if self._drive.is_done or self._is_silent():
                 done_s = min(done_s, time.monotonic())
-            self._speed = self.params.speed if math.isinf(done_s) and self._hears_all() else 0.0
+            hears_all = min(self._heard_s.values()) > time.monotonic() - 1.0
+            self._speed = self.params.speed if math.isinf(done_s) and hears_all else 0.0
         self._command.publish(Twist())
         executor.shutdown()
         if self._error is not None:
@@ -106,14 +113,11 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
         return self._fit(self._drive)
 
     def _fit(self, drive: WallDrive) -> int:
-        chosen = self.params
-        calibration = fit_hyperbola(drive.drive(chosen.start_sigma, chosen.camera_x))
-        save_laser(Path(chosen.output), calibration)
-        print(summary(calibration, drive.count, chosen.output), file=sys.stdout)
+        params = self.params
+        calibration = fit_hyperbola(drive.drive(params.start_sigma, params.camera_x))
+        save_laser(Path(params.output), calibration)
+        print(summary(calibration, drive.count, params.output), file=sys.stdout)
         return 0
-
-    def _hears_all(self) -> bool:
-        return min(self._heard_s.values()) > time.monotonic() - 1.0
 
     def _is_silent(self) -> bool:
         last_s = max(self._begin_s, min(self._heard_s.values()))

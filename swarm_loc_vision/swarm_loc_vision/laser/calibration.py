@@ -1,20 +1,20 @@
-"""From the row of the laser's spot to a distance: a hyperbola.
+"""From the row of the laser's spot to a distance: a hyperbola, fitted to a drive at a wall.
 
 The laser is parallel to the camera's axis, a base b below it, so the spot of something at depth d lies at the
-row p = p_inf + f b / d. (The PushBot paper uses a logarithm, figure 2, which is tens of centimetres off over
-10 to 250 cm.) An error sigma_px of the row makes an error d^2 sigma_px / (f b) of the distance.
+row p = p_inf + f b / d. (The PushBot paper uses a logarithm, figure 2, which is tens of centimetres off
+over 10 to 250 cm.) An error sigma_px of the row makes an error d^2 sigma_px / (f b) of the distance.
 
-Fit a laser calibration to a drive at a wall: the hyperbola, then the bias of tracked rows within pixels.
-
-The centre of all events of a spot that is hardly larger than a pixel is pulled towards the middles of pixels
-(pixel locking). The spot runs along one line of the image as the distance changes, so this error is a
-function of the row: a robot that turns in front of a wall makes the same error in many readings, and
-averaging over a scan does not remove it as it removes noise.
+`WallDrive` collects the samples of the drive, live or from a bag. The hyperbola is fitted first, then the
+bias of tracked rows within pixels. The centre of all events of a spot that is hardly larger than a pixel is
+pulled towards the middles of pixels (pixel locking). The spot runs along one line of the image as the
+distance changes, so this error is a function of the row: a robot that turns in front of a wall makes the same
+error in many readings, and averaging over a scan does not remove it as it removes noise.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,16 +22,120 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
+from swarm_loc_estimator import decode_laser
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.messages.cdr import LASER, ODOMETRY, CdrError
+from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number, number_specs
-from swarm_loc_estimator.common.yaml_tree import Tree, YamlTreeError, read_tree
-from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
+from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, YamlTreeError, read_tree
+
+_MAX_SAMPLES = 100_000
+_MAX_OFF_COURSE = 0.1  # A robot that turns by more does not drive straight at a wall [rad]
+
+
+@dataclass
+class WallDrive:
+    """Collects rows of the laser's spot with the path driven since the start."""
+
+    start_distance: float  # From base_link to the wall at the start [m]
+    stop_distance: float  # From base_link to the wall at the end [m]
+    driven: float = 0.0  # Path so far [m]
+    _begin: tuple[float, float, float] | None = None
+    _odometry: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=1000))
+    _waiting: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=1000))
+    _samples: list[tuple[float, float]] = field(default_factory=list)
+
+    @property
+    def is_done(self) -> bool:
+        """Whether the robot has reached `stop_distance`."""
+        return self.driven >= self.start_distance - self.stop_distance
+
+    @property
+    def count(self) -> int:
+        """Samples so far."""
+        return len(self._samples)
+
+    def take_odometry(self, stamp_ns: int, x: float, y: float, theta: float) -> None:
+        """Add an odometry pose [m, rad].
+
+        Raises:
+            CalibrationError: The robot has turned.
+        """
+        begin = self._begin = self._begin or (x, y, theta)
+        turned = abs(np.remainder(theta - begin[2] + np.pi, 2.0 * np.pi) - np.pi)
+        if turned > _MAX_OFF_COURSE:
+            raise CalibrationError(f"the robot has turned by {turned:.2g} rad on its way to the wall.")
+        self.driven = (x - begin[0]) * np.cos(begin[2]) + (y - begin[1]) * np.sin(begin[2])
+        self._odometry.append((stamp_ns, self.driven))
+        while self._waiting and self._waiting[0][0] <= stamp_ns:
+            self._sample(*self._waiting.popleft())
+
+    def take_row(self, stamp_ns: int, row: float) -> None:
+        """Add a row of the spot [px]; it is used once there is odometry before and after it."""
+        if np.isfinite(row):
+            self._waiting.append((stamp_ns, row))
+
+    def _sample(self, stamp_ns: int, row: float) -> None:
+        stamps, driven = np.array(self._odometry, dtype=float).T
+        if stamp_ns >= stamps[0] and len(self._samples) < _MAX_SAMPLES:
+            self._samples.append((float(np.interp(stamp_ns, stamps, driven)), row))
+
+    def drive(self, start_sigma: float, camera_x: float) -> Drive:
+        """The samples, for the fit."""
+        driven, rows = np.array(self._samples, dtype=float).reshape(-1, 2).T
+        return Drive(self.start_distance, start_sigma, driven, rows, camera_x)
+
+
+def recorded_drive(bag: Path, robot: str, drive: WallDrive) -> WallDrive:
+    """Fill a drive from a bag until it is done; returns the drive.
+
+    Args:
+        bag: With `<robot>/odom` and `<robot>/laser`; `start_distance` is that at the first odometry.
+        robot: Name of the robot; "" for topics without a namespace.
+        drive: An empty drive.
+
+    Raises:
+        CalibrationError: A topic has no usable message, or the robot turns on its way.
+        UserError: The bag cannot be read.
+    """
+    from swarm_loc_estimator.common.bags.reader import BagReader  # noqa: PLC0415 - a live drive reads no bag
+
+    prefix = f"{robot}/" if robot else ""
+    types = {f"{prefix}odom": ODOMETRY, f"{prefix}laser": LASER}
+    seen = dict.fromkeys(types, 0)
+    with BagReader(bag) as reader:
+        for topic, message_type, _, data in reader.messages(types):
+            if message_type != types[topic] or drive.is_done:
+                continue
+            seen[topic] += _take(drive, data, is_laser=message_type == LASER)
+    for topic, count in seen.items():
+        if not count:
+            raise CalibrationError(f"'{bag}' has nothing usable on {topic}.")
+    return drive
+
+
+def _take(drive: WallDrive, data: bytes, *, is_laser: bool) -> bool:
+    """Add a message to the drive; whether it could be used."""
+    try:
+        if is_laser:
+            seen = decode_laser(data)
+            drive.take_row(seen.stamp_ns, seen.row)
+            return math.isfinite(seen.row)
+        odometry = decode_odometry(data)
+    except CdrError:
+        return False
+    if not all(map(math.isfinite, odometry.pose)):
+        return False
+    drive.take_odometry(odometry.stamp_ns, *odometry.pose)
+    return True
+
 
 MIN_SAMPLES = 50
 _MIN_SPREAD = 2.0
 """Least ratio of the largest to the smallest depth; with less, f b and p_inf cannot be separated."""
 _MAX_RESIDUAL_PX = 1.0
 _START_PX = 0.1
+# The prior of the bias: checked by test_laser.py and `make bench-pushbot ARGS="--parts calibration"`.
 _BEND_PX = 0.05  # Prior standard deviation of a knot off the line between its neighbours [px]
 _SIZE_PX = 0.3  # Prior standard deviation of a knot [px]
 _LEAST_SAMPLES = 4

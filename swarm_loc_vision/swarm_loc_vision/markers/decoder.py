@@ -21,6 +21,8 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_vision.markers.families import Family
 from swarm_loc_vision.markers.layouts import Layout, Words
 
+# Limits of the decoder: checked by random squares and by black squares with a speck in `make bench-vision`,
+# and by test_decoder.py.
 FALSE_READINGS = 1e-5
 """Maximum false positive rate for random squares, with whole bits and one threshold. Weighted bits and the
 second threshold increase it: with all 4096 ids to one or two of 100 000 random squares."""
@@ -178,6 +180,7 @@ def _flatten(cells: FloatArray, places: _Places, sharp: FloatArray, plane: Float
     the middle, by column, by row. Light is the mean of the lighter data cells.
     """
     area = len(sharp)
+    # sharpen: subtract light of the four neighbours
     for row in range(area):
         for column in range(area):
             here = cells[row + 1, column + 1]
@@ -188,6 +191,7 @@ def _flatten(cells: FloatArray, places: _Places, sharp: FloatArray, plane: Float
                 + cells[row + 1, column + 2]
             )
             sharp[row, column] = here + _SHARPENING * (4.0 * here - around)
+    # fit dark as a plane to the ring, whose columns and rows are symmetric, so that sums are enough
     middle = 0.5 * (area - 1)
     mean, by_x, by_y, square = 0.0, 0.0, 0.0, 0.0
     for i in range(len(places.ring)):
@@ -198,9 +202,11 @@ def _flatten(cells: FloatArray, places: _Places, sharp: FloatArray, plane: Float
         square += (column - middle) ** 2
     mean, by_x, by_y = mean / len(places.ring), by_x / square, by_y / square
     plane[0], plane[1], plane[2] = mean, by_x, by_y
+    # brightness above dark
     for row in range(area):
         for column in range(area):
             sharp[row, column] -= mean + by_x * (column - middle) + by_y * (row - middle)
+    # the mean of the lighter data cells
     lightest = 0.0
     for i in range(len(places.data)):
         lightest = max(lightest, sharp[places.data[i, 0], places.data[i, 1]])

@@ -36,7 +36,7 @@ from swarm_loc_estimator.common.parameters import Value
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.camera import CameraError
 from swarm_loc_vision.common.images import TRANSPORTS, ImageError, Transport
-from swarm_loc_vision.markers.camera_detector import CameraDetector
+from swarm_loc_vision.markers.detector import CameraDetector
 from swarm_loc_vision.markers.parameters import DetectorParameters, detector_maker
 
 CreateCamera = Callable[[str, Transport], CameraDetector]
@@ -154,8 +154,8 @@ def _calibrate(camera: CameraDetector, data: bytes) -> None:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
-    beside = swarm_beside(options.bag)
-    swarm_file = options.swarm or (beside if beside.exists() else None)
+    recorded = swarm_beside(options.bag)
+    swarm_file = options.swarm or (recorded if recorded.exists() else None)
     described = "" if swarm_file is None else str(swarm_file)
     given: dict[str, Value] = {
         "autostart": True,
@@ -199,7 +199,6 @@ def _summary(name: str, camera: CameraDetector) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     add_bag(parser)
     parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="the new bag")

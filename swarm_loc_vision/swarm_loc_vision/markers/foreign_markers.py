@@ -20,12 +20,11 @@ from swarm_loc_estimator.common.parameters import ParameterError, autostart, cho
 from swarm_loc_vision.common.calibrated_camera import Calibration, camera_of
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.common.images import ImageError
-from swarm_loc_vision.markers.camera_detector import detection_rows
-from swarm_loc_vision.markers.detector import Detections
+from swarm_loc_vision.markers.bodies import PoseSettings, PoseSolver
+from swarm_loc_vision.markers.detector import Detections, detection_rows
 from swarm_loc_vision.markers.families import families
 from swarm_loc_vision.markers.parameters import MarkersInUse, known_markers
 from swarm_loc_vision.markers.pose import square
-from swarm_loc_vision.markers.pose_solver import PoseSettings, PoseSolver
 
 _APRILTAG_CENTRE_PX = 0.5
 """Where AprilTag's detector sees the centre of the first pixel; everywhere else it is at 0."""
@@ -200,7 +199,6 @@ class ForeignMarkers(Calibration):
                 yield marker
 
     def _solved(self, camera: Camera, markers: list[ForeignMarker]) -> Detections:
-        """The markers with poses."""
         count = len(markers)
         ids = np.array([marker.id for marker in markers], np.int64)
         corners = np.array([marker.corners for marker in markers]).reshape(-1, 4, 2)

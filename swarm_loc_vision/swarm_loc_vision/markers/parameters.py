@@ -18,8 +18,7 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.common.images import TRANSPORTS
 from swarm_loc_vision.markers.bodies import Body, robot_body, up_of
-from swarm_loc_vision.markers.camera_detector import CreateDetector
-from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
+from swarm_loc_vision.markers.detector import CreateDetector, DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import Family, families, family_named
 
 _IDS = re.compile(r"(\d+)(?:-(\d+))?")

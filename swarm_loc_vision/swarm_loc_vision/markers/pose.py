@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_vision.markers.ippe import two_starts
 
 _ROUNDS = 12
-_STILL = 1e-6  # Threshold of the weighted squared step at convergence
+_CONVERGED = 1e-6  # Threshold of the weighted squared step at convergence
 _NOWHERE = 1e12
+_NO_SQUARE = 1e-15  # Determinant of corners on one line
+_LYING = 1e-6  # Length of a z axis along the direction up
+# Checked by the NEES of test_pose.py.
 _TRUST = 6.0
 """Prior degrees of freedom of the corners' covariance. The pose covariance is inflated where residuals are
 larger, as on a partly covered marker. A single marker has two degrees of freedom."""
@@ -88,7 +90,7 @@ def marker_poses(
     """
     directions = (corners - intrinsics[2:]) / intrinsics[:2]
     points = np.stack([square(length) for length in lengths]) if len(lengths) else np.zeros((0, 4, 3))
-    starts = two_starts(points, directions, None if upright is None else upright.up)
+    starts = _two_starts(points, directions, None if upright is None else upright.up)
 
     def refined(rows: NDArray[np.int64], covariance: FloatArray) -> Poses:
         count, poses = len(rows), (starts[0][rows], starts[1][rows])
@@ -115,6 +117,86 @@ def marker_poses(
     turned = np.einsum("nij,nij->n", poses.rotation[:, 0], poses.rotation[:, 1])
     poses.chi2[turned >= _SAME, 1] = np.inf
     return poses, is_misfit
+
+
+def _two_starts(
+    points: FloatArray, directions: FloatArray, up: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Two initial poses of each square by Infinitesimal Plane-based Pose Estimation.
+
+    Collins and Bartoli, IJCV 2014: the perspective of a plane at its centre yields two rotations, mirrored
+    about the line of sight. OpenCV's `solvePnPGeneric` finds the same two, but none for 1 % of the squares
+    that are exactly aligned with the image.
+
+    Args:
+        points: (N, 4, 3) corners in the marker's frame, clockwise from the upper left [m].
+        directions: (N, 4, 2) directions of the corners at distance 1.
+        up: (3,) in the camera frame, if the markers' y axes are known to point up.
+
+    Returns:
+        Rotations (N, 2, 3, 3) and positions (N, 2, 3) [m]; a position behind the camera means no pose.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # the homography from the square with corners (-1, 1), (1, 1), (1, -1), (-1, -1)
+        first, second, third, fourth = directions.swapaxes(0, 1)
+        both, a, b = first - second + third - fourth, second - third, fourth - third
+        determinant = _cross(a, b)
+        g, h = _cross(both, b) / determinant, _cross(a, both) / determinant
+        right, down = second - first + g * second, fourth - first + h * fourth
+        # its value and its Jacobian at the centre, by x to the right and y up
+        middle = 1.0 + 0.5 * (g + h)
+        centre = (first + 0.5 * (right + down)) / middle
+        jacobian = 0.5 * np.stack([right - centre * g, centre * h - down], axis=2) / middle[:, None]
+        # a rotation that turns the z axis into the line of sight
+        axis = np.concatenate([centre, np.ones_like(g)], axis=1)
+        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
+        out, ahead = axis[:, :2, None], axis[:, 2:, None]
+        upper = np.eye(2) - out * out.swapaxes(1, 2) / (1.0 + ahead)
+        sight = np.block([[upper, out], [-out.swapaxes(1, 2), ahead]])
+        # the upper left 2 x 2 of the rotation about it, scaled by the largest singular value
+        scaled = np.linalg.solve(upper + centre[:, :, None] * out.swapaxes(1, 2), jacobian)
+        square_sum, area = np.square(scaled).sum(axis=(1, 2)), np.linalg.det(scaled)
+        largest = np.sqrt(0.5 * (square_sum + np.sqrt(np.maximum(square_sum**2 - 4.0 * area**2, 0.0))))
+        turned = scaled / largest[:, None, None]
+        # its third row up to a sign, which makes the two solutions
+        last = np.sqrt(np.maximum(1.0 - np.square(turned).sum(axis=1), 0.0))
+        last[:, 1] *= np.where((turned[:, :, 0] * turned[:, :, 1]).sum(axis=1) > 0.0, -1.0, 1.0)
+        columns = np.stack([np.concatenate([turned, s * last[:, None]], axis=1) for s in (1.0, -1.0)], axis=1)
+        normal = np.cross(columns[..., 0], columns[..., 1])[..., None]
+        rotation = sight[:, None] @ np.concatenate([columns, normal], axis=3)
+    none = ~((np.abs(determinant[:, 0]) > _NO_SQUARE) & (largest > 0.0))
+    rotation[none] = 0.0
+    if up is not None:
+        _set_upright(rotation, up)
+    position = _places(points, directions, rotation)
+    position[none] = -1.0
+    return rotation, position
+
+
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Cross products (N, 1) of vectors (N, 2)."""
+    return a[:, :1] * b[:, 1:] - a[:, 1:] * b[:, :1]
+
+
+def _set_upright(rotation: FloatArray, up: FloatArray) -> None:
+    """Turn the y axes of rotations (N, 2, 3, 3) up and make their z axes level."""
+    out = rotation[..., 2] - (rotation[..., 2] @ up)[..., None] * up
+    length = np.linalg.norm(out, axis=-1)
+    turns = length > _LYING
+    out = out[turns] / length[turns, None]
+    rotation[turns] = np.stack([np.cross(up, out), np.broadcast_to(up, out.shape), out], axis=-1)
+
+
+def _places(points: FloatArray, directions: FloatArray, rotation: FloatArray) -> FloatArray:
+    """Positions (N, 2, 3) for given rotations (N, 2, 3, 3), by linear least squares."""
+    turned = np.einsum("nsij,nkj->nski", rotation, points)
+    along = directions[:, None]
+    shift = along * turned[..., 2:] - turned[..., :2]  # = t_xy - along t_z
+    mean, mean_shift = along.mean(axis=2), shift.mean(axis=2)
+    spread = np.square(along - mean[:, :, None]).sum(axis=(2, 3))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = -((along - mean[:, :, None]) * shift).sum(axis=(2, 3)) / spread
+    return np.concatenate([mean_shift + mean * depth[..., None], depth[..., None]], axis=2)
 
 
 def body_pose(
@@ -205,6 +287,7 @@ def _refine(sight: _Sight, rotation: FloatArray, position: FloatArray, covarianc
     cost = _equations(sight, rotation, position, normal, slope)
     damping = 1e-4
     for _ in range(_ROUNDS):
+        # a damped Gauss-Newton step (Levenberg-Marquardt)
         if not cost < _NOWHERE:
             return np.inf
         if not _factorized(normal, damping, factor):
@@ -217,15 +300,17 @@ def _refine(sight: _Sight, rotation: FloatArray, position: FloatArray, covarianc
                 trial_position[i] = position[i] + step[i]
         _rotated(rotation, step, trial_rotation)
         trial = _equations(sight, trial_rotation, trial_position, trial_normal, trial_slope)
+        # keep it if the cost falls, else damp more
         if trial <= cost:
             rotation[:], position[:] = trial_rotation, trial_position
             normal[:], slope[:] = trial_normal, trial_slope
             cost = trial
             damping *= 0.1
-            if gain < _STILL:
+            if gain < _CONVERGED:
                 break
         else:
             damping *= 10.0
+    # the covariance is the inverse of the normal matrix
     if not _factorized(normal, 0.0, factor):
         return np.inf
     unit = np.zeros(6)
@@ -250,6 +335,7 @@ def _equations(
     points, pixels, weights, intrinsics = sight.points, sight.pixels, sight.weights, sight.intrinsics
     fx, fy = intrinsics[0], intrinsics[1]
     for m in range(len(weights)):
+        # residuals and Jacobian of the four corners
         for k in range(4):
             x, y, z = 0.0, 0.0, 0.0
             for i in range(3):
@@ -269,6 +355,7 @@ def _equations(
             jacobian[2 * k + 1, 1], jacobian[2 * k + 1, 2] = b, -b * v
             jacobian[2 * k + 1, 3], jacobian[2 * k + 1, 4] = -b * (z + v * y), b * v * x
             jacobian[2 * k + 1, 5] = b * x
+        # sums weighted by the inverse covariance of the corners
         for i in range(8):
             weighed[:] = 0.0
             weighed_rest = 0.0

@@ -26,6 +26,7 @@ _MIN_SIDE_PX = 3  # Minimum size of an image with inner pixels
 _DARK = 255
 _FOLLOWED = 1  # Value of a dark pixel on a followed outline whose left neighbour is light
 _SAME = 0.15  # Maximum distance of duplicate quadrangles, relative to their size
+# Limits of outlines: checked by the recall of `make bench-vision` and by test_detector.py.
 _NOISE_SIGMAS = 1.25
 """Minimum ratio of contrast to noise; below it, specks of noise would dominate the run time."""
 _SMOOTHING_PX = 0.5
@@ -276,6 +277,7 @@ def _sides(
     """
     lines = np.empty((4, 3))  # normal (outwards) and offset
     for k in range(4):
+        # the chord between two corners
         begin, end = corners[k], corners[(k + 1) % 4]
         count = end - begin if end > begin else end - begin + length
         du = points[end, 0] - points[begin, 0]
@@ -283,6 +285,7 @@ def _sides(
         chord = math.hypot(du, dv)
         if chord < 0.6 * min_side:
             return False
+        # moments of the outline near it, clear of the corners
         steps = max(abs(du), abs(dv))
         skip = min(int(0.15 * steps), 12)
         slack = _SLACK_PX + _SLACK * chord
@@ -298,6 +301,7 @@ def _sides(
             suu += u * u
             suv += u * v
             svv += v * v
+        # the line along the larger principal axis, which must be straight
         if n < max(_MIN_SEEN * (steps - 2 * skip), 2):
             return False
         su, sv = su / n, sv / n
@@ -311,6 +315,7 @@ def _sides(
             normal_u, normal_v = -normal_u, -normal_v
         lines[k, 0], lines[k, 1] = normal_u, normal_v
         lines[k, 2] = normal_u * (points[begin, 0] + su) + normal_v * (points[begin, 1] + sv) + 0.5
+    # neighbouring lines meet near the corners of the outline
     for k in range(4):
         a, b = lines[k - 1], lines[k]
         determinant = a[0] * b[1] - a[1] * b[0]

@@ -184,6 +184,7 @@ def _collect_side(
     """Collect the pixels near one side by rows or columns across it."""
     frame = found.frames[n, k]
     u, v, du, dv, length = frame[U], frame[V], frame[DU], frame[DV], frame[LENGTH]
+    # the side in raw pixels: its ends, its slope and its bow by the lens
     begin_u, begin_v = u + warp[0, 0], v + warp[0, 1]
     end_u, end_v = u + length * du + _shift(warp, 0, 1.0, 0.0), v + length * dv + _shift(warp, 1, 1.0, 0.0)
     is_flat = abs(end_u - begin_u) >= abs(end_v - begin_v)
@@ -193,11 +194,13 @@ def _collect_side(
     slope = (across_end - across) / (end - begin)
     lean = math.hypot(1.0, slope)
     inwards = lean if (du > 0.0 if is_flat else dv < 0.0) else -lean
+    # walk along the rows or columns that cross it
     width, height = (image.shape[1], image.shape[0]) if is_flat else (image.shape[0], image.shape[1])
     low, high = max(math.ceil(min(begin, end)), 0), min(math.floor(max(begin, end)), width - 1)
     stride = max(1, math.ceil((high - low + 1) / _MAX_ROWS))
     for i in range(low, high + 1, stride):
         share = (i - begin) / (end - begin)
+        # pixels around the outer edge, and in every other row around the inner one
         centre = across + slope * (i - begin) + share * (1.0 - share) * bow
         gap = frame[NEAR] + share * (frame[FAR] - frame[NEAR])
         for inner in range(2 if (i - low) % (2 * stride) == 0 else 1):  # every other row is enough inside
@@ -209,6 +212,7 @@ def _collect_side(
                 if m == _ROOM:
                     return
                 x, y = (float(i), float(j)) if is_flat else (float(j), float(i))
+                # place along and outside of the side, by two Newton steps
                 a, d = share * length, -inner * gap
                 for _ in range(2):
                     s = a / length

@@ -72,8 +72,8 @@ def outline(black: NDArray[np.bool_], left: float, bottom: float, cell: float) -
     ways: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for row, column in np.argwhere(padded).tolist():
         corners = [(row, column), (row, column + 1), (row + 1, column + 1), (row + 1, column)]
-        beside = [(row - 1, column), (row, column + 1), (row + 1, column), (row, column - 1)]
-        for side, other in enumerate(beside):
+        neighbours = [(row - 1, column), (row, column + 1), (row + 1, column), (row, column - 1)]
+        for side, other in enumerate(neighbours):
             if not padded[other]:
                 ways.setdefault(corners[side], []).append(corners[(side + 1) % 4])
     loops: list[Outline] = []

@@ -76,7 +76,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    """The command line."""
     parser = command_parser(__doc__)
     parser.add_argument("swarm_file", metavar="SWARM_FILE", type=Path, nargs="?", help="swarm description")
     parser.add_argument(
@@ -106,7 +105,6 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _grid(text: str) -> list[int]:
-    """Columns and rows."""
     match = _GRID.fullmatch(text)
     if match is None:
         raise argparse.ArgumentTypeError(f"'{text}' must be columns and rows, such as 3x4")

@@ -1,4 +1,4 @@
-"""The marker detector as a managed node, and several of them beside an estimator in one process."""
+"""The marker detector as a managed node, and several of them with an estimator in one process."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from test_marker_detector_node import FAMILY, camera_info, image
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_msgs.msg import MarkerDetectionArray, SwarmPoses
-from swarm_loc_vision.markers.marker_detector_node import MarkerDetectorNode
+from swarm_loc_vision.markers.marker_nodes import MarkerDetectorNode
 
 pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
 
@@ -60,7 +60,7 @@ def test_a_detector_detects_while_it_is_active(ros: Ros, tmp_path: Path) -> None
 
 @pytest.fixture
 def tester() -> Iterator[Node]:
-    """A node beside those that are tested."""
+    """A node apart from those that are tested."""
     rclpy.init(args=[])
     yield rclpy.create_node("tester")
     rclpy.shutdown()

@@ -17,10 +17,10 @@ from sensor_msgs.msg import CameraInfo
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
 from swarm_loc_estimator.common.parameters import ParameterError, UserError
 from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
-from swarm_loc_vision.markers import marker_node
+from swarm_loc_vision.markers import marker_nodes
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.foreign_markers import KINDS, ForeignMarker
-from swarm_loc_vision.markers.marker_bridge_node import MarkerBridgeNode
+from swarm_loc_vision.markers.marker_nodes import MarkerBridgeNode
 
 pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
 
@@ -82,7 +82,7 @@ def test_markers_become_detections(ros: Ros, monkeypatch: pytest.MonkeyPatch) ->
 def test_all_is_compiled_before_markers_come(ros: Ros, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(KINDS, "apriltag", STAND_IN)
     compiled: list[bool] = []
-    monkeypatch.setattr(marker_node, "precompile", lambda: compiled.append(True))
+    monkeypatch.setattr(marker_nodes, "precompile", lambda: compiled.append(True))
     ros.add(MarkerBridgeNode())
     assert compiled
 

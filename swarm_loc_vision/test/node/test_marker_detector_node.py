@@ -20,7 +20,7 @@ from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_msgs.msg import MarkerDetection, MarkerDetectionArray
 from swarm_loc_vision.common import camera_node
 from swarm_loc_vision.markers.families import family_named
-from swarm_loc_vision.markers.marker_detector_node import MarkerDetectorNode
+from swarm_loc_vision.markers.marker_nodes import MarkerDetectorNode
 
 pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
 
@@ -39,7 +39,7 @@ def image(number: int, encoding: str = "mono8", channels: int = 1) -> Image:
 
 
 def compressed(number: int, how: str = "jpeg", suffix: str = ".jpg") -> CompressedImage:
-    """The scene in a file's bytes, likewise."""
+    """The scene in a file's bytes."""
     message = CompressedImage(format=how)
     message.header.frame_id = FRAME
     message.header.stamp.sec = number

@@ -31,7 +31,7 @@ def light(
 
 
 def noise(rng: np.random.Generator, rate: float, seconds: float) -> FloatArray:
-    """Likewise noise events, so many per pixel and second."""
+    """Noise events at a rate per pixel and second."""
     count = rng.poisson(rate * SIZE[0] * SIZE[1] * seconds)
     places = rng.integers(0, 128, (2, count))
     return np.stack([*places, rng.integers(0, 2, count), rng.uniform(0.0, seconds * 1e9, count)])

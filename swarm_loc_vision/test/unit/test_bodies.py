@@ -60,7 +60,7 @@ def test_two_faces_have_one_pose_without_flips() -> None:
         assert (seen.poses.chi2[:, 1] > seen.poses.chi2[:, 0] + 100.0).all()
     assert max(together) < 0.06
     assert np.mean(np.square(together)) < 0.2 * np.mean(np.square(alone))
-    assert 4.0 < np.median(nees) < 6.5  # the surplus over what the corners say is told
+    assert 4.0 < np.median(nees) < 6.5  # the surplus over what the corners say is published
 
 
 def nees_of(seen: Seen, rotation: FloatArray, position: FloatArray, sigma: float = 0.0) -> float:

@@ -20,8 +20,7 @@ from bench.vision.peers import own_detector
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, random_scene
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE, CONTENT_POSE_TWO
 from swarm_loc_vision.common.camera import Camera
-from swarm_loc_vision.markers.camera_detector import detection_rows
-from swarm_loc_vision.markers.detector import Detections, DetectorSettings, MarkerDetector
+from swarm_loc_vision.markers.detector import Detections, DetectorSettings, MarkerDetector, detection_rows
 from swarm_loc_vision.markers.families import Family, draw_marker, family_named
 
 PHOTOS = Path(__file__).resolve().parents[4] / "shared" / "data" / "photos"

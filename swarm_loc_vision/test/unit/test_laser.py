@@ -21,12 +21,13 @@ from swarm_loc_vision.laser.calibration import (
     LaserCalibration,
     LaserFileError,
     RowBias,
+    WallDrive,
     fit_hyperbola,
     fit_row_bias,
     load_laser,
+    recorded_drive,
     save_laser,
 )
-from swarm_loc_vision.laser.drive import WallDrive, recorded_drive
 
 DEPTHS = np.linspace(0.1, 2.5, 200)
 

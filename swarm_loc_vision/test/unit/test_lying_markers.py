@@ -13,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from bench.vision.scenes import CAMERA, project
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.measurement_model import predict
-from swarm_loc_estimator.sensors.camera import SightingConverter
+from swarm_loc_estimator.filter.models import predict
+from swarm_loc_estimator.sensors.camera import DetectionRows, SightingConverter
+from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Robot, Swarm
 from swarm_loc_vision.aerial.control_points import solve_pose
 from swarm_loc_vision.aerial.ground_camera import GroundCamera
@@ -22,8 +23,7 @@ from swarm_loc_vision.aerial.locate_camera import fixed_camera
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.bodies import Seen, robot_body, solve_bodies
-from swarm_loc_vision.markers.camera_detector import detection_rows
-from swarm_loc_vision.markers.detector import Detections
+from swarm_loc_vision.markers.detector import Detections, detection_rows
 from swarm_loc_vision.markers.pose import marker_poses, square
 
 INTRINSICS = np.array([CAMERA[0, 0], CAMERA[1, 1], CAMERA[0, 2], CAMERA[1, 2]])
@@ -72,13 +72,13 @@ def measured(camera: FixedCamera, base: FloatArray, seen: Seen) -> tuple[FloatAr
     found = Detections(seen.id * 0, seen.id, zeros, zeros, zeros, seen.corners, seen.poses, 0, {})
     rows = detection_rows(found, 16.0)
     swarm = Swarm((Robot("a", camera=None, faces=TOPS),), (), (camera,))
-    result = SightingConverter(swarm).convert(np.full(count, 1), np.zeros(count, np.int64), rows)
-    assert result.dropped == {}
-    one = result.measurements
+    drops, never = DropCounts(2), np.zeros(count, np.int64)
+    one = SightingConverter(swarm, drops).convert(DetectionRows(np.full(count, 1), never, rows, never))
+    assert not drops.total
     predicted, _ = predict(one, np.zeros((count, 3)), np.tile(base, (count, 1)))
-    error = one["value"] - predicted
+    error = one.value - predicted
     error[:, 2] = se2.wrap_angle(error[:, 2])
-    return error, one["covariance"]
+    return error, one.covariance
 
 
 @pytest.mark.parametrize("faces", [1, 2])

@@ -10,7 +10,7 @@ import pytest
 from bench.shared.parameter_table import markdown_table
 from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.parameters import DetectorParameters, detector_maker

@@ -30,7 +30,7 @@ def random_markers(count: int, seed: int, min_incidence: float = 0.0) -> tuple[F
 
 
 def upright_markers(count: int, seed: int) -> tuple[FloatArray, FloatArray]:
-    """Likewise, with their y axes up in the camera frame."""
+    """As `random_markers`, with their y axes up in the camera frame."""
     rng = np.random.default_rng(seed)
     yaw = rng.uniform(-1.0, 1.0, count)
     out = np.column_stack([np.sin(yaw), np.zeros(count), -np.cos(yaw)])
@@ -87,7 +87,7 @@ def test_the_other_solution_is_there_where_the_plane_is_ambiguous() -> None:
     other = np.linalg.norm(turn_errors(poses.rotation[:, 1], rotation), axis=1)
     flipped = other < 0.5 * angle
     assert flipped.sum() > 5
-    close = poses.chi2[:, 1] - poses.chi2[:, 0] < 36.0 * 16.0  # the noise is six times what is told
+    close = poses.chi2[:, 1] - poses.chi2[:, 0] < 36.0 * 16.0  # the noise is six times the given one
     assert close[flipped].all()
     assert (poses.chi2[:, 0] <= poses.chi2[:, 1]).all()
 

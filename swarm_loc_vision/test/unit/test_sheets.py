@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_vision.aerial.ground_control import FloorMarkers
 from swarm_loc_vision.aerial.ground_file import load_ground
 from swarm_loc_vision.common.camera import Camera

@@ -1,4 +1,4 @@
-"""The Droplet's firmware of 2018 behind its serial console, as far as drivers speak to it.
+"""The Droplet's firmware of 2018 at its serial console, as far as drivers speak to it.
 
 Two things are up to the program that a user writes for his Droplets: that matrices are printed (the stock
 firmware prints none), and that emitters shine as `set_ir` has said (in exchanges the stock one takes 256).
@@ -290,7 +290,6 @@ class DropletFirmware:
             self._say(f"\t{direction}\t{self._body.lengths[direction]}")
 
     def _reset(self) -> None:
-        """Reset as after power-on."""
         self._stop()
         self._tasks.clear()
         self._line.clear()

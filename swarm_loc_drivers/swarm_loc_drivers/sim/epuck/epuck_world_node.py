@@ -99,6 +99,7 @@ class EpuckWorldNode(WorldNode[EpuckWorldParameters]):
         swarm, self._world = make_world(params)
         self._names = [robot.name for robot in swarm.robots]
 
+        # robots: their firmware, links, clock and true poses
         def firmware_of(robot: int) -> SerialFirmware | WifiFirmware:
             body = SimulatedEpuck(self._world, robot)
             return (
@@ -114,11 +115,13 @@ class EpuckWorldNode(WorldNode[EpuckWorldParameters]):
             link_folder=params.link_folder,
             first_port=params.first_port,
         )
+        # cameras, on the robots and above
         calibration = params.camera.calibration
         self._cameras = [CameraOutput(self, name, calibration) for name in self._names]
         if params.overhead.is_there:  # Python counts -1, which stands for it, from the end
             self._names.append(_AERIAL)
             self._cameras.append(CameraOutput(self, _AERIAL, overhead_model(params.overhead).calibration))
+        # detections for which simulated time waits
         self._held_since_s: float | None = None
         self._unanswered = Unanswered(params.answer_within)
         if params.answer_within > 0.0:
@@ -138,7 +141,7 @@ class EpuckWorldNode(WorldNode[EpuckWorldParameters]):
                 self._unanswered.ask(exposure.robot, exposure.stamp_ns, now_ns)
 
     def is_held(self) -> bool:
-        """Whether simulated time waits for the detections of an image; it does not wait for ever."""
+        """Whether simulated time waits for the detections of an image; up to a limit of real time."""
         if not self._unanswered.is_late(self._world.now_ns):
             self._held_since_s = None
             return False

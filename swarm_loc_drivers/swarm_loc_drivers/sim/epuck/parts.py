@@ -54,7 +54,7 @@ class EpuckBody(Protocol):
 
 CAMERA_WIDTH, CAMERA_HEIGHT = 640, 480
 
-GRAVITY_EPUCK2 = 768  # One g in its raw accelerations
+_GRAVITY = 768  # One g in raw accelerations of an e-puck2
 _AMBIENT = 3600
 _TOF_MM = 2000
 _BATTERY = 3200
@@ -64,7 +64,7 @@ _MICROPHONE = 40
 
 
 class Motors:
-    """The stepper motors: clamped and quantised speeds, counters that a host may preset.
+    """The stepper motors: clamped and quantised speeds, counters of steps.
 
     Args:
         body: The robot.
@@ -77,7 +77,6 @@ class Motors:
     def __init__(self, body: EpuckBody, model: EpuckModel) -> None:
         self._body = body
         self._model = model
-        self._origin = (0, 0)
         self.commanded = (0, 0)
 
     def set_speeds(self, left: int, right: int) -> None:
@@ -85,20 +84,10 @@ class Motors:
         self.commanded = (as_counter(left), as_counter(right))
         self._body.set_wheel_speeds(*map(self._model.rate, self.commanded))
 
-    def steps(self) -> tuple[int, int]:
-        """The counters, unbounded."""
-        left, right = self._body.wheel_steps()
-        return left - self._origin[0], right - self._origin[1]
-
     def counters(self) -> tuple[int, int]:
         """The counters as they are sent, 16 bits."""
-        left, right = self.steps()
+        left, right = self._body.wheel_steps()
         return as_counter(left), as_counter(right)
-
-    def preset(self, left: int, right: int) -> None:
-        """Set the counters."""
-        done_left, done_right = self._body.wheel_steps()
-        self._origin = (done_left - left, done_right - right)
 
 
 def camera_image(body: EpuckBody, width: int, height: int, zoom: int) -> Image:
@@ -122,8 +111,8 @@ def camera_image(body: EpuckBody, width: int, height: int, zoom: int) -> Image:
 def sensor_values(body: EpuckBody, motors: Motors) -> NDArray[np.void]:
     """The sensor values () of SENSORS_DTYPE of a robot that stands level in a quiet room."""
     values = np.zeros((), SENSORS_DTYPE)
-    values["acceleration"] = (0, 0, GRAVITY_EPUCK2)
-    values["acceleration_polar"] = (GRAVITY_EPUCK2, 0.0, 0.0)
+    values["acceleration"] = (0, 0, _GRAVITY)
+    values["acceleration_polar"] = (_GRAVITY, 0.0, 0.0)
     values["temperature"] = _TEMPERATURE
     values["proximity"] = body.proximity()
     values["ambient"] = _AMBIENT
@@ -178,9 +167,9 @@ def _to_discs(origins: FloatArray, rays: FloatArray, centres: FloatArray) -> Flo
         return np.full(rays.shape[:2], math.inf)
     to_centre = centres - origins[:, None, None]
     along = (to_centre * rays[:, :, None]).sum(axis=-1)
-    beside = (to_centre**2).sum(axis=-1) - along**2
-    depth = np.sqrt(np.maximum(PROXIMITY_RADIUS_M**2 - beside, 0.0))
-    met = (beside < PROXIMITY_RADIUS_M**2) & (along > 0.0)
+    off_ray = (to_centre**2).sum(axis=-1) - along**2
+    depth = np.sqrt(np.maximum(PROXIMITY_RADIUS_M**2 - off_ray, 0.0))
+    met = (off_ray < PROXIMITY_RADIUS_M**2) & (along > 0.0)
     nearest: FloatArray = np.where(met, np.maximum(along - depth, 0.0), math.inf).min(axis=-1)
     return nearest
 

@@ -7,6 +7,7 @@ as the client has not been listening.
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Generator
 
 from swarm_loc_drivers.epuck import wifi_protocol as wifi
@@ -19,7 +20,6 @@ FAILED_EXCHANGE_NS = 1_071_000_000
 """How long an exchange between the two chips that fails takes, with the pause after it."""
 
 _CAMERA_ON, _SENSORS_ON = 1, 2
-_PRESET_COUNTERS = 4
 _QUEUE_LIMIT = 5 * wifi.COMMAND_SIZE
 _ZOOM = 4
 
@@ -130,14 +130,8 @@ class WifiFirmware:
         if self._counts_right_backwards:
             values["right_counter"] = as_counter(-int(values["right_counter"]))
         self._sensors = values.tobytes()
-        if not self._command:
-            return
-        left = int.from_bytes(self._command[3:5], "little", signed=True)
-        right = int.from_bytes(self._command[5:7], "little", signed=True)
-        if self._command[2] & _PRESET_COUNTERS:
-            self._motors.preset(left, right)
-        else:
-            self._motors.set_speeds(left, right)
+        if self._command:
+            self._motors.set_speeds(*struct.unpack_from("<2h", self._command, 3))
 
     def _next_image(self) -> Generator[bytes, None, bytes]:
         """The image that waits, as soon as there is one; the next one is fetched at once."""

@@ -85,6 +85,7 @@ class EpuckWorld:
         self._drive = Drive(
             settings.wheels.wheel_separation, settings.errors.wheel_noise, settings.errors.turn_slip
         )
+        # true geometry and cameras
         rng = np.random.default_rng(settings.seed)
         truth = hidden_geometry(rng, swarm, settings.errors)
         self.rig = CameraRig(swarm, truth, settings.arena, settings.camera, settings.seed)
@@ -96,6 +97,7 @@ class EpuckWorld:
             else None
         )
         self._overhead_images = 0
+        # motion
         count = len(swarm.robots)
         self._slip = LastingNoise(rng, (count, 2), STEP_NS * 1e-9, _SLIP_S)
         self.now_ns = settings.start_ns
@@ -105,6 +107,7 @@ class EpuckWorld:
         """(N, 2) of the left and the right wheel, as commanded [steps/s]."""
         self.steps: FloatArray = np.zeros((count, 2))
         """(N, 2) that the left and the right motor have done since the start."""
+        # images: past poses for their exposures, and the next exposure of each camera
         self._period_ns = round(1e9 / settings.camera_rate_hz)
         early_ns = round(1e9 * settings.errors.exposure_early_s)
         remembered_ns = self._period_ns + early_ns + 2 * self._half_exposure_ns + _KEPT_NS
@@ -126,7 +129,9 @@ class EpuckWorld:
         self.steps += self.rates * step_s
         self.now_ns += STEP_NS
         self._past.append((self.now_ns, self.poses))
-        taken = [self._take(robot) for robot in range(len(self._next)) if self._is_due(self._next[robot])]
+        # those that have ended and whose stamp has passed
+        ends_ns = [max(one.stamp_ns, one.middle_ns + self._half_exposure_ns) for one in self._next]
+        taken = [self._take(robot) for robot, end_ns in enumerate(ends_ns) if self.now_ns >= end_ns]
         return sorted([*taken, *self._seen_from_above()], key=lambda exposure: exposure.stamp_ns)
 
     def image(self, exposure: Exposure) -> GrayImage:
@@ -177,10 +182,6 @@ class EpuckWorld:
             return []
         self._overhead_images += 1
         return [Exposure(OVERHEAD, number, middle_ns, middle_ns)]
-
-    def _is_due(self, exposure: Exposure) -> bool:
-        """Whether the exposure has ended and its stamp has passed."""
-        return self.now_ns >= max(exposure.stamp_ns, exposure.middle_ns + self._half_exposure_ns)
 
     def _random(self, *what: int) -> np.random.Generator:
         """Random numbers of their own for one purpose."""
@@ -287,7 +288,6 @@ class EpuckWorldParameters:
 
 
 def _floor_markers(parameters: EpuckWorldParameters) -> tuple[FloorMarker, ...]:
-    """The markers on the floor."""
     path = parameters.control_points_file
     if not path:
         return ()

@@ -186,7 +186,6 @@ class EventCamera:
 
 
 def _columns(columns: Sequence[NDArray[Any]], chosen: NDArray[Any]) -> _Raw:
-    """A selection of events."""
     x, y, polarity, time_us = (column[chosen] for column in columns)
     return x, y, polarity, time_us
 

@@ -314,7 +314,7 @@ class Exploration:
     def _act(self, robot: int) -> None:
         """Drive a robot to its goal, unless this is its first scan, and let it scan."""
         body = self.robots[robot]
-        others = self._others(robot)
+        others = [one for key, one in self.robots.items() if key != robot]
         if not body.time_s:
             for angle, rate in START_TURNS:
                 self._feed(robot, body.turn(angle, others, rate))
@@ -362,6 +362,3 @@ class Exploration:
         if self.on_lights is not None and len(sightings.stamp_ns):
             self.on_lights(robot, sightings)
         self.mapper.add_lights(robot, sightings)
-
-    def _others(self, robot: int) -> list[KinematicPushBot]:
-        return [one for key, one in self.robots.items() if key != robot]

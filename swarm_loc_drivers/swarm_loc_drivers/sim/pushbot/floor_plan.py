@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError
-from swarm_loc_estimator.common.yaml_tree import Tree, read_file, read_tree
-from swarm_loc_estimator.swarm.tree_checks import WHOLE_FILE, TreeChecks
+from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, read_file, read_tree
 
 Rectangle = tuple[float, float, float, float]  # Left, lower, right and upper edge [m]
 _SUFFIXES = (".yaml", ".yml", ".json")
@@ -194,7 +193,6 @@ def _runs(rows: BoolArray) -> NDArray[np.int64]:
 
 
 def _load() -> dict[str, FloorPlan]:
-    """The plans of `floor_plans.json`."""
     path = Path(__file__).with_name("floor_plans.json")
     checks = TreeChecks(path, FloorPlanError)
     plans = json.loads(path.read_text(encoding="utf-8"))

@@ -13,7 +13,7 @@ from functools import partial
 from typing import Any
 
 from swarm_loc_drivers.pushbot.hardware import GENERATIONS
-from swarm_loc_drivers.sim.pushbot.console import PushbotFirmware
+from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.world import (
     STEP_NS,
     PushbotWorldParameters,

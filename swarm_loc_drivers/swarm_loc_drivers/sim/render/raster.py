@@ -62,9 +62,9 @@ def _add_in_row(row: Changes, width: int, left: float, right: float, change: flo
     for column in range(first, last):
         begin, end = max(float(column), left), min(column + 1.0, right)
         middle = 0.5 * (begin + end)
-        behind = (end - begin) * (middle - left) / (right - left) + (column + 1.0 - end)
-        row[column] += change * (behind - before)
-        before = behind
+        after = (end - begin) * (middle - left) / (right - left) + (column + 1.0 - end)
+        row[column] += change * (after - before)
+        before = after
     row[last] += change * (1.0 - before)
 
 
@@ -188,7 +188,7 @@ def ball_in_view(centre: FloatArray, radius: float, reach: float) -> bool:
     return True
 
 
-REACH = LENS_SIZE  # Behind the constants of a lens, the radius at distance 1 up to which they hold
+REACH = LENS_SIZE  # After the constants of a lens, the radius at distance 1 up to which they hold
 
 _CHORD_PX = 4.0  # in 1280 columns, 60 degrees and a distortion of -0.3 it leaves its arc by 0.004 px at most
 
@@ -197,7 +197,7 @@ Motion = tuple[FloatArray, FloatArray]
 
 
 class Patches(NamedTuple):
-    """Flat patches, grouped into surfaces that are seen from one side only."""
+    """Flat patches, grouped into surfaces that are seen only from one side."""
 
     corners: FloatArray  # (Q, 4, 3) [m], clockwise as seen from the front
     change: FloatArray  # (Q,) brightness minus that of the patch it lies on [1]

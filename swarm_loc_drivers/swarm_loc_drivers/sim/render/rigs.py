@@ -54,7 +54,12 @@ class CameraRig:
         self.scene = _scene(swarm, truth, arena, self.faces, np.random.default_rng(seed))
         self._renderer = Renderer(self.scene, model)
         self.cameras = [
-            RobotCamera(index, model, _true_mount(robot.camera, mount), focal_scale=1.0 / scale)
+            RobotCamera(
+                index,
+                model,
+                replace(robot.camera or CameraMount(), x=mount[0], y=mount[1], yaw=mount[2]),
+                focal_scale=1.0 / scale,
+            )
             for index, (robot, mount, scale) in enumerate(
                 zip(swarm.robots, truth.mounts.tolist(), truth.scales.tolist(), strict=True)
             )
@@ -68,15 +73,10 @@ class CameraRig:
         Args:
             robot: Its index.
             middle_ns: Middle of the exposure.
-            track: True paths, from half an exposure before to half an exposure behind.
+            track: True paths, from half an exposure before to half an exposure after.
             rng: Source of the sensor's noise.
         """
         return self._renderer.take(self.cameras[robot], middle_ns, track.all_at, rng)
-
-
-def _true_mount(camera: CameraMount | None, true: list[float]) -> CameraMount:
-    """A described mount with its true place and yaw."""
-    return replace(camera or CameraMount(), x=true[0], y=true[1], yaw=true[2])
 
 
 def _faces(swarm: Swarm, truth: HiddenGeometry, family: Family) -> list[list[Patches]]:
@@ -99,7 +99,6 @@ def _scene(
     faces: list[list[Patches]],
     rng: np.random.Generator,
 ) -> Scene:
-    """Arena, landmarks and robots."""
     boards = [
         _board(pose, mark, arena.family)
         for pose, mark in zip(truth.landmarks.tolist(), swarm.landmarks, strict=True)

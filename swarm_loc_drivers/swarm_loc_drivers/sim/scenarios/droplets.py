@@ -41,9 +41,8 @@ from swarm_loc_drivers.sim.run import (
 from swarm_loc_drivers.sim.scenarios.eight import rounded
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.swarm.board_file import load_ir_platform
-from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr
-from swarm_loc_estimator.swarm.robot_types import DROPLET_ODOMETRY
+from swarm_loc_estimator.swarm.ir_board import IrGains, RobotIr, load_ir_platform
+from swarm_loc_estimator.swarm.new_swarm import DROPLET_ODOMETRY
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 PITCH = 0.13

@@ -35,7 +35,7 @@ _TURN_SPREAD = 0.6
 _TURN_MEMORY_S = 1.0
 _HOMING_GAIN = 2.0
 _BRIDGE_M = 0.6
-_BESIDE_M = 0.3
+_LANDMARK_OFFSET_M = 0.3
 _REACHED_M = 0.3
 ROAMING_SPEED = (0.1, 0.3)
 _ROAMING_TURN = 1.5
@@ -76,10 +76,10 @@ class Shape(Enum):
         return np.concatenate([left, right + np.array([bridge[0] + _BRIDGE_M, 0.0]), bridge[None]])
 
     def landmarks(self, homes: FloatArray) -> FloatArray:
-        """Places of the landmarks (L, 2) [m]: the free cells around homes (N, 2), or one beside the first."""
+        """Places of the landmarks (L, 2) [m]: free cells around homes (N, 2), or one next to the first."""
         if self in {Shape.BORDER, Shape.WANDER}:
             return _border(homes)
-        return homes[:1] - [_BESIDE_M, 0.0 if self is Shape.CHAIN else _BESIDE_M]
+        return homes[:1] - [_LANDMARK_OFFSET_M, 0.0 if self is Shape.CHAIN else _LANDMARK_OFFSET_M]
 
 
 def cells(robots: int) -> FloatArray:

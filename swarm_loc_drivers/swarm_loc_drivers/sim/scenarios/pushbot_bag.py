@@ -1,4 +1,4 @@
-"""Write a simulated exploration by PushBots as a bag, with the floor plan beside it."""
+"""Write a simulated exploration by PushBots as a bag, with the floor plan next to it."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class PushbotBagSettings:
 def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) -> int:
     """Write `map`, and per robot `odom`, `laser`, `lights`, `fix`, `goal`, `events` and `ground_truth`.
 
-    Beside the bag come `swarm.yaml`, `walls.csv`, and `<robot>.yaml` with the calibration of each laser.
+    Next to the bag come `swarm.yaml`, `walls.csv`, and `<robot>.yaml` with the calibration of each laser.
 
     Args:
         settings: Settings of a run.
@@ -106,6 +106,7 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
     plan = floor_plan(settings.plan)
     if len(plan.starts) < settings.robots:
         raise FloorPlanError(f"The floor plan '{settings.plan}' has starts for {len(plan.starts)} robots.")
+    # explore with the mapper, and record what robots measure and what the mapper publishes
     mapper = CooperativeMapper()
     exploration = Exploration(plan, mapper, np.random.default_rng(settings.seed))
     robots = range(settings.robots)
@@ -130,6 +131,7 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
     for _ in robots:
         exploration.join(PushBotNoise(slip=settings.slip))
     exploration.run(settings.duration_s, record_fix)
+    # write the robots' streams
     described = tuple(_described(robot, exploration) for robot in robots)
     names = [one.name for one in described]
     built = assembled_robots(settings.seed, settings.robots)
@@ -140,10 +142,12 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
         streams += [_fixes(name, goals[robot], covariances[robot]), _goals(name, goals[robot])]
         streams.append(_truth(name, exploration.robots[robot].trace))
     streams.append(Stream("map", OCCUPANCY_GRID, np.array(list(maps), dtype=np.int64), list(maps.values())))
+    # events of the cameras at the beginning
     if settings.events_s:
         cameras = HallSight(plan.walls, built, CameraNoise(), np.random.default_rng([settings.seed, 2]))
         traces = [exploration.robots[robot].trace for robot in robots]
         streams += _events(names, _poses(traces, settings.events_s), cameras)
+    # the bag, and files next to it
     count = write_streams(streams, Swarm(described), folder, comment)
     np.savetxt(folder / "walls.csv", plan.walls, fmt="%.4f", delimiter=",", header="x0,y0,x1,y1 [m]")
     calibrate_lasers(names, settings.seed, folder)

@@ -1,15 +1,10 @@
-"""The interface of the readers of one bag file, whatever its storage."""
+"""What the readers of bag files share, whatever the storage: topics, errors, the range of log times."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol
+from typing import NamedTuple
 
 from swarm_loc_estimator.common.parameters import UserError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-
-    from swarm_loc_estimator.common.messages.streams import MessageBatch
 
 RawMessage = tuple[str, str, int, bytes]  # Topic, type, log time [ns], serialized message
 
@@ -18,7 +13,7 @@ MAX_LOG_NS = 2**62
 
 
 class BagError(UserError):
-    """A bag of which nothing can be read; the message is one sentence."""
+    """A bag of which nothing can be read."""
 
 
 class BagTopic(NamedTuple):
@@ -41,33 +36,3 @@ class ReadErrors(list[str]):
         sentence = f"{self._file}: {sentence}"
         if sentence not in self:
             self.append(sentence)
-
-
-class BagFile(Protocol):
-    """One open file."""
-
-    @property
-    def topics(self) -> list[BagTopic]:
-        """The topics."""
-
-    @property
-    def message_count(self) -> int:
-        """Number of messages, as far as they can be counted before reading."""
-
-    @property
-    def time_range_ns(self) -> tuple[int, int]:
-        """First and last log time; (0, 0) without messages."""
-
-    @property
-    def losses(self) -> ReadErrors:
-        """What could not be read; more may come while reading."""
-
-    @property
-    def progress(self) -> float:
-        """Share of the file that was read, 0 to 1."""
-
-    def batches(self, number_of: Mapping[BagTopic, int]) -> Iterator[MessageBatch]:
-        """The messages of some topics in order of log time, numbered by `number_of`."""
-
-    def close(self) -> None:
-        """Close the file."""

@@ -19,10 +19,12 @@ import os
 import struct
 import zlib
 from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from io import BytesIO
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from pathlib import Path
+from typing import Literal, NamedTuple
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
@@ -37,10 +39,6 @@ from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.bag_file import MAX_LOG_NS, BagError, BagTopic, ReadErrors
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.streams import MessageBatch, merged
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
-    from pathlib import Path
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD = struct.Struct("<BQ")  # Opcode and length
@@ -61,7 +59,6 @@ _STEP = 1 << 20
 class Chunk:
     """Where a run of messages lies, and how to unpack it."""
 
-    record: int  # Where its record begins
     offset: int  # Where its content begins
     stored: int  # How long that is
     first_ns: int  # Log time of its first message
@@ -70,7 +67,7 @@ class Chunk:
     size: int = 0  # Length of the content unpacked
     checksum: int = 0  # CRC32 of the content unpacked; 0: none
     whole: bool = True  # Whether nothing of it was cut off
-    is_run: bool = False  # Whether its messages lie in no chunk, but one behind the other in the file
+    is_run: bool = False  # Whether its messages lie in no chunk, but one after the other in the file
 
 
 class MessageScan(NamedTuple):
@@ -80,7 +77,7 @@ class MessageScan(NamedTuple):
     others: int  # Messages of other topics
     unknown: int  # Messages of channels without a topic
     untimed: int  # Messages whose log time cannot be
-    offset: int  # Behind the last message
+    offset: int  # After the last message
 
 
 def parse_chunk(head: bytes, begin: int, length: int, *, whole: bool) -> Chunk | None:
@@ -88,16 +85,14 @@ def parse_chunk(head: bytes, begin: int, length: int, *, whole: bool) -> Chunk |
     if len(head) < _HEAD.size:
         return None
     first_ns, last_ns, size, checksum, name_length = _HEAD.unpack_from(head)
-    behind_name = _HEAD.size + name_length
-    if behind_name + _LENGTH.size > len(head):
+    after_name = _HEAD.size + name_length
+    if after_name + _LENGTH.size > len(head):
         return None
-    compression = head[_HEAD.size : behind_name].decode("ascii", "replace")
-    (stored,) = _LENGTH.unpack_from(head, behind_name)
-    data = behind_name + _LENGTH.size
+    compression = head[_HEAD.size : after_name].decode("ascii", "replace")
+    (stored,) = _LENGTH.unpack_from(head, after_name)
+    data = after_name + _LENGTH.size
     stored = min(stored, length - data)
-    return Chunk(
-        begin - RECORD.size, begin + data, stored, first_ns, last_ns, compression, size, checksum, whole
-    )
+    return Chunk(begin + data, stored, first_ns, last_ns, compression, size, checksum, whole)
 
 
 def unpack(stored: bytes, chunk: Chunk) -> bytes:
@@ -173,14 +168,15 @@ _DEFINITIONS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_I
 
 
 class McapFile:
-    """One open MCAP file; see `BagFile`."""
+    """One open MCAP file.
+
+    Attributes:
+        message_count: Number of messages, as far as they can be counted before reading.
+        losses: What could not be read; more may come while reading.
+    """
 
     def __init__(self, path: Path) -> None:
-        """Open it.
-
-        Raises:
-            BagError: It is no MCAP file.
-        """
+        """Open it; raises BagError if it is no MCAP file."""
         self._path = path
         self._chunks: list[Chunk] = []
         self._index: list[tuple[int, int]] = []
@@ -193,7 +189,7 @@ class McapFile:
         self.losses = ReadErrors(path.name)
         self.message_count = 0
         if path.exists() and not path.is_file():
-            raise BagError(f"{path} is no file.")  # to open a pipe would wait for ever
+            raise BagError(f"{path} is no file.")  # opening a pipe would never return
         try:
             self._file = os.open(path, os.O_RDONLY)
         except OSError as error:
@@ -211,7 +207,7 @@ class McapFile:
 
     @property
     def time_range_ns(self) -> tuple[int, int]:
-        """First and last log time."""
+        """First and last log time; (0, 0) without messages."""
         chunks = [chunk for chunk in self._chunks if chunk.last_ns]
         if not chunks:
             return 0, 0
@@ -268,7 +264,7 @@ class McapFile:
             )
 
     def _walk_file(self, size: int) -> int:
-        """Record all chunks, topics and statistics; return the offset behind the last whole record."""
+        """Record all chunks, topics and statistics; return the offset after the last whole record."""
         offset = len(MAGIC)
         while offset + RECORD.size <= size:
             head: tuple[int, int] = RECORD.unpack(os.pread(self._file, RECORD.size, offset))
@@ -288,7 +284,6 @@ class McapFile:
         return offset
 
     def _note(self, opcode: int, begin: int, length: int) -> None:
-        """Record a top-level record."""
         if opcode == Opcode.CHUNK:
             self._note_chunk(begin, length, whole=True)
         elif opcode == Opcode.MESSAGE:
@@ -317,7 +312,7 @@ class McapFile:
             last.stored = end - last.offset
             last.first_ns, last.last_ns = min(last.first_ns, log_ns), max(last.last_ns, log_ns)
             return
-        self._chunks.append(Chunk(offset, offset, end - offset, log_ns, log_ns, is_run=True))
+        self._chunks.append(Chunk(offset, end - offset, log_ns, log_ns, is_run=True))
 
     def _define(self, opcode: int, content: bytes) -> None:
         """A schema, a channel, the statistics or an entry of the index; damaged ones define nothing."""
@@ -372,7 +367,7 @@ class McapFile:
         return messages
 
     def _walk_chunk(self, data: bytes, number_of: Mapping[BagTopic, int] | None) -> tuple[MessageBatch, int]:
-        """The messages of unpacked records, and the offset behind the last whole one."""
+        """The messages of unpacked records, and the offset after the last whole one."""
         content = np.frombuffer(data, dtype=np.uint8)
         columns = np.empty((4, len(data) // (RECORD.size + MESSAGE_HEAD) + 1), dtype=np.int64)
         numbers, count, offset = self._numbers(number_of), 0, 0

@@ -5,40 +5,30 @@ What rosbag2 and others compress beyond the chunks of MCAP: whole files, and sin
 
 from __future__ import annotations
 
+import itertools
 import shutil
+import tempfile
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO
+from types import MappingProxyType, TracebackType
+from typing import TYPE_CHECKING, Any
 
 import lz4.frame  # type: ignore[import-untyped]
 import numpy as np
 import zstandard
 from numpy.typing import NDArray
-
-from swarm_loc_estimator.common.bags.bag_file import BagError, ReadErrors
-from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-import itertools
-import tempfile
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
-
 from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import parse_qos
 from typing_extensions import Self
 
-from swarm_loc_estimator.common.bags.bag_file import BagFile, BagTopic, RawMessage
+from swarm_loc_estimator.common.bags.bag_file import BagError, BagTopic, RawMessage, ReadErrors
 from swarm_loc_estimator.common.bags.mcap_file import McapFile
 from swarm_loc_estimator.common.bags.sqlite_file import SqliteFile
 from swarm_loc_estimator.common.health import listed
-from swarm_loc_estimator.common.messages.streams import merge_streams
+from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage, merge_streams
 from swarm_loc_estimator.common.yaml_tree import YamlTreeError, read_tree
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterator, Mapping, Sequence
-    from types import TracebackType
-
     from rosbags.interfaces import Qos
 
 PACKED = (".zstd", ".zst", ".lz4")  # Suffixes of compressed files, as in bag_0.db3.zstd
@@ -62,28 +52,22 @@ def unpack_file(path: Path, folder: Path, losses: list[str]) -> Path:
         BagError: It is no file, or needs more than half of the free disk space.
     """
     if not path.is_file():
-        raise BagError(f"{path} is no file.")  # to open a pipe would wait for ever
-    unpacked, room = folder / path.stem, shutil.disk_usage(folder).free // 2
+        raise BagError(f"{path} is no file.")  # opening a pipe would never return
+    unpacked, free = folder / path.stem, shutil.disk_usage(folder).free // 2
     with path.open("rb") as packed, unpacked.open("wb") as file:
         try:
-            for part in _unpacked_parts(packed, path.suffix):
-                room -= len(part)
-                if room < 0:
+            if path.suffix == ".lz4":
+                source = lz4.frame.LZ4FrameFile(packed)
+            else:
+                source = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+            while part := source.read1(_STEP):  # read would lose what stands before an early end
+                free -= len(part)
+                if free < 0:
                     raise BagError(f"{path} unpacks to more than half of the free space in {folder.parent}.")
                 file.write(part)
         except _ERRORS as error:
             losses.append(f"{path.name}: its compression is damaged ({error}); the part before was read.")
     return unpacked
-
-
-def _unpacked_parts(packed: BinaryIO, suffix: str) -> Iterator[bytes]:
-    """The content of a compressed file."""
-    if suffix == ".lz4":
-        source = lz4.frame.LZ4FrameFile(packed)
-    else:
-        source = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
-    while part := source.read1(_STEP):  # read would lose what stands before an early end
-        yield part
 
 
 def unpack_messages(batches: Iterator[MessageBatch], losses: ReadErrors) -> Iterator[MessageBatch]:
@@ -130,7 +114,8 @@ def _unpacked_message(data: bytes) -> bytes | None:
 
 __all__ = ["BagError", "BagReader", "BagTopic", "RawMessage"]
 
-_STORAGES: dict[str, type[McapFile | SqliteFile]] = {".mcap": McapFile, ".db3": SqliteFile}
+BagFile = McapFile | SqliteFile
+_STORAGES: dict[str, type[BagFile]] = {".mcap": McapFile, ".db3": SqliteFile}
 _METADATA_BYTES = 20_000_000
 """Larger metadata are not read; the three thousand topics of a thousand robots take a tenth of it."""
 _ENCODINGS = ("cdr", "")
@@ -206,10 +191,10 @@ class BagReader:
             (topic, type, log time [ns], serialized message).
         """
         wanted = None if topics is None else {name.lstrip("/") for name in topics}
-        chosen = [topic for topic in self.topics if wanted is None or topic.name in wanted]
-        for batch in self._batches({topic: number for number, topic in enumerate(chosen)}):
+        read = [topic for topic in self.topics if wanted is None or topic.name in wanted]
+        for batch in self._batches({topic: number for number, topic in enumerate(read)}):
             for number, log_ns, data in batch.messages():
-                yield chosen[number].name, chosen[number].type, log_ns, data
+                yield read[number].name, read[number].type, log_ns, data
 
     def batches(self, topics: Sequence[str]) -> Iterator[MessageBatch]:
         """All messages of some topics in order of log time, many at once.
@@ -233,7 +218,6 @@ class BagReader:
         return merge_streams(streams)
 
     def _stored(self) -> list[BagTopic]:
-        """The topics of all files."""
         return list(dict.fromkeys(topic for file in self._files for topic in file.topics))
 
     def _here(self, topic: BagTopic) -> BagTopic | None:
@@ -261,7 +245,7 @@ class BagReader:
         self.close()
 
     def _open(self, paths: list[Path]) -> None:
-        """Open every file; one that is unreadable beside readable ones is a loss."""
+        """Open every file; one that is unreadable among readable ones is a loss."""
         errors: list[BagError] = []
         for path in paths:
             try:
@@ -307,7 +291,6 @@ class BagReader:
             self._own_losses.add(f"there is no topic {name}, which {self._renamed[name]} is mapped to.")
 
     def _find(self) -> list[Path]:
-        """The storage files."""
         path = self._path
         if not path.exists():
             raise BagError(f"There is no bag '{path}'.")
@@ -353,7 +336,7 @@ def is_storage(path: Path) -> bool:
 
 
 def _part_number(path: Path) -> tuple[int, str]:
-    """Parts are numbered without leading zeros: bag_10 comes behind bag_9."""
+    """Parts are numbered without leading zeros: bag_10 comes after bag_9."""
     number = path.name.partition(".")[0].rpartition("_")[2]
     return (int(number) if number.isdecimal() else 0, path.name)
 

@@ -10,15 +10,12 @@ from __future__ import annotations
 import shutil
 import sqlite3
 import tempfile
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 from urllib.parse import quote
 
 from swarm_loc_estimator.common.bags.bag_file import MAX_LOG_NS, BagError, BagTopic, ReadErrors
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
 
 _BATCH = 500
 _UNWANTED = -1
@@ -26,7 +23,7 @@ _MAX_ID = 2**63 - 1
 _TIMED = f"WHERE typeof(timestamp) = 'integer' AND timestamp BETWEEN 0 AND {MAX_LOG_NS}"
 _MESSAGES = f"SELECT topic_id, timestamp, data FROM messages {_TIMED} ORDER BY timestamp, id"  # noqa: S608
 _VIEWS = """SELECT name FROM sqlite_master
-WHERE type = 'view' AND lower(name) IN ('topics', 'messages')"""  # they may take for ever
+WHERE type = 'view' AND lower(name) IN ('topics', 'messages')"""  # they may never end
 _TOPICS = "SELECT id, name, type, serialization_format FROM topics ORDER BY id"
 _TABLES = """
 CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT, serialization_format TEXT);
@@ -35,14 +32,10 @@ CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INTEGER, timestamp INTEGE
 
 
 class SqliteFile:
-    """One open sqlite3 bag file; see `BagFile`."""
+    """One open sqlite3 bag file; its attributes are those of `McapFile`."""
 
     def __init__(self, path: Path) -> None:
-        """Open it.
-
-        Raises:
-            BagError: It is no bag, or nothing of it can be read.
-        """
+        """Open it; raises BagError if it is no bag, or nothing of it can be read."""
         self._path = path
         self._rescue: tempfile.TemporaryDirectory[str] | None = None
         self._done = 0
@@ -111,7 +104,7 @@ class SqliteFile:
         self.time_range_ns = (first or 0, last or 0)
 
     def _leave_half_page(self, folder: Path) -> None:
-        """Read whole pages only: sqlite would silently fill the last one of a cut off file with zeros."""
+        """Read only whole pages: sqlite would silently fill the last one of a cut off file with zeros."""
         with self._path.open("rb") as source:
             page = int.from_bytes(source.read(18)[16:], "big")
         size = self._path.stat().st_size
@@ -170,14 +163,13 @@ def _connect(path: Path) -> sqlite3.Connection:
 
 
 def _copy_readable(source: sqlite3.Connection, target: sqlite3.Connection) -> None:
-    """Copy topics and all messages that can be read."""
     target.execute("BEGIN")
     target.executemany("INSERT INTO topics VALUES (?, ?, ?, ?)", source.execute(_TOPICS).fetchall())
     last = _last_id(source)
     next_id: int | None = 0
     while next_id is not None:
-        behind, finished = _copy_stretch(source, target, next_id, last)
-        next_id = None if finished else _next_readable(source, behind, last)
+        after, finished = _copy_stretch(source, target, next_id, last)
+        next_id = None if finished else _next_readable(source, after, last)
     target.execute("COMMIT")
 
 
@@ -212,20 +204,20 @@ def _copy_stretch(
     return next_id, True
 
 
-def _next_readable(source: sqlite3.Connection, behind: int, last: int) -> int | None:
-    """The first readable id behind a damaged page: seen from ever further away, then narrowed down."""
+def _next_readable(source: sqlite3.Connection, after: int, last: int) -> int | None:
+    """The first readable id after a damaged page: seen from farther and farther away, then narrowed down."""
     bad, good = 0, 1
-    while not _readable(source, behind + good, last):
+    while not _readable(source, after + good, last):
         bad, good = good, 2 * good
-        if behind + good > last:
+        if after + good > last:
             return None
     while good - bad > 1:
         middle = (bad + good) // 2
-        if _readable(source, behind + middle, last):
+        if _readable(source, after + middle, last):
             good = middle
         else:
             bad = middle
-    return behind + good
+    return after + good
 
 
 def _readable(source: sqlite3.Connection, message_id: int, last: int) -> bool:

@@ -9,18 +9,13 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from functools import lru_cache
+from pathlib import Path
+from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
 from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -30,9 +25,6 @@ from swarm_loc_estimator.common.bags.bag_file import BagError
 from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS, MESSAGE_PACKAGE, message_folder
 
 if TYPE_CHECKING:
-    from pathlib import Path
-    from types import TracebackType
-
     from rosbags.interfaces import Connection
     from rosbags.rosbag2.writer import StorageWriter
     from rosbags.typesys.store import Typestore
@@ -77,10 +69,8 @@ class _McapStorage:
     def __init__(self, folder: Path, compression: CompressionMode) -> None:
         self.path = folder / f"{folder.name}.mcap"
         self._file = self.path.open("xb")
-        packed = compression == CompressionMode.STORAGE
-        self._writer = McapWriter(
-            self._file, compression=CompressionType.ZSTD if packed else CompressionType.NONE
-        )
+        packed = CompressionType.ZSTD if compression == CompressionMode.STORAGE else CompressionType.NONE
+        self._writer = McapWriter(self._file, compression=packed)
         self._writer.start("ros2", "swarm_loc_estimator")
         self._schemas: dict[str, int] = {}
         self._channels: dict[int, int] = {}

@@ -20,7 +20,7 @@ from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -122,7 +122,7 @@ _FIELD = re.compile(r"(?P<type>[\w/]+)(?P<array>\[(?P<count>\d*)\])?\s+(?P<name>
 
 
 class DefinitionsNotFoundError(UserError):
-    """A message type without a definition; the message is one sentence."""
+    """A message type without a definition."""
 
 
 class Field(NamedTuple):
@@ -160,11 +160,7 @@ def message_folder() -> Path:
 
 @lru_cache(maxsize=256)
 def fields_of(message_type: str) -> tuple[Field, ...]:
-    """The fields of a type such as nav_msgs/msg/Odometry.
-
-    Raises:
-        DefinitionsNotFoundError: The type is not known.
-    """
+    """The fields of a type such as nav_msgs/msg/Odometry; raises DefinitionsNotFoundError if unknown."""
     package, _, name = message_type.replace("/msg/", "/").partition("/")
     if package == MESSAGE_PACKAGE:
         path = message_folder() / f"{name}.msg"
@@ -200,8 +196,8 @@ def parse(definition: str, package: str) -> tuple[Field, ...]:
 
 Rows = NDArray[np.void]
 
-ENCAPSULATION = 4  # Bytes before the payload; alignment counts from behind them
-MAX_PADDING = 7  # Bytes that may come behind a message
+ENCAPSULATION = 4  # Bytes before the payload; alignment counts from their end
+MAX_PADDING = 7  # Bytes that may come after a message
 SECOND_NS = 1_000_000_000
 TIME = "builtin_interfaces/msg/Time"
 
@@ -211,23 +207,11 @@ _struct = lru_cache(maxsize=256)(struct.Struct)
 
 
 class CdrError(ValueError):
-    """Bytes that are not a whole message of the expected type; the message is one sentence."""
+    """Bytes that are not a whole message of the expected type."""
 
 
-class Stamp(Protocol):
-    """A builtin_interfaces/Time, whatever has built it."""
-
-    @property
-    def sec(self) -> int:
-        """Whole seconds, which may be negative."""
-
-    @property
-    def nanosec(self) -> int:
-        """The rest [ns]."""
-
-
-def nanoseconds(stamp: Stamp) -> int:
-    """A stamp [ns]; it may lie before zero, which `rclpy.time.Time` refuses."""
+def nanoseconds(stamp: Any) -> int:
+    """A builtin_interfaces/Time [ns]; it may lie before zero, which `rclpy.time.Time` refuses."""
     return int(stamp.sec) * SECOND_NS + int(stamp.nanosec)
 
 
@@ -301,7 +285,7 @@ def row_dtype(message_type: str, start: int | None = None, order: str = "<") -> 
         message_type: Its type. A field of a message inside is named by its path; a message inside whose
             numbers
             are all of one type, such as a Point, is one field.
-        start: Where it starts, in bytes behind a multiple of 8; None: as all but the first of a sequence do.
+        start: Where it starts, in bytes after a multiple of 8; None: as all but the first of a sequence do.
         order: "<" or ">".
     """
     columns = _columns(message_type) or ()
@@ -385,7 +369,7 @@ class _CdrReader:
         return message
 
     def check_end(self) -> None:
-        """Refuse a message that goes on behind its last field."""
+        """Refuse a message that goes on after its last field."""
         if len(self._data) > self._offset + MAX_PADDING:
             raise CdrError(f"{len(self._data) - self._offset} bytes more than the message has.")
 

@@ -46,7 +46,7 @@ DETECTION_DTYPE = renamed(
 )
 """One swarm_loc_msgs/MarkerDetection as it lies in little-endian CDR; quaternions are x, y, z, w.
 
-It begins 4 bytes behind a multiple of 8; where the first of a message does not, see `DETECTION_GAP`.
+It begins 4 bytes after a multiple of 8; where the first of a message does not, see `DETECTION_GAP`.
 """
 DETECTION_GAP = DETECTION_DTYPE.fields["corners_px"][1]  # type: ignore[index]  # it has fields
 """A detection that starts at a multiple of 8 has 4 bytes of padding here, before its first double."""
@@ -98,16 +98,6 @@ class SharedMessage(NamedTuple):
     columns: tuple[NDArray[Any], ...]  # (n, k) numbers of each, or (n,) detections
 
 
-class SharedHead(NamedTuple):
-    """The beginning of a message of many robots; see `SharedMessage`."""
-
-    stamp_ns: int
-    frame_id: str
-    swarm: int
-    robot: IntArray
-    reading_ns: IntArray
-
-
 def decode_detections(data: bytes) -> DetectionArrayMessage:
     """Read a swarm_loc_msgs/MarkerDetectionArray.
 
@@ -123,22 +113,14 @@ def decode_detections(data: bytes) -> DetectionArrayMessage:
 
 
 def decode_anonymous(data: bytes) -> AnonymousMessage:
-    """Read a swarm_loc_msgs/AnonymousDetectionArray.
-
-    Raises:
-        CdrError: The bytes are not one whole message.
-    """
+    """Read a swarm_loc_msgs/AnonymousDetectionArray; raises CdrError unless the bytes are a whole one."""
     message = decode(data, ANONYMOUS_DETECTIONS)
     rows = message.detections.view(ANONYMOUS_DTYPE)
     return AnonymousMessage(nanoseconds(message.header.stamp), message.header.frame_id, rows)
 
 
 def decode_brightness(data: bytes) -> BrightnessMessage:
-    """Read a swarm_loc_msgs/BrightnessMatrix.
-
-    Raises:
-        CdrError: The bytes are not one whole message.
-    """
+    """Read a swarm_loc_msgs/BrightnessMatrix; raises CdrError unless the bytes are a whole one."""
     message = decode(data, BRIGHTNESS)
     header, *values = vars(message).values()
     return BrightnessMessage(nanoseconds(header.stamp), header.frame_id, *values)

@@ -39,7 +39,7 @@ UNKNOWN_COVARIANCE = np.diag([-1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 """6x6; a negative first element says that the sender does not know (the convention of sensor_msgs)."""
 STAMP_SIZE = 8
 _COVARIANCE = POSE_DOUBLES + np.arange(36).reshape(6, 6)[PLANE].ravel()
-"""Where a planar covariance stands behind a pose."""
+"""Where a planar covariance stands after a pose."""
 
 
 class OdometryMessage(NamedTuple):
@@ -84,11 +84,7 @@ def planar_pose(pose: Any) -> tuple[float, float, float]:
 
 
 def decode_odometry(data: bytes) -> OdometryMessage:
-    """Read a nav_msgs/Odometry.
-
-    Raises:
-        CdrError: The bytes are not one whole message.
-    """
+    """Read a nav_msgs/Odometry; raises CdrError unless the bytes are a whole one."""
     message = decode(data, ODOMETRY)
     header, pose, twist = message.header, message.pose, message.twist.twist
     return OdometryMessage(
@@ -102,21 +98,13 @@ def decode_odometry(data: bytes) -> OdometryMessage:
 
 
 def decode_pose_stamped(data: bytes) -> PoseMessage:
-    """Read a geometry_msgs/PoseStamped.
-
-    Raises:
-        CdrError: The bytes are not one whole message.
-    """
+    """Read a geometry_msgs/PoseStamped; raises CdrError unless the bytes are a whole one."""
     message = decode(data, POSE_STAMPED)
     return PoseMessage(nanoseconds(message.header.stamp), message.header.frame_id, planar_pose(message.pose))
 
 
 def decode_fix(data: bytes) -> FixMessage:
-    """Read a geometry_msgs/PoseWithCovarianceStamped.
-
-    Raises:
-        CdrError: The bytes are not one whole message.
-    """
+    """Read a geometry_msgs/PoseWithCovarianceStamped; raises CdrError unless the bytes are a whole one."""
     message = decode(data, POSE_WITH_COVARIANCE)
     header, pose = message.header, message.pose
     covariance = pose.covariance.reshape(6, 6)[PLANE]
@@ -210,8 +198,8 @@ def _copies(model: bytes, stamp_ns: IntArray, numbers: FloatArray) -> list[bytes
     rows = np.tile(np.frombuffer(model, np.uint8), (len(stamp_ns), 1))
     rows[:, ENCAPSULATION : ENCAPSULATION + STAMP_SIZE] = stamp_bytes(stamp_ns)
     rows[:, -8 * numbers.shape[1] :] = np.ascontiguousarray(numbers, dtype="<f8").view(np.uint8)
-    joined = rows.tobytes()
-    return [joined[begin : begin + len(model)] for begin in range(0, len(joined), len(model))]
+    copies = rows.tobytes()
+    return [copies[begin : begin + len(model)] for begin in range(0, len(copies), len(model))]
 
 
 _DOUBLES = 3 + 9 + 1  # Numbers of a robot in swarm/poses: pose, covariance and age of the fix
@@ -268,11 +256,7 @@ class SwarmPosesReader:
         self._length = -1
 
     def read(self, data: bytes) -> EstimateMessage:
-        """The columns of a message.
-
-        Raises:
-            CdrError: It is not a whole SwarmPoses of little-endian CDR.
-        """
+        """The columns of a message; raises CdrError unless it is a whole SwarmPoses of little-endian CDR."""
         raw, layout = np.frombuffer(data, dtype=np.uint8), self._layout
         if len(data) != self._length or not np.array_equal(raw[layout.others], layout.expected):
             if bytes(data[:2]) != b"\x00\x01":

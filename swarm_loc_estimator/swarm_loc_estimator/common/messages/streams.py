@@ -9,23 +9,15 @@ Many serialized messages at once: one buffer, and columns with the place of each
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
-import numpy.typing as npt
-
-from swarm_loc_estimator.common.arrays import IntArray
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
-import struct
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
-
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.cdr import ENCAPSULATION, MAX_PADDING, SECOND_NS, CdrError
 from swarm_loc_estimator.common.messages.detections import (
@@ -54,7 +46,7 @@ class SerializedMessage(NamedTuple):
 class MessageBatch(NamedTuple):
     """Messages (n,) of several topics."""
 
-    data: npt.NDArray[np.uint8]  # (b,) bytes, read-only
+    data: NDArray[np.uint8]  # (b,) bytes, read-only
     topic: IntArray  # (n,) number of the topic of each
     log_ns: IntArray  # (n,) when each was recorded or arrived
     offset: IntArray  # (n,) where each begins in `data`
@@ -88,11 +80,9 @@ class MessageBatch(NamedTuple):
         for topic, log_ns, offset, length in zip(*(c.tolist() for c in columns), strict=True):
             yield topic, log_ns, bytes(view[offset : offset + length])
 
-    def chosen(self, rows: slice | npt.NDArray[np.intp] | npt.NDArray[np.bool_]) -> MessageBatch:
+    def chosen(self, k: slice | NDArray[np.intp] | NDArray[np.bool_]) -> MessageBatch:
         """Some of them, in the same buffer."""
-        return MessageBatch(
-            self.data, self.topic[rows], self.log_ns[rows], self.offset[rows], self.length[rows]
-        )
+        return MessageBatch(self.data, self.topic[k], self.log_ns[k], self.offset[k], self.length[k])
 
     def in_order_of_time(self) -> MessageBatch:
         """Sorted by time, equal ones as they lie."""
@@ -173,10 +163,10 @@ class StampedMessage(Protocol):
 Message = TypeVar("Message", bound=StampedMessage)
 
 _LITTLE_ENDIAN = b"\x00\x01"
-_NAMES = ENCAPSULATION + 8  # Offset of the first frame name's length, behind the stamp
+_NAMES = ENCAPSULATION + 8  # Offset of the first frame name's length, after the stamp
 _DETECTION_SIZE = DETECTION_DTYPE.itemsize
 _TWIST = tuple(8 * (POSE_DOUBLES + 36 + component) for component in (0, 1, 5))
-"""Offsets of x, y and yaw of the twist behind the start of the numbers of nav_msgs/Odometry."""
+"""Offsets of x, y and yaw of the twist from the start of the numbers of nav_msgs/Odometry."""
 _ODOMETRY_NUMBERS = 8 * (POSE_DOUBLES + 36 + 6 + 36)
 """Size of these numbers [byte]; of other messages with a pose it is less."""
 
@@ -189,7 +179,7 @@ class _Models(NamedTuple):
     """Per topic what its messages have in common that only differ in stamp and numbers."""
 
     names: BytesArray  # (t, w) bytes from `_NAMES` to `end`
-    end: IntArray  # (t,) offset behind the frame names; 0 where no message was read yet
+    end: IntArray  # (t,) offset after the frame names; 0 where no message was read yet
     start: IntArray  # (t,) offset of the numbers
     size: IntArray  # (t,) length of the message, where it does not vary
 
@@ -199,7 +189,7 @@ def _no_models(topics: int) -> _Models:
 
 
 def _with_model(models: _Models, topic: int, data: bytes, end: int, start: int) -> _Models:
-    """The models with that of one topic learnt from a message."""
+    """The models with that of one topic learned from a message."""
     names = np.frombuffer(data[_NAMES:end], dtype=np.uint8)
     missing = names.size - models.names.shape[1]
     if missing > 0:
@@ -267,7 +257,7 @@ class PoseReader:
         if data[:2] == _LITTLE_ENDIAN:
             end = _NAMES
             for _ in range(self._names):
-                end = _behind_string(data, end)
+                end = _after_string(data, end)
             start = end + -(end - ENCAPSULATION) % 8
             self._models = _with_model(self._models, topic, data, end, start)
         return message
@@ -311,7 +301,7 @@ class DetectionReader:
             try:
                 message = self._learn(int(batch.topic[k]), batch.message(k))
                 stamp_ns[k], count[k] = message.stamp_ns, message.detections.size
-                begin[k] = batch.data.size + unlike_size  # as if it lay behind the others
+                begin[k] = batch.data.size + unlike_size  # as if it lay after the others
                 unlike.append(message.detections.tobytes())
                 unlike_size += len(unlike[-1])
             except CdrError:
@@ -327,7 +317,7 @@ class DetectionReader:
         self.frame_ids[topic] = message.frame_id
         self._models.end[topic] = 0
         if data[:2] == _LITTLE_ENDIAN:
-            end = _behind_string(data, _NAMES)
+            end = _after_string(data, _NAMES)
             self._models = _with_model(self._models, topic, data, end, end + -end % 4 + 4)
         return message
 
@@ -374,8 +364,8 @@ class EachReader(Generic[Message]):
         return Messages(stamp_ns, valid, messages, arrival_ns=batch.log_ns)
 
 
-def _behind_string(data: bytes, offset: int) -> int:
-    """Offset behind the string field at or after `offset`, in bytes that are known to be whole."""
+def _after_string(data: bytes, offset: int) -> int:
+    """Offset after the string field that starts at or after `offset`, in bytes that are known to be whole."""
     offset += -offset % 4
     return offset + 4 + int.from_bytes(data[offset : offset + 4], "little")
 

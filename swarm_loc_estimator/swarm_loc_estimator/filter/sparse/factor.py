@@ -272,11 +272,7 @@ class Prior(NamedTuple):
 
 
 def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> Factor:
-    """The factor of a prior and measurements.
-
-    Raises:
-        LinAlgError: The prior is not positive definite.
-    """
+    """The factor of a prior and measurements; raises LinAlgError if the prior is not positive definite."""
     earlier = np.minimum(pattern.front[measured.first], pattern.front[measured.second])
     order = np.argsort(earlier, kind="stable")
     begin = np.searchsorted(earlier[order], np.arange(pattern.fronts + 1))
@@ -292,12 +288,7 @@ def eliminate(pattern: Pattern, prior: Prior, measured: Information) -> Factor:
 
 @cached_njit
 def _eliminate(
-    factor: Factor,
-    prior: Prior,
-    measured: Information,
-    order: IntArray,
-    begin: IntArray,
-    looser: float,
+    factor: Factor, prior: Prior, measured: Information, order: IntArray, begin: IntArray, looser: float
 ) -> None:
     """Write a factor; the measured blocks of front f are order[begin[f]:begin[f + 1]]."""
     pattern = factor.pattern
@@ -306,11 +297,13 @@ def _eliminate(
     child, sibling = np.full(fronts, -1, dtype=np.int64), np.full(fronts, -1, dtype=np.int64)
     local = np.zeros(pattern.front.size, dtype=np.int64)
     for f in range(fronts):
+        # the bodies of the front, its border first
         border = pattern.border[pattern.border_begin[f] : pattern.border_begin[f + 1]]
         bodies = np.concatenate((border, pattern.pivot[pattern.pivot_begin[f] : pattern.pivot_begin[f + 1]]))
         split, size = 3 * border.size, 3 * (bodies.size - border.size)
         for k in range(bodies.size):
             local[bodies[k]] = k
+        # information: p(x_J | x_B) of the prior, measurements, and what earlier fronts leave of theirs
         places = prior.place[bodies]
         information = _conditional(gathered(prior.covariance, places, places), size, looser)
         _add_blocks(information, local, measured, order[begin[f] : begin[f + 1]])
@@ -320,6 +313,7 @@ def _eliminate(
             _add_update(information, local, left, updates[below])
             updates[below] = np.empty((0, 0))
             below = sibling[below]
+        # D and A of the pivots, and what they leave to the front of the border's first body
         spread = factor.spread[factor.spread_begin[f] : factor.spread_begin[f + 1]].reshape(size, size)
         own: FloatArray = np.linalg.cholesky(np.ascontiguousarray(information[split:, split:]))
         root = _last_columns(own, size)

@@ -32,10 +32,10 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 
 _LEAF = 24  # Sets of at most this size are not split
-_CUTS = (0.5, 0.42, 0.58)
+_CUTS = (0.5, 0.42, 0.58)  # Shares of the bodies on the lower side; checked by `make bench-scaling`
 _FEW = 60  # Sets of at most this size are split in the middle only
 _UNEQUAL = 1.15  # Factor by which the separator of an uneven split must be smaller
-_DIRECTIONS = 4
+_DIRECTIONS = 4  # Number of directions in which a set is cut
 _BELOW, _ABOVE, _SEPARATOR, _OUTSIDE = 0, 1, 2, -1
 
 
@@ -59,6 +59,7 @@ def dissect(bodies: IntArray, places: FloatArray, adjacency: Adjacency) -> Order
         waiting -= 1
         first, last = left[waiting, 0], left[waiting, 1]
         part = members[first:last]
+        # a small part is a group; of a larger one the separator is, and its halves are left
         if 0 < part.size <= _LEAF:
             for body in part:
                 groups[written] = body
@@ -260,7 +261,7 @@ class _Sequence(NamedTuple):
 
 @cached_njit
 def _want_pairs(old: _Sequence, new: Pattern, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
-    """Mark all pairs of the new pattern, and of bodies beside, at the front of the earlier body."""
+    """Mark all pairs of the new pattern and of `beside` at the front of the earlier body."""
     for f in range(new.pivot_begin.size - 1):
         for k in range(new.pivot_begin[f], new.pivot_begin[f + 1]):
             a = new.pivot[k]
@@ -274,7 +275,7 @@ def _want_pairs(old: _Sequence, new: Pattern, place: IntArray, beside: IntArray,
 
 @cached_njit
 def _want_with(old: _Sequence, a: int, b: int, place: IntArray, beside: IntArray, wanted: BoolArray) -> None:
-    """Mark a pair of bodies, and the pairs of the bodies beside them."""
+    """Mark a pair of bodies, and the pairs with those of `beside`."""
     _want(old, place[a], place[b], wanted)
     if beside[a] >= 0:
         _want(old, place[beside[a]], place[b], wanted)
@@ -334,7 +335,7 @@ def _follow(old: Pattern, position: IntArray, wanted: BoolArray, f: int) -> int:
     return count
 
 
-_NEAREST = 8
+_NEAREST = 8  # Number of nearest bodies that are neighbours; checked by `make bench-scaling`
 
 
 class Adjacency(NamedTuple):
@@ -400,8 +401,7 @@ def _gabriel(places: FloatArray) -> IntArray:
     a, b = places[pairs[:, 0]], places[pairs[:, 1]]
     nearest, _ = scipy.spatial.cKDTree(places).query(0.5 * (a + b))
     empty = nearest**2 >= 0.25 * np.sum((a - b) ** 2, axis=1) * (1.0 - 1e-9)
-    gabriel: IntArray = pairs[empty]
-    return gabriel
+    return np.asarray(pairs[empty])
 
 
 def spread(places: FloatArray, count: int) -> IntArray:
@@ -433,8 +433,7 @@ class Situation(NamedTuple):
 
     def near(self) -> IntArray:
         """Pairs (k, 2) of near bodies."""
-        pairs: IntArray = self.bodies[near_pairs(self.places[self.bodies])]
-        return pairs
+        return self.bodies[near_pairs(self.places[self.bodies])]
 
     def pattern(self, order: Order, near: IntArray) -> Pattern:
         """The pattern that contains all pairs."""

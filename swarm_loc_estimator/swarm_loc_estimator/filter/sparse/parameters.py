@@ -21,7 +21,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.small_matrix import cholesky3, solve3
+from swarm_loc_estimator.common.numerics import cholesky3, solve3
 from swarm_loc_estimator.filter.sparse.ordering import Order, Pattern
 from swarm_loc_estimator.swarm.calibration_states import BLOCKS, DRIVES, ParameterTable
 
@@ -67,8 +67,7 @@ def carried_pairs(places: FloatArray, across: FloatArray, others: FloatArray) ->
 def centres(covariances: FloatArray) -> FloatArray:
     """Points (n, 2) whose position errors are uncorrelated with the heading, for covariances (n, 3, 3)."""
     across = np.column_stack([-covariances[:, 1, 2], covariances[:, 0, 2]])
-    places: FloatArray = across / covariances[:, 2, 2, None]
-    return places
+    return across / covariances[:, 2, 2, None]
 
 
 @cached_njit

@@ -7,11 +7,14 @@ Low-rank correction: errors that far bodies share, through copies of the errors 
 where a are independent combinations, of unit variance, of the errors of the copies, and y is independent of a
 and represented by the factor. Measurements of x have information T about y, T G about both, and G^T T G about
 a: y is eliminated with T G on the right-hand side, and a is one dense block at the end.
+
+Covariances of each body with its own parameters, and their changes since the newest factor.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +22,7 @@ import scipy
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, reassociated_njit
-from swarm_loc_estimator.common.small_matrix import invert_factor
+from swarm_loc_estimator.common.numerics import invert_factor
 from swarm_loc_estimator.filter.joint_filter import Robots
 from swarm_loc_estimator.filter.sparse.factor import (
     EMPTY,
@@ -33,7 +36,6 @@ from swarm_loc_estimator.filter.sparse.factor import (
     write_fronts,
     write_rows,
 )
-from swarm_loc_estimator.filter.sparse.marginals import Marginals, derived_by
 from swarm_loc_estimator.filter.sparse.ordering import (
     Ordering,
     Pattern,
@@ -45,6 +47,7 @@ from swarm_loc_estimator.filter.sparse.ordering import (
 from swarm_loc_estimator.filter.sparse.parameters import (
     Groups,
     Information,
+    Moves,
     active_blocks,
     block_pairs,
     carried,
@@ -56,11 +59,153 @@ from swarm_loc_estimator.filter.sparse.parameters import (
     summed,
     translation_adjoints,
 )
-from swarm_loc_estimator.swarm.calibration_states import BLOCKS, ParameterTable
+from swarm_loc_estimator.swarm.calibration_states import BLOCKS, DRIVES, ParameterTable
+
+_DRIVEN = slice(3, 3 + DRIVES)
+
+
+class Marginals:
+    """The marginal covariance of each body with its parameters, as predictions change it.
+
+    Attributes:
+        groups: Which bodies have blocks of parameters.
+        current: (n, w, w) see `JointFilter.marginal`.
+        transition: (robots, 3 + BLOCKS, DRIVES) see `JointFilter.transition`.
+    """
+
+    def __init__(self, groups: Groups) -> None:
+        self.groups = groups
+        count, width = groups.owner.size, _width(groups)
+        self.current: FloatArray = np.zeros((count, width, width))
+        self.current[:, :3, :3] = np.eye(3)
+        self._settled = self.current.copy()
+        self.transition = _no_transition(groups)
+
+    def copy(self) -> Marginals:
+        """An independent copy."""
+        other = Marginals.__new__(Marginals)
+        arrays = {name: array.copy() for name, array in vars(self).items() if name != "groups"}
+        vars(other).update(arrays | {"groups": self.groups})
+        return other
+
+    def append_columns(self, groups: Groups) -> None:
+        """Append bodies or blocks, without error."""
+        self.groups, transition = groups, _no_transition(groups)
+        transition[: len(self.transition)] = self.transition
+        self.current, self._settled = (_enlarged(one, groups) for one in (self.current, self._settled))
+        self.transition = transition
+
+    def set_prior(self, bodies: IntArray, own: IntArray, covariances: FloatArray) -> None:
+        """Give columns (c,) of bodies (k,) covariances (k, c, c), independent of their other columns."""
+        for known in (self.current, self._settled):
+            known[bodies[:, None], own], known[bodies[:, None], :, own] = 0.0, 0.0
+            known[bodies[:, None, None], own[:, None], own] = covariances
+        if own[0] < 3:
+            self.transition[bodies[bodies < len(self.transition)], :3] = 0.0
+
+    def settle(self, bodies: IntArray) -> None:
+        """Take the present marginals of bodies (k,) as those of the newest factor."""
+        self._settled[bodies] = self.current[bodies]
+        robots = bodies[bodies < len(self.transition)]
+        self.transition[robots, :3], self.transition[robots, 3:] = 0.0, 1.0
+
+    def within(self, bodies: IntArray) -> Iterator[tuple[tuple[slice, slice], IntArray, IntArray, IntArray]]:
+        """Pairs of parts of bodies (k,); a part is the body or one of its blocks.
+
+        Yields:
+            Rows and columns of both parts, indices (m,) into `bodies`, and the two parts (m,).
+        """
+        parts = range(self.current.shape[1] // 3)
+        first = np.arange(bodies.size)
+        yield (slice(3), slice(3)), first, bodies, bodies
+        robots = np.flatnonzero(bodies < len(self.transition))
+        member = self.groups.member[bodies[robots]]
+        for row, column in itertools.product(parts, parts):
+            there = (member[:, row] >= 0) & (member[:, column] >= 0)
+            if row + column and there.any():
+                where = slice(3 * row, 3 * row + 3), slice(3 * column, 3 * column + 3)
+                yield where, robots[there], member[there, row], member[there, column]
+
+    def since(self, bodies: IntArray, places: FloatArray) -> tuple[FloatArray, Moves]:
+        """Changes of the errors of bodies (k,) since the newest factor, about reference points (n, 2).
+
+        Returns:
+            Process noise (k, w, w) of bodies and parameters, and the transition.
+        """
+        count, before = self.groups.owner.size, self._settled[bodies]
+        adjoint = translation_adjoints(places[bodies])
+        moves = Moves(np.full(count, -1), np.zeros((count, 3, 3)), np.ones((count, 3)))
+        if len(self.transition):
+            of_robots = np.flatnonzero(bodies < len(self.transition))
+            robots, own = bodies[of_robots], np.arange(3, before.shape[1])
+            transition, blocks = self.transition[robots], self.groups.member[robots, 1:]
+            follow = np.tile(np.eye(before.shape[1]), (bodies.size, 1, 1))
+            follow[of_robots, :3, _DRIVEN] = transition[:, :3]
+            follow[of_robots[:, None], own, own] = transition[:, 3:].reshape(robots.size, own.size)
+            before = follow @ before @ follow.transpose(0, 2, 1)
+            moved = transition[:, :3].any(axis=(1, 2))
+            moves.beside[robots[moved]] = blocks[moved, 0]
+            moves.gain[robots] = adjoint[of_robots] @ transition[:, :3]
+            moves.left[blocks[blocks >= 0]] = transition[:, 3:][blocks >= 0]
+        noise = self.current[bodies] - before
+        noise[:, :3] = adjoint @ noise[:, :3]
+        noise[:, :, :3] = noise[:, :, :3] @ adjoint.transpose(0, 2, 1)
+        return noise, moves
+
+
+def _width(groups: Groups) -> int:
+    """Columns of a body with its parameters, or of the body alone where there are no parameters."""
+    return 3 * (1 + BLOCKS) if (groups.member[:, 1:] >= 0).any() else 3
+
+
+def _enlarged(known: FloatArray, groups: Groups) -> FloatArray:
+    """Covariances (n, w, w) with more bodies and blocks, without error."""
+    out = np.zeros((groups.owner.size, _width(groups), _width(groups)))
+    out[: len(known), : known.shape[1], : known.shape[1]] = known
+    return out
+
+
+def _no_transition(groups: Groups) -> FloatArray:
+    """The identity transition; for no robot where there are no parameters."""
+    robots = len(groups.member) if _width(groups) > 3 else 0
+    return np.tile(np.vstack([np.zeros((3, DRIVES)), np.ones((BLOCKS, DRIVES))]), (robots, 1, 1))
+
+
+def derived_by(
+    moves: Moves, robot: int, blocks: IntArray, noise: FloatArray, numbers: IntArray
+) -> list[Derived]:
+    """The blocks and the pose of one robot after a transition, to be appended.
+
+    Args:
+        moves: The transition.
+        robot: The robot.
+        blocks: (BLOCKS,) its blocks, of which the first one changes its pose; -1: none.
+        noise: (w, w) process noise of the pose and the blocks; diagonal within the first block.
+        numbers: (2 + BLOCKS,) of the pose and the blocks before, and of the next body; -1: none.
+
+    Returns:
+        The new blocks in their order, then the pose.
+    """
+    out: list[Derived] = []
+    gain, left = moves.gain[robot], moves.left[blocks[0]]
+    for k in range(1, 1 + BLOCKS):
+        if numbers[k] >= 0:
+            own = noise[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+            out.append(Derived(numbers[k : k + 1], np.diag(moves.left[blocks[k - 1]]), own))
+    if numbers[0] < 0:
+        return out
+    if numbers[1] < 0:
+        return [*out, Derived(numbers[:1], np.eye(3), noise[:3, :3])]
+    variance = np.maximum(np.diag(noise)[3:6], 0.0)
+    share = np.divide(noise[:3, 3:6], variance, out=np.zeros((3, 3)), where=variance > 0.0)
+    weights = np.hstack([np.eye(3), gain - share * left, share])
+    rest = noise[:3, :3] - (share * variance) @ share.T
+    return [*out, Derived(numbers[[0, 1, -1]], weights.T.copy(), rest)]
+
 
 _COPY_SPREAD = np.diag(np.square([3e-5, 3e-5, 3e-4]))
 """Variance of a copy given its body [m^2], [m^2], [rad^2]."""
-_PANELS = 4
+_PANELS = 4  # Number of panels of a product
 
 
 def with_derived_shares(shares: FloatArray, derived: tuple[Derived, ...]) -> FloatArray:
@@ -204,7 +349,8 @@ def _rows(shares: FloatArray, bodies: IntArray) -> FloatArray:
     return out
 
 
-_COPIES = 64
+# The constants below are checked by `make bench-scaling`, which compares with the exact filter.
+_COPIES = 64  # Maximum number of bodies that are copied
 _COPIED_SHARE = 4  # At most one of this number of bodies is copied
 _COPIED_AGAIN = 100
 """Updates after which other bodies are copied: copies become stale, but each change loses correlations."""
@@ -273,7 +419,6 @@ class SparseFilter:
 
     @property
     def _groups(self) -> Groups:
-        """The blocks of each body."""
         return self._marginals.groups
 
     def set_prior(self, columns: IntArray, covariance: FloatArray) -> None:
@@ -308,13 +453,11 @@ class SparseFilter:
         self._marginals.set_prior(bodies, np.arange(3), covariances)
 
     def _append(self, bodies: IntArray, derived: Sequence[Derived]) -> None:
-        """Append new bodies (k,)."""
         self._number[bodies] = self._next_number + np.arange(len(derived))
         self._new += tuple(derived)
 
     @property
     def _next_number(self) -> int:
-        """The number of the next body to append."""
         return self._factor.pattern.front.size + len(self._new)
 
     def add(self, columns: IntArray, covariance: FloatArray) -> None:
@@ -342,10 +485,8 @@ class SparseFilter:
         placed, self._new = self._new[-1], self._new[:-1]
         for other in np.unique(bodies).tolist():
             self._take_in(other)
-        adjoint, back = (
-            translation_adjoints(self._place[[body]])[0],
-            translation_adjoints(-self._place[bodies]),
-        )
+        adjoint = translation_adjoints(self._place[[body]])[0]
+        back = translation_adjoints(-self._place[bodies])
         shares = adjoint @ mapping.reshape(3, -1, 3).transpose(1, 0, 2) @ back
         alike = np.linalg.cholesky(carried(self._place[bodies], self.marginal[bodies, :3, :3]))
         common = np.sum(shares @ alike, axis=0)
@@ -373,8 +514,7 @@ class SparseFilter:
         if columns.size == 0:
             return np.zeros((0, 0))
         body, own = self._groups.columns(columns)
-        covariance: FloatArray = self.marginal[body][np.ix_(own, own)]
-        return covariance
+        return np.asarray(self.marginal[body][np.ix_(own, own)])
 
     def prepare_update(self, columns: IntArray, robots: Robots, cross_covariance: FloatArray) -> None:
         """Write the covariances between the bodies of measurements (m,), before an update with them.
@@ -419,15 +559,11 @@ class SparseFilter:
             change_shared(covariance, pattern, self._number, shares, others)
             shares = others
         self._updates += 1
-        self._add_noise(covariance, bodies, noise)
+        for (row, column), of, first, second in self._marginals.within(bodies):  # of bodies and their blocks
+            covariance[self._number[first], self._number[second]] += noise[of, row, column]
         prior = Prior(covariance, self._number)
         self._prepared = _Prepared(pattern, prior, self._by_body(shares, active), active)
         return self._prepared
-
-    def _add_noise(self, covariance: FloatArray, bodies: IntArray, noise: FloatArray) -> None:
-        """Add the process noise of bodies (k,) and their blocks to covariances by number."""
-        for (row, column), of, first, second in self._marginals.within(bodies):
-            covariance[self._number[first], self._number[second]] += noise[of, row, column]
 
     def _by_body(self, shares: FloatArray, active: IntArray) -> FloatArray:
         """Shares of copies (n, 3, r) of all bodies, from those by number."""

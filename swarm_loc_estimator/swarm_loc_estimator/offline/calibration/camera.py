@@ -19,11 +19,7 @@ from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.filter.models import POLAR
 from swarm_loc_estimator.offline.calibration.recording import Recording
-from swarm_loc_estimator.offline.calibration.robust import (
-    fit_with_prior,
-    population,
-    spread,
-)
+from swarm_loc_estimator.offline.calibration.robust import fit_with_prior, population, spread
 from swarm_loc_estimator.sensors.camera import SightingConverter
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm
@@ -31,7 +27,7 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm
 DENSE_GAP_NS = 200_000_000  # Longest gap of ground truth that is interpolated
 OFFSET_REACH_NS = 250_000_000  # Largest time offset of a camera
 
-_SAME_NS = 3_000_000
+_SAME_NS = 3_000_000  # A true pose this near to a sighting is taken for that of its exposure
 _SAME_VIEW_NS = 4_000_000_000  # Errors of sightings of one marker are correlated for about this long
 _MAX_SIGHTINGS = 2000
 
@@ -45,7 +41,7 @@ class CameraSightings(NamedTuple):
     marker_id: IntArray  # (m,)
     marker: FloatArray  # (m, 3) pose of the marker in `map`, or in the base_link of the target robot
     target: IntArray  # (m,) index of the target robot; -1 for a landmark
-    lone: FloatArray  # (m, 3) true pose of the observer where it is known at the stamp only, else NaN
+    lone: FloatArray  # (m, 3) true pose of the observer where it is known only at the stamp, else NaN
 
     @property
     def independent_share(self) -> float:
@@ -111,7 +107,16 @@ def true_values(
 
 def _logged(recording: Recording, swarm: Swarm, observer: int) -> CameraSightings:
     """All sightings of known markers by a robot."""
-    ideal = replace(swarm, robots=tuple(_ideal(robot) for robot in swarm.robots))
+    # with an ideal sensor and a camera at the origin; the tilt and height of the mount are kept
+    mounts = [
+        one.camera and CameraMount(z=one.camera.z, pitch=one.camera.pitch, roll=one.camera.roll)
+        for one in swarm.robots
+    ]
+    robots = [
+        replace(one, camera=mount, sensor=SensorModel())
+        for one, mount in zip(swarm.robots, mounts, strict=True)
+    ]
+    ideal = replace(swarm, robots=tuple(robots))
     rows = select(recording.detections, recording.detections.robot == observer)
     if not rows.robot.size:
         empty = np.zeros(0, dtype=np.int64)
@@ -130,14 +135,8 @@ def _logged(recording: Recording, swarm: Swarm, observer: int) -> CameraSighting
     )
 
 
-def _ideal(robot: Robot) -> Robot:
-    """The robot with an ideal sensor and a camera at its origin; the mount's tilt and height are kept."""
-    camera = robot.camera and CameraMount(z=robot.camera.z, pitch=robot.camera.pitch, roll=robot.camera.roll)
-    return replace(robot, camera=camera, sensor=SensorModel())
-
-
 def _observer_known(truth: Trajectory, stamp_ns: IntArray) -> tuple[BoolArray, FloatArray]:
-    """Whether the observer's pose is known (m,), and the poses (m, 3) that are known at the stamp only.
+    """Whether the observer's pose is known (m,), and the poses (m, 3) that are known only at the stamp.
 
     An isolated true pose with the stamp of an image belongs to its exposure, whatever the time offset is.
     """
@@ -163,6 +162,7 @@ def _dense_around(truth: Trajectory, stamp_ns: IntArray) -> BoolArray:
 MIN_SIGHTINGS = 100  # Sightings with ground truth needed to calibrate a camera
 
 _OF_CAMERA = ("x", "y", "yaw")
+# Checked by test_calibration.py and make bench-mrclam.
 _WIDE = {
     "x": 0.03,
     "y": 0.02,

@@ -1,10 +1,8 @@
-"""Calibrate the motion of a type of robot: scale factors by speed and turn rate, delay and lag.
+"""Calibrate the motion of a type of robot: scale factors by speed and turn rate, delay, lag and offsets.
 
 An odometry that is a command, or whose wheels slip, reports too much motion, and too early. The true shares
 of it are linear in the true motion over time windows, so a table of them is a linear regression; delay and
-lag are searched.
-
-Calibrate offsets of odometry: of the turn rate, of the course and of the axle.
+lag are searched. Offsets are those of the turn rate, of the course and of the axle.
 """
 
 from __future__ import annotations
@@ -25,12 +23,7 @@ from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.offline.calibration.camera import DENSE_GAP_NS
 from swarm_loc_estimator.offline.calibration.recording import Recording
-from swarm_loc_estimator.offline.calibration.robust import (
-    fit_with_prior,
-    population,
-    ridge,
-    spread,
-)
+from swarm_loc_estimator.offline.calibration.robust import fit_with_prior, population, ridge, spread
 from swarm_loc_estimator.swarm.calibration_states import TURN_BIAS
 from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
@@ -180,11 +173,12 @@ LONGEST_LAG_S = 1.0
 
 WINDOW_S = 5.0  # Length of the windows in which motion is compared
 
-_SHORT_WINDOW_S = 0.5
+# The fit of the table and of lateness is checked by test_calibration.py and make bench-mrclam.
+_SHORT_WINDOW_S = 0.5  # Length of the windows in which turns show delay and lag
 _NODES = (0, 2, 5)  # Numbers of points above 0 that are tried for the table; 0: one scale factor
-_BLOCKS = 5
-_CLEAR_SIGMAS = 2.0
-_NEAR_ZERO = 0.05
+_BLOCKS = 5  # Blocks of time of the cross-validation
+_CLEAR_SIGMAS = 2.0  # A grid is worse than the best one from this many standard errors on
+_NEAR_ZERO = 0.05  # Share of the greatest value below which a point would duplicate 0
 _CLEARLY = 0.85  # Delay and lag are used if they reduce the errors of short windows to this share
 _MOVING = 1e-3  # Speeds below which a robot counts as stationary [m/s, rad/s]
 _SMOOTHNESS, _TO_ONE = 0.02, 0.001
@@ -337,15 +331,10 @@ def nodes_of(values: FloatArray, duration_s: FloatArray, count: int) -> FloatArr
 
 
 def fit_response(drives: Sequence[Drive], late: Lateness, *, table: bool) -> MotionResponse:
-    """True per reported speed and turn rate, for robots of one type.
+    """True per reported speed and turn rate, for robots of one type with a known delay and lag.
 
     Several grids are compared by cross-validation over blocks of time; the smallest is used that is not
-    clearly worse than the best.
-
-    Args:
-        drives: Of all robots of the type.
-        late: Their delay and lag.
-        table: Whether there may be more than one scale factor of each.
+    clearly worse than the best. Without `table` there is one scale factor of each.
     """
     grids = [_grid(drives, count) for count in (_NODES if table else _NODES[:1])]
     held_out = [_held_out_error(drives, late, *grid) for grid in grids]

@@ -23,16 +23,16 @@ from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.fix import NO_FIXES, FixRows
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.infrared import NO_BRIGHTNESS, BrightnessRows
+from swarm_loc_estimator.sensors.inputs import Batch, InputConverter
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.ranges import NO_RANGES, RangeRows
-from swarm_loc_estimator.sensors.registry import Batch, InputConverter
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 
 
 class CalibrationError(UserError):
-    """A recording that cannot be used for calibration; the message is one sentence."""
+    """A recording that cannot be used for calibration."""
 
 
 @dataclass(frozen=True)
@@ -101,14 +101,9 @@ def read_recording(
     remap: Mapping[str, str] = MappingProxyType({}),
     truth: Mapping[str, Trajectory] = MappingProxyType({}),
 ) -> Recording:
-    """Read a bag once.
+    """Read a bag once: a rosbag2 folder, .mcap or .db3 file.
 
-    Args:
-        bag: rosbag2 folder, .mcap or .db3 file.
-        swarm: Robots whose messages are read.
-        progress: Called now and then with the share done and what is being done.
-        remap: Expected topic -> topic of the bag, see `renamed_topics`.
-        truth: Robot name -> ground truth that replaces that of the bag.
+    `remap` is as in `renamed_topics`; `truth` by robot name replaces the ground truth of the bag.
 
     Raises:
         BagError: Nothing in the bag can be read, or a topic cannot be mapped.

@@ -10,12 +10,12 @@ from scipy.optimize import least_squares
 from swarm_loc_estimator.common.arrays import FloatArray
 
 _BEND = 3.0  # Residuals beyond this many sigmas have linear cost
-_NORMAL = 1.4826  # Standard deviation per median absolute deviation, for normal errors
+TO_SIGMA = 1.4826  # Standard deviation per median absolute deviation, for normal errors
 
 
 def spread(residuals: FloatArray) -> float:
     """Robust standard deviation of residuals about zero; NaN without any."""
-    return float(_NORMAL * np.median(np.abs(residuals))) if residuals.size else float("nan")
+    return float(TO_SIGMA * np.median(np.abs(residuals))) if residuals.size else float("nan")
 
 
 def softened(residuals: FloatArray) -> FloatArray:

@@ -1,10 +1,8 @@
-"""Read a folder of the UTIAS multi-robot cooperative localization and mapping dataset.
+"""Read a set of the UTIAS multi-robot cooperative localization and mapping dataset, and write it as a bag.
 
 K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu: The UTIAS multi-robot cooperative localization and
 mapping dataset, The International Journal of Robotics Research 30(8), 2011. Subjects with odometry are
 robots, subjects with a surveyed position are landmarks, whatever the number of the set.
-
-Write a set of the MRCLAM dataset as a bag with its swarm description.
 """
 
 from __future__ import annotations
@@ -31,7 +29,7 @@ from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.sensors.camera import CONTENT_POSITION
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Pose2, Robot, Swarm
-from swarm_loc_estimator.swarm.swarm_writer import save_swarm
+from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 MAX_TRUTH_GAP_NS = 500_000_000
 
@@ -41,7 +39,7 @@ _SIGHTINGS_TO_JUDGE = 10
 
 
 class MrclamError(UserError):
-    """A folder that is not such a dataset; the message is one sentence."""
+    """A folder that is not such a dataset."""
 
 
 @dataclass(frozen=True)
@@ -97,11 +95,9 @@ def read_dataset(folder: Path) -> Dataset:
 
 
 def integrate(stamp_ns: IntArray, twist: FloatArray) -> Trajectory:
-    """Integrate commands from the origin: exact arcs, each command until the stamp of the next row.
+    """Integrate commands from the origin: exact arcs, each until the stamp of the next row.
 
-    Args:
-        stamp_ns: (N,).
-        twist: (N, 2) forward speed [m/s], turn rate [rad/s].
+    Commands (N, 2) are forward speed [m/s] and turn rate [rad/s].
     """
     step_s = np.diff(stamp_ns) * 1e-9
     turn = twist[:-1, 1] * step_s
@@ -275,13 +271,7 @@ class _Stream:
 def convert(
     dataset: Dataset, folder: Path, delay: Delay, progress: Callable[[float, str], None]
 ) -> MrclamImport:
-    """Write a set as a bag with its `swarm.yaml` inside.
-
-    Args:
-        dataset: The set; robots start where their ground truth begins.
-        folder: The bag to create.
-        delay: Delay of detections.
-        progress: Called with the share done, 0 to 1, and what is being done.
+    """Write a set as a bag with its `swarm.yaml` inside; robots start where their ground truth begins.
 
     Raises:
         BagError: The folder is there already, or cannot be created.

@@ -1,38 +1,217 @@
-"""Plots of a replay: the swarm on its map, the path of each robot, errors over time with 3-sigma bands."""
+"""Plots of a replay: the swarm on its map, the path of each robot, errors over time with 3-sigma bands.
+
+The style of all plots (colours, axes, units, file format) stands here, too.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Ellipse
+from matplotlib.patches import Circle, Ellipse
 from matplotlib.patheffects import withStroke
+from PIL import Image
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.offline.metrics import Errors, pool
-from swarm_loc_estimator.offline.report.style import (
-    INK,
-    SOFT,
-    TRUTH,
-    Margins,
-    WorldMap,
-    broken,
-    colour_of,
-    label_map,
-    last_pose,
-    length_text,
-    length_unit,
-    save,
-    seconds_since,
-    style,
-)
 from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.swarm.swarm import Landmark
+
+INK, SOFT, TRUTH = "#22303c", "#6b7a86", "#9aa5b1"
+# Okabe and Ito: distinguishable with any colour vision
+_COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+_DPI = 120
+_PAD_IN = 0.08
+_PALETTE = 256  # Fewer colours halve the size of the file
+_MILLIMETRES_BELOW_M = 0.1
+_MIN_GAP_NS = 2_000_000_000
+
+
+def colour_of(index: int) -> str:
+    """The colour of a robot (index) in all plots."""
+    return _COLOURS[index % len(_COLOURS)]
+
+
+def length_unit(length: float) -> tuple[float, str]:
+    """The readable unit of a length [m]: units per metre, and its name."""
+    return (1e3, "mm") if abs(length) < _MILLIMETRES_BELOW_M else (1.0, "m")
+
+
+def length_text(length: float) -> str:
+    """A length [m] in its readable unit."""
+    metre, unit = length_unit(length)
+    return f"{metre * length:.{1 if unit == 'mm' else 2}f} {unit}"
+
+
+def seconds_since(begin_ns: int, stamp_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
+    """Stamps as seconds since `begin_ns`."""
+    return (stamp_ns - begin_ns).astype(np.float64) * 1e-9
+
+
+def style(axis: Axes) -> None:
+    """Format axes: light grid, no frame."""
+    axis.grid(visible=True, color="#e4e8ec", linewidth=0.6)
+    axis.set_axisbelow(True)
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axis.spines[side].set_color("#c3ccd4")
+    axis.tick_params(colors=SOFT, labelsize=8, length=3)
+
+
+def broken(stamp_ns: npt.NDArray[np.int64], rows: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+    """Rows with a row of NaN inserted in each gap of time, so that lines are interrupted there."""
+    step_ns = np.diff(stamp_ns)
+    if len(step_ns) == 0:
+        return rows
+    gaps = np.flatnonzero(step_ns > max(_MIN_GAP_NS, 5 * int(np.median(step_ns)))) + 1
+    return np.insert(rows, gaps, np.nan, axis=0)
+
+
+class Margins(NamedTuple):
+    """Room around the axes of a figure, and between them [in]."""
+
+    left: float
+    right: float
+    bottom: float
+    top: float
+    across: float
+    down: float
+
+
+def save(figure: Figure, path: Path, margins: Margins | None = None) -> None:
+    """Write a PNG with few colours and without version or time: equal results give equal files.
+
+    Without margins, they are as texts need it, but to measure them takes longer than to draw.
+    """
+    if margins is None:
+        figure.set_layout_engine("constrained", w_pad=_PAD_IN, h_pad=_PAD_IN)
+    else:
+        _place(figure, margins)
+    figure.set_dpi(_DPI)
+    canvas: Any = FigureCanvasAgg(figure)
+    canvas.draw()  # savefig would draw twice, the first time only to arrange the axes
+    image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
+    image.quantize(_PALETTE).save(path, format="png")
+
+
+def _place(figure: Figure, margins: Margins) -> None:
+    """Place the axes of a figure."""
+    width, height = figure.get_size_inches()
+    grid: Any = figure.axes[0].get_gridspec()
+    left, right, bottom, top, across, down = margins
+    inside = np.array([width - left - right, height - bottom - top])
+    gaps, counts = np.array([across, down]), np.array([grid.ncols, grid.nrows])
+    wspace, hspace = gaps * counts / (inside - gaps * (counts - 1))
+    figure.subplots_adjust(
+        left / width, bottom / height, 1.0 - right / width, 1.0 - top / height, wspace, hspace
+    )
+
+
+_MAX_PATH_POINTS = 8000
+_MAX_IDS = 40
+_MARGIN = 0.05  # Margin around the world, as a share of its size
+
+
+class WorldMap:
+    """Draws a result on a map; all lengths in metres.
+
+    Attributes:
+        x: Limits from truth and landmarks; without truth, from estimates.
+        y: Limits in y.
+        radius: Of the disc of a robot.
+    """
+
+    def __init__(self, result: ReplayResult) -> None:
+        self._result = result
+        points = [track.pose[:, :2] for track in result.truth.values()]
+        points += [np.array([[mark.x, mark.y] for mark in result.swarm.landmarks]).reshape(-1, 2)]
+        if not result.truth:
+            points.append(result.poses[..., :2].reshape(-1, 2))
+        every = np.concatenate(points)
+        every = every[np.isfinite(every).all(axis=1)]
+        low, high = (every.min(axis=0), every.max(axis=0)) if len(every) else (np.zeros(2), np.zeros(2))
+        margin = _MARGIN * max(float((high - low).max()), 0.5)
+        self.x = (float(low[0]) - margin, float(high[0]) + margin)
+        self.y = (float(low[1]) - margin, float(high[1]) + margin)
+        self.radius = 0.014 * self.width / max(1.0, len(result.swarm.robots) / 30) ** 0.5
+
+    @property
+    def width(self) -> float:
+        """Extent along x."""
+        return self.x[1] - self.x[0]
+
+    @property
+    def shape(self) -> float:
+        """Height over width."""
+        return (self.y[1] - self.y[0]) / self.width
+
+    def draw_world(self, axis: Axes) -> None:
+        """Draw axes at equal scale, and the landmarks."""
+        style(axis)
+        axis.set(aspect="equal", xlim=self.x, ylim=self.y)
+        for mark in self._result.swarm.landmarks:
+            self._draw_landmark(axis, mark)
+
+    def draw_ids(self, axis: Axes) -> None:
+        """Draw the ids of the landmarks, unless there are too many to read."""
+        landmarks = self._result.swarm.landmarks
+        for mark in landmarks if len(landmarks) <= _MAX_IDS else ():
+            place, shift = (mark.x, mark.y), (4, 4)
+            axis.annotate(str(mark.id), place, shift, textcoords="offset points", fontsize=7, color=SOFT)
+
+    def draw_paths(self, axis: Axes, index: int, alpha: float) -> None:
+        """Draw a robot's true path broad, its estimated path thin above it."""
+        result, colour = self._result, colour_of(index)
+        name = result.swarm.robots[index].name
+        if name in result.truth:
+            track = result.truth[name]
+            truth = broken(track.stamp_ns, track.pose)[:: max(1, len(track.pose) // _MAX_PATH_POINTS)]
+            axis.plot(truth[:, 0], truth[:, 1], color=TRUTH, linewidth=3.6, alpha=0.4, zorder=1)
+        pose = result.poses[:, index][:: max(1, len(result.poses) // _MAX_PATH_POINTS)]
+        axis.plot(pose[:, 0], pose[:, 1], color=colour, linewidth=0.9, alpha=alpha, zorder=2)
+
+    def draw_robot(self, axis: Axes, index: int, pose: FloatArray) -> None:
+        """Draw a disc with a nose at a pose (3,)."""
+        x, y, theta = (float(value) for value in pose)
+        colour = colour_of(index)
+        axis.add_patch(
+            Circle((x, y), self.radius, facecolor=colour, edgecolor="white", linewidth=0.9, zorder=6)
+        )
+        reach = 1.9 * self.radius
+        axis.plot([x, x + reach * math.cos(theta)], [y, y + reach * math.sin(theta)], color=INK, zorder=7)
+
+    def _draw_landmark(self, axis: Axes, mark: Landmark) -> None:
+        """Draw a bar with the direction of the marker; a square if that is unknown."""
+        if mark.yaw is None:
+            axis.plot(mark.x, mark.y, "s", color=INK, markersize=4, zorder=4)
+            return
+        ahead = 0.013 * self.width * np.array([math.cos(mark.yaw), math.sin(mark.yaw)])
+        across = np.array([-ahead[1], ahead[0]])
+        place = np.array([mark.x, mark.y])
+        axis.plot(*np.stack([place - across, place + across]).T, color=INK, linewidth=3.5, zorder=4)
+        axis.plot(*np.stack([place, place + ahead]).T, color=INK, linewidth=1.2, zorder=4)
+
+
+def last_pose(result: ReplayResult, index: int) -> tuple[FloatArray, FloatArray] | None:
+    """A robot's last pose (3,) with its covariance (3, 3); None if it was never located."""
+    known = np.flatnonzero(np.isfinite(result.poses[:, index]).all(axis=1))
+    return (result.poses[known[-1], index], result.covariances[known[-1], index]) if len(known) else None
+
+
+def label_map(axis: Axes) -> None:
+    """Label the axes."""
+    axis.set_xlabel("x in map [m]", color=SOFT, fontsize=9)
+    axis.set_ylabel("y in map [m]", color=SOFT, fontsize=9)
+
 
 _MAP_IN, _ERRORS_IN = 6.6, 4.4
 _ROOM_IN = 0.6  # Height of title, legend and axes
@@ -49,13 +228,10 @@ _NAME_PT = np.array([42.0, 22.0])  # Distance of a name from its robot, horizont
 
 
 def plot_overview(result: ReplayResult, path: Path) -> None:
-    """Draw paths, landmarks and the last poses with their covariance; beside it, errors over time.
-
-    Args:
-        result: The run, shown until its ground truth ends.
-        path: PNG file to write.
-    """
-    result = _until_truth_ends(result)
+    """Draw paths, landmarks and the last poses until the truth ends; to the right, errors over time."""
+    # sensors may stop when all ground truth has ended
+    ends = [int(track.stamp_ns[-1]) for track in result.truth.values() if len(track.stamp_ns)]
+    result = result.select(result.stamp_ns <= max(ends)) if ends else result
     world = WorldMap(result)
     judged = any(len(errors.stamp_ns) for errors in result.errors.values())
     widths = [_MAP_IN, _ERRORS_IN] if judged else [_MAP_IN + _ERRORS_IN]
@@ -73,14 +249,6 @@ def plot_overview(result: ReplayResult, path: Path) -> None:
         )
         axes["h"].set_xlabel("time [s]", color=SOFT, fontsize=9)
     save(figure, path, _AROUND_MAP)
-
-
-def _until_truth_ends(result: ReplayResult) -> ReplayResult:
-    """The result without poses later than all ground truth, when sensors may have stopped, too."""
-    ends = [int(track.stamp_ns[-1]) for track in result.truth.values() if len(track.stamp_ns)]
-    if not ends:
-        return result
-    return result.select(result.stamp_ns <= max(ends))
 
 
 def _title(result: ReplayResult) -> str:
@@ -103,11 +271,15 @@ def _draw_swarm(axis: Axes, result: ReplayResult, world: WorldMap) -> float:
     world.draw_world(axis)
     label_map(axis)
     ends = [last_pose(result, index) for index in range(len(result.swarm.robots))]
-    enlarged = _enlargement([covariance for _, covariance in filter(None, ends)], world.width)
+    sigmas = [math.sqrt(float(np.linalg.eigvalsh(one[:2, :2])[-1])) for _, one in filter(None, ends)]
+    is_seen = not sigmas or 2.0 * _SIGMAS * max(sigmas) > _SEEN * world.width
+    enlarged = 1.0 if is_seen else _ENLARGED
+    late = result.stamp_ns >= result.stamp_ns.max(initial=0) - _TAIL_NS
     middle = np.mean([pose[:2] for pose, _ in filter(None, ends)] or [np.zeros(2)], axis=0)
     for index, end in enumerate(ends):
         world.draw_paths(axis, index, alpha=0.5)
-        _draw_tail(axis, result, index)
+        x, y, _ = result.poses[late, index].T
+        axis.plot(x, y, color=colour_of(index), linewidth=2.4, zorder=3)
         if end is None:
             continue
         pose, covariance = end
@@ -116,19 +288,6 @@ def _draw_swarm(axis: Axes, result: ReplayResult, world: WorldMap) -> float:
         if len(ends) <= _MAX_NAMES:
             _draw_name(axis, result.swarm.robots[index].name, pose, middle, colour_of(index))
     return enlarged
-
-
-def _draw_tail(axis: Axes, result: ReplayResult, index: int) -> None:
-    """Draw the last seconds of a path bold."""
-    late = result.stamp_ns >= result.stamp_ns.max(initial=0) - _TAIL_NS
-    x, y, _ = result.poses[late, index].T
-    axis.plot(x, y, color=colour_of(index), linewidth=2.4, zorder=3)
-
-
-def _enlargement(covariances: list[FloatArray], width: float) -> float:
-    """The factor by which ellipses are enlarged to be visible."""
-    sigmas = [math.sqrt(float(np.linalg.eigvalsh(one[:2, :2])[-1])) for one in covariances]
-    return 1.0 if not sigmas or 2.0 * _SIGMAS * max(sigmas) > _SEEN * width else _ENLARGED
 
 
 def _draw_ellipse(axis: Axes, pose: FloatArray, covariance: FloatArray, enlarged: float, colour: str) -> None:
@@ -142,7 +301,7 @@ def _draw_ellipse(axis: Axes, pose: FloatArray, covariance: FloatArray, enlarged
 
 
 def _draw_name(axis: Axes, name: str, pose: FloatArray, middle: FloatArray, colour: str) -> None:
-    """Write a robot's name beside its path, on the side away from the middle of the swarm."""
+    """Write a robot's name next to its path, on the side away from the middle of the swarm."""
     side = np.array([-math.sin(pose[2]), math.cos(pose[2])])
     away = math.copysign(1.0, float(side @ (pose[:2] - middle))) * side * _NAME_PT
     text = axis.annotate(
@@ -207,12 +366,7 @@ _NEES_95 = (0.216, 9.348)  # 95 % bounds of the normalized squared error of thre
 def plot_paths(result: ReplayResult, path: Path) -> bool:
     """Draw each robot's true and estimated path in a panel of its own.
 
-    Args:
-        result: The run.
-        path: PNG file to write.
-
-    Returns:
-        Whether the file was written: not for one robot nor for more than `_MAX_PANELS`.
+    Returns whether the file was written: not for one robot nor for more than `_MAX_PANELS`.
     """
     robots = result.swarm.robots
     if not 1 < len(robots) <= _MAX_PANELS:
@@ -241,14 +395,9 @@ def plot_paths(result: ReplayResult, path: Path) -> bool:
 
 
 def plot_errors(result: ReplayResult, path: Path) -> bool:
-    """Draw errors over time with their 3-sigma bands, and NEES; the robots with the largest errors when many.
+    """Draw errors over time with their 3-sigma bands, and NEES; of many robots those with the largest errors.
 
-    Args:
-        result: The run.
-        path: PNG file to write.
-
-    Returns:
-        Whether the file was written: not without ground truth.
+    Returns whether the file was written: not without ground truth.
     """
     names = [name for name, errors in result.errors.items() if len(errors.stamp_ns)]
     if not names:

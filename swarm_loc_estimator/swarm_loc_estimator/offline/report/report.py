@@ -1,13 +1,10 @@
-"""The report of a replay: text, plots and one self-contained HTML page with a recording to play.
-
-Text report of a replay: error table, self-calibration, counters.
-"""
+"""The report of a replay: text, plots and one self-contained HTML page with a recording to play."""
 
 from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
@@ -20,7 +17,7 @@ from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.offline.export import estimates
 from swarm_loc_estimator.offline.metrics import ErrorSummary
 from swarm_loc_estimator.offline.report.plots import plot_errors, plot_overview, plot_paths
-from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.offline.result import RecordedMap, ReplayResult
 from swarm_loc_estimator.watch.page import (
     Frame,
     about,
@@ -96,7 +93,8 @@ def self_calibrated_robots(result: ReplayResult) -> list[list[str]]:
             (sensor.distance_scale, sensor.distance_scale * sensor.distance_scale_sigma, 4),
         ]
         if any(sigma for _, sigma, _ in figures):
-            rows.append([robot.name, *(_estimated(*figure) for figure in figures)])
+            said = (f"{value:.{n}f} ± {sigma:.{n}f}" if sigma else "-" for value, sigma, n in figures)
+            rows.append([robot.name, *said])
     return rows
 
 
@@ -138,8 +136,10 @@ def text_report(result: ReplayResult) -> str:
         lines += ["", "No ground truth to compare with."]
     robots = self_calibrated_robots(result)
     if robots:
-        head = "Self-calibration, with one standard deviation"
-        lines += ["", head, *_columns([list(SELF_CALIBRATED), *robots])]
+        shown = [list(SELF_CALIBRATED), *robots]
+        widths = [max(map(len, column)) for column in zip(*shown, strict=True)]
+        lines += ["", "Self-calibration, with one standard deviation"]
+        lines += [_line(row, widths) for row in shown]
     lines += ["", self_calibrated_landmarks(result)] if self_calibrated_landmarks(result) else []
     if result.counters:
         lines += ["", "Counters", *_pairs(result.counters)]
@@ -153,17 +153,6 @@ def _number(value: float, digits: int) -> str:
     if math.isnan(value):
         return "-"
     return f"{value:.{digits}f}"
-
-
-def _estimated(value: float, sigma: float, digits: int) -> str:
-    """A number with its standard deviation; a dash if it was not estimated."""
-    return f"{value:.{digits}f} ± {sigma:.{digits}f}" if sigma else "-"
-
-
-def _columns(rows: list[list[str]]) -> list[str]:
-    """Aligned columns."""
-    widths = [max(len(text) for text in column) for column in zip(*rows, strict=True)]
-    return [_line(row, widths) for row in rows]
 
 
 def _pairs(rows: Mapping[str, object]) -> list[str]:
@@ -216,9 +205,7 @@ class ReportFiles:
 def write_report(result: ReplayResult, folder: Path | str) -> ReportFiles:
     """Write report.txt, report.html and overview.png, and if applicable paths.png and errors.png.
 
-    Args:
-        result: The run.
-        folder: Created if missing; files of an earlier report are replaced.
+    The folder is created if missing; files of an earlier report are replaced.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -269,21 +256,18 @@ small { display: block; color: var(--soft); }
 
 
 def html_report(result: ReplayResult, pictures: dict[str, Path]) -> str:
-    """One self-contained HTML page.
-
-    Args:
-        result: The run.
-        pictures: Heading -> PNG file below it.
-    """
+    """One self-contained HTML page, with pictures: heading -> PNG file below it."""
+    remarks = "".join(f"<li>{escape(remark)}</li>" for remark in result.remarks)
+    run, counters = recorded(result), [[name, str(count)] for name, count in result.counters.items()]
     parts = [
         f"<h1>{escape(result.title)}</h1>",
         _facts(result),
-        _remarks(result),
+        remarks and f"<h2>Remarks</h2><ul>{remarks}</ul>",
         _errors(result),
-        _player(result),
+        run and f'<h2>Run</h2><iframe class="player" title="The run" srcdoc="{escape(page(run))}"></iframe>',
         *(picture(heading, path) for heading, path in pictures.items()),
         _self_calibration(result),
-        _counters(result),
+        f"<h2>Counters</h2>{html_table(counters)}" if counters else "",
     ]
     return page_of(result.title, parts)
 
@@ -298,6 +282,15 @@ def page_of(title: str, parts: Sequence[str]) -> str:
     return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
 
 
+def html_table(rows: Iterable[Sequence[str]], titles: Sequence[str] = (), *, head: str = "") -> str:
+    """A table of texts under titles, or under rows of HTML, which scrolls sideways where it is wide."""
+    if titles:
+        head = "<tr>" + "".join(f"<th>{escape(name)}</th>" for name in titles) + "</tr>"
+    above = f"<thead>{head}</thead>" if head else ""
+    body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows)
+    return f'<div class="wide"><table>{above}<tbody>{body}</tbody></table></div>'
+
+
 def _facts(result: ReplayResult) -> str:
     """Pooled errors, sizes, durations and speed."""
     rows = summaries(result)
@@ -309,20 +302,12 @@ def _facts(result: ReplayResult) -> str:
             ("heading RMSE", f"{figures[7]}°"),
             ("NEES", figures[12]),
         ]
-    first = "".join(_card(name, text, "headline") for name, text in headline)
-    others = "".join(_card(name, text) for name, text in facts(result).items())
-    return f'<dl class="facts">{first}{others}</dl>'
-
-
-def _card(name: str, text: str, kind: str = "") -> str:
-    """One name and value."""
-    return f'<div class="{kind}"><dt>{escape(name)}</dt><dd>{escape(text)}</dd></div>'
-
-
-def _remarks(result: ReplayResult) -> str:
-    """The remarks as a list."""
-    items = "".join(f"<li>{escape(remark)}</li>" for remark in result.remarks)
-    return f"<h2>Remarks</h2><ul>{items}</ul>" if items else ""
+    cards = [("headline", *one) for one in headline] + [("", *one) for one in facts(result).items()]
+    shown = "".join(
+        f'<div class="{kind}"><dt>{escape(name)}</dt><dd>{escape(text)}</dd></div>'
+        for kind, name, text in cards
+    )
+    return f'<dl class="facts">{shown}</dl>'
 
 
 def _errors(result: ReplayResult) -> str:
@@ -336,23 +321,9 @@ def _errors(result: ReplayResult) -> str:
         f"<th>{escape(name)}{f'<small>[{escape(unit)}]</small>' if unit else ''}</th>"
         for name, unit in HEADER
     )
-    body = "".join(
-        f"<tr{' class=pooled' if name == POOLED and row is rows[-1][1] else ''}>"
-        + "".join(f"<td>{escape(text)}</td>" for text in cells(name, row))
-        + "</tr>"
-        for name, row in rows
-    )
-    head = f"<thead><tr>{groups}</tr><tr>{titles}</tr></thead>"
-    return f'{title}<div class="wide"><table>{head}<tbody>{body}</tbody></table></div>'
-
-
-def _player(result: ReplayResult) -> str:
-    """The page of `watch` with this run inside."""
-    recording = recorded(result)
-    if not recording:
-        return ""
-    inside = escape(page(recording))
-    return f'<h2>Run</h2><iframe class="player" title="The run" srcdoc="{inside}"></iframe>'
+    table = html_table((cells(*row) for row in rows), head=f"<tr>{groups}</tr><tr>{titles}</tr>")
+    before, _, pooled = table.rpartition("<tr>")
+    return f"{title}{before}<tr class=pooled>{pooled}"
 
 
 def _self_calibration(result: ReplayResult) -> str:
@@ -360,11 +331,8 @@ def _self_calibration(result: ReplayResult) -> str:
     rows, sentence = self_calibrated_robots(result), self_calibrated_landmarks(result)
     if not rows and not sentence:
         return ""
-    head = "".join(f"<th>{escape(name)}</th>" for name in SELF_CALIBRATED)
-    body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows)
-    table = f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
-    title = "<h2>Self-calibration, with one standard deviation</h2>"
-    return f"{title}{table if rows else ''}<p>{escape(sentence)}</p>"
+    table = html_table(rows, SELF_CALIBRATED) if rows else ""
+    return f"<h2>Self-calibration, with one standard deviation</h2>{table}<p>{escape(sentence)}</p>"
 
 
 def picture(heading: str, path: Path) -> str:
@@ -374,15 +342,7 @@ def picture(heading: str, path: Path) -> str:
     return f'<h2>{name}</h2><div class="wide"><img alt="{name}" src="data:image/png;base64,{data}"></div>'
 
 
-def _counters(result: ReplayResult) -> str:
-    """The table of counters."""
-    rows = "".join(
-        f"<tr><td>{escape(name)}</td><td>{count}</td></tr>" for name, count in result.counters.items()
-    )
-    return f'<h2>Counters</h2><div class="wide"><table><tbody>{rows}</tbody></table></div>' if rows else ""
-
-
-_Thing = TypeVar("_Thing")
+_Thing = TypeVar("_Thing", bound=Frame | RecordedMap)
 MAX_BYTES = 12_000_000
 """Of poses and sightings before compression; maps, goals and aerial images have limits of their own."""
 _MAP_BYTES, _GOAL_BYTES, _IMAGE_BYTES = 6_000_000, 1_000_000, 2_000_000
@@ -400,8 +360,11 @@ def recorded(result: ReplayResult) -> str:
     seen_stride = max(1, -(-seen // (MAX_BYTES // 2)))
     frames = [*map(poses_frame, estimates(result, stride)), *_truth(result, stride)]
     frames += [sightings_frame(stamp_ns, one) for stamp_ns, one in result.sightings[::seen_stride]]
-    frames += [*_maps(result), *_goals(result), *_images(result)]
+    frames += [map_frame(one.log_ns, one.grid) for one in _thinned(result.maps, _MAP_BYTES)]
+    frames += _thinned(_goals(result), _GOAL_BYTES)
+    frames += _thinned([aerial_frame(*one) for one in result.images], _IMAGE_BYTES)
     header = about(result.swarm, result.title, commands=False)
+    header["losses"] = [[one.robot, one.stamp_ns * 1e-6, one.cause] for one in result.losses]
     return recording(header, sorted(frames, key=lambda frame: frame.stamp_ns))
 
 
@@ -419,14 +382,7 @@ def _truth(result: ReplayResult, stride: int) -> Iterator[Frame]:
         yield places_frame("truth", stamp_ns, [robots[i] for i in there], pose[k, there])
 
 
-def _maps(result: ReplayResult) -> Iterator[Frame]:
-    """The maps over time, with the last."""
-    size = max((len(one.data) for one in result.maps), default=1)
-    for one in _thinned(result.maps, _MAP_BYTES // size):
-        yield map_frame(one.log_ns, one.grid)
-
-
-def _goals(result: ReplayResult) -> Iterator[Frame]:
+def _goals(result: ReplayResult) -> list[Frame]:
     """The goals of all robots whenever one of them changes."""
     index_of, newest = result.swarm.index_of, dict[int, FloatArray]()
     rows = [
@@ -438,18 +394,12 @@ def _goals(result: ReplayResult) -> Iterator[Frame]:
     for stamp_ns, robot, pose in sorted(rows, key=lambda row: row[:2]):
         newest[robot] = pose
         frames.append(places_frame("goals", stamp_ns, [*newest], np.array([*newest.values()])))
-    size = max((len(one.data) for one in frames), default=1)
-    yield from _thinned(frames, _GOAL_BYTES // size)
+    return frames
 
 
-def _images(result: ReplayResult) -> Iterator[Frame]:
-    """Aerial images over time."""
-    frames = [aerial_frame(*one) for one in result.images]
-    size = max((len(one.data) for one in frames), default=1)
-    yield from _thinned(frames, _IMAGE_BYTES // size)
-
-
-def _thinned(things: Sequence[_Thing], most: int) -> list[_Thing]:
-    """At most `most` of them, evenly spaced, including the last."""
-    stride = max(1, -(-len(things) // max(1, most)))
-    return [*things[::-1][::stride]][::-1]
+def _thinned(things: Sequence[_Thing], max_bytes: int) -> list[_Thing]:
+    """The last of them and others, evenly spaced: as many as would fit, were all as large as the largest."""
+    size = max((len(one.data) for one in things), default=1)
+    stride: int = max(1, -(-len(things) // max(1, max_bytes // size)))
+    kept: list[_Thing] = list(things[::-1][::stride])
+    return kept[::-1]

@@ -1,12 +1,18 @@
 """Survey: from a recording to a swarm description with places, and what is badly determined.
 
-Picture of a survey: landmarks with ellipses, paths of robots, fixed cameras and anchors.
+Fixed cameras and UWB anchors are placed by the surveyed paths of robots. A fixed camera saw markers on robots
+whose poses are known by then, so its pose is that of the perspective from n points. An anchor was measured
+from many places, which is multilateration. Both are robust fits (Cauchy). Errors of neighbouring measurements
+are alike, so variances are those of a jackknife over spells of time, and of the frame of all paths. Nothing
+is placed that fits elsewhere as well: places on one line do not tell where about this line a camera or an
+anchor is.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -14,17 +20,346 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
-from swarm_loc_estimator.offline.report.style import INK, SOFT, colour_of, label_map, save, style
-from swarm_loc_estimator.offline.survey.cameras_and_anchors import Paths, Placed, place_fixed
-from swarm_loc_estimator.offline.survey.problem import MIN_SIGHTINGS, SurveyProblem, problem_of, start_of
-from swarm_loc_estimator.offline.survey.solve import Solution, Solver
-from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
+from swarm_loc_estimator.offline.report.plots import INK, SOFT, colour_of, label_map, save, style
+from swarm_loc_estimator.offline.survey.solve import (
+    MIN_SIGHTINGS,
+    Solution,
+    Solver,
+    SurveyProblem,
+    problem_of,
+    start_of,
+)
+from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
+from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, Robot, Swarm, UwbDevice
 
+# Checked by test_survey_cameras_and_anchors.py.
+MIN_MEASUREMENTS = 30  # Minimum number of sightings or ranges that place a camera or an anchor
+_SPELLS = 8  # Spells of time of the jackknife
+_DRAWS, _DRAWN = 60, 6  # Starts of an anchor: number of draws, and ranges of each
+_OUTLIER = 5.0  # Residuals of more standard deviations contradict the others
+_LEAST_SIGMA = 1e-4
+_MOST_SIGMA, _MOST_YAW_SIGMA = 1.0, 0.5  # Standard deviations [m], [rad] from which nothing is placed
+_TURNS = 16  # Other places are sought in this number of directions about the line of all robots
+_EQUAL_FIT, _FAR_SHARE, _FAR_M = 1.2, 0.5, 0.3
+"""Another place fits as well if its residuals are larger by no more than this factor. It is farther away than
+this share of the distance from the line, and this length."""
+_DEPTH = 0.05  # Least depth of a marker in front of a camera, of which its direction is computed [m]
+
+
+@dataclass(frozen=True)
+class Paths:
+    """Paths of the robots."""
+
+    # Poses (k, 3) in map of robots (k,) at instants (k,) [ns]; NaN: not known
+    at: Callable[[IntArray, IntArray], FloatArray]
+    frame: FloatArray  # (3, 3) covariance of the right-invariant error that is common to all
+
+    def variances(self, place: FloatArray) -> FloatArray:
+        """Variances (3,) of x, y and directions at a place (2,) by the frame."""
+        moved = np.array([[1.0, 0.0, -place[1]], [0.0, 1.0, place[0]], [0.0, 0.0, 1.0]])
+        return np.asarray(np.diag(moved @ self.frame @ moved.T))
+
+
+@dataclass(frozen=True)
+class Placed:
+    """What was found."""
+
+    cameras: tuple[FixedCamera, ...]  # All cameras, those that were placed with their poses and sigmas
+    anchors: tuple[Anchor, ...]  # The described anchors, then those that were found
+    lines: list[str]  # A table
+    remarks: list[str]  # What is badly determined, one sentence each
+
+
+def place_fixed(recording: Recording, swarm: Swarm, paths: Paths, *, cameras: bool) -> Placed:
+    """Place anchors and, if asked for, cameras that are described.
+
+    Described anchors stay, and other addresses are anchors. The robots of the description are corrected.
+    """
+    placed = Placed(swarm.cameras, swarm.anchors, [], [])
+    if cameras and swarm.cameras:
+        placed = _with_cameras(placed, recording, swarm, paths)
+    return _with_anchors(placed, recording, swarm, paths) if recording.ranges.robot.size else placed
+
+
+def _with_cameras(placed: Placed, recording: Recording, swarm: Swarm, paths: Paths) -> Placed:
+    """All fixed cameras, located by markers on robots."""
+    found, lines = [], ["camera              x [m]     y [m]   z [m]  yaw [deg]  sigma [mm]  contradicting"]
+    remarks = []
+    for index, camera in enumerate(swarm.cameras, len(swarm.robots)):
+        optical, place, stamp_ns = _sighted(recording, swarm, index, camera, paths)
+        if stamp_ns.size < MIN_MEASUREMENTS:
+            found.append(camera)
+            remarks.append(
+                f"Camera {camera.name} stays as it is described: it has seen robots whose paths are known"
+                f" {stamp_ns.size} x, and {MIN_MEASUREMENTS} are needed."
+            )
+            continue
+        fit = _located(camera, optical, place, stamp_ns, paths)
+        if fit is None:
+            found.append(camera)
+            remarks.append(
+                f"Camera {camera.name} stays as it is described, since other places fit as well: it has seen"
+                " robots on one line or at few places only; let them drive over the whole floor."
+            )
+            continue
+        located, wrong = fit
+        found.append(located)
+        sigma, yaw = 1e3 * located.position_sigma, math.degrees(located.yaw)
+        numbers = (
+            f"{located.x:9.3f} {located.y:9.3f} {located.z:7.3f} {yaw:10.1f} {sigma:11.1f} {wrong:14.0%}"
+        )
+        lines.append(f"{located.name:15s} {numbers}")
+    return replace(placed, cameras=tuple(found), lines=[*placed.lines, *lines], remarks=remarks)
+
+
+def _sighted(
+    recording: Recording, swarm: Swarm, index: int, camera: FixedCamera, paths: Paths
+) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Markers (k, 3) in the optical frame of a camera and in map, and the stamps."""
+    rows = recording.detections
+    owners = [swarm.owner_of.get(int(one)) for one in rows.detection["id"]]
+    of_robot = np.array([one is not None and one.robot_index >= 0 for one in owners], dtype=bool)
+    kept = (rows.robot == index) & of_robot & (rows.detection["content"] != CONTENT_BEARING)
+    kept &= np.isfinite(rows.detection["position"]).all(axis=1) & (rows.detection["position"][:, 2] > _DEPTH)
+    stamp_ns = rows.stamp_ns[kept] + round(1e9 * camera.sensor.time_offset_s)
+    chosen = [owner for owner, is_kept in zip(owners, kept, strict=True) if is_kept and owner is not None]
+    robot = np.array([one.robot_index for one in chosen], dtype=np.int64)
+    faces = np.array([(one.marker.x, one.marker.y, one.marker.z) for one in chosen]).reshape(-1, 3)
+    pose = paths.at(robot, stamp_ns)
+    place = np.column_stack([se2.transform_points(pose, faces[:, :2]), faces[:, 2]])
+    known = np.isfinite(pose).all(axis=1)
+    return rows.detection["position"][kept][known], place[known], stamp_ns[known]
+
+
+def _located(
+    camera: FixedCamera, optical: FloatArray, place: FloatArray, stamp_ns: IntArray, paths: Paths
+) -> tuple[FixedCamera, float] | None:
+    """A camera at the pose from which it sees markers (k, 3) of `map` at (k, 3), and the share of wrong ones.
+
+    Only directions are used: distances of a camera depend on its focal length and on sizes of markers. None:
+    other poses fit as well.
+    """
+    # directions of the markers: perspective from n points
+    seen = optical[:, :2] / optical[:, 2:]
+
+    def residual(pose: FloatArray, rows: BoolArray) -> FloatArray:
+        level = Rotation.from_rotvec(pose[:3]).apply(place[rows] - pose[3:], inverse=True)
+        return np.asarray(level[:, :2] / np.maximum(level[:, 2:], _DEPTH) - seen[rows])
+
+    # the best pose, and whether another fits as well
+    start = _aligned(optical, place)
+    pose, sigma, wrong = _robust(residual, start, len(seen))
+    rotation = Rotation.from_rotvec(pose[:3])
+
+    def turned(turn: Rotation, centre: FloatArray) -> FloatArray:
+        return np.append((turn * rotation).as_rotvec(), centre + turn.apply(pose[3:] - centre))
+
+    if not _is_unique(residual, pose, sigma, place, turned, lambda other: other[3:]):
+        return None
+    # uncertainty where it matters: at the middle of the view, on the floor
+    height = float(np.median(place[:, 2]))
+    below = np.median(optical, axis=0)
+
+    def shift(other: FloatArray) -> FloatArray:
+        """Where the middle of the view is on the floor (2,), and the direction of the image (1,)."""
+        turned = Rotation.from_rotvec(other[:3])
+        ray = turned.apply(below)
+        centre = other[3:5] + ray[:2] * (height - other[5]) / ray[2]
+        return np.append(centre, (turned * rotation.inv()).as_rotvec()[2])
+
+    spread = _jackknife(residual, pose, sigma, stamp_ns, shift) + paths.variances(shift(pose)[:2])
+    # the pose as a description states it
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # straight down, yaw and roll are one angle
+        yaw, pitch, roll = Rotation.from_matrix(rotation.as_matrix() @ FROM_OPTICAL.T).as_euler("ZYX")
+    x, y, z = (round(float(value), 5) for value in pose[3:])
+    yaw, pitch, roll = (round(float(angle), 6) for angle in (yaw, pitch, roll))
+    position_sigma = max(math.sqrt(0.5 * float(spread[0] + spread[1])), _LEAST_SIGMA)
+    yaw_sigma = max(math.sqrt(float(spread[2])), _LEAST_SIGMA)
+    if position_sigma > _MOST_SIGMA or yaw_sigma > _MOST_YAW_SIGMA:
+        return None
+    return FixedCamera(
+        camera.name, x, y, z, yaw, pitch, roll, position_sigma, yaw_sigma, camera.sensor
+    ), wrong
+
+
+def _aligned(points: FloatArray, to: FloatArray) -> FloatArray:
+    """Rotation vector and translation (6,) that take most points (k, 3) to others, from distances, too."""
+    weight = np.ones(len(points))
+    for _ in range(20):
+        share = weight / weight.sum()
+        centre, goal = share @ points, share @ to
+        rotation = Rotation.align_vectors(to - goal, points - centre, weights=weight)[0]
+        error = np.linalg.norm(rotation.apply(points - centre) + goal - to, axis=1)
+        weight = 1.0 / np.square(1.0 + np.square(error / max(3.0 * float(np.median(error)), 1e-6)))
+    return np.concatenate([rotation.as_rotvec(), goal - rotation.apply(centre)])
+
+
+def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Paths) -> Placed:
+    """Anchors at all addresses that belong to nobody."""
+    # ranges to unknown addresses while the place of the robot's antenna is known
+    rows = recording.ranges
+    radios = [robot.uwb for robot in swarm.robots]
+    known = {one.address for one in (*radios, *swarm.anchors) if one is not None}
+    usable = (rows.reference == 0) & np.array([radio is not None for radio in radios])[rows.robot]
+    usable &= ~np.isin(rows.device, np.array([*known], dtype=np.uint64)) & (rows.range > 0.0)
+    pose = paths.at(rows.robot, rows.stamp_ns)
+    usable &= np.isfinite(pose).all(axis=1) & np.isfinite(rows.range)
+    devices = [one or UwbDevice(0) for one in radios]
+    antenna = np.array([(one.x, one.y, one.z) for one in devices])[rows.robot]
+    at = np.column_stack([se2.transform_points(pose, antenna[:, :2]), antenna[:, 2]])
+    bias, scale = (
+        np.array([getattr(one, name) for one in devices])[rows.robot]
+        for name in ("range_bias", "range_scale")
+    )
+    measured = (rows.range - bias) / scale
+    # one anchor after the other
+    found, remarks = [*placed.anchors], [*placed.remarks]
+    lines = ["anchor              x [m]     y [m]   z [m]             sigma [mm]  contradicting"]
+    for address in np.unique(rows.device[usable]).tolist():
+        own = usable & (rows.device == address)
+        name = f"Anchor {address:#x}"
+        if own.sum() < MIN_MEASUREMENTS:
+            remarks.append(f"{name} was measured {own.sum()} x only and is left out; drive near it.")
+            continue
+        fit = _multilaterated(at[own], measured[own], rows.stamp_ns[own], paths)
+        if fit is None:
+            remarks.append(
+                f"{name} is left out, since other places fit as well: it was measured from one line or few"
+                " places only, or its ranges contradict each other; drive over the whole floor."
+            )
+            continue
+        place, sigma, wrong = fit
+        x, y, z = (round(float(value), 4) for value in place)
+        found.append(Anchor(address, x, y, z, position_sigma=sigma))
+        numbers = f"{x:9.3f} {y:9.3f} {z:7.3f} {1e3 * sigma:22.1f} {wrong:14.0%}"
+        lines.append(f"{hex(address):15s} {numbers}")
+    lines = lines if len(found) > len(placed.anchors) else []
+    return replace(placed, anchors=tuple(found), lines=[*placed.lines, *lines], remarks=remarks)
+
+
+def _multilaterated(
+    at: FloatArray, measured: FloatArray, stamp_ns: IntArray, paths: Paths
+) -> tuple[FloatArray, float, float] | None:
+    """Place (3,) at distances (k,) from places (k, 3), not below them; its sigma, and share of wrong ones.
+
+    None: other places fit as well.
+    """
+
+    def residual(place: FloatArray, rows: BoolArray) -> FloatArray:
+        return np.asarray(np.linalg.norm(at[rows] - place, axis=1) - measured[rows])[:, None]
+
+    every = np.ones(measured.size, dtype=bool)
+    rng = np.random.default_rng(0)
+    starts = [_linear(at, measured, rng.choice(measured.size, _DRAWN, replace=False)) for _ in range(_DRAWS)]
+    start = min(starts, key=lambda one: float(np.median(np.abs(residual(one, every)))))
+    place, sigma, wrong = _robust(residual, start, measured.size)
+
+    def turned(turn: Rotation, centre: FloatArray) -> FloatArray:
+        return np.asarray(centre + turn.apply(place - centre))
+
+    if not _is_unique(residual, place, sigma, at, turned, lambda other: other[:2]):
+        return None
+    spread = _jackknife(residual, place, sigma, stamp_ns, lambda other: other[:2])
+    spread += paths.variances(place[:2])[:2]
+    height = float(np.median(at[:, 2]))
+    place[2] = height + abs(place[2] - height)  # ranges in a plane do not tell above from below
+    position_sigma = max(math.sqrt(0.5 * float(spread.sum())), _LEAST_SIGMA)
+    return None if position_sigma > _MOST_SIGMA else (place, position_sigma, wrong)
+
+
+def _linear(at: FloatArray, measured: FloatArray, rows: IntArray) -> FloatArray:
+    """A place (3,) from a few distances: their squares less those of the places are linear in it."""
+    some, level = at[rows], float(np.median(at[:, 2]))
+    matrix = np.column_stack([-2.0 * some[:, :2], np.ones(rows.size)])
+    x, y, rest = np.linalg.lstsq(matrix, measured[rows] ** 2 - np.sum(some[:, :2] ** 2, axis=1), rcond=None)[
+        0
+    ]
+    return np.array([x, y, level + math.sqrt(max(rest - x * x - y * y, 0.0))])
+
+
+Residual = Callable[[FloatArray, BoolArray], FloatArray]
+"""Residuals (m, r) of m chosen measurements at parameters (p,)."""
+
+
+def _robust(residual: Residual, start: FloatArray, count: int) -> tuple[FloatArray, float, float]:
+    """Best parameters (p,), the standard deviation of residuals, and the share of those that contradict."""
+    every = np.ones(count, dtype=bool)
+    best = start
+    sigma = math.inf
+    for _ in range(3):
+        error = residual(best, every)
+        sigma = max(1.4826 * float(np.median(np.abs(error))), 1e-6)
+        best = _fitted(residual, best, sigma, every)
+    size = np.linalg.norm(residual(best, every), axis=1)
+    return best, sigma, float(np.mean(size > _OUTLIER * sigma))
+
+
+def _fitted(residual: Residual, start: FloatArray, sigma: float, rows: BoolArray) -> FloatArray:
+    """Parameters (p,) that fit some rows best."""
+
+    def whitened(parameters: FloatArray) -> FloatArray:
+        return residual(parameters, rows).ravel() / sigma
+
+    return np.asarray(least_squares(whitened, start, loss="cauchy", x_scale="jac").x)
+
+
+def _is_unique(
+    residual: Residual,
+    best: FloatArray,
+    sigma: float,
+    at: FloatArray,
+    turned: Callable[[Rotation, FloatArray], FloatArray],
+    of: Callable[[FloatArray], FloatArray],
+) -> bool:
+    """Whether no parameters with another place fit as well.
+
+    If all robots were on a line, distances and directions stay as they are when all is turned about it.
+
+    Args:
+        residual: Of measurements at places (k, 3).
+        best: (p,) parameters, of which the last three are the place.
+        sigma: Of their residuals.
+        at: (k, 3) the places.
+        turned: The best parameters turned about a point (3,).
+        of: (3,) place that belongs to parameters, or (2,) where its height is known badly.
+    """
+    every = np.ones(len(at), dtype=bool)
+    good = at[np.linalg.norm(residual(best, every), axis=1) <= _OUTLIER * sigma]
+    centre = good.mean(axis=0)
+    line = np.linalg.svd(good - centre, full_matrices=False)[2][0]
+    apart = max(_FAR_SHARE * float(np.linalg.norm(np.cross(best[-3:] - centre, line))), _FAR_M)
+    bound = _EQUAL_FIT * max(float(np.median(np.abs(residual(best, every)))), sigma / 1.4826)
+    for angle in np.linspace(0.0, 2.0 * np.pi, _TURNS, endpoint=False)[1:]:
+        other = turned(Rotation.from_rotvec(angle * line), centre)
+        fits = float(np.median(np.abs(residual(other, every)))) < bound
+        if fits and np.linalg.norm(of(other) - of(best)) > apart:
+            return False
+    return True
+
+
+def _jackknife(
+    residual: Residual,
+    best: FloatArray,
+    sigma: float,
+    stamp_ns: IntArray,
+    of: Callable[[FloatArray], FloatArray],
+) -> FloatArray:
+    """Variances (q,) of a function of the parameters, by leaving out one spell of time after the other."""
+    spell = np.empty(stamp_ns.size, dtype=np.int64)  # by rank, since few stamps may be all there are
+    spell[np.argsort(stamp_ns, kind="stable")] = np.arange(stamp_ns.size) * _SPELLS // stamp_ns.size
+    values = np.array([of(_fitted(residual, best, sigma, spell != one)) for one in range(_SPELLS)])
+    return np.asarray((_SPELLS - 1) / _SPELLS * np.sum(np.square(values - values.mean(axis=0)), axis=0))
+
+
+# From here on, checked by test_survey.py.
 _ONE_SIDE = math.radians(45.0)  # Landmarks seen from directions within less than this were seen from one side
 _WRONG = 0.3  # Share of sightings that contradict a landmark from which it is named
 _VAGUE_M, _VAGUE = 0.01, 3.0
@@ -187,19 +522,22 @@ def _frame(problem: SurveyProblem) -> list[str]:
 def _remarks(problem: SurveyProblem, solution: Solution) -> list[str]:
     """What is badly determined, a sentence each with a remedy."""
     sightings, remarks = problem.sightings, []
+    # markers that were seen rarely
     for marker_id, count in sorted(problem.rare.items()):
         remarks.append(f"Marker {marker_id} was seen {count} x only and is left out; drive past it.")
+    # what nothing connects with the rest
     placed = np.isfinite(solution.landmark[:, 0])
     apart = [str(mark.id) for mark, is_in in zip(problem.swarm.landmarks, placed, strict=True) if not is_in]
     moved = np.unique(problem.knots.robot).tolist()
     located = {robot for robot in moved if np.isfinite(solution.knot[problem.knots.robot == robot]).all()}
     lone = [problem.swarm.robots[robot].name for robot in moved if robot not in located]
     if apart or lone:
-        said = _listed([*(f"robot {name}" for name in lone), *(f"landmark {name}" for name in apart)])
+        said = ", ".join([*(f"robot {name}" for name in lone), *(f"landmark {name}" for name in apart)])
         remarks.append(
-            f"{said} cannot be placed: nothing connects them with the others; let robots of both parts pass"
-            " the same landmarks, or each other."
+            f"{said[:1].upper()}{said[1:]} cannot be placed: nothing connects them with the others; let"
+            " robots of both parts pass the same landmarks, or each other."
         )
+    # landmarks that are contradicted, vague, or seen from one side
     sigma = np.sqrt(0.5 * (solution.landmark_covariance[:, 0, 0] + solution.landmark_covariance[:, 1, 1]))
     free = placed & (sigma > 0.0)
     usual = float(np.median(sigma[free])) if free.any() else 0.0
@@ -233,11 +571,6 @@ def _span(angles: FloatArray) -> float:
     return float(np.min(turned[kept - 1 : kept - 1 + ordered.size] - turned[: ordered.size]))
 
 
-def _listed(names: Sequence[str]) -> str:
-    said = ", ".join(names)
-    return said[:1].upper() + said[1:]
-
-
 _SIGMAS = 3.0
 _LEAST_SHARE = 0.02
 """Size of the largest ellipse, as a share of the arena, to which all are enlarged if they are smaller."""
@@ -248,6 +581,7 @@ def draw(done: Surveyed, path: Path) -> Path:
     problem, solution = done.problem, done.solution
     placed = np.isfinite(solution.landmark[:, 0])
     places = solution.landmark[placed, :2]
+    # paths of the robots
     figure = Figure(figsize=(8.0, 7.0))
     axis = figure.subplots()
     style(axis)
@@ -259,6 +593,7 @@ def draw(done: Surveyed, path: Path) -> Path:
         name = problem.swarm.robots[robot].name
         if np.isfinite(own).all():
             axis.annotate(name, own[0, :2].tolist(), fontsize=8, color=colour_of(robot))
+    # landmarks with ellipses, enlarged if the largest is small
     size = float(np.ptp(places, axis=0).max()) if len(places) else 1.0
     axes = [np.linalg.eigh(one[:2, :2]) for one in solution.landmark_covariance[placed]]
     largest = max((_SIGMAS * math.sqrt(max(float(one[0][-1]), 0.0)) for one in axes), default=0.0)
@@ -270,6 +605,7 @@ def draw(done: Surveyed, path: Path) -> Path:
         axis.add_patch(Ellipse(pose[:2], width, height, angle=angle, facecolor=SOFT, alpha=0.35))
         ahead = 0.02 * size * np.array([math.cos(pose[2]), math.sin(pose[2])])
         axis.plot(*np.stack([pose[:2], pose[:2] + ahead]).T, color=INK, linewidth=1.5)
+    # ids of landmarks, cameras and anchors
     marks = [mark for mark, is_in in zip(problem.swarm.landmarks, placed, strict=True) if is_in]
     for mark, place in zip(marks, places.tolist(), strict=True):
         axis.annotate(str(mark.id), place, (4, 4), textcoords="offset points", fontsize=7, color=INK)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,10 +14,9 @@ from matplotlib.figure import Figure
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import number_specs
-from swarm_loc_estimator.offline.report.report import page_of, picture
-from swarm_loc_estimator.offline.report.style import INK, SOFT, colour_of, length_unit, save, style
-from swarm_loc_estimator.offline.sweep.grid import Sweep
-from swarm_loc_estimator.offline.sweep.jobs import FIGURES, Line
+from swarm_loc_estimator.offline.report.plots import INK, SOFT, colour_of, length_unit, save, style
+from swarm_loc_estimator.offline.report.report import html_table, page_of, picture
+from swarm_loc_estimator.offline.sweep.sweep import FIGURES, Line, Sweep
 from swarm_loc_estimator.timeline.settings import Settings
 
 Row = Mapping[str, Any]  # Column -> value; None where there is none
@@ -64,10 +62,7 @@ def rows_of(sweep: Sweep, finished: Mapping[str, Line]) -> list[Row]:
 def write_results(rows: Sequence[Row], varied: Sequence[str], folder: Path) -> Path:
     """Write table.csv, a PNG for each varied value, and sweep.html; returns the page.
 
-    Args:
-        rows: Of the table, at least one.
-        varied: Columns with more than one value.
-        folder: Must exist; files of the same names are replaced.
+    The folder must exist; files of the same names are replaced.
     """
     cells = [[*rows[0]], *([_text(value) for value in row.values()] for row in rows)]
     with (folder / "table.csv").open("w", newline="", encoding="utf-8") as file:
@@ -81,7 +76,8 @@ def write_results(rows: Sequence[Row], varied: Sequence[str], folder: Path) -> P
     remarks = [*([] if judged else [_WITHOUT_TRUTH]), *([f"{failed} {_FAILED}"] if failed else [])]
     remark = "".join(f"<p>{one}</p>" for one in remarks)
     shown = [picture(heading, path) for heading, path in pictures.items()]
-    page.write_text(page_of("Sweep", ["<h1>Sweep</h1>", remark, *shown, _table(cells)]), encoding="utf-8")
+    table = f"<h2>All replays</h2>{html_table(cells[1:], cells[0])}"
+    page.write_text(page_of("Sweep", ["<h1>Sweep</h1>", remark, *shown, table]), encoding="utf-8")
     return page
 
 
@@ -159,14 +155,3 @@ def _text(value: object) -> str:
     if value is None:
         return ""
     return f"{value:.6g}" if isinstance(value, float) else str(value)
-
-
-def _table(cells: Sequence[Sequence[str]]) -> str:
-    """The table as HTML."""
-    head, *body = [
-        "".join(f"<{tag}>{escape(text)}</{tag}>" for text in row)
-        for tag, row in zip(["th", *["td"] * (len(cells) - 1)], cells, strict=True)
-    ]
-    rows = "".join(f"<tr>{row}</tr>" for row in body)
-    table = f"<table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table>"
-    return f'<h2>All replays</h2><div class="wide">{table}</div>'

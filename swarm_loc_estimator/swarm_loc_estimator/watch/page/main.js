@@ -239,7 +239,16 @@ class App {
     if (poses) for (const status of poses.columns.status) counts[status]++;
     if (counts.join() === this.counted) return;
     this.counted = counts.join();
-    element("counts").replaceChildren(...STATUS.flatMap((name, k) => (counts[k] ? [chip(counts[k], name, this.colour(name))] : [])));
+    element("counts").replaceChildren(...STATUS.flatMap((name, k) => (counts[k] ? [chip(counts[k], name, this.colour(name), () => this.next(k))] : [])));
+  }
+
+  // Choose the next robot with a status: those that are not located have no place to click at.
+  next(status) {
+    const poses = this.store.at("poses", this.shownTime), n = this.count;
+    for (let i = 1; i <= n; i++) {
+      const robot = (this.selected + i) % n;
+      if (poses?.columns.status[robot] === status) return this.panel.select(robot), this.touch();
+    }
   }
 
   // How long painting took, and how old each new pose was when it was on the screen: when the task after it runs.
@@ -266,12 +275,12 @@ function push(list, value) {
   if (list.length > SAMPLES) list.shift();
 }
 
-function chip(count, name, colour) {
-  const span = document.createElement("span"), dot = document.createElement("i");
-  span.className = "chip";
+function chip(count, name, colour, onclick) {
+  const button = document.createElement("button"), dot = document.createElement("i");
+  Object.assign(button, { className: "chip", title: "Choose the next of them", onclick });
   dot.style.background = colour;
-  span.append(dot, `${count} ${name}`);
-  return span;
+  button.append(dot, `${count} ${name}`);
+  return button;
 }
 
 function localStorageOr(key, value) {

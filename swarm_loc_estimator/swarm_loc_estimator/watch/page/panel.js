@@ -74,7 +74,7 @@ class Panel {
   numbers(poses, time, i) {
     const { app } = this;
     const p = poses.columns, status = STATUS[p.status[i]];
-    if (!app.link) element("message").textContent = SAY_STATUS[status];
+    if (!app.link) element("message").textContent = (status === "waiting" && this.loss(time, i)) || SAY_STATUS[status];
     const rows = [["status", status]];
     if (p.status[i]) {
       const deg = 180 / Math.PI;
@@ -87,6 +87,12 @@ class Panel {
     }
     for (const [verdict, count] of this.counts(app.store.at("sightings", time, SEEN_MS), i)) rows.push([`sightings ${verdict}`, count]);
     fill(element("numbers"), rows);
+  }
+
+  // Why a robot of a recording is not located any more; "" if it never was.
+  loss(time, i) {
+    const last = (this.app.swarm.losses || []).filter(([robot, stamp]) => robot === i && stamp <= time).pop();
+    return last ? `lost ${((time - last[1]) / 1e3).toFixed(1)} s ago: ${last[2]}` : "";
   }
 
   // What has changed since the last time is not forgotten, only not painted at once.

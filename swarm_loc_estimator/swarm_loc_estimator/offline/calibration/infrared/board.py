@@ -1,6 +1,4 @@
-"""Calibration of an infrared board from a recording with ground truth.
-
-Fit the model of an infrared board to exchanges of robots with known relative poses.
+"""Fit the model of an infrared board to exchanges of robots with known relative poses.
 
 The unknowns are the amplitude law, the symmetric curves of sensors and emitters as tables, and the offset of
 each robot's heading in ground truth. Residuals are computed after a variance-stabilizing transform, with a
@@ -25,12 +23,10 @@ from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import Exchanges
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.search import IrOutcome
-from swarm_loc_estimator.offline.calibration.infrared.element_likelihood import (
-    ElementVerdicts,
-    find_dead_elements,
-)
+from swarm_loc_estimator.offline.calibration.infrared.elements import ElementVerdicts, find_dead_elements
 from swarm_loc_estimator.offline.calibration.infrared.gains import exchanges_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
+from swarm_loc_estimator.offline.calibration.robust import TO_SIGMA, spread
 from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.swarm.ir_board import (
     Amplitude,
@@ -45,10 +41,11 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 _KNOTS = np.radians([0, 15, 30, 40, 50, 60, 70, 80, 90, 110, 135, 180])
 _TABLE = np.radians(np.arange(0, 181, 10))
 _FALLS_FROM = 5  # Index of the first knot from which curves must decrease
+# Weights and limits are checked by test_board_fit.py and, on recordings of 2016, by make bench-droplet_real.
 _STEEPNESS, _BEND = 5.0, 0.8
 """Weights of an increase beyond that knot, and of second differences of the log curves."""
 _YAW_SIGMA = np.radians(4.0)
-_OFFSET, _OFFSET_SIGMA, _EXPONENT, _EXPONENT_SIGMA = 0.05, 0.05, 2.5, 1.0
+_OFFSET, _OFFSET_SIGMA, _EXPONENT, _EXPONENT_SIGMA = 0.05, 0.05, 2.5, 1.0  # Prior of the law, [m] and 1
 _PRIOR = 3.0
 _STEP = 1e-5
 _GAIN_SIGMA, _MIN_SPREAD = 0.25, 0.01
@@ -57,11 +54,10 @@ _LIMIT = 2.0  # Maximum residual after the robust loss [sigma]
 _DIM = 3.0
 """Maximum distance from the median of readings that determine the noise [sigma]; most show no light."""
 _LIT = 8.0  # Minimum expectation of readings that determine the error of the curves [sigma]
-_OUTLIER = 3.0
+_OUTLIER = 3.0  # Residuals beyond it are of blocked or too bright readings [sigma]
 _MIN_SHARE, _MAX_SHARE = 0.02, 0.3
 _ROUNDS = 2
 _MAX_EVALUATIONS = 10
-_TO_SIGMA = 1.4826  # Standard deviation of a normal distribution per median absolute deviation
 
 
 class BoardReadings(NamedTuple):
@@ -113,8 +109,8 @@ def fit_board(start: IrPlatform, data: BoardReadings, robots: int, *, gains: boo
     yaw = problem.parts(unknowns)[3]
     logs, sought = problem.log_gains(unknowns), problem.gains_sought
     if sought.any():
-        spread = float(np.sqrt(np.mean(logs[sought] ** 2)))
-        platform = replace(platform, element_sigma=round(min(max(spread, _MIN_SPREAD), 1.0), 3))
+        size = float(np.sqrt(np.mean(logs[sought] ** 2)))
+        platform = replace(platform, element_sigma=round(min(max(size, _MIN_SPREAD), 1.0), 3))
     return BoardModel(platform, np.exp(logs), sought, yaw, scatter, problem.angles(yaw)[1])
 
 
@@ -133,7 +129,7 @@ def noise_floor(data: BoardReadings) -> float:
     offset and drift of the amplifier cancel.
     """
     middle = float(np.nanmedian(data.readings))
-    limit = _DIM * max(_TO_SIGMA * float(np.nanmedian(np.abs(data.readings - middle))), 0.5)
+    limit = _DIM * max(TO_SIGMA * float(np.nanmedian(np.abs(data.readings - middle))), 0.5)
     steps = []
     for receiver in np.unique(data.receiver).tolist():
         rows = np.flatnonzero(data.receiver == receiver)
@@ -141,7 +137,7 @@ def noise_floor(data: BoardReadings) -> float:
         dark = np.abs(own - middle) < limit
         steps.append(np.diff(own, axis=0)[dark[1:] & dark[:-1]])
     found = np.concatenate(steps)
-    return float(max(_robust_sigma(found) / np.sqrt(2.0), 0.5)) if found.size else 0.5
+    return float(max(spread(found) / np.sqrt(2.0), 0.5)) if found.size else 0.5
 
 
 class _Problem:
@@ -277,7 +273,8 @@ class _Problem:
     def platform_of(self, unknowns: FloatArray) -> IrPlatform:
         """The platform with the law and curves of these unknowns."""
         law, sensor, emitter, _ = self.parts(unknowns)
-        amplitude = Amplitude(float(np.exp(law[0])), float(law[1]), float(law[2]), nearest=_nearest(law[1]))
+        nearest = 0.0 if law[1] > 0.0 else 0.005 - law[1]  # least distance at which this law is valid [m]
+        amplitude = Amplitude(float(np.exp(law[0])), float(law[1]), float(law[2]), nearest=nearest)
         return replace(
             self._platform,
             sensor=self._curve(sensor),
@@ -308,17 +305,12 @@ def _limited(values: FloatArray) -> tuple[FloatArray, FloatArray]:
     return np.sign(values) * size, slope
 
 
-def _nearest(offset: float) -> float:
-    """Minimum distance at which a law with this offset is valid [m]."""
-    return 0.0 if offset > 0.0 else 0.005 - offset
-
-
 def _with_noise(platform: IrPlatform, problem: _Problem, unknowns: FloatArray) -> IrPlatform:
     """The platform with noise and outlier shares estimated from its residuals."""
     expected, scatter = problem.expected(unknowns), problem.scatter(unknowns)
     known = np.isfinite(scatter)
     lit = known & (expected > _LIT * platform.noise) & (expected < platform.saturation)
-    relative = platform.relative * (_robust_sigma(scatter[lit]) if lit.any() else 1.0)
+    relative = platform.relative * (spread(scatter[lit]) if lit.any() else 1.0)
     blocked = float(np.mean(scatter[lit] < -_OUTLIER)) if lit.any() else 0.0
     bright = float(np.mean(scatter[known & ~lit] > _OUTLIER))
     return replace(
@@ -327,11 +319,6 @@ def _with_noise(platform: IrPlatform, problem: _Problem, unknowns: FloatArray) -
         blocked_share=round(min(max(blocked, _MIN_SHARE), _MAX_SHARE), 3),
         bright_share=round(min(max(bright, _MIN_SHARE), _MAX_SHARE), 3),
     )
-
-
-def _robust_sigma(values: FloatArray) -> float:
-    """Robust standard deviation about zero, from the median."""
-    return float(_TO_SIGMA * np.median(np.abs(values)))
 
 
 MAX_RANGE = 0.3  # Maximum distance of exchanges that are used [m]; farther readings are mostly noise
@@ -403,7 +390,6 @@ def with_board(swarm: Swarm, board: BoardRecording, done: BoardCalibration, path
             ir.id,
             done.model.platform,
             str(path.resolve()),
-            ir.estimator,
             gains,
             *done.elements.numbers(place),
         )
@@ -423,9 +409,9 @@ def _clear(
     begin, end = (places[of_swarm[side], rows] for side in (data.receiver, data.transmitter))
     clear = np.ones(len(rows), dtype=np.bool_)
     for k, others in enumerate(places):
-        beside = _distance_to_line(others, begin, end)
+        away = _distance_to_line(others, begin, end)
         third = (of_swarm[data.receiver] != k) & (of_swarm[data.transmitter] != k)
-        clear &= ~(third & (beside < width))
+        clear &= ~(third & (away < width))
     return clear
 
 

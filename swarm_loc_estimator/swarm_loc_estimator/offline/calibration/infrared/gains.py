@@ -1,11 +1,9 @@
 """Calibrate the gains of infrared boards from a recording, one fit for each kind of board.
 
-Cross-validation of gains over blocks of time.
-
-Gains are estimated with one block held out at a time, and the likelihood of the held-out exchanges is
-evaluated. Gains are accepted where it is higher than with unit gains and with unknown gains.
-Errors of the curves are correlated over time, so the sum over all robots must exceed its scatter over blocks.
-Single robots need only a positive sum, since some have few readings.
+Gains are cross-validated: they are estimated with one block of time held out, and the likelihood of the
+held-out exchanges is evaluated. They are accepted where it is higher than with unit gains and with unknown
+gains. Errors of the curves are correlated over time, so the sum over all robots must exceed its scatter over
+blocks. Single robots need only a positive sum, since some have few readings.
 
 The relative pose of an exchange is unknown or uncertain, so the likelihood is marginalized over the pose by
 importance sampling around the solutions with and without gains. All hypotheses on a pair's gains are compared
@@ -16,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -33,17 +31,15 @@ from swarm_loc_estimator.infrared.gains import POSE_SIGMA, Exchanges, GainsError
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.search import DARKEST, IrSolutions
 from swarm_loc_estimator.offline.calibration.camera import DENSE_GAP_NS
-from swarm_loc_estimator.offline.calibration.infrared.element_likelihood import (
+from swarm_loc_estimator.offline.calibration.infrared.elements import (
     BRIGHT_SPAN,
     LOWEST,
     MIN_SHARE,
     PEAK,
     ElementVerdicts,
-    find_dead_elements,
-)
-from swarm_loc_estimator.offline.calibration.infrared.reading_limits import (
     ReadingLimits,
     contradictions,
+    find_dead_elements,
     find_reading_limits,
 )
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
@@ -53,6 +49,7 @@ from swarm_loc_estimator.swarm.ir_board import IrGains, IrPlatform, PairGains
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 BLOCKS = 4
+# Checked by test_gain_validation.py.
 _EVIDENCE = math.log(100.0)  # Minimum increase of the log likelihood of all exchanges
 GAINS, ALIKE, UNKNOWN = range(3)
 """Hypotheses on a robot's gains: the estimate; unit gains with the same uncertainty; unknown gains with the
@@ -63,19 +60,9 @@ _SEED = 1
 
 
 def helpful_gains(
-    platform: IrPlatform,
-    robots: int,
-    exchanges: Exchanges,
-    progress: Callable[[str], None] = lambda _: None,
+    platform: IrPlatform, robots: int, exchanges: Exchanges, progress: Callable[[str], None] = lambda _: None
 ) -> BoolArray:
-    """True (robots,) where gains estimated by `estimate_gains` improve held-out exchanges.
-
-    Args:
-        platform: Of all robots.
-        robots: Number of robots.
-        exchanges: Their exchanges in order of time.
-        progress: Called with the name of each step.
-    """
+    """True (robots,) where gains by `estimate_gains` improve held-out exchanges, given in order of time."""
     count = len(exchanges.receiver)
     logs, blocks = np.full((count, HYPOTHESES, HYPOTHESES), np.nan), np.arange(count) * BLOCKS // count
     for block in range(BLOCKS):
@@ -106,7 +93,9 @@ def _chosen_robots(
         for robot in np.flatnonzero(helps).tolist():
             alone = np.arange(robots) == robot
             own[robot] = min(by_block.sum() for by_block in _by_block(pairs, logs, blocks, helps, alone))
-        sure = min(_beyond_chance(by_block) for by_block in _by_block(pairs, logs, blocks, helps, helps))
+        # the margin by which each sum over blocks exceeds chance
+        whole = _by_block(pairs, logs, blocks, helps, helps)
+        sure = min(float(one.sum() - max(_EVIDENCE, np.linalg.norm(one))) for one in whole)
         if own.min() > 0.0 and sure > 0.0:
             break
         helps[own.argmin()] = False
@@ -114,11 +103,7 @@ def _chosen_robots(
 
 
 def _by_block(
-    pairs: NDArray[np.int64],
-    logs: FloatArray,
-    blocks: NDArray[np.int64],
-    helps: BoolArray,
-    judged: BoolArray,
+    pairs: NDArray[np.int64], logs: FloatArray, blocks: NDArray[np.int64], helps: BoolArray, judged: BoolArray
 ) -> list[FloatArray]:
     """Log-likelihood ratios by block of the estimated gains to each other hypothesis."""
     receiver, transmitter = np.where(helps, GAINS, UNKNOWN)[pairs]
@@ -128,11 +113,6 @@ def _by_block(
         gain = logs[rows, receiver, transmitter] - logs[rows, one, other]
         gains.append(np.bincount(blocks, np.nan_to_num(gain), BLOCKS).astype(np.float64))
     return gains
-
-
-def _beyond_chance(by_block: FloatArray) -> float:
-    """The margin by which a sum over blocks exceeds its threshold."""
-    return float(by_block.sum() - max(_EVIDENCE, np.linalg.norm(by_block)))
 
 
 class _PairElements(NamedTuple):
@@ -149,12 +129,7 @@ def held_out_likelihoods(
 ) -> FloatArray:
     """Log likelihoods (k, H, H) of exchanges by the hypotheses on receiver and transmitter.
 
-    A constant per exchange is omitted; NaN where no pose is found.
-
-    Args:
-        platform: Of all robots.
-        gains: Of every robot, estimated without these exchanges.
-        exchanges: Held-out exchanges.
+    A constant per exchange is omitted; NaN where no pose is found. The gains were estimated without them.
     """
     found = np.full((len(exchanges.receiver), HYPOTHESES, HYPOTHESES), np.nan)
     factors, sigmas = _by_hypothesis(platform, gains)
@@ -204,18 +179,13 @@ def _samples(
     ]
     draws = np.random.default_rng(_SEED).standard_normal((2 * len(solved), _POINTS, 3))
     known: BoolArray = np.isfinite(exchanges.poses[:, 0])
+    offsets = draws.reshape(-1, 3) * POSE_SIGMA
     return [
-        _about_known(exchanges.poses[k], draws)
+        (exchanges.poses[k] + offsets, np.zeros(len(offsets)))
         if known[k]
         else _about_found(solved, k, draws, platform.radius)
         for k in range(count)
     ]
-
-
-def _about_known(pose: FloatArray, draws: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Samples around a known pose, with equal weights."""
-    poses = pose + draws.reshape(-1, 3) * POSE_SIGMA
-    return poses, np.zeros(len(poses))
 
 
 def _about_found(
@@ -329,13 +299,9 @@ class InfraredCalibration:
 def calibrate_infrared(
     recording: Recording, swarm: Swarm, progress: Progress, *, with_truth: bool = True
 ) -> InfraredCalibration:
-    """Calibrate the gains of all robots with infrared boards.
+    """Calibrate the gains of all robots with infrared boards; described gains are ignored.
 
-    Args:
-        recording: With brightness matrices.
-        swarm: The swarm of the recording; its gains are ignored.
-        progress: Called with the share done and the name of the step.
-        with_truth: Whether to use ground truth where available.
+    `with_truth`: whether to use ground truth where it is known.
 
     Raises:
         CalibrationError: No exchange can be used, or no gains are determined.
@@ -429,7 +395,10 @@ def _groups(
         raise CalibrationError(" ".join([f"recording '{recording.name}' {nothing}", *recording.remarks]))
     keys = sorted(exchanges)
     groups = []
-    for members in _alike(screening):
+    alike: dict[IrPlatform, list[int]] = {}
+    for robot, board in screening.boards.items():
+        alike.setdefault(board.platform, []).append(robot)
+    for members in alike.values():
         own = [key for key in keys if key.receiver in members]
         own = own[:: max(1, -(-len(own) // _MAX_EXCHANGES))]
         columns = np.array(own, dtype=np.int64).reshape(-1, 3).T
@@ -442,21 +411,10 @@ def _groups(
     return groups, screening.dropped
 
 
-def _alike(screening: MatrixScreening) -> Iterator[list[int]]:
-    """Robots with the same kind of board, in ascending order."""
-    groups: dict[IrPlatform, list[int]] = {}
-    for robot, board in screening.boards.items():
-        groups.setdefault(board.platform, []).append(robot)
-    yield from groups.values()
-
-
 def _true_poses(recording: Recording, swarm: Swarm, columns: IntArray) -> FloatArray:
     """Range [m], bearing and heading [rad] (k, 3) of transmitters seen from receivers; NaN where not known.
 
-    Args:
-        recording: With ground truth.
-        swarm: The swarm with the robots' names.
-        columns: (3, k) stamp, receiver and transmitter.
+    `columns` (3, k) are stamp, receiver and transmitter.
     """
     stamp_ns, *sides = columns
     places = np.full((2, stamp_ns.size, 3), np.nan)

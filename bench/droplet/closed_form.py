@@ -12,16 +12,17 @@ them. The covariance includes it: it is the mean squared error at the given rang
 from __future__ import annotations
 
 import math
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.numerics import wrap
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.common.se2_scalar import wrap
 from swarm_loc_estimator.infrared.brightness import curve_at, distance_at, expected_brightness
-from swarm_loc_estimator.infrared.search import DARKEST, IrOutcome, IrSolutions, checked
+from swarm_loc_estimator.infrared.search import DARKEST, IrOutcome, IrSolutions, checked, no_solutions
 from swarm_loc_estimator.swarm.ir_board import IrModel, IrPlatform, PairGains
 
 _FOUND, _TOO_WEAK, _UNDETERMINED = int(IrOutcome.FOUND), int(IrOutcome.TOO_WEAK), int(IrOutcome.UNDETERMINED)
@@ -32,6 +33,15 @@ _FEWEST, _CORE = 30, 0.99
 """Minimum number of simulated poses per tabulated range, and share of them that enters the covariance."""
 _SYSTEMATIC = 0.95  # Systematic share of the variance, from the approximation and from gains
 _SIGMA_STEP = 0.02  # Resolution of the standard deviation of log-gains for which errors are tabulated
+
+
+class IrEstimator(Protocol):
+    """One of `ClosedForm` and `MaximumLikelihood`."""
+
+    def solve(
+        self, readings: ArrayLike, gains: PairGains | None = None, saturation: ArrayLike | None = None
+    ) -> IrSolutions:
+        """Relative poses of k pairs, see `MaximumLikelihood.solve`."""
 
 
 class ClosedForm:
@@ -51,9 +61,9 @@ class ClosedForm:
     def solve(
         self, readings: ArrayLike, gains: PairGains | None = None, saturation: ArrayLike | None = None
     ) -> IrSolutions:
-        """Relative poses of k pairs, see `solution.IrEstimator`; there are no alternatives."""
+        """Relative poses of k pairs, see `MaximumLikelihood.solve`; there are no alternatives."""
         values, known, limits = checked(self._platform, readings, gains, saturation)
-        solutions = IrSolutions.none(len(values))
+        solutions = no_solutions(len(values))
         _solve_all(self._platform.model, values, known, limits, solutions.poses, solutions.outcomes)
         found = np.flatnonzero(solutions.outcomes == IrOutcome.FOUND)
         steps = np.ceil(np.sqrt(0.5 * np.sum(known.sigma[found] ** 2, axis=-1)) / _SIGMA_STEP).astype(int)

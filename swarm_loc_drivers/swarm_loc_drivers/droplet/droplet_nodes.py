@@ -1,30 +1,38 @@
-"""The driver of a Droplet at a cable as a ROS 2 node; one per cable, in the robot's namespace.
+"""The drivers of Droplets as ROS 2 nodes: of one Droplet at a cable, and of a fleet of them in one process.
 
     ./run swarm_loc_drivers droplet_driver_node --ros-args -r __ns:=/droplet1 -p address:=/dev/ttyUSB0 \
         -p partners:='["6B6F", "DF64"]'
+    ./run swarm_loc_drivers droplet_fleet_node --ros-args -p swarm_file:=swarm.yaml -p link_folder:=/tmp/links
 
-It follows `cmd_vel` and publishes `odom`, `brightness`, `/tf` and `/diagnostics`; for Droplets without cable
-it follows and publishes `cmd_vel`, `odom` and `/tf` besides. Service: `~/measure`. Parameters: see
-`parameters.py` and `doc/droplet_driver_node.md`.
+The driver, one per cable, in the robot's namespace, follows `cmd_vel` and publishes `odom`, `brightness`,
+`/tf` and `/diagnostics`; for Droplets without cable it follows and publishes `cmd_vel`, `odom` and `/tf` as
+well. Service: `~/measure`. Parameters: see `parameters.py` and `doc/droplet_driver_node.md`.
+
+For every robot of the swarm description that has an infrared board the fleet node starts such a driver, in
+the robot's namespace and at the port of `link_folder` that is named like it; they take turns to emit. What
+Droplets share, such as their model and their noise, is set once for all of them.
 """
 
 from __future__ import annotations
 
 from array import array
 from functools import partial
+from pathlib import Path
 from typing import Any
 
+from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
 from swarm_loc_drivers.common.ros_messages import stamp_message
 from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners
 from swarm_loc_drivers.droplet.exchange import Brightness
-from swarm_loc_drivers.droplet.parameters import DropletParameters
-from swarm_loc_estimator.common.node import run_node
+from swarm_loc_drivers.droplet.parameters import DropletFleetParameters, DropletParameters
+from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node, spin
+from swarm_loc_estimator.common.parameters import ParameterError
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_msgs.msg import BrightnessMatrix
 
 _BRIGHTNESS_QOS = QoSProfile(depth=50)
@@ -55,7 +63,9 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
         for name in self.params.relayed_ids:
             path = _relayed_path(robot, name)
             self._odometry[name] = self._odometry_output(f"/{path}/odom", f"{path}/")
-        listeners = DropletListeners(self._publish_odometry, self._publish_brightness)
+        listeners = DropletListeners(
+            lambda name, state: self._odometry[name].publish(state), self._publish_brightness
+        )
         self._driver = DropletDriver(self.params, listeners, self._now_ns)
         for name in self._odometry:
             topic = f"/{_relayed_path(robot, name)}/cmd_vel" if name else "cmd_vel"
@@ -74,9 +84,6 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
             response.message = f"{len(self.params.partners)} partners are asked to emit."
         return response
 
-    def _publish_odometry(self, name: str, state: OdometryState) -> None:
-        self._odometry[name].publish(state)
-
     def _publish_brightness(self, receiver: int, one: Brightness) -> None:
         message = BrightnessMatrix(
             header=Header(stamp=stamp_message(one.stamp_ns), frame_id=self._base_frame),
@@ -91,8 +98,59 @@ class DropletDriverNode(RobotDriverNode[DropletParameters]):
 
 
 def _relayed_path(robot: str, name: str) -> str:
-    """Namespace of a robot without a cable: beside that of the robot at the cable."""
+    """Namespace of a robot without a cable: next to that of the robot at the cable."""
     return "/".join([*robot.split("/")[:-1], name])
 
 
-main = partial(run_node, "droplet_driver_node", DropletDriverNode)
+run_droplet_driver = partial(run_node, "droplet_driver_node", DropletDriverNode)
+
+
+class DropletFleetNode(ConfiguredNode[DropletFleetParameters]):
+    """Runs the nodes of the drivers."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("droplet_fleet", DropletFleetParameters, **node_arguments)
+        parameters = self.params
+        robots = load_swarm(Path(parameters.swarm_file)).robots
+        names = [robot.name for robot in robots if robot.ir is not None]
+        part, parts = parameters.part, parameters.parts
+        if not names[part::parts]:
+            raise ParameterError(f"parameter part = {part} of {parts} has none of the {len(names)} Droplets.")
+        simulated = bool(self.get_parameter("use_sim_time").value)
+        self._drivers: list[DropletDriverNode] = []
+        for turn in range(part, len(names), parts):
+            own = {
+                **parameters.traits,
+                "address": str(Path(parameters.link_folder) / names[turn]),
+                "turns": len(names),
+                "turn": turn,
+                "use_sim_time": simulated,
+            }
+            self._drivers.append(_driver(names[turn], own))
+
+    def run(self, stop: Stop) -> int:
+        """Drive all robots until asked to stop; the exit status."""
+        for driver in self._drivers:
+            driver.start()
+        return spin(self, stop, *self._drivers)
+
+    def destroy_node(self) -> None:
+        """Stop all robots first."""
+        for driver in self._drivers:
+            driver.begin_to_stop()
+        for driver in self._drivers:
+            driver.destroy_node()
+        super().destroy_node()
+
+
+def _driver(robot: str, parameters: dict[str, Any]) -> DropletDriverNode:
+    """Node of one robot; remappings on the command line apply only to the fleet node."""
+    return DropletDriverNode(
+        namespace=robot,
+        parameter_overrides=[Parameter(name, value=value) for name, value in parameters.items()],
+        use_global_arguments=False,
+        start_parameter_services=False,
+    )
+
+
+run_droplet_fleet = partial(run_node, "droplet_fleet_node", DropletFleetNode)

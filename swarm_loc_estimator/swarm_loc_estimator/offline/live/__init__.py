@@ -1,1 +1,0 @@
-"""Runs of the live graph, recorded and compared with replay."""
