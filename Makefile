@@ -27,7 +27,7 @@ lint:
 
 # Tests are a call of their own, since two files named conftest.py cannot be of one.
 types:
-	$(MYPY) conftest.py bench docs tools $(join $(PACKAGES:=/),$(PACKAGES))
+	$(MYPY) conftest.py bench docs tools $(join $(PACKAGES:=/),$(PACKAGES)) $(wildcard $(PACKAGES:=/examples))
 	$(MYPY) $(wildcard $(PACKAGES:=/launch) $(PACKAGES:=/test))
 
 unit: setup

@@ -47,7 +47,6 @@ def setup(app: Sphinx) -> None:
     app.connect("html-page-context", _add_mermaid)
     app.connect("autodoc-process-signature", _shorten_signature)
     app.connect("autodoc-process-docstring", _prepare_docstring, priority=100)  # before napoleon
-    app.connect("autodoc-skip-member", _skip_field)
 
 
 def _read_source(_app: Sphinx, docname: str, source: list[str]) -> None:
@@ -77,10 +76,11 @@ def _add_mermaid(app: Sphinx, *event: Any) -> None:
 
 
 def _shorten_signature(*event: Any) -> tuple[str | None, str | None]:
-    """Show a default without its own arguments, and a function or factory by its name."""
+    """Show a default without its own arguments, and a function or factory by its name if it has one."""
     signature, returned = event[-2:]
     if signature:
         signature = re.sub(r"= (\w+)\([^()]*\)", r"= \1()", signature)
+        signature = re.sub(r"<function [^<>]*<lambda>[^>]*>", "...", signature)
         signature = re.sub(r"= <(?:function )?(\w+)[^>]*>", r"= \1", signature)
     return signature, returned
 
@@ -88,15 +88,15 @@ def _shorten_signature(*event: Any) -> tuple[str | None, str | None]:
 def _prepare_docstring(
     _app: Sphinx, what: str, _name: str, obj: Any, _options: Any, lines: list[str]
 ) -> None:
-    """Describe the numbers of a dataclass by their specs; let no colon of an attribute name a type."""
+    """Describe the numbers of a dataclass by their specs; let no colon of an attribute name a type.
+
+    A field of a named tuple without a comment has no description.
+    """
+    if lines and lines[0].startswith("Alias for field number"):
+        lines.clear()
     if what in {"attribute", "data", "property"}:
-        lines.insert(0, "")
+        lines.insert(0, r"\ ")  # shown as nothing; a colon behind it names no type
     if isinstance(obj, type) and is_dataclass(obj) and "Attributes:" not in lines:
         specs = [(one.name, one.metadata["spec"]) for one in fields(obj) if "spec" in one.metadata]
         numbers = [f"    {name}: {spec.doc}, in {spec.range_text}." for name, spec in specs]
         lines += ["Attributes:", *numbers, ""] if numbers else []
-
-
-def _skip_field(*event: Any) -> bool | None:
-    """Leave out the fields of named tuples, which their classes describe."""
-    return True if type(event[3]).__name__ == "_tuplegetter" else None

@@ -82,13 +82,13 @@ if __name__ == "__main__":
         t = np.arange(now_s - 1.0, now_s, 0.1)
         x = 1.0 + 0.1 * t  # it drives along x at 0.1 m/s; its wheels report 2 % too far
         beacon = rng.integers(0, 3, t.size)
-        distance = np.hypot(BEACONS[beacon, 0] - x, BEACONS[beacon, 1] - 1.0) + rng.normal(
-            0.0, SIGMA_M, t.size
-        )
+        distance = np.hypot(BEACONS[beacon, 0] - x, BEACONS[beacon, 1] - 1.0)
+        distance += rng.normal(0.0, SIGMA_M, t.size)
         estimate, dropped = estimator.step(
             now_s,
             odometry={"robot": "r1", "stamp_s": t, "pose": np.column_stack([0.102 * t, 0.0 * t, 0.0 * t])},
             beacons={"robot": "r1", "stamp_s": t, "beacon": beacon, "distance": distance},
         )
-        error = estimate.poses[0, :2] - [1.0 + 0.1 * t[-1], 1.0]
-        print(f"{now_s:3.0f} s  error {100.0 * np.hypot(*error):5.2f} cm  dropped {dropped}")
+        error = np.hypot(*(estimate.poses[0, :2] - [1.0 + 0.1 * now_s, 1.0]))
+        sigma = np.sqrt(estimate.covariances[0, 0, 0] + estimate.covariances[0, 1, 1])
+        print(f"{now_s:3.0f} s  error {100.0 * error:5.2f} cm of {100.0 * sigma:5.2f}  dropped {dropped}")

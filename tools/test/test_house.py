@@ -112,6 +112,17 @@ def test_the_architecture_page_shows_the_folders_in_this_order() -> None:
     assert re.findall(r"^\| `(\w+)/` \|", page, re.MULTILINE) == [*ORDER]
 
 
+def test_the_architecture_page_has_the_modules_that_a_detection_passes() -> None:
+    page = (ROOT / "swarm_loc_estimator" / "doc" / "architecture.md").read_text(encoding="utf-8")
+    section = page.partition("## The way of a measurement\n")[2].partition("\n## ")[0]
+    cells = re.findall(r"^\| \w+ \| (`.*?`) \|", section, re.MULTILINE)
+    rows = [[name.replace("/", ".") for name in re.findall(r"`([\w/]+)`", cell)] for cell in cells]
+    passed = [name.partition(".")[2] for name in message_path.passed("detection").modules]
+    assert sorted(name for row in rows for name in row) == sorted(passed)
+    first_of_each = [min(map(passed.index, row)) for row in rows]
+    assert first_of_each == sorted(first_of_each)
+
+
 def product_and_tools() -> list[house.Module]:
     others = [*(ROOT / "bench").rglob("*.py"), *(ROOT / "tools").rglob("*.py")]
     others = [path for path in others if "test" not in path.relative_to(ROOT).parts]

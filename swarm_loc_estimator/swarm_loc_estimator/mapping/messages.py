@@ -66,14 +66,14 @@ class LaserMessage(NamedTuple):
 class ScanMessage(NamedTuple):
     """A sensor_msgs/LaserScan; its stamp is the time of the first beam."""
 
-    stamp_ns: int
-    angle_min: float
-    angle_max: float
-    angle_increment: float
-    time_increment: float
-    range_min: float
-    range_max: float
-    ranges: FloatArray
+    stamp_ns: int  #: Time of the first beam
+    angle_min: float  #: Direction of the first beam [rad]
+    angle_max: float  #: Direction of the last beam [rad]
+    angle_increment: float  #: From a beam to the next one [rad]
+    time_increment: float  #: From a beam to the next one [s]
+    range_min: float  #: [m]
+    range_max: float  #: [m]
+    ranges: FloatArray  #: (b,) [m]
 
     @property
     def frame_id(self) -> str:

@@ -229,9 +229,9 @@ class Runner:
         stamps_ns = self._schedule.due(inputs.end_ns)
         parts = self._estimator.convert(inputs).until_each(np.array(stamps_ns, dtype=np.int64))
         for now_ns in stamps_ns:
-            self._estimator.receive(next(parts))
+            self._estimator.receive_in_parts(next(parts))
             self._tick(now_ns)
-        self._estimator.receive(next(parts))
+        self._estimator.receive_in_parts(next(parts))
 
     def finish(self, last_ns: int) -> None:
         """Run the ticks after the last inputs of a recording that ends at `last_ns`."""

@@ -25,12 +25,12 @@ _UNKNOWN_VARIANCE = -1.0  # First element of an unknown covariance
 class AerialRows(NamedTuple):
     """Anonymous detections of aerial images, a row per detection (d,)."""
 
-    robot: IntArray  # (d,) always -1, the whole swarm
-    stamp_ns: IntArray  # (d,) exposure times
-    number: IntArray  # (d,) index of the detection in its message
-    pose: FloatArray  # (d, 3) x [m], y [m], heading [rad] in `map`; heading NaN: not measured
-    covariance: FloatArray  # (d, 3, 3) of the pose; a first element of -1: unknown
-    arrival_ns: IntArray  # (d,) arrival times
+    robot: IntArray  #: (d,) always -1, the whole swarm
+    stamp_ns: IntArray  #: (d,) exposure times
+    number: IntArray  #: (d,) index of the detection in its message
+    pose: FloatArray  #: (d, 3) x [m], y [m], heading [rad] in `map`; heading NaN: not measured
+    covariance: FloatArray  #: (d, 3, 3) of the pose; a first element of -1: unknown
+    arrival_ns: IntArray  #: (d,) arrival times
 
 
 class AerialSensor(Sensor):

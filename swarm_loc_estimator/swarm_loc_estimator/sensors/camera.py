@@ -42,6 +42,7 @@ from swarm_loc_estimator.sensors.sensor import (
     Sensor,
     SensorSettings,
     SharedTopic,
+    fill,
 )
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Robot, Swarm
@@ -600,8 +601,10 @@ class CameraSensor(Sensor):
         detection["content"] = CONTENT_POSE if "orientation" in columns else CONTENT_POSITION
         detection["orientation"][:, 3], detection["covariance"][:, 0, 0] = 1.0, _UNKNOWN_VARIANCE
         fields = {*columns} & {*(detection.dtype.names or ())}
+        if missing := {"id", "position"} - fields:
+            raise TypeError(f"{cls.name}: the column '{min(missing)}' is missing")
         for name in fields:
-            detection[name] = columns[name]
+            fill(detection[name], columns[name], f"{cls.name}: {name}")
         others = {name: columns[name] for name in {*columns} - fields}
         made: DetectionRows = super().rows({**others, "detection": detection})
         return made

@@ -25,12 +25,12 @@ _MAX_RATE = 200.0  # Larger turn rates are no measurements [rad/s]
 class TurnRateRows(NamedTuple):
     """Turn rates (k,)."""
 
-    robot: IntArray  # (k,) index of the robot
-    stamp_ns: IntArray  # (k,) acquisition stamps
-    velocity: FloatArray  # (k, 3) angular velocity in the frame of the IMU [rad/s]
-    # (k,) turn rate about the vertical, without calibration [rad/s]; NaN before the conversion
+    robot: IntArray  #: (k,) index of the robot
+    stamp_ns: IntArray  #: (k,) acquisition stamps
+    velocity: FloatArray  #: (k, 3) angular velocity in the frame of the IMU [rad/s]
+    #: (k,) turn rate about the vertical, without calibration [rad/s]; NaN before the conversion
     rate: FloatArray
-    arrival_ns: IntArray  # (k,) arrival times
+    arrival_ns: IntArray  #: (k,) arrival times
 
 
 NO_TURN_RATES = TurnRateRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros(0), NO_ROWS)

@@ -37,16 +37,16 @@ from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 class BrightnessRows(NamedTuple):
     """Brightness matrices (b,), as `swarm_loc_msgs/BrightnessMatrix` has them."""
 
-    robot: IntArray  # (b,) index of the robot of the topic
-    stamp_ns: IntArray  # (b,) middle of the exchange, equal for all its power modes
-    receiver: IntArray  # (b,) id of the robot that measured
-    transmitter: IntArray  # (b,) id of the robot that lit its emitters
-    n: IntArray  # (b,) number of sensors, and of emitters
-    power: IntArray  # (b,) index of the power mode
-    saturation: IntArray  # (b,) reading at which a sensor saturates [count]; 0: that of the platform
-    # (b,) of arrays (k,) [count], row-major [sensor, emitter]; k should be n * n
+    robot: IntArray  #: (b,) index of the robot of the topic
+    stamp_ns: IntArray  #: (b,) middle of the exchange, equal for all its power modes
+    receiver: IntArray  #: (b,) id of the robot that measured
+    transmitter: IntArray  #: (b,) id of the robot that lit its emitters
+    n: IntArray  #: (b,) number of sensors, and of emitters
+    power: IntArray  #: (b,) index of the power mode
+    saturation: IntArray  #: (b,) reading at which a sensor saturates [count]; 0: that of the platform
+    #: (b,) of arrays (k,) [count], row-major [sensor, emitter]; k should be n * n
     readings: NDArray[np.object_]
-    arrival_ns: IntArray  # (b,) arrival times
+    arrival_ns: IntArray  #: (b,) arrival times
 
 
 NO_BRIGHTNESS = BrightnessRows(*(NO_ROWS,) * 7, np.zeros(0, dtype=object), NO_ROWS)

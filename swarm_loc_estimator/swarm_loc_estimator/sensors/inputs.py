@@ -187,26 +187,13 @@ class Batch:
         Raises:
             TypeError: There is no such sensor, robot or column, or a column has another length or shape.
         """
-        names = [one.name for one in swarm.robots] + [one.name for one in swarm.cameras]
-        index = {name: k for k, name in enumerate(names)}
         rows = {}
         for name, given in readings.items():
             if name not in SENSORS:
                 raise TypeError(f"there is no sensor '{name}', only {', '.join(SENSORS)}")
-            columns = dict(given)
-            if "stamp_s" in columns:
-                columns["stamp_ns"] = np.round(1e9 * np.asarray(columns.pop("stamp_s"))).astype(np.int64)
-            if "stamp_ns" not in columns:
-                raise TypeError(f"{name}: the column 'stamp_s' or 'stamp_ns' is missing")
-            stamp_ns = columns["stamp_ns"] = np.atleast_1d(np.asarray(columns["stamp_ns"], dtype=np.int64))
-            robots = -1 if name == AerialSensor.name else columns["robot"]
-            robots = np.broadcast_to(np.asarray(robots), stamp_ns.shape).tolist()
-            unknown = [one for one in robots if isinstance(one, str) and one not in index]
-            if unknown:
-                raise TypeError(f"{name}: there is no robot or camera '{unknown[0]}'")
-            columns["robot"] = np.array(
-                [index[one] if isinstance(one, str) else one for one in robots], dtype=np.int64
-            )
+            stamp_ns = _stamps_ns(name, given)
+            columns = {key: column for key, column in given.items() if key != "stamp_s"}
+            columns |= {"stamp_ns": stamp_ns, "robot": _robots(swarm, name, given, stamp_ns.size)}
             columns.setdefault("arrival_ns", np.clip(stamp_ns, begin_ns, now_ns))
             made = SENSORS[name].rows(columns)
             rows[name] = select(made, np.argsort(made.arrival_ns, kind="stable"))
@@ -226,6 +213,38 @@ class Batch:
             rows = {name: select(one, places[name][k]) for name, one in self.rows.items()}
             yield replace(self, begin_ns=begin_ns, end_ns=end_ns, rows=rows)
             begin_ns = end_ns
+
+
+def _stamps_ns(sensor: str, given: Mapping[str, Any]) -> IntArray:
+    """Stamps (k,) of columns with `stamp_s` or `stamp_ns`."""
+    if not isinstance(given, Mapping):
+        raise TypeError(f"{sensor} must be columns by name, not {given!r}")
+    if ("stamp_s" in given) == ("stamp_ns" in given):
+        raise TypeError(f"{sensor} needs either the column 'stamp_s' or 'stamp_ns'")
+    name = "stamp_ns" if "stamp_ns" in given else "stamp_s"
+    stamps = np.atleast_1d(np.asarray(given[name]))
+    if stamps.ndim != 1 or stamps.dtype.kind not in "iuf" or not np.isfinite(stamps).all():
+        raise TypeError(f"{sensor}: {name} must be finite numbers (k,)")
+    stamps = stamps if name == "stamp_ns" else np.round(1e9 * stamps)
+    return stamps.astype(np.int64)
+
+
+def _robots(swarm: Swarm, sensor: str, given: Mapping[str, Any], count: int) -> IntArray:
+    """Indices (k,) of columns with `robot`: names or indices, or one for all."""
+    if not SENSORS[sensor].of_each:
+        return np.full(count, THE_SWARM)
+    if "robot" not in given:
+        raise TypeError(f"{sensor}: the column 'robot' is missing")
+    sources = swarm.sources if SENSORS[sensor].of_cameras else swarm.robots
+    index = {key: k for k, one in enumerate(sources) for key in (one.name, k)}
+    robots = np.atleast_1d(np.asarray(given["robot"])).tolist()
+    if len(robots) not in {1, count}:
+        raise TypeError(f"{sensor}: robot has {len(robots)} values, not {count}")
+    unknown = [one for one in robots if one not in index]
+    if unknown:
+        raise TypeError(f"{sensor}: there is no robot or camera {unknown[0]!r}")
+    found: IntArray = np.broadcast_to([index[one] for one in robots], count)
+    return found
 
 
 def _between(arrivals_ns: IntArray, stamps_ns: IntArray) -> list[slice]:
@@ -261,7 +280,7 @@ class InputConverter:
         """Convert valid readings; count the others in `drops`."""
         self.drops.total.update(batch.dropped)
         kept: dict[str, Any] = {}
-        for name in SENSORS:
+        for name, sensor in SENSORS.items():
             rows = batch.rows.get(name)
             if rows is None or not rows.robot.size:
                 continue
@@ -271,11 +290,14 @@ class InputConverter:
                 rows = select(rows, ~late)
             with Guard(name, rows.robot.size, self.drops.total):
                 found = self._sensors[name].measure(rows)
-                kept[name] = self._valid(found) if isinstance(found, Measurements) else found
+                is_measured = sensor.accumulator is None and sensor.unit is not None
+                kept[name] = self._valid(found) if is_measured else found
         return replace(batch, rows=kept, dropped={}, is_converted=True)
 
-    def _valid(self, found: Measurements) -> Measurements:
+    def _valid(self, found: Any) -> Measurements:
         """Select valid measurements; count the others in `drops`."""
+        if not isinstance(found, Measurements):
+            raise TypeError(f"measure must return Measurements, not {type(found).__name__}")
         reasons = reject_reasons(found)
         reasons[~is_about_swarm(found, self._robots, self._landmarks)] = BAD_MEASUREMENT
         for k in set(reasons[reasons != VALID].tolist()):

@@ -22,10 +22,10 @@ from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 class ScanRows(NamedTuple):
     """Scans (s,)."""
 
-    robot: IntArray  # (s,) index of the robot
-    stamp_ns: IntArray  # (s,) time of the first beam
-    scan: NDArray[Any]  # (s,) of `ScanMessage`
-    arrival_ns: IntArray  # (s,) arrival times
+    robot: IntArray  #: (s,) index of the robot
+    stamp_ns: IntArray  #: (s,) time of the first beam
+    scan: NDArray[Any]  #: (s,) of `ScanMessage`
+    arrival_ns: IntArray  #: (s,) arrival times
 
 
 NO_SCANS = ScanRows(NO_ROWS, NO_ROWS, np.zeros(0, dtype=object), NO_ROWS)

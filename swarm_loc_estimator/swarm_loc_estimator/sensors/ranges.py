@@ -25,13 +25,13 @@ from swarm_loc_estimator.swarm.swarm import Robot, Swarm, UwbDevice
 class RangeRows(NamedTuple):
     """Ranges and range differences (k,)."""
 
-    robot: IntArray  # (k,) index of the robot that measured
-    stamp_ns: IntArray  # (k,) time of measurement
-    device: NDArray[np.uint64]  # (k,) uint64, address of the other device
-    reference: NDArray[np.uint64]  # (k,) uint64, address of the reference; 0: a range
-    range: FloatArray  # (k,) range, or difference [m]
-    variance: FloatArray  # (k,) of `range` [m^2]; 0: that of the swarm description is used
-    arrival_ns: IntArray  # (k,) arrival times
+    robot: IntArray  #: (k,) index of the robot that measured
+    stamp_ns: IntArray  #: (k,) time of measurement
+    device: NDArray[np.uint64]  #: (k,) uint64, address of the other device
+    reference: NDArray[np.uint64]  #: (k,) uint64, address of the reference; 0: a range
+    range: FloatArray  #: (k,) range, or difference [m]
+    variance: FloatArray  #: (k,) of `range` [m^2]; 0: that of the swarm description is used
+    arrival_ns: IntArray  #: (k,) arrival times
 
 
 _NO_ADDRESSES = np.zeros(0, dtype=np.uint64)

@@ -39,6 +39,24 @@ def in_order_of_arrival(parts: Sequence[Rows]) -> Rows:
     return type(rows)(*(column[order] for column in rows))
 
 
+def fill(column: NDArray[Any], given: Any, name: str) -> None:
+    """Write given values to a column (k, ...); a number stands for all.
+
+    Raises:
+        TypeError: They have another length or shape, or are no numbers.
+    """
+    try:
+        if column.dtype == object:
+            for k, one in zip(range(len(column)), given, strict=True):
+                column[k] = one
+        elif np.shape(given) in {(), column.shape}:
+            column[:] = given
+        else:
+            raise TypeError(f"{name} has shape {np.shape(given)}, not {column.shape}")
+    except ValueError as error:
+        raise TypeError(f"{name} has wrong values: {error}") from error
+
+
 class Known(NamedTuple):
     """Expected contents of messages."""
 
@@ -324,13 +342,7 @@ class Sensor:
         made = []
         for name, empty in zip(nothing._fields, nothing, strict=True):
             column = np.empty((count, *empty.shape[1:]), dtype=empty.dtype)
-            given = columns.get(name, cls.optional.get(name))
-            if empty.dtype == object:
-                column[:] = [*given]
-            elif np.shape(given) not in {(), column.shape} and name in columns:
-                raise TypeError(f"{cls.name}: {name} has shape {np.shape(given)}, not {column.shape}")
-            else:
-                column[:] = given
+            fill(column, columns.get(name, cls.optional.get(name)), f"{cls.name}: {name}")
             made.append(column)
         return type(nothing)(*made)
 

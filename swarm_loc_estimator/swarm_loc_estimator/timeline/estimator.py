@@ -48,7 +48,7 @@ from swarm_loc_estimator.timeline.timeline import HasBudget, Timeline
 
 __all__ = ["Estimate", "Estimator", "Status", "Step"]
 
-_PARTS = 8  # Into how many parts `step` splits the readings of a horizon
+_PARTS = 8  # Into how many parts `receive_in_parts` splits the data of a horizon
 _LONG_AGO_NS = np.iinfo(np.int64).min // 2
 
 
@@ -151,6 +151,19 @@ class Estimator:
                 change = accumulator.take(rows)
                 self._timeline.add(change.added)
                 self._timeline.withdraw(change.withdrawn)
+
+    def receive_in_parts(self, inputs: Batch) -> None:
+        """Add new data of any time span, with ticks in between, so that nothing becomes too old in it."""
+        part_ns = self._horizon_ns // _PARTS
+        arrivals_ns = np.concatenate([[inputs.end_ns], *(one.arrival_ns for one in inputs.rows.values())])
+        begins_ns = inputs.begin_ns + (arrivals_ns - inputs.begin_ns) // part_ns * part_ns
+        pauses_ns = np.unique([begins_ns, begins_ns + part_ns])
+        between = (inputs.begin_ns < pauses_ns) & (pauses_ns < inputs.end_ns)
+        *parts, last = inputs.until_each(pauses_ns[between])
+        for part in parts:
+            self.receive(part)
+            self.tick(part.end_ns)
+        self.receive(last)
 
     def set_pose(self, robot: int, stamp_ns: int, pose: ArrayLike, covariance: ArrayLike) -> str:
         """Set a robot to a pose (3,) in `map` with covariance (3, 3); its estimate is replaced.
@@ -309,12 +322,7 @@ class Estimator:
         before, begin_ns = Counter(self.drops), min(end_ns if self._now_ns is None else self._now_ns, end_ns)
         first_ns = begin_ns if self._now_ns is not None else _LONG_AGO_NS
         batch = self.convert(Batch.of_columns(self.swarm, first_ns, end_ns, readings))
-        pauses_ns = np.arange(batch.begin_ns, batch.end_ns, self._horizon_ns // _PARTS)
-        *parts, last = batch.until_each(pauses_ns)
-        for part in parts:
-            self.receive(part)
-            self.tick(part.end_ns)
-        self.receive(last)
+        self.receive_in_parts(batch)
         return Step(self.tick(end_ns), dict(Counter(self.drops) - before))
 
     def _check_clock(self, now_ns: int) -> int:

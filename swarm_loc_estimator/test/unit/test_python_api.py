@@ -18,10 +18,11 @@ import swarm_loc_estimator
 from swarm_loc_estimator import Batch, Estimator, OdometryRows, ReplayResult, Robot, Swarm, replay
 from swarm_loc_estimator.offline.export import write_tum
 from swarm_loc_estimator.offline.report.report import text_report
+from swarm_loc_estimator.sensors.inputs import SENSORS
 
 ROOT = Path(__file__).parents[3]
 PAGE = ROOT / "swarm_loc_estimator" / "doc" / "python_api.md"
-EXAMPLE = ROOT / "swarm_loc_estimator" / "examples" / "replay_errors.py"
+EXAMPLE = ROOT / "swarm_loc_estimator" / "examples" / "replay_and_plot.py"
 BAG = ROOT / "bags" / "eight_five_robots"
 SWARM = Swarm((Robot("robot1"),))
 TWO = np.zeros(2, np.int64)
@@ -114,12 +115,26 @@ def test_the_page_names_what_there_is_and_its_code_runs() -> None:
     printed = [run("-c", block).split("\n") for block in blocks]
     assert float(printed[0][0]) == pytest.approx(0.0027, abs=1e-4)
     assert [line.split()[0] for line in printed[1][:-1]] == [f"epuck{k}" for k in range(1, 6)]
-    assert printed[3][0] == "[[0.02 0.   0.  ]]"
+    assert printed[3][0] == "[[0.5 0.  0. ]]"
     assert printed[3][1] == "{}"
 
 
-def test_the_example_prints_the_errors_of_the_report(result: ReplayResult) -> None:
-    _, *lines = run(str(EXAMPLE), str(BAG)).splitlines()
+def test_the_page_lists_all_names_once() -> None:
+    _, _, table = PAGE.read_text(encoding="utf-8").partition("## All names")
+    assert sorted(re.findall(r"`(\w+)`", table)) == sorted(NAMES)
+
+
+def test_the_page_has_the_columns_of_every_sensor() -> None:
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", PAGE.read_text(encoding="utf-8"), re.MULTILINE))
+    for name, sensor in SENSORS.items():
+        fields = {*sensor.nothing()._fields} - {"robot", "stamp_ns", "arrival_ns", "rate", "detection"}
+        needed, _, optional = rows[name].partition(" | ")
+        assert {one for one in fields - {*sensor.optional} if f"`{one}`" not in needed} == set()
+        assert {one for one in fields & {*sensor.optional} if f"`{one}`" not in optional} == set()
+
+
+def test_the_example_prints_the_errors_of_the_report(result: ReplayResult, tmp_path: Path) -> None:
+    _, *lines, _ = run(str(EXAMPLE), str(BAG), str(tmp_path / "picture.png")).splitlines()
     report = text_report(result).splitlines()
     assert [line.split()[0] for line in lines] == [*result.errors, "all"]
     for line in lines:

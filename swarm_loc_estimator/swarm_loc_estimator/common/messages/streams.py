@@ -329,9 +329,8 @@ class Messages(Generic[Message]):
     stamp_ns: IntArray  #: (n,) stamps of their headers
     valid: NDArray[np.bool_]  #: (n,) whether the bytes were a whole message of the type
     decoded: list[Message]  #: The valid ones
-    robot: IntArray = field(
-        default_factory=_not_known
-    )  #: (n,) index of the topic's robot, or N plus that of the camera; -1: swarm
+    #: (n,) index of the topic's robot, or N plus that of the camera; -1: swarm
+    robot: IntArray = field(default_factory=_not_known)
     arrival_ns: IntArray = field(default_factory=_not_known)  #: (n,) arrival times
 
 
