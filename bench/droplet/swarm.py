@@ -201,15 +201,7 @@ def report(outcomes: Sequence[Outcome]) -> None:
     """Print the table."""
     head = ["run", "position cm", "heading deg", "NEES", "worst cm", "all located s", "located"]
     rows: list[list[Cell]] = [
-        [
-            one.name,
-            one.position_cm,
-            one.heading_deg,
-            one.nees,
-            one.worst_cm,
-            one.located_s,
-            one.located,
-        ]
+        [one.name, one.position_cm, one.heading_deg, one.nees, one.worst_cm, one.located_s, one.located]
         for one in outcomes
     ]
     print(table(head, rows))

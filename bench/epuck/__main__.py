@@ -57,10 +57,7 @@ _ASIDE_M, _ASIDE = 0.3, 0.5
 A focal length that is not known stretches distances, which is estimated, but also moves what is aside.
 """
 
-PAPER = {
-    "w2.paper.robots1": (2.90, 1.86),
-    "w2.paper.robots5": (2.02, 1.56),
-}
+PAPER = {"w2.paper.robots1": (2.90, 1.86), "w2.paper.robots5": (2.02, 1.56)}
 """Mean errors [cm], [deg] that the paper reports for its robots, one and five (section VI)."""
 
 Prepare = Callable[[Swarm], Swarm]

@@ -65,11 +65,7 @@ class RenderedRun:
 def _write(listener: Listener, folder: Path, *, with_noise: bool) -> None:
     """Write all messages as a bag in order of arrival, detections with or without covariance."""
     rows = [
-        (
-            arrival_ns,
-            f"{name}/{topic}",
-            data if with_noise or topic != "detections" else _without_noise(data),
-        )
+        (arrival_ns, f"{name}/{topic}", data if with_noise or topic != "detections" else _without_noise(data))
         for (name, topic), kept in listener.kept.items()
         for arrival_ns, data in zip(*kept, strict=True)
     ]

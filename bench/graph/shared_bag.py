@@ -12,9 +12,7 @@ from swarm_loc_drivers.sim.run import SimulatedRun
 from swarm_loc_drivers.sim.scenarios.bags import Stream, as_detections, truth_stream, write_streams
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.messages.cdr import SWARM_DETECTIONS, SWARM_ODOMETRY
-from swarm_loc_estimator.common.messages.detections import (
-    swarm_key,
-)
+from swarm_loc_estimator.common.messages.detections import swarm_key
 
 PERIOD_NS = 10_000_000  # All that arrives within this goes out together, at its end
 

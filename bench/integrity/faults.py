@@ -31,9 +31,7 @@ _LATENESS_NS = 50_000_000
 
 
 def simulate(
-    settings: EightSettings,
-    as_it_is: SwarmChange | None = None,
-    moved: TruthChange | None = None,
+    settings: EightSettings, as_it_is: SwarmChange | None = None, moved: TruthChange | None = None
 ) -> SimulatedRun:
     """Simulate the eight in a world that differs from its description.
 

@@ -24,17 +24,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-from bench.mrclam.jobs import (
-    MODELS,
-    Results,
-    bag_of,
-    collected,
-    fit,
-    jobs_of,
-    prepare,
-    run,
-    speed_factor,
-)
+from bench.mrclam.jobs import MODELS, Results, bag_of, collected, fit, jobs_of, prepare, run, speed_factor
 from bench.mrclam.report import report
 from bench.mrclam.sets import NoSetsError, find_sets
 from bench.shared.common import OUT

@@ -100,11 +100,7 @@ def unknown_start(swarm: Swarm) -> Swarm:
 
 def _with_models(robot: Robot, fitted: Robot) -> Robot:
     return replace(
-        robot,
-        odometry=fitted.odometry,
-        response=fitted.response,
-        camera=fitted.camera,
-        sensor=fitted.sensor,
+        robot, odometry=fitted.odometry, response=fitted.response, camera=fitted.camera, sensor=fitted.sensor
     )
 
 

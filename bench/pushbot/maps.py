@@ -13,16 +13,7 @@ from bench.pushbot.runs import RunResult
 from bench.shared.common import new_plot, save_plot
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 
-_SHOWN = (
-    "corridor",
-    "office",
-    "ring",
-    "bend",
-    "atrium",
-    "tee",
-    "two_robots",
-    "five_robots",
-)
+_SHOWN = ("corridor", "office", "ring", "bend", "atrium", "tee", "two_robots", "five_robots")
 _COLUMNS = 3
 
 

@@ -91,10 +91,7 @@ def all_peers() -> dict[str, Peer]:
     """By name; pupil-apriltags only where it is installed."""
     family = family_named(FAMILY)
     detector = own_detector(family)
-    peers: dict[str, Peer] = {
-        "own": lambda gray: as_found(detector.detect(gray)),
-        "cv2.aruco": stock(family),
-    }
+    peers: dict[str, Peer] = {"own": lambda gray: as_found(detector.detect(gray)), "cv2.aruco": stock(family)}
     if importlib.util.find_spec("pupil_apriltags"):
         peers |= {"pupil 1": pupil(1.0), "pupil 2": pupil(2.0)}
     return peers

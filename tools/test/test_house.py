@@ -66,7 +66,7 @@ def test_a_detection_passes_reading_converting_fusing_and_encoding() -> None:
         "swarm_loc_estimator.common.messages.poses",
     ]
     assert [name for name in passed.modules if name in expected] == expected
-    assert "swarm_loc_estimator.timeline.estimate.Estimate" in passed.containers
+    assert "swarm_loc_estimator.filter.measurements.Measurements" in passed.containers
     known = {module.name for module in house.product_modules()}
     assert known.issuperset(passed.modules)
 

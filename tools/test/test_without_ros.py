@@ -41,10 +41,7 @@ for file in sorted(pathlib.Path(package.__path__[0]).rglob("*.py")):
 @pytest.mark.parametrize(
     ("package", "modules"),
     [
-        (
-            "swarm_loc_estimator",
-            {"timeline.estimator", "cli.replay"},
-        ),
+        ("swarm_loc_estimator", {"timeline.estimator", "cli.replay"}),
         ("swarm_loc_drivers", {"sim.run", "sim.epuck.world"}),
         ("swarm_loc_vision", {"markers.detector"}),
     ],

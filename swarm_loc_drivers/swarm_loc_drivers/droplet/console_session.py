@@ -52,11 +52,7 @@ class ConsoleTalk:
     """
 
     def __init__(
-        self,
-        elements: int,
-        echo_timeout_ns: int,
-        on_said: Callable[[Said], None],
-        counts: Counter[str],
+        self, elements: int, echo_timeout_ns: int, on_said: Callable[[Said], None], counts: Counter[str]
     ) -> None:
         self._parser = protocol.ConsoleParser(elements)
         self._timeout_ns = echo_timeout_ns

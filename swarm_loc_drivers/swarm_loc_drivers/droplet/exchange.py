@@ -17,11 +17,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.droplet import protocol
 from swarm_loc_drivers.droplet.console_session import MARGIN_NS, ConsoleTalk, Talk, relay
-from swarm_loc_drivers.droplet.hardware import (
-    EMITTED_AFTER_NS,
-    PRINTED_AFTER_NS,
-    SET_POWER_DELAY_NS,
-)
+from swarm_loc_drivers.droplet.hardware import EMITTED_AFTER_NS, PRINTED_AFTER_NS, SET_POWER_DELAY_NS
 from swarm_loc_drivers.droplet.protocol import Matrix, Said, SendAborted
 
 _BRIGHTER = 1.5

@@ -59,11 +59,7 @@ class DropletParameters(DropletTraits):
         5, "count", 0, 4095, "a far matrix without a brighter reading shows no robot and is requested again"
     )
     turns: int = number(
-        0,
-        "1",
-        0,
-        10_000,
-        "with a cable at every Droplet: how many take turns to emit; 0: partners are asked",
+        0, "1", 0, 10_000, "with a cable at every Droplet: how many take turns to emit; 0: partners are asked"
     )
     turn: int = number(0, "1", 0, 9_999, "which turn is this one's, counted from 0")
     relayed: tuple[str, ...] = texts(

@@ -21,11 +21,7 @@ from swarm_loc_drivers.droplet.exchange import (
     brightness_of,
     publish_pair,
 )
-from swarm_loc_drivers.droplet.hardware import (
-    EMITTED_AFTER_NS,
-    PRINTED_AFTER_NS,
-    SET_POWER_DELAY_NS,
-)
+from swarm_loc_drivers.droplet.hardware import EMITTED_AFTER_NS, PRINTED_AFTER_NS, SET_POWER_DELAY_NS
 from swarm_loc_drivers.droplet.protocol import Matrix, Said
 
 _LATEST = 0.5  # Share of a half after which no emission begins, since it might end in the next half

@@ -61,12 +61,7 @@ class EventPackets:
                 )
 
     def _add(
-        self,
-        x: NDArray[np.uint8],
-        y: NDArray[np.uint8],
-        is_on: BoolArray,
-        stamps_ns: IntArray,
-        board_us: int,
+        self, x: NDArray[np.uint8], y: NDArray[np.uint8], is_on: BoolArray, stamps_ns: IntArray, board_us: int
     ) -> None:
         if self._waiting:
             since_ns = stamps_ns[-1] - self._waiting[0][3][0]

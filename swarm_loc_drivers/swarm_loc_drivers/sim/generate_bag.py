@@ -120,10 +120,7 @@ def _parser() -> argparse.ArgumentParser:
     images.set_defaults(write=_images)
     for one in (eight, images):
         one.add_argument(
-            "--world",
-            choices=sorted(WORLDS),
-            default="w0",
-            help="error model; see sim/worlds.py",
+            "--world", choices=sorted(WORLDS), default="w0", help="error model; see sim/worlds.py"
         )
         one.add_argument("--speed", type=number_in(0.001, 0.12, "m/s"), default=0.06, help="[m/s]")
         one.add_argument("--start-unknown", action="store_true", help="leave start poses out of swarm.yaml")
@@ -131,10 +128,7 @@ def _parser() -> argparse.ArgumentParser:
     droplets = _swarm(swarms, "droplets", "Droplets that measure each other by infrared", 20, 1000, 90.0)
     droplets.set_defaults(write=_droplets)
     droplets.add_argument(
-        "--world",
-        choices=sorted(DROPLET_WORLDS),
-        default="d1",
-        help="error model; see sim/droplet/world.py",
+        "--world", choices=sorted(DROPLET_WORLDS), default="d1", help="error model; see sim/droplet/world.py"
     )
     droplets.add_argument("--calibrated", action="store_true", help="write the elements' gains to swarm.yaml")
     droplets.add_argument("--start-known", action="store_true", help="write start poses to swarm.yaml")

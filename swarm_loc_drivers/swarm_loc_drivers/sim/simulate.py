@@ -52,6 +52,7 @@ def parse(arguments: Sequence[str] | None) -> SimulationOptions:
             default=default,
             help=f"{spec.doc} (default: {default:g})",
         )
+    # the environment, and how robots are seen
     parser.add_argument(
         "--plan",
         default=defaults.plan,

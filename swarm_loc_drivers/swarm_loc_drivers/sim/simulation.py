@@ -285,14 +285,7 @@ def _check_pushbots(swarm: Swarm) -> None:
         )
 
 
-EPUCK = RobotType(
-    "epuck",
-    _epuck_starts,
-    check_swarm,
-    _epuck_nodes,
-    ("w2", "w0", "w2fast"),
-    has_markers=True,
-)
+EPUCK = RobotType("epuck", _epuck_starts, check_swarm, _epuck_nodes, ("w2", "w0", "w2fast"), has_markers=True)
 ROBOT_TYPES = {
     one.name: one
     for one in (

@@ -30,9 +30,7 @@ def test_robots_are_located_by_what_their_cameras_see(tmp_path: Path) -> None:
     (tmp_path / "parameters.yaml").write_text(PARAMETERS, encoding="utf-8")
     (tmp_path / "links").mkdir()
     options = SimulationOptions(
-        str(tmp_path / "swarm.yaml"),
-        world="w0",
-        parameter_file=str(tmp_path / "parameters.yaml"),
+        str(tmp_path / "swarm.yaml"), world="w0", parameter_file=str(tmp_path / "parameters.yaml")
     )
     nodes = graph_of(options, swarm, str(tmp_path / "links"))
     truth: dict[int, np.ndarray[tuple[int], np.dtype[np.float64]]] = {}

@@ -63,8 +63,7 @@ class Desk:
         self.matrices: list[Brightness] = []
         self.velocity: dict[str, tuple[float, float, float]] = {}
         listeners = DropletListeners(
-            lambda name, state: self.states[name].append(state),
-            lambda _, one: self.matrices.append(one),
+            lambda name, state: self.states[name].append(state), lambda _, one: self.matrices.append(one)
         )
         self.driver = DropletDriver(params, listeners, clock)
         self.driver.start()

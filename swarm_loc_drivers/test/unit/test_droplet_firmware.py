@@ -17,13 +17,7 @@ from swarm_loc_drivers.droplet.hardware import (
     message_ns,
 )
 from swarm_loc_drivers.droplet.protocol import ConsoleParser, Matrix
-from swarm_loc_drivers.sim.droplet.firmware import (
-    DropletFirmware,
-    Print,
-    print_2014,
-    print_2016,
-    print_named,
-)
+from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print, print_2014, print_2016, print_named
 from swarm_loc_drivers.sim.droplet.world import STEP_NS, DropletWorld, SimulatedDroplet, nominal_gait
 
 

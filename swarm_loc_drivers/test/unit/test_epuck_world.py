@@ -181,10 +181,7 @@ def test_proximity_rises_before_walls_and_robots() -> None:
 
 @pytest.mark.parametrize(
     ("change", "said"),
-    [
-        ({"start": None}, "'epuck1' has no start pose"),
-        ({"camera": None}, "'epuck1' has no camera"),
-    ],
+    [({"start": None}, "'epuck1' has no start pose"), ({"camera": None}, "'epuck1' has no camera")],
 )
 def test_a_swarm_that_cannot_be_simulated_is_refused_in_one_sentence(
     change: dict[str, None], said: str

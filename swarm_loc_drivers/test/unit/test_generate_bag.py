@@ -98,12 +98,7 @@ def test_an_existing_bag_is_not_overwritten(bag: Path, capsys: pytest.CaptureFix
     ],
 )
 def test_a_value_out_of_range_is_refused(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    swarm: str,
-    option: str,
-    value: str,
-    limits: str,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], swarm: str, option: str, value: str, limits: str
 ) -> None:
     with pytest.raises(SystemExit):
         main([swarm, str(tmp_path / "bag"), option, value])

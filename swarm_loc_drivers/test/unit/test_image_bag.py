@@ -84,12 +84,7 @@ def test_a_detector_finds_the_landmarks_where_they_are() -> None:
         for marker_id, corners in zip(found.id.tolist(), found.corners, strict=True):
             if marker_id in marks:
                 mark = marks[marker_id]
-                expected = pixels_of(
-                    RobotCamera(robot, camera, CAMERA),
-                    camera,
-                    pose,
-                    square_of(mark),
-                )
+                expected = pixels_of(RobotCamera(robot, camera, CAMERA), camera, pose, square_of(mark))
                 errors += np.linalg.norm(corners - expected, axis=1).tolist()
     assert len(errors) > 4 * len(run.frames)
     assert np.median(errors) < 0.12

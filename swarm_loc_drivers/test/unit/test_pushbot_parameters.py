@@ -13,10 +13,7 @@ from bench.shared.parameter_table import markdown_table
 from swarm_loc_drivers.pushbot.parameters import ExplorationParameters, PushbotParameters
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlanError
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
-from swarm_loc_drivers.sim.pushbot.world import (
-    PushbotWorldParameters,
-    make_pushbot_world,
-)
+from swarm_loc_drivers.sim.pushbot.world import PushbotWorldParameters, make_pushbot_world
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_drivers.sim.worlds import WorldError
 from swarm_loc_estimator.common.parameters import ParameterError

@@ -183,11 +183,7 @@ def _edge(light: Image, start: FloatArray, end: FloatArray) -> FloatArray:
 
 
 @settings(max_examples=25)
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    model=st.sampled_from([SHARP, FISHY]),
-    tilt=st.floats(-0.15, 0.15),
-)
+@given(seed=st.integers(0, 2**32 - 1), model=st.sampled_from([SHARP, FISHY]), tilt=st.floats(-0.15, 0.15))
 def test_a_picture_shows_what_its_rays_meet(seed: int, model: CameraModel, tilt: float) -> None:
     """Walls, floor, markers, bodies and who hides whom, from anywhere in the arena, to all sides."""
     rng = np.random.default_rng(seed)

@@ -12,13 +12,7 @@ import pytest
 from swarm_loc_drivers.sim import simulate
 from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
 from swarm_loc_drivers.sim.epuck.parts import Unanswered
-from swarm_loc_drivers.sim.simulation import (
-    ROBOT_TYPES,
-    SimulationOptions,
-    graph_of,
-    placed,
-    simulated_swarm,
-)
+from swarm_loc_drivers.sim.simulation import ROBOT_TYPES, SimulationOptions, graph_of, placed, simulated_swarm
 from swarm_loc_drivers.sim.worlds import WORLDS, WorldError
 from swarm_loc_estimator.cli import new
 from swarm_loc_estimator.common.parameters import ParameterError, parameter_specs

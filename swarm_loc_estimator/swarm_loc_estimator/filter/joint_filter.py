@@ -229,11 +229,7 @@ def _gather(
 
 @cached_njit
 def update_one(
-    covariance: FloatArray,
-    columns: IntArray,
-    jacobian: FloatArray,
-    innovation: FloatArray,
-    noise: FloatArray,
+    covariance: FloatArray, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Fuse one measurement: update the covariance (n, n) in place, return correction (n,) and gain (3, n).
 

@@ -93,13 +93,7 @@ def learn(belief: BeliefArrays, robot: int, pose: FloatArray, stamp_ns: int) -> 
 
 
 @cached_njit
-def _add_evidence(
-    belief: BeliefArrays,
-    robot: int,
-    window: int,
-    pose: FloatArray,
-    since_s: float,
-) -> None:
+def _add_evidence(belief: BeliefArrays, robot: int, window: int, pose: FloatArray, since_s: float) -> None:
     """Add the likelihood of a window that ends at a pose (3,) to those before."""
     state = belief.integrity
     now, begin = belief.transform[robot], state.drift_transform[robot, window]

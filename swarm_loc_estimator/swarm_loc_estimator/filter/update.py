@@ -31,12 +31,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.numerics import assign, assign_matrix
-from swarm_loc_estimator.filter.correlated_noise import (
-    count_repeated,
-    inflate_fix,
-    record_pair,
-    use_mean,
-)
+from swarm_loc_estimator.filter.correlated_noise import count_repeated, inflate_fix, record_pair, use_mean
 from swarm_loc_estimator.filter.integrity import (
     LossLimits,
     add_noise_inflation,
@@ -391,13 +386,7 @@ def related_columns(measurements: Measurements, belief: BeliefArrays) -> IntArra
 
 
 @inlined_njit
-def _evaluate(
-    measurements: Measurements,
-    k: int,
-    belief: BeliefArrays,
-    work: Innovations,
-    row: int,
-) -> None:
+def _evaluate(measurements: Measurements, k: int, belief: BeliefArrays, work: Innovations, row: int) -> None:
     """Linearize measurement k about the belief and gate it: stages 2 and 3; write the row of `work`."""
     columns, jacobian, innovation = work.columns[row], work.jacobian[row], work.innovation[row]
     pose, motion, noise = work.pose[row], work.motion[row], work.noise[row]

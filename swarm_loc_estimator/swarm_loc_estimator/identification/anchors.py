@@ -97,12 +97,7 @@ def _rice(
 
 
 def tracks_of(
-    anchors: Anchors,
-    rows: IntArray,
-    picture: Picture,
-    places: IntArray,
-    point: TrackPoint,
-    scale: Scale,
+    anchors: Anchors, rows: IntArray, picture: Picture, places: IntArray, point: TrackPoint, scale: Scale
 ) -> Tracks:
     """The tracks (k,) that pairs of an anchor (of rows) and a detection (of places) give.
 

@@ -243,12 +243,7 @@ class Chains:
         return math.log1p(-self.model.detection_probability) - _NEGLIGIBLE
 
     def _normalised(
-        self,
-        picture: Picture,
-        point: TrackPoint,
-        stamp_ns: int,
-        tracks: list[Tracks],
-        anchors: list[Anchors],
+        self, picture: Picture, point: TrackPoint, stamp_ns: int, tracks: list[Tracks], anchors: list[Anchors]
     ) -> Chains:
         """The chains that are kept, normalised to a total probability of one."""
         entering = self.model.entering if self.images else 1.0 - self.model.absent

@@ -177,11 +177,7 @@ def spread_at(spread: FloatArray, x: float, y: float) -> tuple[float, float, flo
 
 @cached_njit
 def _describe(
-    one: Measurements,
-    camera: FloatArray,
-    waiting: Waiting,
-    other: OtherSide,
-    constraints: ConstraintArray,
+    one: Measurements, camera: FloatArray, waiting: Waiting, other: OtherSide, constraints: ConstraintArray
 ) -> None:
     """Write the constraint (1,) of a row of measurements, see `with_constraint`."""
     constraint = constraints[0]

@@ -41,13 +41,7 @@ from swarm_loc_estimator.initialization.alignment import (
     refreshed,
     with_constraint,
 )
-from swarm_loc_estimator.initialization.window import (
-    NO_WINDOW,
-    Window,
-    is_redundant,
-    locate,
-    with_row,
-)
+from swarm_loc_estimator.initialization.window import NO_WINDOW, Window, is_redundant, locate, with_row
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW

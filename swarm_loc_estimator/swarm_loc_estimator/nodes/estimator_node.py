@@ -237,6 +237,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
 
     def _make_reports(self, cost: TickCost, elapsed_s: float) -> list[Report]:
         """One report per robot and one for the estimator; warnings are logged."""
+        # Load, and what was left out or dropped.
         load = load_report(
             cost, elapsed_s, self.params.tick_period_s, self._estimator.settings.fusion_period_s
         )
@@ -248,6 +249,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self.health.warn_of_drops({k: n for k, n in drops.items() if k not in _ORDINARY_DROPS})
         if self._estimate is None:
             return [merged(causes, "estimator")]
+        # Robots, with faults and identities.
         now_ns = self._time_ns()
         own = [self._estimator.drops_of(source) for source in range(len(self._swarm.sources))]
         losses = [self._estimator.loss_of(robot) for robot in range(len(self._swarm.robots))]
@@ -256,6 +258,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         contradictions = self._estimator.contradictions(now_ns)
         add_contradictions(reports, contradictions)
         add_identities(reports, self._estimator.identities)
+        # The estimator as a whole.
         *robots, whole = reports
         frames = {"frame": self._frame, "frame moves": self._estimator.frame_moves}
         whole.values |= {"time jumps": self._estimator.time_jumps, **frames, **self._estimator.counters}

@@ -353,7 +353,8 @@ def integrate(tracks: TrackArrays, oldest_ns: int, rows: NewRows, changed_from_n
         tracks.stamp_ns[robot, row] = stamps_ns[k]
         assign(tracks.raw[robot, row], raw[k])
         assign(tracks.twist[robot, row], twist[k])
-        if row == 0:  # a track starts at the reported pose
+        # A track starts at the reported pose.
+        if row == 0:
             assign(tracks.pose[robot, 0], raw[k])
             tracks.covariance[robot, 0].fill(0.0)
             tracks.jacobian[robot, 0].fill(0.0)

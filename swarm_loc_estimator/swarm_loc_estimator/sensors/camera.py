@@ -239,11 +239,7 @@ class Markers(NamedTuple):
 
 @cached_njit
 def convert_all(
-    detections: NDArray[np.void],
-    cameras: Cameras,
-    markers: Markers,
-    out: Measurements,
-    outcomes: IntArray,
+    detections: NDArray[np.void], cameras: Cameras, markers: Markers, out: Measurements, outcomes: IntArray
 ) -> None:
     """Fill the measurements (d,) except stamps and observers, and write their outcomes (d,)."""
     for k in range(outcomes.size):
@@ -306,12 +302,7 @@ def _measure_upright(detections: NDArray[np.void], k: int, cameras: Cameras, out
 
 @cached_njit
 def _measure_lying(
-    detections: NDArray[np.void],
-    k: int,
-    cameras: Cameras,
-    markers: Markers,
-    place: int,
-    out: Measurements,
+    detections: NDArray[np.void], k: int, cameras: Cameras, markers: Markers, place: int, out: Measurements
 ) -> int:
     """Write value and covariance of measurement k of a lying marker; return its outcome."""
     camera = out.observer[k]

@@ -17,13 +17,7 @@ from swarm_loc_estimator.common.messages.poses import decode_fix
 from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import Measurements, select
 from swarm_loc_estimator.filter.models import CARTESIAN, MODELS
-from swarm_loc_estimator.sensors.sensor import (
-    NO_ROWS,
-    DropCounts,
-    Sensor,
-    SensorSettings,
-    SharedTopic,
-)
+from swarm_loc_estimator.sensors.sensor import NO_ROWS, DropCounts, Sensor, SensorSettings, SharedTopic
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 HEADING_UNKNOWN = math.pi**2
@@ -67,11 +61,7 @@ def _shared_rows(message: SharedMessage, arrival_ns: IntArray) -> FixRows:
 
 
 def about_robots(
-    robots: IntArray | int,
-    stamps_ns: IntArray | int,
-    poses: FloatArray,
-    covariances: FloatArray,
-    model: int,
+    robots: IntArray | int, stamps_ns: IntArray | int, poses: FloatArray, covariances: FloatArray, model: int
 ) -> Measurements:
     """Absolute measurements (m,) of poses (m, 3) in `map` with covariances (m, 3, 3)."""
     out = Measurements.empty(len(poses))

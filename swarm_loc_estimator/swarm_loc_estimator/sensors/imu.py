@@ -75,10 +75,7 @@ class TurnRateSensor(Sensor):
     def measure(self, rows: TurnRateRows) -> TurnRateRows:
         """Select finite turn rates of robots with an IMU, turned to the vertical."""
         rows = rows._replace(rate=np.sum(self._vertical[rows.robot] * rows.velocity, axis=1))
-        reasons = {
-            "imu_non_finite": ~np.isfinite(rows.rate),
-            "imu_absurd": ~(np.abs(rows.rate) <= _MAX_RATE),
-        }
+        reasons = {"imu_non_finite": ~np.isfinite(rows.rate), "imu_absurd": ~(np.abs(rows.rate) <= _MAX_RATE)}
         good = self.drops.screen(rows.robot, reasons)
         return rows if good.all() else select(rows, good)
 

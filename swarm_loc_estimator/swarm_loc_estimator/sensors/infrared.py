@@ -23,13 +23,7 @@ from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, Measurement
 from swarm_loc_estimator.filter.models import MODELS, POLAR
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.search import IrOutcome, IrSolutions
-from swarm_loc_estimator.sensors.sensor import (
-    NO_ROWS,
-    REJECT_REASONS,
-    Change,
-    Sensor,
-    reject_reasons,
-)
+from swarm_loc_estimator.sensors.sensor import NO_ROWS, REJECT_REASONS, Change, Sensor, reject_reasons
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, PairGains, RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 

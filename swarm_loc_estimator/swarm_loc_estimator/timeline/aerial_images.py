@@ -18,13 +18,7 @@ from swarm_loc_estimator.filter.measurements import LossReason, Measurements, se
 from swarm_loc_estimator.filter.models import CARTESIAN, gate_threshold
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.identification.anchors import Scale
-from swarm_loc_estimator.identification.assignment import (
-    AMBIGUOUS,
-    UNSEEN,
-    Assignment,
-    assign,
-    log_ratios,
-)
+from swarm_loc_estimator.identification.assignment import AMBIGUOUS, UNSEEN, Assignment, assign, log_ratios
 from swarm_loc_estimator.identification.chain import ChainModel, Chains, Identity
 from swarm_loc_estimator.identification.memory import Identities, IdentityMemory, Outcome
 from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gathered_between

@@ -213,9 +213,7 @@ class Estimator:
     @property
     def counters(self) -> dict[str, int]:
         """Numbers of used data by name, and of losses of robots by reason, since the last reset."""
-        others = {
-            "constraints kept": int(self._timeline.verdict_counts()[Verdict.CONSTRAINT]),
-        }
+        others = {"constraints kept": int(self._timeline.verdict_counts()[Verdict.CONSTRAINT])}
         for accumulator in self._converter.accumulators.values():
             others |= accumulator.counters
         if images := self._timeline.state.images:
@@ -295,11 +293,7 @@ class Estimator:
         return self._estimate(now_ns)
 
     def step(
-        self,
-        now_s: float | None = None,
-        *,
-        now_ns: int | None = None,
-        **readings: Mapping[str, Any],
+        self, now_s: float | None = None, *, now_ns: int | None = None, **readings: Mapping[str, Any]
     ) -> Step:
         """Take readings as columns and return the estimate at an instant, for scripts and notebooks.
 

@@ -10,11 +10,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.correlated_noise import (
-    at_initialization,
-    record_constraint,
-    without_repeats,
-)
+from swarm_loc_estimator.filter.correlated_noise import at_initialization, record_constraint, without_repeats
 from swarm_loc_estimator.filter.integrity import WELL_CONFIRMED, LossLimits, is_kidnapped
 from swarm_loc_estimator.filter.joint_filter import JointFilter, Robots
 from swarm_loc_estimator.filter.measurements import (
@@ -25,14 +21,7 @@ from swarm_loc_estimator.filter.measurements import (
     Verdict,
     select,
 )
-from swarm_loc_estimator.filter.models import (
-    ANONYMOUS,
-    CARTESIAN,
-    MODELS,
-    SCAN,
-    is_compiled,
-    locates_alone,
-)
+from swarm_loc_estimator.filter.models import ANONYMOUS, CARTESIAN, MODELS, SCAN, is_compiled, locates_alone
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.filter.state import IN_MAP, InitialPose, Meetings, SwarmState, correct
 from swarm_loc_estimator.filter.update import (

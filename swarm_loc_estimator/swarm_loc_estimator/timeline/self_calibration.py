@@ -84,9 +84,7 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
         imu=replace(robot.imu, **(turning if robot.imu.is_used else {})),
         camera=camera
         and replace(
-            camera,
-            yaw=float(se2.wrap_angle(camera.yaw + value[CAMERA_YAW])),
-            yaw_sigma=sigma[CAMERA_YAW],
+            camera, yaw=float(se2.wrap_angle(camera.yaw + value[CAMERA_YAW])), yaw_sigma=sigma[CAMERA_YAW]
         ),
         sensor=replace(
             with_noise_inflation(sensor, float(state.integrity.noise_inflation[index])),

@@ -24,13 +24,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.numerics import assign, assign_matrix
-from swarm_loc_estimator.filter.measurements import (
-    Command,
-    Measurements,
-    Verdict,
-    concatenate,
-    select,
-)
+from swarm_loc_estimator.filter.measurements import Command, Measurements, Verdict, concatenate, select
 from swarm_loc_estimator.filter.models import ANONYMOUS
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.timeline.settings import Settings

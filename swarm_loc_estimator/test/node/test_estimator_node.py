@@ -253,11 +253,7 @@ def test_drops_are_warned_of_once_in_a_while_and_ordinary_ones_never(ros: Ros, s
     ):
         estimator.drops = drops
         node._make_reports(TickCost(), 1.0)
-    assert lines == [
-        "dropped so far: 3 absurd",
-        "dropped so far: 40 non_finite",
-        "dropped so far: 5 absurd",
-    ]
+    assert lines == ["dropped so far: 3 absurd", "dropped so far: 40 non_finite", "dropped so far: 5 absurd"]
 
 
 def test_diagnostics_name_what_is_missing_and_why(ros: Ros, swarm_file: Any) -> None:

@@ -46,10 +46,7 @@ def test_a_bad_parameter_ends_the_node_with_one_sentence(
     ("robot", "sentence"),
     [
         ("  robot{}: {{}}", "robots names 10000 robots but must name at most 5000."),
-        (
-            LONG_ROBOT,
-            "has more than the 2000000 bytes that are allowed.",
-        ),
+        (LONG_ROBOT, "has more than the 2000000 bytes that are allowed."),
     ],
     ids=["short", "long"],
 )
@@ -101,8 +98,7 @@ def test_parameters_describe_themselves_and_cannot_be_changed_while_active(node:
 
 
 @pytest.mark.parametrize(
-    ("number", "sign"),
-    [(signal.SIGINT, "no messages received on alpha/odom"), (signal.SIGTERM, "ready")],
+    ("number", "sign"), [(signal.SIGINT, "no messages received on alpha/odom"), (signal.SIGTERM, "ready")]
 )
 def test_a_signal_ends_the_node_cleanly(
     tmp_path: Path, swarm_file: Path, number: signal.Signals, sign: str

@@ -23,9 +23,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
 from bench.shared.bags import SharedHead, encode_shared_detections, encode_shared_numbers
-from swarm_loc_estimator.common.messages.detections import (
-    swarm_key,
-)
+from swarm_loc_estimator.common.messages.detections import swarm_key
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_msgs.msg import SwarmDetections, SwarmOdometry, SwarmPoses
 

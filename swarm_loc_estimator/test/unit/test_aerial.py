@@ -24,10 +24,7 @@ Arrival = tuple[int, Event]
 
 
 def run(
-    world: World,
-    arrivals: Sequence[Arrival],
-    period_s: float = 0.25,
-    settings: Settings | None = None,
+    world: World, arrivals: Sequence[Arrival], period_s: float = 0.25, settings: Settings | None = None
 ) -> tuple[Estimator, list[Estimate]]:
     estimator = Estimator(world.swarm, settings)
     last_ns = max(arrival_ns for arrival_ns, _ in arrivals)

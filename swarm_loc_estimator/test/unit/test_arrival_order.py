@@ -372,10 +372,7 @@ def test_a_clock_that_wobbles_neither_resets_nor_breaks() -> None:
 @pytest.mark.parametrize("sparse_from", [2, 250])
 def test_the_same_data_give_the_same_bytes(sparse_from: int, lasting: float) -> None:
     plan = Plan(3, 3.0, flips=0.1, content=POSE_TWO, lasting=lasting, survey=lasting)
-    world, chosen = (
-        simulate(plan, 3),
-        Settings(sparse_from=sparse_from),
-    )
+    world, chosen = (simulate(plan, 3), Settings(sparse_from=sparse_from))
     a, b = (outcome(world, on_time(world), ticks(T0, T0 + 3 * SECOND), chosen).estimate for _ in range(2))
     assert a.poses.tobytes() == b.poses.tobytes()
     assert a.covariances.tobytes() == b.covariances.tobytes()

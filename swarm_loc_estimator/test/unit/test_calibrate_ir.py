@@ -265,11 +265,7 @@ def test_a_saturation_that_is_lower_than_described_is_told_where_gains_fail_by_i
     ],
 )
 def test_what_cannot_be_written_is_said_before_the_work(
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    out: str,
-    words: str,
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, out: str, words: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "bag" / "x.yaml").mkdir(parents=True)

@@ -11,10 +11,7 @@ from ir_world import random_poses
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import Exchanges
-from swarm_loc_estimator.offline.calibration.infrared.elements import (
-    ElementVerdicts,
-    find_dead_elements,
-)
+from swarm_loc_estimator.offline.calibration.infrared.elements import ElementVerdicts, find_dead_elements
 from swarm_loc_estimator.swarm.ir_board import PairGains, load_ir_platform
 
 PLATFORM = load_ir_platform("droplet_2016")

@@ -224,10 +224,7 @@ def test_a_detector_that_falls_silent_is_named_as_soon_as_its_period_allows(
     world, last_ns = World(), round(3 * period_s * SECOND)
     for k in range(4):
         world.detections(round(k * period_s * SECOND))
-    for late_s, message in (
-        (-0.1, "tracked"),
-        (0.1, f"a/detections is silent for {patience_s + 0.1:.1f} s"),
-    ):
+    for late_s, message in ((-0.1, "tracked"), (0.1, f"a/detections is silent for {patience_s + 0.1:.1f} s")):
         now_ns = last_ns + round((patience_s + late_s) * SECOND)
         world.odometry("a", now_ns, now_ns)
         status = estimate(now_ns, Status.TRACKED, Status.TRACKED)

@@ -125,8 +125,7 @@ def test_the_bag_holds_the_truth_however_the_image_is_turned(tmp_path: Path, mir
     if mirrored:
         ones = [
             replace(
-                one,
-                sightings=tuple(replace(s, y=-s.y, orientation=-s.orientation) for s in one.sightings),
+                one, sightings=tuple(replace(s, y=-s.y, orientation=-s.orientation) for s in one.sightings)
             )
             for one in ones
         ]

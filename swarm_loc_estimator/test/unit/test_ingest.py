@@ -221,13 +221,7 @@ def test_each_topic_is_read_and_counted_and_malformed_ones_go_no_further() -> No
     (read,) = ingest.read(batch_of(messages, [odom, odom, odom, seen], [14, 30, 40, 50]))
 
     driven = [column.tolist() for column in read["odometry"]]
-    assert driven == [
-        [1, 1],
-        [10, 20],
-        [[*pose], [*pose]],
-        [[*TWIST], [*TWIST]],
-        [14, 30],
-    ]
+    assert driven == [[1, 1], [10, 20], [[*pose], [*pose]], [[*TWIST], [*TWIST]], [14, 30]]
     assert read["detections"].detection["id"].tolist() == [7, 8]
     assert [read["detections"].robot.tolist(), read["detections"].stamp_ns.tolist()] == [[0, 0], [15, 15]]
     assert read["detections"].arrival_ns.tolist() == [50, 50]

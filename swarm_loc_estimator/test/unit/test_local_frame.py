@@ -134,11 +134,7 @@ def test_a_move_has_the_covariance_of_sampled_errors() -> None:
     rng = np.random.default_rng(0)
     state = SwarmState(ParameterTable.of([Robot(f"r{i}") for i in range(4)]))
     for robot in range(3):
-        state.initialize(
-            robot,
-            InitialPose(rng.normal(0.0, 1.0, 3), np.eye(3)),
-            Preintegrated.begin(T0),
-        )
+        state.initialize(robot, InitialPose(rng.normal(0.0, 1.0, 3), np.eye(3)), Preintegrated.begin(T0))
     root = 1e-3 * rng.standard_normal((9, 9))
     state.filter.covariance[:9, :9] = root @ root.T
     transforms, joint = state.transform[:3].copy(), state.filter.covariance[:9, :9].copy()

@@ -98,10 +98,7 @@ def beam_at(found: Scans, change: FloatArray, beam: int) -> tuple[int, float, fl
 
 
 @settings(max_examples=25, deadline=None)
-@given(
-    change=st.lists(st.floats(-0.02, 0.02), min_size=8, max_size=8),
-    beam=st.integers(0, len(TURN) - 1),
-)
+@given(change=st.lists(st.floats(-0.02, 0.02), min_size=8, max_size=8), beam=st.integers(0, len(TURN) - 1))
 def test_jacobians_are_those_of_finite_differences(change: list[float], beam: int) -> None:
     found, here, step = scans(), np.array(change), 1e-6
     fate, line, residual, variance = beam_at(found, here, beam)

@@ -15,10 +15,7 @@ import pytest
 from compiled_code import compiled_since, printed_by_process, signatures
 
 from bench.shared.bags import SharedHead, encode_shared_detections, encode_shared_numbers
-from swarm_loc_estimator.common.messages.detections import (
-    DETECTION_DTYPE,
-    swarm_key,
-)
+from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, swarm_key
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.nodes.load import Thinning
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
@@ -96,12 +93,7 @@ def compiled_late(size: Size) -> list[str]:
 
 
 def run(
-    bag: Path,
-    settings: Settings,
-    *,
-    late: bool = False,
-    moved_landmarks: bool = False,
-    relayed: bool = False,
+    bag: Path, settings: Settings, *, late: bool = False, moved_landmarks: bool = False, relayed: bool = False
 ) -> None:
     """Estimate the beginning of a bag as the node does.
 

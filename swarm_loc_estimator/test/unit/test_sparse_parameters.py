@@ -17,12 +17,7 @@ from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.filter.update import related_columns
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.swarm.calibration_states import (
-    CAMERA_SCALE,
-    CAMERA_YAW,
-    DRIVES,
-    ParameterTable,
-)
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW, DRIVES, ParameterTable
 from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Landmark, Robot
 

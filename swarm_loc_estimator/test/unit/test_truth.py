@@ -170,10 +170,7 @@ def ros1_odometry() -> bytes:
 
 @pytest.mark.parametrize(
     ("schema", "encoding", "data"),
-    [
-        ("nav_msgs/Odometry", "ros1", ros1_odometry()),
-        (ODOMETRY, "json", b'{"header": {"frame_id": "odom"}}'),
-    ],
+    [("nav_msgs/Odometry", "ros1", ros1_odometry()), (ODOMETRY, "json", b'{"header": {"frame_id": "odom"}}')],
     ids=["ros1", "json"],
 )
 def test_a_bag_of_ros_1_or_json_fails_and_says_so(

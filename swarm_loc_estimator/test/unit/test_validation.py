@@ -199,9 +199,7 @@ def test_precise_sightings_during_a_silence_keep_the_covariance_positive(turn_ra
 def test_poses_before_the_newest_measurement_have_sound_covariances(state_period_s: float) -> None:
     run = simulate(Plan(2, 4.0, speed=0.5), 2)
     for estimate in play(
-        Estimator(run.swarm, Settings(state_period_s=state_period_s)),
-        on_time(run),
-        ticks(T0, END, 0.05),
+        Estimator(run.swarm, Settings(state_period_s=state_period_s)), on_time(run), ticks(T0, END, 0.05)
     ):
         assert_sound(estimate)
 

@@ -200,16 +200,7 @@ def head(
     return f"{lines[0]} {lines[-1]}"
 
 
-@pytest.mark.parametrize(
-    "host",
-    [
-        b"[::1].evil.com",
-        b"evil.com\\@127.0.0.1",
-        b"evil.com",
-        b"\xff\xfe",
-        b"",
-    ],
-)
+@pytest.mark.parametrize("host", [b"[::1].evil.com", b"evil.com\\@127.0.0.1", b"evil.com", b"\xff\xfe", b""])
 def test_foreign_host_headers_are_refused(
     server: WatchServer, caplog: pytest.LogCaptureFixture, host: bytes
 ) -> None:

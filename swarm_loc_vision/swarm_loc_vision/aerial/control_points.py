@@ -10,13 +10,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.aerial.ground_camera import (
-    POSE_SIZE,
-    GroundCamera,
-    pose_slopes,
-    projected,
-    rotation_of,
-)
+from swarm_loc_vision.aerial.ground_camera import POSE_SIZE, GroundCamera, pose_slopes, projected, rotation_of
 from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.common.camera import Camera
 

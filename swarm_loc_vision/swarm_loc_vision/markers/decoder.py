@@ -132,13 +132,7 @@ def correctable_bits(words: int, bits: int) -> int:
 
 
 @cached_njit
-def _read(
-    cells: FloatArray,
-    words: Words,
-    places: _Places,
-    rules: _Rules,
-    readings: Readings,
-) -> None:
+def _read(cells: FloatArray, words: Words, places: _Places, rules: _Rules, readings: Readings) -> None:
     """Decode each candidate into the readings."""
     word, quarters, errors, margin, contrast = readings
     area, count = cells.shape[1] - 2, len(places.data)

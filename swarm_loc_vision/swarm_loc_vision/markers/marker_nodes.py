@@ -56,10 +56,7 @@ class MarkerNode(CameraNode[Markers]):
 
     def figures(self) -> dict[str, str]:
         """Numbers of markers."""
-        return {
-            "markers": str(self._camera.markers),
-            "markers that fit no square": str(self._camera.misfits),
-        }
+        return {"markers": str(self._camera.markers), "markers that fit no square": str(self._camera.misfits)}
 
     def trouble(self) -> str:
         """A warning if many markers since the last call do not fit a square."""

@@ -92,9 +92,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--board", type=_grid, metavar="COLUMNSxROWS", help="add a grid of markers")
     parser.add_argument(
-        "--size",
-        type=number_in(0.005, 1.0, "m"),
-        help=f"side of those markers (default: {_BOARD_SIDE_M} m)",
+        "--size", type=number_in(0.005, 1.0, "m"), help=f"side of those markers (default: {_BOARD_SIDE_M} m)"
     )
     parser.add_argument(
         "--first-id",

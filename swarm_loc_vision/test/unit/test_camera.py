@@ -97,10 +97,7 @@ def test_what_a_fisheye_sees_far_off_its_axis_has_no_ideal_pixel(distortion: tup
     [
         ({"fx": 0.0}, "not calibrated: its focal lengths are 0 and 990 px"),
         ({"cx": float("nan")}, r"cx is nan, but must lie in \[-1e\+06, 1e\+06\]"),
-        (
-            {"distortion": (0.0, float("inf"), 0.0, 0.0)},
-            "distortion coefficient 1 is inf, but must lie in",
-        ),
+        ({"distortion": (0.0, float("inf"), 0.0, 0.0)}, "distortion coefficient 1 is inf, but must lie in"),
         ({"fy": float("nan")}, "focal lengths are 1000 and nan px, but must lie in"),
         ({"width": 0}, "0 x 960 pixels, but must have at least 1 x 1"),
         ({"fx": 1e300}, r"focal lengths are 1e\+300 and 990 px, but must lie in \(0, 1e\+06\] px"),

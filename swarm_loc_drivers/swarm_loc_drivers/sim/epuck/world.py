@@ -258,11 +258,7 @@ class EpuckWorldParameters:
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
     )
     answer_within: float = number(
-        0.0,
-        "s",
-        0.0,
-        10.0,
-        "simulated time waits for <robot>/detections of images older than this; 0: never",
+        0.0, "s", 0.0, 10.0, "simulated time waits for <robot>/detections of images older than this; 0: never"
     )
     link_folder: str = text(
         "", "where each robot's serial port appears under its name; empty: robots on WiFi"

@@ -61,11 +61,7 @@ class KinematicPushBot:
     """
 
     def __init__(
-        self,
-        plan: FloorPlan,
-        pose: FloatArray,
-        noise: PushBotNoise,
-        rng: np.random.Generator,
+        self, plan: FloorPlan, pose: FloatArray, noise: PushBotNoise, rng: np.random.Generator
     ) -> None:
         self._plan = plan
         self._noise = noise

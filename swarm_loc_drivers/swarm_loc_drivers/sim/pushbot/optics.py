@@ -141,11 +141,7 @@ class HallSight:
     """
 
     def __init__(
-        self,
-        walls: FloatArray,
-        built: Sequence[LaserOptics],
-        noise: CameraNoise,
-        rng: np.random.Generator,
+        self, walls: FloatArray, built: Sequence[LaserOptics], noise: CameraNoise, rng: np.random.Generator
     ) -> None:
         self._walls = walls
         self._optics = built

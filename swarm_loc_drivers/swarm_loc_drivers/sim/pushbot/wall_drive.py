@@ -9,12 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraNoise, EventCamera, Spot
-from swarm_loc_drivers.sim.pushbot.optics import (
-    CAMERA_X_M,
-    LaserOptics,
-    assembled_robots,
-    spot_brightness,
-)
+from swarm_loc_drivers.sim.pushbot.optics import CAMERA_X_M, LaserOptics, assembled_robots, spot_brightness
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.event_encoding import Events
 from swarm_loc_vision.events.parameters import LightSource, TrackerSettings

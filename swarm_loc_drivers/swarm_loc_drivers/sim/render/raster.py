@@ -220,12 +220,7 @@ def project(lens: FloatArray, x: float, y: float) -> tuple[float, float]:
 
 @cached_njit
 def _add_boundary(
-    changes: Changes,
-    lens: FloatArray,
-    start: FloatArray,
-    end: FloatArray,
-    change: float,
-    box: FloatArray,
+    changes: Changes, lens: FloatArray, start: FloatArray, end: FloatArray, change: float, box: FloatArray
 ) -> None:
     """The image changes by `change` to the left of the line from `start` to `end`, seen in the image.
 

@@ -93,11 +93,7 @@ def _faces(swarm: Swarm, truth: HiddenGeometry, family: Family) -> list[list[Pat
 
 
 def _scene(
-    swarm: Swarm,
-    truth: HiddenGeometry,
-    arena: Arena,
-    faces: list[list[Patches]],
-    rng: np.random.Generator,
+    swarm: Swarm, truth: HiddenGeometry, arena: Arena, faces: list[list[Patches]], rng: np.random.Generator
 ) -> Scene:
     boards = [
         _board(pose, mark, arena.family)

@@ -78,9 +78,7 @@ def starts(settings: DropletRunSettings) -> FloatArray:
 
 
 def describe_droplets(
-    settings: DropletRunSettings,
-    start: FloatArray,
-    gains: Sequence[IrGains] = (),
+    settings: DropletRunSettings, start: FloatArray, gains: Sequence[IrGains] = ()
 ) -> Swarm:
     """The swarm description.
 

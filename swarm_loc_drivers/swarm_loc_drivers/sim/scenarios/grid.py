@@ -16,12 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from swarm_loc_drivers.sim.differential_drive import Controller, Drive, record_drive
-from swarm_loc_drivers.sim.run import (
-    SIGHTING_DTYPE,
-    Records,
-    SimulatedRun,
-    Trajectories,
-)
+from swarm_loc_drivers.sim.run import SIGHTING_DTYPE, Records, SimulatedRun, Trajectories
 from swarm_loc_drivers.sim.sightings import Exposures, View, deliver, schedule_exposures
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray

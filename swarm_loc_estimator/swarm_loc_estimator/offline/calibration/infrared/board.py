@@ -386,13 +386,7 @@ def with_board(swarm: Swarm, board: BoardRecording, done: BoardCalibration, path
         if done.with_gains and np.any(factors != 1.0):
             ones = (1.0,) * board.platform.n
             gains = IrGains(tuple(np.clip(factors, 0.05, 20.0).round(4).tolist()), ones, GAIN_SIGMA)
-        found = RobotIr(
-            ir.id,
-            done.model.platform,
-            str(path.resolve()),
-            gains,
-            *done.elements.numbers(place),
-        )
+        found = RobotIr(ir.id, done.model.platform, str(path.resolve()), gains, *done.elements.numbers(place))
         robots[index] = replace(robots[index], ir=replace(found, gate_probability=ir.gate_probability))
     return replace(swarm, robots=tuple(robots))
 
