@@ -41,7 +41,9 @@ FOR_SWEEPS = {"distributed", "optuna", "ray"}
 PIP_NAMES = {"python3-pil": "pillow"}  # What pip calls packages in which rosdep's name is another one
 LOADED_BY_NAME = {"swarm_loc_estimator": {"event_camera_msgs", "sensor_msgs"}}
 """Packages that `message_class` imports."""
-HERE = {"_typeshed", "bench", "workspace"} | {path.stem for path in ROOT.glob("swarm_loc_*/test/**/*.py")}
+HERE = {"_typeshed", "bench", "workspace"} | {
+    path.stem for folder in ("test", "examples") for path in ROOT.glob(f"swarm_loc_*/{folder}/**/*.py")
+}
 """Of the type checker, or of this workspace and in none of its packages."""
 
 

@@ -23,11 +23,11 @@ LIMITS = {
 }
 PATH_LIMITS = {
     # Kind of message: modules, containers
-    "detection": (30, 15),
-    "odometry": (25, 14),
-    "range": (31, 16),
-    "scan": (35, 19),
-    "brightness": (37, 31),
+    "detection": (22, 6),
+    "odometry": (18, 8),
+    "range": (23, 7),
+    "scan": (26, 11),
+    "brightness": (27, 21),
 }
 ORDER = (
     *("common", "swarm", "odometry", "identification", "filter", "initialization", "infrared", "mapping"),
