@@ -151,7 +151,7 @@ class CommandKind(IntEnum):
 
 
 class Command(NamedTuple):
-    """A command of a user, executed at its stamp before the measurements of that instant."""
+    """A command of a user, executed at its stamp, after the measurements of that instant."""
 
     stamp_ns: int
     kind: CommandKind

@@ -14,8 +14,8 @@ With right-invariant errors X = exp(xi) X_hat the chain depends on xi_target - x
 Jacobian (3 x 3) serves both robots, with opposite signs. Two more columns are for the camera's yaw offset
 and scale error, see CAMERA_YAW and CAMERA_SCALE of swarm/calibration_states.py.
 
-An innovation is gated by its Mahalanobis distance. The heading is not gated but down-weighted: the planar
-ambiguity of a square marker flips it in otherwise good sightings.
+An innovation is gated by its Mahalanobis distance. The heading of a marker is not gated but down-weighted:
+the planar ambiguity of a square marker flips it in otherwise good sightings.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ POSE_GATE = float(gate_threshold(0.9999, 3))
 CARTESIAN, POLAR = 0, 1  # Models of a marker's position; with a heading, of its pose
 ANONYMOUS, SCAN = 2, 3  # Positions of unknown robots, and lidar scans: they become fixes when they are fused
 COMPILED = (CARTESIAN, POLAR)
-"""Models whose measurements compiled code evaluates; the others are links, evaluated by their records."""
+"""Models with compiled kernels. Others are links, evaluated by their records, or become fixes."""
 
 
 class Prediction(NamedTuple):
@@ -353,9 +353,9 @@ def squared_distance(innovation: FloatArray, covariance: FloatArray) -> float:
 def position_distance(
     innovation: FloatArray, covariance: FloatArray, more: tuple[float, float] = (0.0, 0.0)
 ) -> float:
-    """Squared Mahalanobis distance of the first two components, the only ones that are gated.
+    """Squared Mahalanobis distance of the position, the first two components.
 
-    The heading is not gated: the planar ambiguity of a square marker flips it in otherwise good sightings.
+    The heading of a marker is not gated: the planar ambiguity of a square flips it in good sightings.
 
     Args:
         innovation: (3,).

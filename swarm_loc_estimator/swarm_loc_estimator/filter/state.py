@@ -417,8 +417,9 @@ class SwarmState:
             why: Reason, for diagnostics.
             stamp_ns: Stamp of the measurement or command that shows it.
         """
-        self.lost_why[robot], self.lost_ns[robot] = why, stamp_ns
-        self.losses[why] += 1
+        if self.tracked[robot]:
+            self.lost_why[robot], self.lost_ns[robot] = why, stamp_ns
+            self.losses[why] += 1
         self._decorrelate(np.array([robot]), np.eye(3)[None])
         self._forget_pairs(robot)
         self.tracked[robot] = False

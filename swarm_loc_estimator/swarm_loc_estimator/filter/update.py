@@ -2,7 +2,7 @@
 
 1. Predict both sides to the stamp of the measurement.
 2. Innovation: measured minus predicted, linearized about the belief (eqs. (11) and (13) of the e-puck paper).
-3. Gate it; of two mirrored solutions, use the likelier one; a heading that may be flipped counts less.
+3. Of two mirrored solutions, use the likelier one; gate it; a heading that may be flipped counts less.
 4. Attribute an outlier: to the observer, to what it measured, or to their pair, which may be excluded.
 5. Confirm a pose that was assumed, or refute it.
 6. Correct poses, parameters and landmarks (eqs. (11), (12) and (14)).
@@ -10,14 +10,14 @@
 8. Count gated measurements; a robot with too many in a row is lost.
 
 In order, each measurement passes all stages before the next one, at its exact stamp. Together, the stages
-take all measurements of a period, linearized about one belief; a large swarm is cheaper so.
+take many measurements of a period, linearized about one belief; a large swarm is cheaper so.
 
 `fuse` is compiled. Where it needs what is not, it pauses, and is resumed at the next stage. Links, whose
 models have no compiled kernel, such as ranges, are evaluated by their records. Such a measurement is gated
-with the number of components of its model. When accepted it confirms the poses of its robots; when gated it
-counts towards their loss, but does not refute a configured start. A contradiction is evidence against its
-pair of observer and source, never against one of them. It takes no part in the noise inflation of robots or
-in the mean of repeated measurements (`correlated_noise.py`): these need positions and headings.
+with the number of gated components of its model. When accepted it confirms the poses of its robots; when
+gated it counts towards their loss, but does not refute a configured start. A contradiction is evidence
+against its pair of observer and source, never against one of them. It takes no part in the noise inflation of
+robots or in the mean of repeated measurements (`correlated_noise.py`): these need positions and headings.
 """
 
 from __future__ import annotations
@@ -108,8 +108,10 @@ class Innovations(NamedTuple):
     innovation: FloatArray  # (m, 3) measured minus predicted
     noise: FloatArray  # (m, 3, 3) measurement covariances for the update
     pair: FloatArray  # (m, PAIR_ROWS, 3) new mean of the pair, stored if used, see `correlated_noise`
-    distance: FloatArray  # (m,) squared Mahalanobis distance of the position, small errors left out
-    whitened: FloatArray  # (m, 2) position innovation over its standard deviation, without small errors
+    distance: (
+        FloatArray  # (m,) squared, Mahalanobis, that is gated; of a marker's position without small errors
+    )
+    whitened: FloatArray  # (m, 2) innovation of the position over its deviation, as for `distance`
     cause: IntArray  # (m,) possible cause of the innovation, see `integrity.cause_of`
     accepted: BoolArray  # (m,) True if the innovation passes the gate
     nis: FloatArray  # (m,) normalized innovation squared
@@ -646,7 +648,7 @@ def evaluate_link(
     gated = slice(model.gated)
     work.noise[k, :count, :count], work.innovation[k, :count] = noise, innovation
     work.whitened[k], work.cause[k] = 0.0, 0
-    # Gate; a model that fails at these poses is gated, too.
+    # Gate; what is not finite at these poses is gated, too.
     if np.isfinite(s).all() and np.isfinite(innovation).all() and np.isfinite(jacobian).all():
         work.distance[k] = innovation[gated] @ np.linalg.solve(s[gated, gated], innovation[gated])
         work.accepted[k] = work.distance[k] <= one.gate

@@ -61,6 +61,7 @@ SENSORS: dict[str, type[Sensor]] = {
     )
 }
 """All sensors by name. Simultaneous measurements are fused in this order."""
+_FAR_NS = 2**62  # Largest stamp, 146 years after 1970
 _FIRST_OWN_MODEL = 1000  # Number of the first model of a sensor that is registered
 
 
@@ -194,7 +195,8 @@ class Batch:
             stamp_ns = _stamps_ns(name, given)
             columns = {key: column for key, column in given.items() if key != "stamp_s"}
             columns |= {"stamp_ns": stamp_ns, "robot": _robots(swarm, name, given, stamp_ns.size)}
-            columns.setdefault("arrival_ns", np.clip(stamp_ns, begin_ns, now_ns))
+            arrival_ns = columns.get("arrival_ns", np.minimum(stamp_ns, now_ns))
+            columns["arrival_ns"] = np.maximum(arrival_ns, begin_ns)
             made = SENSORS[name].rows(columns)
             rows[name] = select(made, np.argsort(made.arrival_ns, kind="stable"))
         arrivals_ns = [int(one.arrival_ns[0]) for one in rows.values() if one.robot.size]
@@ -211,7 +213,8 @@ class Batch:
         begin_ns = self.begin_ns
         for k, end_ns in enumerate([*stamps_ns.tolist(), self.end_ns]):
             rows = {name: select(one, places[name][k]) for name, one in self.rows.items()}
-            yield replace(self, begin_ns=begin_ns, end_ns=end_ns, rows=rows)
+            dropped = {} if k else self.dropped
+            yield replace(self, begin_ns=begin_ns, end_ns=end_ns, rows=rows, dropped=dropped)
             begin_ns = end_ns
 
 
@@ -226,7 +229,9 @@ def _stamps_ns(sensor: str, given: Mapping[str, Any]) -> IntArray:
     if stamps.ndim != 1 or stamps.dtype.kind not in "iuf" or not np.isfinite(stamps).all():
         raise TypeError(f"{sensor}: {name} must be finite numbers (k,)")
     stamps = stamps if name == "stamp_ns" else np.round(1e9 * stamps)
-    return stamps.astype(np.int64)
+    far_ns = (np.uint64 if stamps.dtype.kind == "u" else np.int64)(_FAR_NS)
+    found: IntArray = np.clip(stamps, 0 if stamps.dtype.kind == "u" else -far_ns, far_ns).astype(np.int64)
+    return found
 
 
 def _robots(swarm: Swarm, sensor: str, given: Mapping[str, Any], count: int) -> IntArray:

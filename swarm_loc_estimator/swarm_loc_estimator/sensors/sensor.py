@@ -43,17 +43,20 @@ def fill(column: NDArray[Any], given: Any, name: str) -> None:
     """Write given values to a column (k, ...); a number stands for all.
 
     Raises:
-        TypeError: They have another length or shape, or are no numbers.
+        TypeError: They have another length or shape, or are no numbers that the column can hold.
     """
     try:
         if column.dtype == object:
             for k, one in zip(range(len(column)), given, strict=True):
                 column[k] = one
         elif np.shape(given) in {(), column.shape}:
-            column[:] = given
+            with np.errstate(invalid="ignore"):
+                column[:] = given
+            if column.dtype.kind in "iu" and not np.all(column == given):
+                raise TypeError(f"{name} must be whole numbers that fit into {column.dtype}")
         else:
             raise TypeError(f"{name} has shape {np.shape(given)}, not {column.shape}")
-    except ValueError as error:
+    except (OverflowError, ValueError) as error:
         raise TypeError(f"{name} has wrong values: {error}") from error
 
 

@@ -27,7 +27,7 @@ from swarm_loc_estimator.sensors.imu import TurnRateRows, TurnRateSensor
 from swarm_loc_estimator.sensors.inputs import Batch, InputConverter
 from swarm_loc_estimator.sensors.lidar import ScanSensor, SweepStore
 from swarm_loc_estimator.sensors.odometry import OdometryRows, OdometrySensor
-from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, Accumulator, reject_reasons
+from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, Accumulator, Guard, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import (
     ConstantOdometry,
@@ -148,9 +148,10 @@ class Estimator:
                 self._turn_rates.append(rows)
             else:
                 accumulator = self._gathering[name] = self._converter.accumulators[name]
-                change = accumulator.take(rows)
-                self._timeline.add(change.added)
-                self._timeline.withdraw(change.withdrawn)
+                with Guard(name, rows.robot.size, self._converter.drops.total):
+                    change = accumulator.take(rows)
+                    self._timeline.add(change.added)
+                    self._timeline.withdraw(change.withdrawn)
 
     def receive_in_parts(self, inputs: Batch) -> None:
         """Add new data of any time span, with ticks in between, so that nothing becomes too old in it."""
@@ -298,7 +299,7 @@ class Estimator:
         """Take readings as columns and return the estimate at an instant, for scripts and notebooks.
 
         Readings may be of any time span: they are received and fused part by part, in order of their
-        arrival, as live. Those without `arrival_ns` arrive at their stamps, or late ones at the last step.
+        arrival, as live. Those without `arrival_ns` arrive at their stamps, but late ones at the last step.
 
         Args:
             now_s: The instant [s].
@@ -312,10 +313,15 @@ class Estimator:
         """
         if (now_s is None) == (now_ns is None):
             raise TypeError("step needs either now_s or now_ns")
+        if now_s is not None and not np.isfinite(now_s):
+            raise TypeError(f"now_s must be finite, not {now_s}")
         end_ns = round(1e9 * now_s) if now_s is not None else int(now_ns or 0)
-        before, begin_ns = Counter(self.drops), min(end_ns if self._now_ns is None else self._now_ns, end_ns)
-        first_ns = begin_ns if self._now_ns is not None else _LONG_AGO_NS
-        batch = self.convert(Batch.of_columns(self.swarm, first_ns, end_ns, readings))
+        # Readings of a new clock, or before the first step, arrive at their stamps however old they are.
+        begin_ns = _LONG_AGO_NS
+        if self._now_ns is not None and end_ns >= self._now_ns - self._jump_back_ns:
+            begin_ns = min(self._now_ns, end_ns)
+        before = Counter(self.drops)
+        batch = self.convert(Batch.of_columns(self.swarm, begin_ns, end_ns, readings))
         self.receive_in_parts(batch)
         return Step(self.tick(end_ns), dict(Counter(self.drops) - before))
 

@@ -121,7 +121,7 @@ class Fusion:
         nis[:] = np.nan
         begin = 0
         for command in commands:
-            end = int(measurements.stamp_ns.searchsorted(command.stamp_ns))
+            end = int(measurements.stamp_ns.searchsorted(command.stamp_ns, side="right"))
             self._fuse_all(state, measurements, slice(begin, end), verdicts, nis)
             self._execute(state, command)
             begin = end
@@ -239,6 +239,9 @@ class Fusion:
         if tied.any():
             some = measurements if tied.all() else select(measurements, tied)
             verdicts[tied], nis[tied] = self._update(state, some)
+            tied[tied] = (
+                verdicts[tied] != Verdict.OPEN
+            )  # robots that the prediction lost may be located again
         untied = np.flatnonzero(~tied)
         sides = zip(measurements.observer[untied], measurements.target[untied], strict=True)
         for k, (observer, target) in zip(untied.tolist(), sides, strict=True):
@@ -344,6 +347,8 @@ class Fusion:
         robot, stamp_ns = command.robot, command.stamp_ns
         if command.kind == CommandKind.FORGET:
             state.deinitialize(robot, LossReason.COMMAND, stamp_ns)
+            if state.origin != IN_MAP and not state.tracked.any():
+                self._local.leave(state, stamp_ns)
             return
         if not self._tracks.has_started(robot, stamp_ns):
             return

@@ -356,8 +356,8 @@ class Timeline:
 
     @property
     def waiting(self) -> int:
-        """Number of measurements waiting for the next `advance`."""
-        return sum(measurements.size for measurements in self._new)
+        """Number of measurements and commands waiting for the next `advance`."""
+        return sum(measurements.size for measurements in self._new) + len(self._new_commands)
 
     def oldest_due_ns(self, otherwise_ns: int) -> int:
         """Stamp of the oldest measurement left to fuse, at most `otherwise_ns`."""
@@ -421,9 +421,9 @@ class Timeline:
 
     def _merge(self, oldest_ns: int) -> None:
         """Merge new measurements into the buffer."""
-        count, new = self.waiting, self._not_older(self._new, oldest_ns)
+        given, new = sum(one.size for one in self._new), self._not_older(self._new, oldest_ns)
         self._new = []
-        self.too_old += count - new.size
+        self.too_old += given - new.size
         inserted, first_ns = self._buffer.merge(new)
         self.duplicates += new.size - inserted
         if first_ns is not None:
@@ -431,10 +431,11 @@ class Timeline:
 
     def _order(self, oldest_ns: int) -> None:
         """Insert new commands by their stamps."""
-        for command in self._new_commands:
-            if command.stamp_ns < oldest_ns:
+        for given in self._new_commands:
+            if given.stamp_ns < oldest_ns:
                 self.too_old += 1
                 continue
+            command = given._replace(stamp_ns=self._rounded(given.stamp_ns))
             insort(self._commands, command, key=lambda one: (one.stamp_ns, one.robot))
             self._redo_from(command.stamp_ns)
         self._new_commands = []
@@ -451,14 +452,19 @@ class Timeline:
 
         With `state_period_s`, stamps are rounded to the closest stored state.
         """
-        rows, period = concatenate(parts), self._state_period_ns
+        rows = concatenate(parts)
         fresh = rows.stamp_ns >= oldest_ns
         if not fresh.all():
             rows = select(rows, fresh)
-        if period:  # detections of different aerial images must not be mixed
-            nearest_ns = (rows.stamp_ns + period // 2) // period * period
+        if self._state_period_ns:  # detections of different aerial images must not be mixed
+            nearest_ns = self._rounded(rows.stamp_ns)
             rows = rows._replace(stamp_ns=np.where(rows.model == ANONYMOUS, rows.stamp_ns, nearest_ns))
         return rows
+
+    def _rounded(self, stamps_ns: Stamps) -> Stamps:
+        """Stamps rounded to the closest stored state."""
+        period_ns = self._state_period_ns
+        return (stamps_ns + period_ns // 2) // period_ns * period_ns if period_ns else stamps_ns
 
     def _go_back(self, key: int) -> None:
         """Roll back to the last checkpoint before step `key`, unless `key` is ahead."""
@@ -487,8 +493,13 @@ class Timeline:
                 return True
             # Fuse, and store a checkpoint if the last one is old.
             rows, measurements = slice(begin, end), buffer.part(begin, end)
-            self._step(self._ahead, measurements, commands, buffer.verdicts[rows], buffer.nis[rows])
             self._head_key = key
+            try:
+                self._step(self._ahead, measurements, commands, buffer.verdicts[rows], buffer.nis[rows])
+            except Exception:  # the state is half updated: the next call returns to a checkpoint
+                self._redo_from(min(stamps_ns))
+                self.is_busy = False
+                raise
             if key - max(self._checkpoints[-1][0], -(2**62)) >= self._spacing_ns:
                 self._checkpoints.append((key, self._ahead.copy()))
             if end < len(buffer) and not has_budget():

@@ -111,6 +111,21 @@ def test_one_fix_with_heading_moves_them_too(tracked: bool) -> None:
     assert nees(errors[located], last.covariances[located]).max() < 25.0
 
 
+def test_a_local_frame_ends_when_all_its_robots_are_forgotten() -> None:
+    world = without_landmarks(simulate(BLIND, 0))
+    estimator, at_ns = Estimator(world.swarm, SETTINGS), T0 + 8 * SECOND
+    run(estimator, world, 8.0)
+    assert estimator.origin
+    for robot in range(4):
+        estimator.forget(robot, at_ns)
+    estimator.tick(at_ns)
+    assert estimator.origin == ""
+    kept = estimator.counters["constraints kept"]
+    give_fix(estimator, 1, at_ns + SECOND // 10, np.array([0.1, 0.2, 0.3]), FIX, at_ns + SECOND // 5)
+    estimator.tick(at_ns + SECOND // 5)
+    assert estimator.counters["constraints kept"] == kept + 1
+
+
 def _unseen(event: Event, robot: int) -> Event:
     seen = event.detections
     return replace(event, detections=seen[:0] if event.robot == robot else seen[seen["id"] // 10 != robot])

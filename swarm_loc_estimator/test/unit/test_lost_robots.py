@@ -22,6 +22,7 @@ from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import LOSS_CAUSES, LossReport
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
+from swarm_loc_estimator.timeline.settings import Settings
 
 LATE = {1.2: 1.2, 1.5: 2.2, 1.8: 1.8, 2.1: 2.1}
 """When fixes that are wrong were measured and when they come [s]."""
@@ -109,6 +110,26 @@ def test_the_end_of_a_local_frame_is_no_fault_in_the_report() -> None:
     none, waiting = np.zeros((1, 1, 3)), np.zeros((1, 1), dtype=np.uint8)
     result = ReplayResult("x", FIXED, np.array([0]), none, none[..., None], waiting, losses=ended)
     assert result.loss_remarks == []
+
+
+def test_a_robot_that_is_not_located_is_not_lost_by_a_command() -> None:
+    estimator = Estimator(Swarm((Robot("a", camera=None),)))
+    estimator.forget(0, T0)
+    estimator.tick(T0)
+    assert estimator.losses == []
+
+
+@pytest.mark.parametrize("period_s", [0.0, 0.2])
+def test_the_fix_that_shows_that_a_robot_is_too_uncertain_is_kept(period_s: float) -> None:
+    settings = Settings(lost_sigma=0.1, horizon_s=5.0, fusion_period_s=period_s, sparse_from=2)
+    estimator = Estimator(Swarm(tuple(Robot(name, start=(0.0, 0.0, 0.0)) for name in "ab")), settings)
+    for now_s in np.arange(1.0, 31.0):
+        t = now_s - 1.0 + 0.1 * np.arange(10)
+        driven = {"robot": "a", "stamp_s": t, "pose": np.multiply.outer(t, (0.5, 0.0, 0.0))}
+        fix = {"robot": "a", "stamp_s": t[1:2], "pose": driven["pose"][1:2], "covariance": [np.eye(3) * 1e-4]}
+        readings = {"odometry": driven} | ({"fixes": fix} if now_s == 29.0 else {})
+        estimator.step(now_s, now_ns=None, **readings)
+    assert estimator.counters == {"measurements used": 0, "constraints kept": 1, "lost: uncertain": 1}
 
 
 def test_a_robot_that_was_never_located_only_waits() -> None:

@@ -2,13 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from swarm_loc_estimator import Batch, Estimator, Robot, Swarm, load_swarm, replay
+from swarm_loc_estimator import (
+    Anchor,
+    Batch,
+    Estimator,
+    Robot,
+    Settings,
+    Swarm,
+    UwbDevice,
+    load_swarm,
+    replay,
+)
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.measurements import Measurements
+from swarm_loc_estimator.filter.models import MODELS, RANGE, Prediction
 from swarm_loc_estimator.offline.recorded_bag import read_bag, unwatched
 from swarm_loc_estimator.sensors.inputs import SENSORS
 
@@ -120,7 +134,20 @@ def test_late_readings_count_up_to_the_horizon_and_what_was_dropped_is_returned(
             {"detections": {"robot": 0, "stamp_s": T, "id": 7, "position": np.zeros((50, 2))}},
             r"detections: position has shape \(50, 2\), not \(50, 3\)",
         ),
+        *(
+            (
+                {"ranges": {"robot": 0, "stamp_s": T, "range": 1.0, "device": device}},
+                f"ranges: device {wrong}",
+            )
+            for device, wrong in [
+                (7.6, "must be whole numbers that fit into"),
+                (np.nan, "has wrong values: cannot convert float NaN"),
+                (np.full(50, -7), "must be whole numbers that fit into"),
+                (-1, "has wrong values: Python integer"),
+            ]
+        ),
         ({"now_ns": 5 * SECOND}, "step needs either now_s or now_ns"),
+        ({"now_s": np.nan}, "now_s must be finite, not nan"),
         ({"now_s": None}, "step needs either now_s or now_ns"),
     ],
 )
@@ -130,6 +157,77 @@ def test_what_is_wrong_is_named_and_nothing_is_taken(given: dict[str, Any], sent
         estimator.step(**dict[str, Any]({"now_s": 5.0, "odometry": DRIVEN} | given))
     assert estimator.drops == {}
     assert estimator.step(5.0, odometry=DRIVEN).dropped == {}
+
+
+def test_readings_after_a_jump_of_the_clock_are_used_as_at_first() -> None:
+    estimator, expected = Estimator(SWARM), Estimator(SWARM).step(5.0, odometry=DRIVEN).estimate
+    estimator.step(1005.0, odometry=DRIVEN | {"stamp_s": 1000.0 + T})
+    found, dropped = estimator.step(5.0, odometry=DRIVEN)
+    assert (dropped, estimator.time_jumps) == ({}, 1)
+    np.testing.assert_array_equal(found.poses, expected.poses)
+
+
+@pytest.mark.parametrize("stamp", [{"stamp_s": 1e12}, {"stamp_ns": np.array([2**63 + 5], np.uint64)}])
+def test_a_stamp_beyond_all_clocks_is_in_the_future(stamp: dict[str, Any]) -> None:
+    given = DRIVEN | {"pose": [[0.0, 0.0, 0.0]]} | stamp
+    given = {name: given[name] for name in ("robot", "pose", *stamp)}
+    assert Estimator(SWARM).step(5.0, odometry=given).dropped == {"future_stamp": 1}
+
+
+def test_an_arrival_before_the_last_step_does_not_reset() -> None:
+    estimator = Estimator(SWARM)
+    estimator.step(5.0, odometry=DRIVEN)
+    driven = {"robot": 0, "stamp_s": 5.1, "pose": [[0.5, 0.0, 0.0]], "arrival_ns": SECOND}
+    assert estimator.step(5.2, odometry=driven).estimate.poses[0, 0] == pytest.approx(0.5, abs=0.01)
+    assert estimator.time_jumps == 0
+
+
+def test_scans_of_a_wrong_type_cost_only_themselves() -> None:
+    estimator = Estimator(SWARM)
+    with pytest.warns(RuntimeWarning, match="the code of the sensor 'scans' raised AttributeError"):
+        found = estimator.step(5.0, odometry=DRIVEN, scans={"robot": 0, "stamp_s": 1.0, "scan": [5]})
+    assert found.dropped == {"scans_AttributeError": 1}
+    assert found.estimate.poses[0, 0] == pytest.approx(0.49, abs=0.02)
+
+
+def test_what_was_dropped_before_is_counted_once_however_many_parts_there_are() -> None:
+    estimator = Estimator(SWARM)
+    estimator.receive_in_parts(Batch(0, 60 * SECOND, {}, dropped={"bad_message": 3}))
+    assert estimator.drops == {"bad_message": 3}
+
+
+def test_an_error_of_a_model_leaves_nothing_fused_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, model = 0, MODELS[RANGE]
+
+    def predict(one: Measurements, observer: FloatArray, target: FloatArray) -> Prediction:
+        nonlocal calls
+        calls += 1
+        if calls == 20:
+            raise ZeroDivisionError("once")
+        assert model.predict is not None
+        return model.predict(one, observer, target)
+
+    robot = Robot("r1", start=(0.0, 0.0, 0.0), uwb=UwbDevice(1, range_sigma=0.05))
+    swarm, settings = Swarm((robot,), anchors=(Anchor(10, 5.0, 0.0),)), Settings(horizon_s=60.0)
+    ranges = {"robot": 0, "stamp_s": T, "device": 10, "range": 5.0 - DRIVEN["pose"][:, 0]}
+    expected = Estimator(swarm, settings).step(5.0, odometry=DRIVEN, ranges=ranges).estimate
+    estimator = Estimator(swarm, settings)
+    monkeypatch.setitem(MODELS, RANGE, replace(model, predict=predict))
+    with pytest.raises(ZeroDivisionError):
+        estimator.step(5.0, odometry=DRIVEN, ranges=ranges)
+    np.testing.assert_array_equal(estimator.step(5.0).estimate.covariances, expected.covariances)
+
+
+def test_a_command_comes_after_the_measurements_of_its_instant_and_waiting_ones_are_counted() -> None:
+    for settings in (Settings(), Settings(state_period_s=1.0)):
+        estimator = Estimator(SWARM, settings)
+        fix = {"robot": 0, "stamp_s": 4.5, "pose": [[0.45, 0.0, 0.0]], "covariance": [np.eye(3) * 1e-4]}
+        estimator.step(4.9, odometry=DRIVEN, fixes=fix)
+        estimator.set_pose(0, round(4.55 * SECOND), (2.0, 0.0, 0.0), np.eye(3) * 1e-2)
+        assert estimator.step(4.9).estimate.poses[0, 0] > 1.9
+        estimator.forget(0, 4 * SECOND)
+        estimator.reset()
+        assert estimator.drops["reset"] == 1
 
 
 def test_a_replay_with_rare_outputs_uses_all_data() -> None:
