@@ -88,6 +88,8 @@ NO_MEASUREMENTS = Measurements.empty(0)
 
 def select(rows: Rows, some: slice | BoolArray | IntArray) -> Rows:
     """Select rows of a tuple of columns by a slice, a mask or indices."""
+    if isinstance(some, slice) and some.indices(len(rows[0])) == (0, len(rows[0]), 1):
+        return rows
     return type(rows)(*(column[some] for column in rows))
 
 

@@ -220,7 +220,8 @@ def register(model: MeasurementModel) -> None:
 
 def is_compiled(models: np.typing.NDArray[np.int64]) -> BoolArray:
     """Whether compiled code evaluates measurements of models (m,)."""
-    return np.isin(models, COMPILED)
+    is_position: BoolArray = (models == CARTESIAN) | (models == POLAR)
+    return is_position
 
 
 @inlined_njit

@@ -156,6 +156,9 @@ class Estimator:
     def receive_in_parts(self, inputs: Batch) -> None:
         """Add new data of any time span, with ticks in between, so that nothing becomes too old in it."""
         part_ns = self._horizon_ns // _PARTS
+        if inputs.end_ns - inputs.begin_ns <= part_ns:
+            self.receive(inputs)
+            return
         arrivals_ns = np.concatenate([[inputs.end_ns], *(one.arrival_ns for one in inputs.rows.values())])
         begins_ns = inputs.begin_ns + (arrivals_ns - inputs.begin_ns) // part_ns * part_ns
         pauses_ns = np.unique([begins_ns, begins_ns + part_ns])

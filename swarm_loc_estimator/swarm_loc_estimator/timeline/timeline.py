@@ -22,8 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.numerics import assign, assign_matrix
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.measurements import Command, Measurements, Verdict, concatenate, select
 from swarm_loc_estimator.filter.models import ANONYMOUS
 from swarm_loc_estimator.filter.state import SwarmState
@@ -100,7 +99,8 @@ class MeasurementBuffer:
         """Remove measurements (k,); return the stamp of the first one found, None if none was found."""
         first_ns = None
         for k in np.argsort(gone.stamp_ns, kind="stable").tolist():
-            place = _lower_bound(self._columns, self._begin, self._end, gone, k)
+            first = self._begin + int(self.stamp_ns.searchsorted(gone.stamp_ns[k]))
+            place = _lower_bound(self._columns, first, self._end, gone, k)
             if place == self._end or _compared(self._columns, place, gone, k) != 0:
                 continue
             first_ns = int(gone.stamp_ns[k]) if first_ns is None else first_ns
@@ -154,45 +154,70 @@ def _merge(
             order[place] = order[place - 1]
             place -= 1
         order[place] = row
-    # Leave out duplicates, among themselves and of the buffer.
-    kept = 0
+    # Find their places; leave out duplicates, among themselves and of the buffer.
+    kept, places = 0, begin + np.searchsorted(columns.stamp_ns[begin:end], new.stamp_ns[order])
     for k in range(order.size):
         row = order[k]
         if kept and _compared(new, row, new, order[kept - 1]) == 0:
             continue
-        place = _lower_bound(columns, begin, end, new, row)
+        place = _lower_bound(columns, places[k], end, new, row)
         if place < end and _compared(columns, place, new, row) == 0:
             continue
-        order[kept] = row
+        order[kept], places[kept] = row, place
         kept += 1
-    # Merge from the back: each old row moves once.
-    old, place = end - 1, end + kept - 1
-    for k in range(kept - 1, -1, -1):
-        row = order[k]
-        while old >= begin and _compared(new, row, columns, old) < 0:
-            _copy(columns, place, columns, old)
-            verdicts[place], nis[place] = verdicts[old], nis[old]
-            old -= 1
-            place -= 1
-        _copy(columns, place, new, row)
-        verdicts[place], nis[place] = 0, math.nan
-        place -= 1
+    order, places = order[:kept], places[:kept]
+    # Insert column by column: a call with all columns for each row would cost more than the copies.
+    _insert(columns.stamp_ns, new.stamp_ns, order, places, end, 1)
+    _insert(columns.received_from, new.received_from, order, places, end, 1)
+    _insert(columns.observer, new.observer, order, places, end, 1)
+    _insert(columns.target, new.target, order, places, end, 1)
+    _insert(columns.landmark, new.landmark, order, places, end, 1)
+    _insert(columns.model, new.model, order, places, end, 1)
+    _insert(columns.reading, new.reading, order, places, end, 1)
+    _insert(columns.has_heading, new.has_heading, order, places, end, 1)
+    _insert(columns.has_second, new.has_second, order, places, end, 1)
+    _insert(columns.stamp_variance, new.stamp_variance, order, places, end, 1)
+    _insert(columns.gate, new.gate, order, places, end, 1)
+    _insert(columns.sensor.reshape(-1), new.sensor.reshape(-1), order, places, end, 3)
+    _insert(columns.marker.reshape(-1), new.marker.reshape(-1), order, places, end, 3)
+    _insert(columns.height.reshape(-1), new.height.reshape(-1), order, places, end, 2)
+    _insert(columns.reference.reshape(-1), new.reference.reshape(-1), order, places, end, 3)
+    _insert(columns.value.reshape(-1), new.value.reshape(-1), order, places, end, 3)
+    _insert(columns.second.reshape(-1), new.second.reshape(-1), order, places, end, 3)
+    _insert(columns.covariance.reshape(-1), new.covariance.reshape(-1), order, places, end, 9)
+    _insert(columns.systematic_share.reshape(-1), new.systematic_share.reshape(-1), order, places, end, 3)
+    _insert(columns.arrival_ns, new.arrival_ns, order, places, end, 1)
+    _insert(verdicts, np.zeros(new.stamp_ns.size, dtype=np.uint8), order, places, end, 1)
+    _insert(nis, np.full(new.stamp_ns.size, math.nan), order, places, end, 1)
     return kept, new.stamp_ns[order[0]] if kept else 0
 
 
 @cached_njit
-def _lower_bound(columns: Measurements, begin: int, end: int, new: Measurements, k: int) -> int:
-    """Index of the first row from `begin` to `end` that is not less than row k of others."""
-    place: int = begin + np.searchsorted(columns.stamp_ns[begin:end], new.stamp_ns[k])
+def _insert(
+    column: NDArray[Any], values: NDArray[Any], order: IntArray, places: IntArray, end: int, width: int
+) -> None:
+    """Insert rows `order` of values before places of a column; both are flat, `width` numbers a row."""
+    old = end - 1
+    for k in range(order.size - 1, -1, -1):
+        while old >= places[k]:
+            for i in range(width):
+                column[(old + k + 1) * width + i] = column[old * width + i]
+            old -= 1
+        for i in range(width):
+            column[(places[k] + k) * width + i] = values[order[k] * width + i]
+
+
+@inlined_njit
+def _lower_bound(columns: Measurements, place: int, end: int, new: Measurements, k: int) -> int:
+    """Index of the first row from `place` to `end` that is not less than row k of others."""
     while place < end and _compared(columns, place, new, k) < 0:
         place += 1
     return place
 
 
-@cached_njit
+@inlined_njit
 def _compared(a: Measurements, i: int, b: Measurements, j: int) -> int:
     """Compare row i of measurements with row j of others: -1 if it is less, 1 if greater, 0 if equal."""
-    # What tells most measurements apart.
     if a.stamp_ns[i] != b.stamp_ns[j]:
         return -1 if a.stamp_ns[i] < b.stamp_ns[j] else 1
     if a.observer[i] != b.observer[j]:
@@ -203,7 +228,12 @@ def _compared(a: Measurements, i: int, b: Measurements, j: int) -> int:
         return -1 if a.reading[i] < b.reading[j] else 1
     if a.model[i] != b.model[j]:
         return -1 if a.model[i] < b.model[j] else 1
-    # Only measurements that contradict each other get here.
+    return _compared_further(a, i, b, j)
+
+
+@cached_njit
+def _compared_further(a: Measurements, i: int, b: Measurements, j: int) -> int:
+    """The same for measurements that their first columns do not tell apart: they contradict each other."""
     for r in range(2, -1, -1):
         order = _compared_vectors(a.covariance[i, r], b.covariance[j, r])
         if order != 0:
@@ -248,25 +278,6 @@ def _compared_vectors(a: FloatArray, b: FloatArray) -> int:
         if a[i] != b[i]:
             return -1 if a[i] < b[i] else 1
     return 0
-
-
-@cached_njit
-def _copy(out: Measurements, i: int, rows: Measurements, k: int) -> None:
-    """Write row k of measurements to row i of others."""
-    out.stamp_ns[i], out.received_from[i] = rows.stamp_ns[k], rows.received_from[k]
-    out.observer[i], out.target[i], out.landmark[i] = rows.observer[k], rows.target[k], rows.landmark[k]
-    out.model[i], out.reading[i] = rows.model[k], rows.reading[k]
-    out.has_heading[i], out.has_second[i] = rows.has_heading[k], rows.has_second[k]
-    out.stamp_variance[i], out.gate[i] = rows.stamp_variance[k], rows.gate[k]
-    assign(out.sensor[i], rows.sensor[k])
-    assign(out.marker[i], rows.marker[k])
-    assign(out.height[i], rows.height[k])
-    assign(out.reference[i], rows.reference[k])
-    assign(out.value[i], rows.value[k])
-    assign(out.second[i], rows.second[k])
-    assign_matrix(out.covariance[i], rows.covariance[k])
-    assign(out.systematic_share[i], rows.systematic_share[k])
-    out.arrival_ns[i] = rows.arrival_ns[k]
 
 
 Step = Callable[[SwarmState, Measurements, Sequence[Command], NDArray[np.uint8], FloatArray], None]
