@@ -12,7 +12,7 @@ from enum import Enum, IntEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
@@ -269,44 +269,43 @@ def contradictions(
     names += [f"anchor {anchor.address}" for anchor in swarm.anchors]
     conflicting = tracks.has_conflicting_sources(now_ns)
     reset = tracks.had_fault(now_ns) & ~conflicting
-    robots = np.flatnonzero(state.tracked).tolist()
-    denied = [robot for robot in robots if is_contradicted(state.integrity, robot)]
+    denied = [
+        is_tracked and is_contradicted(state.integrity, robot)
+        for robot, is_tracked in enumerate(state.tracked)
+    ]
     contradicted = np.flatnonzero(state.contradicted_ns > NEVER_NS).tolist()
     aside = excluded_pairs(state.integrity, now_ns)
+    found: list[tuple[Contradicted, ArrayLike]] = [
+        (Contradicted.ODOMETRY, conflicting),
+        (Contradicted.RESET, reset),
+        (Contradicted.CONSTANT, tracks.integrates_twist()),
+        (Contradicted.UNMOVED, unmoved),
+        (Contradicted.POSE, denied),
+        (Contradicted.NOISE, state.integrity.noise_inflation),
+    ]
     return [
-        *(_odometry(names[robot]) for robot in np.flatnonzero(conflicting).tolist()),
-        *(_reset(names[robot]) for robot in np.flatnonzero(reset).tolist()),
-        *(_constant(names[robot]) for robot in np.flatnonzero(tracks.integrates_twist()).tolist()),
-        *(_unmoved(names[robot]) for robot in np.flatnonzero(unmoved).tolist()),
-        *(_pose(names[robot]) for robot in denied),
+        *(
+            _of_robot(names[robot], kind)
+            for kind, robots in found
+            for robot in np.flatnonzero(robots).tolist()
+        ),
         *(_sightings(names[observer], names[source % len(names)]) for observer, source in aside),
         *(_description(names[source], source, state) for source in contradicted),
-        *(_noise(names[robot]) for robot in np.flatnonzero(state.integrity.noise_inflation).tolist()),
     ]
 
 
-def _odometry(name: str) -> Contradiction:
-    text = f"the odometry of {name} jumps back and forth: it may have two sources"
-    return Contradiction(name, Contradicted.ODOMETRY, text)
+_TEXTS = {
+    Contradicted.ODOMETRY: "the odometry of {0} jumps back and forth: it may have two sources",
+    Contradicted.RESET: "the odometry of {0} jumped or was reset: its motion at that moment is unknown",
+    Contradicted.CONSTANT: "the odometry of {0} has a constant pose but a twist: integrating the twist",
+    Contradicted.UNMOVED: "the odometry of {0} has a constant pose and no twist, although {0} moves",
+    Contradicted.POSE: "the newest measurements contradict the pose of {0}",
+    Contradicted.NOISE: "the measurements of {0} are noisier than described; inflating their noise",
+}
 
 
-def _reset(name: str) -> Contradiction:
-    text = f"the odometry of {name} jumped or was reset: its motion at that moment is unknown"
-    return Contradiction(name, Contradicted.RESET, text)
-
-
-def _constant(name: str) -> Contradiction:
-    text = f"the odometry of {name} has a constant pose but a twist: integrating the twist"
-    return Contradiction(name, Contradicted.CONSTANT, text)
-
-
-def _unmoved(name: str) -> Contradiction:
-    text = f"the odometry of {name} has a constant pose and no twist, although {name} moves"
-    return Contradiction(name, Contradicted.UNMOVED, text)
-
-
-def _pose(name: str) -> Contradiction:
-    return Contradiction(name, Contradicted.POSE, f"the newest measurements contradict the pose of {name}")
+def _of_robot(name: str, kind: Contradicted) -> Contradiction:
+    return Contradiction(name, kind, _TEXTS[kind].format(name))
 
 
 def _sightings(observer: str, source: str) -> Contradiction:
@@ -323,8 +322,3 @@ def _description(name: str, source: int, state: SwarmState) -> Contradiction:
         moved = float(np.hypot(*state.landmark[source - robots, :2]))
         text = f"{name} is about {moved:.2f} m from its surveyed place; re-estimating its place"
     return Contradiction(name, Contradicted.DESCRIPTION, text)
-
-
-def _noise(name: str) -> Contradiction:
-    text = f"the measurements of {name} are noisier than described; inflating their noise"
-    return Contradiction(name, Contradicted.NOISE, text)

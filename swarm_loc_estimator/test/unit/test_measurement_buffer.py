@@ -5,6 +5,7 @@ from __future__ import annotations
 import random
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -63,6 +64,19 @@ def test_what_was_computed_goes_with_its_measurement(parts: list[list[Row]]) -> 
             np.testing.assert_equal(buffer.nis[k], nis)
             buffer.verdicts[k], buffer.nis[k] = 1 + len(computed) % 3, float(len(computed))
             computed[row] = int(buffer.verdicts[k]), float(buffer.nis[k])
+
+
+@pytest.mark.parametrize("name", Measurements._fields)
+def test_each_column_moves_with_its_measurement_and_tells_two_apart_but_the_arrival(name: str) -> None:
+    pair, earlier, buffer = Measurements.empty(2), Measurements.empty(1), MeasurementBuffer()
+    getattr(pair, name)[1] = 1 - getattr(pair, name)[1].astype(int)
+    count, _ = buffer.merge(pair)
+    assert count == (1 if name == "arrival_ns" else 2)
+    before = in_bytes(buffer.part(0, count))
+    earlier.stamp_ns[:] = -1
+    buffer.merge(earlier)
+    assert in_bytes(buffer.part(1, count + 1)) == before
+    assert in_bytes(buffer.part(0, 1)) == in_bytes(earlier)
 
 
 def test_what_was_computed_stays_with_what_lies_before_and_space_is_used_again() -> None:
