@@ -11,17 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator import (
-    NOBODY,
-    Estimator,
-    Measurements,
-    Messages,
-    Prediction,
-    Robot,
-    Sensor,
-    Swarm,
-    register,
-)
+from swarm_loc_estimator import Estimator, Measurements, Messages, Prediction, Robot, Sensor, Swarm, register
 
 BEACONS = np.array([[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]])  # x, y in map [m]
 SIGMA_M = 0.03
@@ -59,8 +49,7 @@ class BeaconSensor(Sensor):
 
     def measure(self, rows: BeaconRows) -> Measurements:
         """Convert readings (k,) to measurements."""
-        out = self.measurements(rows)  # stamps, observers, model and gate
-        out.target[:] = NOBODY
+        out = self.measurements(rows)  # with stamps, observers, model and gate; of no other robot
         out.reading[:] = rows.beacon
         out.marker[:, :2] = BEACONS[rows.beacon]
         out.value[:, 0], out.covariance[:, 0, 0] = rows.distance, SIGMA_M**2
