@@ -11,8 +11,8 @@ robot: M is its pose in `map`, corrected by X_target if the landmark is estimate
 observer: S is the identity, or the pose of a fixed camera in `map`.
 
 With right-invariant errors X = exp(xi) X_hat the chain depends on xi_target - xi_observer only, so one
-Jacobian (3 x 3) serves both robots, with opposite signs. Two more columns are for the camera's yaw offset
-and scale error, see CAMERA_YAW and CAMERA_SCALE of swarm/calibration_states.py.
+Jacobian (3 x 3) serves both robots, with opposite signs. Three more columns are for the camera's yaw
+offset, scale error and range offset, see CAMERA_YAW of swarm/calibration_states.py.
 
 An innovation is gated by its Mahalanobis distance. The heading of a marker is not gated but down-weighted:
 the planar ambiguity of a square marker flips it in otherwise good sightings.
@@ -248,7 +248,7 @@ def predict(
     target_pose: FloatArray,
     camera: FloatArray | None = None,
 ) -> tuple[FloatArray, FloatArray]:
-    """Predicted values (m, 3) and their Jacobians (m, 3, 5) by xi_target - xi_observer, camera yaw and scale.
+    """Predicted values (m, 3) and their Jacobians (m, 3, 6) by xi_target - xi_observer and camera errors.
 
     A heading that was not measured has a zero row.
 
@@ -256,11 +256,11 @@ def predict(
         measurements: (m,).
         observer_pose: (m, 3) in `map`; rows without an observer are ignored.
         target_pose: (m, 3), or correction of a landmark's survey; rows with neither are ignored.
-        camera: (m, 2) yaw offset of the sensor, positive to the left [rad], and relative error of distances;
-            zero by default.
+        camera: (m, 3) yaw offset of the sensor, positive to the left [rad], relative error of distances, and
+            range offset [m]; zero by default.
     """
-    value, jacobian = np.zeros((measurements.size, 3)), np.zeros((measurements.size, 3, 5))
-    errors = np.zeros((measurements.size, 2)) if camera is None else camera
+    value, jacobian = np.zeros((measurements.size, 3)), np.zeros((measurements.size, 3, 6))
+    errors = np.zeros((measurements.size, 3)) if camera is None else camera
     _predict_all(measurements, observer_pose, target_pose, errors, value, jacobian)
     return value, jacobian
 
@@ -276,7 +276,7 @@ def _predict_all(
 ) -> None:
     """Write `predict` for all measurements."""
     for k in range(observer_pose.shape[0]):
-        errors = (camera[k, 0], camera[k, 1])
+        errors = (camera[k, 0], camera[k, 1], camera[k, 2])
         predict_one(measurements, k, observer_pose[k], target_pose[k], errors, value[k], jacobian[k])
 
 
@@ -286,11 +286,11 @@ def predict_one(
     k: int,
     observer_pose: FloatArray,
     target_pose: FloatArray,
-    camera: tuple[float, float],
+    camera: tuple[float, float, float],
     value: FloatArray,
     jacobian: FloatArray,
 ) -> None:
-    """Write the predicted value (3,) of measurement k and its Jacobian (3, 5), see `predict`."""
+    """Write the predicted value (3,) of measurement k and its Jacobian (3, 6), see `predict`."""
     sensor, marker = measurements.sensor[k], measurements.marker[k]
     sx, sy, stheta = sensor[0], sensor[1], sensor[2] + camera[0]
     if measurements.observer[k] >= 0:
@@ -311,14 +311,16 @@ def predict_one(
         jacobian[0, j] *= stretch
         jacobian[1, j] *= stretch
     jacobian[0, 4], jacobian[1, 4], jacobian[2, 4] = x, y, 0.0
+    jacobian[0, 5] = jacobian[1, 5] = jacobian[2, 5] = 0.0
     if measurements.model[k] == POLAR:
         distance = max(math.hypot(x, y), 1e-6)
         ux, uy = x / distance, y / distance
-        value[0], value[1] = stretch * distance, math.atan2(y, x)
+        value[0], value[1] = stretch * distance + camera[2], math.atan2(y, x)
         for j in range(5):
             forward, left = jacobian[0, j], jacobian[1, j]
             jacobian[0, j] = ux * forward + uy * left
             jacobian[1, j] = (ux * left - uy * forward) / (stretch * distance)
+        jacobian[0, 5] = 1.0
 
 
 @inlined_njit

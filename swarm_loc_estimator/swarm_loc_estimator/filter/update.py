@@ -78,10 +78,15 @@ from swarm_loc_estimator.odometry.track_arrays import (
     new_sample,
     rate_at,
 )
-from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW
+from swarm_loc_estimator.swarm.calibration_states import (
+    CAMERA_OFFSET,
+    CAMERA_SCALE,
+    CAMERA_YAW,
+    PARAMETERS,
+)
 
-DEPENDS_ON = 8
-"""Filter columns per measurement: three of the observer, three of the target, camera yaw and camera scale."""
+DEPENDS_ON = 9
+"""Filter columns per measurement: three of the observer, three of the target, three of the camera."""
 _USED, _GATED = int(Verdict.USED), int(Verdict.GATED)
 _UNCERTAIN, _REFUTED = int(LossReason.UNCERTAIN), int(LossReason.REFUTED)
 PREDICT, EVALUATE, ATTRIBUTE, SETTLE = 1, 2, 4, 7  # Stages at which `fuse` is begun or resumed
@@ -100,7 +105,7 @@ class Innovations(NamedTuple):
     pose: FloatArray
     # (m, 3) rate of change of xi_target - xi_observer by driving [1/s], see `relative_motion`
     motion: FloatArray
-    # (m, 3, 5) of the observer's error with the target's, and of the target's with yaw and scale of the
+    # (m, 3, 6) of the observer's error with the target's, and of the target's with the parameters of the
     # observer's camera
     cross_covariance: FloatArray
     columns: IntArray  # (m, DEPENDS_ON) filter columns
@@ -119,7 +124,7 @@ class Innovations(NamedTuple):
     contradicted: BoolArray  # (N + L,) True for robots and landmarks that are contradicted
     predicted: FloatArray  # (3,) value
     other: FloatArray  # (3,) innovation of the second solution
-    value_jacobian: FloatArray  # (3, 5) Jacobian of the value, see `models.predict`
+    value_jacobian: FloatArray  # (3, 6) Jacobian of the value, see `models.predict`
     relative_covariance: FloatArray  # (3, 3) covariance of xi_target - xi_observer
     innovation_covariance: FloatArray  # (3, 3) covariance of the innovation
     variances: FloatArray  # (3,) of the predicted value
@@ -131,7 +136,7 @@ def new_innovations(count: int, robots: int, sources: int) -> Innovations:
     return Innovations(
         np.zeros((count, 2, 3)),
         np.zeros((count, 3)),
-        np.zeros((count, 3, 5)),
+        np.zeros((count, 3, 6)),
         np.zeros((count, DEPENDS_ON), dtype=np.int64),
         np.zeros((count, 3, DEPENDS_ON)),
         np.zeros((count, 3)),
@@ -146,7 +151,7 @@ def new_innovations(count: int, robots: int, sources: int) -> Innovations:
         np.zeros(sources, dtype=np.bool_),
         np.zeros(3),
         np.zeros(3),
-        np.zeros((3, 5)),
+        np.zeros((3, 6)),
         np.zeros((3, 3)),
         np.zeros((3, 3)),
         np.zeros(3),
@@ -380,7 +385,7 @@ def related_columns(measurements: Measurements, belief: BeliefArrays) -> IntArra
     for k in range(columns.shape[0]):
         columns[k, 0], columns[k, 1] = body_columns(measurements, k, belief)
         columns[k, 2] = -1
-        for m in (CAMERA_YAW, CAMERA_SCALE):
+        for m in range(CAMERA_YAW, PARAMETERS):
             column = belief.table.column[max(measurements.observer[k], 0), m]
             if measurements.observer[k] >= 0 and column >= 0:
                 columns[k, 2] = column - (m - CAMERA_YAW)
@@ -483,14 +488,15 @@ def relative_motion(
 
 
 @inlined_njit
-def _camera(belief: BeliefArrays, observer: int) -> tuple[tuple[float, float], tuple[int, int]]:
-    """Yaw and scale of an observer's camera, and their filter columns; -1: not estimated."""
+def _camera(belief: BeliefArrays, observer: int) -> tuple[tuple[float, float, float], tuple[int, int, int]]:
+    """Yaw, scale and range offset of an observer's camera, and their filter columns; -1: not estimated."""
     if observer < 0:
-        return (0.0, 0.0), (-1, -1)
+        return (0.0, 0.0, 0.0), (-1, -1, -1)
     parameter, column = belief.parameter, belief.table.column
+    yaw, scale, offset = CAMERA_YAW, CAMERA_SCALE, CAMERA_OFFSET
     return (
-        (parameter[observer, CAMERA_YAW], parameter[observer, CAMERA_SCALE]),
-        (column[observer, CAMERA_YAW], column[observer, CAMERA_SCALE]),
+        (parameter[observer, yaw], parameter[observer, scale], parameter[observer, offset]),
+        (column[observer, yaw], column[observer, scale], column[observer, offset]),
     )
 
 
@@ -498,7 +504,7 @@ def _camera(belief: BeliefArrays, observer: int) -> tuple[tuple[float, float], t
 def _write_jacobian(
     value_jacobian: FloatArray,
     bodies: tuple[int, int],
-    camera_columns: tuple[int, int],
+    camera_columns: tuple[int, int, int],
     columns: IntArray,
     jacobian: FloatArray,
 ) -> None:
@@ -511,7 +517,7 @@ def _write_jacobian(
         for i in range(3):
             jacobian[i, j] = -value_jacobian[i, j] if bodies[0] >= 0 else 0.0
             jacobian[i, 3 + j] = value_jacobian[i, j] if bodies[1] >= 0 else 0.0
-    for j in range(2):
+    for j in range(3):
         columns[6 + j] = max(camera_columns[j], 0)
         for i in range(3):
             jacobian[i, 6 + j] = value_jacobian[i, 3 + j] if camera_columns[j] >= 0 else 0.0
@@ -545,14 +551,14 @@ def body_columns(measurements: Measurements, k: int, belief: BeliefArrays) -> tu
 
 @inlined_njit
 def _read_cross_covariance(
-    p: FloatArray, bodies: tuple[int, int], camera: tuple[int, int], out: FloatArray
+    p: FloatArray, bodies: tuple[int, int], camera: tuple[int, int, int], out: FloatArray
 ) -> None:
-    """Write `cross_covariance` (3, 5) of one measurement; undefined if a side is missing."""
+    """Write `cross_covariance` (3, 6) of one measurement; undefined if a side is missing."""
     o, t = max(bodies[0], 0), max(bodies[1], 0)
     for i in range(3):
         for j in range(3):
             out[i, j] = p[o + i, t + j]
-        for k in range(2):
+        for k in range(3):
             out[i, 3 + k] = p[t + i, max(camera[k], 0)]
 
 
@@ -560,7 +566,7 @@ def _read_cross_covariance(
 def _add_uncertainty(
     belief: BeliefArrays,
     bodies: tuple[int, int],
-    camera: tuple[int, int],
+    camera: tuple[int, int, int],
     value_jacobian: FloatArray,
     cross_covariance: FloatArray,
     relative: FloatArray,
@@ -582,7 +588,7 @@ def _add_uncertainty(
         x, y, z = _turned(value_jacobian, i, relative)
         for j in range(3):
             s[i, j] = s[i, j] + x * value_jacobian[j, 0] + y * value_jacobian[j, 1] + z * value_jacobian[j, 2]
-    for k in range(2):
+    for k in range(3):
         if camera[k] >= 0:
             for a in range(3):
                 own = own_within(belief, o // 3, a, 3 + CAMERA_YAW + k)
@@ -590,7 +596,7 @@ def _add_uncertainty(
             for i in range(3):
                 shared = value_jacobian[i, 0] * relative[0, 0] + value_jacobian[i, 1] * relative[1, 0]
                 shared += value_jacobian[i, 2] * relative[2, 0]
-                for other in range(2):  # its own variance, and its covariance with the other parameter
+                for other in range(3):  # its own variance, and its covariances with the other parameters
                     if camera[other] >= 0:
                         both = own_within(belief, o // 3, 3 + CAMERA_YAW + other, 3 + CAMERA_YAW + k)
                         shared += 0.5 * value_jacobian[i, 3 + other] * both

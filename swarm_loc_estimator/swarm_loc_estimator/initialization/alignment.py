@@ -100,7 +100,7 @@ def with_constraint(
     Args:
         constraints: In order of time; not changed.
         one: Row of a measurement between the robot and a localized side.
-        camera: (2,) estimated yaw offset [rad] and scale error of its sensor.
+        camera: (3,) estimated yaw offset [rad], scale error and range offset [m] of its sensor.
         waiting: The robot without a pose.
         other: The localized side.
         window_ns: Age up to which constraints are kept.
@@ -196,7 +196,7 @@ def _describe(
     x, y, angle = value[0], value[1], ltheta if sees else mtheta
     xx, xy, yy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     if one.model == POLAR:  # along and across the line of sight
-        x, y, angle = value[0], 0.0, angle + value[1]
+        x, y, angle = value[0] - camera[2], 0.0, angle + value[1]
         xy, yy = value[0] * xy, value[0] * value[0] * yy
     size = 1.0 / (1.0 + camera[1])
     x, y, xx, xy, yy = size * x, size * y, size * size * xx, size * size * xy, size * size * yy

@@ -1,7 +1,8 @@
 """Self-calibration states: systematic errors of odometry, cameras and the map, estimated with the poses.
 
 The first three parameters of a robot are errors of its motion, whose effect on the pose grows with distance
-and turn. The last two are the yaw offset and the scale error of its camera. A landmark with an inexact survey
+and turn. The last three are the yaw offset, the scale error and the range offset of its camera: a range r is
+measured as (1 + scale) r + offset. A landmark with an inexact survey
 is a static body: its state is a correction of the survey, with a right-invariant error about the identity.
 Parameters with a standard deviation in the description are estimated from the start, others only after a
 contradiction, with the standard deviations below. Their filter columns follow those of all poses, in the
@@ -25,15 +26,16 @@ DISTANCE_SCALE = 1  # Relative error of the distance driven
 TURN_SCALE = 2  # Relative error of the turn
 CAMERA_YAW = 3  # Yaw offset of the camera, positive to the left [rad]; constant, or it changes slowly
 CAMERA_SCALE = 4  # Relative error of distances measured by the camera
+CAMERA_OFFSET = 5  # Error of ranges of sightings without heading, the same at each range [m]
 
 DRIVES = 3  # Number of leading parameters that act through the motion
-PARAMETERS = 5
+PARAMETERS = 6
 BLOCKS = -(-PARAMETERS // DRIVES)
 """Number of blocks of three columns for a robot's parameters: one for motion, one for the camera."""
 _BLOCK, _SLOT = np.divmod(np.arange(PARAMETERS), DRIVES)
 """Block of each parameter, and its index in the block."""
 
-_CONTRADICTED_SIGMA = (0.0, 0.05, 0.1, 0.03, 0.03)
+_CONTRADICTED_SIGMA = (0.0, 0.05, 0.1, 0.03, 0.03, 0.0)
 """Standard deviations of parameters that are exact in the description, after a contradiction."""
 _CONTRADICTED_SURVEY_SIGMA = (0.02, 0.03)
 """Standard deviations of a landmark's position [m] and yaw [rad] after a contradiction."""
@@ -68,6 +70,7 @@ class ParameterTable(NamedTuple):
             if robot.camera is not None:
                 sigma[i, CAMERA_YAW] = robot.camera.yaw_sigma
                 sigma[i, CAMERA_SCALE] = robot.sensor.distance_scale_sigma
+                sigma[i, CAMERA_OFFSET] = robot.sensor.range_offset_sigma
                 time_s[i, CAMERA_YAW] = robot.camera.yaw_time_s
         wanted = sigma > 0.0
         doubted = np.where(wanted, sigma, _CONTRADICTED_SIGMA)

@@ -239,6 +239,9 @@ class SensorModel:
         0.0, "1/rad^2", -10.0, 10.0, "q of the range curve; 0.5 when depth is logged as range"
     )
     range_offset: float = number(0.0, "m", -5.0, 5.0, "added to the scaled range")
+    range_offset_sigma: float = number(
+        0.0, "m", 0.0, 5.0, "standard deviation of range_offset; 0: exact, else estimated"
+    )
     robot_range_offset: float = number(0.0, "m", -5.0, 5.0, "also added to the range of a robot's marker")
     bearing_curve: float = number(0.0, "1/rad", -10.0, 10.0, "quadratic term of the bearing")
     bearing_offset: float = number(0.0, "rad", -TURN, TURN, "added to the scaled bearing")

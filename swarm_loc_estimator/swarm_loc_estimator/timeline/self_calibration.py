@@ -11,6 +11,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.filter.integrity import with_noise_inflation
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.calibration_states import (
+    CAMERA_OFFSET,
     CAMERA_SCALE,
     CAMERA_YAW,
     DISTANCE_SCALE,
@@ -90,6 +91,8 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
             with_noise_inflation(sensor, float(state.integrity.noise_inflation[index])),
             distance_scale=seen * sensor.distance_scale,
             distance_scale_sigma=min(1.0, sigma[CAMERA_SCALE] / abs(seen)),
+            range_offset=(sensor.range_offset - value[CAMERA_OFFSET]) / seen,
+            range_offset_sigma=sigma[CAMERA_OFFSET] / abs(seen),
         ),
     )
 

@@ -104,21 +104,22 @@ def test_jacobians_agree_with_finite_differences(who: str, model: int, heading: 
 @pytest.mark.parametrize("model", [CARTESIAN, POLAR])
 @pytest.mark.parametrize("who", ["landmark", "surveyed", "robot"])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_camera_may_be_turned_and_stretch_distances(
+def test_the_camera_may_be_turned_and_stretch_or_lengthen_distances(
     who: str, model: int, heading: int, seed: int
 ) -> None:
-    s, camera, step = scene(seed), np.array([0.2, 0.1]), 1e-6
-    one = select(measurement(who, model, s.sensor, s.marker, heading), np.zeros(5, dtype=np.int64))
-    errors = camera + step * np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0]])
-    value, jacobian = predict(one, s.observer[None].repeat(5, 0), s.target[None].repeat(5, 0), errors)
-    for column in range(2):
+    s, camera, step = scene(seed), np.array([0.2, 0.1, 0.05]), 1e-6
+    one = select(measurement(who, model, s.sensor, s.marker, heading), np.zeros(7, dtype=np.int64))
+    errors = camera + step * np.vstack([np.kron(np.eye(3), [[1], [-1]]), np.zeros((1, 3))])
+    value, jacobian = predict(one, s.observer[None].repeat(7, 0), s.target[None].repeat(7, 0), errors)
+    for column in range(3):
         slope = value[2 * column] - value[2 * column + 1]
         slope[1:] = [wrapped(slope[1]) if model == POLAR else slope[1], wrapped(slope[2]) * heading]
-        np.testing.assert_allclose(slope / (2 * step), jacobian[4, :, 3 + column], atol=2e-8, rtol=1e-6)
+        np.testing.assert_allclose(slope / (2 * step), jacobian[6, :, 3 + column], atol=2e-8, rtol=1e-6)
     s.sensor[2] += camera[0]
     expected, _ = predicted(who, model, s, heading)
     expected[: 2 if model == CARTESIAN else 1] *= 1.0 + camera[1]
-    np.testing.assert_allclose(value[4], expected, atol=1e-12)
+    expected[0] += camera[2] if model == POLAR else 0.0
+    np.testing.assert_allclose(value[6], expected, atol=1e-12)
 
 
 def test_a_marker_at_the_sensor_itself_has_finite_numbers() -> None:

@@ -17,7 +17,13 @@ from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.filter.update import related_columns
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.swarm.calibration_states import CAMERA_SCALE, CAMERA_YAW, DRIVES, ParameterTable
+from swarm_loc_estimator.swarm.calibration_states import (
+    CAMERA_OFFSET,
+    CAMERA_SCALE,
+    CAMERA_YAW,
+    DRIVES,
+    ParameterTable,
+)
 from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Landmark, Robot
 
@@ -30,7 +36,7 @@ CALIBRATED = Robot(
     "",
     odometry=ODOMETRY,
     camera=CameraMount(yaw_sigma=0.03, yaw_time_s=2.0),
-    sensor=SensorModel(distance_scale_sigma=0.04),
+    sensor=SensorModel(distance_scale_sigma=0.04, range_offset_sigma=0.03),
 )
 KINDS = (
     CALIBRATED,
@@ -88,24 +94,24 @@ class Both:
         """Use a measurement of each pair (m, 2), N + l being landmark l; return the sparse filter's gaps.
 
         Returns:
-            Gaps of the corrections by the dense filter's columns, and of `cross_covariance` (m, 3, 5).
+            Gaps of the corrections by the dense filter's columns, and of `cross_covariance` (m, 3, 6).
         """
         robots = len(self.poses)
         columns = Measurements.empty(len(pairs))
         columns.observer[:] = pairs[:, 0]
         columns.target[:] = np.where(pairs[:, 1] < robots, pairs[:, 1], NOBODY)
         columns.landmark[:] = np.where(pairs[:, 1] < robots, NOBODY, pairs[:, 1] - robots)
-        chains = self.rng.normal(0.0, 1.0, (len(pairs), 3, 5))
+        chains = self.rng.normal(0.0, 1.0, (len(pairs), 3, 6))
         innovation = self.rng.normal(0.0, 0.02, (len(pairs), 3))
         related = [related_columns(columns, state.arrays()) for state in self.states]
         dense, sparse = (state.filter for state in self.states)
         assert isinstance(sparse, SparseFilter)
         tracked = self.states[1].tracked
-        cross_covariance = np.zeros((len(pairs), 3, 5))
+        cross_covariance = np.zeros((len(pairs), 3, 6))
         sparse.prepare_update(related[1], Robots(self.poses[:, :2], tracked.copy()), cross_covariance)
         gaps = []
         for k, (observer, target, _) in enumerate(related[0].tolist()):
-            exact = np.zeros((3, 5))
+            exact = np.zeros((3, 6))
             if target >= 0:
                 exact[:, :3] = dense.covariance[observer : observer + 3, target : target + 3]
                 camera = self.states[0].arrays().table.column[pairs[k, 0], CAMERA_YAW:]
@@ -116,12 +122,12 @@ class Both:
         corrections = []
         for state, first in zip(self.states, related, strict=True):
             table = state.arrays().table
-            used, jacobian = np.zeros((len(pairs), 8), dtype=np.int64), np.zeros((len(pairs), 3, 8))
+            used, jacobian = np.zeros((len(pairs), 9), dtype=np.int64), np.zeros((len(pairs), 3, 9))
             for k, (observer, target, _) in enumerate(first.tolist()):
                 used[k, :3], jacobian[k, :, :3] = observer + np.arange(3), -chains[k, :, :3]
                 if target >= 0:
                     used[k, 3:6], jacobian[k, :, 3:6] = target + np.arange(3), chains[k, :, :3]
-                for place, parameter in enumerate((CAMERA_YAW, CAMERA_SCALE), 6):
+                for place, parameter in enumerate((CAMERA_YAW, CAMERA_SCALE, CAMERA_OFFSET), 6):
                     estimated = int(table.column[pairs[k, 0], parameter])
                     if estimated >= 0:
                         used[k, place], jacobian[k, :, place] = estimated, chains[k, :, place - 3]

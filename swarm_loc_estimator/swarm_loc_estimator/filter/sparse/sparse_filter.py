@@ -522,7 +522,7 @@ class SparseFilter:
         Args:
             columns: (m, 3) first columns of observers, targets and observers' cameras; -1: none.
             robots: Positions of all robots.
-            cross_covariance: (m, 3, 5) written: of observers with targets, and of targets with cameras;
+            cross_covariance: (m, 3, 6) written: of observers with targets, and of targets with cameras;
                 undefined where there is none.
         """
         tied = (columns[:, :2] >= 0).all(axis=1)
@@ -530,7 +530,7 @@ class SparseFilter:
         prepared = self._prepare(bodies[tied, :2], robots)
         cross_covariance[tied, :, :3] = self._about_map(prepared.covariance_of, *bodies[tied, :2].T)
         seen = (columns[:, 1:] >= 0).all(axis=1)
-        cross_covariance[seen, :, 3:] = self._about_map(prepared.covariance_of, *bodies[seen, 1:].T)[:, :, :2]
+        cross_covariance[seen, :, 3:] = self._about_map(prepared.covariance_of, *bodies[seen, 1:].T)
 
     def _prepare(self, pairs: IntArray, robots: Robots) -> _Prepared:
         """Compute the covariances of a pattern that contains pairs (k, 2)."""

@@ -27,11 +27,13 @@ from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.sensors.camera import CONTENT_POSITION
-from swarm_loc_estimator.swarm.error_models import OdometryModel
+from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Pose2, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 MAX_TRUTH_GAP_NS = 500_000_000
+RANGE_OFFSET_SIGMA, RANGE_SCALE_SIGMA = 0.05, 0.02
+"""The range curve of these cameras differs by so much between days: an offset [m] and a scale [1]."""
 
 _ODOMETRY = re.compile(r"Robot(\d+)_Odometry\.dat")
 _MISFIT = 0.5  # A barcode whose median sighting is further than this from its landmark is wrong [m]
@@ -350,6 +352,7 @@ def _robot(robot: RobotLog, barcode: int | None) -> Robot:
         ROBOT_TYPE,
         odometry=OdometryModel(wheel_separation=WHEEL_SEPARATION, timeout_s=TIMEOUT_S),
         camera=CameraMount(),
+        sensor=SensorModel(range_offset_sigma=RANGE_OFFSET_SIGMA, distance_scale_sigma=RANGE_SCALE_SIGMA),
         faces=() if barcode is None else (Face("body", barcode),),
         start=_start(robot),
     )
