@@ -15,6 +15,7 @@ from scipy.stats import chi2
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_OFFSET
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.settings import Policy, Settings
 
