@@ -1,4 +1,4 @@
-"""Scenarios of other sensors than odometry and cameras on robots: ceiling cameras, motion capture.
+"""Scenarios of ceiling cameras, gyroscopes, motion capture, UWB and lidar.
 
 Each replaces readings of a time by wrong ones, and says whom a contradiction may name.
 """
@@ -12,15 +12,24 @@ from typing import Any
 
 import numpy as np
 
+from bench.inputs.gyro import RATE_HZ, simulate_gyroscopes
+from bench.inputs.imu import IMU, with_imus
+from bench.inputs.lidar_map import exact_map, record
 from bench.inputs.mocap import FIX_NS, HEADING_SIGMA, POSITION_SIGMA
+from bench.inputs.uwb_world import Plan, simulate
 from bench.integrity import faults
 from bench.integrity.ceiling import drive_under_ceiling, hung, observe_tags
 from bench.integrity.fault import CLEAN, FAULT_S, Fault, settings_of
+from bench.pushbot.mapping import PLANS
+from bench.shared.common import OUT
 from bench.shared.simulated_run import detection_rows
+from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.run import CAMERA_LATENESS, LivedRun, SimulatedRun, arrival_ns
+from swarm_loc_drivers.sim.worlds import W0, ErrorModel
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.filter.measurements import concatenate, select
+from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.sensors.fix import NO_FIXES, FixRows
 from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
@@ -132,9 +141,9 @@ def _face_turned_90(seed: int) -> Fault:
     return _under_ceiling(seed, turned, {f"epuck{which + 1}"}, which, span_s=span_s)
 
 
-def _eight(seed: int) -> SimulatedRun:
+def _eight(seed: int, errors: ErrorModel = CLEAN) -> SimulatedRun:
     """The eight, for longer than other scenarios."""
-    return faults.simulate(settings_of(seed, CLEAN, _DURATION_S))
+    return faults.simulate(settings_of(seed, errors, _DURATION_S))
 
 
 def _fixes(
@@ -210,6 +219,64 @@ def _sure_detections(seed: int) -> Fault:
     return _faulty(run, "detections", good, wrong, {f"epuck{observer + 1}"}, {observer, other})
 
 
+def _gyroscopes(seed: int, break_it: Callable[[FloatArray], FloatArray], span_s: Span = FAULT_S) -> Fault:
+    """The gyroscope of a robot breaks within 5 s, in every other seed those of all robots.
+
+    Detections are as noisy as those of the e-puck paper, so that turn rates matter.
+
+    Args:
+        seed: Of the run and the fault.
+        break_it: Makes wrong rates (k, 3) of those of a robot from the fault on.
+        span_s: Begin and end of the fault.
+    """
+    rng, run = _rng(seed), with_imus(_eight(seed, W0))
+    good, which = simulate_gyroscopes(rng, run, IMU), int(rng.integers(5))
+    broken = [which] if seed % 2 else range(len(run.swarm.robots))
+    span_s = (span_s[0] + float(rng.uniform(0.0, 5.0)), span_s[1])
+    order, velocity = np.argsort(good.stamp_ns, kind="stable"), good.velocity.copy()
+    since = order[faults.seconds(run, good.stamp_ns[order]) >= span_s[0]]
+    for robot in broken:
+        own = since[good.robot[since] == robot]
+        velocity[own] = break_it(velocity[own])
+    guilty, concerned = {f"gyroscope of epuck{robot + 1}" for robot in broken}, broken if seed % 2 else ()
+    return _faulty(run, "imu", good, good._replace(velocity=velocity), guilty, concerned, span_s)
+
+
+def _on_another_axis(seed: int) -> Fault:
+    """The yaw rate appears on another axis, and noise on the vertical one."""
+    rng, sigma = _rng(seed), IMU.turn_noise_density * math.sqrt(RATE_HZ)
+
+    def on_its_side(rates: FloatArray) -> FloatArray:
+        return np.roll(rates, 1 + int(seed % 3 == 0), axis=1) + sigma * rng.standard_normal(rates.shape)
+
+    return _gyroscopes(seed, on_its_side)
+
+
+def _uwb_repeated(seed: int) -> Fault:
+    """Ranges of all radios are measured twice a second and published five times each."""
+    world = simulate(Plan(duration_s=_DURATION_S, steps_per_range=10), seed)
+    run, good = world.lived(), world.range_rows()
+    again = [
+        good._replace(stamp_ns=good.stamp_ns + late_ns, arrival_ns=good.arrival_ns + late_ns)
+        for late_ns in range(0, 500_000_000, 100_000_000)
+    ]
+    guilty = {f"radio of {robot.name}" for robot in run.swarm.robots}
+    return _faulty(run, "ranges", good, concatenate(again), guilty)
+
+
+def _scans_late(seed: int) -> Fault:
+    """Scans are stamped late, as by a driver that stamps them when it publishes them."""
+    plan, late_ns = floor_plan(PLANS[seed % len(PLANS)]), (200_000_000, 400_000_000)[seed % 2]
+    folder = OUT / "integrity" / f"scans_late{seed}"
+    folder.mkdir(parents=True, exist_ok=True)
+    swarm_map, _ = save_map(exact_map(plan), folder / "map")
+    run, good = record(plan, swarm_map, seed, _DURATION_S)
+    stamps_ns, scans = good.stamp_ns + late_ns, good.scan.copy()
+    scans[:] = [one._replace(stamp_ns=one.stamp_ns + late_ns) for one in scans]
+    late = good._replace(stamp_ns=stamps_ns, scan=scans, arrival_ns=good.arrival_ns + late_ns)
+    return _faulty(run, "scans", good, late, {f"lidar of {run.swarm.robots[0].name}"})
+
+
 SENSOR_SCENARIOS: Mapping[str, Callable[[int], Fault]] = {
     "ceiling_camera_moved": lambda seed: _ceiling_camera(seed, (0.03, 0.0), (0.08, 0.0)),
     "ceiling_camera_turned": lambda seed: _ceiling_camera(
@@ -217,10 +284,17 @@ SENSOR_SCENARIOS: Mapping[str, Callable[[int], Fault]] = {
     ),
     "ceiling_cameras_swapped": _ceiling_cameras_swapped,
     "face_turned_90": _face_turned_90,
+    "gyro_zero": lambda seed: _gyroscopes(seed, np.zeros_like),
+    "gyro_axis": _on_another_axis,
+    "gyro_freezes": lambda seed: _gyroscopes(
+        seed, lambda rates: np.broadcast_to(rates[0], rates.shape), _TO_THE_END_S
+    ),
     "mocap_swapped": lambda seed: _mocap_swapped(seed, _TO_THE_END_S),
     "mocap_swapped_8s": lambda seed: _mocap_swapped(seed, (FAULT_S[0], FAULT_S[0] + 8.0)),
     "mocap_frame_5cm_100hz": _mocap_frame,
     "mocap_creep_3mm": _mocap_creep,
     "fixes_1khz": _fixes_1khz,
     "sure_detections": _sure_detections,
+    "uwb_repeated": _uwb_repeated,
+    "scans_late": _scans_late,
 }

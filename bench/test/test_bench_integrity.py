@@ -107,7 +107,9 @@ def _rows(rows: Any) -> set[tuple[int, int, bytes]]:
     )
 
 
-@pytest.mark.parametrize("scenario", ["ceiling_camera_moved", "mocap_swapped"])
+@pytest.mark.parametrize(
+    "scenario", ["ceiling_camera_moved", "gyro_zero", "mocap_swapped", "uwb_repeated", "scans_late"]
+)
 def test_without_its_fault_a_world_is_as_it_is_described(scenario: str) -> None:
     fault = SENSOR_SCENARIOS[scenario](SEED)
     found = score(replace(fault, readings=fault.healthy, ends_s=None, concerned=frozenset()))
