@@ -14,8 +14,8 @@ from dataclasses import replace
 import numpy as np
 
 from bench.inputs.gyro import simulate_gyroscopes
+from bench.integrity.fault import CLEAN
 from bench.integrity.faults import twist_only, with_twists
-from bench.integrity.scenarios import CLEAN
 from bench.shared.common import ProgressLine, new_plot, rms, save_plot
 from bench.shared.simulated_run import errors_of, estimates_of, inputs_of, mean_nees, position_rmse, ticks
 from swarm_loc_drivers.sim.run import SimulatedRun
@@ -42,7 +42,7 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
         blind = _blind(seed)
         rates = simulate_gyroscopes(np.random.default_rng([seed, 9]), blind, IMU)
         found["without"].append(_estimate(blind))
-        found["with"].append(_estimate(_with_imus(blind), imu=rates))
+        found["with"].append(_estimate(with_imus(blind), imu=rates))
         run = with_twists(simulate_eight(EightSettings(seed=seed, duration_s=BLIND_S, errors=CLEAN)))
         found["pose"].append(_settled(_estimate(run)))
         for robot in range(len(run.swarm.robots)):
@@ -77,7 +77,8 @@ def _blind(seed: int) -> SimulatedRun:
     return run.masked(~blind)
 
 
-def _with_imus(run: SimulatedRun) -> SimulatedRun:
+def with_imus(run: SimulatedRun) -> SimulatedRun:
+    """The run with an IMU on each robot."""
     robots = tuple(replace(robot, imu=IMU) for robot in run.swarm.robots)
     return replace(run, swarm=replace(run.swarm, robots=robots))
 

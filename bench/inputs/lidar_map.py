@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 import scipy
@@ -32,18 +33,17 @@ from bench.pushbot.lidar import (
 )
 from bench.pushbot.mapping import LIDAR_SLIPS, PLANS
 from bench.shared.common import ProgressLine
+from bench.shared.simulated_run import errors_of, inputs_between, odometry_rows
 from swarm_loc_drivers.sim.pushbot.exploration import PERIOD_S, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan
+from swarm_loc_drivers.sim.run import ODOMETRY_DTYPE, LivedRun, Trajectories
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.messages import decode_scan
 from swarm_loc_estimator.offline.metrics import is_misleading, nees
-from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.sensors.lidar import ScanRows
-from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
@@ -152,7 +152,7 @@ def block(ranges: FloatArray, share: float, rng: np.random.Generator, time_s: fl
     return np.where(np.isfinite(out) & (out < NEAREST), 0.0, out)
 
 
-def drive(
+def record(
     plan: FloorPlan,
     swarm_map: Path,
     seed: int,
@@ -161,8 +161,8 @@ def drive(
     map_sigma: float = MAP_SIGMAS["exact"],
     blocked: float = 0.0,
     start_shift: tuple[float, float, float] = (0.0, 0.0, 0.0),
-) -> LidarRun:
-    """Drive through a hall and localize in a map.
+) -> tuple[LivedRun, ScanRows]:
+    """Drive through a hall: the run from second 0, and its scans, which arrive with their last beam.
 
     Args:
         plan: The hall.
@@ -173,7 +173,7 @@ def drive(
         blocked: Share of the beams that meet what is not in the map.
         start_shift: Added to the start in the description.
     """
-    # a robot whose start is known about, and its estimator
+    # a robot whose start is known about
     rng = np.random.default_rng(seed)
     pose = np.array([*plan.starts[0], rng.uniform(-math.pi, math.pi)])
     body = LidarBody(plan, pose.copy(), PushBotNoise(slip=LIDAR_SLIPS[seed % len(LIDAR_SLIPS)]), rng)
@@ -181,34 +181,48 @@ def drive(
     start: Pose2 = (float(said[0]), float(said[1]), float(said[2]))
     lidar = replace(LIDAR, map_sigma=map_sigma)
     robot = Robot(NAME, start=start, start_sigma=_START, lidar=lidar, odometry=_ODOMETRY)
-    estimator = Estimator(Swarm((robot,), map=swarm_map))
-    # drive, and compare at each sweep
-    zero = np.zeros(1, dtype=np.int64)
-    errors, covariances, tracked, cpu_s, sweeps = [], [], [], 0.0, 0
-    for step in range(round(until_s / PERIOD_S) + 1):
+    # its odometry, and a scan at the end of each sweep
+    odometry, scans, arrivals_ns = [], [], []
+    steps = round(until_s / PERIOD_S)
+    for step in range(steps + 1):
         now_ns = round(step * PERIOD_S * 1e9)
-        now = np.array([now_ns])
         if step % ODOMETRY_STEPS == 0:
-            rows = OdometryRows.without_twist(zero, now, body.odometry[None].copy(), now)
-            estimator.receive(Batch.of(now_ns, now_ns, odometry=rows))
+            odometry.append((0, now_ns, now_ns, body.odometry))
         if step and step % SWEEP_STEPS == 0:
             ranges = body.ranges(step - SWEEP_STEPS)
             if blocked:
                 ranges = block(ranges, blocked, rng, now_ns * 1e-9)
-            scans = np.empty(1, dtype=object)
-            scans[0] = decode_scan(scan_message(round((step - SWEEP_STEPS) * PERIOD_S * 1e9), ranges))
-            stamp = np.array([scans[0].stamp_ns])
-            begin_s = time.process_time()
-            estimator.receive(Batch.of(now_ns, now_ns, scans=ScanRows(zero, stamp, scans, now)))
-            estimate = estimator.tick(now_ns)
-            cpu_s, sweeps = cpu_s + time.process_time() - begin_s, sweeps + 1
-            if now_ns > 1e9 * _EVALUATE_FROM_S:
-                error = estimate.poses[0] - body.pose
-                error[2] = float(wrap_angle(error[2]))
-                errors.append(error)
-                covariances.append(estimate.covariances[0])
-                tracked.append(estimate.status[0] == Status.TRACKED)
+            scans.append(decode_scan(scan_message(round((step - SWEEP_STEPS) * PERIOD_S * 1e9), ranges)))
+            arrivals_ns.append(now_ns)
         body.step()
+    truth = Trajectories(round(PERIOD_S * 1e9) * np.arange(steps + 1), np.array(body.trace)[:, None])
+    run = LivedRun(Swarm((robot,), map=swarm_map), truth, np.array(odometry, ODOMETRY_DTYPE))
+    column = np.empty(len(scans), dtype=object)
+    column[:] = scans
+    stamps_ns = np.array([one.stamp_ns for one in scans])
+    return run, ScanRows(np.zeros_like(stamps_ns), stamps_ns, column, np.array(arrivals_ns))
+
+
+def drive(plan: FloorPlan, swarm_map: Path, seed: int, until_s: float, **others: Any) -> LidarRun:
+    """Drive through a hall and localize in a map; arguments are those of `record`."""
+    run, scans = record(plan, swarm_map, seed, until_s, **others)
+    estimator = Estimator(run.swarm)
+    inputs = inputs_between(scans.arrival_ns, odometry=odometry_rows(run), scans=scans)
+    estimates, cpu_s = [], 0.0
+    for now_ns, batch in zip(scans.arrival_ns.tolist(), inputs, strict=True):
+        begin_s = time.process_time()
+        estimator.receive(batch)
+        estimate = estimator.tick(now_ns)
+        cpu_s += time.process_time() - begin_s
+        if now_ns > 1e9 * _EVALUATE_FROM_S:
+            estimates.append(estimate)
+    error = errors_of(
+        np.array([one.poses for one in estimates]), run, np.array([one.stamp_ns for one in estimates])
+    )
     return LidarRun(
-        np.array(errors), np.array(covariances), np.array(tracked), 1e3 * cpu_s / sweeps, estimator.drops
+        error[:, 0],
+        np.array([one.covariances[0] for one in estimates]),
+        np.array([one.status[0] == Status.TRACKED for one in estimates]),
+        1e3 * cpu_s / len(inputs),
+        estimator.drops,
     )

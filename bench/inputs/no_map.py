@@ -12,8 +12,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from bench.integrity.fault import CLEAN
 from bench.integrity.faults import seconds
-from bench.integrity.scenarios import CLEAN
 from bench.shared.common import ProgressLine, new_plot, rms, save_plot
 from bench.shared.simulated_run import errors_of, estimates_of, fitted_errors, inputs_of, ticks
 from swarm_loc_drivers.sim.run import SimulatedRun

@@ -9,7 +9,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_drivers.sim.run import CAMERA_LATENESS, START_NS, arrival_ns
+from swarm_loc_drivers.sim.run import (
+    CAMERA_LATENESS,
+    ODOMETRY_DTYPE,
+    START_NS,
+    LivedRun,
+    Trajectories,
+    arrival_ns,
+)
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import RANGES, encode
@@ -17,12 +24,13 @@ from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.filter.measurements import concatenate, select
 from swarm_loc_estimator.sensors.inputs import Ingest
+from swarm_loc_estimator.sensors.ranges import RangeRows
+from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Anchor, Robot, StartSigma, Swarm, UwbDevice
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 
 STEP_NS = 50_000_000
-_STEPS_PER_RANGE = 4  # of one link: five a second
 TICK_STEPS = 2
 _SPEED, _TURN_RATE, _ARENA_M = 0.3, 1.0, 3.0
 _ANCHORS = ((-4.0, -4.0, 2.0), (4.0, -4.0, 2.4), (4.0, 4.0, 2.0), (-4.0, 4.0, 2.4))
@@ -44,6 +52,7 @@ class Plan:
     known_starts: int = 99  # Number of robots with a start, the first ones
     nlos: float = 0.0  # Share of ranges that are too long, for seconds per link
     sigma: float = 0.05  # Noise of a range [m]
+    steps_per_range: int = 4  # Of one link: five ranges a second
 
 
 class Ranges(NamedTuple):
@@ -75,6 +84,28 @@ class UwbWorld:
     def antenna_z(self) -> float:
         """Height of the robots' antennas [m]."""
         return _ANTENNA_Z
+
+    @property
+    def addresses(self) -> list[int]:
+        """Addresses of all devices, of robots and then of anchors."""
+        radios = [robot.uwb.address for robot in self.swarm.robots if robot.uwb]
+        return radios + [anchor.address for anchor in self.swarm.anchors]
+
+    def lived(self) -> LivedRun:
+        """Truth and odometry of the run, which arrives at its stamps."""
+        stamp_ns = START_NS + STEP_NS * np.arange(len(self.truth))
+        odometry = np.zeros(self.odometry.shape[:2], ODOMETRY_DTYPE)
+        odometry["robot"], odometry["pose"] = np.arange(self.plan.robots), self.odometry
+        odometry["stamp_ns"] = odometry["arrival_ns"] = stamp_ns[:, None]
+        return LivedRun(self.swarm, Trajectories(stamp_ns, self.truth), odometry.reshape(-1))
+
+    def range_rows(self) -> RangeRows:
+        """The ranges in order of arrival."""
+        step, robot, device, distance, arrivals_ns = self.ranges
+        address = np.array(self.addresses, dtype=np.uint64)[device]
+        stamps_ns, zero = START_NS + STEP_NS * step, np.zeros_like(distance)
+        rows = RangeRows(robot, stamps_ns, address, zero.astype(np.uint64), distance, zero, arrivals_ns)
+        return in_order_of_arrival([rows])
 
     def anchor_places(self) -> FloatArray:
         """Antennas (A, 3) of the anchors."""
@@ -144,14 +175,14 @@ def antenna(world: UwbWorld, steps: IntArray | int, device: int) -> FloatArray:
 
 
 def _measured(world: UwbWorld, rng: np.random.Generator) -> Ranges:
-    """Each link five times a second, one after the other."""
+    """Each link as often as planned, one after the other."""
     plan, n = world.plan, world.plan.robots
     links = [(robot, n + k) for robot in range(n) for k in range(plan.anchors)]
     if plan.between_robots:
         links += [(robot, other) for robot in range(n) for other in range(robot)]
     parts = []
     for number, (robot, device) in enumerate(links):
-        steps = np.arange(1 + number % _STEPS_PER_RANGE, len(world.truth), _STEPS_PER_RANGE)
+        steps = np.arange(1 + number % plan.steps_per_range, len(world.truth), plan.steps_per_range)
         distance = np.linalg.norm(antenna(world, steps, device) - antenna(world, steps, robot), axis=1)
         distance += _nlos(plan, steps.size, rng) + plan.sigma * rng.standard_normal(steps.size)
         arrivals_ns = arrival_ns(rng, START_NS + steps * STEP_NS, CAMERA_LATENESS)
@@ -164,7 +195,7 @@ def _measured(world: UwbWorld, rng: np.random.Generator) -> Ranges:
 
 def _nlos(plan: Plan, count: int, rng: np.random.Generator) -> FloatArray:
     """How much too long the ranges (count,) of a link are: in bursts, one error each."""
-    bias, step_s = np.zeros(count), _STEPS_PER_RANGE * STEP_NS * 1e-9
+    bias, step_s = np.zeros(count), plan.steps_per_range * STEP_NS * 1e-9
     while np.mean(bias > 0.0) < plan.nlos:
         begin = int(rng.integers(count))
         bias[begin : begin + round(rng.uniform(*_NLOS_S) / step_s)] = rng.uniform(*_NLOS_M)
@@ -180,9 +211,7 @@ def messages(world: UwbWorld, ingest: Ingest) -> list[SerializedMessage]:
         data = encode_odometry("odom", "base", stamps, world.odometry[:, k], twist, unknown, unknown)
         handle = ingest.handle_of[f"{robot.name}/odom"]
         out += [SerializedMessage(handle, *one) for one in zip(data, stamps.tolist(), strict=True)]
-    addresses = [r.uwb.address for r in world.swarm.robots if r.uwb] + [
-        a.address for a in world.swarm.anchors
-    ]
+    addresses = world.addresses
     for step, robot, device, distance, arrived_ns in zip(*world.ranges, strict=True):
         header = {"stamp": int(START_NS + step * STEP_NS)}
         one = {"device": addresses[int(device)], "range": float(distance)}

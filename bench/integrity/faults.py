@@ -12,6 +12,7 @@ from swarm_loc_drivers.sim.run import (
     FRAME_DTYPE,
     ODOMETRY_DTYPE,
     SIGHTING_DTYPE,
+    LivedRun,
     Records,
     SimulatedRun,
     Trajectories,
@@ -50,7 +51,7 @@ def simulate(
     return SimulatedRun(swarm, truth, odometry, frames, sightings)
 
 
-def seconds(run: SimulatedRun, stamp_ns: IntArray) -> FloatArray:
+def seconds(run: LivedRun, stamp_ns: IntArray) -> FloatArray:
     """Time since the run began (k,) [s]."""
     since: FloatArray = (stamp_ns - run.start_ns).astype(np.float64) * 1e-9
     return since

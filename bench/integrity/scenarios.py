@@ -1,47 +1,25 @@
-"""Scenarios: each injects a fault into a run of five e-pucks on the eight, sixty seconds, by seed."""
+"""Scenarios: each injects a fault into a run, mostly of five e-pucks on the eight for sixty seconds, by seed.
+
+Those of other sensors than odometry and cameras on robots are in `sensors.py`.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
 from bench.integrity import faults
+from bench.integrity.fault import CLEAN, FAULT_S, SYSTEMATIC, Fault, settings_of
+from bench.integrity.sensors import SENSOR_SCENARIOS
 from swarm_loc_drivers.sim.run import SimulatedRun, Trajectories
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings
-from swarm_loc_drivers.sim.worlds import W0, W2, ErrorModel
+from swarm_loc_drivers.sim.worlds import W0, W2
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.swarm.error_models import SensorModel
 
-DURATION_S = 60.0
-FAULT_S = (15.0, 45.0)
 _FACE = 20  # A marker of the second robot
-
-DETECTOR = SensorModel(forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06)  # Noise as described
-CLEAN = replace(W0, forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06, described=DETECTOR)
-SYSTEMATIC = replace(W2, forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06, described=DETECTOR)
-"""Systematic errors of w2 that the description does not contain."""
-
-
-@dataclass(frozen=True)
-class Fault:
-    """A run with a fault."""
-
-    run: SimulatedRun  # The run
-    # End of the fault, after which the estimate should recover; None: it does not end
-    ends_s: float | None = None
-    # Begin and end of the time in which no data that has arrived shows the fault
-    hidden_s: tuple[float, float] | None = None
-    about: str = ""  # Name of the faulty robot or landmark, if it depends on the seed
-
-
-def settings_of(seed: int, errors: ErrorModel) -> EightSettings:
-    """Five robots for a minute."""
-    return EightSettings(seed=seed, duration_s=DURATION_S, errors=errors)
 
 
 def _clean_w0(seed: int) -> Fault:
@@ -49,8 +27,8 @@ def _clean_w0(seed: int) -> Fault:
 
 
 @lru_cache(maxsize=1)  # scenarios of one seed share it
-def _clean(seed: int) -> Fault:
-    return Fault(faults.simulate(settings_of(seed, CLEAN)))
+def _clean(seed: int) -> SimulatedRun:
+    return faults.simulate(settings_of(seed, CLEAN))
 
 
 def _w2_on_w0_file(seed: int) -> Fault:
@@ -64,11 +42,11 @@ def _hidden_in_noise(seed: int) -> Fault:
 def _driver_gap(seed: int) -> Fault:
     begin_s = 17.3 + 2.7 * seed % 20.0
     end_s = begin_s + (1.2, 1.6, 2.0, 3.0, 6.0)[seed % 5]
-    return Fault(faults.restarted_driver(_clean(seed).run, 0, begin_s, end_s), end_s)
+    return Fault(faults.restarted_driver(_clean(seed), 0, begin_s, end_s), end_s)
 
 
 def _wrong_starts(seed: int) -> Fault:
-    return Fault(faults.wrong_starts(_clean(seed).run, np.random.default_rng([seed, 1])), 0.0)
+    return Fault(faults.wrong_starts(_clean(seed), np.random.default_rng([seed, 1])), 0.0)
 
 
 def _kidnapped(seed: int) -> Fault:
@@ -81,31 +59,31 @@ def _kidnapped(seed: int) -> Fault:
 def _false_sightings(seed: int) -> Fault:
     value = np.random.default_rng([seed, 2]).uniform([0.2, -0.15, -3.0], [0.5, 0.15, 3.0])
     run = faults.false_sightings(
-        _clean(seed).run, (0, _FACE), FAULT_S, lambda stamps, _: np.tile(value, (stamps.size, 1))
+        _clean(seed), (0, _FACE), FAULT_S, lambda stamps, _: np.tile(value, (stamps.size, 1))
     )
     return Fault(run, FAULT_S[1])
 
 
 def _moved_landmark(seed: int) -> Fault:
     angle = np.random.default_rng([seed, 3]).uniform(0.0, 2.0 * math.pi)
-    which, step = faults.busiest_landmark(_clean(seed).run), (0.2 * math.cos(angle), 0.2 * math.sin(angle))
+    which, step = faults.busiest_landmark(_clean(seed)), (0.2 * math.cos(angle), 0.2 * math.sin(angle))
     moved = faults.simulate(settings_of(seed, CLEAN), lambda swarm: faults.moved_landmark(swarm, which, step))
     return Fault(moved, about=f"landmark {which}")
 
 
 def _wrong_scale(seed: int) -> Fault:
-    return Fault(faults.rescaled_odometry(_clean(seed).run, 0, 1.1))
+    return Fault(faults.rescaled_odometry(_clean(seed), 0, 1.1))
 
 
 def _turned_camera(seed: int) -> Fault:
     turned = faults.simulate(
         settings_of(seed, CLEAN), lambda swarm: faults.turned_camera(swarm, 0, math.radians(10.0))
     )
-    return Fault(faults.changed_cameras(_clean(seed).run, turned, 0, FAULT_S[0]))
+    return Fault(faults.changed_cameras(_clean(seed), turned, 0, FAULT_S[0]))
 
 
 def _two_odometry_sources(seed: int) -> Fault:
-    return Fault(faults.second_odometry(_clean(seed).run, 0, FAULT_S[0], 20.0))
+    return Fault(faults.second_odometry(_clean(seed), 0, FAULT_S[0], 20.0))
 
 
 _BLIND_S = 10.0  # Time without sightings of and by a robot whose odometry is reset
@@ -116,7 +94,7 @@ def _reset_blind(seed: int, *, at_origin: bool) -> Fault:
     rng = np.random.default_rng([seed, 6])
     at_s = float(rng.uniform(18.0, 30.0))
     begin_s, end_s = at_s - 0.5, at_s + _BLIND_S
-    run = faults.with_twists(_clean(seed).run)
+    run = faults.with_twists(_clean(seed))
     pose = faults.odometry_pose(run, 0, at_s)
     if at_origin:
         near = np.append(rng.normal(0.0, 0.02, 2), rng.uniform(-0.5, 0.5))
@@ -131,16 +109,16 @@ def _reset_blind(seed: int, *, at_origin: bool) -> Fault:
 
 
 def _twist_only(seed: int) -> Fault:
-    run = faults.with_twists(_clean(seed).run)
+    run = faults.with_twists(_clean(seed))
     return Fault(faults.twist_only(run, 0))
 
 
 def _odometry_flood(seed: int) -> Fault:
-    return Fault(faults.second_odometry(_clean(seed).run, 0, FAULT_S[0], 1000.0))
+    return Fault(faults.second_odometry(_clean(seed), 0, FAULT_S[0], 1000.0))
 
 
 def _creeping_spoof(seed: int, observers: int = 1) -> Fault:
-    rng, run = np.random.default_rng([seed, 4]), _clean(seed).run
+    rng, run = np.random.default_rng([seed, 4]), _clean(seed)
     for k, (observer, target) in enumerate(((0, 1), (2, 3))[:observers]):
         sight = (observer, _FACE + 10 * (target - 1))
         source = _creeping(run, rng, observer, target)
@@ -187,4 +165,5 @@ SCENARIOS: Mapping[str, Callable[[int], Fault]] = {
     "creeping_spoof": _creeping_spoof,
     "creeping_spoof_two": lambda seed: _creeping_spoof(seed, 2),
     "hidden_in_noise": _hidden_in_noise,
+    **SENSOR_SCENARIOS,
 }

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from bench.integrity.fault import Fault
 from bench.integrity.faults import seconds
-from bench.integrity.scenarios import Fault
 from bench.shared.common import rms
 from bench.shared.simulated_run import errors_of, estimates_of, inputs_of, ticks
+from swarm_loc_drivers.sim.run import LivedRun
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.offline.metrics import is_misleading, nees
 from swarm_loc_estimator.timeline.estimate import Contradicted
@@ -19,6 +22,7 @@ from swarm_loc_estimator.timeline.estimator import Status
 _RIGHT_M = 0.05
 _SETTLED_S = 1.0
 _STEADY_S = 3.0
+_AFTER_S = 30.0  # Time after a fault in which other robots' errors are compared
 
 
 class Estimated(NamedTuple):
@@ -44,22 +48,83 @@ class Score:
     error_m: FloatArray  # (T, N) distance from the truth; NaN where not located
     misleading: BoolArray  # (T, N) whether misleading
     reported: frozenset[tuple[str, Contradicted]] = frozenset()  # Reported contradictions by name and kind
+    blame: Blame | None = None  # Of a fault that says who is guilty
+
+
+@dataclass(frozen=True)
+class Blame:
+    """Who is named for a fault, and what it does to robots that it does not concern."""
+
+    # From the fault's begin until a guilty source is named [s]; the length of the run: never
+    named_s: float
+    accused: int  # Number of innocent sources named
+    # RMSE of the other robots during the fault, over that of the run without it; NaN: it concerns all robots
+    others_ratio: float = math.nan
+    others_after_ratio: float = math.nan  # The same after the fault; NaN, too, if it does not end
+
+
+class Named(NamedTuple):
+    """A reported contradiction."""
+
+    time_s: float  # Since the run began [s]
+    about: str  # Name of the source
+    kind: Contradicted  # What is contradicted
 
 
 def score(fault: Fault) -> Score:
     """Run the estimator over a scenario, ticking ten times a second."""
-    run = fault.run
-    tick_ns, estimates = ticks(run), []
-    reported: set[tuple[str, Contradicted]] = set()
-    for estimate, estimator in estimates_of(run.swarm, inputs_of(run, tick_ns), tick_ns):
+    estimated, named = _estimated(fault.run, fault.readings)
+    found = scored(estimated, fault.ends_s, fault.hidden_s)
+    found = replace(found, reported=frozenset((one.about, one.kind) for one in named))
+    if not fault.guilty:
+        return found
+    blame = blame_of(fault, named)
+    if fault.concerned:
+        during, after = _others_ratios(fault, estimated)
+        blame = replace(blame, others_ratio=during, others_after_ratio=after)
+    return replace(found, blame=blame)
+
+
+def _estimated(run: LivedRun, readings: Mapping[str, Any]) -> tuple[Estimated, list[Named]]:
+    """Estimates of a run with further readings, and what is contradicted at each tick."""
+    tick_ns, estimates, named = ticks(run), [], []
+    time_s = seconds(run, tick_ns)
+    inputs = inputs_of(run, tick_ns, **readings)
+    for now_s, (estimate, estimator) in zip(
+        time_s.tolist(), estimates_of(run.swarm, inputs, tick_ns), strict=True
+    ):
         estimates.append(estimate)
-        reported |= {(one.about, one.kind) for one in estimator.contradictions(estimate.stamp_ns)}
+        named += [Named(now_s, one.about, one.kind) for one in estimator.contradictions(estimate.stamp_ns)]
     error = errors_of(np.array([one.poses for one in estimates]), run, tick_ns)
     covariance = np.array([one.covariances for one in estimates])
     tracked = np.array([one.status for one in estimates]) == Status.TRACKED
-    estimated = Estimated(seconds(run, tick_ns), error, covariance, tracked)
-    found = scored(estimated, fault.ends_s, fault.hidden_s)
-    return replace(found, reported=frozenset(reported))
+    return Estimated(time_s, error, covariance, tracked), named
+
+
+def blame_of(fault: Fault, named: Sequence[Named]) -> Blame:
+    """Who is named for a fault; a contradicted pose is a symptom and names no source."""
+    sources = [one for one in named if one.kind != Contradicted.POSE]
+    since_s = [one.time_s - fault.begins_s for one in sources if one.about in fault.guilty]
+    named_s = min((one for one in since_s if one >= 0.0), default=fault.run.duration_s)
+    return Blame(named_s, len({one.about for one in sources} - fault.guilty))
+
+
+def _others_ratios(fault: Fault, estimated: Estimated) -> tuple[float, float]:
+    """Errors of robots that a fault does not concern, by those without it: while it lasts, and afterwards."""
+    others = [k for k in range(len(fault.run.swarm.robots)) if k not in fault.concerned]
+    healthy, _ = _estimated(fault.run, fault.healthy)
+    end_s = fault.run.duration_s if fault.ends_s is None else fault.ends_s
+    spans = [(fault.begins_s, end_s), (end_s, end_s + _AFTER_S)]
+    during, after = (_rmse_m(estimated, others, one) / _rmse_m(healthy, others, one) for one in spans)
+    return during, math.nan if fault.ends_s is None else after
+
+
+def _rmse_m(estimated: Estimated, robots: list[int], span_s: tuple[float, float]) -> float:
+    """RMSE of the positions of some robots within a time, where located; NaN without any [m]."""
+    inside = (estimated.time_s >= span_s[0]) & (estimated.time_s < span_s[1])
+    error = estimated.error[inside][:, robots, :2]
+    known = error[np.isfinite(error).all(axis=-1)]
+    return rms(np.hypot(*known.T)) if known.size else math.nan
 
 
 def scored(

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from swarm_loc_drivers.sim.run import in_order_of_arrival
+from swarm_loc_drivers.sim.run import SimulatedRun, in_order_of_arrival
 from swarm_loc_drivers.sim.scenarios.bags import as_detections
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.replay import ListedSchedule, Runner
-from swarm_loc_estimator.sensors.camera import DetectionRows
+from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.timeline.estimator import Estimator
@@ -22,7 +22,7 @@ from swarm_loc_estimator.timeline.estimator import Estimator
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from swarm_loc_drivers.sim.run import LivedRun, SimulatedRun
+    from swarm_loc_drivers.sim.run import LivedRun
     from swarm_loc_estimator.common.arrays import FloatArray, IntArray
     from swarm_loc_estimator.swarm.swarm import Swarm
     from swarm_loc_estimator.timeline.estimator import Estimate
@@ -64,9 +64,13 @@ def estimates_of(
         yield estimator.tick(now_ns), estimator
 
 
-def inputs_of(run: SimulatedRun, tick_ns: IntArray, **others: Any) -> list[Batch]:
-    """Odometry and detections of a run, and other readings by sensor, cut as by `inputs_between`."""
-    return inputs_between(tick_ns, odometry=odometry_rows(run), detections=detection_rows(run), **others)
+def inputs_of(run: LivedRun, tick_ns: IntArray, **others: Any) -> list[Batch]:
+    """Odometry and detections of a run, and other readings by sensor or in place of these.
+
+    They are cut as by `inputs_between`.
+    """
+    detections = detection_rows(run) if isinstance(run, SimulatedRun) else NO_DETECTIONS
+    return inputs_between(tick_ns, **{"odometry": odometry_rows(run), "detections": detections, **others})
 
 
 def inputs_between(tick_ns: IntArray, **rows: Any) -> list[Batch]:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import pickle
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from bench.integrity.faults import seconds
 from bench.integrity.late_start import run_late_start
 from bench.integrity.scenarios import SCENARIOS
-from bench.integrity.scoring import score
+from bench.integrity.scoring import Blame, Named, blame_of, score
+from bench.integrity.sensors import SENSOR_SCENARIOS
 from swarm_loc_estimator.timeline.estimate import Contradicted
 
 SEED = 23
@@ -66,3 +72,71 @@ def test_an_estimator_that_starts_late_locates_robots_that_map(tmp_path: Path) -
     assert found.misleading_share <= 0.001
     assert found.recovery_s <= 3.0
     assert found.tracked_share >= 0.8
+
+
+@pytest.mark.parametrize("scenario", SENSOR_SCENARIOS)
+def test_readings_are_wrong_during_a_fault_only_and_of_nobody_else(scenario: str) -> None:
+    wrong = []
+    for seed in (1, 2):
+        fault = SENSOR_SCENARIOS[scenario](seed)
+        end_s = fault.run.duration_s if fault.ends_s is None else fault.ends_s
+        ((sensor, readings),) = fault.readings.items()
+        changed = _rows(readings) ^ _rows(fault.healthy[sensor])
+        time_s = seconds(fault.run, np.array([stamp_ns for _, stamp_ns, _ in changed]))
+        assert time_s.min() >= fault.begins_s
+        assert time_s.max() < end_s
+        assert time_s.max() - time_s.min() > 0.8 * (end_s - fault.begins_s)
+        if sensor != "detections" and fault.concerned:
+            assert {robot for robot, *_ in changed} == fault.concerned
+        assert np.all(np.diff(readings.arrival_ns) >= 0)
+        wrong.append(changed)
+    assert wrong[0] != wrong[1]
+
+
+def _rows(rows: Any) -> set[tuple[int, int, bytes]]:
+    """Robot, stamp and all of each row."""
+    columns = [
+        column[name] if name else column for column in rows for name in column.dtype.names or ("",)
+    ]  # fields one by one, without padding
+    texts = (
+        [pickle.dumps(one) if column.dtype == object else one.tobytes() for one in column]
+        for column in columns
+    )
+    return set(
+        zip(rows.robot.tolist(), rows.stamp_ns.tolist(), map(b"".join, zip(*texts, strict=True)), strict=True)
+    )
+
+
+@pytest.mark.parametrize(
+    "scenario", ["ceiling_camera_moved", "gyro_zero", "mocap_swapped", "uwb_repeated", "scans_late"]
+)
+def test_without_its_fault_a_world_is_as_it_is_described(scenario: str) -> None:
+    fault = SENSOR_SCENARIOS[scenario](SEED)
+    found = score(replace(fault, readings=fault.healthy, ends_s=None, concerned=frozenset()))
+    assert found.misleading_share <= 0.001
+    assert found.tracked_share >= 0.98
+    assert found.nees <= 6.0
+    assert found.blame == Blame(fault.run.duration_s, 0)
+
+
+def test_a_source_counts_as_named_from_the_fault_on_and_symptoms_accuse_nobody() -> None:
+    fault = replace(SENSOR_SCENARIOS["mocap_swapped"](SEED), begins_s=15.0, guilty=frozenset({"a", "b"}))
+    named = [
+        Named(3.0, "a", Contradicted.SIGHTINGS),
+        Named(17.0, "c", Contradicted.NOISE),
+        Named(18.0, "c", Contradicted.DESCRIPTION),
+        Named(18.0, "d", Contradicted.POSE),
+        Named(19.0, "b", Contradicted.DESCRIPTION),
+        Named(21.0, "a", Contradicted.DESCRIPTION),
+    ]
+    assert blame_of(fault, named) == Blame(4.0, 1)
+    assert blame_of(fault, named[:4]) == Blame(fault.run.duration_s, 1)
+
+
+def test_detections_that_claim_too_much_are_named_and_do_not_disturb_others() -> None:
+    found = score(SENSOR_SCENARIOS["sure_detections"](SEED))
+    assert found.blame is not None
+    assert found.blame.named_s <= 5.0
+    assert found.blame.accused == 0
+    assert found.blame.others_ratio <= 1.5
+    assert found.blame.others_after_ratio <= 1.2

@@ -1,0 +1,300 @@
+"""Scenarios of ceiling cameras, gyroscopes, motion capture, UWB and lidar.
+
+Each replaces readings of a time by wrong ones, and says whom a contradiction may name.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from bench.inputs.gyro import RATE_HZ, simulate_gyroscopes
+from bench.inputs.imu import IMU, with_imus
+from bench.inputs.lidar_map import exact_map, record
+from bench.inputs.mocap import FIX_NS, HEADING_SIGMA, POSITION_SIGMA
+from bench.inputs.uwb_world import Plan, simulate
+from bench.integrity import faults
+from bench.integrity.ceiling import drive_under_ceiling, hung, observe_tags
+from bench.integrity.fault import CLEAN, FAULT_S, Fault, settings_of
+from bench.pushbot.mapping import PLANS
+from bench.shared.common import OUT
+from bench.shared.simulated_run import detection_rows
+from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
+from swarm_loc_drivers.sim.run import CAMERA_LATENESS, LivedRun, SimulatedRun, arrival_ns
+from swarm_loc_drivers.sim.worlds import W0, ErrorModel
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.filter.measurements import concatenate, select
+from swarm_loc_estimator.mapping.map_file import save_map
+from swarm_loc_estimator.sensors.camera import DetectionRows
+from swarm_loc_estimator.sensors.fix import NO_FIXES, FixRows
+from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
+from swarm_loc_estimator.swarm.swarm import Swarm
+
+_DURATION_S = 80.0  # Of each run; more than 30 s after the fault
+_TO_THE_END_S = (FAULT_S[0], _DURATION_S)
+_MOCAP_SIGMA = (POSITION_SIGMA, POSITION_SIGMA, HEADING_SIGMA)
+Span = tuple[float, float]
+
+
+def _rng(seed: int) -> np.random.Generator:
+    """Draws the fault, not the run."""
+    return np.random.default_rng([seed, 30])
+
+
+def _aside(rng: np.random.Generator, distance: float) -> FloatArray:
+    """A step (2,) of a length into a random direction [m]."""
+    angle = rng.uniform(0.0, 2.0 * math.pi)
+    return distance * np.array([math.cos(angle), math.sin(angle)])
+
+
+def _is_within(run: LivedRun, rows: Any, span_s: Span) -> BoolArray:
+    """Which rows (k,) have their stamps in a time since the run began."""
+    time_s = faults.seconds(run, rows.stamp_ns)
+    inside: BoolArray = (time_s >= span_s[0]) & (time_s < span_s[1])
+    return inside
+
+
+def _faulty(
+    run: LivedRun,
+    sensor: str,
+    good: Any,
+    wrong: Any,
+    guilty: Collection[str],
+    concerned: Collection[int] = (),
+    span_s: Span = FAULT_S,
+) -> Fault:
+    """A run with wrong readings of a sensor for a while.
+
+    Args:
+        run: The run.
+        sensor: Name of the sensor.
+        good: Its readings without the fault.
+        wrong: Those that replace them.
+        guilty: Names of the sources that are to blame.
+        concerned: Robots that the fault concerns; none: all.
+        span_s: Begin and end of the fault.
+    """
+    before, during = select(good, ~_is_within(run, good, span_s)), _is_within(run, wrong, span_s)
+    return Fault(
+        run,
+        ends_s=span_s[1] if span_s[1] < run.duration_s else None,
+        readings={sensor: in_order_of_arrival([before, select(wrong, during)])},
+        healthy={sensor: good},
+        begins_s=span_s[0],
+        guilty=frozenset(guilty),
+        concerned=frozenset(concerned),
+    )
+
+
+def _under_ceiling(
+    seed: int, change: Callable[[Swarm], Swarm], guilty: Collection[str], *concerned: int, span_s: Span
+) -> Fault:
+    """Robots under two ceiling cameras, in a world that changes for a while."""
+    run = drive_under_ceiling(seed, _DURATION_S)
+    seen = hung(run.swarm, np.random.default_rng([seed, 31]))
+    good, wrong = observe_tags(run, seen, seed), observe_tags(run, change(seen), seed)
+    return _faulty(run, "detections", good, wrong, guilty, concerned, span_s)
+
+
+def _ceiling_camera(seed: int, least: Sequence[float], most: Sequence[float]) -> Fault:
+    """One camera moves, in every other seed to the end; `least` and `most` of distance [m] and turn [rad]."""
+    rng = _rng(seed)
+    which, (distance, turn) = int(rng.integers(2)), rng.uniform(least, most).tolist()
+    (dx, dy), turn = _aside(rng, distance).tolist(), turn * float(rng.choice([-1.0, 1.0]))
+
+    def moved(swarm: Swarm) -> Swarm:
+        cameras = list(swarm.cameras)
+        one = cameras[which]
+        cameras[which] = replace(one, x=one.x + dx, y=one.y + dy, yaw=one.yaw + turn)
+        return replace(swarm, cameras=tuple(cameras))
+
+    span_s = _TO_THE_END_S if seed % 2 else FAULT_S
+    return _under_ceiling(seed, moved, {f"ceiling{which + 1}"}, span_s=span_s)
+
+
+def _ceiling_cameras_swapped(seed: int) -> Fault:
+    run = drive_under_ceiling(seed, _DURATION_S)
+    good = observe_tags(run, hung(run.swarm, np.random.default_rng([seed, 31])), seed)
+    swapped = good._replace(robot=2 * len(run.swarm.robots) + 1 - good.robot)
+    span_s = (0.0, _DURATION_S) if seed % 2 else FAULT_S
+    names = {camera.name for camera in run.swarm.cameras}
+    return _faulty(run, "detections", good, swapped, names, span_s=span_s)
+
+
+def _face_turned_90(seed: int) -> Fault:
+    """A tag lies turned, in every other seed all the time."""
+    rng = _rng(seed)
+    which, turn = int(rng.integers(5)), float(rng.choice([-0.5, 0.5])) * math.pi
+
+    def turned(swarm: Swarm) -> Swarm:
+        robots = list(swarm.robots)
+        (face,) = robots[which].faces
+        robots[which] = replace(robots[which], faces=(replace(face, yaw=(face.yaw or 0.0) + turn),))
+        return replace(swarm, robots=tuple(robots))
+
+    span_s = (0.0, _DURATION_S) if seed % 2 else FAULT_S
+    return _under_ceiling(seed, turned, {f"epuck{which + 1}"}, which, span_s=span_s)
+
+
+def _eight(seed: int, errors: ErrorModel = CLEAN) -> SimulatedRun:
+    """The eight, for longer than other scenarios."""
+    return faults.simulate(settings_of(seed, errors, _DURATION_S))
+
+
+def _fixes(
+    run: LivedRun, seed: int, period_ns: int = FIX_NS, sigma: Sequence[float] = _MOCAP_SIGMA
+) -> FixRows:
+    """Absolute fixes of all robots, in order of arrival; `sigma` is of x, y [m] and heading [rad]."""
+    rng, robots = np.random.default_rng([seed, 32]), len(run.swarm.robots)
+    stamp_ns = np.arange(run.start_ns + int(rng.integers(period_ns)), run.end_ns, period_ns)
+    pose = run.truth.all_at(stamp_ns).reshape(-1, 3)
+    pose += np.array(sigma) * rng.standard_normal(pose.shape)
+    stamps, who = np.repeat(stamp_ns, robots), np.tile(np.arange(robots), stamp_ns.size)
+    covariance = np.tile(np.diag(np.square(sigma)), (who.size, 1, 1))
+    rows = FixRows(who, stamps, pose, covariance, arrival_ns(rng, stamps, CAMERA_LATENESS))
+    return in_order_of_arrival([rows])
+
+
+def _fixes_of(*robots: int) -> set[str]:
+    """Names of the fixes of robots."""
+    return {f"fixes of epuck{robot + 1}" for robot in robots}
+
+
+def _mocap_swapped(seed: int, span_s: Span) -> Fault:
+    run = _eight(seed)
+    good = _fixes(run, seed)
+    a, b = _rng(seed).choice(len(run.swarm.robots), 2, replace=False).tolist()
+    body_of = np.arange(len(run.swarm.robots))
+    body_of[[a, b]] = b, a
+    wrong = good._replace(robot=body_of[good.robot])
+    return _faulty(run, "fixes", good, wrong, _fixes_of(a, b), {a, b}, span_s)
+
+
+def _mocap_frame(seed: int) -> Fault:
+    """The frame of a body is 5 cm off, as of a marker plate that was pushed."""
+    rng, run = _rng(seed), _eight(seed)
+    good, which = _fixes(run, seed, 10_000_000), int(rng.integers(5))
+    pose, own = good.pose.copy(), good.robot == which
+    pose[own] = se2.compose(pose[own], np.append(_aside(rng, 0.05), 0.0))
+    return _faulty(run, "fixes", good, good._replace(pose=pose), _fixes_of(which), {which})
+
+
+def _mocap_creep(seed: int) -> Fault:
+    rng, run = _rng(seed), _eight(seed)
+    good, which = _fixes(run, seed), int(rng.integers(5))
+    way_s = (good.robot == which) * (faults.seconds(run, good.stamp_ns) - FAULT_S[0])
+    wrong = good._replace(pose=good.pose + way_s[:, None] * np.append(_aside(rng, 0.003), 0.0))
+    return _faulty(run, "fixes", good, wrong, _fixes_of(which), {which})
+
+
+def _fixes_1khz(seed: int) -> Fault:
+    """A robot gets wrong fixes, and no other gets any."""
+    rng, run = _rng(seed), _eight(seed)
+    which, fixes = int(rng.integers(5)), _fixes(run, seed, 1_000_000, (0.01, 0.01, 0.02))
+    wrong = select(fixes, fixes.robot == which)
+    wrong = wrong._replace(pose=wrong.pose + np.append(_aside(rng, 0.05), 0.0))
+    return _faulty(run, "fixes", NO_FIXES, wrong, _fixes_of(which), {which})
+
+
+def _sure_detections(seed: int) -> Fault:
+    """An observer's detections of a robot come a second time, 3 cm off and claimed to be exact."""
+    rng, run = _rng(seed), _eight(seed)
+    good = detection_rows(run)
+    # one of the five pairs that see each other most
+    target = np.array([run.swarm.owner_of[int(one)].robot_index for one in good.detection["id"]])
+    seen = _is_within(run, good, FAULT_S) & (target >= 0)
+    pairs, counts = np.unique(np.column_stack([good.robot, target])[seen], axis=0, return_counts=True)
+    observer, other = pairs[np.argsort(counts)[-1 - int(rng.integers(5))]].tolist()
+    # its detections
+    again = select(good, (good.robot == observer) & (target == other))
+    detection = again.detection.copy()
+    detection["position"][:, [0, 2]] += _aside(rng, 0.03)
+    detection["covariance"] = 1e-10 * np.eye(6)
+    wrong: DetectionRows = concatenate([good, again._replace(detection=detection)])
+    return _faulty(run, "detections", good, wrong, {f"epuck{observer + 1}"}, {observer, other})
+
+
+def _gyroscopes(seed: int, break_it: Callable[[FloatArray], FloatArray], span_s: Span = FAULT_S) -> Fault:
+    """The gyroscope of a robot breaks within 5 s, in every other seed those of all robots.
+
+    Detections are as noisy as those of the e-puck paper, so that turn rates matter.
+
+    Args:
+        seed: Of the run and the fault.
+        break_it: Makes wrong rates (k, 3) of those of a robot from the fault on.
+        span_s: Begin and end of the fault.
+    """
+    rng, run = _rng(seed), with_imus(_eight(seed, W0))
+    good, which = simulate_gyroscopes(rng, run, IMU), int(rng.integers(5))
+    broken = [which] if seed % 2 else range(len(run.swarm.robots))
+    span_s = (span_s[0] + float(rng.uniform(0.0, 5.0)), span_s[1])
+    order, velocity = np.argsort(good.stamp_ns, kind="stable"), good.velocity.copy()
+    since = order[faults.seconds(run, good.stamp_ns[order]) >= span_s[0]]
+    for robot in broken:
+        own = since[good.robot[since] == robot]
+        velocity[own] = break_it(velocity[own])
+    guilty, concerned = {f"gyroscope of epuck{robot + 1}" for robot in broken}, broken if seed % 2 else ()
+    return _faulty(run, "imu", good, good._replace(velocity=velocity), guilty, concerned, span_s)
+
+
+def _on_another_axis(seed: int) -> Fault:
+    """The yaw rate appears on another axis, and noise on the vertical one."""
+    rng, sigma = _rng(seed), IMU.turn_noise_density * math.sqrt(RATE_HZ)
+
+    def on_its_side(rates: FloatArray) -> FloatArray:
+        return np.roll(rates, 1 + int(seed % 3 == 0), axis=1) + sigma * rng.standard_normal(rates.shape)
+
+    return _gyroscopes(seed, on_its_side)
+
+
+def _uwb_repeated(seed: int) -> Fault:
+    """Ranges of all radios are measured twice a second and published five times each."""
+    world = simulate(Plan(duration_s=_DURATION_S, steps_per_range=10), seed)
+    run, good = world.lived(), world.range_rows()
+    again = [
+        good._replace(stamp_ns=good.stamp_ns + late_ns, arrival_ns=good.arrival_ns + late_ns)
+        for late_ns in range(0, 500_000_000, 100_000_000)
+    ]
+    guilty = {f"radio of {robot.name}" for robot in run.swarm.robots}
+    return _faulty(run, "ranges", good, concatenate(again), guilty)
+
+
+def _scans_late(seed: int) -> Fault:
+    """Scans are stamped late, as by a driver that stamps them when it publishes them."""
+    plan, late_ns = floor_plan(PLANS[seed % len(PLANS)]), (200_000_000, 400_000_000)[seed % 2]
+    folder = OUT / "integrity" / f"scans_late{seed}"
+    folder.mkdir(parents=True, exist_ok=True)
+    swarm_map, _ = save_map(exact_map(plan), folder / "map")
+    run, good = record(plan, swarm_map, seed, _DURATION_S)
+    stamps_ns, scans = good.stamp_ns + late_ns, good.scan.copy()
+    scans[:] = [one._replace(stamp_ns=one.stamp_ns + late_ns) for one in scans]
+    late = good._replace(stamp_ns=stamps_ns, scan=scans, arrival_ns=good.arrival_ns + late_ns)
+    return _faulty(run, "scans", good, late, {f"lidar of {run.swarm.robots[0].name}"})
+
+
+SENSOR_SCENARIOS: Mapping[str, Callable[[int], Fault]] = {
+    "ceiling_camera_moved": lambda seed: _ceiling_camera(seed, (0.03, 0.0), (0.08, 0.0)),
+    "ceiling_camera_turned": lambda seed: _ceiling_camera(
+        seed, (0.0, math.radians(2.0)), (0.0, math.radians(5.0))
+    ),
+    "ceiling_cameras_swapped": _ceiling_cameras_swapped,
+    "face_turned_90": _face_turned_90,
+    "gyro_zero": lambda seed: _gyroscopes(seed, np.zeros_like),
+    "gyro_axis": _on_another_axis,
+    "gyro_freezes": lambda seed: _gyroscopes(
+        seed, lambda rates: np.broadcast_to(rates[0], rates.shape), _TO_THE_END_S
+    ),
+    "mocap_swapped": lambda seed: _mocap_swapped(seed, _TO_THE_END_S),
+    "mocap_swapped_8s": lambda seed: _mocap_swapped(seed, (FAULT_S[0], FAULT_S[0] + 8.0)),
+    "mocap_frame_5cm_100hz": _mocap_frame,
+    "mocap_creep_3mm": _mocap_creep,
+    "fixes_1khz": _fixes_1khz,
+    "sure_detections": _sure_detections,
+    "uwb_repeated": _uwb_repeated,
+    "scans_late": _scans_late,
+}
