@@ -138,7 +138,7 @@ def _face_turned_90(seed: int) -> Fault:
         return replace(swarm, robots=tuple(robots))
 
     span_s = (0.0, _DURATION_S) if seed % 2 else FAULT_S
-    return _under_ceiling(seed, turned, {f"epuck{which + 1}"}, which, span_s=span_s)
+    return _under_ceiling(seed, turned, {f"marker of epuck{which + 1}"}, which, span_s=span_s)
 
 
 def _eight(seed: int, errors: ErrorModel = CLEAN) -> SimulatedRun:

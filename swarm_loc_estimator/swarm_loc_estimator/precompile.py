@@ -19,8 +19,8 @@ from swarm_loc_estimator.common.messages.detections import (
 )
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.filter.integrity import is_kidnapped
 from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS
+from swarm_loc_estimator.filter.sources import is_kidnapped
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
@@ -144,7 +144,7 @@ def _run(settings: Settings, *, infrared: bool, fused: bool = True) -> None:
 def _call_rare(swarm: Swarm) -> None:
     """What is called once something contradicts, or once many infrared exchanges are fused together."""
     state = SwarmState(ParameterTable.of(swarm.robots, swarm.surveyed), pairs=2)
-    is_kidnapped(state.integrity, 0)
+    is_kidnapped(state.sources, 0)
 
 
 def _light() -> FloatArray:

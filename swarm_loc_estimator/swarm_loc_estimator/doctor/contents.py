@@ -214,7 +214,7 @@ _CONTRADICTED = MappingProxyType(
             "Check the mount of its camera, the size and ids of markers, and places of landmarks",
         ),
         Contradicted.DESCRIPTION: ("other than described", "Measure it again, or use survey or calibrate"),
-        Contradicted.NOISE: ("noisier than described", "Use calibrate, or describe more noise"),
+        Contradicted.SUSPENDED: ("at odds with the rest", "Check its place, its clock, and whose body it is"),
     }
 )
 """What is contradicted, and what to do about it."""

@@ -230,8 +230,8 @@ def _gather(
 @cached_njit
 def update_one(
     covariance: FloatArray, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Fuse one measurement: update the covariance (n, n) in place, return correction (n,) and gain (3, n).
+) -> FloatArray:
+    """Fuse one measurement: update the covariance (n, n) in place, return the correction (n,).
 
     Eqs. (11), (13), (14), and (12) in Joseph's form, which keeps the covariance positive definite, expanded
     to P - K H P - (P H^T - K S) K^T, where the last term is the rounding error, and made symmetric.
@@ -264,7 +264,7 @@ def update_one(
             value += k1 * change[1, j] + c1 * gain[1, j]
             value += k2 * change[2, j] + c2 * gain[2, j]
             covariance[i, j] -= value
-    return correction, gain
+    return correction
 
 
 @cached_njit

@@ -28,6 +28,7 @@ class Measurements(NamedTuple):
     observer: IntArray  #: (m,) robot with the sensor; NOBODY: the sensor is fixed in `map`
     target: IntArray  #: (m,) measured robot, or NOBODY
     landmark: IntArray  #: (m,) measured landmark or anchor (index of `Swarm.surveyed`), or NOBODY
+    mount: IntArray  #: (m,) fixed camera with the sensor (index of `Swarm.surveyed`), or NOBODY
     model: IntArray  #: (m,) number of the model in `models.MODELS`
     #: (m,) number that tells simultaneous measurements of two sides apart: of the marker, the radio, the
     #: detection in its image; of a scan the stamp of its first beam [ns]
@@ -57,7 +58,7 @@ class Measurements(NamedTuple):
         def whole(value: int = 0) -> IntArray:
             return np.full(count, value)
 
-        sides = whole(NOBODY), whole(NOBODY), whole(NOBODY), whole(NOBODY)
+        sides = whole(NOBODY), whole(NOBODY), whole(NOBODY), whole(NOBODY), whole(NOBODY)
         flags = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
         places = zeros(3), zeros(3), zeros(2), zeros(3)
         values = zeros(3), zeros(3), zeros(3, 3) + np.eye(3), zeros(3)

@@ -7,8 +7,8 @@ compiled kernel. Each of their measurements observes the pose of a marker in a s
 
 the transform chains (3) and (5) of the e-puck paper in the plane (its printed eq. (6) has three wrong signs,
 which the chain avoids). S is the sensor on the observer, M the marker on the target. A landmark has no target
-robot: M is its pose in `map`, corrected by X_target if the landmark is estimated. An absolute fix has no
-observer: S is the identity, or the pose of a fixed camera in `map`.
+robot: M is its pose in `map`, corrected by X_target if the landmark is estimated. So is the pose S of a fixed
+camera, by X_observer. An absolute fix has no observer: S is the identity.
 
 With right-invariant errors X = exp(xi) X_hat the chain depends on xi_target - xi_observer only, so one
 Jacobian (3 x 3) serves both robots, with opposite signs. Three more columns are for the camera's yaw
@@ -254,7 +254,7 @@ def predict(
 
     Args:
         measurements: (m,).
-        observer_pose: (m, 3) in `map`; rows without an observer are ignored.
+        observer_pose: (m, 3) in `map`, or correction of the survey of a fixed camera.
         target_pose: (m, 3), or correction of a landmark's survey; rows with neither are ignored.
         camera: (m, 3) yaw offset of the sensor, positive to the left [rad], relative error of distances, and
             range offset [m]; zero by default.
@@ -293,7 +293,7 @@ def predict_one(
     """Write the predicted value (3,) of measurement k and its Jacobian (3, 6), see `predict`."""
     sensor, marker = measurements.sensor[k], measurements.marker[k]
     sx, sy, stheta = sensor[0], sensor[1], sensor[2] + camera[0]
-    if measurements.observer[k] >= 0:
+    if measurements.observer[k] >= 0 or measurements.mount[k] >= 0:
         sx, sy, stheta = composed(observer_pose[0], observer_pose[1], observer_pose[2], sx, sy, stheta)
     mx, my, mtheta = marker[0], marker[1], marker[2]
     if measurements.target[k] >= 0 or measurements.landmark[k] >= 0:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,23 +17,14 @@ from swarm_loc_estimator.filter.measurements import NOBODY, LossReason
 from swarm_loc_estimator.identification.memory import IdentityMemory
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.swarm.calibration_states import (
-    DISTANCE_SCALE,
     PARAMETERS,
-    TURN_SCALE,
     ParameterTable,
 )
 
 NEVER_NS = np.iinfo(np.int64).min
 PAIR_ROWS = 10  # Rows of three numbers stored per pair, see `correlated_noise.py`
-_SOURCES = 16  # Most recent sources of a robot whose innovations are remembered
-WINDOWS = 2  # Windows in which the drift of odometry is observed, see `prediction.py`
-LOG_SCALES = math.log(2.0) * np.arange(-1.0, 7.5, 0.5)
-"""Logarithms of the scales of the process noise, from one half to 128.
-
-Those below 1 take up what chance adds: without them, the mean of a robot as described would exceed 1.
-"""
-_SUSPECT_UNITS = 2.0
-"""Noise inflation of all robots once their description has proved wrong, in units of `integrity.py`."""
+_LINKS = 16  # Most recent links of a robot that are remembered
+_DOUBT_AT_FIRST = 5.0
 _DOUBTED_POSE_SIGMA = (0.02, 0.02, 0.03)
 """Standard deviation added to the pose of a contradicted robot [m], [m], [rad]."""
 _REOPENED_POSE_SIGMA = (0.06, 0.06, 0.12)
@@ -43,47 +33,22 @@ _ALONE: IntArray = np.zeros(0, dtype=np.int64)
 _NO_SHARES: FloatArray = np.zeros((0, 3, 3))
 
 
-class IntegrityArrays(NamedTuple):
-    """Statistics of recent innovations for fault detection; see `integrity.py`.
+class SourceArrays(NamedTuple):
+    """What is known of sources (S,) and of links of robots (N, K), see `sources.py`."""
 
-    A source is a measured object: robot i has index i, landmark l has index N + l. Measurements of models
-    without a kernel have sources of their own, with indices that are larger by N + L.
-    """
-
-    source: IntArray  # (N, S) sources measured most recently by each robot; -1: none
-    source_ns: IntArray  # (N, S) stamp of the last measurement of the pair
-    counted_ns: IntArray  # (N, S) stamp of the last measurement counted as evidence
-    outlier: BoolArray  # (N, S) True if the last measurement was an outlier
-    unexplained: BoolArray  # (N, S) True if no parameter error could explain it
-    trending: BoolArray  # (N, S) True if the last innovations had a trend
-    evidence: FloatArray  # (N, S) evidence against the pair
-    whitened: FloatArray  # (N, S, 2) sum of whitened innovations since the last test for a trend
-    squares: FloatArray  # (N, S) sum of their squares
-    looks: IntArray  # (N, S) number of these innovations
-    fault_score: FloatArray  # (N + L,) of each robot and landmark
-    confirmations: IntArray  # (N,) number of sightings that agree with the robot's initial pose
-    confirmed_ns: IntArray  # (N,) stamp of the last counted confirmation
-    gated_in_a_row: IntArray  # (N,) counted gated measurements since the last accepted one; not quick repeats
-    gated_source: IntArray  # (N,) source of the last gated measurement
-    gated_ns: IntArray  # (N,) stamp of the last gated measurement
-    gated_fixes: IntArray  # (N,) absolute fixes gated since the last accepted fix or landmark sighting
-    gated_fix_ns: IntArray  # (N,) stamp of the last counted gated fix
-    # (N,) level of noise inflation of each robot's measurements, see `filter/integrity.py`
-    noise_inflation: FloatArray
-    # (N, W) begin of each window in which the drift of odometry is observed, see `filter/prediction.py`
-    drift_ns: IntArray
-    drift_transform: FloatArray  # (N, W, 3) T at that time
-    drift_noise: FloatArray  # (N, W, 3, 3) preintegrated covariance of the track at that time
-    drift_covariance: FloatArray  # (N, W, 3, 3) of the error of T at that time
-    motion_likelihood: FloatArray  # (N, scales) log-likelihood of each scale of the process noise
-    motion_scale: FloatArray  # (N,) scale of the process noise of each robot
-    # (N,) True if it stays 1, as scales of the robot's motion are described as estimated
-    motion_explained: BoolArray
-    # (N, 3, 3) covariance of each robot's error beyond that of the filter, see `filter/correlated_noise.py`
-    excess: FloatArray
-    # (N, S, 2, 3, 3) covariance of the errors of observer and target with the repeated error of their pair
-    repeated: FloatArray
-    repeated_at: FloatArray  # (N, S, 2) place of the target, as the observer saw it last [m]
+    source: IntArray  # (N, K) source that each robot has a link with; -1: none
+    seen_ns: IntArray  # (N, K) stamp of the newest measurement of the link
+    finding: IntArray  # (N, K) what it says: AGREES, DRIFTS, DEVIATES or ELSEWHERE
+    evidence: FloatArray  # (N, K) evidence against the link
+    drift: FloatArray  # (N, K, 2) mean of the last whitened innovations
+    # (N, K, 3) x, y of the target as it was seen last [m], and `learned` of the robot then
+    last_look: FloatArray
+    score: FloatArray  # (S,) fault score
+    confirmations: FloatArray  # (N,) number of measurements that agree with the robot's initial pose
+    gated: FloatArray  # (N,) number of gated measurements since the last accepted one
+    measured_ns: IntArray  # (N,) stamp of the newest accepted measurement
+    learned: FloatArray  # (N,) sum of the logarithms by which updates have reduced the variance
+    excess: FloatArray  # (N, 3, 3) covariance of each robot's error beyond that of the filter
 
 
 class BeliefArrays(NamedTuple):
@@ -101,11 +66,12 @@ class BeliefArrays(NamedTuple):
     preintegrated_jacobian: FloatArray
     tracked: BoolArray
     last_fix_ns: IntArray
-    integrity: IntegrityArrays
+    sources: SourceArrays
     pair_robot: IntArray
     pair_stamp_ns: IntArray
     pair_history: FloatArray
     is_dense: bool
+    doubt: float
 
 
 @cached_njit
@@ -171,42 +137,22 @@ def correct(belief: BeliefArrays, correction: FloatArray) -> None:
             mark[0], mark[1], mark[2] = moved_by_twist(c[0], c[1], c[2], mark[0], mark[1], mark[2])
 
 
-def new_integrity(robots: int, landmarks: int) -> IntegrityArrays:
-    """All fault scores zero, no pair known."""
-    return IntegrityArrays(
-        # pairs of observer and source
-        source=np.full((robots, _SOURCES), -1),
-        source_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
-        counted_ns=np.full((robots, _SOURCES), NEVER_NS // 2),
-        outlier=np.zeros((robots, _SOURCES), dtype=bool),
-        unexplained=np.zeros((robots, _SOURCES), dtype=bool),
-        trending=np.zeros((robots, _SOURCES), dtype=bool),
-        evidence=np.zeros((robots, _SOURCES)),
-        whitened=np.zeros((robots, _SOURCES, 2)),
-        squares=np.zeros((robots, _SOURCES)),
-        looks=np.zeros((robots, _SOURCES), dtype=np.int64),
-        # robots and landmarks
-        fault_score=np.zeros(robots + landmarks),
-        confirmations=np.zeros(robots, dtype=np.int64),
-        confirmed_ns=np.full(robots, NEVER_NS // 2),
-        gated_in_a_row=np.zeros(robots, dtype=np.int64),
-        gated_source=np.full(robots, -1),
-        gated_ns=np.full(robots, NEVER_NS // 2),
-        gated_fixes=np.zeros(robots, dtype=np.int64),
-        gated_fix_ns=np.full(robots, NEVER_NS // 2),
-        noise_inflation=np.zeros(robots),
-        # the scale of a robot's process noise
-        drift_ns=np.full((robots, WINDOWS), NEVER_NS // 2),
-        drift_transform=np.zeros((robots, WINDOWS, 3)),
-        drift_noise=np.zeros((robots, WINDOWS, 3, 3)),
-        drift_covariance=np.zeros((robots, WINDOWS, 3, 3)),
-        motion_likelihood=np.zeros((robots, LOG_SCALES.size)),
-        motion_scale=np.ones(robots),
-        motion_explained=np.zeros(robots, dtype=bool),
-        # errors that repeat
+def new_sources(robots: int, surveyed: int) -> SourceArrays:
+    """All fault scores zero, no link known."""
+    links = (robots, _LINKS)
+    return SourceArrays(
+        source=np.full(links, -1),
+        seen_ns=np.full(links, NEVER_NS // 2),
+        finding=np.zeros(links, dtype=np.int64),
+        evidence=np.zeros(links),
+        drift=np.zeros((*links, 2)),
+        last_look=np.full((*links, 3), np.nan),
+        score=np.zeros(3 * robots + surveyed),
+        confirmations=np.zeros(robots),
+        gated=np.zeros(robots),
+        measured_ns=np.zeros(robots, dtype=np.int64),
+        learned=np.zeros(robots),
         excess=np.zeros((robots, 3, 3)),
-        repeated=np.zeros((robots, _SOURCES, 2, 3, 3)),
-        repeated_at=np.zeros((robots, _SOURCES, 2)),
     )
 
 
@@ -261,9 +207,9 @@ class SwarmState:
         tracked: (N,) True if the robot is part of the estimate.
         start_pending: (N,) True if the robot may still be initialized at its configured start.
         last_fix_ns: (N,) stamp of the newest accepted landmark sighting or absolute fix.
-        integrity: Statistics of recent innovations.
+        sources: What is known of sources, see `sources.py`.
         contradicted_ns: (N + L,) last contradiction of each robot and landmark; NEVER_NS if none.
-        all_augmented: True after `augment_all`.
+        doubt: Of the description: how often it was contradicted as a whole, see `sources.add_doubt`.
         pair_robot: (N, pairs) robots observed by each robot; -1 for an empty slot.
         pair_stamp_ns: (N, pairs) stamp of the last measurement of the pair.
         pair_history: (N, pairs, PAIR_ROWS, 3) mean of the measurements, see `correlated_noise.py`.
@@ -295,10 +241,9 @@ class SwarmState:
         self.tracked: NDArray[np.bool_] = np.zeros(robots, dtype=bool)
         self.start_pending: NDArray[np.bool_] = np.ones(robots, dtype=bool)
         self.last_fix_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
-        self.integrity = new_integrity(robots, landmarks)
-        self.integrity.motion_explained[:] = (table.column[:, [DISTANCE_SCALE, TURN_SCALE]] >= 0).any(axis=1)
+        self.sources = new_sources(robots, landmarks)
         self.contradicted_ns: IntArray = np.full(robots + landmarks, NEVER_NS)
-        self.all_augmented = False
+        self.doubt = 0.0
         self.pair_robot: NDArray[np.int64] = np.full((robots, pairs), -1)
         self.pair_stamp_ns: NDArray[np.int64] = np.full((robots, pairs), NEVER_NS)
         self.pair_history: FloatArray = np.zeros((robots, pairs, PAIR_ROWS, 3))
@@ -317,9 +262,9 @@ class SwarmState:
         other = SwarmState.__new__(SwarmState)
         for name, value in vars(self).items():
             # arrays in dictionaries are replaced, never written to
-            is_immutable = value is None or isinstance(value, tuple | int)
+            is_immutable = value is None or isinstance(value, tuple | int | float)
             setattr(other, name, value if is_immutable else value.copy())
-        other.integrity = IntegrityArrays(*(column.copy() for column in self.integrity))
+        other.sources = SourceArrays(*(column.copy() for column in self.sources))
         return other
 
     def arrays(self) -> BeliefArrays:
@@ -337,18 +282,21 @@ class SwarmState:
             self.preintegrated_jacobian,
             self.tracked,
             self.last_fix_ns,
-            self.integrity,
+            self.sources,
             self.pair_robot,
             self.pair_stamp_ns,
             self.pair_history,
             self.filter.is_dense,
+            self.doubt,
         )
 
     def is_known(self, side: int) -> bool:
         """Whether a side of a measurement is localized: a tracked robot, or NOBODY for `map` itself."""
         return side == NOBODY or bool(self.tracked[side])
 
-    def initialize(self, robot: int, initial: InitialPose, at: Preintegrated, confirmations: int = 0) -> None:
+    def initialize(
+        self, robot: int, initial: InitialPose, at: Preintegrated, confirmations: float = 0.0
+    ) -> None:
         """Add the robot to the estimate.
 
         Args:
@@ -363,7 +311,7 @@ class SwarmState:
         mapping = initial.shares.transpose(1, 0, 2).reshape(3, -1)
         self.filter.correlate(robot_columns(np.array([robot]))[0], others, mapping)
 
-    def start(self, robots: IntArray, starts: Starts, confirmations: int = 0) -> None:
+    def start(self, robots: IntArray, starts: Starts, confirmations: float = 0.0) -> None:
         """Add robots (k,) with independent errors to the estimate, see `initialize`."""
         for robot in robots[self.tracked[robots]].tolist():
             self._forget_pairs(robot)
@@ -374,7 +322,7 @@ class SwarmState:
         self.preintegrated_jacobian[robots] = starts.preintegrated_jacobian
         self.tracked[robots] = True
         self.start_pending[robots] = False
-        self._trust(robots, confirmations)
+        self._trust(robots, confirmations, starts.stamp_ns)
         for robot in robots.tolist():
             self.constraints.pop(robot, None)
             self.windows.pop(robot, None)
@@ -406,8 +354,7 @@ class SwarmState:
         self.filter.covariance[:] = 0.5 * (covariance + covariance.T)
         self.constraints.clear()
         self.windows.clear()
-        self._restart_drift(tracked)
-        self.integrity.excess[:], self.integrity.repeated[:] = 0.0, 0.0
+        self.sources.excess[:] = 0.0
 
     def deinitialize(self, robot: int, why: LossReason, stamp_ns: int) -> None:
         """Remove the robot from the estimate until a fix initializes it.
@@ -424,7 +371,7 @@ class SwarmState:
         self._forget_pairs(robot)
         self.tracked[robot] = False
         self.start_pending[robot] = False
-        self._trust(np.array([robot]), 0)
+        self._trust(np.array([robot]), 0.0, np.array([stamp_ns]))
 
     def augment(self, source: int, pose: FloatArray) -> None:
         """Estimate, or re-estimate, the parameters of a contradicted robot or landmark.
@@ -434,12 +381,10 @@ class SwarmState:
             pose: (3,) of the robot in `map`; its covariance is inflated.
         """
         robots = self.tracked.size
-        self.integrity.fault_score[source] = 0.0
-        self.integrity.evidence[self.integrity.source == source] = 0.0
-        if source < robots:
-            self.integrity.evidence[source] = 0.0
+        self.forgive(source)
         if source >= robots:
             self._augment_landmark(source - robots)
+            self._doubt_all_that_rest_on(source)
             return
         before = self._table.column[source]
         self._use_table(self._table.with_robot(source))
@@ -449,7 +394,13 @@ class SwarmState:
         self.filter.set_prior(columns[new], np.diag(variances[new]))
         doubt = error_covariance(pose, np.diag(np.square(_DOUBTED_POSE_SIGMA)))
         self.filter.add(robot_columns(np.array([source]))[0], doubt)
-        self._restart_drift(source)
+
+    def forgive(self, source: int) -> None:
+        """Forget what speaks against a robot, landmark or fixed camera."""
+        self.sources.score[source] = 0.0
+        self.sources.evidence[self.sources.source == source] = 0.0
+        if source < self.tracked.size:
+            self.sources.evidence[source] = 0.0
 
     def augment_all(self, poses: FloatArray) -> None:
         """Reset all parameters to their priors and re-estimate them.
@@ -458,7 +409,7 @@ class SwarmState:
             poses: (N, 3) of the robots in `map`; these means are kept.
         """
         robots, landmarks = self.tracked.size, self.landmark.shape[0]
-        self.all_augmented = True
+        self.doubt = _DOUBT_AT_FIRST
         table = self._table
         for robot in range(robots):
             table = table.with_robot(robot)
@@ -470,13 +421,7 @@ class SwarmState:
         covariances = np.where(self.tracked[:, None, None], error_covariance(poses, sigma), np.eye(3))
         self.filter.set_body_priors(np.arange(robots), covariances)
         self._set_described_priors()
-        self.integrity.fault_score[:], self.integrity.evidence[:] = 0.0, 0.0
-        np.maximum(self.integrity.noise_inflation, _SUSPECT_UNITS, out=self.integrity.noise_inflation)
-        self._restart_drift(np.arange(robots))
-
-    def _restart_drift(self, robots: int | IntArray) -> None:
-        """End the windows in which drift is observed: a pose that is not trusted says nothing of wheels."""
-        self.integrity.drift_ns[robots] = NEVER_NS // 2
+        self.sources.score[: robots + landmarks], self.sources.evidence[:] = 0.0, 0.0
 
     def _use_table(self, table: ParameterTable) -> None:
         """Extend the filter to the columns of a larger table."""
@@ -489,9 +434,27 @@ class SwarmState:
         self._use_table(self._table.with_landmark(landmark))
         columns = self.landmark_column(landmark) + np.arange(3)
         if is_new:
-            self.filter.set_prior(columns, self._table.survey[landmark])
+            self.filter.set_prior(columns, self._table.reopened[landmark])
         else:
-            self.filter.add(columns, self._table.survey[landmark])
+            self.filter.add(columns, self._table.reopened[landmark])
+
+    def _doubt_all_that_rest_on(self, source: int) -> None:
+        """Let robots that have links with one source only share the error of its place.
+
+        They move with it: right-invariant errors of a common motion are equal.
+        """
+        links = self.sources.source
+        only = ((links == source) | (links < 0)).all(axis=1) & (links == source).any(axis=1) & self.tracked
+        if only.any() and self.filter.is_dense:
+            landmark = source - self.tracked.size
+            columns = np.concatenate(
+                [
+                    robot_columns(np.flatnonzero(only)).reshape(-1),
+                    self.landmark_column(landmark) + np.arange(3),
+                ]
+            )
+            bodies = columns.size // 3
+            self.filter.add(columns, np.tile(self._table.reopened[landmark], (bodies, bodies)))
 
     def _set_described_priors(self) -> None:
         """Set the described priors of all parameters and landmarks."""
@@ -501,18 +464,13 @@ class SwarmState:
             if first >= 0:
                 self.filter.set_prior(first + np.arange(3), survey)
 
-    def _trust(self, robots: IntArray, confirmations: int) -> None:
-        """Reset the integrity statistics of robots (k,)."""
-        self.integrity.gated_in_a_row[robots] = 0
-        self.integrity.gated_fixes[robots] = 0
-        self._restart_drift(robots)
-        self.integrity.excess[robots] = 0.0
-        self.integrity.fault_score[robots] = 0.0
-        self.integrity.confirmations[robots] = confirmations
-        self.integrity.source[robots] = -1
-        named = self.integrity.source % self.integrity.fault_score.size
-        for column in (self.integrity.evidence, self.integrity.repeated):
-            column[np.isin(named, robots)] = 0.0
+    def _trust(self, robots: IntArray, confirmations: float, stamp_ns: IntArray) -> None:
+        """Forget the links of robots (k,), and what was known of their errors."""
+        state = self.sources
+        state.gated[robots], state.score[robots], state.excess[robots] = 0.0, 0.0, 0.0
+        state.confirmations[robots], state.measured_ns[robots] = confirmations, stamp_ns
+        state.source[robots] = -1
+        state.evidence[np.isin(state.source % state.score.size, robots)] = 0.0
 
     def _forget_pairs(self, robot: int) -> None:
         """Clear the stored means of all pairs of the robot: its new errors are independent of them."""
@@ -526,6 +484,15 @@ class SwarmState:
             columns = self._table.column[robot, self._table.column[robot] >= 0]
             self.filter.set_prior(columns, np.diag(np.diag(self.filter.block(columns))))
         self.filter.set_body_priors(robots, covariances)
+
+    def pose_covariances(self) -> FloatArray:
+        """Covariances (N, 3, 3) of the pose errors of all robots."""
+        if not self.filter.is_dense:
+            alone: FloatArray = self.filter.marginal[: self.tracked.size, :3, :3].copy()
+            return alone
+        columns = robot_columns(np.arange(self.tracked.size))
+        whole: FloatArray = self.filter.covariance[columns[:, :, None], columns[:, None, :]]
+        return whole
 
     def parameter_sigma(self, robot: int) -> FloatArray:
         """Standard deviations (PARAMETERS,) of a robot's parameters; zero if not estimated."""

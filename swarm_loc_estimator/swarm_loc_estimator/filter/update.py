@@ -1,13 +1,12 @@
-"""The update: measurements correct the belief, in order or together, by one sequence of eight stages.
+"""The update: measurements correct the belief, in order or together, by one sequence of seven stages.
 
 1. Predict both sides to the stamp of the measurement.
 2. Innovation: measured minus predicted, linearized about the belief (eqs. (11) and (13) of the e-puck paper).
 3. Of two mirrored solutions, use the likelier one; gate it; a heading that may be flipped counts less.
-4. Attribute an outlier: to the observer, to what it measured, or to their pair, which may be excluded.
+4. Attribute an outlier: to one of the sources that it links, or to their link, which may be excluded.
 5. Confirm a pose that was assumed, or refute it.
-6. Correct poses, parameters and landmarks (eqs. (11), (12) and (14)).
-7. Learn the process noise of the robots from what was corrected.
-8. Count gated measurements; a robot with too many in a row is lost.
+6. Correct poses, parameters, landmarks and cameras (eqs. (11), (12) and (14)).
+7. Count gated measurements; a robot with too many in a row is lost.
 
 In order, each measurement passes all stages before the next one, at its exact stamp. Together, the stages
 take many measurements of a period, linearized about one belief; a large swarm is cheaper so.
@@ -16,8 +15,8 @@ take many measurements of a period, linearized about one belief; a large swarm i
 models have no compiled kernel, such as ranges, are evaluated by their records. Such a measurement is gated
 with the number of gated components of its model. When accepted it confirms the poses of its robots; when
 gated it counts towards their loss, but does not refute a configured start. A contradiction is evidence
-against its pair of observer and source, never against one of them. It takes no part in the noise inflation of
-robots or in the mean of repeated measurements (`correlated_noise.py`): these need positions and headings.
+against its link, never against one end. It takes no part in the mean of repeated measurements
+(`correlated_noise.py`), which needs positions and headings.
 """
 
 from __future__ import annotations
@@ -31,21 +30,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.numerics import assign, assign_matrix
-from swarm_loc_estimator.filter.correlated_noise import count_repeated, inflate_fix, record_pair, use_mean
-from swarm_loc_estimator.filter.integrity import (
-    LossLimits,
-    add_noise_inflation,
-    assess,
-    assess_link,
-    cause_of,
-    confirm,
-    count_gated,
-    is_excluded,
-    is_uncertain,
-    noise_of_frequent_looks,
-    small_variances,
-    stamp_variance,
-)
+from swarm_loc_estimator.filter.correlated_noise import inflate_fix, record_pair, use_mean
 from swarm_loc_estimator.filter.joint_filter import JointFilter, update_one
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.filter.models import (
@@ -60,7 +45,29 @@ from swarm_loc_estimator.filter.models import (
     squared_distance,
     write_innovation,
 )
-from swarm_loc_estimator.filter.prediction import learn, new_scratch, predict
+from swarm_loc_estimator.filter.prediction import new_scratch, predict
+from swarm_loc_estimator.filter.sources import (
+    OCCUPIED_M,
+    LossLimits,
+    add_doubt,
+    assess,
+    assess_direction,
+    confirm,
+    count_gated,
+    direction_of,
+    find_link,
+    is_elsewhere,
+    is_excluded,
+    is_fix,
+    is_suspended,
+    is_uncertain,
+    note_update,
+    robot_of,
+    share_of,
+    small_variances,
+    source_of,
+    stamp_variance,
+)
 from swarm_loc_estimator.filter.state import (
     PAIR_ROWS,
     BeliefArrays,
@@ -117,7 +124,9 @@ class Innovations(NamedTuple):
         FloatArray  # (m,) squared, Mahalanobis, that is gated; of a marker's position without small errors
     )
     whitened: FloatArray  # (m, 2) innovation of the position over its deviation, as for `distance`
-    cause: IntArray  # (m,) possible cause of the innovation, see `integrity.cause_of`
+    share: FloatArray  # (m,) by how much it counts, see `sources.share_of`
+    elsewhere: BoolArray  # (m,) whether no wrong description explains the innovation
+    misread: BoolArray  # (m,) whether the direction of a marker is read turned by a quarter or more
     accepted: BoolArray  # (m,) True if the innovation passes the gate
     nis: FloatArray  # (m,) normalized innovation squared
     lost: IntArray  # (N + 1,) why a robot is lost (`LossReason`), 0: it is not; the last element is NOBODY
@@ -144,7 +153,9 @@ def new_innovations(count: int, robots: int, sources: int) -> Innovations:
         np.zeros((count, PAIR_ROWS, 3)),
         np.zeros(count),
         np.zeros((count, 2)),
-        np.zeros(count, dtype=np.int64),
+        np.zeros(count),
+        np.zeros(count, dtype=np.bool_),
+        np.zeros(count, dtype=np.bool_),
         np.zeros(count, dtype=np.bool_),
         np.zeros(count),
         np.zeros(robots + 1, dtype=np.int64),
@@ -169,7 +180,7 @@ def fuse_in_order(
     nis: FloatArray,
 ) -> tuple[int, int, int, int]:
     """Fuse measurements one by one, each at its exact stamp, from `begin` on; see `fuse`."""
-    work = new_innovations(1, belief.tracked.size, belief.integrity.fault_score.size)
+    work = new_innovations(1, belief.tracked.size, belief.sources.score.size)
     return fuse(measurements, begin, PREDICT, -1, tracks, belief, limits, work, verdicts, nis)
 
 
@@ -224,29 +235,39 @@ def fuse(
             links = False
             for i in range(k, end):
                 if has_kernel(measurements, i):
-                    _evaluate(measurements, i, belief, work, i - k)
+                    _evaluate(measurements, i, belief, limits, work, i - k)
                 else:
                     links = True
             if links:
                 return k, IS_LINK, -1, 0
         if stage <= ATTRIBUTE:
-            # 4. Attribute outliers; measurements of excluded pairs are not used.
+            # 4. Attribute outliers; measurements of excluded links are not used.
             for i in range(k, end):
                 row = i - k
                 whitened = (work.whitened[row, 0], work.whitened[row, 1])
-                if has_kernel(measurements, i):
-                    distance, cause, limit = work.distance[row], work.cause[row], limits.max_fault_score
-                    source = assess(measurements, i, belief, limit, distance, whitened, cause)
-                    if source >= 0 and not together:
-                        return k, CONTRADICTED, source, 0
-                    if source >= 0:
-                        work.contradicted[source] = True
-                else:
-                    scale = assess_link(measurements, i, belief, work.distance[row], whitened[0])
+                distance, share, limit = work.distance[row], work.share[row], limits.max_fault_score
+                elsewhere = work.elsewhere[row]
+                source = assess(measurements, i, belief, limit, distance, whitened, share, elsewhere)
+                if source >= 0 and not together:
+                    return k, CONTRADICTED, source, 0
+                if source >= 0:
+                    work.contradicted[source] = True
+                if measurements.observer[i] < 0 and measurements.has_heading[i] and work.accepted[row]:
+                    assess_direction(belief, measurements.target[i], work.misread[row], share, limit)
+                if (
+                    distance > limit
+                    and is_fix(measurements, i)
+                    and _is_occupied(measurements, i, tracks, belief)
+                ):
+                    belief.sources.score[source_of(measurements, i, belief)] = 2.0 * limit
+                place = find_link(measurements, i, belief)
+                if not has_kernel(measurements, i) and place >= 0:
+                    scale = 1.0 + belief.sources.evidence[robot_of(measurements, i), place]
                     for a in range(3):
                         for b in range(3):
                             work.noise[row, a, b] *= scale
-                work.accepted[row] = work.accepted[row] and not is_excluded(measurements, i, belief)
+                excluded = is_excluded(measurements, i, belief, limit)
+                work.accepted[row] = work.accepted[row] and not excluded
                 nis[i], verdicts[i] = work.nis[row], _USED if work.accepted[row] else _GATED
             # 5. Confirm assumed poses, or refute them; a link does not refute.
             for i in range(k, end):
@@ -265,19 +286,13 @@ def fuse(
                 return k, CORRECTS, -1, 0
             if work.accepted[0]:
                 columns, jacobian, noise = work.columns[0], work.jacobian[0], work.noise[0]
-                correction, gain = update_one(belief.covariance, columns, jacobian, work.innovation[0], noise)
-                if has_kernel(measurements, k):
-                    own = gain[:, columns[:6]]
-                    count_repeated(measurements, k, belief, work.predicted, own, jacobian, noise)
+                before = _covariances(measurements, k, belief)
+                correction = update_one(belief.covariance, columns, jacobian, work.innovation[0], noise)
                 correct(belief, correction)
-        # 7. Learn the process noise of all involved robots.
-        if work.accepted.any():
-            for i in range(k, end):
-                learn(belief, measurements.observer[i], work.pose[i - k, 0], measurements.stamp_ns[i])
-                learn(belief, measurements.target[i], work.pose[i - k, 1], measurements.stamp_ns[i])
-        # 8. Count gated measurements.
+                note_update(measurements, k, belief, before)
+        # 7. Count gated measurements.
         for i in range(k, end):
-            robot, why = count_gated(measurements, i, belief, work.accepted[i - k], limits)
+            robot, why = count_gated(measurements, i, belief, work.accepted[i - k], work.share[i - k], limits)
             if robot >= 0 and not together:
                 return k, LOST, robot, why
             if robot >= 0 and work.lost[robot] == 0:
@@ -310,10 +325,43 @@ def _predict_one(
             if is_uncertain(belief, sides[i], pose[i], limits):
                 lost: int = sides[i]
                 return lost
-    if measurements.landmark[k] >= 0:
-        assign(pose[1], belief.landmark[measurements.landmark[k]])
+    _write_surveyed(measurements, k, belief, pose)
     relative_motion(measurements, k, tracks, belief, pose, work.motion[0])
     return -1
+
+
+@cached_njit
+def _is_occupied(measurements: Measurements, k: int, tracks: TrackArrays, belief: BeliefArrays) -> bool:
+    """Whether fix k puts its robot where another one is: the bodies of a motion capture are exchanged."""
+    pose = np.empty(3)
+    for robot in range(belief.tracked.size):
+        if belief.tracked[robot] and robot != measurements.target[k]:
+            look_up_pose(tracks, robot, measurements.stamp_ns[k], pose)
+            to_map(belief, robot, pose)
+            x, y = pose[0] - measurements.value[k, 0], pose[1] - measurements.value[k, 1]
+            if math.hypot(x, y) < OCCUPIED_M:
+                return True
+    return False
+
+
+@inlined_njit
+def _write_surveyed(measurements: Measurements, k: int, belief: BeliefArrays, pose: FloatArray) -> None:
+    """Write corrections of surveyed places to the poses (2, 3) of the sides that are no robots."""
+    if measurements.mount[k] >= 0:
+        assign(pose[0], belief.landmark[measurements.mount[k]])
+    if measurements.landmark[k] >= 0:
+        assign(pose[1], belief.landmark[measurements.landmark[k]])
+
+
+@cached_njit
+def _covariances(measurements: Measurements, k: int, belief: BeliefArrays) -> FloatArray:
+    """Covariances (2, 3, 3) of the errors of observer and target of measurement k; undefined for others."""
+    sides, out = (measurements.observer[k], measurements.target[k]), np.empty((2, 3, 3))
+    for side in range(2):
+        for i in range(3):
+            for j in range(3):
+                out[side, i, j] = covariance_within(belief, 3 * max(sides[side], 0), i, j)
+    return out
 
 
 @cached_njit
@@ -364,8 +412,7 @@ def _write_poses(
             to_map(belief, sides[i], pose)
             if is_uncertain(belief, sides[i], pose, limits):
                 work.lost[sides[i]] = _UNCERTAIN
-    if measurements.landmark[k] >= 0:
-        assign(work.pose[k, 1], belief.landmark[measurements.landmark[k]])
+    _write_surveyed(measurements, k, belief, work.pose[k])
     relative_motion(measurements, k, tracks, belief, work.pose[k], work.motion[k])
 
 
@@ -393,7 +440,14 @@ def related_columns(measurements: Measurements, belief: BeliefArrays) -> IntArra
 
 
 @inlined_njit
-def _evaluate(measurements: Measurements, k: int, belief: BeliefArrays, work: Innovations, row: int) -> None:
+def _evaluate(
+    measurements: Measurements,
+    k: int,
+    belief: BeliefArrays,
+    limits: LossLimits,
+    work: Innovations,
+    row: int,
+) -> None:
     """Linearize measurement k about the belief and gate it: stages 2 and 3; write the row of `work`."""
     columns, jacobian, innovation = work.columns[row], work.jacobian[row], work.innovation[row]
     pose, motion, noise = work.pose[row], work.motion[row], work.noise[row]
@@ -405,7 +459,7 @@ def _evaluate(measurements: Measurements, k: int, belief: BeliefArrays, work: In
     predict_one(measurements, k, pose[0], pose[1], camera, predicted, value_jacobian)
     _write_jacobian(value_jacobian, bodies, camera_columns, columns, jacobian)
     assign_matrix(noise, measurements.covariance[k])
-    add_noise_inflation(measurements, k, belief, noise)
+    add_doubt(measurements, k, belief, noise)
     of_stamp = stamp_variance(measurements, k, belief)
     if of_stamp > 0.0:
         _add_stamp_noise(value_jacobian, motion, of_stamp, noise)
@@ -426,11 +480,12 @@ def _evaluate(measurements: Measurements, k: int, belief: BeliefArrays, work: In
             assign(innovation, other)
     # Gate.
     work.accepted[row] = position_distance(innovation, s) <= measurements.gate[k]
-    small = small_variances(measurements.model[k], predicted)
+    small = small_variances(measurements, k, predicted)
     work.distance[row] = position_distance(innovation, s, small)
     for i in range(2):
         work.whitened[row, i] = innovation[i] / math.sqrt(s[i, i] + small[i])
-    work.cause[row] = cause_of(measurements.model[k], innovation, predicted)
+    work.elsewhere[row] = is_elsewhere(measurements, k, innovation, predicted)
+    work.share[row] = share_of(measurements, k, belief)
     if measurements.observer[k] < 0 and measurements.systematic_share[k, 0] > 0.0:
         work.nis[row] = squared_distance(innovation, s)
         work.accepted[row] = work.nis[row] <= POSE_GATE
@@ -442,7 +497,12 @@ def _evaluate(measurements: Measurements, k: int, belief: BeliefArrays, work: In
     # A heading that may be flipped or misread counts less.
     if measurements.has_heading[k]:
         before = (noise[0, 2], noise[1, 2], noise[2, 2])
-        if measurements.observer[k] < 0 and is_misread(innovation[2], s[2, 2], measurements.gate[k]):
+        misread = measurements.observer[k] < 0 and is_misread(innovation[2], s[2, 2], measurements.gate[k])
+        work.misread[row] = misread
+        direction = direction_of(belief, max(measurements.target[k], 0))
+        if misread or (
+            measurements.observer[k] < 0 and is_suspended(belief, direction, limits.max_fault_score)
+        ):
             noise[0, 2] = noise[1, 2] = noise[2, 0] = noise[2, 1] = 0.0
             noise[2, 2] = NO_HEADING
         else:
@@ -453,10 +513,9 @@ def _evaluate(measurements: Measurements, k: int, belief: BeliefArrays, work: In
                 s[2, i] = s[i, 2]
     work.nis[row] = squared_distance(innovation, s)
     # Looks that follow each other closely share their errors; so do repeated exchanges of a pair.
-    scale = noise_of_frequent_looks(measurements, k, belief)
     for i in range(3):
         for j in range(3):
-            noise[i, j] *= scale
+            noise[i, j] /= work.share[row]
     use_mean(measurements, k, belief, pose, predicted, variances, innovation, noise, work.pair[row])
 
 
@@ -543,10 +602,13 @@ def _add_stamp_noise(
 def body_columns(measurements: Measurements, k: int, belief: BeliefArrays) -> tuple[int, int]:
     """First filter columns of the observer and the target of measurement k; -1: none."""
     observer, target = measurements.observer[k], measurements.target[k]
-    first = 3 * target if target >= 0 else -1
+    columns = belief.table.survey_column
+    of_observer, of_target = 3 * observer if observer >= 0 else -1, 3 * target if target >= 0 else -1
+    if measurements.mount[k] >= 0:
+        of_observer = columns[measurements.mount[k]]
     if measurements.landmark[k] >= 0:
-        first = belief.table.survey_column[measurements.landmark[k]]
-    return (3 * observer if observer >= 0 else -1), first
+        of_target = columns[measurements.landmark[k]]
+    return of_observer, of_target
 
 
 @inlined_njit
@@ -652,8 +714,10 @@ def evaluate_link(
     s = jacobian @ _covariance(columns, belief, joint, work.cross_covariance[k]) @ jacobian.T + noise
     innovation = model.innovation(one.value, predicted.value)
     gated = slice(model.gated)
+    noise /= work.share[k]
     work.noise[k, :count, :count], work.innovation[k, :count] = noise, innovation
-    work.whitened[k], work.cause[k] = 0.0, 0
+    work.whitened[k], work.elsewhere[k] = 0.0, False
+    work.share[k] = share_of(one.columns(), 0, belief)
     # Gate; what is not finite at these poses is gated, too.
     if np.isfinite(s).all() and np.isfinite(innovation).all() and np.isfinite(jacobian).all():
         work.distance[k] = innovation[gated] @ np.linalg.solve(s[gated, gated], innovation[gated])
@@ -667,10 +731,14 @@ def evaluate_link(
 
 def _columns(one: Measurements, belief: BeliefArrays) -> tuple[int, int]:
     """First filter columns of observer and target of one measurement; -1: none."""
-    first = 3 * int(one.target) if one.target >= 0 else -1
-    if one.landmark >= 0:
-        first = int(belief.table.survey_column[one.landmark])
-    return (3 * int(one.observer) if one.observer >= 0 else -1), first
+    sides = [
+        3 * int(one.observer) if one.observer >= 0 else -1,
+        3 * int(one.target) if one.target >= 0 else -1,
+    ]
+    for side, surveyed in enumerate((one.mount, one.landmark)):
+        if surveyed >= 0:
+            sides[side] = int(belief.table.survey_column[surveyed])
+    return sides[0], sides[1]
 
 
 def _covariance(

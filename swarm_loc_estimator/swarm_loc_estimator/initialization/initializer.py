@@ -24,10 +24,10 @@ import numpy as np
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.filter.integrity import CONFIRMED, WELL_CONFIRMED
 from swarm_loc_estimator.filter.measurements import NOBODY, LossReason, Measurements, select
 from swarm_loc_estimator.filter.models import MODELS, locates_alone
 from swarm_loc_estimator.filter.prediction import new_scratch, predict
+from swarm_loc_estimator.filter.sources import CONFIRMED, WELL_CONFIRMED
 from swarm_loc_estimator.filter.state import IN_MAP, InitialPose, Meetings, Starts, SwarmState
 from swarm_loc_estimator.initialization.alignment import (
     HEADING_SIGMA,
@@ -60,7 +60,7 @@ _SHORTEST_WINDOW_PAUSE_NS, _WINDOW_PAUSE_SHARE = 500_000_000, 4
 
 Keep = Callable[[SwarmState, Measurements], bool]
 """Keeps a row of measurements; returns whether it helps to locate a robot."""
-Located = Callable[[SwarmState, int, InitialPose, Preintegrated, int], None]
+Located = Callable[[SwarmState, int, InitialPose, Preintegrated, float], None]
 """Called with a robot, the pose of its track, the instant, and how many measurements confirm the pose."""
 
 
@@ -110,7 +110,7 @@ class Initializer:
         track = self._tracks.at(np.array([robot]), np.array([now_ns]))
         at = Preintegrated(now_ns, track.covariance[0], track.jacobian[0])
         if locates_alone(one.columns(), 0) and self._is_sure(one.covariance):
-            located(state, robot, _fixed(one, track.pose[0]), at, CONFIRMED)
+            located(state, robot, _fixed(one, track.pose[0]), at, CONFIRMED + 1.0)
             return True
         if MODELS[int(one.model)].initializes != "alone":
             return self._note_partial(state, one, robot, other, at, located)
@@ -171,7 +171,7 @@ class Initializer:
 
     def _located(self, state: SwarmState, other: int, one: Measurements) -> OtherSide:
         """The side of a measurement that is located, brought up to its stamp."""
-        landmark = int(one.landmark)
+        landmark = max(int(one.landmark), int(one.mount))
         if landmark >= 0:
             moved = state.landmark[landmark].copy()
             return OtherSide(NOBODY, landmark, moved, moved, np.zeros((3, 3)))
@@ -369,7 +369,7 @@ class LocalFrame:
         robot: int,
         initial: InitialPose,
         at: Preintegrated,
-        confirmations: int = CONFIRMED,
+        confirmations: float = CONFIRMED,
     ) -> None:
         """Move all robots to `map` with a robot whose pose there is known.
 

@@ -2,8 +2,8 @@
 
 A detection is a marker's pose in the camera's optical frame (x right, y down, z forward). It is converted to
 a measurement in the planar sensor frame: at the camera's position on the robot or, of a fixed camera, in
-`map`, rotated by its yaw, with the mount's pitch and roll removed. A fixed camera has no observer, and the
-error of its pose is the systematic share of its measurements.
+`map`, rotated by its yaw, with the mount's pitch and roll removed. A fixed camera is no robot, but the
+mount of its measurements.
 
 The tilt and the distance of a small marker in an image are uncertain, and the error of one is that of the
 other. But a marker that lies flat has neither: its corners, projected by its measured pose into the image and
@@ -201,13 +201,15 @@ OUTCOMES = (
 MEASURED, _UNKNOWN_ID, _OWN_MARKER, _NO_CAMERA, _BAD_CONTENT, _NON_FINITE, _ABSURD = range(7)
 _FIXED_ON_FIXED, _FACE_DOWN, _NOT_FLAT = range(7, len(OUTCOMES))
 _MAX_DISTANCE_M = 1e3
+_FLOOR_M, _FLOOR_SHARE, _FLOOR_RAD = 3e-4, 5e-4, 2e-3
+"""Least standard deviation of a pose, whatever a message claims: [m], share of the distance, [rad]."""
 SENSOR_DTYPE = np.dtype([(f.name, np.float64) for f in fields(SensorModel)])
 
 
 class Cameras(NamedTuple):
     """Cameras of robots (N), then fixed ones: has one, S (., 3), optical to level rotation (., 3, 3), errors.
 
-    `height` is z of the mount, `variance` (., 3) that of a fixed camera's pose: x, y, yaw.
+    `height` is z of the mount.
     """
 
     robots: int
@@ -218,7 +220,6 @@ class Cameras(NamedTuple):
     sensor: NDArray[np.void]
     gate: FloatArray
     bearing_gate: FloatArray
-    variance: FloatArray
 
 
 class Markers(NamedTuple):
@@ -263,7 +264,7 @@ def convert_all(
             outcomes[k] = _measure_lying(detections, k, cameras, markers, place, out)
         else:
             _measure_upright(detections, k, cameras, out)
-        _add_common_noise(cameras.variance[camera], markers.variance[place], k, out)
+        _add_face_noise(markers.variance[place], k, out)
 
 
 @cached_njit
@@ -274,7 +275,7 @@ def _measure_bearing(optical: FloatArray, k: int, cameras: Cameras, out: Measure
     to_level_frame(cameras.level[camera], optical, position)
     out.model[k], out.gate[k], out.marker[k, 2] = BEARING, cameras.bearing_gate[camera], 0.0
     out.value[k, 0] = _calibrated_bearing(sensor, position)
-    out.covariance[k, 0, 0] = sensor.bearing_sigma**2 + cameras.variance[camera, 2]
+    out.covariance[k, 0, 0] = sensor.bearing_sigma**2
     out.covariance[k, 1, 1] = out.covariance[k, 2, 2] = 1.0
 
 
@@ -297,7 +298,8 @@ def _measure_upright(detections: NDArray[np.void], k: int, cameras: Cameras, out
         scale(position, 1.0 / sensor.distance_scale)
         out.second[k, 0], out.second[k, 1] = position[0], position[1]
         out.second[k, 2] = face_heading(level, detections[k].alternative_orientation)
-    _pose_noise(sensor, level, detections[k].covariance, out.covariance[k])
+    distance = math.hypot(out.value[k, 0], out.value[k, 1])
+    _pose_noise(sensor, level, detections[k].covariance, distance, out.covariance[k])
 
 
 @cached_njit
@@ -324,7 +326,7 @@ def _measure_lying(
             break
     if result != CAST:
         return _FACE_DOWN if result == FACE_DOWN else _NOT_FLAT
-    _add_residual(sensor, out.covariance[k])
+    _add_residual(sensor, abs(height), out.covariance[k])
     if not out.has_heading[k]:
         out.value[k, 2] = out.marker[k, 2] = 0.0
         out.covariance[k, 2, :] = out.covariance[k, :, 2] = 0.0
@@ -333,21 +335,11 @@ def _measure_lying(
 
 
 @cached_njit
-def _add_common_noise(of_camera: FloatArray, of_face: float, k: int, out: Measurements) -> None:
-    """Add the variances of a fixed camera's pose (3,) and of a face's position to measurement k."""
-    noise, distance2 = out.covariance[k], 1.0
-    if out.model[k] == POLAR:
-        distance2 = max(out.value[k, 0] ** 2, 1e-6)
-    noise[0, 0] += of_face + of_camera[0]
-    noise[1, 1] += (of_face + of_camera[1]) / distance2
-    if out.has_heading[k]:
-        noise[2, 2] += of_camera[2]
-    if out.model[k] == POLAR:
-        noise[1, 1] += of_camera[2]
-    if of_camera[0] > 0.0:
-        out.systematic_share[k, 0] = of_camera[0] / noise[0, 0]
-        out.systematic_share[k, 1] = of_camera[1] / distance2 / noise[1, 1]
-        out.systematic_share[k, 2] = of_camera[2] / noise[2, 2] if out.has_heading[k] else 0.0
+def _add_face_noise(variance: float, k: int, out: Measurements) -> None:
+    """Add the variance of a face's position to measurement k."""
+    out.covariance[k, 0, 0] += variance
+    distance2 = max(out.value[k, 0] ** 2, 1e-6) if out.model[k] == POLAR else 1.0
+    out.covariance[k, 1, 1] += variance / distance2
 
 
 @inlined_njit
@@ -417,7 +409,9 @@ def _calibrate(
 
 
 @cached_njit
-def _pose_noise(sensor: SensorModel, level: FloatArray, published: FloatArray, noise: FloatArray) -> None:
+def _pose_noise(
+    sensor: SensorModel, level: FloatArray, published: FloatArray, distance: float, noise: FloatArray
+) -> None:
     """Write the covariance (3, 3) of forward, left, heading; from the sensor model if unknown (-1)."""
     if published[0, 0] < 0.0:
         noise[0, 0], noise[1, 1] = sensor.forward_sigma**2, sensor.left_sigma**2
@@ -432,15 +426,16 @@ def _pose_noise(sensor: SensorModel, level: FloatArray, published: FloatArray, n
             for a in range(6):
                 for b in range(6):
                     noise[i, j] += to_plane[i, a] * published[a, b] * to_plane[j, b]
-    _add_residual(sensor, noise)
+    _add_residual(sensor, distance, noise)
 
 
 @cached_njit
-def _add_residual(sensor: SensorModel, noise: FloatArray) -> None:
-    """Add the residual errors of a camera to the covariance (3, 3) of forward, left, heading."""
-    noise[0, 0] += sensor.residual_position_sigma**2
-    noise[1, 1] += sensor.residual_position_sigma**2
-    noise[2, 2] += sensor.residual_heading_sigma**2
+def _add_residual(sensor: SensorModel, distance: float, noise: FloatArray) -> None:
+    """Add the residual errors of a camera to the covariance (3, 3) of the planar pose, and the floor."""
+    floor = _FLOOR_M + _FLOOR_SHARE * distance
+    noise[0, 0] += sensor.residual_position_sigma**2 + floor**2
+    noise[1, 1] += sensor.residual_position_sigma**2 + floor**2
+    noise[2, 2] += sensor.residual_heading_sigma**2 + _FLOOR_RAD**2
 
 
 @cached_njit
@@ -494,14 +489,14 @@ class SightingConverter:
 
     def __init__(self, swarm: Swarm, drops: DropCounts | None = None) -> None:
         self._drops = drops or DropCounts(len(swarm.sources))
-        # Cameras: mounts, calibration, gates; fixed ones have errors of their poses.
+        # Cameras: mounts, calibration, gates.
         fixed, robots = swarm.cameras, swarm.robots
+        self._first_mount = len(swarm.surveyed) - len(fixed)
         mounts: list[CameraMount | FixedCamera] = [robot.camera or CameraMount() for robot in robots]
         mounts += fixed
         models = [source.sensor for source in swarm.sources]
         tilts = [_tilt(mount.pitch, mount.roll) @ FROM_OPTICAL for mount in mounts]
         sensors = [tuple(getattr(model, name) for name in SENSOR_DTYPE.names or ()) for model in models]
-        sigmas = [(0.0, 0.0)] * len(robots) + [(one.position_sigma, one.yaw_sigma) for one in fixed]
         self._cameras = Cameras(
             robots=len(robots),
             present=np.array([one.camera is not None for one in robots] + [True] * len(fixed), dtype=bool),
@@ -511,7 +506,6 @@ class SightingConverter:
             sensor=np.array(sensors, dtype=SENSOR_DTYPE),
             gate=MODELS[POLAR].gate([model.gate_probability for model in models]),
             bearing_gate=MODELS[BEARING].gate([model.gate_probability for model in models]),
-            variance=np.square([(position, position, yaw) for position, yaw in sigmas]).reshape(-1, 3),
         )
         # Markers by id: on whom, where, how large.
         owners = sorted(swarm.owner_of.items())
@@ -541,7 +535,9 @@ class SightingConverter:
                 self._drops.add(OUTCOMES[k], rows.robot[outcomes == k])
         if found != [MEASURED]:
             out = select(out, outcomes == MEASURED)
-        out.observer[out.observer >= self._cameras.robots] = NOBODY
+        fixed = out.observer >= self._cameras.robots
+        out.mount[fixed] = out.observer[fixed] - self._cameras.robots + self._first_mount
+        out.observer[fixed] = NOBODY
         self._note_stamp_variance(out)
         return out
 

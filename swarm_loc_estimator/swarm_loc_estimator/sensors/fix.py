@@ -24,6 +24,8 @@ HEADING_UNKNOWN = math.pi**2
 """Variance from which a heading counts as not measured [rad^2]; it exceeds that of uniform headings."""
 NO_COVARIANCE = "fix_without_covariance"
 """Reason to drop a fix without covariance of a robot whose description has no `fix.position_sigma`."""
+_FLOOR = np.diag(np.square([5e-4, 5e-4, 1e-3]))
+"""Least covariance of a fix, whatever a message claims: 0.5 mm, 1 mrad."""
 _GATE = float(MODELS[CARTESIAN].gate(0.9999))
 
 
@@ -117,7 +119,7 @@ class FixSensor(Sensor):
             rows, unknown = self._described(rows, unknown), unknown & (self._default[rows.robot, 0, 0] == 0.0)
             self.drops.add(NO_COVARIANCE, rows.robot[unknown])
             rows = select(rows, ~unknown)
-        fixes = about_robots(rows.robot, rows.stamp_ns, rows.pose, rows.covariance, CARTESIAN)
+        fixes = about_robots(rows.robot, rows.stamp_ns, rows.pose, rows.covariance + _FLOOR, CARTESIAN)
         fixes.systematic_share[:], fixes.arrival_ns[:] = self._share[rows.robot][:, None], rows.arrival_ns
         fixes.gate[:] = self._gate[rows.robot]
         take_out_headings(fixes, np.isnan(rows.pose[:, 2]))

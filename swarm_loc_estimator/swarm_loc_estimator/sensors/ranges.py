@@ -21,6 +21,8 @@ from swarm_loc_estimator.filter.models import MODELS, RANGE, RANGE_DIFFERENCE
 from swarm_loc_estimator.sensors.sensor import NO_ROWS, DropCounts, Sensor, SensorSettings
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm, UwbDevice
 
+_FLOOR_M = 5e-3  # Least standard deviation of a range, whatever a message claims [m]
+
 
 class RangeRows(NamedTuple):
     """Ranges and range differences (k,)."""
@@ -135,7 +137,7 @@ class RangeSensor(Sensor):
         out.value[:, 0] = value / scale
         described = np.square(self._sigma[rows.robot, is_difference.astype(np.int64)])
         noise = np.where(rows.variance == 0.0, described, rows.variance) / np.square(scale)
-        out.covariance[:, 0, 0] = noise + devices.variance[reference]
+        out.covariance[:, 0, 0] = np.maximum(noise, _FLOOR_M**2) + devices.variance[reference]
         return out
 
     def _usable(self, rows: RangeRows, device: IntArray, reference: IntArray) -> BoolArray:

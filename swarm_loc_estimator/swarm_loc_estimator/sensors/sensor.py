@@ -405,6 +405,7 @@ def _check_parameters(
         observer, target = measurements.observer[k], measurements.target[k]
         good = NOBODY <= observer < robots and NOBODY <= target < robots
         good = good and NOBODY <= measurements.landmark[k] < landmarks
+        good = good and NOBODY <= measurements.mount[k] < landmarks
         good = good and (observer != target or observer == NOBODY)
         variance = measurements.stamp_variance[k]
         good = good and math.isfinite(variance) and variance >= 0.0

@@ -2,8 +2,8 @@
 
 The first three parameters of a robot are errors of its motion, whose effect on the pose grows with distance
 and turn. The last three are the yaw offset, the scale error and the range offset of its camera: a range r is
-measured as (1 + scale) r + offset. A landmark with an inexact survey
-is a static body: its state is a correction of the survey, with a right-invariant error about the identity.
+measured as (1 + scale) r + offset. A landmark with an inexact survey and a fixed camera are static bodies:
+their state is a correction of the survey, with a right-invariant error about the identity.
 Parameters with a standard deviation in the description are estimated from the start, others only after a
 contradiction, with the standard deviations below. Their filter columns follow those of all poses, in the
 order in which they were added.
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import error_covariance
-from swarm_loc_estimator.swarm.swarm import Landmark, Robot
+from swarm_loc_estimator.swarm.swarm import FixedCamera, Robot, Surveyed
 
 TURN_BIAS = 0  # Bias of the turn rate while moving, or of the gyroscope [rad/s]; it changes slowly
 DISTANCE_SCALE = 1  # Relative error of the distance driven
@@ -39,6 +39,7 @@ _CONTRADICTED_SIGMA = (0.0, 0.05, 0.1, 0.03, 0.03, 0.0)
 """Standard deviations of parameters that are exact in the description, after a contradiction."""
 _CONTRADICTED_SURVEY_SIGMA = (0.02, 0.03)
 """Standard deviations of a landmark's position [m] and yaw [rad] after a contradiction."""
+_CONTRADICTED_CAMERA_SIGMA = (0.1, 0.05)  # The same of a fixed camera, which may have been pushed
 
 _MIN_SURVEY_SIGMA = 1e-4
 """Minimum standard deviation of an estimated landmark [m, rad], so that its covariance is invertible."""
@@ -53,11 +54,13 @@ class ParameterTable(NamedTuple):
     # (L,) first of the three filter columns of each landmark; -1: not estimated
     survey_column: NDArray[np.int64]
     survey: FloatArray  # (L, 3, 3) prior covariance of its right-invariant error
+    reopened: FloatArray  # (L, 3, 3) covariance that is added after a contradiction
+    first_camera: int  # Index of the first fixed camera among what was surveyed
     in_blocks: bool  # True if a robot's parameters have blocks of three columns, some of them unused
 
     @classmethod
     def of(
-        cls, robots: Sequence[Robot], landmarks: Sequence[Landmark] = (), *, in_blocks: bool = False
+        cls, robots: Sequence[Robot], landmarks: Sequence[Surveyed] = (), *, in_blocks: bool = False
     ) -> ParameterTable:
         """Table of the parameters that the descriptions of robots and landmarks estimate from the start."""
         sigma, time_s = np.zeros((len(robots), PARAMETERS)), np.zeros((len(robots), PARAMETERS))
@@ -77,8 +80,12 @@ class ParameterTable(NamedTuple):
         doubted[[robot.camera is None for robot in robots], DRIVES:] = 0.0
         times = np.where(time_s > 0.0, time_s, np.inf)
         surveys = np.array([_survey(mark) for mark in landmarks]).reshape(-1, 3, 3)
+        first_camera = sum(not isinstance(mark, FixedCamera) for mark in landmarks)
+        reopened = np.array([_reopened(mark) for mark in landmarks]).reshape(-1, 3, 3)
         column, survey_column = np.full(sigma.shape, -1), np.full(len(landmarks), -1)
-        table = cls(column, doubted, times, survey_column, surveys, in_blocks).with_parameters(wanted)
+        table = cls(
+            column, doubted, times, survey_column, surveys, reopened, first_camera, in_blocks
+        ).with_parameters(wanted)
         surveyed = np.array([mark.is_estimated for mark in landmarks], dtype=bool)
         survey_column[surveyed] = table.filter_size + 3 * np.arange(surveyed.sum())
         return table
@@ -123,8 +130,19 @@ class ParameterTable(NamedTuple):
         return self._replace(survey_column=survey_column)
 
 
-def _survey(mark: Landmark) -> FloatArray:
-    """Prior covariance (3, 3) of the right-invariant error of a landmark's survey."""
-    position, yaw = (mark.position_sigma, mark.yaw_sigma) if mark.is_estimated else _CONTRADICTED_SURVEY_SIGMA
-    sigma = np.maximum([position, position, yaw], _MIN_SURVEY_SIGMA)
-    return error_covariance([mark.x, mark.y, mark.yaw or 0.0], np.diag(sigma**2))
+def _survey(mark: Surveyed) -> FloatArray:
+    """Prior covariance (3, 3) of the right-invariant error of what was surveyed."""
+    return _error(mark, (mark.position_sigma, mark.yaw_sigma))
+
+
+def _reopened(mark: Surveyed) -> FloatArray:
+    """Covariance (3, 3) that is added to this error after a contradiction."""
+    if isinstance(mark, FixedCamera):
+        return _error(mark, _CONTRADICTED_CAMERA_SIGMA)
+    return _survey(mark) if mark.is_estimated else _error(mark, _CONTRADICTED_SURVEY_SIGMA)
+
+
+def _error(mark: Surveyed, sigma: tuple[float, float]) -> FloatArray:
+    """Covariance (3, 3) of a right-invariant error with standard deviations of position [m] and yaw [rad]."""
+    position, yaw = np.maximum(sigma, _MIN_SURVEY_SIGMA).tolist()
+    return error_covariance([mark.x, mark.y, mark.yaw or 0.0], np.diag([position**2, position**2, yaw**2]))

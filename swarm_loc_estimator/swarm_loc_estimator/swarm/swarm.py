@@ -195,10 +195,20 @@ class FixedCamera:
     pitch: float = number(math.pi / 2, "rad", -TURN, TURN, "turned down; by default straight down")
     roll: float = number(0.0, "rad", -TURN, TURN, "turned about the optical axis")
     position_sigma: float = number(
-        0.001, "m", 0.0, 10.0, "error of positions on the floor, the same in all of its images", above=True
+        0.001, "m", 0.0, 10.0, "standard deviation of x and y, estimated with the poses", above=True
     )
-    yaw_sigma: float = number(0.002, "rad", 0.0, 1.0, "error of headings, the same in all images", above=True)
+    yaw_sigma: float = number(
+        0.002, "rad", 0.0, 1.0, "standard deviation of yaw, estimated with the poses", above=True
+    )
     sensor: SensorModel = SensorModel()
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether its pose is estimated: always, since its standard deviation is never zero."""
+        return True
+
+
+Surveyed = Landmark | FixedCamera  # A static body whose pose may be estimated
 
 
 @dataclass(frozen=True)
@@ -265,10 +275,10 @@ class Swarm:
         return {robot.name: index for index, robot in enumerate(self.robots)}
 
     @cached_property
-    def surveyed(self) -> tuple[Landmark, ...]:
-        """Static bodies whose places may be estimated: the landmarks, then the anchors as such."""
+    def surveyed(self) -> tuple[Surveyed, ...]:
+        """Static bodies whose places may be estimated: landmarks, anchors as such, and fixed cameras."""
         anchors = (Landmark(a.address, a.x, a.y, a.z, position_sigma=a.position_sigma) for a in self.anchors)
-        return (*self.landmarks, *anchors)
+        return (*self.landmarks, *anchors, *self.cameras)
 
     @cached_property
     def owner_of(self) -> Mapping[int, MarkerOwner]:

@@ -13,9 +13,9 @@ import numpy as np
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.filter.integrity import CONFIRMED, count_missed, count_seen, is_contradicted
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, select
 from swarm_loc_estimator.filter.models import CARTESIAN, gate_threshold
+from swarm_loc_estimator.filter.sources import CONFIRMED, RELIEF, is_contradicted
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 from swarm_loc_estimator.identification.anchors import Scale
 from swarm_loc_estimator.identification.assignment import AMBIGUOUS, UNSEEN, Assignment, assign, log_ratios
@@ -79,9 +79,8 @@ class PictureFusion:
         strangers = int(np.sum(found.robot == UNSEEN)) - int(np.sum(~state.tracked & self._moves))
         for robot in robots[unseen & ~in_view].tolist() if strangers > 0 else ():
             # the robot may have left the view, or be one of the unassigned detections
-            count_missed(
-                state.integrity, robot, min(self._miss, _MAX_FAULT_SCORE - state.integrity.fault_score[robot])
-            )
+            score = state.sources.score
+            score[robot] += min(self._miss, _MAX_FAULT_SCORE - score[robot])
         place = np.full(state.tracked.size, UNSEEN)
         probability = np.zeros(state.tracked.size)
         place[robots], probability[robots] = found.place, found.probability
@@ -94,9 +93,9 @@ class PictureFusion:
 
     def _miss_robot(self, state: SwarmState, robot: int, stamp_ns: int) -> None:
         """Increase the fault score of a robot that was not detected at its estimated position."""
-        unconfirmed = state.integrity.confirmations[robot] < CONFIRMED
-        doubt = count_missed(state.integrity, robot, self._miss)
-        if unconfirmed or doubt >= self._settings.max_fault_score:
+        unconfirmed = state.sources.confirmations[robot] < CONFIRMED
+        state.sources.score[robot] += self._miss
+        if unconfirmed or state.sources.score[robot] >= self._settings.max_fault_score:
             state.deinitialize(robot, LossReason.NOT_IN_IMAGE, stamp_ns)
 
     def identify(self, state: SwarmState, image: Measurements, assignment: Assignment) -> bool:
@@ -153,7 +152,7 @@ class PictureFusion:
             return Outcome.NOT_MOVED, None
         _memory(state).chains[robot] = chains = chains.advanced(picture, point, stamp_ns)
         answer = chains.answer() if chains.images > 1 else None
-        believed = bool(state.tracked[robot]) and not is_contradicted(state.integrity, robot)
+        believed = bool(state.tracked[robot]) and not is_contradicted(state.arrays(), robot)
         sure = answer is not None and self._is_sure(answer, is_believed=believed)
         return Outcome.UNDECIDED, answer if sure else None
 
@@ -210,8 +209,8 @@ def _memory(state: SwarmState) -> IdentityMemory:
 
 def relieve_seen(state: SwarmState, robots: IntArray) -> None:
     """Reduce the fault scores of robots (k,) that were detected at their estimated positions."""
-    for robot in robots.tolist():
-        count_seen(state.integrity, robot)
+    score = state.sources.score
+    score[robots] = np.maximum(0.0, score[robots] - 4.0 * RELIEF)
 
 
 def picture_of(image: Measurements) -> Picture:

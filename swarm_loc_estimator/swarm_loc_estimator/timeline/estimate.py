@@ -16,16 +16,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.numerics import add_scaled, composed, wrap
-from swarm_loc_estimator.filter.integrity import (
+from swarm_loc_estimator.common.numerics import composed, wrap
+from swarm_loc_estimator.filter.measurements import LossReason
+from swarm_loc_estimator.filter.prediction import new_scratch, write_predicted
+from swarm_loc_estimator.filter.sources import (
     CONFIRMED,
-    excluded_pairs,
+    excluded_links,
     inflate_suspect_covariance,
     is_contradicted,
 )
-from swarm_loc_estimator.filter.measurements import LossReason
-from swarm_loc_estimator.filter.prediction import new_scratch, write_predicted
-from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, IntegrityArrays, SwarmState
+from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.track_arrays import TrackArrays, look_up, new_sample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
@@ -39,7 +39,7 @@ class Status(IntEnum):
     WAITING = 0  # not localized
     TRACKED = 1
     STALE = 2  # localized, but its odometry has timed out
-    UNCONFIRMED = 3  # initialized, but not confirmed by a sighting yet
+    UNCONFIRMED = 3  # initialized, but not confirmed by a later measurement yet
     CONTRADICTED = 4  # its newest sightings contradict its pose
     UNCERTAIN = 5  # localized, but its standard deviation exceeds lost_sigma or lost_heading_sigma
 
@@ -114,12 +114,11 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, limits: TrackedLimits,
         look_up(tracks, i, out.stamp_ns, sample, 0)
         to = Preintegrated(out.stamp_ns, sample.covariance[0], sample.jacobian[0])
         write_predicted(belief, i, to, scratch, t, error)
-        add_scaled(error, belief.integrity.excess[i], 1.0)
         x, y, theta = composed(t[0], t[1], t[2], track[0], track[1], track[2])
         out.poses[i, 0], out.poses[i, 1], out.poses[i, 2] = x, y, wrap(theta)
         _pose_covariance(x, y, error, out.covariances[i])
-        inflate_suspect_covariance(belief.integrity, i, out.covariances[i])
-        out.status[i] = _status(belief.integrity, i, sample.silence_s[0], limits, out.covariances[i])
+        inflate_suspect_covariance(belief.sources, i, out.covariances[i])
+        out.status[i] = _status(belief, i, sample.silence_s[0], limits, out.covariances[i])
         cos, sin = np.cos(theta - raw[2]), np.sin(theta - raw[2])
         out.map_to_odom[i, 0] = x - cos * raw[0] + sin * raw[1]
         out.map_to_odom[i, 1] = y - sin * raw[0] - cos * raw[1]
@@ -128,14 +127,14 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, limits: TrackedLimits,
 
 @inlined_njit
 def _status(
-    integrity: IntegrityArrays, robot: int, silence_s: float, limits: TrackedLimits, covariance: FloatArray
+    belief: BeliefArrays, robot: int, silence_s: float, limits: TrackedLimits, covariance: FloatArray
 ) -> int:
     """Status of a localized robot with the reported covariance (3, 3)."""
     if silence_s > limits.timeout_s[robot]:
         return _STALE
-    if integrity.confirmations[robot] < CONFIRMED:
+    if belief.sources.confirmations[robot] <= CONFIRMED:
         return _UNCONFIRMED
-    if is_contradicted(integrity, robot):
+    if is_contradicted(belief, robot):
         return _CONTRADICTED
     position = max(covariance[0, 0], covariance[1, 1])
     if position > limits.position_sigma**2 or covariance[2, 2] > limits.heading_sigma**2:
@@ -242,7 +241,7 @@ class Contradicted(Enum):
     POSE = "pose"
     SIGHTINGS = "sightings"
     DESCRIPTION = "description"
-    NOISE = "noise"
+    SUSPENDED = "suspended source"
 
 
 class Contradiction(NamedTuple):
@@ -254,7 +253,12 @@ class Contradiction(NamedTuple):
 
 
 def contradictions(
-    swarm: Swarm, state: SwarmState, tracks: OdometryTracks, unmoved: BoolArray, now_ns: int
+    swarm: Swarm,
+    state: SwarmState,
+    tracks: OdometryTracks,
+    unmoved: BoolArray,
+    max_fault_score: float,
+    now_ns: int,
 ) -> list[Contradiction]:
     """All faults detected at an instant.
 
@@ -263,25 +267,28 @@ def contradictions(
         state: Newest state.
         tracks: Odometry, to detect conflicting sources, resets and constant poses.
         unmoved: (N,) robots that move although their odometry has never changed.
+        max_fault_score: Fault score from which a source is contradicted.
         now_ns: The instant.
     """
     names = [robot.name for robot in swarm.robots] + [f"landmark {mark.id}" for mark in swarm.landmarks]
     names += [f"anchor {anchor.address}" for anchor in swarm.anchors]
+    names += [camera.name for camera in swarm.cameras]
+    robots, belief, maps = len(swarm.robots), state.arrays(), swarm.map is not None
+    names += [f"{'lidar' if maps and one.lidar.is_used else 'fixes'} of {one.name}" for one in swarm.robots]
+    names += [f"marker of {one.name}" for one in swarm.robots]
     conflicting = tracks.has_conflicting_sources(now_ns)
     reset = tracks.had_fault(now_ns) & ~conflicting
-    denied = [
-        is_tracked and is_contradicted(state.integrity, robot)
-        for robot, is_tracked in enumerate(state.tracked)
-    ]
+    denied = [is_tracked and is_contradicted(belief, robot) for robot, is_tracked in enumerate(state.tracked)]
     contradicted = np.flatnonzero(state.contradicted_ns > NEVER_NS).tolist()
-    aside = excluded_pairs(state.integrity, now_ns)
+    aside = [(robot, source % len(names)) for robot, source in excluded_links(state.sources, now_ns)]
+    outside = range(len(names) - 2 * robots - len(swarm.cameras), len(names))  # cameras, fixes and markers
+    suspended = np.flatnonzero(state.sources.score[robots:] >= max_fault_score + 1.0) + robots
     found: list[tuple[Contradicted, ArrayLike]] = [
         (Contradicted.ODOMETRY, conflicting),
         (Contradicted.RESET, reset),
         (Contradicted.CONSTANT, tracks.integrates_twist()),
         (Contradicted.UNMOVED, unmoved),
         (Contradicted.POSE, denied),
-        (Contradicted.NOISE, state.integrity.noise_inflation),
     ]
     return [
         *(
@@ -289,7 +296,11 @@ def contradictions(
             for kind, robots in found
             for robot in np.flatnonzero(robots).tolist()
         ),
-        *(_sightings(names[observer], names[source % len(names)]) for observer, source in aside),
+        *(
+            _sightings(*(names[i] for i in ((source, robot) if source in outside else (robot, source))))
+            for robot, source in aside
+        ),
+        *(_suspended(names[source]) for source in suspended.tolist()),
         *(_description(names[source], source, state) for source in contradicted),
     ]
 
@@ -300,7 +311,6 @@ _TEXTS = {
     Contradicted.CONSTANT: "the odometry of {0} has a constant pose but a twist: integrating the twist",
     Contradicted.UNMOVED: "the odometry of {0} has a constant pose and no twist, although {0} moves",
     Contradicted.POSE: "the newest measurements contradict the pose of {0}",
-    Contradicted.NOISE: "the measurements of {0} are noisier than described; inflating their noise",
 }
 
 
@@ -311,6 +321,11 @@ def _of_robot(name: str, kind: Contradicted) -> Contradiction:
 def _sightings(observer: str, source: str) -> Contradiction:
     text = f"excluding {observer}'s measurements of {source}: inconsistent with all others"
     return Contradiction(observer, Contradicted.SIGHTINGS, text)
+
+
+def _suspended(name: str) -> Contradiction:
+    text = f"the {name} contradicts the rest, and is not used until it agrees again"
+    return Contradiction(name, Contradicted.SUSPENDED, text)
 
 
 def _description(name: str, source: int, state: SwarmState) -> Contradiction:

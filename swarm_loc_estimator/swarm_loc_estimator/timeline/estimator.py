@@ -240,7 +240,9 @@ class Estimator:
     def contradictions(self, now_ns: int) -> list[Contradiction]:
         """Contradicted robots and landmarks at an instant, robots first."""
         unmoved = self._constant.contradicted(now_ns)
-        return contradictions(self.swarm, self._timeline.state, self._tracks, unmoved, now_ns)
+        return contradictions(
+            self.swarm, self._timeline.state, self._tracks, unmoved, self.settings.max_fault_score, now_ns
+        )
 
     @property
     def losses(self) -> list[LossReport]:

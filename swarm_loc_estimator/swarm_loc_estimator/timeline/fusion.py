@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,9 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.correlated_noise import at_initialization, record_constraint, without_repeats
-from swarm_loc_estimator.filter.integrity import WELL_CONFIRMED, LossLimits, is_kidnapped
 from swarm_loc_estimator.filter.joint_filter import JointFilter, Robots
 from swarm_loc_estimator.filter.measurements import (
+    NOBODY,
     Command,
     CommandKind,
     LossReason,
@@ -21,7 +22,25 @@ from swarm_loc_estimator.filter.measurements import (
     Verdict,
     select,
 )
-from swarm_loc_estimator.filter.models import ANONYMOUS, CARTESIAN, MODELS, SCAN, is_compiled, locates_alone
+from swarm_loc_estimator.filter.models import (
+    ANONYMOUS,
+    CARTESIAN,
+    COMPILED,
+    MODELS,
+    SCAN,
+    is_compiled,
+    locates_alone,
+)
+from swarm_loc_estimator.filter.sources import (
+    CORRELATION_NS,
+    MAX_DOUBT,
+    RELIEF,
+    SUSPECT,
+    WELL_CONFIRMED,
+    LossLimits,
+    is_kidnapped,
+    note_batch,
+)
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.filter.state import IN_MAP, InitialPose, Meetings, SwarmState, correct
 from swarm_loc_estimator.filter.update import (
@@ -57,6 +76,8 @@ _PAIRS_PER_ROBOT = 32
 """Maximum number of observed robots per robot with a stored mean of infrared measurements."""
 _CONTRADICTED_DESCRIPTION, _CONTRADICTED_WITHIN_NS = 2, 60_000_000_000
 """All parameters are re-estimated if this number of robots and landmarks is contradicted in this time."""
+_SETTLING_NS = 10_000_000_000  # A camera that is contradicted again so soon is suspended
+_NO: Any = np.False_
 
 
 class Fusion:
@@ -88,7 +109,10 @@ class Fusion:
         self._local = LocalFrame(swarm, tracks, self._initializer, settings.origin_after_s)
         self._pictures = PictureFusion(swarm, settings, tracks)
         self._scans = MapScans(swarm, settings, tracks, sweeps)
-        self._sides = len(swarm.robots), len(swarm.robots) + len(swarm.surveyed)
+        robots, surveyed = len(swarm.robots), len(swarm.surveyed)
+        self._sides = robots, 3 * robots + surveyed
+        self._first_mount, self._first_direction = surveyed - len(swarm.cameras), 2 * robots + surveyed
+        self._sees = [robot.camera is not None for robot in swarm.robots]
         self._table = ParameterTable.of(swarm.robots, swarm.surveyed, in_blocks=self.is_sparse)
         self._pairs = _PAIRS_PER_ROBOT if any(robot.ir is not None for robot in swarm.robots) else 0
 
@@ -193,9 +217,12 @@ class Fusion:
     ) -> None:
         """Fuse the scan (1,) of a lidar."""
         self.starts.initialize_measured(state, one)
-        fix, verdicts[:] = self._scans.fix_of(state, one.row(0))
+        fix, verdicts[:], confirms = self._scans.fix_of(state, one.row(0))
         if fix is not None:
+            known, before = state.sources.confirmations, state.sources.confirmations.copy()
             self._fuse(state, fix, verdicts, nis)
+            if not confirms:
+                np.minimum(known, before, out=known)
 
     def _fuse_in_order(
         self, state: SwarmState, measurements: Measurements, verdicts: NDArray[np.uint8], nis: FloatArray
@@ -282,13 +309,15 @@ class Fusion:
             for k in np.flatnonzero(~is_compiled(rows.model)).tolist() if why == IS_LINK else ():
                 evaluate_link(rows.row(k), k, tracks, belief, state.filter, work)
             stage = ATTRIBUTE
-        # Correct, learn and count.
+        # Correct and count.
         if work.accepted.any():
             used = slice(None) if work.accepted.all() else work.accepted
             evaluated = (work.jacobian[used], work.innovation[used], work.noise[used])
+            covariances = state.pose_covariances()
             correction = state.filter.update(work.columns[used], *evaluated)
             belief = state.arrays()  # the update may have reallocated them
             correct(belief, correction)
+            note_batch(rows, work.accepted, belief, covariances)
         fuse(rows, 0, SETTLE, middle_ns, tracks, belief, limits, work, outcome, own_nis)
         lost = work.lost > 0
         self._deinitialize(state, work, newest_ns)
@@ -316,6 +345,11 @@ class Fusion:
         """Store a row of measurements as a constraint if it can initialize a robot, or what `keep` does."""
         initializes, keep = MODELS[int(one.model)].initializes, keep or self._initializer.note
         alone = initializes == "alone"
+        if self._is_suspended(state, one):
+            return Verdict.GATED
+        direction = self._first_direction + int(one.target)
+        if one.observer == NOBODY and state.sources.score[direction] >= self._limits.max_fault_score:
+            one = one._replace(has_heading=_NO, has_second=_NO)
         if not initializes or not keep(state, at_initialization(one) if alone else one):
             return Verdict.NOT_LOCALIZED
         sides = np.array([one.observer, one.target])
@@ -324,20 +358,44 @@ class Fusion:
             record_constraint(one, state.arrays(), tracks)
         return Verdict.CONSTRAINT
 
+    def _is_suspended(self, state: SwarmState, one: Measurements) -> bool:
+        """Whether the camera or fixes of a row are suspended; those of a lost robot recover."""
+        if one.observer != NOBODY or int(one.model) not in COMPILED:
+            return False
+        robots, score, limit = state.tracked.size, state.sources.score, self._limits.max_fault_score
+        robot, last_ns = int(one.target), state.sources.measured_ns
+        source = self._first_direction - robots + robot if one.mount == NOBODY else robots + int(one.mount)
+        if score[source] >= limit and one.stamp_ns - last_ns[robot] >= CORRELATION_NS:
+            last_ns[robot], score[source] = one.stamp_ns, score[source] - RELIEF
+        return bool(score[source] >= limit)
+
     def _augment(self, state: SwarmState, source: int, stamp_ns: int) -> None:
-        """Re-estimate the parameters of a contradicted robot or landmark; deinitialize a kidnapped robot."""
-        robots = state.tracked.size
-        if source < robots and is_kidnapped(state.integrity, source):
+        """Open a contradicted source: parameters of a robot, or the place of a landmark or camera.
+
+        A kidnapped robot is deinitialized. So is one without a camera, whose marker may be turned. A camera
+        that is contradicted again is suspended.
+        """
+        robots, limit = state.tracked.size, self._limits.max_fault_score
+        if source < robots and (is_kidnapped(state.sources, source) or not self._sees[source]):
+            links, score = state.sources.source[source], state.sources.score
+            suspect = (score[links[(links >= robots) & (links < score.size)]] >= SUSPECT).any()
+            if not self._sees[source] and not suspect:
+                direction = self._first_direction + source
+                score[direction] = max(score[direction], limit + 1.0)
             state.deinitialize(source, LossReason.KIDNAPPED, stamp_ns)
             return
-        poses = self._poses(state, stamp_ns)
+        poses, again_ns = self._poses(state, stamp_ns), state.contradicted_ns[source] + _SETTLING_NS
         state.contradicted_ns[source] = stamp_ns
-        lately = np.sum(state.contradicted_ns > stamp_ns - _CONTRADICTED_WITHIN_NS)
-        if (
-            lately < _CONTRADICTED_DESCRIPTION
-            or state.all_augmented
-            or robots > self._policy.reopen_all_up_to
-        ):
+        if source >= robots + self._first_mount:
+            state.augment(source, poses[0])
+            state.sources.score[source] = 2.0 * limit if stamp_ns < again_ns else 0.0
+            return
+        lately = np.sum(
+            state.contradicted_ns[: robots + self._first_mount] > stamp_ns - _CONTRADICTED_WITHIN_NS
+        )
+        if state.doubt:
+            state.doubt = min(state.doubt + 1.0, MAX_DOUBT)
+        if state.doubt or lately < _CONTRADICTED_DESCRIPTION or robots > self._policy.reopen_all_up_to:
             state.augment(source, poses[min(source, robots - 1)])
         else:
             state.augment_all(poses)

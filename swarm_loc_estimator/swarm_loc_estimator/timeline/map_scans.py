@@ -28,9 +28,9 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import between
-from swarm_loc_estimator.filter.integrity import CONFIRMED, count_missed, count_seen
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.filter.models import CARTESIAN, POSE_GATE
+from swarm_loc_estimator.filter.sources import CONFIRMED, RELIEF
 from swarm_loc_estimator.filter.state import IN_MAP, SwarmState
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import MapFileError, load_map
@@ -381,8 +381,8 @@ class MapScans:
         self._limits = TrackedLimits.of(swarm, settings)
         self._walls = walls_of(swarm)
 
-    def fix_of(self, state: SwarmState, one: Measurements) -> tuple[Measurements | None, Verdict]:
-        """Match a scan; returns its fix (1,), or None and why there is none.
+    def fix_of(self, state: SwarmState, one: Measurements) -> tuple[Measurements | None, Verdict, bool]:
+        """Match a scan; returns its fix (1,), or None and why there is none, and if it confirms a start.
 
         Args:
             state: Its fault scores are changed.
@@ -391,28 +391,27 @@ class MapScans:
         robot, stamp_ns = int(one.target), int(one.stamp_ns)
         sweep = self._sweeps.get((robot, int(one.reading)))
         if self._walls is None or sweep is None or state.origin != IN_MAP or not state.tracked[robot]:
-            return None, Verdict.NOT_LOCALIZED
+            return None, Verdict.NOT_LOCALIZED, False
         estimate = estimate_at(state, self._tracks.arrays, self._limits, stamp_ns)
         beams = self._beams(robot, stamp_ns, sweep)
         walls = self._walls._replace(variance=self._walls.variance + self._lidars[robot].map_sigma ** 2)
         found = match(walls, *beams, estimate.poses[robot], estimate.covariances[robot])
         if found.outcome == OFF_MAP:
-            confirmed = state.integrity.confirmations[robot] >= CONFIRMED
-            if count_missed(state.integrity, robot, 1.0) >= (_MAX_MISSED if confirmed else _MAX_AT_START):
+            confirmed = state.sources.confirmations[robot] >= CONFIRMED
+            state.sources.score[robot] += 1.0
+            if state.sources.score[robot] >= (_MAX_MISSED if confirmed else _MAX_AT_START):
                 state.deinitialize(
                     robot, LossReason.OFF_MAP, stamp_ns
                 )  # later ones may fit by chance, elsewhere
-            return None, Verdict.OFF_MAP
+            return None, Verdict.OFF_MAP, False
         if found.outcome == BLOCKED:
-            return None, Verdict.BLOCKED
-        count_seen(state.integrity, robot)
-        if found.determined < _ALL or found.fitting < _SURE_FIT:  # does not confirm a start
-            state.integrity.confirmed_ns[robot] = stamp_ns
+            return None, Verdict.BLOCKED, False
+        state.sources.score[robot] = max(0.0, state.sources.score[robot] - 4.0 * RELIEF)
         fix = about_robots(robot, stamp_ns, found.pose[None], found.covariance[None], CARTESIAN)
         fix.systematic_share[:] = _SYSTEMATIC_SHARE
         # with a second solution it locates no robot alone: it was sought near the pose that may be wrong
         fix.has_second[:], fix.second[:] = True, fix.value
-        return fix, Verdict.OPEN
+        return fix, Verdict.OPEN, found.determined >= _ALL and found.fitting >= _SURE_FIT
 
     def _beams(
         self, robot: int, stamp_ns: int, sweep: LidarSweep

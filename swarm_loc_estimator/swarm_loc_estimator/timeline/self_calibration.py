@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.filter.integrity import with_noise_inflation
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.calibration_states import (
     CAMERA_OFFSET,
@@ -19,11 +19,11 @@ from swarm_loc_estimator.swarm.calibration_states import (
     TURN_SCALE,
     ParameterTable,
 )
-from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Robot, Surveyed, Swarm
 
 
 def learns(swarm: Swarm) -> bool:
-    """Whether parameters of any camera, odometry or landmark are described with a standard deviation."""
+    """Whether any parameter or place is described with a standard deviation."""
     lasting = np.delete(ParameterTable.of(swarm.robots).column, TURN_BIAS, axis=1)
     return bool((lasting >= 0).any()) or any(mark.is_estimated for mark in swarm.surveyed)
 
@@ -34,21 +34,22 @@ def learned(swarm: Swarm, state: SwarmState) -> Swarm:
     The bias of the turn rate is omitted, because it changes. Standard deviations of landmarks are marginal:
     they include errors common to all landmarks.
     """
-    surveyed = [
-        _landmark(mark, index, state) if state.landmark_column(index) >= 0 else mark
+    surveyed: list[Any] = [
+        _placed(mark, index, state) if state.landmark_column(index) >= 0 else mark
         for index, mark in enumerate(swarm.surveyed)
     ]
-    marks, places = surveyed[: len(swarm.landmarks)], surveyed[len(swarm.landmarks) :]
+    marks, anchors = len(swarm.landmarks), len(swarm.landmarks) + len(swarm.anchors)
     return replace(
         swarm,
         robots=tuple(
             _robot(robot, index, state) if state.tracked[index] else robot
             for index, robot in enumerate(swarm.robots)
         ),
-        landmarks=tuple(marks),
+        landmarks=tuple(surveyed[:marks]),
+        cameras=tuple(surveyed[anchors:]),
         anchors=tuple(
             replace(anchor, x=place.x, y=place.y, position_sigma=place.position_sigma)
-            for anchor, place in zip(swarm.anchors, places, strict=True)
+            for anchor, place in zip(swarm.anchors, surveyed[marks:anchors], strict=True)
         ),
     )
 
@@ -88,7 +89,7 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
             camera, yaw=float(se2.wrap_angle(camera.yaw + value[CAMERA_YAW])), yaw_sigma=sigma[CAMERA_YAW]
         ),
         sensor=replace(
-            with_noise_inflation(sensor, float(state.integrity.noise_inflation[index])),
+            sensor,
             distance_scale=seen * sensor.distance_scale,
             distance_scale_sigma=min(1.0, sigma[CAMERA_SCALE] / abs(seen)),
             range_offset=(sensor.range_offset - value[CAMERA_OFFSET]) / seen,
@@ -97,12 +98,13 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
     )
 
 
-def _landmark(mark: Landmark, number: int, state: SwarmState) -> Landmark:
-    """Landmark at its estimated pose."""
+def _placed(mark: Surveyed, number: int, state: SwarmState) -> Any:
+    """A landmark or fixed camera at its estimated pose."""
     x, y, yaw = se2.compose(state.landmark[number], [mark.x, mark.y, mark.yaw or 0.0]).tolist()
     covariance = se2.pose_covariance([x, y, yaw], state.landmark_covariance(number))
+    moved: Any = mark
     return replace(
-        mark,
+        moved,
         x=x,
         y=y,
         yaw=None if mark.yaw is None else yaw,

@@ -172,6 +172,7 @@ def _merge(
     _insert(columns.observer, new.observer, order, places, end, 1)
     _insert(columns.target, new.target, order, places, end, 1)
     _insert(columns.landmark, new.landmark, order, places, end, 1)
+    _insert(columns.mount, new.mount, order, places, end, 1)
     _insert(columns.model, new.model, order, places, end, 1)
     _insert(columns.reading, new.reading, order, places, end, 1)
     _insert(columns.has_heading, new.has_heading, order, places, end, 1)
@@ -248,6 +249,8 @@ def _compared_further(a: Measurements, i: int, b: Measurements, j: int) -> int:
         return -1 if a.received_from[i] < b.received_from[j] else 1
     if a.landmark[i] != b.landmark[j]:
         return -1 if a.landmark[i] < b.landmark[j] else 1
+    if a.mount[i] != b.mount[j]:
+        return -1 if a.mount[i] < b.mount[j] else 1
     if a.has_heading[i] != b.has_heading[j]:
         return -1 if b.has_heading[j] else 1
     if a.has_second[i] != b.has_second[j]:

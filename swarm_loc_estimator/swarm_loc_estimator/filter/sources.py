@@ -1,0 +1,676 @@
+"""Sources: what can be wrong as one, and how much is believed of each.
+
+A source is a robot (its wheels, its camera, its marker), a landmark, an anchor, a fixed camera, the absolute
+fixes of a robot, or the direction of the marker of a robot. A link is what a robot and another source
+measured of each other. Four rules hold for all:
+
+**Floor.** No message makes the noise of a measurement smaller than the description allows (`sensors/`).
+
+**Rate.** Measurements of a link within its correlation time share their error: each counts by its share of
+that time, as information, as evidence, as confirmation and towards a loss. A value that comes
+again is none.
+
+**Systematic.** What errs in the same way again is a state (`swarm/calibration_states.py`), or is considered
+in the reported covariance (`excess`). Errors of sightings repeat while a robot looks from the same place, and
+the noise of wheels is the less known the longer nothing has measured a robot. An update leaves A = P P0^-1 of
+an error, where P0 and P are the covariances before and after. So the covariance X beyond the filter's
+becomes A X A^T + w (P - A P), where P - A P is the noise that the update added and w tells how much of it
+repeats: with the share s of the variance that does, the correlation r by motion, and the share a that updates
+since the last look have left of its error, w = 2 s r a / (1 - r a). Poses and gates do not depend on X.
+
+**Health.** A measurement is an outlier when the squared Mahalanobis distance of its position exceeds a
+threshold that one good measurement in twenty exceeds; a mean of whitened innovations tells of a drift. Both
+raise the fault score of that end of the link of which the larger share of links is bad; of equal shares, of
+the end with more of them. A robot whose camera was turned disagrees with all that it sees, a landmark that
+was moved with all that see it, a fixed camera that was moved with all that it sees. If both ends agree with
+others, the outlier is evidence against the link alone, which is excluded. What agrees lowers scores and
+evidence. A robot that has no other link agrees with a camera wherever that is.
+
+From a fault score on, a source is contradicted: the parameters of a robot and the place of a landmark or
+camera are opened; fixes and the direction of a marker are not used until they agree again, nor is a camera
+that is contradicted again. Radios are wrong in pairs, since a wall lengthens ranges: they are evidence
+against their link only, whose noise it raises.
+
+A pose that was assumed is confirmed by measurements that agree, or refuted. A robot is lost that is too
+uncertain, off its fixes, or with too many gated measurements in a row.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
+from swarm_loc_estimator.common.numerics import cholesky3, factor_numbers, solve3
+from swarm_loc_estimator.filter.measurements import LossReason, Measurements
+from swarm_loc_estimator.filter.models import POLAR, has_kernel
+from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SourceArrays, covariance_within
+
+# Rate
+CORRELATION_NS = 100_000_000  # Errors of a link within this time are the same
+_LEAST_SHARE = 1e-3
+# Systematic; tuned on MRCLAM set 1, where 80 % of the variances of sightings repeat
+_REPEATED = 0.5  # Share of the variance of a sighting that repeats at the same place
+_LASTING = 0.05  # Share of that which never fades: what a description lacks
+_LENGTH_M = 0.03  # Motion of one end, as the other sees it, after which its correlation is 1/e
+# Health; tuned on the scenarios of bench/integrity
+EXCLUDED, _MAX_EVIDENCE = 10.0, 15.0  # Evidence from which a link is excluded, and its maximum
+_OUTLIER = 6.0
+_MAX_WEIGHT, _DRIFT_WEIGHT, RELIEF = 3.0, 0.5, 0.25
+"""Largest weight of an outlier, weight of a drift, and decrease by a measurement that agrees."""
+_FORGETTING, _DRIFT = 0.125, 0.6
+"""Weight of the newest in the mean of whitened innovations, and the mean from which they drift."""
+SUSPECT, WELL_CONFIRMED = 7.5, 18.0
+"""Fault score from which a robot is not tracked, and confirmations up to which its covariance is widened."""
+_SUSPECT_SIGMA = (0.03, 0.03, 0.06)
+"""Standard deviations added while a pose is suspect or little confirmed: x [m], y [m], heading [rad]."""
+
+_DOUBTED_M, _DOUBTED_RAD, _DOUBTED_HEADING, _DOUBTED_S = 0.004, 0.01, 0.03, 0.03
+"""Noise for each contradiction of the description as a whole [m], [rad], [rad], [s]."""
+MAX_DOUBT = 5.0
+
+LINK, UNDECIDED = -1, -2  # Who is wrong if no source is
+RECENT_NS, _ONE_IMAGE_NS = 400_000_000, 20_000_000
+CONFIRMED = 2.0  # Confirmations from which an assumed pose counts as known
+AGREES, DRIFTS, DEVIATES, ELSEWHERE = range(4)
+"""Findings of the newest measurement of a link; an outlier that no wrong description explains: ELSEWHERE."""
+_EXPLAINED_M, _EXPLAINED_SHARE = 0.1, 0.35
+"""Error that a wrong description can explain: a constant, and a share of the distance."""
+_SMALL_M, _SMALL_SHARE = 0.003, 0.005
+"""Errors up to this constant and share of the distance are inliers whatever the noise is."""
+_REPORTED_NS = 3_000_000_000
+OCCUPIED_M = 0.02  # Two robots cannot be nearer [m]
+
+
+class LossLimits(NamedTuple):
+    """Limits beyond which a robot is lost."""
+
+    position_sigma: float  # Standard deviation of its position [m]
+    heading_sigma: float  # Of its heading [rad]
+    gated_in_a_row: int  # Gated measurements since the last accepted one
+    max_fault_score: float  # Fault score from which a source is contradicted
+
+
+@inlined_njit
+def robot_of(measurements: Measurements, k: int) -> int:
+    """The robot that has the link of measurement k: the observer, else the target; -1: none."""
+    observer: int = measurements.observer[k]
+    target: int = measurements.target[k]
+    return observer if observer >= 0 else target
+
+
+@inlined_njit
+def source_of(measurements: Measurements, k: int, belief: BeliefArrays) -> int:
+    """The source that measurement k links to `robot_of` it; -1: none.
+
+    Robots are 0 to N - 1, what was surveyed follows, then the fixes of each robot, then the directions of
+    their markers. A link without compiled kernel, such as that of two radios, has the number of all sources
+    more, and no other links.
+    """
+    robots, sources = belief.tracked.size, belief.sources.score.size
+    landmark: int = measurements.landmark[k]
+    mount: int = measurements.mount[k]
+    source: int = measurements.target[k]
+    if landmark >= 0:
+        source = robots + landmark
+    elif mount >= 0:
+        source = robots + mount
+    elif measurements.observer[k] < 0:
+        source = fixes_of(belief, source)
+    return source if has_kernel(measurements, k) or source < 0 else source + sources
+
+
+@inlined_njit
+def fixes_of(belief: BeliefArrays, robot: int) -> int:
+    """The source of the absolute fixes of a robot."""
+    number: int = belief.tracked.size + belief.landmark.shape[0] + robot
+    return number
+
+
+@inlined_njit
+def direction_of(belief: BeliefArrays, robot: int) -> int:
+    """The source of the direction of a robot's marker."""
+    number: int = 2 * belief.tracked.size + belief.landmark.shape[0] + robot
+    return number
+
+
+@inlined_njit
+def is_fix(measurements: Measurements, k: int) -> bool:
+    """Whether measurement k is an absolute fix, not the sighting of a fixed camera."""
+    fix: bool = measurements.observer[k] < 0 and measurements.mount[k] < 0 and has_kernel(measurements, k)
+    return fix
+
+
+@inlined_njit
+def find_link(measurements: Measurements, k: int, belief: BeliefArrays) -> int:
+    """The place of the link of measurement k in the row of its robot; -1: it has none."""
+    robot, source = robot_of(measurements, k), source_of(measurements, k, belief)
+    if robot >= 0 and source >= 0:
+        sources = belief.sources.source[robot]
+        for place in range(sources.size):
+            if sources[place] == source:
+                return place
+    return -1
+
+
+@inlined_njit
+def _new_link(state: SourceArrays, robot: int, source: int) -> int:
+    """Give a new link the place of the one measured longest ago."""
+    oldest = 0
+    for place in range(state.source.shape[1]):
+        if state.seen_ns[robot, place] < state.seen_ns[robot, oldest]:
+            oldest = place
+    state.source[robot, oldest], state.seen_ns[robot, oldest] = source, NEVER_NS // 2
+    state.finding[robot, oldest], state.evidence[robot, oldest] = AGREES, 0.0
+    for i in range(2):
+        state.drift[robot, oldest, i] = 0.0
+    for i in range(3):
+        state.last_look[robot, oldest, i] = math.nan
+    return oldest
+
+
+@inlined_njit
+def share_of(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
+    """By how much measurement k counts: its part of the correlation time since the last one of its link."""
+    place = find_link(measurements, k, belief)
+    if place < 0:
+        return 1.0
+    since_ns = measurements.stamp_ns[k] - belief.sources.seen_ns[robot_of(measurements, k), place]
+    if since_ns == 0:  # two markers of one picture are two measurements, the same one twice is not
+        again = k > 0 and measurements.stamp_ns[k] == measurements.stamp_ns[k - 1]
+        again = again and measurements.observer[k] == measurements.observer[k - 1]
+        again = again and measurements.target[k] == measurements.target[k - 1]
+        again = again and measurements.reading[k] == measurements.reading[k - 1]
+        return _LEAST_SHARE if again or measurements.observer[k] < 0 else 1.0
+    if since_ns < 0:
+        return 1.0
+    x, y = _place_of(measurements, k)
+    last = belief.sources.last_look[robot_of(measurements, k), place]
+    if x == last[0] and y == last[1]:
+        return _LEAST_SHARE
+    share: float = max(min(1.0, since_ns / CORRELATION_NS), _LEAST_SHARE)
+    return share
+
+
+@inlined_njit
+def _place_of(measurements: Measurements, k: int) -> tuple[float, float]:
+    """Where measurement k puts its target, as its observer sees it; of a range, the range and 0."""
+    x: float = measurements.value[k, 0]
+    y: float = measurements.value[k, 1]
+    if measurements.model[k] == POLAR:
+        x, y = x * math.cos(y), x * math.sin(y)
+    return x, y
+
+
+@inlined_njit
+def add_doubt(measurements: Measurements, k: int, belief: BeliefArrays, noise: FloatArray) -> None:
+    """Add what a description lacks that was contradicted as a whole to the noise (3, 3) of sighting k."""
+    if belief.doubt > 0.0 and measurements.observer[k] >= 0:
+        across = _DOUBTED_RAD if measurements.model[k] == POLAR else _DOUBTED_M
+        noise[0, 0] += (belief.doubt * _DOUBTED_M) ** 2
+        noise[1, 1] += (belief.doubt * across) ** 2
+        noise[2, 2] += (belief.doubt * _DOUBTED_HEADING) ** 2
+
+
+@inlined_njit
+def stamp_variance(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
+    """Variance of the stamp of measurement k, as described and with such doubt [s^2]."""
+    doubt = belief.doubt * _DOUBTED_S if measurements.observer[k] >= 0 else 0.0
+    variance: float = measurements.stamp_variance[k] + doubt * doubt
+    return variance
+
+
+@inlined_njit
+def small_variances(measurements: Measurements, k: int, predicted: FloatArray) -> tuple[float, float]:
+    """Variances of position errors too small to be outliers: forward or range, left or bearing."""
+    polar, distance = measurements.model[k] == POLAR, predicted[0]
+    if not polar:
+        distance = 0.0 if is_fix(measurements, k) else math.hypot(predicted[0], predicted[1])
+    small = (_SMALL_M + _SMALL_SHARE * abs(distance)) ** 2
+    return small, (small / max(distance * distance, 1e-6) if polar else small)
+
+
+@inlined_njit
+def is_elsewhere(measurements: Measurements, k: int, innovation: FloatArray, predicted: FloatArray) -> bool:
+    """Whether no wrong description explains an innovation (3,) of a prediction (3,)."""
+    if measurements.model[k] == POLAR:
+        distance, along, across = predicted[0], abs(innovation[0]), abs(innovation[1]) * predicted[0]
+    else:
+        distance = 0.0 if is_fix(measurements, k) else math.hypot(predicted[0], predicted[1])
+        along, across = abs(innovation[0]), abs(innovation[1])
+    elsewhere: bool = math.hypot(along, across) > _EXPLAINED_M + _EXPLAINED_SHARE * distance
+    return elsewhere
+
+
+@inlined_njit
+def assess(
+    measurements: Measurements,
+    k: int,
+    belief: BeliefArrays,
+    max_fault_score: float,
+    distance: float,
+    whitened: tuple[float, float],
+    share: float,
+    elsewhere: bool,
+) -> int:
+    """Update the link of measurement k, fault scores and evidence.
+
+    Args:
+        measurements: (m,).
+        k: Which one.
+        belief: Its sources are changed.
+        max_fault_score: Fault score from which a source is contradicted.
+        distance: Squared Mahalanobis distance of its gated components.
+        whitened: The innovation over its standard deviation.
+        share: By how much it counts, see `share_of`.
+        elsewhere: Whether no wrong description explains it.
+
+    Returns:
+        The robot, or N + l, that is contradicted now and is to be opened; -1: nobody.
+    """
+    robot, source, state = robot_of(measurements, k), source_of(measurements, k, belief), belief.sources
+    if robot < 0 or source < 0 or not math.isfinite(distance):
+        return -1
+    place, is_link = find_link(measurements, k, belief), not has_kernel(measurements, k)
+    if place < 0:
+        place = _new_link(state, robot, source)
+    now_ns = measurements.stamp_ns[k]
+    state.seen_ns[robot, place] = max(now_ns, state.seen_ns[robot, place])
+    # What does it say? Outliers of links without kernel are those that are gated.
+    limit = measurements.gate[k] if is_link else _OUTLIER
+    drift, weight = state.drift[robot, place], share
+    for i in range(2):
+        drift[i] += _FORGETTING * share * (whitened[i] - drift[i])
+    if distance > limit:
+        state.finding[robot, place] = ELSEWHERE if elsewhere else DEVIATES
+        weight *= min(distance / limit, _MAX_WEIGHT)
+    elif drift[0] * drift[0] + drift[1] * drift[1] > _DRIFT * _DRIFT:
+        state.finding[robot, place] = DRIFTS
+        weight *= _DRIFT_WEIGHT
+    else:
+        state.finding[robot, place] = AGREES
+        _relieve(belief, robot, place, share * (4.0 * RELIEF if is_link else RELIEF), now_ns)
+        return -1
+    # Who is wrong: one of the ends, or the link alone?
+    guilty = LINK if is_link else _guilty(belief, robot, source, now_ns)
+    if guilty == UNDECIDED:
+        return -1
+    if guilty == LINK:
+        most = EXCLUDED - 1.0 if is_link and state.finding[robot, place] == DRIFTS else _MAX_EVIDENCE
+        most = max(most, state.evidence[robot, place])
+        state.evidence[robot, place] = min(state.evidence[robot, place] + weight, most)
+        return -1
+    other = _as_good(belief, robot, guilty, now_ns)
+    if other >= 0:
+        state.score[other] = min(state.score[other] + weight, 2.0 * max_fault_score)
+    was_suspended = state.score[guilty] >= max_fault_score
+    state.score[guilty] = min(state.score[guilty] + weight, 2.0 * max_fault_score)
+    if was_suspended or state.score[guilty] < max_fault_score or guilty >= fixes_of(belief, 0):
+        return -1
+    return guilty if guilty >= belief.tracked.size else _instead(belief, guilty, max_fault_score, now_ns)
+
+
+@cached_njit
+def _as_good(belief: BeliefArrays, robot: int, guilty: int, now_ns: int) -> int:
+    """The fixed camera that is as credible as a guilty one, with which it disagrees about a robot; -1: none.
+
+    A robot between two cameras does not tell which of both is wrong, as long as the others that the guilty
+    one sees agree with it.
+    """
+    state, rival, agreeing = belief.sources, -1, 0
+    if not _sees_robots(belief, guilty):
+        return -1
+    for place in range(state.source.shape[1]):
+        source = state.source[robot, place]
+        if source >= 0 and source != guilty and now_ns - state.seen_ns[robot, place] < RECENT_NS:
+            if rival >= 0 or not _sees_robots(belief, source):
+                return -1
+            rival = source
+    for row in range(belief.tracked.size):
+        for place in range(state.source.shape[1]):
+            recent = state.source[row, place] == guilty and now_ns - state.seen_ns[row, place] < RECENT_NS
+            agreeing += 1 if recent and state.finding[row, place] == AGREES else 0
+    return rival if agreeing > 0 else -1
+
+
+@inlined_njit
+def assess_direction(belief: BeliefArrays, robot: int, misread: bool, share: float, limit: float) -> None:
+    """Update the fault score of the direction of a robot's marker by a measurement from outside."""
+    direction, score = direction_of(belief, robot), belief.sources.score
+    if misread:
+        score[direction] = min(score[direction] + share, 2.0 * limit)
+    else:
+        score[direction] = max(0.0, score[direction] - share * RELIEF)
+
+
+@cached_njit
+def _instead(belief: BeliefArrays, robot: int, max_fault_score: float, now_ns: int) -> int:
+    """Suspend the fixes of a contradicted robot in its place; return the robot if it has none."""
+    state, fixes = belief.sources, fixes_of(belief, robot)
+    for place in range(state.source.shape[1]):
+        if state.source[robot, place] == fixes and now_ns - state.seen_ns[robot, place] < RECENT_NS:
+            if state.score[fixes] >= max_fault_score:
+                return robot
+            state.score[fixes], state.score[robot] = 2.0 * max_fault_score, 0.0
+            return -1
+    return robot
+
+
+@cached_njit
+def _relieve(belief: BeliefArrays, robot: int, place: int, relief: float, now_ns: int) -> None:
+    """Lower evidence and fault scores by a measurement that agrees.
+
+    A fixed camera that is suspect is relieved by robots only that others locate, too.
+    """
+    state, others = belief.sources, 0
+    source = state.source[robot, place]
+    state.evidence[robot, place] = max(0.0, state.evidence[robot, place] - relief)
+    if source >= state.score.size:
+        return
+    for other in range(state.source.shape[1]):
+        recent = now_ns - state.seen_ns[robot, other] < RECENT_NS and other != place
+        others += 1 if recent and state.finding[robot, other] == AGREES else 0
+    state.score[robot] = max(0.0, state.score[robot] - relief)
+    if others > 0 or not _sees_robots(belief, source) or state.score[source] < SUSPECT:
+        state.score[source] = max(0.0, state.score[source] - relief)
+
+
+@cached_njit
+def _guilty(belief: BeliefArrays, robot: int, source: int, now_ns: int) -> int:
+    """That end of a bad link of which more links are bad; LINK: neither; UNDECIDED."""
+    bad_robot, share_robot = _bad_links(belief, robot, now_ns)
+    bad_source, share_source = _bad_links(belief, source, now_ns)
+    if max(share_robot, share_source) <= 0.5:
+        return LINK
+    outer = source >= belief.tracked.size + belief.table.first_camera
+    if outer and share_robot == share_source and (bad_source >= 2 or bad_source >= bad_robot):
+        return source  # many robots do not move at once, but a camera may
+    if share_robot >= share_source:
+        return robot if bad_robot >= 2 else UNDECIDED
+    return source
+
+
+@inlined_njit
+def _sees_robots(belief: BeliefArrays, source: int) -> bool:
+    """Whether a source is a fixed camera."""
+    sees: bool = belief.tracked.size + belief.table.first_camera <= source < fixes_of(belief, 0)
+    return sees
+
+
+@cached_njit
+def _bad_links(belief: BeliefArrays, node: int, now_ns: int) -> tuple[int, float]:
+    """Number and share of bad links of a source; a robot with no other link agrees with a camera anywhere."""
+    state, robots = belief.sources, belief.tracked.size
+    bad, count = 0, 0
+    for row in range(robots):
+        named = 1 if row == node else 0
+        for place in range(state.source.shape[1]):  # most robots have no link to it: a quick check first
+            named += state.source[row, place] == node
+        if not named:
+            continue
+        own = 0
+        for place in range(state.source.shape[1]):
+            about = 0 <= state.source[row, place] < state.score.size
+            own += 1 if about and now_ns - state.seen_ns[row, place] < RECENT_NS else 0
+        for place in range(state.source.shape[1]):
+            other = state.source[row, place]
+            about = 0 <= other < state.score.size and node in (row, other)
+            if about and now_ns - state.seen_ns[row, place] < RECENT_NS:
+                is_bad = state.finding[row, place] != AGREES
+                bad += 1 if is_bad else 0
+                count += 1 if is_bad or own > 1 or node < robots + belief.table.first_camera else 0
+    return bad, bad / max(1, count)
+
+
+@inlined_njit
+def is_suspended(belief: BeliefArrays, source: int, max_fault_score: float) -> bool:
+    """Whether a source is not used: fixes, directions or a fixed camera that the rest contradicts."""
+    aside: bool = (
+        belief.tracked.size <= source < belief.sources.score.size
+        and belief.sources.score[source] >= max_fault_score
+    )
+    return aside
+
+
+@inlined_njit
+def is_excluded(measurements: Measurements, k: int, belief: BeliefArrays, max_fault_score: float) -> bool:
+    """Whether the link of measurement k, or its source, is not used."""
+    place = find_link(measurements, k, belief)
+    aside: bool = place >= 0 and belief.sources.evidence[robot_of(measurements, k), place] >= EXCLUDED
+    return aside or is_suspended(belief, source_of(measurements, k, belief), max_fault_score)
+
+
+def excluded_links(state: SourceArrays, now_ns: int) -> list[tuple[int, int]]:
+    """The excluded links, as robot and source, among those measured recently."""
+    aside = (state.evidence >= EXCLUDED) & (now_ns - state.seen_ns < _REPORTED_NS)
+    return [(int(robot), int(state.source[robot, place])) for robot, place in np.argwhere(aside)]
+
+
+@inlined_njit
+def is_kidnapped(state: SourceArrays, robot: int, within_ns: int = RECENT_NS) -> bool:
+    """Whether most recent measurements of a robot can only mean that it is at another place."""
+    newest_ns, elsewhere, count = NEVER_NS // 2, 0, 0
+    for place in range(state.source.shape[1]):
+        newest_ns = max(newest_ns, state.seen_ns[robot, place])
+    for place in range(state.source.shape[1]):
+        recent = 0 <= state.source[robot, place] < state.score.size
+        recent = recent and newest_ns - state.seen_ns[robot, place] < within_ns
+        if recent and state.evidence[robot, place] < EXCLUDED:
+            count += 1
+            elsewhere += 1 if state.finding[robot, place] == ELSEWHERE else 0
+    return 2 * elsewhere > count
+
+
+@inlined_njit
+def is_contradicted(belief: BeliefArrays, robot: int) -> bool:
+    """Whether the newest measurements contradict the pose of a robot; it is not tracked then.
+
+    They do where at least half of its links deny it: links that are excluded or with a suspect source, fixes
+    and radios that deviate; or where its newest image says that it is elsewhere.
+    """
+    state, newest_ns, denied, count = belief.sources, NEVER_NS // 2, 0, 0
+    if state.score[robot] >= SUSPECT or is_kidnapped(state, robot, _ONE_IMAGE_NS):
+        return True
+    for place in range(state.source.shape[1]):
+        newest_ns = max(newest_ns, state.seen_ns[robot, place])
+    for place in range(state.source.shape[1]):
+        source = state.source[robot, place]
+        if source < 0 or newest_ns - state.seen_ns[robot, place] >= RECENT_NS:
+            continue
+        finding, is_outer = state.finding[robot, place], source >= fixes_of(belief, 0)
+        denies = state.evidence[robot, place] >= EXCLUDED
+        denies = denies or (is_outer and finding >= DEVIATES) or is_suspended(belief, source, SUSPECT)
+        count += 1
+        denied += 1 if denies else 0
+    return denied > 0 and 2 * denied >= count
+
+
+@inlined_njit
+def confirm(measurements: Measurements, k: int, belief: BeliefArrays, accepted: bool) -> int:
+    """Check measurement k against assumed poses; return a robot whose pose is refuted, or -1."""
+    observer, target = measurements.observer[k], measurements.target[k]
+    known = belief.sources.confirmations
+    knows_observer = observer < 0 or known[observer] >= CONFIRMED
+    knows_target = target < 0 or known[target] >= CONFIRMED
+    if accepted:
+        if knows_observer and target >= 0:
+            known[target] += _news(belief, target, measurements.stamp_ns[k])
+        if knows_target and observer >= 0:
+            known[observer] += _news(belief, observer, measurements.stamp_ns[k])
+        return -1
+    if knows_observer and knows_target:
+        return -1
+    elsewhere: int = target if knows_observer else observer
+    return elsewhere
+
+
+@inlined_njit
+def _news(belief: BeliefArrays, robot: int, stamp_ns: int) -> float:
+    """The part of the correlation time that has passed since a robot was measured last."""
+    since_ns = stamp_ns - belief.sources.measured_ns[robot]
+    news: float = max(0.0, min(1.0, since_ns / CORRELATION_NS))
+    return news
+
+
+@inlined_njit
+def is_uncertain(belief: BeliefArrays, robot: int, pose: FloatArray, limits: LossLimits) -> bool:
+    """Whether the standard deviation of the robot's position or heading at `pose` (3,) exceeds its limit."""
+    first = 3 * robot
+    xx, yy = covariance_within(belief, first, 0, 0), covariance_within(belief, first, 1, 1)
+    xt, yt = covariance_within(belief, first, 0, 2), covariance_within(belief, first, 1, 2)
+    tt = covariance_within(belief, first, 2, 2)
+    x = xx - 2.0 * pose[1] * xt + pose[1] * pose[1] * tt
+    y = yy + 2.0 * pose[0] * yt + pose[0] * pose[0] * tt
+    uncertain: bool = max(x, y) > limits.position_sigma**2 or tt > limits.heading_sigma**2
+    return uncertain
+
+
+@inlined_njit
+def inflate_suspect_covariance(state: SourceArrays, robot: int, covariance: FloatArray) -> None:
+    """Inflate the covariance (3, 3) of a pose that is suspect or little confirmed."""
+    if state.score[robot] > CONFIRMED or state.confirmations[robot] < WELL_CONFIRMED:
+        for i in range(3):
+            covariance[i, i] += _SUSPECT_SIGMA[i] ** 2
+
+
+@inlined_njit
+def count_gated(
+    measurements: Measurements,
+    k: int,
+    belief: BeliefArrays,
+    accepted: bool,
+    share: float,
+    limits: LossLimits,
+) -> tuple[int, int]:
+    """Count gated measurements in a row; return a robot that is lost by them, or -1, and why."""
+    observer, target, state = measurements.observer[k], measurements.target[k], belief.sources
+    lost, why = -1, 0
+    for side in (observer, target):
+        if side >= 0:
+            state.gated[side] = 0.0 if accepted else state.gated[side] + share
+            if accepted:
+                state.measured_ns[side] = max(state.measured_ns[side], measurements.stamp_ns[k])
+            if state.gated[side] >= limits.gated_in_a_row:
+                lost, why = side, _GATED
+    if accepted and (observer < 0 or target < 0):
+        fixed = max(observer, target)
+        belief.last_fix_ns[fixed] = max(belief.last_fix_ns[fixed], measurements.stamp_ns[k])
+    if (
+        not accepted
+        and is_fix(measurements, k)
+        and _is_off_its_fixes(belief, target, find_link(measurements, k, belief))
+    ):
+        lost, why = target, _OFF_FIXES
+    return lost, why
+
+
+@cached_njit
+def _is_off_its_fixes(belief: BeliefArrays, robot: int, place: int) -> bool:
+    """Whether fixes deny a robot that nothing else ties to `map`.
+
+    Robots that were located by way of it agree with it wherever it is.
+    """
+    state = belief.sources
+    if state.evidence[robot, place] < EXCLUDED:
+        return False
+    for other in range(state.source.shape[1]):
+        ties = belief.tracked.size <= state.source[robot, other] < state.score.size and other != place
+        recent = state.seen_ns[robot, place] - state.seen_ns[robot, other] < RECENT_NS
+        if ties and recent and state.finding[robot, other] == AGREES:
+            return False
+    return True
+
+
+@cached_njit
+def note_update(measurements: Measurements, k: int, belief: BeliefArrays, before: FloatArray) -> None:
+    """Update the excess covariances of the robots of measurement k, which was used.
+
+    Args:
+        measurements: (m,).
+        k: Which one.
+        belief: Just updated; its sources are changed.
+        before: (2, 3, 3) covariances of the errors of observer and target before the update.
+    """
+    sides = (measurements.observer[k], measurements.target[k])
+    for i in range(2):
+        if sides[i] >= 0:
+            _learn(belief, sides[i], before[i])
+    weight = _weight(measurements, k, belief)
+    for i in range(2):
+        if sides[i] >= 0:
+            _carry_excess(belief, sides[i], before[i], weight)
+
+
+@cached_njit
+def note_batch(measurements: Measurements, used: BoolArray, belief: BeliefArrays, before: FloatArray) -> None:
+    """Do so for measurements (m,) that were fused together; `before` (N, 3, 3) is of all robots."""
+    total, count = np.zeros(before.shape[0]), np.zeros(before.shape[0])
+    for k in range(used.size):
+        for side in (measurements.observer[k], measurements.target[k]):
+            if used[k] and side >= 0:
+                count[side] += 1.0
+    for robot in range(count.size):
+        if count[robot] > 0.0:
+            _learn(belief, robot, before[robot])
+    for k in range(used.size):
+        if used[k]:
+            weight = _weight(measurements, k, belief)
+            for side in (measurements.observer[k], measurements.target[k]):
+                if side >= 0:
+                    total[side] += weight
+    for robot in range(count.size):
+        if count[robot] > 0.0:
+            _carry_excess(belief, robot, before[robot], total[robot] / count[robot])
+
+
+@cached_njit
+def _learn(belief: BeliefArrays, robot: int, before: FloatArray) -> None:
+    """Add the logarithm by which an update has reduced the variances of a robot, their geometric mean."""
+    first, _, second, _, _, third = factor_numbers(before)
+    now = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            now[i, j] = covariance_within(belief, 3 * robot, i, j)
+    one, _, two, _, _, three = factor_numbers(now)
+    learned = 2.0 / 3.0 * math.log((first * second * third) / (one * two * three))
+    if learned > 0.0:  # False for NaN
+        belief.sources.learned[robot] += learned
+
+
+@cached_njit
+def _weight(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
+    """Twice the correlation of the error of measurement k with those of its link before, as they are left."""
+    place, state, robot = find_link(measurements, k, belief), belief.sources, robot_of(measurements, k)
+    if place < 0:
+        return 0.0
+    (x, y), last = _place_of(measurements, k), state.last_look[robot, place]
+    moved, since = math.hypot(x - last[0], y - last[1]), math.exp(last[2] - state.learned[robot])
+    last[0], last[1], last[2] = x, y, state.learned[robot]
+    if not has_kernel(measurements, k) or measurements.systematic_share[k, 0] > 0.0 or not moved >= 0.0:
+        return 0.0
+    left = math.exp(-moved / _LENGTH_M) * since
+    repeats = left / max(1.0 - left, 1e-3) + _LASTING * since / max(1.0 - since, 1e-3)
+    return 2.0 * _REPEATED * repeats
+
+
+@cached_njit
+def _carry_excess(belief: BeliefArrays, robot: int, before: FloatArray, weight: float) -> None:
+    """X <- A X A^T + w (P - A P) with A = P P_before^-1."""
+    factor, now, carried = cholesky3(before), np.empty((3, 3)), np.empty((3, 3))
+    excess = belief.sources.excess[robot]
+    for i in range(3):
+        for j in range(3):
+            now[i, j] = covariance_within(belief, 3 * robot, i, j)
+    for i in range(3):
+        solve3(factor, now[i], carried[i])  # a row of A
+    new = np.dot(np.dot(carried, excess), carried.T) + weight * (now - np.dot(carried, now))
+    if math.isfinite(np.sum(new)):
+        for i in range(3):
+            for j in range(3):
+                excess[i, j] = 0.5 * (new[i, j] + new[j, i])
+
+
+_GATED, _OFF_FIXES = int(LossReason.GATED), int(LossReason.OFF_FIXES)
