@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from bench.vision.scenes import Gray
 
 SIDE_PX = 30.0
-_OWN_MARKERS = {"opencv": "aruco_6x6", "apriltag": "apriltag_36h11"}
+_OWN_MARKERS = {"opencv": "aruco_6x6", "apriltag": "apriltag_36h11", "charuco": "aruco_4x4"}
 """Folder of photographs -> families of the markers in them."""
 _BLACK_SQUARES, _CLUTTERED, _RANDOM_IMAGES = 200, 20, 5
 _RANDOM = random_family(np.random.default_rng(99))

@@ -7,6 +7,9 @@ interpolation, which would shift edges along rows or columns by up to a tenth of
 behind the border, known from the word of the marker, are part of the model, because their light blurs into
 the border. The fit gives the covariance, which is larger for blurred markers.
 
+Tone curves and sharpening of cameras displace edges, which the edge itself does not show. They also displace
+the inner edge of the border, whose place the outer one predicts: how far measures the trust in the corners.
+
 Before a marker is decoded, and where that fit fails, lines are fitted to the edges that profiles across each
 side cross. The spread of the crossings around their line gives the covariance of the lines and corners.
 """
@@ -69,6 +72,9 @@ _TABLE_END, _TABLE_STEPS = 5.0, 256.0
 _NORMAL = ndtr(np.arange(-_TABLE_END, _TABLE_END, 1.0 / _TABLE_STEPS))
 _BY_CHANCE, _CLEARLY_WHITE = 3.0, 0.7
 """Maximum displacement of white cells behind the border by noise [sigma]; minimum whiteness."""
+_OF_CORNERS = 0.3  # Variance of corners over squares of these displacements; from photographs of a board
+_USUAL_PX = 0.2  # Displacement that is assumed, with the weight of one side
+_MAX_PX, _MAX_CHANCE_PX = 1.0, 0.1  # Bounds on a displacement, which may be of a cover, and on its noise
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
 
 
@@ -90,8 +96,8 @@ def fit_sides(
     ends: FloatArray,
     covariance: FloatArray,
     contrast: FloatArray,
-) -> None:
-    """Fit the four sides of each marker.
+) -> float:
+    """Fit the four sides of each marker; returns the variance of corners by displaced edges [px^2].
 
     Args:
         pixels: Pixels near the sides of quadrangles within a pixel of the markers.
@@ -106,13 +112,19 @@ def fit_sides(
         np.empty((_PARAMETERS, _PARAMETERS)),
         np.empty(_PARAMETERS),
         np.empty((4, 5)),
-        np.empty(4),
+        np.empty((4, 2)),
     )
+    squares, sides = _USUAL_PX**2, 1.0
     for n in range(len(strips)):
         contrast[n] = _fit_sides(pixels, n, strips[n], border, work)
         if contrast[n] > 0.0:
             ends[n] = work.p[:_ENDS]
             covariance[n] = work.normal[:_ENDS, :_ENDS]
+            for gap, chance in work.gaps:
+                if 0.0 < chance < _MAX_CHANCE_PX:
+                    squares += min(abs(gap), _MAX_PX) ** 2 - chance**2
+                    sides += 1.0
+    return _OF_CORNERS * max(squares / sides, 0.0)
 
 
 @cached_njit
@@ -154,7 +166,8 @@ def _add_doubts(frames: FloatArray, border: int, work: _Work) -> None:
     """
     for k in range(4):
         cell = min(frames[k, NEAR], frames[k, FAR]) / border
-        together = (_NEIGHBOURS * work.windows[k, 0] ** 3 / cell**2) ** 2 + work.gaps[k] ** 2
+        gap = max(abs(work.gaps[k, 0]) - _BY_CHANCE * work.gaps[k, 1], 0.0)
+        together = (_NEIGHBOURS * work.windows[k, 0] ** 3 / cell**2) ** 2 + gap**2
         for i in (2 * k, 2 * k + 1):
             work.normal[i, i] += _MIN_STEP_PX**2
             for j in (2 * k, 2 * k + 1):
@@ -163,7 +176,7 @@ def _add_doubts(frames: FloatArray, border: int, work: _Work) -> None:
 
 @cached_njit
 def _set_gaps(pixels: SidePixels, n: int, strips: Bits, border: int, noise: float, work: _Work) -> None:
-    """Set `work.gaps` to the displacement of white cells behind the border beyond noise [px].
+    """Set `work.gaps` to the displacement of white cells behind the border and its noise [px]; 0: none there.
 
     The residuals across an edge add up to its displacement.
     """
@@ -185,13 +198,13 @@ def _set_gaps(pixels: SidePixels, n: int, strips: Bits, border: int, noise: floa
             level, _, _ = _profile(d, gap, across, white)
             light = 1.0 + p[_LIGHT_X] * pixels.place[n, i, 0] + p[_LIGHT_Y] * pixels.place[n, i, 1]
             paint = p[_DARK] + p[_CONTRAST] * level
-            work.gaps[k] += (pixels.value[n, i] / light - paint) / white
+            work.gaps[k, 0] += (pixels.value[n, i] / light - paint) / white
             counts[k] += 1.0
     for k in range(4):
         if counts[k] > 0.0:
             reach = 2.0 * _inner_reach(pixels.frames[n, k], border, work.windows[k, 0]) / p[_CONTRAST]
-            by_chance = _BY_CHANCE * noise / math.sqrt(counts[k])
-            work.gaps[k] = reach * max(abs(work.gaps[k] / counts[k]) - by_chance, 0.0)
+            work.gaps[k, 0] *= reach / counts[k]
+            work.gaps[k, 1] = reach * noise / math.sqrt(counts[k])
 
 
 @cached_njit
@@ -378,8 +391,6 @@ def _invert(matrix: FloatArray) -> bool:
 _MIN_CROSSINGS = 3
 _MIN_SINE = 0.1  # Minimum sine of the angle between neighbouring sides
 _MIN_SIGMA_PX = 0.004  # Standard deviation of a line without noise, from print, lens and pixels
-_NEIGHBOUR_PX3 = 0.25
-"""Bias by neighbouring edges that blur into the side, times the square of a cell's width [px]."""
 _SHARE_FRESH = 0.5  # Share of independent information of crossings, which share pixels
 
 
@@ -411,7 +422,7 @@ def refine(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, spacing
     reaches = 0.5 * np.minimum(lengths[:, 0] + lengths[:, 2], lengths[:, 1] + lengths[:, 3]) / cells
     profile_crossings(image, lens, corners, reaches, spacing, crossings)
     ends, of_ends = np.empty((len(quads), 8)), np.empty((len(quads), 8, 8))
-    _fit_lines(crossings, reaches, lengths, ends, of_ends, contrast)
+    _fit_lines(crossings, lengths, ends, of_ends, contrast)
     _intersect(corners, ends, of_ends, covariance, contrast)
     return Corners(corners, covariance, contrast)
 
@@ -432,19 +443,19 @@ def refine_read(
     corners, covariance = quads.copy(), np.zeros((len(quads), 8, 8))
     ends, of_ends, contrast = np.zeros((len(quads), 8)), np.zeros((len(quads), 8, 8)), np.empty(len(quads))
     pixels = side_pixels(image, lens, quads, cells, border)
-    fit_sides(pixels, strips, border, ends, of_ends, contrast)
+    unsure = fit_sides(pixels, strips, border, ends, of_ends, contrast)
     _intersect(corners, ends, of_ends, covariance, contrast)
     lost = np.flatnonzero(contrast == 0.0)
     if len(lost):
         again = refine(image, lens, quads[lost], cells)
         corners[lost], covariance[lost], contrast[lost] = again
+    covariance += unsure * np.eye(8)
     return Corners(corners, covariance, contrast)
 
 
 @cached_njit
 def _fit_lines(
     crossings: FloatArray,
-    widths: FloatArray,
     lengths: FloatArray,
     ends: FloatArray,
     covariance: FloatArray,
@@ -453,11 +464,10 @@ def _fit_lines(
     """Fit a line to the crossings of each side; fills the last three arguments as `sides.fit_sides`."""
     line = np.empty(5)
     for n in range(len(crossings)):
-        min_variance = _MIN_SIGMA_PX**2 + (_NEIGHBOUR_PX3 / widths[n] ** 2) ** 2
         contrast[n] = 1e9
         covariance[n] = 0.0
         for k in range(4):
-            contrast[n] = min(contrast[n], _fit_line(crossings[n, k], min_variance, line))
+            contrast[n] = min(contrast[n], _fit_line(crossings[n, k], line))
             length, i, j = lengths[n, k], 2 * k, 2 * k + 1
             ends[n, i], ends[n, j] = line[0], line[0] + length * line[1]
             covariance[n, i, i] = line[2]
@@ -466,12 +476,11 @@ def _fit_lines(
 
 
 @cached_njit
-def _fit_line(crossings: FloatArray, min_variance: float, line: FloatArray) -> float:
+def _fit_line(crossings: FloatArray, line: FloatArray) -> float:
     """Fit a line by least squares, repeated without outliers.
 
     Args:
         crossings: (M, 3) along, outside, contrast.
-        min_variance: Variance of the offset without noise [px^2].
         line: (5,) filled with the offset at `along` = 0, the slope, and var, cov, var of both.
 
     Returns:
@@ -507,10 +516,10 @@ def _fit_line(crossings: FloatArray, min_variance: float, line: FloatArray) -> f
         limit = max(2.5 * math.sqrt(variance), 0.1)
         mean_contrast = sc / n
     # covariance of offset and slope
-    of_one = (variance + min_variance) / _SHARE_FRESH
+    of_one = (variance + _MIN_SIGMA_PX**2) / _SHARE_FRESH
     determinant = sxx - sx * sx / n
     line[0], line[1] = offset, slope
-    line[2] = of_one * sxx / (n * determinant) + min_variance
+    line[2] = of_one * sxx / (n * determinant) + _MIN_SIGMA_PX**2
     line[3] = -of_one * sx / (n * determinant)
     line[4] = of_one / determinant
     return mean_contrast
