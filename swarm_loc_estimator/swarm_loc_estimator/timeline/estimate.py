@@ -239,6 +239,7 @@ class Contradicted(Enum):
     RESET = "odometry reset"
     CONSTANT = "constant odometry"
     UNMOVED = "constant odometry of a moving robot"
+    GYROSCOPE = "turns of a gyroscope"
     POSE = "pose"
     SIGHTINGS = "sightings"
     DESCRIPTION = "description"
@@ -248,7 +249,7 @@ class Contradicted(Enum):
 class Contradiction(NamedTuple):
     """A fault of a robot or landmark."""
 
-    about: str  # Name of the robot, or a landmark such as "landmark 7"
+    about: str  # Name of the robot, or what it is, such as "landmark 7" or "gyroscope of epuck1"
     kind: Contradicted  # Contradicted property
     text: str  # Message for users, one sentence
 
@@ -273,15 +274,18 @@ def contradictions(
         is_tracked and is_contradicted(state.integrity, robot)
         for robot, is_tracked in enumerate(state.tracked)
     ]
-    contradicted = np.flatnonzero(state.contradicted_ns > NEVER_NS).tolist()
+    # Turns of gyroscopes may still turn out uncertain, which would explain what was found since then.
+    is_new = state.contradicted_ns > now_ns - tracks.unsettled_ns
+    contradicted = np.flatnonzero((state.contradicted_ns > NEVER_NS) & ~is_new).tolist()
     aside = excluded_pairs(state.integrity, now_ns)
     found: list[tuple[Contradicted, ArrayLike]] = [
         (Contradicted.ODOMETRY, conflicting),
         (Contradicted.RESET, reset),
         (Contradicted.CONSTANT, tracks.integrates_twist()),
         (Contradicted.UNMOVED, unmoved),
+        (Contradicted.GYROSCOPE, tracks.contradicts_gyroscope()),
         (Contradicted.POSE, denied),
-        (Contradicted.NOISE, state.integrity.noise_inflation),
+        (Contradicted.NOISE, state.integrity.noise_inflation * (not is_new.any())),
     ]
     return [
         *(
@@ -299,13 +303,16 @@ _TEXTS = {
     Contradicted.RESET: "the odometry of {0} jumped or was reset: its motion at that moment is unknown",
     Contradicted.CONSTANT: "the odometry of {0} has a constant pose but a twist: integrating the twist",
     Contradicted.UNMOVED: "the odometry of {0} has a constant pose and no twist, although {0} moves",
+    Contradicted.GYROSCOPE: "the gyroscope of {0} does not turn with its wheels; using the turns of the"
+    " wheels: check its axes (imu.roll, imu.pitch) and its driver",
     Contradicted.POSE: "the newest measurements contradict the pose of {0}",
     Contradicted.NOISE: "the measurements of {0} are noisier than described; inflating their noise",
 }
 
 
 def _of_robot(name: str, kind: Contradicted) -> Contradiction:
-    return Contradiction(name, kind, _TEXTS[kind].format(name))
+    about = f"gyroscope of {name}" if kind is Contradicted.GYROSCOPE else name
+    return Contradiction(about, kind, _TEXTS[kind].format(name))
 
 
 def _sightings(observer: str, source: str) -> Contradiction:
