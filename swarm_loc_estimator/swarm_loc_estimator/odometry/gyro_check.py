@@ -3,7 +3,7 @@
 The turns of both are summed with forgetting. A gyroscope is wrong when it contradicts the wheels for seconds
 of turning: it reports zeros, turns about another axis, the wrong way or in other units, or repeats one value.
 A robot that is blocked, slides or is pushed contradicts its wheels for a shorter time. Until it is known
-which of the two is wrong, their difference is the uncertainty of the turn, from a second before it is noticed.
+which of the two is wrong, their difference is the uncertainty of the turn, from a second before it shows on.
 A verdict at a row depends on earlier rows only, what is uncertain on rows of the next second as well, so that
 late data and replays give the same track.
 """
@@ -26,8 +26,8 @@ _RATIO, _AGREED_S = 6, 7
 _COVERED = 8  # Difference of the sums that the covariance covers already, forgotten in the same way [rad]
 DOUBT, _REPEATED_S = 9, 10
 """Time of contradiction minus time of agreement, within +-`_PATIENCE_S`; time with one measured value [s]."""
-UNSURE = 11  # Whether both contradict each other, or that time is too long for a turn that changes
-SOON_UNSURE = 12  # Whether they do at a row within `COVER_NS`; not continued from row to row
+UNSURE = 11  # 1: that time is too long for a turn that changes, 2: both contradict each other, 0: neither
+SOON_UNSURE = 12  # The largest of a row that begins it within `COVER_NS`; not continued from row to row
 CHECKS = 13  # Number of these values
 
 _MEMORY_S, _RATIO_MEMORY_S = 1.2, 10.0
@@ -131,8 +131,8 @@ def check_turn(
     # Cover what neither noise nor an unusual ratio explains, and all at a verdict.
     is_doubted, covered = check[DOUBT] > 0.0, check[_COVERED]
     is_apart = apart > max(_LEAST_APART, _APART_SIGMAS * sigma) + slack
-    check[UNSURE] = 1.0 if is_apart or is_repeated else 0.0
-    if was_doubted or not (is_doubted or is_apart or check[SOON_UNSURE] > 0.0) or apart <= covered:
+    check[UNSURE] = 2.0 if is_apart else 1.0 if is_repeated else 0.0
+    if was_doubted or not (is_doubted or is_apart or check[SOON_UNSURE] == 2.0) or apart <= covered:
         return 0.0
     check[_COVERED] = apart
     return float(apart**2 - covered**2)
@@ -142,12 +142,14 @@ def check_turn(
 def first_to_cover(tracks: TrackArrays, robot: int, row: int) -> int:
     """Mark the rows before one from which turns are uncertain; the first of them, `row` if there is none."""
     check, stamps = tracks.gyro_check[robot], tracks.stamp_ns[robot, :row]
-    if not check[row, UNSURE] > check[row - 1, UNSURE]:
+    unsure = check[row, UNSURE]
+    if not unsure > check[row - 1, UNSURE]:
         return row
     first = max(1, np.searchsorted(stamps, tracks.stamp_ns[robot, row] - COVER_NS))
-    while first < row and check[first, SOON_UNSURE] > 0.0:
+    while first < row and check[first, SOON_UNSURE] >= unsure:
         first += 1
-    check[first:row, SOON_UNSURE] = 1.0
+    for before in range(first, row):
+        check[before, SOON_UNSURE] = max(unsure, check[before, SOON_UNSURE])
     return first
 
 

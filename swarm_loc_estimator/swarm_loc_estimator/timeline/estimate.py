@@ -246,6 +246,9 @@ class Contradicted(Enum):
     NOISE = "noise"
 
 
+GYROSCOPE_OF = "gyroscope of "  # Before the name of its robot
+
+
 class Contradiction(NamedTuple):
     """A fault of a robot or landmark."""
 
@@ -311,7 +314,7 @@ _TEXTS = {
 
 
 def _of_robot(name: str, kind: Contradicted) -> Contradiction:
-    about = f"gyroscope of {name}" if kind is Contradicted.GYROSCOPE else name
+    about = GYROSCOPE_OF + name if kind is Contradicted.GYROSCOPE else name
     return Contradiction(about, kind, _TEXTS[kind].format(name))
 
 
