@@ -3,7 +3,8 @@
 The turns of both are summed with forgetting. A gyroscope is wrong when it contradicts the wheels for seconds
 of turning: it reports zeros, turns about another axis, the wrong way or in other units, or repeats one value.
 A robot that is blocked, slides or is pushed contradicts its wheels for a shorter time. Until it is known
-which of the two is wrong, their difference is the uncertainty of the turn, from a second before it shows on.
+which of the two is wrong, their difference is the uncertainty of the turn, from a second before it shows on;
+until a gyroscope has agreed with the wheels for the first time, its turns are no more certain than theirs.
 A verdict at a row depends on earlier rows only, what is uncertain on rows of the next second as well, so that
 late data and replays give the same track.
 """
@@ -26,7 +27,7 @@ _RATIO, _AGREED_S = 6, 7
 _COVERED = 8  # Difference of the sums that the covariance covers already, forgotten in the same way [rad]
 DOUBT, _REPEATED_S = 9, 10
 """Time of contradiction minus time of agreement, within +-`_PATIENCE_S`; time with one measured value [s]."""
-UNSURE = 11  # 1: that time is too long for a turn that changes, 2: both contradict each other, 0: neither
+UNSURE = 11  # 1: that time is too long for a turn that changes, or both never agreed; 2: they contradict; 0
 SOON_UNSURE = 12  # The largest of a row that begins it within `COVER_NS`; not continued from row to row
 CHECKS = 13  # Number of these values
 
@@ -102,7 +103,7 @@ def check_turn(
     check[WHEELS] = kept * check[WHEELS] + wheels
     check[GYRO] = kept * check[GYRO] + gyro
     check[_VARIANCE] = kept**2 * check[_VARIANCE] + variance
-    if check[UNSURE] == 0.0:  # otherwise the change may be that of a wrong gyroscope
+    if check[UNSURE] < 2.0:  # otherwise the change may be that of a wrong gyroscope
         noise = min(_MOST_NOISE, 0.5 * (difference - check[_LAST]) ** 2 / variance)
         check[_STEPS] = min(_MOST_STEPS, check[_STEPS] + 1.0)
         check[_NOISE] += (noise - check[_NOISE]) / check[_STEPS]
@@ -123,15 +124,14 @@ def check_turn(
         if agrees and not (is_repeated and check[_AGREED_S] > 0.0):
             check[_AGREED_S] = min(_RATIO_MEMORY_S, check[_AGREED_S] + duration_s)
             check[_RATIO] += min(1.0, duration_s / check[_AGREED_S]) * (by_gyro / by_wheels - check[_RATIO])
-        if is_repeated:
-            agrees = apart < least + slack
-        weight = _REPEATED_WEIGHT if is_repeated else 1.0
-        doubt = check[DOUBT] + weight * (-duration_s if agrees else duration_s)
+        doubt = check[DOUBT] + (-duration_s if agrees else duration_s)
+        if is_repeated:  # which proves nothing where it is right
+            doubt = check[DOUBT] + (_REPEATED_WEIGHT * duration_s if apart > least + slack else 0.0)
         check[DOUBT] = min(_PATIENCE_S, max(-_PATIENCE_S, doubt))
     # Cover what neither noise nor an unusual ratio explains, and all at a verdict.
     is_doubted, covered = check[DOUBT] > 0.0, check[_COVERED]
     is_apart = apart > max(_LEAST_APART, _APART_SIGMAS * sigma) + slack
-    check[UNSURE] = 2.0 if is_apart else 1.0 if is_repeated else 0.0
+    check[UNSURE] = 2.0 if is_apart else 1.0 if is_repeated or check[_AGREED_S] == 0.0 else 0.0
     if was_doubted or not (is_doubted or is_apart or check[SOON_UNSURE] == 2.0) or apart <= covered:
         return 0.0
     check[_COVERED] = apart
@@ -163,4 +163,5 @@ def unmark_from(tracks: TrackArrays, robot: int, row: int) -> int:
     while first < row and check[first, SOON_UNSURE] == 0.0:
         first += 1
     check[first:, SOON_UNSURE] = 0.0
-    return int(first)
+    found: int = first
+    return found

@@ -112,10 +112,10 @@ def test_a_frozen_gyroscope_is_named_when_the_turn_changes(seed: int) -> None:
 @pytest.mark.parametrize("share", [1.0, 2.0, 0.6])
 @pytest.mark.parametrize("seed", range(5))
 def test_right_gyroscopes_are_neither_named_nor_less_certain(share: float, seed: int) -> None:
-    """Skid-steered robots report twice their turns; this is learned in the first seconds of turning."""
+    """From the first turn on; skid-steered robots report twice their turns, which is learned in seconds."""
     drive = Drive(seed, share=share)
     assert not drive.doubted().any()
-    from_s = 0.0 if share == 1.0 else 5.0
+    from_s = 1.0 if share == 1.0 else 5.0
     end_ns = T0 + np.array([round(from_s * 1e9), round(39e9)])
     begin, end = drive.tracks().at(np.zeros(2, dtype=np.int64), end_ns).covariance[:, 2, 2]
     assert end - begin == pytest.approx(GYRO.turn_noise_density**2 * (39.0 - from_s), rel=1e-6)
