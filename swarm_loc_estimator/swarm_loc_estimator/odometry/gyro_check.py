@@ -28,7 +28,9 @@ _COVERED = 8  # Difference of the sums that the covariance covers already, forgo
 DOUBT, _REPEATED_S = 9, 10
 """Time of contradiction minus time of agreement, within +-`_PATIENCE_S`; time with one measured value [s]."""
 UNSURE = 11  # 1: that time is too long for a turn that changes, or both never agreed; 2: they contradict; 0
-SOON_UNSURE = 12  # The largest of a row that begins it within `COVER_NS`; not continued from row to row
+SOON_UNSURE = 12
+"""The largest of a row that begins it within `COVER_NS`; -1: both agree there for the first time. It is not
+continued from row to row."""
 CHECKS = 13  # Number of these values
 
 _MEMORY_S, _RATIO_MEMORY_S = 1.2, 10.0
@@ -139,17 +141,18 @@ def check_turn(
 
 
 @norefcount_njit
-def first_to_cover(tracks: TrackArrays, robot: int, row: int) -> int:
-    """Mark the rows before one from which turns are uncertain; the first of them, `row` if there is none."""
+def first_to_change(tracks: TrackArrays, robot: int, row: int) -> int:
+    """Mark rows before one that shows whether they are certain; the first of them, `row` if it does not."""
     check, stamps = tracks.gyro_check[robot], tracks.stamp_ns[robot, :row]
-    unsure = check[row, UNSURE]
-    if not unsure > check[row - 1, UNSURE]:
+    mark = check[row, UNSURE]
+    if check[row, _AGREED_S] > 0.0 and check[row - 1, _AGREED_S] == 0.0:
+        mark = -1.0
+    elif not mark > check[row - 1, UNSURE]:
         return row
-    first = max(1, np.searchsorted(stamps, tracks.stamp_ns[robot, row] - COVER_NS))
-    while first < row and check[first, SOON_UNSURE] >= unsure:
-        first += 1
+    first: int = max(1, np.searchsorted(stamps, tracks.stamp_ns[robot, row] - COVER_NS))
     for before in range(first, row):
-        check[before, SOON_UNSURE] = max(unsure, check[before, SOON_UNSURE])
+        old = check[before, SOON_UNSURE]
+        check[before, SOON_UNSURE] = max(mark, old) if old != 0.0 else mark
     return first
 
 

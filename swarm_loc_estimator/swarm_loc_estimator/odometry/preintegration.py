@@ -25,7 +25,7 @@ from swarm_loc_estimator.odometry.gyro_check import (
     begin_check,
     check_turn,
     continue_check,
-    first_to_cover,
+    first_to_change,
     unmark_from,
 )
 from swarm_loc_estimator.odometry.track_arrays import (
@@ -412,10 +412,10 @@ def integrate_again(tracks: TrackArrays, from_ns: IntArray, changed_from_ns: Int
 
 @norefcount_njit
 def _integrate_row(tracks: TrackArrays, robot: int, row: int, changed_from_ns: IntArray) -> int:
-    """The same as `_integrate_step`; rows before whose turns it makes uncertain are integrated again."""
+    """The same as `_integrate_step`; rows before whose certainty it changes are integrated again."""
     fault = _integrate_step(tracks, robot, row)
     if tracks.imu[robot].turn_noise_density > 0.0:
-        first = first_to_cover(tracks, robot, row)
+        first = first_to_change(tracks, robot, row)
         if first < row:
             changed_from_ns[robot] = min(changed_from_ns[robot], tracks.stamp_ns[robot, first - 1])
             for changed in range(first, row + 1):
@@ -470,7 +470,7 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
             check = tracks.gyro_check[robot, row]
             if check[DOUBT] <= 0.0:
                 turn, rate[2], estimates_turn = turned, turned / duration_s, covered == 0.0
-                if check[UNSURE] == check[SOON_UNSURE] == 0.0:  # otherwise the noise is that of the wheels
+                if check[UNSURE] + check[SOON_UNSURE] <= 0.0:  # otherwise the noise is that of the wheels
                     is_turning = is_moving or turned != 0.0
                     density = tracks.imu[robot].turn_noise_density if is_turning else 0.0
                     gyro_variance = density**2 * duration_s
