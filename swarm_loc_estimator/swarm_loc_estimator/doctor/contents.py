@@ -30,7 +30,7 @@ from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
 from swarm_loc_estimator.sensors.inputs import SENSORS
 from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot
-from swarm_loc_estimator.timeline.estimate import Contradicted, Contradiction, Status
+from swarm_loc_estimator.timeline.estimate import GYROSCOPE_OF, Contradicted, Contradiction, Status
 
 CAMERA_INFO, IMAGE, COMPRESSED_IMAGE = (
     f"sensor_msgs/msg/{name}" for name in ("CameraInfo", "Image", "CompressedImage")
@@ -145,7 +145,8 @@ def check_estimate(evidence: Evidence) -> Iterator[Finding]:
     estimated = evidence.estimated
     groups: dict[tuple[Contradicted, bool], list[Contradiction]] = {}
     for one in estimated.contradictions:
-        groups.setdefault((one.kind, one.about.startswith("landmark")), []).append(one)
+        if one.kind is not Contradicted.GYROSCOPE:  # those are named by `check_motion`
+            groups.setdefault((one.kind, one.about.startswith("landmark")), []).append(one)
     for (kind, _), some in groups.items():
         problem, remedy = _CONTRADICTED[kind]
         verb = "is" if len(some) == 1 else "are"
@@ -272,9 +273,7 @@ _CLEARER = 0.5  # Residual of a mirrored track over that of the true one, below 
 _STANDS_M = 1e-4
 _SCALE, _YAW, _SIGNIFICANT = 0.15, math.radians(30.0), 5.0
 """Least errors of scale and yaw that are named, and least multiple of their sigma."""
-_TURN_NS, _MIN_TURN = 500_000_000, 2.0
-"""Turns of gyroscopes are compared over this time, and if wheels turn by this much in all [rad]."""
-_DEGREES, _SLACK = 20.0, 0.3  # Ratios of gyroscope to wheels from which units, sign or silence are named
+_DEGREES, _SLACK = 20.0, 0.3  # Ratios of a wrong gyroscope to wheels from which units or sign are named
 _AHEAD = 0.4  # Least usual share of the optical z axis in the directions of markers
 
 Change = Callable[[FloatArray], FloatArray]
@@ -290,29 +289,22 @@ _WRONG: MappingProxyType[str, Change] = MappingProxyType(
 
 
 def _check_turns(evidence: Evidence, index: int, own: OdometryRows) -> Iterator[Finding]:
-    """Turns of a gyroscope compared with those of the wheels."""
-    rates = select(evidence.turn_rates, evidence.turn_rates.robot == index)
-    if rates.stamp_ns.size < _MIN_MOTION_ROWS or own.robot.size < _MIN_MOTION_ROWS:
+    """What a gyroscope measures that the wheels contradict."""
+    robot, kind = evidence.swarm.robots[index], Contradicted.GYROSCOPE
+    about = [one.about for one in evidence.estimated.contradictions if one.kind is kind]
+    if GYROSCOPE_OF + robot.name not in about:
         return
-    order, by = np.argsort(own.stamp_ns, kind="stable"), np.argsort(rates.stamp_ns, kind="stable")
-    own, rates = select(own, order), select(rates, by)
-    passed_s = 1e-9 * np.diff(rates.stamp_ns)
-    turned = np.append(0.0, np.cumsum(0.5 * (rates.rate[1:] + rates.rate[:-1]) * passed_s))
-    begin_ns = max(own.stamp_ns[0], rates.stamp_ns[0])
-    at_ns = np.arange(begin_ns, min(own.stamp_ns[-1], rates.stamp_ns[-1]), _TURN_NS)
-    by_wheels = np.diff(np.interp(at_ns, own.stamp_ns, np.unwrap(own.pose[:, 2])))
-    by_gyroscope = np.diff(np.interp(at_ns, rates.stamp_ns, turned))
-    if np.abs(by_wheels).sum() < _MIN_TURN:
-        return
-    ratio = float(by_gyroscope @ by_wheels / (by_wheels @ by_wheels))
-    name = f"{evidence.source_name(index)}'s gyroscope"
-    problem = f"measures {ratio:.2g} times the turns of the wheels"
+    tracks, rates = OdometryTracks([robot]), evidence.turn_rates
+    rates = select(rates, rates.robot == index)
+    tracks.extend_turns(np.zeros_like(rates.robot), rates.stamp_ns, rates.rate)
+    tracks.extend(np.zeros_like(own.robot), own.stamp_ns, own.pose, own.twist)
+    ratio = tracks.turn_ratio(0)
+    remedy = "Look at its driver: is angular_velocity set, and its z axis vertical?"
     if ratio > _DEGREES:
-        yield Finding(name, problem, "Publish radians per second")
+        remedy = "Publish radians per second"
     elif ratio < -_SLACK:
-        yield Finding(name, problem, "Turns are positive to the left: correct its driver or mount (imu.roll)")
-    elif abs(ratio) < _SLACK:
-        yield Finding(name, problem, "Look at its driver: is angular_velocity set, and its z axis vertical?")
+        remedy = "Turns are positive to the left: correct its driver or mount (imu.roll)"
+    yield Finding(f"{robot.name}'s gyroscope", f"measures {ratio:.2g} times the turns of the wheels", remedy)
 
 
 class _Alignment(NamedTuple):

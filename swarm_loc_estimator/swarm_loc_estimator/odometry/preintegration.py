@@ -4,7 +4,7 @@ Steps are checked for jumps, resets, and a pose that is constant while the twist
 with what the robot can do between two stamps, and with the twists at both ends. Drivers report the twist of
 the step before, of the step after or of the instant, so the mean twist of a step lies between the two; while
 it does not, or the twist is not filled, it proves nothing. Where there is a gyroscope, its turn rate is
-integrated to the turn.
+integrated to the turn, as long as it agrees with the wheels, see `gyro_check.py`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,16 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit, norefcount_njit
 from swarm_loc_estimator.common.numerics import add_scaled, assign, assign_matrix, wrap
+from swarm_loc_estimator.odometry.gyro_check import (
+    DOUBT,
+    SOON_UNSURE,
+    UNSURE,
+    begin_check,
+    check_turn,
+    continue_check,
+    first_to_change,
+    unmark_from,
+)
 from swarm_loc_estimator.odometry.track_arrays import (
     BEFORE_ALL_NS,
     LATEST_NS,
@@ -27,6 +37,7 @@ from swarm_loc_estimator.odometry.track_arrays import (
     add_in_track_frame,
     add_step_jacobian,
     add_step_noise,
+    turn_variance,
 )
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 
@@ -227,25 +238,29 @@ def _has_rows(tracks: TrackArrays, robot: int, after_ns: int, until_ns: int) -> 
 
 
 @inlined_njit
-def turn_by_gyro(tracks: TrackArrays, robot: int, begin_ns: int, end_ns: int, is_moving: bool) -> float:
-    """Calibrated turn of a robot between two instants [rad]; NaN if it was not measured throughout.
+def turn_by_gyro(
+    tracks: TrackArrays, robot: int, begin_ns: int, end_ns: int, is_moving: bool
+) -> tuple[float, bool]:
+    """Calibrated turn of a robot between two instants [rad], and whether the measured value is repeated.
 
-    While the wheels stand, what noise and bias explain is no turn.
+    The turn is NaN if it was not measured throughout. While the wheels stand, what noise and bias explain is
+    no turn.
     """
     stamps, imu = tracks.gyro_ns[robot, : tracks.gyro_filled[robot]], tracks.imu[robot]
     before = int(np.searchsorted(stamps, begin_ns, side="right")) - 1
     after = int(np.searchsorted(stamps, end_ns))
     if before < 0 or after == stamps.size:
-        return math.nan
+        return math.nan, False
     if tracks.gyro_piece[robot, before] != tracks.gyro_piece[robot, after]:
-        return math.nan
+        return math.nan, False
+    repeats = tracks.gyro_rate[robot, before] == tracks.gyro_rate[robot, after]
     angle = _angle_at(tracks, robot, after, end_ns) - _angle_at(tracks, robot, before, begin_ns)
     duration_s = (end_ns - begin_ns) * 1e-9
     turn: float = imu.turn_scale * angle + imu.turn_bias * duration_s
     noise, bias = imu.turn_noise_density * math.sqrt(duration_s), imu.turn_bias_sigma * duration_s
     if not is_moving and abs(turn) <= _STILL_SIGMAS * math.hypot(noise, bias):
-        return 0.0
-    return turn
+        return 0.0, repeats
+    return turn, repeats
 
 
 @inlined_njit
@@ -362,6 +377,8 @@ def integrate(tracks: TrackArrays, oldest_ns: int, rows: NewRows, changed_from_n
             tracks.agreed[robot, 0].fill(0)
             tracks.fastest[robot, 0].fill(0.0)
             tracks.unmoved[robot, 0].fill(0.0)
+            if tracks.imu[robot].turn_noise_density > 0.0:
+                begin_check(tracks, robot)
             assign(tracks.begin_pose[robot], raw[k])
             tracks.begin_ns[robot] = tracks.known_ns[robot, 0] = stamps_ns[k]
             tracks.jump_ns[robot, 0, 0] = tracks.jump_ns[robot, 0, 1] = BEFORE_ALL_NS // 2
@@ -373,9 +390,10 @@ def integrate(tracks: TrackArrays, oldest_ns: int, rows: NewRows, changed_from_n
                 stamps = tracks.stamp_ns[robot, :row]
                 first = max(1, np.searchsorted(stamps, tracks.twist_from_ns[robot], side="right"))
                 changed_from_ns[robot] = min(changed_from_ns[robot], stamps[first - 1])
+            tracks.gyro_check[robot, row].fill(0.0)
             for changed in range(first, row):
-                _integrate_step(tracks, robot, changed)
-            counts[_integrate_step(tracks, robot, row)] += new[k]
+                _integrate_row(tracks, robot, changed, changed_from_ns)
+            counts[_integrate_row(tracks, robot, row, changed_from_ns)] += new[k]
         tracks.filled[robot] = row + 1
     return Integrated(duplicates, counts[JUMP], counts[RESET])
 
@@ -385,11 +403,24 @@ def integrate_again(tracks: TrackArrays, from_ns: IntArray, changed_from_ns: Int
     """Integrate the rows of each robot after an instant (N,) again; lower `changed_from_ns` (N,)."""
     for robot in range(from_ns.size):
         stamps = tracks.stamp_ns[robot, : tracks.filled[robot]]
-        first = max(1, np.searchsorted(stamps, from_ns[robot], side="right"))
+        first = max(1, unmark_from(tracks, robot, np.searchsorted(stamps, from_ns[robot], side="right")))
         for row in range(first, stamps.size):
-            _integrate_step(tracks, robot, row)
+            _integrate_row(tracks, robot, row, changed_from_ns)
         if first < stamps.size:
             changed_from_ns[robot] = min(changed_from_ns[robot], stamps[first - 1])
+
+
+@norefcount_njit
+def _integrate_row(tracks: TrackArrays, robot: int, row: int, changed_from_ns: IntArray) -> int:
+    """The same as `_integrate_step`; rows before whose certainty it changes are integrated again."""
+    fault = _integrate_step(tracks, robot, row)
+    if tracks.imu[robot].turn_noise_density > 0.0:
+        first = first_to_change(tracks, robot, row)
+        if first < row:
+            changed_from_ns[robot] = min(changed_from_ns[robot], tracks.stamp_ns[robot, first - 1])
+            for changed in range(first, row + 1):
+                _integrate_step(tracks, robot, changed)
+    return fault
 
 
 @norefcount_njit
@@ -408,6 +439,8 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
     assign_matrix(covariance, tracks.covariance[robot, row - 1])
     assign_matrix(jacobian, tracks.jacobian[robot, row - 1])
     known_ns = tracks.known_ns[robot, row - 1]
+    if tracks.imu[robot].turn_noise_density > 0.0:
+        continue_check(tracks, robot, row)
     jumps_ns = tracks.jump_ns[robot, row]
     jumps_ns[0], jumps_ns[1] = tracks.jump_ns[robot, row - 1, 0], tracks.jump_ns[robot, row - 1, 1]
     if fault != NO_FAULT:
@@ -424,15 +457,23 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
     tracks.known_ns[robot, row] = stamp_ns
     before_rate = tracks.rate[robot, row - 1]
     forward, left, turn = _true_motion(tracks, robot, reported, duration_s, before_rate, rate)
-    has_imu, turn_variance = tracks.imu[robot].turn_noise_density > 0.0, math.nan
+    has_imu, gyro_variance, covered = tracks.imu[robot].turn_noise_density > 0.0, math.nan, 0.0
+    estimates_turn = not has_imu
     if has_imu:
         is_moving = reported[0] != 0.0 or reported[1] != 0.0 or reported[2] != 0.0
-        turned = turn_by_gyro(tracks, robot, before_ns, stamp_ns, is_moving)
+        turned, repeats = turn_by_gyro(tracks, robot, before_ns, stamp_ns, is_moving)
         if not math.isnan(turned):
-            turn, rate[2] = turned, turned / duration_s
-            turn_variance = 0.0
-            if is_moving or turned != 0.0:
-                turn_variance = tracks.imu[robot].turn_noise_density ** 2 * duration_s
+            wheels = model.turn_scale * reported[2]  # its lag is short
+            wheels_variance = turn_variance(model, math.hypot(forward, left), wheels, duration_s)
+            turns = wheels, turned, wheels_variance
+            covered = check_turn(tracks, robot, row, turns, duration_s, is_moving, repeats)
+            check = tracks.gyro_check[robot, row]
+            if check[DOUBT] <= 0.0:
+                turn, rate[2], estimates_turn = turned, turned / duration_s, covered == 0.0
+                if check[UNSURE] + check[SOON_UNSURE] <= 0.0:  # otherwise the noise is that of the wheels
+                    is_turning = is_moving or turned != 0.0
+                    density = tracks.imu[robot].turn_noise_density if is_turning else 0.0
+                    gyro_variance = density**2 * duration_s
     # displacement of the axle, then of base_link ahead of it
     cos, sin = math.cos(model.course_offset), math.sin(model.course_offset)
     way_x, way_y = cos * forward - sin * left, sin * forward + cos * left + model.axle_offset * turn
@@ -444,10 +485,11 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
     tracks.pose[robot, row, 2] = start[2] + turn
     changed = abs(rate[2] - before_rate[2])
     x, y = start[0] + 0.5 * step_x, start[1] + 0.5 * step_y
-    estimates_turn = not (has_imu and math.isnan(turn_variance))
-    step = OdometryStep(forward, left, turn, changed, duration_s, x, y, middle, turn_variance, estimates_turn)
+    step = OdometryStep(forward, left, turn, changed, duration_s, x, y, middle, gyro_variance, estimates_turn)
     add_step_noise(model, step, covariance)
     add_step_jacobian(model, step, jacobian)
+    if covered > 0.0:
+        add_in_track_frame((x, y, middle), (0.0, 0.0, covered, 0.0), covariance)
     if by_twist and before_ns <= tracks.twist_from_ns[robot]:  # the motion before is lost
         lost = tracks.unmoved[robot, row - 1]
         path, turned = lost[0] ** 2 + lost[1] ** 2, lost[2] ** 2

@@ -34,6 +34,15 @@ class OdometryStep(NamedTuple):
     estimates_turn: bool  # Whether the estimated scale and bias of turns are those of the sensor of this turn
 
 
+@inlined_njit
+def turn_variance(model: OdometryModel, path: float, turn: float, duration_s: float) -> float:
+    """Variance of the turn of a step by the wheels [rad^2], but for that of a change of the turn rate."""
+    turned = 0.5 * model.wheel_separation * turn
+    wheels = abs(path + turned) + abs(path - turned)
+    drift = model.turn_drift * duration_s if wheels > 0.0 else 0.0
+    return model.wheel_noise * wheels / model.wheel_separation**2 + model.turn_noise * abs(turn) + drift
+
+
 @cached_njit
 def add_step_noise(model: OdometryModel, step: OdometryStep, covariance: FloatArray) -> None:
     """Add a step's noise to a covariance (3, 3) in the track's frame.
@@ -48,12 +57,11 @@ def add_step_noise(model: OdometryModel, step: OdometryStep, covariance: FloatAr
     along = 0.25 * wheel * (right_wheel + left_wheel) + model.distance_noise * path
     along += model.distance_turn_noise * abs(turn)
     across = model.lateral_noise * path
-    heading = wheel * (right_wheel + left_wheel) / separation**2 + model.turn_noise * abs(turn)
+    heading = turn_variance(model, path, turn, duration_s)
     heading += model.turn_change_noise * step.turn_rate_change
     if right_wheel + left_wheel > 0.0:
         along += model.distance_drift * duration_s
         across += model.lateral_drift * duration_s
-        heading += model.turn_drift * duration_s
     cross = 0.5 * wheel * (right_wheel - left_wheel) / separation
     if not math.isnan(step.turn_variance):
         heading, cross = step.turn_variance, 0.0
@@ -162,6 +170,7 @@ class TrackArrays(NamedTuple):
     # (N, capacity) end of the known motion: the row's instant, or earlier after repeated faults
     known_ns: IntArray
     jump_ns: IntArray  # (N, capacity, 2) instants of the last two faults, newest first
+    gyro_check: FloatArray  # (N, capacity, CHECKS) see `gyro_check.py`; (N, capacity, 0) without an IMU
     twist_from_ns: IntArray  # (N,) instant after which the twist is integrated; LATEST_NS: never
     twist_until_ns: IntArray  # (N,) instant until which it is
     delay_ns: IntArray  # (N,) delay of the stamps

@@ -11,6 +11,7 @@ So a prediction costs two look-ups however many odometry messages lie between.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -18,6 +19,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.odometry.gyro_check import CHECKS, COVER_NS, DOUBT, GYRO, WHEELS, unmark_from
 from swarm_loc_estimator.odometry.preintegration import (
     UNCHANGED_NS,
     NewRows,
@@ -55,6 +57,7 @@ _ROWS = (
     "unmoved",
     "known_ns",
     "jump_ns",
+    "gyro_check",
 )
 _GYRO_ROWS = ("gyro_ns", "gyro_rate", "gyro_angle", "gyro_piece")
 
@@ -108,7 +111,12 @@ class OdometryTracks:
         """Maximum time before its stamp at which a row may change look-ups [ns]."""
         timeout_ns = np.ceil(self._model["timeout_s"] * 1e9).astype(np.int64)
         delay_ns = np.minimum(self._delay_ns, self._imu_delay_ns)
-        return int(np.max(timeout_ns - np.minimum(0, delay_ns), initial=0))
+        return int(np.max(timeout_ns - np.minimum(0, delay_ns), initial=0)) + self.unsettled_ns
+
+    @property
+    def unsettled_ns(self) -> int:
+        """Time before the newest row for which it may make turns uncertain [ns]; 0 without gyroscopes."""
+        return COVER_NS if self.arrays.gyro_check.size else 0
 
     def has_started(self, robots: IntArray | int, stamps_ns: IntArray | int) -> BoolArray:
         """Whether robots (k,) have odometry before instants (k,); always True for robots without odometry."""
@@ -131,6 +139,18 @@ class OdometryTracks:
         newest = np.maximum(self.arrays.filled - 1, 0)
         never = np.isfinite(self.arrays.unmoved[np.arange(self._robots), newest, 0])
         return np.asarray(never & (self.arrays.filled > 1) & ~self.integrates_twist())
+
+    def contradicts_gyroscope(self) -> BoolArray:
+        """Whether the wheels of each robot (N,) contradict its gyroscope, whose turns are then not used."""
+        if not self.arrays.gyro_check.size:
+            return np.zeros(self._robots, dtype=bool)
+        newest = np.maximum(self.arrays.filled - 1, 0)
+        return np.asarray(self.arrays.gyro_check[np.arange(self._robots), newest, DOUBT] > 0.0)
+
+    def turn_ratio(self, robot: int) -> float:
+        """Turn of a robot's gyroscope per turn of its wheels, of all rows; NaN without turns."""
+        by_wheels, by_gyro = self.arrays.gyro_check[robot, : self.arrays.filled[robot], [WHEELS, GYRO]]
+        return float(by_gyro @ by_wheels / (by_wheels @ by_wheels or math.nan))
 
     def had_fault(self, now_ns: int) -> BoolArray:
         """Whether the odometry of each robot (N,) has jumped or was reset within the last seconds."""
@@ -243,6 +263,7 @@ class OdometryTracks:
             unmoved=np.zeros((*shape, 3)),
             known_ns=np.zeros(shape, dtype=np.int64),
             jump_ns=np.zeros((*shape, 2), dtype=np.int64),
+            gyro_check=np.zeros((*shape, CHECKS if rates else 0)),
             twist_from_ns=np.full(self._robots, LATEST_NS),
             twist_until_ns=np.full(self._robots, LATEST_NS),
             # description of the robots
@@ -290,6 +311,7 @@ class OdometryTracks:
             first = int(
                 np.searchsorted(arrays.stamp_ns[robot, :count], stamps[late & (robots == robot)].min())
             )
+            first = unmark_from(arrays, robot, first)
             later = (getattr(arrays, name)[robot, first:count] for name in ("stamp_ns", "raw", "twist"))
             again = np.zeros(count - first, dtype=bool)
             taken.append(NewRows._make([np.full(count - first, robot), *later, again]))

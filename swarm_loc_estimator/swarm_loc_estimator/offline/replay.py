@@ -38,6 +38,9 @@ TICK_S = 0.1  # Default time between two outputs [s]
 TICKS_S = (1e-3, 3600.0)  # Range of it [s]
 
 
+_NOTED = (Contradicted.CONSTANT, Contradicted.GYROSCOPE)  # Kinds for which the estimator uses something else
+
+
 def replay(
     bag: Path | str,
     swarm: Swarm | None = None,
@@ -87,7 +90,7 @@ def replay(
         jumps = f"The log time jumps ahead by more than an hour, {periodic.jumps} x"
         remarks.append(f"{jumps}; no poses are given meanwhile.")
     found = estimator.contradictions(summary.range_ns[1])
-    remarks += [f"Note: {one.text}." for one in found if one.kind is Contradicted.CONSTANT]
+    remarks += [f"Note: {one.text}." for one in found if one.kind in _NOTED]
     result = runner.result(bag.name, summary.range_ns, {**summary.truth, **truth}, summary.received)
     if estimator.origin:
         remarks.append(

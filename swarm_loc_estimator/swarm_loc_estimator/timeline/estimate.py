@@ -238,16 +238,20 @@ class Contradicted(Enum):
     RESET = "odometry reset"
     CONSTANT = "constant odometry"
     UNMOVED = "constant odometry of a moving robot"
+    GYROSCOPE = "turns of a gyroscope"
     POSE = "pose"
     SIGHTINGS = "sightings"
     DESCRIPTION = "description"
     SUSPENDED = "suspended source"
 
 
+GYROSCOPE_OF = "gyroscope of "  # Before the name of its robot
+
+
 class Contradiction(NamedTuple):
     """A fault of a robot or landmark."""
 
-    about: str  # Name of the robot, or a landmark such as "landmark 7"
+    about: str  # Name of the robot, or what it is, such as "landmark 7" or "gyroscope of epuck1"
     kind: Contradicted  # Contradicted property
     text: str  # Message for users, one sentence
 
@@ -279,7 +283,9 @@ def contradictions(
     conflicting = tracks.has_conflicting_sources(now_ns)
     reset = tracks.had_fault(now_ns) & ~conflicting
     denied = [is_tracked and is_contradicted(belief, robot) for robot, is_tracked in enumerate(state.tracked)]
-    contradicted = np.flatnonzero(state.contradicted_ns > NEVER_NS).tolist()
+    # Turns of gyroscopes may still turn out uncertain, which would explain what was found since then.
+    is_new = state.contradicted_ns > now_ns - tracks.unsettled_ns
+    contradicted = np.flatnonzero((state.contradicted_ns > NEVER_NS) & ~is_new).tolist()
     aside = [(robot, source % len(names)) for robot, source in excluded_links(state.sources, now_ns)]
     outside = range(len(names) - 2 * robots - len(swarm.cameras), len(names))  # cameras, fixes and markers
     suspended = np.flatnonzero(state.sources.score[robots:] >= max_fault_score + 1.0) + robots
@@ -288,6 +294,7 @@ def contradictions(
         (Contradicted.RESET, reset),
         (Contradicted.CONSTANT, tracks.integrates_twist()),
         (Contradicted.UNMOVED, unmoved),
+        (Contradicted.GYROSCOPE, tracks.contradicts_gyroscope()),
         (Contradicted.POSE, denied),
     ]
     return [
@@ -310,12 +317,15 @@ _TEXTS = {
     Contradicted.RESET: "the odometry of {0} jumped or was reset: its motion at that moment is unknown",
     Contradicted.CONSTANT: "the odometry of {0} has a constant pose but a twist: integrating the twist",
     Contradicted.UNMOVED: "the odometry of {0} has a constant pose and no twist, although {0} moves",
+    Contradicted.GYROSCOPE: "the gyroscope of {0} does not turn with its wheels; using the turns of the"
+    " wheels: check its axes (imu.roll, imu.pitch) and its driver",
     Contradicted.POSE: "the newest measurements contradict the pose of {0}",
 }
 
 
 def _of_robot(name: str, kind: Contradicted) -> Contradiction:
-    return Contradiction(name, kind, _TEXTS[kind].format(name))
+    about = GYROSCOPE_OF + name if kind is Contradicted.GYROSCOPE else name
+    return Contradiction(about, kind, _TEXTS[kind].format(name))
 
 
 def _sightings(observer: str, source: str) -> Contradiction:
