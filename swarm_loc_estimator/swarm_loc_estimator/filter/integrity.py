@@ -461,6 +461,7 @@ _MAX_GATED_FIXES = 3
 """Gated fixes after which a robot is re-initialized from its fixes, whatever other robots measure of it."""
 _CONFIRMED_AGAIN_NS = 150_000_000
 """Sightings within this time count as one confirmation, because their errors are correlated."""
+_SHARE_OF_HEADING = 0.5  # Share of a position's variance by the heading from which its error lies on an arc
 
 
 class LossLimits(NamedTuple):
@@ -499,16 +500,39 @@ def _count_confirmation(state: IntegrityArrays, robot: int, stamp_ns: int) -> No
 
 
 @inlined_njit
-def is_uncertain(belief: BeliefArrays, robot: int, pose: FloatArray, limits: LossLimits) -> bool:
-    """Whether the standard deviation of the robot's position or heading at `pose` (3,) exceeds its limit."""
+def is_uncertain(
+    belief: BeliefArrays, robot: int, pose: FloatArray, limits: LossLimits, relies_on_heading: bool
+) -> bool:
+    """Whether the robot at `pose` (3,) is too uncertain to be measured.
+
+    So is its position beyond its limit, and one that an uncertain heading has put on an arc, see
+    `depends_on_heading`; or its heading, if the measurement relies on it.
+    """
     first = 3 * robot
     xx, yy = covariance_within(belief, first, 0, 0), covariance_within(belief, first, 1, 1)
     xt, yt = covariance_within(belief, first, 0, 2), covariance_within(belief, first, 1, 2)
     tt = covariance_within(belief, first, 2, 2)
     x = xx - 2.0 * pose[1] * xt + pose[1] * pose[1] * tt
     y = yy + 2.0 * pose[0] * yt + pose[0] * pose[0] * tt
-    uncertain: bool = max(x, y) > limits.position_sigma**2 or tt > limits.heading_sigma**2
+    uncertain: bool = max(x, y) > limits.position_sigma**2
+    if tt > limits.heading_sigma**2:
+        on_arc = depends_on_heading(x + y, xt - pose[1] * tt, yt + pose[0] * tt, tt)
+        uncertain = uncertain or relies_on_heading or on_arc
     return uncertain
+
+
+@inlined_njit
+def depends_on_heading(position: float, xt: float, yt: float, heading: float) -> bool:
+    """Whether most of a position's variance stems from the heading, so that its error lies on an arc.
+
+    Args:
+        position: Variance of x plus that of y [m^2].
+        xt: Covariance of x and the heading [m rad].
+        yt: That of y [m rad].
+        heading: Variance of the heading [rad^2].
+    """
+    depends: bool = xt * xt + yt * yt > _SHARE_OF_HEADING * position * heading
+    return depends
 
 
 @inlined_njit

@@ -49,8 +49,10 @@ from swarm_loc_estimator.filter.integrity import (
 from swarm_loc_estimator.filter.joint_filter import JointFilter, update_one
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.filter.models import (
+    CARTESIAN,
     MODELS,
     NO_HEADING,
+    POLAR,
     POSE_GATE,
     has_kernel,
     is_misread,
@@ -302,7 +304,8 @@ def _predict_one(
             predict(belief, sides[i], to, scratch)
             assign(pose[i], sample.pose[i])
             to_map(belief, sides[i], pose[i])
-            if is_uncertain(belief, sides[i], pose[i], limits):
+            by_axes = i == 0 and measurements.model[k] == CARTESIAN
+            if is_uncertain(belief, sides[i], pose[i], limits, by_axes):
                 lost: int = sides[i]
                 return lost
     if measurements.landmark[k] >= 0:
@@ -357,7 +360,8 @@ def _write_poses(
                 continue
             look_up_pose(tracks, sides[i], measurements.stamp_ns[k], pose)
             to_map(belief, sides[i], pose)
-            if is_uncertain(belief, sides[i], pose, limits):
+            by_axes = i == 0 and measurements.model[k] == CARTESIAN
+            if is_uncertain(belief, sides[i], pose, limits, by_axes):
                 work.lost[sides[i]] = _UNCERTAIN
     if measurements.landmark[k] >= 0:
         assign(work.pose[k, 1], belief.landmark[measurements.landmark[k]])
@@ -419,6 +423,10 @@ def _evaluate(measurements: Measurements, k: int, belief: BeliefArrays, work: In
         write_innovation(measurements, k, measurements.second[k], predicted, other)
         if squared_distance(other, s) < squared_distance(innovation, s):
             assign(innovation, other)
+    # An observer of unknown heading turns bearing and heading alike, the one perhaps by a turn less.
+    if measurements.model[k] == POLAR and measurements.has_heading[k]:
+        expected = s[2, 1] / s[1, 1] * innovation[1]
+        innovation[2] += 2.0 * math.pi * round((expected - innovation[2]) / (2.0 * math.pi))
     # Gate.
     work.accepted[row] = position_distance(innovation, s) <= measurements.gate[k]
     small = small_variances(measurements.model[k], predicted)
