@@ -461,7 +461,9 @@ _MAX_GATED_FIXES = 3
 """Gated fixes after which a robot is re-initialized from its fixes, whatever other robots measure of it."""
 _CONFIRMED_AGAIN_NS = 150_000_000
 """Sightings within this time count as one confirmation, because their errors are correlated."""
-_SHARE_OF_HEADING = 0.5  # Share of a position's variance by the heading from which its error lies on an arc
+_SHARE_OF_HEADING, _SHARE_OF_DRIVER = 0.5, 0.1
+"""Share of a position's variance by the heading from which its error lies on an arc, and that of a robot with
+odometry: its earlier headings, which the present one does not tell, have moved it, too."""
 
 
 class LossLimits(NamedTuple):
@@ -501,12 +503,12 @@ def _count_confirmation(state: IntegrityArrays, robot: int, stamp_ns: int) -> No
 
 @inlined_njit
 def is_uncertain(
-    belief: BeliefArrays, robot: int, pose: FloatArray, limits: LossLimits, relies_on_heading: bool
+    belief: BeliefArrays, robot: int, pose: FloatArray, limits: LossLimits, drives: bool, by_axes: bool
 ) -> bool:
-    """Whether the robot at `pose` (3,) is too uncertain to be measured.
+    """Whether the robot at `pose` (3,) is too uncertain for a measurement.
 
-    So is its position beyond its limit, and one that an uncertain heading has put on an arc, see
-    `depends_on_heading`; or its heading, if the measurement relies on it.
+    So is a position beyond its limit, and one that depends on an uncertain heading. An uncertain heading
+    alone is not, unless the robot measures along its axes (`by_axes`), which is not linear in the heading.
     """
     first = 3 * robot
     xx, yy = covariance_within(belief, first, 0, 0), covariance_within(belief, first, 1, 1)
@@ -516,22 +518,23 @@ def is_uncertain(
     y = yy + 2.0 * pose[0] * yt + pose[0] * pose[0] * tt
     uncertain: bool = max(x, y) > limits.position_sigma**2
     if tt > limits.heading_sigma**2:
-        on_arc = depends_on_heading(x + y, xt - pose[1] * tt, yt + pose[0] * tt, tt)
-        uncertain = uncertain or relies_on_heading or on_arc
+        sideways = (xt - pose[1] * tt, yt + pose[0] * tt)
+        uncertain = uncertain or by_axes or depends_on_heading(x + y, sideways, tt, drives)
     return uncertain
 
 
 @inlined_njit
-def depends_on_heading(position: float, xt: float, yt: float, heading: float) -> bool:
-    """Whether most of a position's variance stems from the heading, so that its error lies on an arc.
+def depends_on_heading(position: float, sideways: tuple[float, float], heading: float, drives: bool) -> bool:
+    """Whether much of a position's variance stems from the heading, so that its error lies on an arc.
 
     Args:
         position: Variance of x plus that of y [m^2].
-        xt: Covariance of x and the heading [m rad].
-        yt: That of y [m rad].
+        sideways: Covariances of x and of y with the heading [m rad].
         heading: Variance of the heading [rad^2].
+        drives: Whether the robot has odometry.
     """
-    depends: bool = xt * xt + yt * yt > _SHARE_OF_HEADING * position * heading
+    share = _SHARE_OF_DRIVER if drives else _SHARE_OF_HEADING
+    depends: bool = sideways[0] ** 2 + sideways[1] ** 2 > share * position * heading
     return depends
 
 

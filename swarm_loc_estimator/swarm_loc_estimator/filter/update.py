@@ -52,7 +52,6 @@ from swarm_loc_estimator.filter.models import (
     CARTESIAN,
     MODELS,
     NO_HEADING,
-    POLAR,
     POSE_GATE,
     has_kernel,
     is_misread,
@@ -304,8 +303,9 @@ def _predict_one(
             predict(belief, sides[i], to, scratch)
             assign(pose[i], sample.pose[i])
             to_map(belief, sides[i], pose[i])
+            drives = not tracks.is_stationary[sides[i]]
             by_axes = i == 0 and measurements.model[k] == CARTESIAN
-            if is_uncertain(belief, sides[i], pose[i], limits, by_axes):
+            if is_uncertain(belief, sides[i], pose[i], limits, drives, by_axes):
                 lost: int = sides[i]
                 return lost
     if measurements.landmark[k] >= 0:
@@ -360,8 +360,9 @@ def _write_poses(
                 continue
             look_up_pose(tracks, sides[i], measurements.stamp_ns[k], pose)
             to_map(belief, sides[i], pose)
+            drives = not tracks.is_stationary[sides[i]]
             by_axes = i == 0 and measurements.model[k] == CARTESIAN
-            if is_uncertain(belief, sides[i], pose, limits, by_axes):
+            if is_uncertain(belief, sides[i], pose, limits, drives, by_axes):
                 work.lost[sides[i]] = _UNCERTAIN
     if measurements.landmark[k] >= 0:
         assign(work.pose[k, 1], belief.landmark[measurements.landmark[k]])
@@ -423,10 +424,6 @@ def _evaluate(measurements: Measurements, k: int, belief: BeliefArrays, work: In
         write_innovation(measurements, k, measurements.second[k], predicted, other)
         if squared_distance(other, s) < squared_distance(innovation, s):
             assign(innovation, other)
-    # An observer of unknown heading turns bearing and heading alike, the one perhaps by a turn less.
-    if measurements.model[k] == POLAR and measurements.has_heading[k]:
-        expected = s[2, 1] / s[1, 1] * innovation[1]
-        innovation[2] += 2.0 * math.pi * round((expected - innovation[2]) / (2.0 * math.pi))
     # Gate.
     work.accepted[row] = position_distance(innovation, s) <= measurements.gate[k]
     small = small_variances(measurements.model[k], predicted)

@@ -127,7 +127,8 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, limits: TrackedLimits,
         inflate_suspect_covariance(belief.integrity, i, out.covariances[i])
         _cap_heading(out.covariances[i])
         out.heading_known[i] = out.covariances[i, 2, 2] <= limits.heading_sigma**2
-        out.status[i] = _status(belief.integrity, i, sample.silence_s[0], limits, out.covariances[i])
+        drives, silence_s = not tracks.is_stationary[i], sample.silence_s[0]
+        out.status[i] = _status(belief.integrity, i, silence_s, limits, out.covariances[i], drives)
         cos, sin = np.cos(theta - raw[2]), np.sin(theta - raw[2])
         out.map_to_odom[i, 0] = x - cos * raw[0] + sin * raw[1]
         out.map_to_odom[i, 1] = y - sin * raw[0] - cos * raw[1]
@@ -136,9 +137,14 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, limits: TrackedLimits,
 
 @inlined_njit
 def _status(
-    integrity: IntegrityArrays, robot: int, silence_s: float, limits: TrackedLimits, covariance: FloatArray
+    integrity: IntegrityArrays,
+    robot: int,
+    silence_s: float,
+    limits: TrackedLimits,
+    covariance: FloatArray,
+    drives: bool,
 ) -> int:
-    """Status of a localized robot with the reported covariance (3, 3)."""
+    """Status of a localized robot with the reported covariance (3, 3); whether it has odometry."""
     if silence_s > limits.timeout_s[robot]:
         return _STALE
     if integrity.confirmations[robot] < CONFIRMED:
@@ -146,11 +152,9 @@ def _status(
     if is_contradicted(integrity, robot):
         return _CONTRADICTED
     xx, yy, tt = covariance[0, 0], covariance[1, 1], covariance[2, 2]
-    if max(xx, yy) > limits.position_sigma**2:
-        return _UNCERTAIN
-    if tt > limits.heading_sigma**2 and depends_on_heading(xx + yy, covariance[0, 2], covariance[1, 2], tt):
-        return _UNCERTAIN
-    return _TRACKED
+    sideways = (covariance[0, 2], covariance[1, 2])
+    turns = tt > limits.heading_sigma**2 and depends_on_heading(xx + yy, sideways, tt, drives)
+    return _UNCERTAIN if turns or max(xx, yy) > limits.position_sigma**2 else _TRACKED
 
 
 @inlined_njit
