@@ -25,7 +25,7 @@ class Errors:
     """Estimate minus truth of one robot, where both are known."""
 
     stamp_ns: IntArray  #: (N,)
-    #: (N, 3) x [m], y [m], heading [rad, wrapped] in map; NaN for a heading that is told as unknown
+    #: (N, 3) x [m], y [m], heading [rad, wrapped] in map; NaN for an unknown heading
     error: FloatArray
     sigma: FloatArray  #: (N, 3) one standard deviation of x, y, theta as estimated; NaN where unknown
     #: (N,) squared error normalised by the covariance, ideally 3 on average; infinite where the covariance is
