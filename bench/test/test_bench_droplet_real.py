@@ -49,3 +49,4 @@ def test_a_heading_is_held_against_the_truth_turned_by_how_the_fiducial_sits() -
     found = outcome_of(run(0.0), {"seen": 0.1}, {"seen"})
     np.testing.assert_allclose(found.heading_deg[0], np.degrees(0.1), rtol=1e-6)
     assert found.figures["heading_known_share"] == pytest.approx(9 / 12)
+    assert found.figures["tracked_share"] == pytest.approx(0.5)

@@ -42,6 +42,7 @@ class Outcome:
     score: Score  # As `bench.integrity` has it, of the instants with truth
     estimated: Estimated  # What it is of
     located_share: float  # Share of the robots that can be seen that were located at all
+    tracked_share: float  # Share of all robots' instants that were told as tracked, with truth or without
     position_cm: FloatArray  # (K,) errors of the poses told as tracked whose truth is known
     heading_deg: FloatArray  # (K,) likewise, without sign; NaN where it is told as unknown
 
@@ -50,7 +51,7 @@ class Outcome:
         """By their names."""
         return {
             "located_share": self.located_share,
-            "tracked_share": float(self.estimated.tracked.mean()),
+            "tracked_share": self.tracked_share,
             "position_cm": float(np.median(self.position_cm)),
             "position_p90_cm": float(np.quantile(self.position_cm, 0.9)),
             "heading_known_share": float(np.isfinite(self.heading_deg).mean()),
@@ -157,6 +158,7 @@ def outcome_of(result: ReplayResult, yaw: dict[str, float], seen: set[str]) -> O
         scored(estimated),
         estimated,
         float(np.mean(located)),
+        float(np.mean(result.status == Status.TRACKED)),
         100.0 * np.hypot(told[:, 0], told[:, 1]),
         np.where(known, np.degrees(np.abs(told[:, 2])), np.nan),
     )
