@@ -103,7 +103,7 @@ def passed(name: str) -> Passed:
 def _publish(estimator: Estimator, encoder: SwarmPosesEncoder, now_ns: int) -> None:
     """Encode the poses at an instant, as the node does."""
     e = estimator.tick(now_ns)
-    encoder.encode(e.stamp_ns, e.poses, e.covariances, e.fix_age_s, e.status)
+    encoder.encode(e.stamp_ns, e.poses, e.covariances, e.fix_age_s, e.status, e.heading_known)
 
 
 class _Trace:

@@ -27,7 +27,8 @@ def run(error_m: float) -> ReplayResult:
     covariance[:, 0] = np.diag([1e-6, 1e-6, 1e-2])
     told = np.tile(np.array([Status.TRACKED, Status.WAITING], dtype=np.uint8), (70, 1))
     swarm = Swarm((Robot("seen"), Robot("unseen")))
-    return ReplayResult("", swarm, stamp_ns, pose, covariance, told, {"seen": TRUTH})
+    known = (told == Status.TRACKED) & (stamp_ns < 9 * SECOND)[:, None]
+    return ReplayResult("", swarm, stamp_ns, pose, covariance, told, {"seen": TRUTH}, heading_known=known)
 
 
 def test_a_robot_stands_where_two_sightings_agree_that_follow_each_other_soon() -> None:
@@ -47,3 +48,5 @@ def test_a_sure_pose_told_as_tracked_beside_the_truth_misleads_and_is_in_no_othe
 def test_a_heading_is_held_against_the_truth_turned_by_how_the_fiducial_sits() -> None:
     found = outcome_of(run(0.0), {"seen": 0.1}, {"seen"})
     np.testing.assert_allclose(found.heading_deg[0], np.degrees(0.1), rtol=1e-6)
+    assert found.figures["heading_known_share"] == pytest.approx(9 / 12)
+    assert found.figures["tracked_share"] == pytest.approx(0.5)

@@ -42,7 +42,7 @@ def test_noise_that_the_description_hides_is_found_and_costs_no_robot() -> None:
     assert found.misleading_share <= 0.001
     assert found.tracked_share >= 0.99
     assert found.position_m <= 0.015
-    assert ("epuck1", Contradicted.NOISE) in found.reported
+    assert ("epuck1", Contradicted.SUSPENDED) in found.reported
 
 
 def test_a_landmark_that_was_moved_is_named() -> None:
@@ -123,7 +123,7 @@ def test_a_source_counts_as_named_from_the_fault_on_and_symptoms_accuse_nobody()
     fault = replace(SENSOR_SCENARIOS["mocap_swapped"](SEED), begins_s=15.0, guilty=frozenset({"a", "b"}))
     named = [
         Named(3.0, "a", Contradicted.SIGHTINGS),
-        Named(17.0, "c", Contradicted.NOISE),
+        Named(17.0, "c", Contradicted.SUSPENDED),
         Named(18.0, "c", Contradicted.DESCRIPTION),
         Named(18.0, "d", Contradicted.POSE),
         Named(19.0, "b", Contradicted.DESCRIPTION),

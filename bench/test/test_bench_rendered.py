@@ -108,6 +108,7 @@ def test_errors_are_those_of_ten_poses_a_second_in_a_stretch_of_time() -> None:
         np.tile(np.eye(3), (len(stamps), 1, 1, 1)),
         np.ones((len(stamps), 1), dtype=np.uint8),
         {"r": truth},
+        heading_known=np.ones((len(stamps), 1), dtype=bool),
     )
     summary = report.errors_within(result, 2 * SECOND, 3 * SECOND)
     assert (summary.count, summary.position_mean) == (11, pytest.approx(0.25))

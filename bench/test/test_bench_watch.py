@@ -170,7 +170,14 @@ def test_a_report_plays_its_run_without_a_server(browser: Browser, tmp_path: Pat
     covariance = np.tile(np.diag([1e-4, 1e-4, 1e-3]), (40, 3, 1, 1))
     truth = {"alpha": Trajectory(stamp_ns, pose[:, 0] + [0.003, 0.004, 0.0])}
     result = ReplayResult(
-        "a run", SWARM, stamp_ns, pose, covariance, np.isfinite(pose[..., 0]).view(np.uint8), truth
+        "a run",
+        SWARM,
+        stamp_ns,
+        pose,
+        covariance,
+        np.isfinite(pose[..., 0]).view(np.uint8),
+        truth,
+        heading_known=np.isfinite(pose[..., 0]),
     )
     file = tmp_path / "run.html"
     file.write_text(page_of(recorded(result)), encoding="utf-8")

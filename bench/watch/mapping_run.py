@@ -57,7 +57,9 @@ class _Notes:
         status = np.where(np.isfinite(pose[:, 0]), Status.TRACKED, Status.WAITING).astype(np.uint8)
         age = np.full(len(pose), np.nan)
         self.frames.append(
-            poses_frame(EstimateMessage(stamp_ns, "map", self.names, pose, covariance, age, status))
+            poses_frame(
+                EstimateMessage(stamp_ns, "map", self.names, pose, covariance, age, status, status > 0)
+            )
         )
         self._truth[arrival.robot] = arrival.truth
         known = np.flatnonzero(np.isfinite(self._truth[:, 0]))

@@ -67,7 +67,7 @@ def main() -> None:
         angle = phase + speed * count * PERIOD_S
         at = places + 0.15 * np.column_stack([np.cos(angle), np.sin(angle)])
         pose, now_ns = np.column_stack([at, angle + math.pi / 2.0]), time.time_ns()
-        poses.publish(encoder.encode(now_ns, pose, covariance, np.full(n, 0.3), status))
+        poses.publish(encoder.encode(now_ns, pose, covariance, np.full(n, 0.3), status, status > 0))
         if count % _SIGHTINGS_EVERY == 0:
             sightings.publish(encode_sightings("map", now_ns, seen))
         if count % _DIAGNOSTICS_EVERY == 0:

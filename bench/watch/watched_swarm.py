@@ -78,7 +78,8 @@ def swarm_frames(stamp_ns: int, poses: FloatArray = PLACES, status: Sequence[int
     covariance = np.tile(np.diag([1e-4, 4e-4, 1e-3]), (3, 1, 1))
     age = np.array([0.1, -1.0, -1.0])
     names = tuple(robot.name for robot in SWARM.robots)
-    estimate = EstimateMessage(stamp_ns, "map", names, shown, covariance, age, np.array(status, np.uint8))
+    state = np.array(status, np.uint8)
+    estimate = EstimateMessage(stamp_ns, "map", names, shown, covariance, age, state, state > 0)
     sees = Sightings(
         np.array([0, 0, 1], np.int32),
         np.array([1, -1, -2], np.int32),

@@ -8,7 +8,6 @@ robot stand; misleading is what `bench.integrity` calls so.
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,11 +28,7 @@ from swarm_loc_estimator.swarm.ir_board import IrGains, save_ir_platform
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
-from swarm_loc_estimator.timeline.settings import Settings
 
-SETTINGS = Settings(lost_heading_sigma=1.5, fix_window_s=60.0)
-"""Headings of robots that turn by themselves are seldom surer than the default; it is 7 to 20 s from one
-exchange of two robots to the next."""
 LIVE_RATE = 10.0
 REACH_M, MIN_EXCHANGES = 0.2, 5  # Who lit its emitters so often so near to a receiver can be seen
 _STOOD_S, _STOOD_M, _STOOD_RAD = 30.0, 0.0035, np.radians(8.0)
@@ -47,18 +42,20 @@ class Outcome:
     score: Score  # As `bench.integrity` has it, of the instants with truth
     estimated: Estimated  # What it is of
     located_share: float  # Share of the robots that can be seen that were located at all
+    tracked_share: float  # Share of all robots' instants that were told as tracked, with truth or without
     position_cm: FloatArray  # (K,) errors of the poses told as tracked whose truth is known
-    heading_deg: FloatArray  # (K,) likewise, without sign
+    heading_deg: FloatArray  # (K,) likewise, without sign; NaN where it is told as unknown
 
     @property
     def figures(self) -> dict[str, float]:
         """By their names."""
         return {
             "located_share": self.located_share,
-            "tracked_share": float(self.estimated.tracked.mean()),
+            "tracked_share": self.tracked_share,
             "position_cm": float(np.median(self.position_cm)),
             "position_p90_cm": float(np.quantile(self.position_cm, 0.9)),
-            "heading_deg": float(np.median(self.heading_deg)),
+            "heading_known_share": float(np.isfinite(self.heading_deg).mean()),
+            "heading_deg": float(np.nanmedian(self.heading_deg)),
             "nees": self.score.nees,
             "misleading_share": self.score.misleading_share,
         }
@@ -75,7 +72,7 @@ def measure(tests: list[tuple[Recorded, BoardCalibration]], names: list[str]) ->
         swarm_file = described(recorded, done, names)
         yaw = dict(zip(names, done.model.truth_yaw.tolist(), strict=True))
         seen = can_be_seen(recorded, names)
-        result = replay(recorded.bag, load_swarm(swarm_file), SETTINGS)
+        result = replay(recorded.bag, load_swarm(swarm_file))
         outcomes[name] = outcome_of(result, yaw, seen)
         if recorded is shortest:
             said("live")
@@ -91,7 +88,7 @@ def measure(tests: list[tuple[Recorded, BoardCalibration]], names: list[str]) ->
 def report(outcomes: dict[str, Outcome], agreement: dict[str, float]) -> None:
     """Print the table, and how far live poses are from those of the replay; draw."""
     rows: list[list[Cell]] = [[name, *one.figures.values()] for name, one in outcomes.items()]
-    head = ["graph", "located", "tracked", "cm", "90 % cm", "heading deg", "NEES", "misleading"]
+    head = ["graph", "located", "tracked", "cm", "90 % cm", "heading known", "deg", "NEES", "misleading"]
     print(table(head, rows))
     print(table(["live beside replay", ""], [[name, value] for name, value in agreement.items()]))
     print(f"plot: {draw(outcomes)}")
@@ -156,13 +153,14 @@ def outcome_of(result: ReplayResult, yaw: dict[str, float], seen: set[str]) -> O
     located = [
         np.isfinite(result.poses[:, k]).all(axis=1).any() for k, r in enumerate(robots) if r.name in seen
     ]
-    told = error[tracked]
+    told, known = error[tracked], result.heading_known[tracked]
     return Outcome(
         scored(estimated),
         estimated,
         float(np.mean(located)),
+        float(np.mean(result.status == Status.TRACKED)),
         100.0 * np.hypot(told[:, 0], told[:, 1]),
-        np.degrees(np.abs(told[:, 2])),
+        np.where(known, np.degrees(np.abs(told[:, 2])), np.nan),
     )
 
 
@@ -180,14 +178,9 @@ def lived(
     recorded: Recorded, swarm_file: Path, yaw: dict[str, float], seen: set[str]
 ) -> tuple[Outcome, dict[str, float]]:
     """Play a recording into the live graph; also how far its poses are from those of a replay."""
-    parameters = swarm_file.with_suffix(".parameters.yaml")
-    chosen = {name: getattr(SETTINGS, name) for name in ("lost_heading_sigma", "fix_window_s")}
-    parameters.write_text(json.dumps({"estimator": {"ros__parameters": chosen}}), encoding="utf-8")
-    options = GraphOptions(
-        str(swarm_file), bag=str(recorded.bag), rate=LIVE_RATE, parameter_file=str(parameters)
-    )
+    options = GraphOptions(str(swarm_file), bag=str(recorded.bag), rate=LIVE_RATE)
     live = play_live(options, log=OUT / "droplet_real" / f"{recorded.name}.log")
-    compared = compare_with_replay(live, recorded.bag, SETTINGS)
+    compared = compare_with_replay(live, recorded.bag)
     return outcome_of(live.result, yaw, seen), {
         "difference_rms_m": compared.rms_m,
         "equal_share": compared.equal_share,

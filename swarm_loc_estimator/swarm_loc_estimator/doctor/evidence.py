@@ -174,7 +174,7 @@ class Evidence:
                 estimator.receive(arrived)
                 estimate = estimator.tick(now_ns)
                 status = estimate.status.astype(np.int64)
-                new = (begin_ns < 0) & (status == Status.TRACKED)
+                new = (begin_ns < 0) & (status == Status.TRACKED) & estimate.heading_known
                 begin_ns[new], begin_pose[new] = now_ns, estimate.poses[new]
                 for one in estimator.contradictions(now_ns):
                     ticks[one.about, one.kind] += 1

@@ -54,6 +54,7 @@ from swarm_loc_estimator.common.numerics import (
     wrap,
 )
 from swarm_loc_estimator.filter.measurements import Measurements
+from swarm_loc_estimator.filter.models import ANY_HEADING
 from swarm_loc_estimator.filter.state import PAIR_ROWS, BeliefArrays
 from swarm_loc_estimator.odometry.track_arrays import OdometrySample
 
@@ -112,6 +113,8 @@ def use_mean(
         pair[_RANDOM, i], pair[_SYSTEMATIC, i] = max(noise[i, i] - again, 0.0), again
         pair[_MEAN, i] = predicted[i] + innovation[i]
         pair[_VARIANCE, i] = max(variances[i], 0.0)  # rounding may make the difference negative
+        if i > 0:  # else an angle that was forgotten for long would be relearned over many turns
+            pair[_VARIANCE, i] = min(pair[_VARIANCE, i], ANY_HEADING)
     if belief.pair_robot[observer, place] == target:
         _join(belief.pair_history[observer, place], predicted, innovation, noise, pair)
     else:

@@ -38,6 +38,7 @@ from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
 _STUDENT_DOF = 4.0
 _MISREAD = 0.25 * np.pi  # Minimum error of the heading of a misread fiducial [rad]
 NO_HEADING = 1e4  # Variance of a heading that is not used [rad^2]
+ANY_HEADING = np.pi**2 / 3.0  # Variance of a heading of which nothing is known, uniform over a turn [rad^2]
 
 
 def gate_threshold(probability: ArrayLike, degrees_of_freedom: int = 2) -> FloatArray:

@@ -85,6 +85,11 @@ _REPORTED_NS = 3_000_000_000
 OCCUPIED_M = 0.02  # Two robots cannot be nearer [m]
 
 
+_SHARE_OF_HEADING, _SHARE_OF_DRIVER = 0.5, 0.1
+"""Share of a position's variance by the heading from which its error lies on an arc, and that of a robot with
+odometry: its earlier headings, which the present one does not tell, have moved it, too."""
+
+
 class LossLimits(NamedTuple):
     """Limits beyond which a robot is lost."""
 
@@ -516,16 +521,40 @@ def _news(belief: BeliefArrays, robot: int, stamp_ns: int) -> float:
 
 
 @inlined_njit
-def is_uncertain(belief: BeliefArrays, robot: int, pose: FloatArray, limits: LossLimits) -> bool:
-    """Whether the standard deviation of the robot's position or heading at `pose` (3,) exceeds its limit."""
+def is_uncertain(
+    belief: BeliefArrays, robot: int, pose: FloatArray, limits: LossLimits, drives: bool, by_axes: bool
+) -> bool:
+    """Whether the robot at `pose` (3,) is too uncertain for a measurement.
+
+    So is a position beyond its limit, and one that depends on an uncertain heading. An uncertain heading
+    alone is not, unless the robot measures along its axes (`by_axes`), which is not linear in the heading.
+    """
     first = 3 * robot
     xx, yy = covariance_within(belief, first, 0, 0), covariance_within(belief, first, 1, 1)
     xt, yt = covariance_within(belief, first, 0, 2), covariance_within(belief, first, 1, 2)
     tt = covariance_within(belief, first, 2, 2)
     x = xx - 2.0 * pose[1] * xt + pose[1] * pose[1] * tt
     y = yy + 2.0 * pose[0] * yt + pose[0] * pose[0] * tt
-    uncertain: bool = max(x, y) > limits.position_sigma**2 or tt > limits.heading_sigma**2
+    uncertain: bool = max(x, y) > limits.position_sigma**2
+    if tt > limits.heading_sigma**2:
+        sideways = (xt - pose[1] * tt, yt + pose[0] * tt)
+        uncertain = uncertain or by_axes or depends_on_heading(x + y, sideways, tt, drives)
     return uncertain
+
+
+@inlined_njit
+def depends_on_heading(position: float, sideways: tuple[float, float], heading: float, drives: bool) -> bool:
+    """Whether much of a position's variance stems from the heading, so that its error lies on an arc.
+
+    Args:
+        position: Variance of x plus that of y [m^2].
+        sideways: Covariances of x and of y with the heading [m rad].
+        heading: Variance of the heading [rad^2].
+        drives: Whether the robot has odometry.
+    """
+    share = _SHARE_OF_DRIVER if drives else _SHARE_OF_HEADING
+    depends: bool = sideways[0] ** 2 + sideways[1] ** 2 > share * position * heading
+    return depends
 
 
 @inlined_njit

@@ -34,6 +34,7 @@ from swarm_loc_estimator.filter.correlated_noise import inflate_fix, record_pair
 from swarm_loc_estimator.filter.joint_filter import JointFilter, update_one
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.filter.models import (
+    CARTESIAN,
     MODELS,
     NO_HEADING,
     POSE_GATE,
@@ -322,7 +323,9 @@ def _predict_one(
             predict(belief, sides[i], to, scratch)
             assign(pose[i], sample.pose[i])
             to_map(belief, sides[i], pose[i])
-            if is_uncertain(belief, sides[i], pose[i], limits):
+            drives = not tracks.is_stationary[sides[i]]
+            by_axes = i == 0 and measurements.model[k] == CARTESIAN
+            if is_uncertain(belief, sides[i], pose[i], limits, drives, by_axes):
                 lost: int = sides[i]
                 return lost
     _write_surveyed(measurements, k, belief, pose)
@@ -410,7 +413,9 @@ def _write_poses(
                 continue
             look_up_pose(tracks, sides[i], measurements.stamp_ns[k], pose)
             to_map(belief, sides[i], pose)
-            if is_uncertain(belief, sides[i], pose, limits):
+            drives = not tracks.is_stationary[sides[i]]
+            by_axes = i == 0 and measurements.model[k] == CARTESIAN
+            if is_uncertain(belief, sides[i], pose, limits, drives, by_axes):
                 work.lost[sides[i]] = _UNCERTAIN
     _write_surveyed(measurements, k, belief, work.pose[k])
     relative_motion(measurements, k, tracks, belief, work.pose[k], work.motion[k])

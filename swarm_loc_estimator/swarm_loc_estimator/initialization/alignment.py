@@ -64,6 +64,7 @@ Constraint = Any  # A row of a ConstraintArray inside compiled code, where the f
 
 NO_CONSTRAINTS: ConstraintArray = np.zeros(0, dtype=CONSTRAINT_DTYPE)
 _MAX_CONSTRAINTS = 20
+_ARC = 0.3**2  # Variance of a heading beyond which errors of points that turn with it lie on arcs [rad^2]
 
 
 class Waiting(NamedTuple):
@@ -176,6 +177,13 @@ def spread_at(spread: FloatArray, x: float, y: float) -> tuple[float, float, flo
 
 
 @cached_njit
+def _spread_around(spread: FloatArray, x: float, y: float) -> tuple[float, float, float]:
+    """As `spread_at`; a circle about that ellipse where the heading is so unknown that errors lie on arcs."""
+    xx, xy, yy = spread_at(spread, x, y)
+    return (xx + yy, 0.0, xx + yy) if spread[2, 2] > _ARC else (xx, xy, yy)
+
+
+@cached_njit
 def _describe(
     one: Measurements, camera: FloatArray, waiting: Waiting, other: OtherSide, constraints: ConstraintArray
 ) -> None:
@@ -264,7 +272,7 @@ def refreshed(constraints: ConstraintArray, belief: BeliefArrays) -> ConstraintA
         xx, xy, yy = turned(
             constraint.map_xx, constraint.map_xy, constraint.map_yy, math.cos(turn), math.sin(turn)
         )
-        at_xx, at_xy, at_yy = spread_at(spread, constraint.map_x, constraint.map_y)
+        at_xx, at_xy, at_yy = _spread_around(spread, constraint.map_x, constraint.map_y)
         constraint.map_xx, constraint.map_xy, constraint.map_yy = xx + at_xx, xy + at_xy, yy + at_yy
         constraint.turn_variance += spread[2, 2]
     return out[:count]
@@ -420,7 +428,9 @@ def _drifted(constraints: ConstraintArray, track_noise: FloatArray) -> Constrain
         for i in range(3):
             for j in range(3):
                 drift[i, j] = track_noise[i, j] - constraint.track_noise[i, j]
-        xx, xy, yy = spread_at(drift, constraint.local_x, constraint.local_y)
+        xx, xy, yy = _spread_around(drift, constraint.local_x, constraint.local_y)
+        if drift[2, 2] > _ARC:
+            constraint.turn_variance += drift[2, 2]
         constraint.local_xx += xx
         constraint.local_xy += xy
         constraint.local_yy += yy

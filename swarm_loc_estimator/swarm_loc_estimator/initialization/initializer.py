@@ -70,11 +70,12 @@ class Initializer:
     Args:
         tracks: The robots' odometry.
         window_s: Age up to which a constraint is used.
-        heading_sigma: Largest standard deviation of the heading of a robot that is initialized [rad].
+        heading_sigma: Largest standard deviation of the heading of a robot that is initialized [rad]; one
+            without odometry may have any, because its heading carries it nowhere.
     """
 
     def __init__(self, tracks: OdometryTracks, window_s: float, heading_sigma: float = HEADING_SIGMA) -> None:
-        self._heading_sigma = heading_sigma
+        self._heading_sigma = np.where(tracks.arrays.is_stationary, np.inf, heading_sigma)
         self._tracks = tracks
         self._window_ns = int(window_s * 1e9)
 
@@ -109,7 +110,7 @@ class Initializer:
         observer, now_ns = int(one.observer), int(one.stamp_ns)
         track = self._tracks.at(np.array([robot]), np.array([now_ns]))
         at = Preintegrated(now_ns, track.covariance[0], track.jacobian[0])
-        if locates_alone(one.columns(), 0) and self._is_sure(one.covariance):
+        if locates_alone(one.columns(), 0) and self._is_sure(robot, one.covariance):
             located(state, robot, _fixed(one, track.pose[0]), at, CONFIRMED + 1.0)
             return True
         if MODELS[int(one.model)].initializes != "alone":
@@ -125,7 +126,7 @@ class Initializer:
         few = constraints.size < MIN_CONSTRAINTS or constraints["stamp_ns"][0] == now_ns
         if few or now_ns < state.next_attempt_ns[robot]:
             return True
-        initial = align(refreshed(constraints, state.arrays()), at.covariance, self._heading_sigma)
+        initial = align(refreshed(constraints, state.arrays()), at.covariance, self._heading_sigma[robot])
         if initial is not None:
             located(state, robot, initial, at, CONFIRMED)
         else:
@@ -159,15 +160,15 @@ class Initializer:
         state.next_window_ns[robot] = at.stamp_ns + max(
             _SHORTEST_WINDOW_PAUSE_NS, (at.stamp_ns - first_ns) // _WINDOW_PAUSE_SHARE
         )
-        initial = locate(state, robot, window, at.covariance, self._heading_sigma)
+        initial = locate(state, robot, window, at.covariance, self._heading_sigma[robot])
         if initial is not None:
             located(state, robot, initial, at, 0)
         return True
 
-    def _is_sure(self, covariance: FloatArray) -> bool:
-        """Whether a pose with a covariance (3, 3) may initialize a robot."""
+    def _is_sure(self, robot: int, covariance: FloatArray) -> bool:
+        """Whether a pose with a covariance (3, 3) may initialize the robot."""
         x, y, heading = np.sqrt(np.diag(covariance)).tolist()
-        return bool(max(x, y) < POSITION_SIGMA and heading < self._heading_sigma)
+        return bool(max(x, y) < POSITION_SIGMA and heading < self._heading_sigma[robot])
 
     def _located(self, state: SwarmState, other: int, one: Measurements) -> OtherSide:
         """The side of a measurement that is located, brought up to its stamp."""

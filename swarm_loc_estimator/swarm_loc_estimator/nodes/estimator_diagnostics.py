@@ -177,6 +177,8 @@ class Diagnostics:
                 values.update(self._input_values(handle, topic, now_ns, elapsed_s))
         summary = {int(status): int(np.sum(estimate.status == status)) for status in Status}
         words = ", ".join(f"{summary[status]} {status.name.lower()}" for status in Status if summary[status])
+        turned = int(np.sum((estimate.status != Status.WAITING) & ~estimate.heading_known))
+        words += f", {turned} of unknown heading" if turned else ""
         reports.append(Report("estimator", "; ".join(troubles) or words, level_of(troubles), values))
         return reports
 
@@ -224,13 +226,17 @@ class Diagnostics:
             troubles.append("its odometry is silent")
         sigma = np.sqrt(np.diagonal(estimate.covariances[index]))
         if status is Status.UNCERTAIN:
-            size = f"{_figure(max(sigma[:2]))} m and {_figure(sigma[2])} rad"
-            troubles.append(f"its standard deviation, {size}, exceeds lost_sigma or lost_heading_sigma")
-        values["status"] = status.name.lower()
+            size = f"{_figure(max(sigma[:2]))} m, with a heading of {_figure(sigma[2])} rad"
+            troubles.append(f"its position is uncertain: its standard deviation is {size}")
+        heading_known = bool(estimate.heading_known[index])
+        words = status.name.lower()
+        if status is not Status.WAITING and not heading_known:
+            words += ", heading unknown"
+        values["status"], values["heading known"] = status.name.lower(), str(heading_known).lower()
         values["fix age [s]"] = _figure(estimate.fix_age_s[index])
         values["sigma x [m]"], values["sigma y [m]"] = _figure(sigma[0]), _figure(sigma[1])
         values["sigma theta [rad]"] = _figure(sigma[2])
-        return Report(robot.name, "; ".join(troubles) or status.name.lower(), level_of(troubles), values)
+        return Report(robot.name, "; ".join(troubles) or words, level_of(troubles), values)
 
     def _input_troubles(self, handle: int, topic: InputTopic, robot: Robot | None, now_ns: int) -> list[str]:
         """Problems of an input, in words."""

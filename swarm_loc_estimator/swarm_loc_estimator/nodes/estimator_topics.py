@@ -332,7 +332,9 @@ class EstimateOutputs:
         e = estimate
         located = e.status != Status.WAITING
         self._swarm_poses.publish(
-            self._swarm_poses_encoder.encode(e.stamp_ns, e.poses, e.covariances, e.fix_age_s, e.status)
+            self._swarm_poses_encoder.encode(
+                e.stamp_ns, e.poses, e.covariances, e.fix_age_s, e.status, e.heading_known
+            )
         )
         stamp_ns = e.stamp_ns + self._tolerance_ns
         for publisher, encoder, robots in self._transforms:

@@ -172,7 +172,7 @@ def _add_estimates(result: ReplayResult, writer: BagWriter) -> None:
     newest = None
     for one in estimates(result):
         newest = seen.get(one.stamp_ns, newest)
-        columns = (one.pose, one.covariance, one.fix_age_s, one.status)
+        columns = one[3:]
         writer.write("swarm/poses", one.stamp_ns, poses.encode(one.stamp_ns, *columns))
         located: BoolArray = ~np.isnan(one.pose[:, 0])
         if located.any():
@@ -187,4 +187,5 @@ def estimates(result: ReplayResult, stride: int = 1) -> Iterator[EstimateMessage
     for k in range(0, len(result.stamp_ns), stride):
         pose = result.poses[k]
         stamp_ns, covariance = int(result.stamp_ns[k]), result.covariances[k]
-        yield EstimateMessage(stamp_ns, _MAP, names, pose, covariance, not_kept, result.status[k])
+        states = result.status[k], result.heading_known[k]
+        yield EstimateMessage(stamp_ns, _MAP, names, pose, covariance, not_kept, *states)

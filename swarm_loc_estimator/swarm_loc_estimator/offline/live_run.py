@@ -243,8 +243,11 @@ class Recorder(Node):
         poses = self.poses()
         stamp_ns = np.array([one.stamp_ns for one in poses], dtype=np.int64)
         pose, covariance = np.array([one.pose for one in poses]), np.array([one.covariance for one in poses])
-        status = np.array([one.status for one in poses])
-        return ReplayResult(title, swarm, stamp_ns, pose, covariance, status, truth, dict(self.drops))
+        status, known = (
+            np.array([getattr(one, name) for one in poses]) for name in ("status", "heading_known")
+        )
+        result = ReplayResult(title, swarm, stamp_ns, pose, covariance, status, heading_known=known)
+        return replace(result, truth=truth, counters=dict(self.drops))
 
     def _on_poses(self, data: bytes) -> None:
         self.raw.append(data)

@@ -25,7 +25,8 @@ class Errors:
     """Estimate minus truth of one robot, where both are known."""
 
     stamp_ns: IntArray  #: (N,)
-    error: FloatArray  #: (N, 3) x [m], y [m], heading [rad, wrapped] in map
+    #: (N, 3) x [m], y [m], heading [rad, wrapped] in map; NaN for an unknown heading
+    error: FloatArray
     sigma: FloatArray  #: (N, 3) one standard deviation of x, y, theta as estimated; NaN where unknown
     #: (N,) squared error normalised by the covariance, ideally 3 on average; infinite where the covariance is
     #: not positive definite, NaN where there is none
@@ -48,7 +49,7 @@ class ErrorSummary:
     position_median: float
     position_p95: float
     position_max: float
-    heading_rmse: float  #: [rad], of the absolute heading error; mean, median, p95 and max follow
+    heading_rmse: float  #: [rad], of the absolute error of known headings; mean, median, p95 and max follow
     heading_mean: float
     heading_median: float
     heading_p95: float
@@ -122,9 +123,7 @@ def nees(error: FloatArray, covariance: FloatArray) -> FloatArray:
 
 def summarise(errors: Errors) -> ErrorSummary:
     """Statistics of the errors of one robot, or of several pooled ones."""
-    position, heading = errors.position, np.abs(errors.error[:, 2])
-    if len(position) == 0:
-        return ErrorSummary(0, *[float("nan")] * 11)
+    position, heading = errors.position, np.abs(errors.error[np.isfinite(errors.error[:, 2]), 2])
     known = errors.nees[~np.isnan(errors.nees)]
     return ErrorSummary(
         len(position),
@@ -149,7 +148,9 @@ def pool(errors: Sequence[Errors]) -> Errors:
 
 
 def _figures(values: FloatArray) -> tuple[float, float, float, float, float]:
-    """Root mean square, mean, median, 95th percentile and maximum of absolute errors."""
+    """Root mean square, mean, median, 95th percentile and maximum of absolute errors; NaN without any."""
+    if not values.size:
+        return (float("nan"),) * 5
     rmse = float(np.sqrt(np.mean(values * values)))
     median, p95 = (float(figure) for figure in np.percentile(values, [50, 95]))
     return rmse, float(values.mean()), median, p95, float(values.max())

@@ -216,6 +216,7 @@ class Runner:
         self._pose = np.zeros((_TICKS_AT_ONCE, robots, 3))
         self._covariance = np.zeros((_TICKS_AT_ONCE, robots, 3, 3))
         self._status = np.zeros((_TICKS_AT_ONCE, robots), dtype=np.uint8)
+        self._heading_known = np.zeros((_TICKS_AT_ONCE, robots), dtype=bool)
         self._is_local = np.zeros(_TICKS_AT_ONCE, dtype=bool)
         self._sightings_left = _MAX_SIGHTINGS if keep_sightings else 0
         self._sightings: list[tuple[int, Sightings]] = []
@@ -259,6 +260,7 @@ class Runner:
             poses=self._spool.array("pose", np.float64, robots, 3),
             covariances=self._spool.array("covariance", np.float64, robots, 3, 3),
             status=self._spool.array("status", np.uint8, robots),
+            heading_known=self._spool.array("heading_known", np.bool_, robots),
             sightings=tuple(self._sightings),
             losses=tuple(one for _, losses in sorted(self._losses.items()) for one in losses),
             images=self._images.images() if self._images is not None else (),
@@ -277,7 +279,8 @@ class Runner:
         estimate = self._estimator.tick(now_ns)
         k, self._filled = self._filled, self._filled + 1
         self._stamp_ns[k], self._pose[k], self._covariance[k] = now_ns, estimate.poses, estimate.covariances
-        self._status[k], self._is_local[k] = estimate.status, bool(self._estimator.origin)
+        self._status[k], self._heading_known[k] = estimate.status, estimate.heading_known
+        self._is_local[k] = bool(self._estimator.origin)
         self._note_losses()
         if self._images is not None:
             self._images.note(self._estimator.identities)
@@ -301,7 +304,7 @@ class Runner:
     def _flush(self) -> None:
         """Move the ticks in memory to the temporary file."""
         filled, self._filled = slice(self._filled), 0
-        for name in ("stamp_ns", "pose", "covariance", "status", "is_local"):
+        for name in ("stamp_ns", "pose", "covariance", "status", "heading_known", "is_local"):
             self._spool.append(name, getattr(self, f"_{name}")[filled])
 
 

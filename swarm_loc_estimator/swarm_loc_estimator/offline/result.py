@@ -107,6 +107,7 @@ class ReplayResult:
     poses: npt.NDArray[np.float64]
     covariances: npt.NDArray[np.float64]  #: (T, N, 3, 3) of x, y, theta
     status: npt.NDArray[np.uint8]  #: (T, N) of `Status`
+    heading_known: npt.NDArray[np.bool_] = field(kw_only=True)  #: (T, N) whether the heading is known, too
     #: Robot name -> ground truth; robots without are missing
     truth: Mapping[str, Trajectory] = field(default_factory=dict)
     #: Counts by name, such as dropped inputs by reason
@@ -157,6 +158,7 @@ class ReplayResult:
             poses=self.poses[rows],
             covariances=self.covariances[rows],
             status=self.status[rows],
+            heading_known=self.heading_known[rows],
             is_local=self.is_local[rows] if self.is_local.size else self.is_local,
         )
 
@@ -167,7 +169,10 @@ class ReplayResult:
 
     @cached_property
     def errors(self) -> Mapping[str, Errors]:
-        """Robot name -> estimate minus ground truth, for robots that have any; only TRACKED poses mislead."""
+        """Robot name -> estimate minus ground truth, for robots that have any.
+
+        Only TRACKED poses mislead; an unknown heading has no error (NaN).
+        """
         found = {}
         for index, robot in enumerate(self.swarm.robots):
             if robot.name in self.truth:
@@ -176,8 +181,10 @@ class ReplayResult:
                     known &= ~self.is_local
                 track = Trajectory(self.stamp_ns[known], self.poses[known, index])
                 errors = compare(track, self.covariances[known, index], self.truth[robot.name])
-                tracked = np.interp(errors.stamp_ns, self.stamp_ns, self.status[:, index] == Status.TRACKED)
-                found[robot.name] = replace(errors, misleading=errors.misleading & (tracked > 0.5))
+                states = self.status[:, index] == Status.TRACKED, self.heading_known[:, index]
+                tracked, turned = (np.interp(errors.stamp_ns, self.stamp_ns, one) > 0.5 for one in states)
+                errors.error[~turned, 2] = np.nan
+                found[robot.name] = replace(errors, misleading=errors.misleading & tracked)
         return found
 
     @cached_property

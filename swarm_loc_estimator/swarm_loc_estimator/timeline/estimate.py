@@ -18,9 +18,11 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.numerics import composed, wrap
 from swarm_loc_estimator.filter.measurements import LossReason
+from swarm_loc_estimator.filter.models import ANY_HEADING
 from swarm_loc_estimator.filter.prediction import new_scratch, write_predicted
 from swarm_loc_estimator.filter.sources import (
     CONFIRMED,
+    depends_on_heading,
     excluded_links,
     inflate_suspect_covariance,
     is_contradicted,
@@ -34,14 +36,14 @@ from swarm_loc_estimator.timeline.settings import Settings
 
 
 class Status(IntEnum):
-    """Localization status of a robot; the values of SwarmPose.status."""
+    """Status of a robot's position; the values of SwarmPose.status."""
 
     WAITING = 0  # not localized
     TRACKED = 1
     STALE = 2  # localized, but its odometry has timed out
     UNCONFIRMED = 3  # initialized, but not confirmed by a later measurement yet
     CONTRADICTED = 4  # its newest sightings contradict its pose
-    UNCERTAIN = 5  # localized, but its standard deviation exceeds lost_sigma or lost_heading_sigma
+    UNCERTAIN = 5  # localized, but its position is uncertain beyond lost_sigma, or by an unknown heading
 
 
 _WAITING, _TRACKED, _STALE = int(Status.WAITING), int(Status.TRACKED), int(Status.STALE)
@@ -54,7 +56,7 @@ class TrackedLimits(NamedTuple):
 
     timeout_s: FloatArray  # (N,) age of the newest odometry [s]
     position_sigma: float  # Standard deviation of x and of y [m]
-    heading_sigma: float  # Standard deviation of the heading [rad]
+    heading_sigma: float  # Standard deviation of a known heading [rad]
 
     @classmethod
     def of(cls, swarm: Swarm, settings: Settings) -> TrackedLimits:
@@ -72,6 +74,9 @@ class Estimate(NamedTuple):
     map_to_odom: FloatArray  #: (N, 3) transform from `map` to the robot's odom frame; NaN where `poses` are
     status: NDArray[np.uint8]  #: (N,) of `Status`
     fix_age_s: FloatArray  #: (N,) age of the newest accepted landmark sighting or absolute fix [s]; -1: none
+    heading_known: (
+        BoolArray  #: (N,) whether the standard deviation of the heading is below `lost_heading_sigma`
+    )
 
 
 def estimate_at(state: SwarmState, tracks: TrackArrays, limits: TrackedLimits, now_ns: int) -> Estimate:
@@ -98,6 +103,7 @@ def _new_estimate(now_ns: int, robots: int) -> Estimate:
         np.full((robots, 3), np.nan),
         np.full(robots, _WAITING, dtype=np.uint8),
         np.full(robots, -1.0),
+        np.zeros(robots, dtype=np.bool_),
     )
 
 
@@ -118,7 +124,10 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, limits: TrackedLimits,
         out.poses[i, 0], out.poses[i, 1], out.poses[i, 2] = x, y, wrap(theta)
         _pose_covariance(x, y, error, out.covariances[i])
         inflate_suspect_covariance(belief.sources, i, out.covariances[i])
-        out.status[i] = _status(belief, i, sample.silence_s[0], limits, out.covariances[i])
+        _cap_heading(out.covariances[i])
+        out.heading_known[i] = out.covariances[i, 2, 2] <= limits.heading_sigma**2
+        drives, silence_s = not tracks.is_stationary[i], sample.silence_s[0]
+        out.status[i] = _status(belief, i, silence_s, limits, out.covariances[i], drives)
         cos, sin = np.cos(theta - raw[2]), np.sin(theta - raw[2])
         out.map_to_odom[i, 0] = x - cos * raw[0] + sin * raw[1]
         out.map_to_odom[i, 1] = y - sin * raw[0] - cos * raw[1]
@@ -127,19 +136,33 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, limits: TrackedLimits,
 
 @inlined_njit
 def _status(
-    belief: BeliefArrays, robot: int, silence_s: float, limits: TrackedLimits, covariance: FloatArray
+    belief: BeliefArrays,
+    robot: int,
+    silence_s: float,
+    limits: TrackedLimits,
+    covariance: FloatArray,
+    drives: bool,
 ) -> int:
-    """Status of a localized robot with the reported covariance (3, 3)."""
+    """Status of a localized robot with the reported covariance (3, 3); whether it has odometry."""
     if silence_s > limits.timeout_s[robot]:
         return _STALE
     if belief.sources.confirmations[robot] <= CONFIRMED:
         return _UNCONFIRMED
     if is_contradicted(belief, robot):
         return _CONTRADICTED
-    position = max(covariance[0, 0], covariance[1, 1])
-    if position > limits.position_sigma**2 or covariance[2, 2] > limits.heading_sigma**2:
-        return _UNCERTAIN
-    return _TRACKED
+    xx, yy, tt = covariance[0, 0], covariance[1, 1], covariance[2, 2]
+    sideways = (covariance[0, 2], covariance[1, 2])
+    turns = tt > limits.heading_sigma**2 and depends_on_heading(xx + yy, sideways, tt, drives)
+    return _UNCERTAIN if turns or max(xx, yy) > limits.position_sigma**2 else _TRACKED
+
+
+@inlined_njit
+def _cap_heading(covariance: FloatArray) -> None:
+    """Limit the variance of the heading in a covariance (3, 3) to that of a heading anywhere in a turn."""
+    scale = np.sqrt(min(1.0, ANY_HEADING / covariance[2, 2]))
+    for i in range(3):
+        covariance[i, 2] *= scale
+        covariance[2, i] *= scale
 
 
 @inlined_njit
@@ -160,8 +183,8 @@ _MEMORY_NS = 30_000_000_000  # Time within which these moves happen, and for whi
 _LONG_AGO_NS = np.iinfo(np.int64).min // 2
 
 LOSS_CAUSES = {
-    LossReason.UNCERTAIN: "its standard deviation exceeded {0.lost_sigma:g} m (lost_sigma) or"
-    " {0.lost_heading_sigma:g} rad (lost_heading_sigma)",
+    LossReason.UNCERTAIN: "its position's standard deviation exceeded {0.lost_sigma:g} m (lost_sigma), or"
+    " stemmed from a heading beyond {0.lost_heading_sigma:g} rad (lost_heading_sigma)",
     LossReason.REFUTED: f"a measurement contradicted its pose before {CONFIRMED} had confirmed it",
     LossReason.GATED: "{0.lost_after} measurements in a row were gated",
     LossReason.OFF_FIXES: "several absolute fixes in a row were gated",

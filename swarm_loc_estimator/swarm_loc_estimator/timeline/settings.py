@@ -90,7 +90,11 @@ class Settings:
         1.0, "m", 0.01, 1e3, "maximum standard deviation of the position; beyond it a robot is lost"
     )
     lost_heading_sigma: float = number(
-        0.3, "rad", 0.01, 10.0, "maximum standard deviation of the heading; beyond it a robot is lost"
+        0.3,
+        "rad",
+        0.01,
+        10.0,
+        "maximum standard deviation of a known heading; positions that depend on unknown ones are lost",
     )
     max_fault_score: float = number(
         10.0,

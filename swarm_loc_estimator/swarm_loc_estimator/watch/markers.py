@@ -74,7 +74,7 @@ class MarkersEncoder:
             _Marker("landmarks_facing", LINE_LIST, line, self._faces, _inked(self._faces)),
             _Marker("cameras", CUBE_LIST, (0.6 * size,) * 3, self._cameras, _inked(self._cameras)),
             _Marker("robots", SPHERE_LIST, (size, size, 0.5 * size), _lifted(pose), colours),
-            _lines("headings", line, _headings(pose, size)),
+            _lines("headings", line, _headings(estimate.pose[estimate.heading_known], size)),
             _lines("ellipses_95", (0.06 * size, 0.0, 0.0), ellipses(pose, estimate.covariance[located])),
         ]
         if sightings is not None:

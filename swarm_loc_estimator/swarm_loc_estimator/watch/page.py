@@ -84,7 +84,8 @@ def poses_frame(estimate: EstimateMessage) -> Frame:
     }
     columns: dict[str, npt.NDArray[Any]] = {"x": pose[:, 0], "y": pose[:, 1]}
     columns |= {name: column.astype(np.float32) for name, column in single.items()}
-    return pack("poses", estimate.stamp_ns, {**columns, "status": estimate.status})
+    states = {"status": estimate.status, "known": estimate.heading_known.astype(np.uint8)}
+    return pack("poses", estimate.stamp_ns, {**columns, **states})
 
 
 def sightings_frame(stamp_ns: int, sightings: Sightings) -> Frame:

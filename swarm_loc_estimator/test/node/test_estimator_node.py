@@ -329,7 +329,8 @@ class StandIn:
         assert has_budget()
         poses = np.array([[1.0, 2.0, 0.5], [np.nan, np.nan, np.nan]])
         covariances = np.tile(np.eye(3), (2, 1, 1))
-        return Estimate(now_ns, poses, covariances, poses, np.array([1, 0], np.uint8), np.array([0.25, -1.0]))
+        status, age_s = np.array([1, 0], np.uint8), np.array([0.25, -1.0])
+        return Estimate(now_ns, poses, covariances, poses, status, age_s, status > 0)
 
 
 def test_the_node_only_carries_between_topics_and_estimator(ros: Ros, swarm_file: Any) -> None:
@@ -351,4 +352,6 @@ def test_the_node_only_carries_between_topics_and_estimator(ros: Ros, swarm_file
     assert told[-1].odometry == [(1, T0_NS + step) for step in range(5)]
     assert xytheta(robots.newest("alpha")) == pytest.approx([1.0, 2.0, 0.5])
     assert robots.newest("alpha").fix_age_s == 0.25
+    assert robots.newest("alpha").heading_known
+    assert not robots.newest("beta").heading_known
     assert stamp_ns(robots.poses[-1]) == T0_NS + 10

@@ -30,8 +30,8 @@ from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
 
 CAUSES = {
-    LossReason.UNCERTAIN: "its standard deviation exceeded 0.05 m (lost_sigma)"
-    " or 0.3 rad (lost_heading_sigma)",
+    LossReason.UNCERTAIN: "its position's standard deviation exceeded 0.05 m (lost_sigma), or stemmed"
+    " from a heading beyond 0.3 rad (lost_heading_sigma)",
     LossReason.REFUTED: "a measurement contradicted its pose before 2 had confirmed it",
     LossReason.GATED: "7 measurements in a row were gated",
     LossReason.OFF_FIXES: "several absolute fixes in a row were gated",

@@ -23,7 +23,7 @@ def contradicted(
         covariance = np.diag([one**2, one**2, 0.01])[None]
         status = np.array([Status.WAITING if np.isnan(pose[0]) else Status.TRACKED], np.uint8)
         now_ns = T0 + k * TENTH
-        estimate = Estimate(now_ns, pose[None], covariance, pose[None], status, np.zeros(1))
+        estimate = Estimate(now_ns, pose[None], covariance, pose[None], status, np.zeros(1), status > 0)
         odometry.add(stands[k : k + 1], estimate)
         found.append(bool(odometry.contradicted(now_ns)[0]))
     return found
@@ -87,6 +87,7 @@ def test_poses_that_were_set_are_no_moves() -> None:
             pose = np.full((1, 3), float(k))
             status = np.array([Status.TRACKED], np.uint8)
             odometry.add(
-                np.ones(1, bool), Estimate(now_ns, pose, 1e-6 * np.eye(3)[None], pose, status, pose[:, 0])
+                np.ones(1, bool),
+                Estimate(now_ns, pose, 1e-6 * np.eye(3)[None], pose, status, pose[:, 0], status > 0),
             )
             assert not odometry.contradicted(now_ns).any()

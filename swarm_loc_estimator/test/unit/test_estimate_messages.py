@@ -41,7 +41,8 @@ def estimate_of(names: list[str], seed: int, stamp_ns: int = 5 * SECOND + 3) -> 
     covariance = root @ np.swapaxes(root, 1, 2)
     status = random.integers(0, 5, n).astype(np.uint8)
     pose[status == 0] = covariance[status == 0] = np.nan
-    return EstimateMessage(stamp_ns, "map", tuple(names), pose, covariance, random.normal(size=n), status)
+    age, known = random.normal(size=n), (status > 0) & (random.random(n) < 0.5)
+    return EstimateMessage(stamp_ns, "map", tuple(names), pose, covariance, age, status, known)
 
 
 @given(
@@ -118,7 +119,14 @@ def test_markers_are_what_viewers_read() -> None:
     pose = np.array([[1.0, 2.0, np.pi / 2], [3.0, 4.0, 0.0], [np.nan] * 3])
     covariance = np.tile(np.diag([0.04, 0.01, 0.1]), (3, 1, 1))
     one = EstimateMessage(
-        SECOND, "map", ("a", "b", "c"), pose, covariance, np.zeros(3), np.array([1, 4, 0], np.uint8)
+        SECOND,
+        "map",
+        ("a", "b", "c"),
+        pose,
+        covariance,
+        np.zeros(3),
+        np.array([1, 4, 0], np.uint8),
+        np.array([True, False, False]),
     )
     seen = Sightings(
         np.array([0, 0, 2, -1], np.int32),
@@ -133,7 +141,7 @@ def test_markers_are_what_viewers_read() -> None:
     named = {marker.ns: marker for marker in markers[1:] if marker.ns != "names"}
     assert [(p.x, p.y) for p in named["robots"].points] == [(1.0, 2.0), (3.0, 4.0)]
     assert named["robots"].colors[0].b > 0.6
-    start, end = named["headings"].points[:2]
+    start, end = named["headings"].points  # that of b is unknown
     assert (start.x, start.y) == (1.0, 2.0)
     assert end.x == pytest.approx(1.0)
     assert end.y > 2.0
@@ -165,6 +173,7 @@ def test_a_run_is_written_as_mcap(tmp_path: Path) -> None:
         pose,
         covariance,
         np.isfinite(pose[..., 0]).view(np.uint8),
+        heading_known=np.array([[True, False], [True, True], [False, True]]),
     )
     file = tmp_path / "run.mcap"
     file.write_bytes(b"an older one")
@@ -177,6 +186,7 @@ def test_a_run_is_written_as_mcap(tmp_path: Path) -> None:
         (first, *_) = [bytes(data) for _, _, _, data in bag.messages(["tf"])]
     assert [one.stamp_ns for one in poses] == stamp_ns.tolist()
     assert [one.status.tolist() for one in poses] == [[1, 0], [1, 1], [1, 1]]
+    assert [one.heading_known.tolist() for one in poses] == result.heading_known.tolist()
     transforms: Any = typestore().deserialize_cdr(first, "tf2_msgs/msg/TFMessage")
     (transform,) = transforms.transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("map", "a/base_link")

@@ -83,6 +83,7 @@ def estimate(now_ns: int, *status: Status) -> Estimate:
         np.zeros((n, 3)),
         np.array(status, np.uint8),
         np.zeros(n),
+        np.ones(n, bool),
     )
 
 
@@ -213,8 +214,19 @@ def test_a_robot_that_is_too_uncertain_is_named() -> None:
     a, b, _ = world.reports(0, estimate(0, Status.TRACKED, Status.UNCERTAIN), recent(), {})
     assert "deviation" not in a.message
     assert b.warning
-    assert b.message == "its standard deviation, 2 m and 2 rad, exceeds lost_sigma or lost_heading_sigma"
+    assert b.message == "its position is uncertain: its standard deviation is 2 m, with a heading of 2 rad"
     assert b.values["status"] == "uncertain"
+
+
+@pytest.mark.parametrize(("known", "message"), [(True, "tracked"), (False, "tracked, heading unknown")])
+def test_an_unknown_heading_is_told_and_is_no_fault(known: bool, message: str) -> None:
+    world = World()
+    world.odometry("b", 0, 0)
+    now = estimate(0, Status.TRACKED, Status.TRACKED)
+    now.heading_known[1] = known
+    _, b, _ = world.reports(0, now, recent(), {})
+    assert (b.message, b.warning) == (message, False)
+    assert (b.values["status"], b.values["heading known"]) == ("tracked", str(known).lower())
 
 
 @pytest.mark.parametrize(("period_s", "patience_s"), [(0.05, 10.0), (1.0, 10.0), (60.0, 300.0)])

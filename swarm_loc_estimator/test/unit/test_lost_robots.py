@@ -99,7 +99,9 @@ def test_many_losses_are_listed_in_few_words() -> None:
     losses = tuple(LossReport(k % 30, LossReason.GATED, k * SECOND, "gated") for k in range(600))
     swarm = Swarm(tuple(Robot(f"r{k}") for k in range(30)))
     none, waiting = np.zeros((1, 30, 3)), np.zeros((1, 30), dtype=np.uint8)
-    result = ReplayResult("many", swarm, np.array([0]), none, none[..., None], waiting, losses=losses)
+    result = ReplayResult(
+        "many", swarm, np.array([0]), none, none[..., None], waiting, losses=losses, heading_known=waiting > 0
+    )
     assert len(result.loss_remarks) == 21
     assert result.loss_remarks[-1] == "10 more robots were lost."
     assert max(map(len, result.loss_remarks)) < 150
@@ -108,7 +110,9 @@ def test_many_losses_are_listed_in_few_words() -> None:
 def test_the_end_of_a_local_frame_is_no_fault_in_the_report() -> None:
     ended = (LossReport(0, LossReason.FRAME, 0, LOSS_CAUSES[LossReason.FRAME]),)
     none, waiting = np.zeros((1, 1, 3)), np.zeros((1, 1), dtype=np.uint8)
-    result = ReplayResult("x", FIXED, np.array([0]), none, none[..., None], waiting, losses=ended)
+    result = ReplayResult(
+        "x", FIXED, np.array([0]), none, none[..., None], waiting, losses=ended, heading_known=waiting > 0
+    )
     assert result.loss_remarks == []
 
 

@@ -40,16 +40,17 @@ def yaw(quaternion: Any) -> float:
 def test_swarm_poses(frame: str) -> None:
     encoder = SwarmPosesEncoder(NAMES, frame)
     ages, status = np.array([0.5, 1.5, -1.0]), np.array([1, 2, 0], np.uint8)
+    known = np.array([False, True, False])
     for stamp in (5, STAMP_NS):
         message = read(
-            encoder.encode(stamp, POSES, COVARIANCES, ages, status), "swarm_loc_msgs/msg/SwarmPoses"
+            encoder.encode(stamp, POSES, COVARIANCES, ages, status, known), "swarm_loc_msgs/msg/SwarmPoses"
         )
         assert (stamp_ns(message), message.header.frame_id) == (stamp, frame)
     assert [robot.name for robot in message.robots] == NAMES
     for k, robot in enumerate(message.robots):
         assert np.array_equal([robot.x, robot.y, robot.theta], POSES[k], equal_nan=True)
         assert np.array_equal(robot.covariance, COVARIANCES[k].ravel())
-        assert (robot.fix_age_s, robot.status) == (ages[k], status[k])
+        assert (robot.fix_age_s, robot.status, robot.heading_known) == (ages[k], status[k], known[k])
 
 
 def test_robot_poses_are_sure_of_the_plane_but_not_beyond_doubt() -> None:

@@ -1,14 +1,20 @@
 """Robots without odometry that move: their poses walk at random, as fast as their description says."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from core_geometry import wrapped
 from core_messages import SECOND, T0, give_fix
+from ir_swarm import DROPLET, Event, Place, exchange, messages
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.swarm.error_models import RandomWalk
+from swarm_loc_estimator.offline.metrics import is_misleading, nees
+from swarm_loc_estimator.sensors.inputs import Batch
+from swarm_loc_estimator.sensors.odometry import OdometryRows
+from swarm_loc_estimator.swarm.error_models import OdometryModel, RandomWalk
+from swarm_loc_estimator.swarm.ir_board import RobotIr
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm, SwarmError
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.settings import Settings
@@ -100,20 +106,109 @@ def test_a_start_counts_from_the_first_measurement_on() -> None:
     assert np.sqrt(estimate.covariances[0, 0, 0]) == pytest.approx(math.hypot(0.01, HIDDEN), rel=0.01)
 
 
-def test_a_robot_of_unsure_heading_is_located_where_such_headings_are_not_lost() -> None:
-    sigma, poses = np.array([0.02, 0.02, 0.45]), walked(5)[0]
-    found = []
-    for limit in (0.3, 1.5):
+def test_a_robot_of_unsure_heading_is_located_and_its_heading_told_as_unknown() -> None:
+    """Its heading carries it nowhere, so that its position is as good without."""
+    sigma, poses = np.array([0.02, 0.02, 0.8]), walked(5)[0]
+    for limit, is_known in ((0.3, False), (1.5, True)):
         settings = Settings(fusion_period_s=0.0, lost_heading_sigma=limit)
         estimator = Estimator(SWARM, settings)
         for k in range(3):
             stamp_ns = T0 + k * SECOND
             give_fix(estimator, 0, stamp_ns, poses[0], np.diag(sigma**2), stamp_ns)
-        found.append(estimator.tick(T0 + 2 * SECOND).status[0])
-    assert found[0] == Status.WAITING
-    assert found[1] != Status.WAITING
+        estimate = estimator.tick(T0 + 2 * SECOND)
+        assert estimate.status[0] == Status.TRACKED
+        assert estimate.heading_known[0] == is_known
+
+
+def test_a_heading_is_forgotten_up_to_any_in_a_turn_while_the_position_is_kept() -> None:
+    estimator, sigma = Estimator(Swarm((replace(SWARM.robots[0], random_walk=RandomWalk(1e-6, 0.5)),))), []
+    for k in range(40):
+        stamp_ns = T0 + k * SECOND
+        if k < 5 or k == 35:
+            give_fix(estimator, 0, stamp_ns, [0.3, 0.1, 0.5], np.diag(FIX_SIGMA**2), stamp_ns)
+        estimate = estimator.tick(stamp_ns)
+        assert k < 3 or estimate.status[0] == Status.TRACKED
+        sigma.append(math.sqrt(estimate.covariances[0, 2, 2]))
+        assert estimate.heading_known[0] == (sigma[-1] <= 0.3)
+        assert k < 3 or (np.linalg.eigvalsh(estimate.covariances[0]) > 0.0).all()
+    assert not estimator.losses
+    assert sigma[34] == pytest.approx(math.pi / math.sqrt(3.0))
+    assert sigma[35] < 0.3
 
 
 def test_a_robot_with_odometry_does_not_walk_at_random() -> None:
     with pytest.raises(SwarmError, match=r"robot 'a' has a random_walk, which must be 0"):
         Swarm((Robot("a", random_walk=WALK),))
+
+
+WALKING = RandomWalk(1e-5, 0.06)  # Of Droplets that turn by more than a radian between two of their exchanges
+
+
+@pytest.mark.parametrize("seed", [5, 11, 12])
+def test_robots_that_turn_unseen_are_located_by_each_other_and_mislead_nobody(seed: int) -> None:
+    """All read each other, one is fixed from outside. Where errors lie on arcs, no ellipse may hide it."""
+    rng, robots, squared, told, seconds = np.random.default_rng(seed), 6, list[float](), 0, 150
+    swarm = Swarm(
+        tuple(
+            Robot(
+                f"r{k}", camera=None, stands=True, random_walk=WALKING, ir=RobotIr(k + 1, DROPLET, "droplet")
+            )
+            for k in range(robots)
+        )
+    )
+    places = 0.12 * np.array([(0, 0), (1, 0), (2, 0), (0, 1), (1, 1), (2, 1)])
+    poses, estimator = np.column_stack([places, rng.uniform(-math.pi, math.pi, robots)]), Estimator(swarm)
+    for second in range(seconds):
+        poses = poses + rng.standard_normal((robots, 3)) * np.sqrt([1e-5, 1e-5, WALKING.heading])
+        stamp_ns = T0 + second * SECOND
+        events: list[Event] = [Place(0, stamp_ns, poses[0])]
+        if second % 6 == 0:
+            events += exchange(rng, wrapped(poses), int(rng.integers(robots)), stamp_ns)
+        estimator.receive(messages(events, [stamp_ns] * len(events)))
+        estimate = estimator.tick(stamp_ns)
+        tracked = estimate.status == Status.TRACKED
+        error, covariance = wrapped(estimate.poses - poses)[tracked], estimate.covariances[tracked]
+        assert not is_misleading(error, covariance).any()
+        squared += nees(error[:, :2], covariance[:, :2, :2]).tolist()
+        told += int(tracked.sum()) if second >= 75 else 0
+    assert told > 0.7 * 75 * robots
+    assert np.mean(squared) < 3.0
+
+
+def test_a_heading_forgotten_for_minutes_is_relearned_in_a_few_exchanges() -> None:
+    rng, walk = np.random.default_rng(2), RandomWalk(1e-7, 0.1)
+    seer = Robot("seer", camera=None, stands=True, start=(0.0, 0.0, 0.3), ir=RobotIr(1, DROPLET, "droplet"))
+    turner = replace(seer, name="turner", start=None, random_walk=walk, ir=RobotIr(2, DROPLET, "droplet"))
+    estimator, poses = Estimator(Swarm((seer, turner))), np.array([[0.0, 0.0, 0.3], [0.1, 0.05, 1.0]])
+    for second in (*range(8), 600, 601, 602, 603):
+        stamp_ns = T0 + second * SECOND
+        poses[1, 2] = 1.0 if second < 600 else -1.4
+        lights = [one for one in exchange(rng, poses, 1, stamp_ns) if one.robot == 0]
+        estimator.receive(messages(lights, [stamp_ns] * len(lights)))
+        estimate = estimator.tick(stamp_ns)
+    assert estimate.status[1] == Status.TRACKED
+    assert math.sqrt(estimate.covariances[1, 2, 2]) < 0.8
+    assert abs(wrapped(estimate.poses - poses)[1, 2]) < 0.3
+
+
+def test_a_robot_that_turns_on_the_spot_keeps_its_place_until_it_drives() -> None:
+    """Odometry that turns badly: its heading is soon unknown, but not where it stands."""
+    model = OdometryModel(wheel_noise=1e-6, turn_noise=0.05)
+    robot = Robot(
+        "r", odometry=model, camera=None, start=(0.5, 0.2, 0.0), start_sigma=StartSigma(0.01, 0.01, 0.02)
+    )
+    estimator, told = Estimator(Swarm((robot,))), []
+    for k in range(120):
+        stamp_ns = T0 + k * SECOND // 10
+        pose = (0.0, 0.0, 0.15 * k) if k < 100 else (0.03 * (k - 100), 0.0, 15.0)
+        rows = np.array([0]), np.array([stamp_ns]), np.array([pose]), np.array([stamp_ns])
+        estimator.receive(Batch.of(stamp_ns, stamp_ns, odometry=OdometryRows.without_twist(*rows)))
+        if k % 5 == 0 and k < 100:
+            fix = [0.5, 0.2, math.nan]
+            give_fix(estimator, 0, stamp_ns, fix, np.diag(FIX_SIGMA**2), stamp_ns)
+        estimate = estimator.tick(stamp_ns)
+        told.append((int(estimate.status[0]), bool(estimate.heading_known[0])))
+    assert not estimator.losses
+    assert told[10] == (Status.TRACKED, True)
+    assert told[99] == (Status.TRACKED, False)
+    assert told[-1] == (Status.UNCERTAIN, False)

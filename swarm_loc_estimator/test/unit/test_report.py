@@ -47,6 +47,7 @@ def result_of(robots: int, ticks: int = 200, truths: int | None = None, title: s
         ("A remark.",),
         10.0,
         0.25,
+        heading_known=np.ones((ticks, robots), dtype=bool),
     )
 
 
@@ -168,6 +169,7 @@ def test_nothing_at_all_is_still_a_report(tmp_path: Path) -> None:
         np.empty((0, 1, 3)),
         np.empty((0, 1, 3, 3)),
         np.empty((0, 1), np.uint8),
+        heading_known=np.empty((0, 1), bool),
     )
     files = write_report(empty, tmp_path)
     assert "No ground truth" in files.text.read_text()

@@ -216,6 +216,7 @@ class EstimateMessage(NamedTuple):
     covariance: FloatArray  # (N, 3, 3); NaN: not located
     fix_age_s: FloatArray  # (N,) [s]; -1: never
     status: NDArray[np.uint8]  # (N,) of `Status`
+    heading_known: BoolArray  # (N,)
 
 
 def _bytes_from(offsets: Sequence[int], size: int) -> NDArray[np.intp]:
@@ -230,7 +231,7 @@ class _Layout:
         frame_id: Frame of the poses.
         names: N robots.
         numbers: (N, 104) indices of the bytes of each robot's numbers.
-        status: (N,) indices of the status.
+        states: (N, 2) indices of the status, and of whether the heading is known.
         others: (m,) indices of all bytes but these and the stamp.
         expected: (m,) these bytes.
     """
@@ -241,9 +242,9 @@ class _Layout:
         self.frame_id: str = message.header.frame_id
         self.names = tuple(robot.name for robot in message.robots)
         self.numbers = _bytes_from(places.get("robots.x", []), 8 * _DOUBLES)
-        self.status = np.array(places.get("robots.status", []), dtype=np.intp)
+        self.states = _bytes_from(places.get("robots.status", []), 2)
         is_other = np.ones(len(data), dtype=np.bool_)
-        is_other[_STAMP] = is_other[self.numbers] = is_other[self.status] = False
+        is_other[_STAMP] = is_other[self.numbers] = is_other[self.states] = False
         self.others = np.flatnonzero(is_other)
         self.expected = np.frombuffer(data, np.uint8)[self.others]
 
@@ -272,7 +273,8 @@ class SwarmPosesReader:
             numbers[:, :3],
             numbers[:, 3:12].reshape(-1, 3, 3),
             numbers[:, 12],
-            raw[layout.status],
+            raw[layout.states[:, 0]],
+            raw[layout.states[:, 1]] != 0,
         )
 
 
@@ -297,13 +299,14 @@ class SwarmPosesEncoder:
         covariances: FloatArray,
         fix_age_s: FloatArray,
         status: NDArray[np.uint8],
+        heading_known: BoolArray,
     ) -> bytes:
-        """The message for poses (N, 3), covariances (N, 3, 3), ages (N,) and status (N,)."""
+        """The message for poses (N, 3), covariances (N, 3, 3), ages, status and known headings (N,)."""
         message = self._message
         message[_STAMP] = stamp_bytes(np.array([stamp_ns]))
         numbers = np.column_stack([poses, covariances.reshape(-1, 9), fix_age_s])
         message[self._layout.numbers] = np.ascontiguousarray(numbers, "<f8").view(np.uint8)
-        message[self._layout.status] = status
+        message[self._layout.states] = np.column_stack([status, heading_known])
         return message.tobytes()
 
 

@@ -270,7 +270,8 @@ ROBOT_TYPE = "droplet"
 DIAMETER_M = 0.044
 METRES_PER_PIXEL = DIAMETER_M / 42.0  # Robots that touch are 42 pixels apart in the recordings of 2016
 FIX_SIGMA = (0.001, 0.001, 0.05)  # Standard deviations of fixes by the camera: x, y [m], heading [rad]
-WALK = RandomWalk(position=5e-6, heading=3e-2)  # The robots turn often and move some centimetres per minute
+WALK = RandomWalk(position=1e-4, heading=3e-2)
+"""By the camera, over 1 to 10 minutes: of the fastest robot of each recording; most move a tenth of that."""
 _NS = 1_000_000_000
 _BRIGHTNESS, _FIXES = kinds()["brightness"], kinds()["fixes"]
 

@@ -18,6 +18,7 @@ from swarm_loc_estimator.offline.export import estimates
 from swarm_loc_estimator.offline.metrics import ErrorSummary
 from swarm_loc_estimator.offline.report.plots import plot_errors, plot_overview, plot_paths
 from swarm_loc_estimator.offline.result import RecordedMap, ReplayResult
+from swarm_loc_estimator.timeline.estimate import Status
 from swarm_loc_estimator.watch.page import (
     Frame,
     about,
@@ -113,13 +114,17 @@ def self_calibrated_landmarks(result: ReplayResult) -> str:
 
 
 def facts(result: ReplayResult) -> dict[str, str]:
-    """Sizes, durations and speed by name."""
+    """Sizes, durations, speed and what is located by name."""
     rows = {
         "robots": str(len(result.swarm.robots)),
         "landmarks": str(len(result.swarm.landmarks)),
         "poses": str(len(result.stamp_ns)),
         "duration of the data": f"{result.data_s:.1f} s",
     }
+    tracked = result.status == Status.TRACKED
+    if tracked.size:
+        known = (tracked & result.heading_known).mean()
+        rows["tracked"] = f"{tracked.mean():.1%} of the robots' poses, {known:.1%} with a known heading"
     if math.isfinite(result.speed_factor):
         rows["duration of the run"] = f"{result.wall_s:.2f} s, {result.speed_factor:.0f} x real time"
     return rows

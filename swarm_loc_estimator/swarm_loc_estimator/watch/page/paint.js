@@ -51,7 +51,7 @@ class Painter {
     return Math.max(swarm.radius[i] * view.scale, count > 300 ? 2.5 : 4);
   }
 
-  robots(c, { theta, status }) {
+  robots(c, { theta, status, known }) {
     const { app } = this, n = theta.length;
     for (let k = 1; k < STATUS.length; k++) {
       c.fillStyle = app.colour(STATUS[k]);
@@ -67,7 +67,7 @@ class Painter {
     c.lineWidth = n > 300 ? 1 : 2;
     c.beginPath();
     for (let i = 0; i < n; i++) {
-      if (!status[i] || !this.isSeen(i)) continue;
+      if (!known[i] || !this.isSeen(i)) continue;
       const reach = 1.7 * this.radius(i);
       c.moveTo(this.u[i], this.v[i]);
       c.lineTo(this.u[i] + reach * Math.cos(theta[i]), this.v[i] - reach * Math.sin(theta[i]));

@@ -9,7 +9,7 @@ const SAY_STATUS = {
   stale: "its odometry is silent: the last known pose",
   unconfirmed: "where its description says; no sighting has confirmed it",
   contradicted: "its newest sightings do not agree with its pose",
-  uncertain: "its standard deviation is beyond the limit: too long unseen",
+  uncertain: "its position is uncertain beyond the limit: too long unseen",
 };
 
 class Panel {
@@ -79,7 +79,7 @@ class Panel {
     if (p.status[i]) {
       const deg = 180 / Math.PI;
       const turned = Math.atan2(Math.sin(p.theta[i]), Math.cos(p.theta[i]));
-      rows.push(["x", `${p.x[i].toFixed(3)} m`], ["y", `${p.y[i].toFixed(3)} m`], ["heading", `${(turned * deg).toFixed(1)}°`]);
+      rows.push(["x", `${p.x[i].toFixed(3)} m`], ["y", `${p.y[i].toFixed(3)} m`], ["heading", p.known[i] ? `${(turned * deg).toFixed(1)}°` : "unknown"]);
       rows.push(["σ x, y", `${mm(p.sxx[i])}, ${mm(p.syy[i])} mm`], ["σ heading", `${(Math.sqrt(p.stt[i]) * deg).toFixed(2)}°`]);
       if (p.age[i] === p.age[i]) rows.push(["age of its own fix", p.age[i] < 0 ? "never" : `${p.age[i].toFixed(1)} s`]);
       const error = this.newestError(time, i);
