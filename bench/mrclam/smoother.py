@@ -277,7 +277,7 @@ class _Sighting:
         found = [values.atPose2(key) for key in factor.keys()]  # noqa: SIM118 # a method of gtsam
         unmoved = (0.0, 0.0, 0.0)  # of a landmark as it was surveyed
         poses = np.array([*((pose.x(), pose.y(), pose.theta()) for pose in found), unmoved])
-        value, jacobian, error = np.zeros(3), np.zeros((3, 5)), np.zeros(3)
+        value, jacobian, error = np.zeros(3), np.zeros((3, 6)), np.zeros(3)
         predict_one(self._measured, self._k, poses[0], poses[1], (0.0, 0.0, 0.0), value, jacobian)
         write_innovation(self._measured, self._k, self._measured.value[self._k], value, error)
         if jacobians is not None:

@@ -68,9 +68,8 @@ SUSPECT, WELL_CONFIRMED = 7.5, 18.0
 _SUSPECT_SIGMA = (0.03, 0.03, 0.06)
 """Standard deviations added while a pose is suspect or little confirmed: x [m], y [m], heading [rad]."""
 
-_DOUBTED_M, _DOUBTED_RAD, _DOUBTED_HEADING, _DOUBTED_S = 0.004, 0.01, 0.03, 0.03
-"""Noise for each contradiction of the description as a whole [m], [rad], [rad], [s]."""
-MAX_DOUBT = 5.0
+_DOUBTED_M, _DOUBTED_RAD, _DOUBTED_HEADING, _DOUBTED_S = 0.02, 0.05, 0.15, 0.15
+"""Noise of sightings that is added once a description was contradicted as a whole [m], [rad], [rad], [s]."""
 
 LINK, UNDECIDED = -1, -2  # Who is wrong if no source is
 RECENT_NS, _ONE_IMAGE_NS = 400_000_000, 20_000_000
@@ -213,17 +212,17 @@ def _place_of(measurements: Measurements, k: int) -> tuple[float, float]:
 @inlined_njit
 def add_doubt(measurements: Measurements, k: int, belief: BeliefArrays, noise: FloatArray) -> None:
     """Add what a description lacks that was contradicted as a whole to the noise (3, 3) of sighting k."""
-    if belief.doubt > 0.0 and measurements.observer[k] >= 0:
+    if belief.is_doubted and measurements.observer[k] >= 0:
         across = _DOUBTED_RAD if measurements.model[k] == POLAR else _DOUBTED_M
-        noise[0, 0] += (belief.doubt * _DOUBTED_M) ** 2
-        noise[1, 1] += (belief.doubt * across) ** 2
-        noise[2, 2] += (belief.doubt * _DOUBTED_HEADING) ** 2
+        noise[0, 0] += _DOUBTED_M**2
+        noise[1, 1] += across * across
+        noise[2, 2] += _DOUBTED_HEADING**2
 
 
 @inlined_njit
 def stamp_variance(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
     """Variance of the stamp of measurement k, as described and with such doubt [s^2]."""
-    doubt = belief.doubt * _DOUBTED_S if measurements.observer[k] >= 0 else 0.0
+    doubt = _DOUBTED_S if belief.is_doubted and measurements.observer[k] >= 0 else 0.0
     variance: float = measurements.stamp_variance[k] + doubt * doubt
     return variance
 

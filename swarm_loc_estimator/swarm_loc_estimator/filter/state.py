@@ -24,7 +24,6 @@ from swarm_loc_estimator.swarm.calibration_states import (
 NEVER_NS = np.iinfo(np.int64).min
 PAIR_ROWS = 10  # Rows of three numbers stored per pair, see `correlated_noise.py`
 _LINKS = 16  # Most recent links of a robot that are remembered
-_DOUBT_AT_FIRST = 5.0
 _DOUBTED_POSE_SIGMA = (0.02, 0.02, 0.03)
 """Standard deviation added to the pose of a contradicted robot [m], [m], [rad]."""
 _REOPENED_POSE_SIGMA = (0.06, 0.06, 0.12)
@@ -71,7 +70,7 @@ class BeliefArrays(NamedTuple):
     pair_stamp_ns: IntArray
     pair_history: FloatArray
     is_dense: bool
-    doubt: float
+    is_doubted: bool
 
 
 @cached_njit
@@ -209,7 +208,7 @@ class SwarmState:
         last_fix_ns: (N,) stamp of the newest accepted landmark sighting or absolute fix.
         sources: What is known of sources, see `sources.py`.
         contradicted_ns: (N + L,) last contradiction of each robot and landmark; NEVER_NS if none.
-        doubt: Of the description: how often it was contradicted as a whole, see `sources.add_doubt`.
+        is_doubted: Whether the description was contradicted as a whole, see `augment_all`.
         pair_robot: (N, pairs) robots observed by each robot; -1 for an empty slot.
         pair_stamp_ns: (N, pairs) stamp of the last measurement of the pair.
         pair_history: (N, pairs, PAIR_ROWS, 3) mean of the measurements, see `correlated_noise.py`.
@@ -243,7 +242,7 @@ class SwarmState:
         self.last_fix_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.sources = new_sources(robots, landmarks)
         self.contradicted_ns: IntArray = np.full(robots + landmarks, NEVER_NS)
-        self.doubt = 0.0
+        self.is_doubted = False
         self.pair_robot: NDArray[np.int64] = np.full((robots, pairs), -1)
         self.pair_stamp_ns: NDArray[np.int64] = np.full((robots, pairs), NEVER_NS)
         self.pair_history: FloatArray = np.zeros((robots, pairs, PAIR_ROWS, 3))
@@ -262,7 +261,7 @@ class SwarmState:
         other = SwarmState.__new__(SwarmState)
         for name, value in vars(self).items():
             # arrays in dictionaries are replaced, never written to
-            is_immutable = value is None or isinstance(value, tuple | int | float)
+            is_immutable = value is None or isinstance(value, tuple | int)
             setattr(other, name, value if is_immutable else value.copy())
         other.sources = SourceArrays(*(column.copy() for column in self.sources))
         return other
@@ -287,7 +286,7 @@ class SwarmState:
             self.pair_stamp_ns,
             self.pair_history,
             self.filter.is_dense,
-            self.doubt,
+            self.is_doubted,
         )
 
     def is_known(self, side: int) -> bool:
@@ -381,7 +380,10 @@ class SwarmState:
             pose: (3,) of the robot in `map`; its covariance is inflated.
         """
         robots = self.tracked.size
-        self.forgive(source)
+        self.sources.score[source] = 0.0
+        self.sources.evidence[self.sources.source == source] = 0.0
+        if source < robots:
+            self.sources.evidence[source] = 0.0
         if source >= robots:
             self._augment_landmark(source - robots)
             self._doubt_all_that_rest_on(source)
@@ -395,13 +397,6 @@ class SwarmState:
         doubt = error_covariance(pose, np.diag(np.square(_DOUBTED_POSE_SIGMA)))
         self.filter.add(robot_columns(np.array([source]))[0], doubt)
 
-    def forgive(self, source: int) -> None:
-        """Forget what speaks against a robot, landmark or fixed camera."""
-        self.sources.score[source] = 0.0
-        self.sources.evidence[self.sources.source == source] = 0.0
-        if source < self.tracked.size:
-            self.sources.evidence[source] = 0.0
-
     def augment_all(self, poses: FloatArray) -> None:
         """Reset all parameters to their priors and re-estimate them.
 
@@ -409,7 +404,7 @@ class SwarmState:
             poses: (N, 3) of the robots in `map`; these means are kept.
         """
         robots, landmarks = self.tracked.size, self.landmark.shape[0]
-        self.doubt = _DOUBT_AT_FIRST
+        self.is_doubted = True
         table = self._table
         for robot in range(robots):
             table = table.with_robot(robot)

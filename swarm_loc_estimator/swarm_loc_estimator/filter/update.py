@@ -719,10 +719,10 @@ def evaluate_link(
     s = jacobian @ _covariance(columns, belief, joint, work.cross_covariance[k]) @ jacobian.T + noise
     innovation = model.innovation(one.value, predicted.value)
     gated = slice(model.gated)
+    work.share[k] = share_of(one.columns(), 0, belief)
     noise /= work.share[k]
     work.noise[k, :count, :count], work.innovation[k, :count] = noise, innovation
     work.whitened[k], work.elsewhere[k] = 0.0, False
-    work.share[k] = share_of(one.columns(), 0, belief)
     # Gate; what is not finite at these poses is gated, too.
     if np.isfinite(s).all() and np.isfinite(innovation).all() and np.isfinite(jacobian).all():
         work.distance[k] = innovation[gated] @ np.linalg.solve(s[gated, gated], innovation[gated])

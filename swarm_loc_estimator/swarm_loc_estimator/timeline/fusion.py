@@ -33,7 +33,6 @@ from swarm_loc_estimator.filter.models import (
 )
 from swarm_loc_estimator.filter.sources import (
     CORRELATION_NS,
-    MAX_DOUBT,
     RELIEF,
     SUSPECT,
     WELL_CONFIRMED,
@@ -393,9 +392,7 @@ class Fusion:
         lately = np.sum(
             state.contradicted_ns[: robots + self._first_mount] > stamp_ns - _CONTRADICTED_WITHIN_NS
         )
-        if state.doubt:
-            state.doubt = min(state.doubt + 1.0, MAX_DOUBT)
-        if state.doubt or lately < _CONTRADICTED_DESCRIPTION or robots > self._policy.reopen_all_up_to:
+        if state.is_doubted or lately < _CONTRADICTED_DESCRIPTION or robots > self._policy.reopen_all_up_to:
             state.augment(source, poses[min(source, robots - 1)])
         else:
             state.augment_all(poses)
