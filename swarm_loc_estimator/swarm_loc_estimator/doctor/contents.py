@@ -215,6 +215,7 @@ _CONTRADICTED = MappingProxyType(
             "Check the mount of its camera, the size and ids of markers, and places of landmarks",
         ),
         Contradicted.DESCRIPTION: ("other than described", "Measure it again, or use survey or calibrate"),
+        Contradicted.REPEATED: ("repeated", "Let its driver publish each range once"),
         Contradicted.SUSPENDED: ("at odds with the rest", "Check its place, its clock, and whose body it is"),
     }
 )

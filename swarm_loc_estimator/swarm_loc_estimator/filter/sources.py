@@ -286,12 +286,17 @@ def assess(
     # What does it say? Outliers of links without kernel are those that are gated.
     limit = measurements.gate[k] if is_link else _OUTLIER
     drift, weight = state.drift[robot, place], share
-    for i in range(2):
-        drift[i] += _FORGETTING * share * (whitened[i] - drift[i])
+    if is_link:  # of one component; the other is the share of repeated values
+        drift[0] += _FORGETTING * share * (whitened[0] - drift[0])
+        drift[1] += _FORGETTING * ((1.0 if share == _LEAST_SHARE else 0.0) - drift[1])
+    else:
+        for i in range(2):
+            drift[i] += _FORGETTING * share * (whitened[i] - drift[i])
+    mean = drift[0] * drift[0] + (0.0 if is_link else drift[1] * drift[1])
     if distance > limit:
         state.finding[robot, place] = ELSEWHERE if elsewhere else DEVIATES
         weight *= min(distance / limit, _MAX_WEIGHT)
-    elif drift[0] * drift[0] + drift[1] * drift[1] > _DRIFT * _DRIFT:
+    elif mean > _DRIFT * _DRIFT:
         state.finding[robot, place] = DRIFTS
         weight *= _DRIFT_WEIGHT
     else:
@@ -445,6 +450,13 @@ def is_excluded(measurements: Measurements, k: int, belief: BeliefArrays, max_fa
     place = find_link(measurements, k, belief)
     aside: bool = place >= 0 and belief.sources.evidence[robot_of(measurements, k), place] >= EXCLUDED
     return aside or is_suspended(belief, source_of(measurements, k, belief), max_fault_score)
+
+
+def repeating_robots(state: SourceArrays, now_ns: int) -> BoolArray:
+    """Robots (N,) with a radio whose newest values are more often repeated than new."""
+    is_link = state.source >= state.score.size
+    repeats = is_link & (state.drift[..., 1] > 0.5) & (now_ns - state.seen_ns < _REPORTED_NS)
+    return np.asarray(repeats.any(axis=1))
 
 
 def excluded_links(state: SourceArrays, now_ns: int) -> list[tuple[int, int]]:

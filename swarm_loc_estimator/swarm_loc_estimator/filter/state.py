@@ -39,7 +39,8 @@ class SourceArrays(NamedTuple):
     seen_ns: IntArray  # (N, K) stamp of the newest measurement of the link
     finding: IntArray  # (N, K) what it says: AGREES, DRIFTS, DEVIATES or ELSEWHERE
     evidence: FloatArray  # (N, K) evidence against the link
-    drift: FloatArray  # (N, K, 2) mean of the last whitened innovations
+    # (N, K, 2) mean of the last whitened innovations; of a radio, the second is the share of repeated values
+    drift: FloatArray
     # (N, K, 3) x, y of the target as it was seen last [m], and `learned` of the robot then
     last_look: FloatArray
     score: FloatArray  # (S,) fault score

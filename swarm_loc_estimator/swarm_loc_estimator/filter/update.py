@@ -487,8 +487,11 @@ def _evaluate(
     work.accepted[row] = position_distance(innovation, s) <= measurements.gate[k]
     small = small_variances(measurements, k, predicted)
     work.distance[row] = position_distance(innovation, s, small)
-    for i in range(2):
-        work.whitened[row, i] = innovation[i] / math.sqrt(s[i, i] + small[i])
+    x, y = innovation[0] / math.sqrt(s[0, 0] + small[0]), innovation[1] / math.sqrt(s[1, 1] + small[1])
+    if is_fix(measurements, k):  # late fixes err along the path
+        cos, sin = math.cos(pose[1, 2]), math.sin(pose[1, 2])
+        x, y = cos * x + sin * y, cos * y - sin * x
+    work.whitened[row, 0], work.whitened[row, 1] = x, y
     work.elsewhere[row] = is_elsewhere(measurements, k, innovation, predicted)
     work.share[row] = share_of(measurements, k, belief)
     if measurements.observer[k] < 0 and measurements.systematic_share[k, 0] > 0.0:

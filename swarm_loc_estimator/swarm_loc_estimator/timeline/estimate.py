@@ -26,6 +26,7 @@ from swarm_loc_estimator.filter.sources import (
     excluded_links,
     inflate_suspect_covariance,
     is_contradicted,
+    repeating_robots,
 )
 from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
@@ -266,6 +267,7 @@ class Contradicted(Enum):
     SIGHTINGS = "sightings"
     DESCRIPTION = "description"
     SUSPENDED = "suspended source"
+    REPEATED = "repeated values"
 
 
 GYROSCOPE_OF = "gyroscope of "  # Before the name of its robot
@@ -331,6 +333,10 @@ def contradictions(
             for robot, source in aside
         ),
         *(_suspended(names[source]) for source in suspended.tolist()),
+        *(
+            _repeated(names[robot])
+            for robot in np.flatnonzero(repeating_robots(state.sources, now_ns)).tolist()
+        ),
         *(_description(names[source], source, state) for source in contradicted),
     ]
 
@@ -354,6 +360,11 @@ def _of_robot(name: str, kind: Contradicted) -> Contradiction:
 def _sightings(observer: str, source: str) -> Contradiction:
     text = f"excluding {observer}'s measurements of {source}: inconsistent with all others"
     return Contradiction(observer, Contradicted.SIGHTINGS, text)
+
+
+def _repeated(name: str) -> Contradiction:
+    text = f"the radio of {name} repeats its values: they count once; publish each range once, with its stamp"
+    return Contradiction(f"radio of {name}", Contradicted.REPEATED, text)
 
 
 def _suspended(name: str) -> Contradiction:
