@@ -73,6 +73,7 @@ _DOUBTED_M, _DOUBTED_RAD, _DOUBTED_HEADING, _DOUBTED_S = 0.02, 0.05, 0.15, 0.15
 
 LINK, UNDECIDED = -1, -2  # Who is wrong if no source is
 RECENT_NS, _ONE_IMAGE_NS = 400_000_000, 20_000_000
+_TIED_NS = 5_000_000_000  # A measurement that agreed so long ago still speaks for a pose
 CONFIRMED = 2.0  # Confirmations from which an assumed pose counts as known
 AGREES, DRIFTS, DEVIATES, ELSEWHERE = range(4)
 """Findings of the newest measurement of a link; an outlier that no wrong description explains: ELSEWHERE."""
@@ -493,14 +494,13 @@ def is_contradicted(belief: BeliefArrays, robot: int) -> bool:
     for place in range(state.source.shape[1]):
         newest_ns = max(newest_ns, state.seen_ns[robot, place])
     for place in range(state.source.shape[1]):
-        source = state.source[robot, place]
-        if source < 0 or newest_ns - state.seen_ns[robot, place] >= RECENT_NS:
-            continue
+        source, since_ns = state.source[robot, place], newest_ns - state.seen_ns[robot, place]
         finding, is_outer = state.finding[robot, place], source >= fixes_of(belief, 0)
-        denies = state.evidence[robot, place] >= EXCLUDED
-        denies = denies or (is_outer and finding >= DEVIATES) or is_suspended(belief, source, SUSPECT)
-        count += 1
-        denied += 1 if denies else 0
+        denies = state.evidence[robot, place] >= EXCLUDED or (is_outer and finding >= DEVIATES)
+        denies = denies or is_suspended(belief, source, SUSPECT)
+        if source >= 0 and since_ns < (RECENT_NS if denies else _TIED_NS):
+            count += 1
+            denied += 1 if denies else 0
     return denied > 0 and 2 * denied >= count
 
 
@@ -598,29 +598,26 @@ def count_gated(
     if accepted and (observer < 0 or target < 0):
         fixed = max(observer, target)
         belief.last_fix_ns[fixed] = max(belief.last_fix_ns[fixed], measurements.stamp_ns[k])
-    if (
-        not accepted
-        and is_fix(measurements, k)
-        and _is_off_its_fixes(belief, target, find_link(measurements, k, belief))
-    ):
-        lost, why = target, _OFF_FIXES
+    if share > 0.0 and not accepted and is_fix(measurements, k):
+        score, limit = state.score[source_of(measurements, k, belief)], limits.max_fault_score
+        if limit <= score < 1.5 * limit and _is_off_its_fixes(belief, target, measurements.stamp_ns[k]):
+            lost, why = target, _OFF_FIXES
     return lost, why
 
 
 @cached_njit
-def _is_off_its_fixes(belief: BeliefArrays, robot: int, place: int) -> bool:
+def _is_off_its_fixes(belief: BeliefArrays, robot: int, now_ns: int) -> bool:
     """Whether fixes deny a robot that nothing else ties to `map`.
 
     Robots that were located by way of it agree with it wherever it is.
     """
     state = belief.sources
-    if state.evidence[robot, place] < EXCLUDED:
-        return False
     for other in range(state.source.shape[1]):
-        ties = belief.tracked.size <= state.source[robot, other] < state.score.size and other != place
-        recent = state.seen_ns[robot, place] - state.seen_ns[robot, other] < RECENT_NS
+        ties = belief.tracked.size <= state.source[robot, other] < fixes_of(belief, 0)
+        recent = now_ns - state.seen_ns[robot, other] < _TIED_NS
         if ties and recent and state.finding[robot, other] == AGREES:
             return False
+    state.score[fixes_of(belief, robot)] = SUSPECT  # they locate it anew, and are suspect until they agree
     return True
 
 

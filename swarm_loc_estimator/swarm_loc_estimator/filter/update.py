@@ -255,12 +255,6 @@ def fuse(
                     work.contradicted[source] = True
                 if measurements.observer[i] < 0 and measurements.has_heading[i] and work.accepted[row]:
                     assess_direction(belief, measurements.target[i], work.misread[row], share, limit)
-                if (
-                    distance > limit
-                    and is_fix(measurements, i)
-                    and _is_occupied(measurements, i, tracks, belief)
-                ):
-                    belief.sources.score[source_of(measurements, i, belief)] = 2.0 * limit
                 place = find_link(measurements, i, belief)
                 if not has_kernel(measurements, i) and place >= 0:
                     scale = 1.0 + belief.sources.evidence[robot_of(measurements, i), place]
@@ -269,6 +263,12 @@ def fuse(
                             work.noise[row, a, b] *= scale
                 excluded = is_excluded(measurements, i, belief, limit)
                 work.accepted[row] = work.accepted[row] and not excluded
+                if is_fix(measurements, i) and not work.accepted[row]:
+                    occupied = _is_occupied(measurements, i, tracks, belief)
+                    if occupied:
+                        belief.sources.score[source_of(measurements, i, belief)] = 2.0 * limit
+                    if occupied or measurements.has_second[i]:  # sought near the pose: it does not refute it
+                        work.share[row] = 0.0
                 nis[i], verdicts[i] = work.nis[row], _USED if work.accepted[row] else _GATED
             # 5. Confirm assumed poses, or refute them; a link does not refute.
             for i in range(k, end):
