@@ -264,10 +264,11 @@ def fuse(
                 excluded = is_excluded(measurements, i, belief, limit)
                 work.accepted[row] = work.accepted[row] and not excluded
                 if is_fix(measurements, i) and not work.accepted[row]:
-                    occupied = _is_occupied(measurements, i, tracks, belief)
-                    if occupied:
-                        belief.sources.score[source_of(measurements, i, belief)] = 2.0 * limit
-                    if occupied or measurements.has_second[i]:  # sought near the pose: it does not refute it
+                    fixes, score = source_of(measurements, i, belief), belief.sources.score
+                    if _is_occupied(measurements, i, tracks, belief):
+                        score[fixes] = 2.0 * limit
+                    # Fixes that are wrong for long, or were sought near the pose, do not refute it.
+                    if score[fixes] >= 1.5 * limit or measurements.has_second[i]:
                         work.share[row] = 0.0
                 nis[i], verdicts[i] = work.nis[row], _USED if work.accepted[row] else _GATED
             # 5. Confirm assumed poses, or refute them; a link does not refute.
