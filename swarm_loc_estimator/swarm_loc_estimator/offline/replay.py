@@ -38,7 +38,7 @@ TICK_S = 0.1  # Default time between two outputs [s]
 TICKS_S = (1e-3, 3600.0)  # Range of it [s]
 
 
-_NOTED = (Contradicted.CONSTANT, Contradicted.GYROSCOPE)  # Kinds for which the estimator uses something else
+_NOTE_PERIOD_NS, _MAX_NOTES = 1_000_000_000, 20
 
 
 def replay(
@@ -89,8 +89,7 @@ def replay(
     if periodic.jumps:
         jumps = f"The log time jumps ahead by more than an hour, {periodic.jumps} x"
         remarks.append(f"{jumps}; no poses are given meanwhile.")
-    found = estimator.contradictions(summary.range_ns[1])
-    remarks += [f"Note: {one.text}." for one in found if one.kind in _NOTED]
+    remarks += runner.notes(summary.range_ns)
     result = runner.result(bag.name, summary.range_ns, {**summary.truth, **truth}, summary.received)
     if estimator.origin:
         remarks.append(
@@ -224,6 +223,8 @@ class Runner:
         self._losses: dict[int, list[LossReport]] = {}
         self._losses_left = _MAX_LOSSES
         self._filled = 0
+        self._notes: dict[tuple[str, Contradicted], tuple[int, str]] = {}
+        self._noted_ns = 0
 
     def take(self, inputs: Batch) -> None:
         """Feed inputs, and run all ticks that are due until the last of them."""
@@ -275,8 +276,25 @@ class Runner:
             wall_s=time.perf_counter() - self._began_s,
         )
 
+    def notes(self, range_ns: tuple[int, int]) -> list[str]:
+        """A remark on each source that was named in a recording, with the time after its first message."""
+        self._note(range_ns[1])
+        begin_ns, notes = range_ns[0], [*self._notes.values()]
+        said = [f"Note: {text} (at {max(0, at - begin_ns) * 1e-9:.1f} s)." for at, text in notes[:_MAX_NOTES]]
+        return said + [f"... and {len(notes) - _MAX_NOTES} more."] * (len(notes) > _MAX_NOTES)
+
+    def _note(self, now_ns: int) -> None:
+        """Keep the sentences about sources that are named now; a contradicted pose is a symptom."""
+        self._noted_ns = now_ns
+        for one in self._estimator.contradictions(now_ns):
+            if one.kind != Contradicted.POSE:
+                key = one.about, one.kind
+                self._notes[key] = self._notes.get(key, (now_ns, ""))[0], one.text
+
     def _tick(self, now_ns: int) -> None:
         estimate = self._estimator.tick(now_ns)
+        if now_ns - self._noted_ns >= _NOTE_PERIOD_NS:
+            self._note(now_ns)
         k, self._filled = self._filled, self._filled + 1
         self._stamp_ns[k], self._pose[k], self._covariance[k] = now_ns, estimate.poses, estimate.covariances
         self._status[k], self._heading_known[k] = estimate.status, estimate.heading_known

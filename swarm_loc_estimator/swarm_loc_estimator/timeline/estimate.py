@@ -362,13 +362,24 @@ def _sightings(observer: str, source: str) -> Contradiction:
     return Contradiction(observer, Contradicted.SIGHTINGS, text)
 
 
+_CHECKS = {
+    "": "its place (x, y, yaw), its topic and its clock",
+    "fixes": "whose body it is, the place of its frame and the clock",
+    "lidar": "its mount (lidar.yaw), its stamps and the map",
+    "marker": "the yaw of the face of {}",
+}
+"""What to check of a source that is not used."""
+
+
 def _repeated(name: str) -> Contradiction:
     text = f"the radio of {name} repeats its values: they count once; publish each range once, with its stamp"
     return Contradiction(f"radio of {name}", Contradicted.REPEATED, text)
 
 
 def _suspended(name: str) -> Contradiction:
-    text = f"the {name} contradicts the rest, and is not used until it agrees again"
+    what, _, robot = name.partition(" of ")
+    check = _CHECKS[what if robot else ""].format(robot)
+    text = f"{name} contradicts the rest, and is not used until it agrees again: check {check}"
     return Contradiction(name, Contradicted.SUSPENDED, text)
 
 
