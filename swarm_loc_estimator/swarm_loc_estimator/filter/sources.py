@@ -7,7 +7,7 @@ measured of each other. Four rules hold for all:
 **Floor.** No message makes the noise of a measurement smaller than the description allows (`sensors/`).
 
 **Rate.** Measurements of a link within its correlation time share their error: each counts by its share of
-that time, as information, as evidence, as confirmation and towards a loss. A value that comes
+that time, as information, as evidence, as confirmation and towards a loss. A range that comes
 again is none.
 
 **Systematic.** What errs in the same way again is a state (`swarm/calibration_states.py`), or is considered
@@ -54,7 +54,6 @@ CORRELATION_NS = 100_000_000  # Errors of a link within this time are the same
 _LEAST_SHARE = 1e-3
 # Systematic; tuned on MRCLAM set 1, where 80 % of the variances of sightings repeat
 _REPEATED = 0.5  # Share of the variance of a sighting that repeats at the same place
-_LASTING = 0.05  # Share of that which never fades: what a description lacks
 _LENGTH_M = 0.03  # Motion of one end, as the other sees it, after which its correlation is 1/e
 # Health; tuned on the scenarios of bench/integrity
 EXCLUDED, _MAX_EVIDENCE = 10.0, 15.0  # Evidence from which a link is excluded, and its maximum
@@ -68,6 +67,7 @@ SUSPECT, WELL_CONFIRMED = 7.5, 18.0
 _SUSPECT_SIGMA = (0.03, 0.03, 0.06)
 """Standard deviations added while a pose is suspect or little confirmed: x [m], y [m], heading [rad]."""
 
+DOUBTED_SHARE = 0.33  # Share of bad links from which a description is contradicted as a whole
 _DOUBTED_M, _DOUBTED_RAD, _DOUBTED_HEADING, _DOUBTED_S = 0.02, 0.05, 0.15, 0.15
 """Noise of sightings that is added once a description was contradicted as a whole [m], [rad], [rad], [s]."""
 
@@ -192,22 +192,11 @@ def share_of(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
         return _LEAST_SHARE if again or measurements.observer[k] < 0 else 1.0
     if since_ns < 0:
         return 1.0
-    x, y = _place_of(measurements, k)
     last = belief.sources.last_look[robot_of(measurements, k), place]
-    if x == last[0] and y == last[1]:
+    if measurements.value[k, 0] == last[0] and not has_kernel(measurements, k):
         return _LEAST_SHARE
     share: float = max(min(1.0, since_ns / CORRELATION_NS), _LEAST_SHARE)
     return share
-
-
-@inlined_njit
-def _place_of(measurements: Measurements, k: int) -> tuple[float, float]:
-    """Where measurement k puts its target, as its observer sees it; of a range, the range and 0."""
-    x: float = measurements.value[k, 0]
-    y: float = measurements.value[k, 1]
-    if measurements.model[k] == POLAR:
-        x, y = x * math.cos(y), x * math.sin(y)
-    return x, y
 
 
 @inlined_njit
@@ -453,6 +442,12 @@ def is_excluded(measurements: Measurements, k: int, belief: BeliefArrays, max_fa
     return aside or is_suspended(belief, source_of(measurements, k, belief), max_fault_score)
 
 
+def bad_share(state: SourceArrays, now_ns: int) -> float:
+    """Share of bad links among all that were measured recently, except radios'."""
+    recent = (state.source >= 0) & (state.source < state.score.size) & (now_ns - state.seen_ns < RECENT_NS)
+    return float(np.sum(recent & (state.finding != AGREES)) / max(1, np.sum(recent)))
+
+
 def repeating_robots(state: SourceArrays, now_ns: int) -> BoolArray:
     """Robots (N,) with a radio whose newest values are more often repeated than new."""
     is_link = state.source >= state.score.size
@@ -570,8 +565,16 @@ def depends_on_heading(position: float, sideways: tuple[float, float], heading: 
 
 @inlined_njit
 def inflate_suspect_covariance(state: SourceArrays, robot: int, covariance: FloatArray) -> None:
-    """Inflate the covariance (3, 3) of a pose that is suspect or little confirmed."""
-    if state.score[robot] > CONFIRMED or state.confirmations[robot] < WELL_CONFIRMED:
+    """Inflate the covariance (3, 3) of a pose that is suspect, little confirmed, or off most it measures."""
+    newest_ns, bad, count = NEVER_NS // 2, 0, 0
+    for place in range(state.source.shape[1]):
+        newest_ns = max(newest_ns, state.seen_ns[robot, place])
+    for place in range(state.source.shape[1]):
+        if state.source[robot, place] >= 0 and newest_ns - state.seen_ns[robot, place] < RECENT_NS:
+            count += 1
+            bad += 1 if state.finding[robot, place] != AGREES else 0
+    is_off = bad >= 2 and 2 * bad > count
+    if is_off or state.score[robot] > CONFIRMED or state.confirmations[robot] < WELL_CONFIRMED:
         for i in range(3):
             covariance[i, i] += _SUSPECT_SIGMA[i] ** 2
 
@@ -683,14 +686,15 @@ def _weight(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
     place, state, robot = find_link(measurements, k, belief), belief.sources, robot_of(measurements, k)
     if place < 0:
         return 0.0
-    (x, y), last = _place_of(measurements, k), state.last_look[robot, place]
-    moved, since = math.hypot(x - last[0], y - last[1]), math.exp(last[2] - state.learned[robot])
+    x, y, last = measurements.value[k, 0], measurements.value[k, 1], state.last_look[robot, place]
+    if measurements.model[k] == POLAR:
+        x, y = x * math.cos(y), x * math.sin(y)
+    moved, since = math.hypot(x - last[0], y - last[1]), last[2] - state.learned[robot]
     last[0], last[1], last[2] = x, y, state.learned[robot]
     if not has_kernel(measurements, k) or measurements.systematic_share[k, 0] > 0.0 or not moved >= 0.0:
         return 0.0
-    left = math.exp(-moved / _LENGTH_M) * since
-    repeats = left / max(1.0 - left, 1e-3) + _LASTING * since / max(1.0 - since, 1e-3)
-    return 2.0 * _REPEATED * repeats
+    left = math.exp(since - moved / _LENGTH_M)
+    return 2.0 * _REPEATED * left / max(1.0 - left, 1e-3)
 
 
 @cached_njit

@@ -41,7 +41,7 @@ class SourceArrays(NamedTuple):
     evidence: FloatArray  # (N, K) evidence against the link
     # (N, K, 2) mean of the last whitened innovations; of a radio, the second is the share of repeated values
     drift: FloatArray
-    # (N, K, 3) x, y of the target as it was seen last [m], and `learned` of the robot then
+    # (N, K, 3) x, y of the target as seen last [m], or its range, and `learned` of the robot then
     last_look: FloatArray
     score: FloatArray  # (S,) fault score
     confirmations: FloatArray  # (N,) number of measurements that agree with the robot's initial pose

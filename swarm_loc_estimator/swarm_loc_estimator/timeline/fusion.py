@@ -33,10 +33,12 @@ from swarm_loc_estimator.filter.models import (
 )
 from swarm_loc_estimator.filter.sources import (
     CORRELATION_NS,
+    DOUBTED_SHARE,
     RELIEF,
     SUSPECT,
     WELL_CONFIRMED,
     LossLimits,
+    bad_share,
     is_kidnapped,
     note_batch,
 )
@@ -73,8 +75,6 @@ _SURER_AT_FIRST = 1.5
 """`lost_heading_sigma` over the maximum standard deviation of the heading at initialization."""
 _PAIRS_PER_ROBOT = 32
 """Maximum number of observed robots per robot with a stored mean of infrared measurements."""
-_CONTRADICTED_DESCRIPTION, _CONTRADICTED_WITHIN_NS = 2, 60_000_000_000
-"""All parameters are re-estimated if this number of robots and landmarks is contradicted in this time."""
 _SETTLING_NS = 10_000_000_000  # A camera that is contradicted again so soon is suspended
 _NO: Any = np.False_
 
@@ -389,10 +389,11 @@ class Fusion:
             state.augment(source, poses[0])
             state.sources.score[source] = 2.0 * limit if stamp_ns < again_ns else 0.0
             return
-        lately = np.sum(
-            state.contradicted_ns[: robots + self._first_mount] > stamp_ns - _CONTRADICTED_WITHIN_NS
-        )
-        if state.is_doubted or lately < _CONTRADICTED_DESCRIPTION or robots > self._policy.reopen_all_up_to:
+        if (
+            state.is_doubted
+            or robots > self._policy.reopen_all_up_to
+            or bad_share(state.sources, stamp_ns) < DOUBTED_SHARE
+        ):
             state.augment(source, poses[min(source, robots - 1)])
         else:
             state.augment_all(poses)
