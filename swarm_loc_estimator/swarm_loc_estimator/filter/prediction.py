@@ -119,7 +119,7 @@ def _growth(belief: BeliefArrays, robot: int, stamp_ns: int) -> float:
     begin_ns, last_ns = belief.predicted_to_ns[robot], belief.sources.measured_ns[robot]
     middle_s = (0.5 * (begin_ns - last_ns) + 0.5 * (stamp_ns - last_ns)) * 1e-9
     growth: float = _GROWTH * max(0.0, middle_s)
-    return growth
+    return growth if belief.table.drives[robot] else 0.0
 
 
 @cached_njit

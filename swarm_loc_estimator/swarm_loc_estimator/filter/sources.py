@@ -58,8 +58,8 @@ _LENGTH_M = 0.03  # Motion of one end, as the other sees it, after which its cor
 # Health; tuned on the scenarios of bench/integrity
 EXCLUDED, _MAX_EVIDENCE = 10.0, 15.0  # Evidence from which a link is excluded, and its maximum
 _OUTLIER = 6.0
-_MAX_WEIGHT, _DRIFT_WEIGHT, RELIEF = 3.0, 0.5, 0.25
-"""Largest weight of an outlier, weight of a drift, and decrease by a measurement that agrees."""
+_MAX_WEIGHT, _MAX_LINK_WEIGHT, _DRIFT_WEIGHT, RELIEF = 3.5, 2.0, 0.5, 0.25
+"""Largest weights of an outlier and one of radios, weight of a drift, and decrease by what agrees."""
 _FORGETTING, _DRIFT = 0.125, 0.6
 """Weight of the newest in the mean of whitened innovations, and the mean from which they drift."""
 SUSPECT, WELL_CONFIRMED = 7.5, 18.0
@@ -184,12 +184,8 @@ def share_of(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
     if place < 0:
         return 1.0
     since_ns = measurements.stamp_ns[k] - belief.sources.seen_ns[robot_of(measurements, k), place]
-    if since_ns == 0:  # two markers of one picture are two measurements, the same one twice is not
-        again = k > 0 and measurements.stamp_ns[k] == measurements.stamp_ns[k - 1]
-        again = again and measurements.observer[k] == measurements.observer[k - 1]
-        again = again and measurements.target[k] == measurements.target[k - 1]
-        again = again and measurements.reading[k] == measurements.reading[k - 1]
-        return _LEAST_SHARE if again or measurements.observer[k] < 0 else 1.0
+    if since_ns == 0:  # two markers of one picture are two measurements, two fixes are not
+        return _LEAST_SHARE if is_fix(measurements, k) else 1.0
     if since_ns < 0:
         return 1.0
     last = belief.sources.last_look[robot_of(measurements, k), place]
@@ -273,8 +269,9 @@ def assess(
         place = _new_link(state, robot, source)
     now_ns = measurements.stamp_ns[k]
     state.seen_ns[robot, place] = max(now_ns, state.seen_ns[robot, place])
-    # What does it say? Outliers of links without kernel are those that are gated.
-    limit = measurements.gate[k] if is_link else _OUTLIER
+    # What does it say? Outliers of fixes and radios are those that are gated.
+    most = _MAX_LINK_WEIGHT if is_link else _MAX_WEIGHT
+    limit = measurements.gate[k] if is_link or is_fix(measurements, k) else _OUTLIER
     drift, weight = state.drift[robot, place], share
     if is_link:  # of one component; the other is the share of repeated values
         drift[0] += _FORGETTING * share * (whitened[0] - drift[0])
@@ -285,7 +282,7 @@ def assess(
     mean = drift[0] * drift[0] + (0.0 if is_link else drift[1] * drift[1])
     if distance > limit:
         state.finding[robot, place] = ELSEWHERE if elsewhere else DEVIATES
-        weight *= min(distance / limit, _MAX_WEIGHT)
+        weight *= min(distance / limit, most)
     elif mean > _DRIFT * _DRIFT:
         state.finding[robot, place] = DRIFTS
         weight *= _DRIFT_WEIGHT

@@ -55,6 +55,7 @@ class ParameterTable(NamedTuple):
     survey_column: NDArray[np.int64]
     survey: FloatArray  # (L, 3, 3) prior covariance of its right-invariant error
     reopened: FloatArray  # (L, 3, 3) covariance that is added after a contradiction
+    drives: BoolArray  # (N,) whether the robot has odometry
     first_camera: int  # Index of the first fixed camera among what was surveyed
     in_blocks: bool  # True if a robot's parameters have blocks of three columns, some of them unused
 
@@ -80,11 +81,12 @@ class ParameterTable(NamedTuple):
         doubted[[robot.camera is None for robot in robots], DRIVES:] = 0.0
         times = np.where(time_s > 0.0, time_s, np.inf)
         surveys = np.array([_survey(mark) for mark in landmarks]).reshape(-1, 3, 3)
+        drives = np.array([not robot.stands for robot in robots], dtype=bool)
         first_camera = sum(not isinstance(mark, FixedCamera) for mark in landmarks)
         reopened = np.array([_reopened(mark) for mark in landmarks]).reshape(-1, 3, 3)
         column, survey_column = np.full(sigma.shape, -1), np.full(len(landmarks), -1)
         table = cls(
-            column, doubted, times, survey_column, surveys, reopened, first_camera, in_blocks
+            column, doubted, times, survey_column, surveys, reopened, drives, first_camera, in_blocks
         ).with_parameters(wanted)
         surveyed = np.array([mark.is_estimated for mark in landmarks], dtype=bool)
         survey_column[surveyed] = table.filter_size + 3 * np.arange(surveyed.sum())

@@ -43,7 +43,7 @@ def test_pictures_that_repeat_their_errors_mislead_less() -> None:
         estimator, estimates = run(world)
         last = estimates[-1]
         error = wrapped(last.poses - world.at(last.stamp_ns))
-        excess = se2.pose_covariance(last.poses, estimator._timeline.state.integrity.excess)
+        excess = se2.pose_covariance(last.poses, estimator._timeline.state.sources.excess)
         told.append(nees(error, last.covariances))
         independent.append(nees(error, last.covariances - excess))
     assert np.median(told) < 8.0  # half of each error is taken as repeated, and all of it is
@@ -60,7 +60,7 @@ def test_robots_that_drive_on_are_as_certain_as_the_filter_is() -> None:
     world = simulate(replace(STANDING, standing=(), speed=0.4), 401)
     state = run(world)[0]._timeline.state
     own = np.array([np.trace(state.filter.block(3 * robot + np.arange(3))) for robot in range(3)])
-    assert (np.trace(state.integrity.excess, axis1=1, axis2=2) < 0.3 * own).all()
+    assert (np.trace(state.sources.excess, axis1=1, axis2=2) < 0.3 * own).all()
 
 
 @pytest.mark.parametrize("standing", [(), (0, 1, 2)])
@@ -73,5 +73,5 @@ def test_covariances_are_never_smaller_than_those_of_the_filter(standing: tuple[
             [(at, one) for at, one in on_time(world) if now_ns - SECOND // 2 < at <= now_ns],
             [now_ns],
         )
-        least = np.linalg.eigvalsh(estimator._timeline.state.integrity.excess)[:, 0]
+        least = np.linalg.eigvalsh(estimator._timeline.state.sources.excess)[:, 0]
         assert (least > -1e-11).all()
