@@ -134,14 +134,13 @@ class ParameterTable(NamedTuple):
 
 def _survey(mark: Surveyed) -> FloatArray:
     """Prior covariance (3, 3) of the right-invariant error of what was surveyed."""
-    return _error(mark, (mark.position_sigma, mark.yaw_sigma))
+    given = mark.position_sigma, mark.yaw_sigma
+    return _error(mark, given if mark.is_estimated else _CONTRADICTED_SURVEY_SIGMA)
 
 
 def _reopened(mark: Surveyed) -> FloatArray:
     """Covariance (3, 3) that is added to this error after a contradiction."""
-    if isinstance(mark, FixedCamera):
-        return _error(mark, _CONTRADICTED_CAMERA_SIGMA)
-    return _survey(mark) if mark.is_estimated else _error(mark, _CONTRADICTED_SURVEY_SIGMA)
+    return _error(mark, _CONTRADICTED_CAMERA_SIGMA) if isinstance(mark, FixedCamera) else _survey(mark)
 
 
 def _error(mark: Surveyed, sigma: tuple[float, float]) -> FloatArray:
