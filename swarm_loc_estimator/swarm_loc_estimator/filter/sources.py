@@ -68,9 +68,6 @@ _SUSPECT_SIGMA = (0.03, 0.03, 0.06)
 """Standard deviations added while a pose is suspect or little confirmed: x [m], y [m], heading [rad]."""
 
 DOUBTED_SHARE = 0.33  # Share of bad links from which a description is contradicted as a whole
-_DOUBTED_M, _DOUBTED_RAD, _DOUBTED_HEADING, _DOUBTED_S = 0.02, 0.05, 0.15, 0.15
-"""Noise of sightings that is added once a description was contradicted as a whole [m], [rad], [rad], [s]."""
-
 LINK, UNDECIDED = -1, -2  # Who is wrong if no source is
 RECENT_NS, _ONE_IMAGE_NS = 400_000_000, 20_000_000
 _TIED_NS = 5_000_000_000  # A measurement that agreed so long ago still speaks for a pose
@@ -193,24 +190,6 @@ def share_of(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
         return _LEAST_SHARE
     share: float = max(min(1.0, since_ns / CORRELATION_NS), _LEAST_SHARE)
     return share
-
-
-@inlined_njit
-def add_doubt(measurements: Measurements, k: int, belief: BeliefArrays, noise: FloatArray) -> None:
-    """Add what a description lacks that was contradicted as a whole to the noise (3, 3) of sighting k."""
-    if belief.is_doubted and measurements.observer[k] >= 0:
-        across = _DOUBTED_RAD if measurements.model[k] == POLAR else _DOUBTED_M
-        noise[0, 0] += _DOUBTED_M**2
-        noise[1, 1] += across * across
-        noise[2, 2] += _DOUBTED_HEADING**2
-
-
-@inlined_njit
-def stamp_variance(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
-    """Variance of the stamp of measurement k, as described and with such doubt [s^2]."""
-    doubt = _DOUBTED_S if belief.is_doubted and measurements.observer[k] >= 0 else 0.0
-    variance: float = measurements.stamp_variance[k] + doubt * doubt
-    return variance
 
 
 @inlined_njit
@@ -562,16 +541,8 @@ def depends_on_heading(position: float, sideways: tuple[float, float], heading: 
 
 @inlined_njit
 def inflate_suspect_covariance(state: SourceArrays, robot: int, covariance: FloatArray) -> None:
-    """Inflate the covariance (3, 3) of a pose that is suspect, little confirmed, or off most it measures."""
-    newest_ns, bad, count = NEVER_NS // 2, 0, 0
-    for place in range(state.source.shape[1]):
-        newest_ns = max(newest_ns, state.seen_ns[robot, place])
-    for place in range(state.source.shape[1]):
-        if state.source[robot, place] >= 0 and newest_ns - state.seen_ns[robot, place] < RECENT_NS:
-            count += 1
-            bad += 1 if state.finding[robot, place] != AGREES else 0
-    is_off = bad >= 2 and 2 * bad > count
-    if is_off or state.score[robot] > CONFIRMED or state.confirmations[robot] < WELL_CONFIRMED:
+    """Inflate the covariance (3, 3) of a pose that is suspect or little confirmed."""
+    if state.score[robot] > CONFIRMED or state.confirmations[robot] < WELL_CONFIRMED:
         for i in range(3):
             covariance[i, i] += _SUSPECT_SIGMA[i] ** 2
 

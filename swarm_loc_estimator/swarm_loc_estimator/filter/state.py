@@ -71,7 +71,6 @@ class BeliefArrays(NamedTuple):
     pair_stamp_ns: IntArray
     pair_history: FloatArray
     is_dense: bool
-    is_doubted: bool
 
 
 @cached_njit
@@ -287,7 +286,6 @@ class SwarmState:
             self.pair_stamp_ns,
             self.pair_history,
             self.filter.is_dense,
-            self.is_doubted,
         )
 
     def is_known(self, side: int) -> bool:

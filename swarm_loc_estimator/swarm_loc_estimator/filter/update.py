@@ -50,7 +50,6 @@ from swarm_loc_estimator.filter.prediction import new_scratch, predict
 from swarm_loc_estimator.filter.sources import (
     OCCUPIED_M,
     LossLimits,
-    add_doubt,
     assess,
     assess_direction,
     confirm,
@@ -67,7 +66,6 @@ from swarm_loc_estimator.filter.sources import (
     share_of,
     small_variances,
     source_of,
-    stamp_variance,
 )
 from swarm_loc_estimator.filter.state import (
     PAIR_ROWS,
@@ -330,7 +328,7 @@ def _predict_one(
                 lost: int = sides[i]
                 return lost
     _write_surveyed(measurements, k, belief, pose)
-    relative_motion(measurements, k, tracks, belief, pose, work.motion[0])
+    relative_motion(measurements, k, tracks, pose, work.motion[0])
     return -1
 
 
@@ -419,7 +417,7 @@ def _write_poses(
             if is_uncertain(belief, sides[i], pose, limits, drives, by_axes):
                 work.lost[sides[i]] = _UNCERTAIN
     _write_surveyed(measurements, k, belief, work.pose[k])
-    relative_motion(measurements, k, tracks, belief, work.pose[k], work.motion[k])
+    relative_motion(measurements, k, tracks, work.pose[k], work.motion[k])
 
 
 @inlined_njit
@@ -465,8 +463,7 @@ def _evaluate(
     predict_one(measurements, k, pose[0], pose[1], camera, predicted, value_jacobian)
     _write_jacobian(value_jacobian, bodies, camera_columns, columns, jacobian)
     assign_matrix(noise, measurements.covariance[k])
-    add_doubt(measurements, k, belief, noise)
-    of_stamp = stamp_variance(measurements, k, belief)
+    of_stamp = measurements.stamp_variance[k]
     if of_stamp > 0.0:
         _add_stamp_noise(value_jacobian, motion, of_stamp, noise)
     # Covariance of the innovation, S = H P H^T + R, eq. (13).
@@ -533,7 +530,6 @@ def relative_motion(
     measurements: Measurements,
     k: int,
     tracks: TrackArrays,
-    belief: BeliefArrays,
     pose: FloatArray,
     motion: FloatArray,
 ) -> None:
@@ -542,7 +538,7 @@ def relative_motion(
     Zero for an exact stamp, where the rate is not needed. `pose` (2, 3) is that of observer and target.
     """
     motion.fill(0.0)
-    if stamp_variance(measurements, k, belief) == 0.0:
+    if measurements.stamp_variance[k] == 0.0:
         return
     sides = (measurements.observer[k], measurements.target[k])
     for i in range(2):

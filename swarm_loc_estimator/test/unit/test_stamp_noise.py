@@ -99,11 +99,11 @@ def test_relative_motion_is_the_rate_of_what_is_predicted(target: int) -> None:
 
     motion = np.empty(3)
     _, jacobian, poses = predicted(0)
-    relative_motion(one, 0, tracks.arrays, BELIEF, poses, motion)
+    relative_motion(one, 0, tracks.arrays, poses, motion)
     rate = wrapped((predicted(2_000_000)[0] - predicted(-2_000_000)[0])[None])[0] / 0.004
     np.testing.assert_allclose(jacobian[:, :3] @ motion, rate, rtol=0.01, atol=2e-3)
     one.stamp_variance[:] = 0.0
-    relative_motion(one, 0, tracks.arrays, BELIEF, poses, motion)
+    relative_motion(one, 0, tracks.arrays, poses, motion)
     assert (motion == 0.0).all()
 
 
@@ -112,14 +112,14 @@ def test_a_robot_whose_motion_is_unknown_gives_no_rate() -> None:
     one = Measurements.empty(1)
     one.observer[:], one.target[:], one.stamp_variance[:], one.stamp_ns[:] = 0, NOBODY, 1.0, T0
     motion = np.full(3, np.nan)
-    relative_motion(one, 0, tracks.arrays, BELIEF, np.zeros((2, 3)), motion)
+    relative_motion(one, 0, tracks.arrays, np.zeros((2, 3)), motion)
     assert (motion == 0.0).all()  # nothing has come
     tracks.extend(
         np.zeros(2, np.int64), np.array([T0, T0 + SECOND // 10]), np.array([[0.0] * 3, [0.1, 0, 0]])
     )
     for after_s, expected in ((-1.0, 0.0), (0.05, -1.0), (0.3, -1.0), (5.0, 0.0)):
         one.stamp_ns[:] = T0 + round(after_s * SECOND)
-        relative_motion(one, 0, tracks.arrays, BELIEF, np.zeros((2, 3)), motion)
+        relative_motion(one, 0, tracks.arrays, np.zeros((2, 3)), motion)
         np.testing.assert_allclose(motion, [expected, 0.0, 0.0], atol=1e-9)
 
 
