@@ -288,7 +288,8 @@ def assess(
     limit = measurements.gate[k] if is_link else _OUTLIER
     drift, weight = state.drift[robot, place], share
     if is_link:  # of one component; the other is the share of repeated values
-        drift[0] += _FORGETTING * share * (whitened[0] - drift[0])
+        if distance <= limit:  # an outlier, which may be as large as any, tells of no drift
+            drift[0] += _FORGETTING * share * (whitened[0] - drift[0])
         drift[1] += _FORGETTING * ((1.0 if share == _LEAST_SHARE else 0.0) - drift[1])
     else:
         for i in range(2):
