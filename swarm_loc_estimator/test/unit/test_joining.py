@@ -238,7 +238,7 @@ def test_an_operator_seats_and_forgets_a_robot() -> None:
     assert estimator.tick(T0 + 5 * SECOND).status[0] == Status.WAITING
 
 
-def test_a_robot_that_waits_enters_with_the_third_exact_fix_and_the_clues_before_are_counted() -> None:
+def test_a_robot_that_waits_enters_with_the_third_exact_fix_and_the_fourth_confirms_it() -> None:
     world = simulate(Plan(1, 4.0, landmarks=0, start_known=(False,)), 5)
     estimator, status = Estimator(world.swarm), []
     for stamp_ns, event in on_time(world):
@@ -246,8 +246,8 @@ def test_a_robot_that_waits_enters_with_the_third_exact_fix_and_the_clues_before
         if (stamp_ns - T0) % SECOND == 0:
             give_fix(estimator, 0, stamp_ns, world.at(stamp_ns)[0], 1e-6 * np.eye(3), stamp_ns)
             status.append((estimator.tick(stamp_ns).status[0], *estimator.counters.values()))
-    waiting, tracked = Status.WAITING, Status.TRACKED
-    assert status == [(waiting, 0, 1), (waiting, 0, 2), (tracked, 0, 3), (tracked, 1, 3), (tracked, 2, 3)]
+    waiting, assumed, tracked = Status.WAITING, Status.UNCONFIRMED, Status.TRACKED
+    assert status == [(waiting, 0, 1), (waiting, 0, 2), (assumed, 0, 3), (tracked, 1, 3), (tracked, 2, 3)]
     assert not estimator.drops
 
 
