@@ -60,10 +60,10 @@ def test_a_camera_is_located_to_four_millimetres_by_markers_on_the_floor(describ
     assert described.position_sigma < 0.001
 
 
-def test_one_picture_locates_all_robots(described: FixedCamera) -> None:
+def test_three_pictures_locate_all_robots_and_the_fourth_confirms_them(described: FixedCamera) -> None:
     swarm = Swarm(ROBOTS, (), (described,))
     rig = CeilingRig(ROBOTS, (HUNG,), ARENA, MODEL, FLOOR, 1)
-    picture = rig.take(0, START_NS + 10**9, still(POSES), np.random.default_rng(9))
+    rng, estimator = np.random.default_rng(9), Estimator(swarm)
     detector = MarkerDetector(
         DetectorSettings(),
         {FAMILY: np.arange(250)},
@@ -71,15 +71,17 @@ def test_one_picture_locates_all_robots(described: FixedCamera) -> None:
         lengths=dict.fromkeys(range(3), TOP.size),
         bodies=[robot_body(robot) for robot in ROBOTS],
     )
-    rows = detection_rows(detector.detect(picture), 16.0)
-    count, stamp_ns = len(rows), START_NS + 10**9
-    seen = DetectionRows(np.full(count, 3), np.full(count, stamp_ns), rows, np.full(count, stamp_ns))
-    estimator = Estimator(swarm)
-    estimator.receive(Batch.of(stamp_ns, stamp_ns, detections=seen))
-    estimate = estimator.tick(stamp_ns)
-    assert (estimate.status == Status.TRACKED).all()
+    status = []
+    for stamp_ns in (START_NS + k * 10**8 for k in range(10, 14)):
+        rows = detection_rows(detector.detect(rig.take(0, stamp_ns, still(POSES), rng)), 16.0)
+        count = len(rows)
+        seen = DetectionRows(np.full(count, 3), np.full(count, stamp_ns), rows, np.full(count, stamp_ns))
+        estimator.receive(Batch.of(stamp_ns, stamp_ns, detections=seen))
+        estimate = estimator.tick(stamp_ns)
+        status.append(set(estimate.status.tolist()))
+    assert status == [{Status.WAITING}, {Status.WAITING}, {Status.UNCONFIRMED}, {Status.TRACKED}]
     errors = estimate.poses - POSES
     assert np.linalg.norm(errors[:, :2], axis=1).max() < 0.0015
     assert np.abs(se2.wrap_angle(errors[:, 2])).max() < math.radians(0.4)
-    assert estimator.drops == {"unknown_id": len(FLOOR)}
-    assert estimator.drops_of(3) == {"unknown_id": len(FLOOR)}
+    assert estimator.drops == {"unknown_id": 4 * len(FLOOR)}
+    assert estimator.drops_of(3) == {"unknown_id": 4 * len(FLOOR)}

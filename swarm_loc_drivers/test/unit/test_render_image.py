@@ -94,7 +94,7 @@ def seen_at(place: tuple[float, float, float, float], mount: CameraMount) -> tup
     return np.array([point[0], point[1], towards + turned]), float(point[2])
 
 
-@settings(max_examples=40)
+@settings(max_examples=40, deadline=None)
 @given(place=places, mount=mounts, model=st.sampled_from([SHARP, FISHY]))
 @example(  # both sides' long upright edges bend within one column
     place=(0.25, 0.25, 0.0, 0.0), mount=CameraMount(x=0.0, y=0.0, z=0.125), model=FISHY
@@ -124,7 +124,7 @@ def test_a_marker_fills_each_row_and_column_as_its_projection_does(
         assert (wrong <= 1e-4 + (BEND_PX * edge if model is FISHY else 0.0)).all()
 
 
-@settings(max_examples=60)
+@settings(max_examples=60, deadline=None)
 @given(place=places, mount=mounts, model=st.sampled_from([SHARP, SOFT]))
 def test_lines_through_a_markers_edges_meet_in_its_corners(
     place: tuple[float, float, float, float], mount: CameraMount, model: CameraModel
@@ -182,7 +182,7 @@ def _edge(light: Image, start: FloatArray, end: FloatArray) -> FloatArray:
     return np.array([1.0, -slope, -offset]) if upright else np.array([-slope, 1.0, -offset])
 
 
-@settings(max_examples=25)
+@settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), model=st.sampled_from([SHARP, FISHY]), tilt=st.floats(-0.15, 0.15))
 def test_a_picture_shows_what_its_rays_meet(seed: int, model: CameraModel, tilt: float) -> None:
     """Walls, floor, markers, bodies and who hides whom, from anywhere in the arena, to all sides."""

@@ -77,7 +77,7 @@ class JointFilter(Protocol):
         Args:
             columns: (m, 3) first columns of observers, targets and observers' cameras; -1: none.
             robots: Positions of all robots.
-            cross_covariance: (m, 3, 5) written by a sparse filter: of the observers with the targets, and of
+            cross_covariance: (m, 3, 6) written by a sparse filter: of the observers with the targets, and of
                 the targets with the cameras.
         """
 

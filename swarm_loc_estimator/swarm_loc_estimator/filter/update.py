@@ -289,7 +289,7 @@ def fuse(
                 before = _covariances(measurements, k, belief)
                 correction = update_one(belief.covariance, columns, jacobian, work.innovation[0], noise)
                 correct(belief, correction)
-                note_update(measurements, k, belief, before)
+                note_update(measurements, k, belief, before, work.cross_covariance[0, :, :3])
         # 7. Count gated measurements.
         for i in range(k, end):
             robot, why = count_gated(measurements, i, belief, work.accepted[i - k], work.share[i - k], limits)

@@ -14,7 +14,14 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
 from swarm_loc_estimator.filter.models import BEARING, CARTESIAN, POLAR
-from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, DetectionRows, SightingConverter
+from swarm_loc_estimator.sensors.camera import (
+    _FLOOR_M,
+    _FLOOR_RAD,
+    _FLOOR_SHARE,
+    CONTENT_BEARING,
+    DetectionRows,
+    SightingConverter,
+)
 from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, Swarm
@@ -124,7 +131,8 @@ def test_a_published_covariance_is_carried_into_the_plane(mount: CameraMount) ->
         Rotation.from_rotvec(errors[:, 3:]) * Rotation.from_quat(samples["orientation"])
     ).as_quat()
     spread = np.cov(converted(samples, swarm(mount))[0].value.T)
-    expected = measured.covariance[0]
+    floor = _FLOOR_M + _FLOOR_SHARE * np.hypot(*measured.value[0, :2])
+    expected = measured.covariance[0] - np.diag(np.square([floor, floor, _FLOOR_RAD]))
     np.testing.assert_allclose(spread, expected, atol=0.08 * np.abs(expected).max())
 
 

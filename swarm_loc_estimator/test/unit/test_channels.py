@@ -28,6 +28,7 @@ T0 = 1_000 * SECOND
 SWARM = Swarm((Robot("a", odometry=OdometryModel(wheel_noise=1e-6)), Robot("b", stands=True)))
 NAMES = st.sampled_from(["", "a", "ab/base_link", "r\u00f6/base_link"])
 COVARIANCE = np.diag([1e-4, 4e-4, 1e-2])
+FLOOR = np.diag(np.square([5e-4, 5e-4, 1e-3]))  # added to that of each fix
 
 
 def big_endian(data: bytes, message_type: str) -> bytes:
@@ -147,11 +148,12 @@ def test_fixes_without_covariance_have_that_of_the_description(
     measured = converter.convert(batch).rows["fixes"]
     assert converter.drops.total == ({} if used else {"fix_without_covariance": 1})
     *first, last = (measured.row(k) for k in range(measured.size))
-    np.testing.assert_array_equal(last.covariance, COVARIANCE)
+    np.testing.assert_allclose(last.covariance, COVARIANCE + FLOOR)
     assert [bool(one.has_heading) for one in first] == {"": [], "position": [False], "all": [True]}[used]
     for one in first:
-        variance = [0.1**2, 0.1**2, 0.2**2 if used == "all" else 1.0]
-        np.testing.assert_allclose(one.covariance, np.diag(variance))
+        expected = np.diag([0.1**2, 0.1**2, 0.2**2]) + FLOOR
+        expected[2, 2] = expected[2, 2] if used == "all" else 1.0
+        np.testing.assert_allclose(one.covariance, expected)
         np.testing.assert_allclose(one.value, [1.0, 2.0, 3.0 if used == "all" else 0.0])
 
 
@@ -205,11 +207,11 @@ def test_odometry_of_a_robot_that_has_none_is_dropped() -> None:
 
 
 def test_fixes_that_cannot_be_used_are_dropped_with_a_reason() -> None:
-    good, flat = COVARIANCE, np.diag([0.0, 1e-4, 1e-2])
+    good, bad = COVARIANCE, np.diag([1e-4, -1e-4, 1e-2])
     found, _ = read(
         ("b/fix", encode_fix("map", T0, (math.nan, 0.0, 0.0), good), T0),
         ("b/fix", encode_fix("map", T0, (1e9, 0.0, 0.0), good), T0),
-        ("b/fix", encode_fix("map", T0, (0.0, 0.0, 0.0), flat), T0),
+        ("b/fix", encode_fix("map", T0, (0.0, 0.0, 0.0), bad), T0),
         ("b/fix", encode_fix("map", T0 + SECOND, (0.0, 0.0, 0.0), good), T0),
     )
     estimator = Estimator(SWARM)

@@ -160,24 +160,28 @@ def test_a_robot_too_unsure_after_a_silence_waits_and_is_found_again(
 def test_a_robot_too_uncertain_is_not_tracked_though_nothing_measures_it(
     lost_sigma: float, lost_heading_sigma: float
 ) -> None:
+    """A heading alone makes no position uncertain, but one from which the position depends does."""
     world = simulate(Plan(2, 12.0), 1)
-    arrivals = [(t, e) for t, e in on_time(world) if e.pose is not None or t < T0 + 3 * SECOND]
+    arrivals = [(t, e) for t, e in on_time(world) if e.pose is not None or t < T0 + 4 * SECOND]
     instants = ticks(T0, T0 + 12 * SECOND)
     settings = Settings(lost_sigma=lost_sigma, lost_heading_sigma=lost_heading_sigma)
     limited = play(Estimator(world.swarm, settings), arrivals, instants)
     free = play(Estimator(world.swarm, Settings(lost_sigma=1e3, lost_heading_sigma=10.0)), arrivals, instants)
     for estimate, other in zip(limited, free, strict=True):
-        sigma = np.sqrt(np.diagonal(estimate.covariances, axis1=1, axis2=2))
-        beyond = (sigma[:, :2].max(axis=1) > settings.lost_sigma) | (
-            sigma[:, 2] > settings.lost_heading_sigma
-        )
+        variance = np.diagonal(estimate.covariances, axis1=1, axis2=2)
+        beyond = variance[:, :2].max(axis=1) > lost_sigma**2
+        unknown = variance[:, 2] > lost_heading_sigma**2
+        # the part of the variance of the position that the heading explains
+        explained = np.sum(estimate.covariances[:, :2, 2] ** 2, axis=1) / variance[:, 2]
+        beyond |= unknown & (explained > 0.1 * variance[:, :2].sum(axis=1))
         was_tracked = other.status == Status.TRACKED
         np.testing.assert_array_equal(
             estimate.status, np.where(beyond & was_tracked, Status.UNCERTAIN, other.status)
         )
+        np.testing.assert_array_equal(estimate.heading_known, ~unknown)
         np.testing.assert_array_equal(estimate.poses, other.poses)
         np.testing.assert_array_equal(estimate.covariances, other.covariances)
-    assert (limited[30].status == Status.TRACKED).all()
+    assert (limited[40].status == Status.TRACKED).all()
     assert (limited[-1].status == Status.UNCERTAIN).any()
 
 
@@ -238,7 +242,7 @@ def test_an_operator_seats_and_forgets_a_robot() -> None:
     assert estimator.tick(T0 + 5 * SECOND).status[0] == Status.WAITING
 
 
-def test_a_robot_that_waits_enters_with_the_third_exact_fix_and_the_clues_before_are_counted() -> None:
+def test_a_robot_that_waits_enters_with_the_third_exact_fix_and_the_fourth_confirms_it() -> None:
     world = simulate(Plan(1, 4.0, landmarks=0, start_known=(False,)), 5)
     estimator, status = Estimator(world.swarm), []
     for stamp_ns, event in on_time(world):
@@ -246,8 +250,8 @@ def test_a_robot_that_waits_enters_with_the_third_exact_fix_and_the_clues_before
         if (stamp_ns - T0) % SECOND == 0:
             give_fix(estimator, 0, stamp_ns, world.at(stamp_ns)[0], 1e-6 * np.eye(3), stamp_ns)
             status.append((estimator.tick(stamp_ns).status[0], *estimator.counters.values()))
-    waiting, tracked = Status.WAITING, Status.TRACKED
-    assert status == [(waiting, 0, 1), (waiting, 0, 2), (tracked, 0, 3), (tracked, 1, 3), (tracked, 2, 3)]
+    waiting, assumed, tracked = Status.WAITING, Status.UNCONFIRMED, Status.TRACKED
+    assert status == [(waiting, 0, 1), (waiting, 0, 2), (assumed, 0, 3), (tracked, 1, 3), (tracked, 2, 3)]
     assert not estimator.drops
 
 

@@ -70,7 +70,7 @@ class Both:
         first = np.where(pairs >= 0, 3 * pairs, -1)
         robots = Robots(self.places, self.active)
         dense, sparse = self.filters
-        related = np.zeros((count, 3, 5))
+        related = np.zeros((count, 3, 6))
         sparse.prepare_update(np.column_stack([first, np.full(count, -1)]), robots, related)
         cross_covariance = related[:, :, :3]
         for k in np.flatnonzero((pairs >= 0).all(axis=1)).tolist():
@@ -149,7 +149,7 @@ def test_a_copy_goes_its_own_way() -> None:
     other = sparse.copy()
     robots = Robots(both.places, both.active)
     first = 3 * pairs[:10]
-    other.prepare_update(np.column_stack([first, np.full(10, -1)]), robots, np.zeros((10, 3, 5)))
+    other.prepare_update(np.column_stack([first, np.full(10, -1)]), robots, np.zeros((10, 3, 6)))
     jacobian, noise = np.tile(np.hstack([-np.eye(3), np.eye(3)]), (10, 1, 1)), np.tile(np.eye(3), (10, 1, 1))
     columns = (first[:, :, None] + np.arange(3)).reshape(10, 6)
     other.update(columns, jacobian, np.ones((10, 3)), 1e-6 * noise)
@@ -166,14 +166,17 @@ def test_what_is_contradicted_is_estimated() -> None:
     before = state.filter.block(np.arange(3))
     state.augment(0, np.zeros(3))
     assert np.linalg.eigvalsh(state.filter.block(np.arange(3)) - before).min() > 1e-4
-    assert (state.parameter_sigma(0)[1:] > 0.01).all()
+    estimated = table.sigma[0] > 0.0
+    assert estimated[CAMERA_YAW]
+    assert (state.parameter_sigma(0)[estimated] > 0.01).all()
+    assert not state.parameter_sigma(0)[~estimated].any()
     assert not state.parameter_sigma(1).any()
     state.augment(2, np.zeros(3))
     column, yaw = state.landmark_column(0), int(state.arrays().table.column[0, CAMERA_YAW])
     assert np.linalg.eigvalsh(state.landmark_covariance(0)).min() > 1e-5
     assert isinstance(state.filter, SparseFilter)
     related = np.array([[0, column, yaw], [0, 3, yaw]])
-    cross_covariance = np.ones((2, 3, 5))
+    cross_covariance = np.ones((2, 3, 6))
     state.filter.prepare_update(related, Robots(np.zeros((2, 2)), state.tracked), cross_covariance)
     np.testing.assert_allclose(cross_covariance, 0.0, atol=1e-12)
     jacobian = np.zeros((1, 3, 8))

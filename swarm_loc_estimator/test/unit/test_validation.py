@@ -110,7 +110,7 @@ GOOD = np.array([0.3, 0.2, 0.1])
         ([1e200, 0.0, 0.0], np.eye(3), "absurd"),
         (GOOD, -np.eye(3), "bad_covariance"),
         (GOOD, math.nan * np.eye(3), "bad_covariance"),
-        (GOOD, np.diag([0.0, 1.0, 1.0]), "bad_covariance"),
+        (GOOD, np.diag([1.0, -1.0, 1.0]), "bad_covariance"),
         (GOOD, [[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 1.0]], "bad_covariance"),
         (GOOD, [[1.0, 0.5, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], "bad_covariance"),
     ],
@@ -128,6 +128,19 @@ def test_seats_and_fixes_are_checked(
         give_fix(estimator, 0, END, pose, covariance, END)
     assert_sound(estimator.tick(END))
     assert estimator.drops[reason] == before + 1
+
+
+def test_an_exact_coordinate_is_refused_for_a_seat_and_has_the_least_noise_in_a_fix() -> None:
+    run, flat = world(), np.diag([0.0, 1.0, 1.0])
+    estimator = Estimator(run.swarm)
+    play(estimator, on_time(run), ticks(T0, END))
+    assert estimator.set_pose(0, END, GOOD, flat) == "bad_covariance"
+    before = estimator.drops["bad_covariance"]
+    give_fix(estimator, 0, END, run.at(END)[0], flat, END)
+    assert_sound(estimator.tick(END))
+    assert estimator.drops["bad_covariance"] == before
+    fixes, _, _ = estimator.recent()
+    assert fixes.covariance[-1, 0, 0] == pytest.approx(5e-4**2)
 
 
 def test_a_robot_is_seated_from_its_first_odometry_on_and_before_that_refused() -> None:
@@ -304,7 +317,7 @@ def test_drops_are_counted_for_the_robot_whose_data_they_are() -> None:
     estimator.tick(now_ns)
     for robot, stamp_ns in stamps_ns.items():
         Event(robot, stamp_ns, (0.0, 0.0, 0.0)).give(estimator, now_ns)
-    give_fix(estimator, 2, now_ns, np.zeros(3), np.diag([1.0, 1.0, 0.0]), now_ns)
+    give_fix(estimator, 2, now_ns, np.zeros(3), np.diag([1.0, 1.0, -1.0]), now_ns)
     give_fix(estimator, 1, now_ns, np.zeros(3), np.zeros((3, 3)), now_ns)
     estimator.tick(now_ns)
     expected: list[dict[str, int]] = [

@@ -491,7 +491,7 @@ class Solver:
         poses = [se2.compose(self._knot[observer], problem.tracks[0, rows])]
         moved = se2.compose(self._knot[target], problem.tracks[1, rows])
         poses.append(np.where((target >= 0)[:, None], moved, self._landmark[mark]))
-        camera = self._parameter[robot, 3:]
+        camera = np.pad(self._parameter[robot, 3:], ((0, 0), (0, 1)))  # ranges have no offset
         value, jacobian = predict(some, poses[0], poses[1], camera)
         by_pose = jacobian[:, :, :3]
         noise = some.covariance.copy()
@@ -505,7 +505,7 @@ class Solver:
         mirrored = -np.einsum("kij,kj->ki", root, other)
         better = (some.has_second > 0) & (np.sum(mirrored**2, axis=1) < np.sum(residual**2, axis=1))
         residual[better] = mirrored[better]
-        whole = np.concatenate([-by_pose, by_pose, jacobian[:, :, 3:]], axis=2)
+        whole = np.concatenate([-by_pose, by_pose, jacobian[:, :, 3:5]], axis=2)
         columns = np.full((rows.size, 8), -1)
         columns[:, :3] = self._knot_column[observer][:, None] + np.arange(3)
         first = np.where(target >= 0, self._knot_column[target], self._landmark_column[mark])
