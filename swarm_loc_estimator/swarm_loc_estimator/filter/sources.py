@@ -617,7 +617,7 @@ def _is_off_its_fixes(belief: BeliefArrays, robot: int, now_ns: int) -> bool:
         recent = now_ns - state.seen_ns[robot, other] < _TIED_NS
         if ties and recent and state.finding[robot, other] == AGREES:
             return False
-    state.score[fixes_of(belief, robot)] = SUSPECT  # they locate it anew, and are suspect until they agree
+    state.score[fixes_of(belief, robot)] = SUSPECT  # they locate it again, and are suspect until they agree
     return True
 
 
