@@ -45,14 +45,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.numerics import (
-    assign,
-    assign_matrix,
-    between,
-    cholesky3,
-    composed,
-    wrap,
-)
+from swarm_loc_estimator.common.numerics import assign, assign_matrix, between, cholesky3, composed, wrap
 from swarm_loc_estimator.filter.measurements import Measurements
 from swarm_loc_estimator.filter.models import ANY_HEADING
 from swarm_loc_estimator.filter.state import PAIR_ROWS, BeliefArrays

@@ -33,12 +33,7 @@ from swarm_loc_estimator.common.numerics import (
     factor_numbers,
     moved_by_twist,
 )
-from swarm_loc_estimator.filter.state import (
-    BeliefArrays,
-    covariance_within,
-    own_column,
-    own_covariance,
-)
+from swarm_loc_estimator.filter.state import BeliefArrays, covariance_within, own_column, own_covariance
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, DRIVES, TURN_BIAS
 

@@ -83,7 +83,6 @@ _SMALL_M, _SMALL_SHARE = 0.003, 0.005
 _REPORTED_NS = 3_000_000_000
 OCCUPIED_M = 0.02  # Two robots cannot be nearer [m]
 
-
 _SHARE_OF_HEADING, _SHARE_OF_DRIVER = 0.5, 0.1
 """Share of a position's variance by the heading from which its error lies on an arc, and that of a robot with
 odometry: its earlier headings, which the present one does not tell, have moved it, too."""
@@ -115,13 +114,10 @@ def source_of(measurements: Measurements, k: int, belief: BeliefArrays) -> int:
     more, and no other links.
     """
     robots, sources = belief.tracked.size, belief.sources.score.size
-    landmark: int = measurements.landmark[k]
-    mount: int = measurements.mount[k]
+    surveyed: int = max(measurements.landmark[k], measurements.mount[k])
     source: int = measurements.target[k]
-    if landmark >= 0:
-        source = robots + landmark
-    elif mount >= 0:
-        source = robots + mount
+    if surveyed >= 0:
+        source = robots + surveyed
     elif measurements.observer[k] < 0:
         source = fixes_of(belief, source)
     return source if has_kernel(measurements, k) or source < 0 else source + sources
@@ -169,10 +165,8 @@ def _new_link(state: SourceArrays, robot: int, source: int) -> int:
             oldest = place
     state.source[robot, oldest], state.seen_ns[robot, oldest] = source, NEVER_NS // 2
     state.finding[robot, oldest], state.evidence[robot, oldest] = AGREES, 0.0
-    for i in range(2):
-        state.drift[robot, oldest, i] = 0.0
-    for i in range(3):
-        state.last_look[robot, oldest, i] = math.nan
+    state.drift[robot, oldest].fill(0.0)
+    state.last_look[robot, oldest].fill(math.nan)
     return oldest
 
 
@@ -318,10 +312,8 @@ def _as_good(belief: BeliefArrays, robot: int, guilty: int, now_ns: int) -> int:
 def assess_direction(belief: BeliefArrays, robot: int, misread: bool, share: float, limit: float) -> None:
     """Update the fault score of the direction of a robot's marker by a measurement from outside."""
     direction, score = direction_of(belief, robot), belief.sources.score
-    if misread:
-        score[direction] = min(score[direction] + share, 2.0 * limit)
-    else:
-        score[direction] = max(0.0, score[direction] - share * RELIEF)
+    change = share if misread else -share * RELIEF
+    score[direction] = min(max(0.0, score[direction] + change), 2.0 * limit)
 
 
 @cached_njit
@@ -543,8 +535,8 @@ def depends_on_heading(position: float, sideways: tuple[float, float], heading: 
 
 
 @inlined_njit
-def inflate_suspect_covariance(state: SourceArrays, robot: int, covariance: FloatArray) -> None:
-    """Inflate the covariance (3, 3) of a pose that is suspect or little confirmed."""
+def widen_suspect_covariance(state: SourceArrays, robot: int, covariance: FloatArray) -> None:
+    """Widen the covariance (3, 3) of a pose that is suspect or little confirmed."""
     if state.score[robot] > CONFIRMED or state.confirmations[robot] < WELL_CONFIRMED:
         for i in range(3):
             covariance[i, i] += _SUSPECT_SIGMA[i] ** 2
@@ -552,12 +544,7 @@ def inflate_suspect_covariance(state: SourceArrays, robot: int, covariance: Floa
 
 @inlined_njit
 def count_gated(
-    measurements: Measurements,
-    k: int,
-    belief: BeliefArrays,
-    accepted: bool,
-    share: float,
-    limits: LossLimits,
+    measurements: Measurements, k: int, belief: BeliefArrays, accepted: bool, share: float, limits: LossLimits
 ) -> tuple[int, int]:
     """Count gated measurements in a row; return a robot that is lost by them, or -1, and why."""
     observer, target, state = measurements.observer[k], measurements.target[k], belief.sources
@@ -591,7 +578,7 @@ def _is_off_its_fixes(belief: BeliefArrays, robot: int, now_ns: int) -> bool:
         recent = now_ns - state.seen_ns[robot, other] < _TIED_NS
         if ties and recent and state.finding[robot, other] == AGREES:
             return False
-    state.score[fixes_of(belief, robot)] = SUSPECT  # they locate it anew, and are suspect until they agree
+    state.score[fixes_of(belief, robot)] = SUSPECT  # they locate it again, and are suspect until they agree
     return True
 
 

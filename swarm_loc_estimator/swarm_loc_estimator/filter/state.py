@@ -16,13 +16,12 @@ from swarm_loc_estimator.filter.joint_filter import DenseFilter, JointFilter
 from swarm_loc_estimator.filter.measurements import NOBODY, LossReason
 from swarm_loc_estimator.identification.memory import IdentityMemory
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
-from swarm_loc_estimator.swarm.calibration_states import (
-    PARAMETERS,
-    ParameterTable,
-)
+from swarm_loc_estimator.swarm.calibration_states import PARAMETERS, ParameterTable
 
 NEVER_NS = np.iinfo(np.int64).min
 PAIR_ROWS = 10  # Rows of three numbers stored per pair, see `correlated_noise.py`
+DEPENDS_ON = 9
+"""Filter columns per measurement: three of the observer, three of the target, three of the camera."""
 _LINKS = 16  # Most recent links of a robot that are remembered
 _DOUBTED_POSE_SIGMA = (0.02, 0.02, 0.03)
 """Standard deviation added to the pose of a contradicted robot [m], [m], [rad]."""
@@ -71,6 +70,69 @@ class BeliefArrays(NamedTuple):
     pair_stamp_ns: IntArray
     pair_history: FloatArray
     is_dense: bool
+
+
+class Innovations(NamedTuple):
+    """Measurements (m,) evaluated at one belief, and reused buffers for one evaluation."""
+
+    # (m, 2, 3) observers and targets in `map` at the stamps; of a landmark, its pose correction
+    pose: FloatArray
+    # (m, 3) rate of change of xi_target - xi_observer by driving [1/s], see `relative_motion`
+    motion: FloatArray
+    # (m, 3, 6) of the observer's error with the target's, and of the target's with the parameters of the
+    # observer's camera
+    cross_covariance: FloatArray
+    columns: IntArray  # (m, DEPENDS_ON) filter columns
+    jacobian: FloatArray  # (m, 3, DEPENDS_ON) Jacobian of the innovation
+    innovation: FloatArray  # (m, 3) measured minus predicted
+    noise: FloatArray  # (m, 3, 3) measurement covariances for the update
+    pair: FloatArray  # (m, PAIR_ROWS, 3) new mean of the pair, stored if used, see `correlated_noise`
+    # (m,) squared, Mahalanobis, that is gated; of a marker's position without small errors
+    distance: FloatArray
+    whitened: FloatArray  # (m, 2) innovation of the position over its deviation, as for `distance`
+    share: FloatArray  # (m,) by how much it counts, see `sources.share_of`
+    elsewhere: BoolArray  # (m,) whether no wrong description explains the innovation
+    misread: BoolArray  # (m,) whether the direction of a marker is read turned by a quarter or more
+    accepted: BoolArray  # (m,) True if the innovation passes the gate
+    nis: FloatArray  # (m,) normalized innovation squared
+    lost: IntArray  # (N + 1,) why a robot is lost (`LossReason`), 0: it is not; the last element is NOBODY
+    contradicted: BoolArray  # (N + L,) True for robots and landmarks that are contradicted
+    predicted: FloatArray  # (3,) value
+    other: FloatArray  # (3,) innovation of the second solution
+    value_jacobian: FloatArray  # (3, 6) Jacobian of the value, see `models.predict`
+    relative_covariance: FloatArray  # (3, 3) covariance of xi_target - xi_observer
+    innovation_covariance: FloatArray  # (3, 3) covariance of the innovation
+    variances: FloatArray  # (3,) of the predicted value
+
+
+@cached_njit
+def new_innovations(count: int, robots: int, sources: int) -> Innovations:
+    """Allocate innovations of `count` measurements; `sources` are robots and landmarks."""
+    return Innovations(
+        np.zeros((count, 2, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 6)),
+        np.zeros((count, DEPENDS_ON), dtype=np.int64),
+        np.zeros((count, 3, DEPENDS_ON)),
+        np.zeros((count, 3)),
+        np.zeros((count, 3, 3)),
+        np.zeros((count, PAIR_ROWS, 3)),
+        np.zeros(count),
+        np.zeros((count, 2)),
+        np.zeros(count),
+        np.zeros(count, dtype=np.bool_),
+        np.zeros(count, dtype=np.bool_),
+        np.zeros(count, dtype=np.bool_),
+        np.zeros(count),
+        np.zeros(robots + 1, dtype=np.int64),
+        np.zeros(sources, dtype=np.bool_),
+        np.zeros(3),
+        np.zeros(3),
+        np.zeros((3, 6)),
+        np.zeros((3, 3)),
+        np.zeros((3, 3)),
+        np.zeros(3),
+    )
 
 
 @cached_njit
@@ -376,7 +438,7 @@ class SwarmState:
 
         Args:
             source: Index of the robot, or N plus the index of the landmark.
-            pose: (3,) of the robot in `map`; its covariance is inflated.
+            pose: (3,) of the robot in `map`; its covariance is widened.
         """
         robots = self.tracked.size
         self.sources.score[source] = 0.0

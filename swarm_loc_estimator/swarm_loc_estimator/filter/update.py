@@ -22,12 +22,11 @@ against its link, never against one end. It takes no part in the mean of repeate
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.numerics import assign, assign_matrix
 from swarm_loc_estimator.filter.correlated_noise import inflate_fix, record_pair, use_mean
@@ -68,10 +67,11 @@ from swarm_loc_estimator.filter.sources import (
     source_of,
 )
 from swarm_loc_estimator.filter.state import (
-    PAIR_ROWS,
     BeliefArrays,
+    Innovations,
     correct,
     covariance_within,
+    new_innovations,
     own_within,
     to_map,
 )
@@ -84,15 +84,8 @@ from swarm_loc_estimator.odometry.track_arrays import (
     new_sample,
     rate_at,
 )
-from swarm_loc_estimator.swarm.calibration_states import (
-    CAMERA_OFFSET,
-    CAMERA_SCALE,
-    CAMERA_YAW,
-    PARAMETERS,
-)
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_OFFSET, CAMERA_SCALE, CAMERA_YAW, PARAMETERS
 
-DEPENDS_ON = 9
-"""Filter columns per measurement: three of the observer, three of the target, three of the camera."""
 _USED, _GATED = int(Verdict.USED), int(Verdict.GATED)
 _UNCERTAIN, _REFUTED = int(LossReason.UNCERTAIN), int(LossReason.REFUTED)
 PREDICT, EVALUATE, ATTRIBUTE, SETTLE = 1, 2, 4, 7  # Stages at which `fuse` is begun or resumed
@@ -102,70 +95,6 @@ or landmark is contradicted."""
 PREDICTED, IS_LINK, CORRECTS = 4, 5, 6
 """Why it pauses: sides are predicted; links are to be evaluated by their records; the joint filter is to
 correct. It is resumed at EVALUATE, ATTRIBUTE and SETTLE."""
-
-
-class Innovations(NamedTuple):
-    """Measurements (m,) evaluated at one belief, and reused buffers for one evaluation."""
-
-    # (m, 2, 3) observers and targets in `map` at the stamps; of a landmark, its pose correction
-    pose: FloatArray
-    # (m, 3) rate of change of xi_target - xi_observer by driving [1/s], see `relative_motion`
-    motion: FloatArray
-    # (m, 3, 6) of the observer's error with the target's, and of the target's with the parameters of the
-    # observer's camera
-    cross_covariance: FloatArray
-    columns: IntArray  # (m, DEPENDS_ON) filter columns
-    jacobian: FloatArray  # (m, 3, DEPENDS_ON) Jacobian of the innovation
-    innovation: FloatArray  # (m, 3) measured minus predicted
-    noise: FloatArray  # (m, 3, 3) measurement covariances for the update
-    pair: FloatArray  # (m, PAIR_ROWS, 3) new mean of the pair, stored if used, see `correlated_noise`
-    distance: (
-        FloatArray  # (m,) squared, Mahalanobis, that is gated; of a marker's position without small errors
-    )
-    whitened: FloatArray  # (m, 2) innovation of the position over its deviation, as for `distance`
-    share: FloatArray  # (m,) by how much it counts, see `sources.share_of`
-    elsewhere: BoolArray  # (m,) whether no wrong description explains the innovation
-    misread: BoolArray  # (m,) whether the direction of a marker is read turned by a quarter or more
-    accepted: BoolArray  # (m,) True if the innovation passes the gate
-    nis: FloatArray  # (m,) normalized innovation squared
-    lost: IntArray  # (N + 1,) why a robot is lost (`LossReason`), 0: it is not; the last element is NOBODY
-    contradicted: BoolArray  # (N + L,) True for robots and landmarks that are contradicted
-    predicted: FloatArray  # (3,) value
-    other: FloatArray  # (3,) innovation of the second solution
-    value_jacobian: FloatArray  # (3, 6) Jacobian of the value, see `models.predict`
-    relative_covariance: FloatArray  # (3, 3) covariance of xi_target - xi_observer
-    innovation_covariance: FloatArray  # (3, 3) covariance of the innovation
-    variances: FloatArray  # (3,) of the predicted value
-
-
-@cached_njit
-def new_innovations(count: int, robots: int, sources: int) -> Innovations:
-    """Allocate innovations of `count` measurements; `sources` are robots and landmarks."""
-    return Innovations(
-        np.zeros((count, 2, 3)),
-        np.zeros((count, 3)),
-        np.zeros((count, 3, 6)),
-        np.zeros((count, DEPENDS_ON), dtype=np.int64),
-        np.zeros((count, 3, DEPENDS_ON)),
-        np.zeros((count, 3)),
-        np.zeros((count, 3, 3)),
-        np.zeros((count, PAIR_ROWS, 3)),
-        np.zeros(count),
-        np.zeros((count, 2)),
-        np.zeros(count),
-        np.zeros(count, dtype=np.bool_),
-        np.zeros(count, dtype=np.bool_),
-        np.zeros(count, dtype=np.bool_),
-        np.zeros(count),
-        np.zeros(robots + 1, dtype=np.int64),
-        np.zeros(sources, dtype=np.bool_),
-        np.zeros(3),
-        np.zeros(3),
-        np.zeros((3, 6)),
-        np.zeros((3, 3)),
-        np.zeros((3, 3)),
-        np.zeros(3),
-    )
 
 
 @cached_njit
@@ -256,9 +185,7 @@ def fuse(
                 place = find_link(measurements, i, belief)
                 if not has_kernel(measurements, i) and place >= 0:
                     scale = 1.0 + belief.sources.evidence[robot_of(measurements, i), place]
-                    for a in range(3):
-                        for b in range(3):
-                            work.noise[row, a, b] *= scale
+                    work.noise[row] *= scale
                 excluded = is_excluded(measurements, i, belief, limit)
                 work.accepted[row] = work.accepted[row] and not excluded
                 if is_fix(measurements, i) and not work.accepted[row]:
@@ -445,12 +372,7 @@ def related_columns(measurements: Measurements, belief: BeliefArrays) -> IntArra
 
 @inlined_njit
 def _evaluate(
-    measurements: Measurements,
-    k: int,
-    belief: BeliefArrays,
-    limits: LossLimits,
-    work: Innovations,
-    row: int,
+    measurements: Measurements, k: int, belief: BeliefArrays, limits: LossLimits, work: Innovations, row: int
 ) -> None:
     """Linearize measurement k about the belief and gate it: stages 2 and 3; write the row of `work`."""
     columns, jacobian, innovation = work.columns[row], work.jacobian[row], work.innovation[row]
@@ -495,9 +417,7 @@ def _evaluate(
     if measurements.observer[k] < 0 and measurements.systematic_share[k, 0] > 0.0:
         work.nis[row] = squared_distance(innovation, s)
         work.accepted[row] = work.nis[row] <= POSE_GATE
-        for i in range(3):
-            for j in range(3):
-                s[i, j] -= noise[i, j]
+        s -= noise
         inflate_fix(measurements.systematic_share[k], s, noise)
         return
     # A heading that may be flipped or misread counts less.
@@ -519,9 +439,7 @@ def _evaluate(
                 s[2, i] = s[i, 2]
     work.nis[row] = squared_distance(innovation, s)
     # Looks that follow each other closely share their errors; so do repeated exchanges of a pair.
-    for i in range(3):
-        for j in range(3):
-            noise[i, j] /= work.share[row]
+    noise /= work.share[row]
     use_mean(measurements, k, belief, pose, predicted, variances, innovation, noise, work.pair[row])
 
 

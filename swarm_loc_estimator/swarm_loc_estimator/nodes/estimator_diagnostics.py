@@ -17,7 +17,7 @@ from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.inputs import Ingest, InputStatistics, InputTopic
 from swarm_loc_estimator.swarm.swarm import FixedCamera, Robot, Swarm
-from swarm_loc_estimator.timeline.estimate import GYROSCOPE_OF, Contradiction, LossReport
+from swarm_loc_estimator.timeline.estimate import Contradiction, LossReport
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
 
 _FULL_LOAD = 0.95
@@ -68,7 +68,7 @@ def add_contradictions(reports: Sequence[Report], contradictions: Sequence[Contr
     """Add contradictions to the reports of the robots that they are about, the others to the last report."""
     report_of = {report.name: report for report in reports}
     for one in contradictions:
-        report = report_of.get(one.about.removeprefix(GYROSCOPE_OF), reports[-1])
+        report = report_of.get(one.about.rpartition(" of ")[2], reports[-1])
         report.message = f"{report.message}; {one.text}" if report.warning else one.text
         report.level = Level.WARN
 

@@ -4,7 +4,7 @@ Steps are checked for jumps, resets, and a pose that is constant while the twist
 with what the robot can do between two stamps, and with the twists at both ends. Drivers report the twist of
 the step before, of the step after or of the instant, so the mean twist of a step lies between the two; while
 it does not, or the twist is not filled, it proves nothing. Where there is a gyroscope, its turn rate is
-integrated to the turn, as long as it agrees with the wheels, see `gyro_check.py`.
+integrated to the turn, as long as it agrees with the wheels, see `track_arrays.py`.
 """
 
 from __future__ import annotations
@@ -18,26 +18,24 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit, norefcount_njit
 from swarm_loc_estimator.common.numerics import add_scaled, assign, assign_matrix, wrap
-from swarm_loc_estimator.odometry.gyro_check import (
-    DOUBT,
-    SOON_UNSURE,
-    UNSURE,
-    begin_check,
-    check_turn,
-    continue_check,
-    first_to_change,
-    unmark_from,
-)
 from swarm_loc_estimator.odometry.track_arrays import (
     BEFORE_ALL_NS,
+    DOUBT,
     LATEST_NS,
+    SOON_UNSURE,
+    UNSURE,
     OdometryStep,
     TrackArrays,
     add_dropout_noise,
     add_in_track_frame,
     add_step_jacobian,
     add_step_noise,
+    begin_check,
+    check_turn,
+    continue_check,
+    first_to_change,
     turn_variance,
+    unmark_from,
 )
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 

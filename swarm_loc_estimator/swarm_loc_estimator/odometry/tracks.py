@@ -19,7 +19,6 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.odometry.gyro_check import CHECKS, COVER_NS, DOUBT, GYRO, WHEELS, unmark_from
 from swarm_loc_estimator.odometry.preintegration import (
     UNCHANGED_NS,
     NewRows,
@@ -30,12 +29,18 @@ from swarm_loc_estimator.odometry.preintegration import (
 )
 from swarm_loc_estimator.odometry.track_arrays import (
     BEFORE_ALL_NS,
+    CHECKS,
+    COVER_NS,
+    DOUBT,
+    GYRO,
     IMU_DTYPE,
     LATEST_NS,
     MODEL_DTYPE,
+    WHEELS,
     OdometrySample,
     TrackArrays,
     look_up_all,
+    unmark_from,
 )
 from swarm_loc_estimator.swarm.error_models import MotionResponse
 from swarm_loc_estimator.swarm.swarm import Robot

@@ -15,7 +15,7 @@ from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, select
 from swarm_loc_estimator.filter.models import SCAN
 from swarm_loc_estimator.mapping.messages import LidarSweep, decode_scan, read_sweep
 from swarm_loc_estimator.sensors.fix import about_robots
-from swarm_loc_estimator.sensors.sensor import NO_ROWS, Change, Sensor
+from swarm_loc_estimator.sensors.sensor import Change, Sensor
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 
@@ -26,9 +26,6 @@ class ScanRows(NamedTuple):
     stamp_ns: IntArray  #: (s,) time of the first beam
     scan: NDArray[Any]  #: (s,) of `ScanMessage`
     arrival_ns: IntArray  #: (s,) arrival times
-
-
-NO_SCANS = ScanRows(NO_ROWS, NO_ROWS, np.zeros(0, dtype=object), NO_ROWS)
 
 
 class SweepStore:

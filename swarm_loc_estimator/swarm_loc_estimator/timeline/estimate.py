@@ -24,9 +24,9 @@ from swarm_loc_estimator.filter.sources import (
     CONFIRMED,
     depends_on_heading,
     excluded_links,
-    inflate_suspect_covariance,
     is_contradicted,
     repeating_robots,
+    widen_suspect_covariance,
 )
 from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
@@ -124,7 +124,7 @@ def _write_all(belief: BeliefArrays, tracks: TrackArrays, limits: TrackedLimits,
         x, y, theta = composed(t[0], t[1], t[2], track[0], track[1], track[2])
         out.poses[i, 0], out.poses[i, 1], out.poses[i, 2] = x, y, wrap(theta)
         _pose_covariance(x, y, error, out.covariances[i])
-        inflate_suspect_covariance(belief.sources, i, out.covariances[i])
+        widen_suspect_covariance(belief.sources, i, out.covariances[i])
         _cap_heading(out.covariances[i])
         out.heading_known[i] = out.covariances[i, 2, 2] <= limits.heading_sigma**2
         drives, silence_s = not tracks.is_stationary[i], sample.silence_s[0]
@@ -321,6 +321,7 @@ def contradictions(
         (Contradicted.UNMOVED, unmoved),
         (Contradicted.GYROSCOPE, tracks.contradicts_gyroscope()),
         (Contradicted.POSE, denied),
+        (Contradicted.REPEATED, repeating_robots(state.sources, now_ns)),
     ]
     return [
         *(
@@ -333,10 +334,6 @@ def contradictions(
             for robot, source in aside
         ),
         *(_suspended(names[source]) for source in suspended.tolist()),
-        *(
-            _repeated(names[robot])
-            for robot in np.flatnonzero(repeating_robots(state.sources, now_ns)).tolist()
-        ),
         *(_description(names[source], source, state) for source in contradicted),
     ]
 
@@ -349,12 +346,14 @@ _TEXTS = {
     Contradicted.GYROSCOPE: "the gyroscope of {0} does not turn with its wheels; using the turns of the"
     " wheels: check its axes (imu.roll, imu.pitch) and its driver",
     Contradicted.POSE: "the newest measurements contradict the pose of {0}",
+    Contradicted.REPEATED: "the radio of {0} repeats its values: they count once; publish each range once,"
+    " with its stamp",
 }
+_PART = {Contradicted.GYROSCOPE: GYROSCOPE_OF, Contradicted.REPEATED: "radio of "}
 
 
 def _of_robot(name: str, kind: Contradicted) -> Contradiction:
-    about = GYROSCOPE_OF + name if kind is Contradicted.GYROSCOPE else name
-    return Contradiction(about, kind, _TEXTS[kind].format(name))
+    return Contradiction(_PART.get(kind, "") + name, kind, _TEXTS[kind].format(name))
 
 
 def _sightings(observer: str, source: str) -> Contradiction:
@@ -369,11 +368,6 @@ _CHECKS = {
     "marker": "the yaw of the face of {}",
 }
 """What to check of a source that is not used."""
-
-
-def _repeated(name: str) -> Contradiction:
-    text = f"the radio of {name} repeats its values: they count once; publish each range once, with its stamp"
-    return Contradiction(f"radio of {name}", Contradicted.REPEATED, text)
 
 
 def _suspended(name: str) -> Contradiction:

@@ -43,7 +43,15 @@ from swarm_loc_estimator.filter.sources import (
     note_batch,
 )
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
-from swarm_loc_estimator.filter.state import IN_MAP, InitialPose, Meetings, SwarmState, correct
+from swarm_loc_estimator.filter.state import (
+    IN_MAP,
+    InitialPose,
+    Innovations,
+    Meetings,
+    SwarmState,
+    correct,
+    new_innovations,
+)
 from swarm_loc_estimator.filter.update import (
     ATTRIBUTE,
     CONTRADICTED,
@@ -53,11 +61,9 @@ from swarm_loc_estimator.filter.update import (
     LOST,
     PREDICT,
     SETTLE,
-    Innovations,
     evaluate_link,
     fuse,
     fuse_in_order,
-    new_innovations,
     related_columns,
 )
 from swarm_loc_estimator.identification.assignment import AMBIGUOUS

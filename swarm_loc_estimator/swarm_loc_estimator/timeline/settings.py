@@ -101,7 +101,7 @@ class Settings:
         "1",
         2.0,
         1e9,
-        "fault score above which the parameters of a robot or landmark are re-estimated; 1e9: never",
+        "fault score from which a source is contradicted: estimated again or left out; 1e9: never",
     )
     fix_window_s: float = number(20.0, "s", 0.1, 600.0, "maximum age of sightings that initialize a robot")
     origin_after_s: float = number(

@@ -14,8 +14,8 @@ from core_world import MOUNT, Plan, World, simulate
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.filter.models import CARTESIAN
-from swarm_loc_estimator.filter.state import InitialPose
-from swarm_loc_estimator.filter.update import PREDICT, fuse, new_innovations
+from swarm_loc_estimator.filter.state import InitialPose, new_innovations
+from swarm_loc_estimator.filter.update import PREDICT, fuse
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.fix import about_robots
