@@ -53,7 +53,7 @@ class Sums:
 
     count: int  # Of poses
     position: float  # Sum of squared position errors [m^2]
-    heading: float  # Sum of squared heading errors [rad^2]
+    heading: float  # Sum of squared heading errors, as if all headings were known [rad^2]
     nees: float  # Sum of normalized errors squared
     nees_count: int  # Their number
     misleading: int  # Number of poses TRACKED with an error beyond 5 sigma and 2 cm
@@ -174,7 +174,7 @@ def sums_of(errors: Mapping[str, Errors]) -> Sums | None:
     return Sums(
         pooled.stamp_ns.size,
         float(np.sum(pooled.position**2)),
-        float(np.sum(pooled.error[:, 2] ** 2)),
+        float(np.nanmean(pooled.error[:, 2] ** 2)) * pooled.stamp_ns.size,
         float(np.nansum(pooled.nees)),
         int(np.sum(~np.isnan(pooled.nees))),
         int(pooled.misleading.sum()),
