@@ -64,7 +64,7 @@ _MAX_WEIGHT, _MAX_LINK_WEIGHT, _DRIFT_WEIGHT, RELIEF = 3.5, 2.0, 0.5, 0.25
 """Largest weights of an outlier and one of radios, weight of a drift, and decrease by what agrees."""
 _FORGETTING, _DRIFT = 0.125, 0.6
 """Weight of the newest in the mean of whitened innovations, and the mean from which they drift."""
-SUSPECT, WELL_CONFIRMED = 7.5, 18.0
+SUSPECT, WELL_CONFIRMED = 7.5, 12.0
 """Fault score from which a robot is not tracked, and confirmations up to which its covariance is widened."""
 _SUSPECT_SIGMA = (0.03, 0.03, 0.06)
 """Standard deviations added while a pose is suspect or little confirmed: x [m], y [m], heading [rad]."""
@@ -491,9 +491,11 @@ def confirm(measurements: Measurements, k: int, belief: BeliefArrays, accepted: 
 
 @inlined_njit
 def _news(belief: BeliefArrays, robot: int, stamp_ns: int) -> float:
-    """The part of the correlation time that has passed since a robot was measured last."""
+    """The part of one and a half correlation times that has passed since a robot was measured."""
     since_ns = stamp_ns - belief.sources.measured_ns[robot]
-    news: float = max(0.0, min(1.0, since_ns / CORRELATION_NS))
+    if belief.sources.confirmations[robot] == 0.0:
+        return 1.0
+    news: float = max(0.0, min(1.0, since_ns / (1.5 * CORRELATION_NS)))
     return news
 
 
@@ -584,7 +586,12 @@ def _is_off_its_fixes(belief: BeliefArrays, robot: int, now_ns: int) -> bool:
 
 @cached_njit
 def note_update(
-    measurements: Measurements, k: int, belief: BeliefArrays, before: FloatArray, cross: FloatArray
+    measurements: Measurements,
+    k: int,
+    belief: BeliefArrays,
+    before: FloatArray,
+    cross: FloatArray,
+    place: FloatArray,
 ) -> None:
     """Update the excess covariances of the robots of measurement k, which was used.
 
@@ -594,13 +601,14 @@ def note_update(
         belief: Just updated; its sources are changed.
         before: (2, 3, 3) covariances of the errors of observer and target before the update.
         cross: (3, 3) of the error of the observer with that of the target, of kernels only.
+        place: (2,) where the observer sees the target.
     """
     sides, left = (measurements.observer[k], measurements.target[k]), np.zeros((2, 3, 3))
     for i in range(2):
         if sides[i] >= 0:
             own = before[i] - _shared(measurements, k, belief, cross)
             _learn(belief, sides[i], before[i], own, left[i])
-    weight = _weight(measurements, k, belief)
+    weight = _weight(measurements, k, belief, place)
     for i in range(2):
         if sides[i] >= 0:
             _carry_excess(belief, sides[i], before[i], left[i], weight)
@@ -608,7 +616,12 @@ def note_update(
 
 @cached_njit
 def note_batch(
-    measurements: Measurements, used: BoolArray, belief: BeliefArrays, before: FloatArray, cross: FloatArray
+    measurements: Measurements,
+    used: BoolArray,
+    belief: BeliefArrays,
+    before: FloatArray,
+    cross: FloatArray,
+    place: FloatArray,
 ) -> None:
     """Do so for measurements (m,) fused together; `before` (N, 3, 3) is of robots, `cross` (m, 3, 6)."""
     total, count = np.zeros(before.shape[0]), np.zeros(before.shape[0])
@@ -623,7 +636,7 @@ def note_batch(
             _learn(belief, robot, before[robot], own[robot] / count[robot], left[robot])
     for k in range(used.size):
         if used[k]:
-            weight = _weight(measurements, k, belief)
+            weight = _weight(measurements, k, belief, place[k])
             for side in (measurements.observer[k], measurements.target[k]):
                 if side >= 0:
                     total[side] += weight
@@ -671,17 +684,16 @@ def _learn(belief: BeliefArrays, robot: int, before: FloatArray, own: FloatArray
 
 
 @cached_njit
-def _weight(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
+def _weight(measurements: Measurements, k: int, belief: BeliefArrays, seen: FloatArray) -> float:
     """Twice the correlation of the error of measurement k with those of its link before, as they are left."""
     place, state, robot = find_link(measurements, k, belief), belief.sources, robot_of(measurements, k)
     if place < 0:
         return 0.0
-    x, y, last = measurements.value[k, 0], measurements.value[k, 1], state.last_look[robot, place]
-    if measurements.model[k] == POLAR:
-        x, y = x * math.cos(y), x * math.sin(y)
-    moved, since = math.hypot(x - last[0], y - last[1]), last[2] - state.learned[robot]
-    last[0], last[1], last[2] = x, y, state.learned[robot]
-    if not has_kernel(measurements, k) or measurements.systematic_share[k, 0] > 0.0 or not moved >= 0.0:
+    last = state.last_look[robot, place]
+    moved, since = math.hypot(seen[0] - last[0], seen[1] - last[1]), last[2] - state.learned[robot]
+    last[0], last[1], last[2] = seen[0], seen[1], state.learned[robot]
+    alone = is_fix(measurements, k) or measurements.systematic_share[k, 0] > 0.0
+    if alone or not has_kernel(measurements, k) or not moved >= 0.0:
         return 0.0
     left = math.exp(since - moved / _LENGTH_M)
     return 2.0 * _REPEATED * left / max(1.0 - left, 1e-3)

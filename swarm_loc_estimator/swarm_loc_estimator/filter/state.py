@@ -90,6 +90,7 @@ class Innovations(NamedTuple):
     # (m,) squared, Mahalanobis, that is gated; of a marker's position without small errors
     distance: FloatArray
     whitened: FloatArray  # (m, 2) innovation of the position over its deviation, as for `distance`
+    place: FloatArray  # (m, 2) where the observer sees the target, predicted [m]; of a range, the range
     share: FloatArray  # (m,) by how much it counts, see `sources.share_of`
     elsewhere: BoolArray  # (m,) whether no wrong description explains the innovation
     misread: BoolArray  # (m,) whether the direction of a marker is read turned by a quarter or more
@@ -118,6 +119,7 @@ def new_innovations(count: int, robots: int, sources: int) -> Innovations:
         np.zeros((count, 3, 3)),
         np.zeros((count, PAIR_ROWS, 3)),
         np.zeros(count),
+        np.zeros((count, 2)),
         np.zeros((count, 2)),
         np.zeros(count),
         np.zeros(count, dtype=np.bool_),

@@ -36,6 +36,7 @@ from swarm_loc_estimator.filter.models import (
     CARTESIAN,
     MODELS,
     NO_HEADING,
+    POLAR,
     POSE_GATE,
     has_kernel,
     is_misread,
@@ -216,7 +217,7 @@ def fuse(
                 before = _covariances(measurements, k, belief)
                 correction = update_one(belief.covariance, columns, jacobian, work.innovation[0], noise)
                 correct(belief, correction)
-                note_update(measurements, k, belief, before, work.cross_covariance[0, :, :3])
+                note_update(measurements, k, belief, before, work.cross_covariance[0, :, :3], work.place[0])
         # 7. Count gated measurements.
         for i in range(k, end):
             robot, why = count_gated(measurements, i, belief, work.accepted[i - k], work.share[i - k], limits)
@@ -388,6 +389,9 @@ def _evaluate(
     of_stamp = measurements.stamp_variance[k]
     if of_stamp > 0.0:
         _add_stamp_noise(value_jacobian, motion, of_stamp, noise)
+    polar = measurements.model[k] == POLAR
+    work.place[row, 0] = predicted[0] * math.cos(predicted[1]) if polar else predicted[0]
+    work.place[row, 1] = predicted[0] * math.sin(predicted[1]) if polar else predicted[1]
     # Covariance of the innovation, S = H P H^T + R, eq. (13).
     assign_matrix(s, noise)
     if belief.is_dense:
@@ -641,6 +645,7 @@ def evaluate_link(
     noise /= work.share[k]
     work.noise[k, :count, :count], work.innovation[k, :count] = noise, innovation
     work.whitened[k], work.elsewhere[k] = 0.0, False
+    work.place[k] = one.value[0], 0.0
     # Gate; what is not finite at these poses is gated, too.
     if np.isfinite(s).all() and np.isfinite(innovation).all() and np.isfinite(jacobian).all():
         work.distance[k] = innovation[gated] @ np.linalg.solve(s[gated, gated], innovation[gated])

@@ -186,7 +186,7 @@ _LONG_AGO_NS = np.iinfo(np.int64).min // 2
 LOSS_CAUSES = {
     LossReason.UNCERTAIN: "its position's standard deviation exceeded {0.lost_sigma:g} m (lost_sigma), or"
     " stemmed from a heading beyond {0.lost_heading_sigma:g} rad (lost_heading_sigma)",
-    LossReason.REFUTED: f"a measurement contradicted its pose before {CONFIRMED} had confirmed it",
+    LossReason.REFUTED: f"a measurement contradicted its pose before {CONFIRMED:g} had confirmed it",
     LossReason.GATED: "{0.lost_after} measurements in a row were gated",
     LossReason.OFF_FIXES: "several absolute fixes in a row were gated",
     LossReason.KIDNAPPED: "its measurements can only mean that it is elsewhere",

@@ -93,7 +93,7 @@ def after_fixes(swarm: Swarm, poses: list[FloatArray]) -> list[Estimate]:
 def test_fixes_that_share_their_errors_make_no_surer_than_one() -> None:
     first, *_, last = after_fixes(walker(fix=FixModel(1.0)), [POSE] * 40)
     assert first.status[0] == Status.TRACKED
-    np.testing.assert_allclose(last.covariances[0], NOISE, rtol=1e-3)
+    np.testing.assert_allclose(last.covariances[0], NOISE, rtol=5e-3)  # and the floor
     independent = after_fixes(walker(), [POSE] * 40)
     assert independent[0].status[0] != Status.TRACKED
     assert np.trace(independent[-1].covariances[0]) < 0.1 * np.trace(NOISE)

@@ -8,13 +8,13 @@ from core_geometry import wrapped
 from core_messages import SECOND, T0, give_fix
 from ir_swarm import DROPLET, Event, Place, exchange, messages
 
-from swarm_loc_estimator.filter.integrity import LossLimits, count_gated, is_contradicted
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
+from swarm_loc_estimator.filter.sources import LossLimits, assess, count_gated, is_contradicted, share_of
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import RandomWalk
 from swarm_loc_estimator.swarm.ir_board import RobotIr
-from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Contradicted
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 from swarm_loc_estimator.timeline.settings import Settings
@@ -30,15 +30,22 @@ HERE, THERE = np.array([0.1, 0.2, 0.3]), np.array([0.4, 0.0, 1.3])
 
 
 def looked(state: SwarmState, second: int, observer: int, passed: bool) -> int:
-    """Count a fix of the root, or what another robot measures of it; returns who is lost."""
+    """Assess a fix of the root, or what another robot measures of it; returns who is lost."""
     one = Measurements.empty(1)
     one.stamp_ns[:], one.observer[:], one.target[:] = T0 + second * SECOND, observer, ROOT
-    lost, _ = count_gated(one, 0, state.arrays(), passed, LIMITS)
-    return lost
+    return assessed(state, one, passed=passed)
+
+
+def assessed(state: SwarmState, one: Measurements, *, passed: bool) -> int:
+    """Assess a measurement that passes its gate or is far beyond it; returns who is lost."""
+    belief, one.gate[:] = state.arrays(), 18.0
+    share = share_of(one, 0, belief)
+    assess(one, 0, belief, LIMITS.max_fault_score, 0.0 if passed else 100.0, (0.0, 0.0), share, False)
+    return count_gated(one, 0, belief, passed, share, LIMITS)[0]
 
 
 def new_state() -> SwarmState:
-    return SwarmState(ParameterTable.of([Robot("root"), Robot("neighbour")]))
+    return SwarmState(ParameterTable.of([Robot("root"), Robot("neighbour")], [Landmark(1)]))
 
 
 def test_what_others_say_does_not_outweigh_fixes() -> None:
@@ -48,27 +55,28 @@ def test_what_others_say_does_not_outweigh_fixes() -> None:
     for second in range(3):
         assert looked(state, second, NEIGHBOUR, passed=True) == -1
         lost.append(looked(state, second, NOBODY, passed=False))
-        assert is_contradicted(state.integrity, ROOT)
+        assert is_contradicted(state.arrays(), ROOT)
     assert lost == [-1, -1, ROOT]
 
 
 def test_one_fix_that_is_wrong_is_forgiven_with_the_next_good_one() -> None:
     state = new_state()
-    for second in range(20):
-        assert looked(state, second, NOBODY, passed=second % 2 == 0) == -1
-        assert is_contradicted(state.integrity, ROOT) == (second % 2 == 1)
+    for second in range(100):
+        assert looked(state, second, NOBODY, passed=second % 20 != 1) == -1
+        assert is_contradicted(state.arrays(), ROOT) == (second % 20 == 1)
     for _ in range(5):  # of one instant, as of several trackers
-        assert looked(state, 30, NOBODY, passed=False) == -1
+        assert looked(state, 130, NOBODY, passed=False) == -1
 
 
 def test_a_fix_that_is_wrong_is_forgiven_with_a_landmark_in_its_place() -> None:
     state = new_state()
     assert looked(state, 0, NOBODY, passed=False) == -1
-    assert is_contradicted(state.integrity, ROOT)
+    assert is_contradicted(state.arrays(), ROOT)
     one = Measurements.empty(1)
     one.stamp_ns[:], one.observer[:], one.target[:] = T0 + SECOND, ROOT, NOBODY
-    assert count_gated(one, 0, state.arrays(), True, LIMITS)[0] == -1
-    assert not is_contradicted(state.integrity, ROOT)
+    one.landmark[:] = 0
+    assert assessed(state, one, passed=True) == -1
+    assert not is_contradicted(state.arrays(), ROOT)
 
 
 def test_a_robot_that_was_carried_away_is_not_told_as_tracked_until_it_is_found() -> None:

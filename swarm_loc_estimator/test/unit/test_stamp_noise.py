@@ -15,8 +15,7 @@ from scipy.stats import chi2
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
-from swarm_loc_estimator.filter.models import POLAR, predict
-from swarm_loc_estimator.filter.sources import add_doubt, stamp_variance
+from swarm_loc_estimator.filter.models import predict
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.filter.update import relative_motion
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
@@ -74,21 +73,6 @@ def test_what_is_left_of_systematic_errors_adds_to_the_noise_that_a_detection_te
     plain, more = (measured_of(swarm, np.full(2, T0), joined([known, unknown])).covariance for swarm in seers)
     np.testing.assert_allclose(more[0] - plain[0], np.diag([1e-4, 1e-4, 4e-4]), atol=1e-15)
     np.testing.assert_array_equal(more[1], plain[1])
-
-
-def test_a_description_that_was_contradicted_as_a_whole_adds_noise_to_what_robots_see_alone() -> None:
-    state, rows = SwarmState(ParameterTable.of(SWARM.robots, SWARM.landmarks)), Measurements.empty(3)
-    rows.observer[:], rows.model[1] = [0, 1, NOBODY], POLAR
-    for doubted in (False, True):
-        if doubted:
-            state.augment_all(np.zeros((2, 3)))
-        belief, noise = state.arrays(), np.zeros((3, 3, 3))
-        for k in range(3):
-            add_doubt(rows, k, belief, noise[k])
-        variances = [[*np.diag(noise[k]), stamp_variance(rows, k, belief)] for k in range(3)]
-        is_noisy = np.array(variances) > 0.0
-        assert (is_noisy == [[doubted] * 4, [doubted] * 4, [False] * 4]).all()
-    assert noise[1, 1, 1] > noise[0, 1, 1]  # a bearing: radians
 
 
 @pytest.mark.parametrize("target", [-1, 1])
