@@ -11,13 +11,7 @@ that time, as information, as evidence, as confirmation and towards a loss. A ra
 again is none.
 
 **Systematic.** What errs in the same way again is a state (`swarm/calibration_states.py`), or is considered
-in the reported covariance (`excess`). Errors of sightings repeat while a robot looks from the same place, and
-the noise of wheels is the less known the longer nothing has measured a robot. An update leaves the part A of
-an error and adds noise: with P0 and P, the covariances before and after, and C, that with the estimated place
-of the source, A = I - (P0 - P) (P0 - C)^-T, and the noise is A (P0 - P). So the covariance X beyond the
-filter's becomes A X A^T + w A (P0 - P), where w tells how much of the noise repeats: with the share s of the
-variance that does, the correlation r by motion, and the share a that updates since the last look have left of
-its error, w = 2 s r a / (1 - r a). Poses and gates do not depend on X.
+in the reported covariance (`correlated_noise.py`).
 
 **Health.** A measurement is an outlier when the squared Mahalanobis distance of its position exceeds a
 threshold that one good measurement in twenty exceeds; a mean of whitened innovations tells of a drift. Both
@@ -45,7 +39,6 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.common.numerics import factor_numbers
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements
 from swarm_loc_estimator.filter.models import POLAR, has_kernel
 from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SourceArrays, covariance_within
@@ -53,10 +46,6 @@ from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SourceArray
 # Rate
 CORRELATION_NS = 100_000_000  # Errors of a link within this time are the same
 _LEAST_SHARE = 1e-3
-# Systematic; tuned on MRCLAM set 1, where 80 % of the variances of sightings repeat
-_REPEATED = 0.5  # Share of the variance of a sighting that repeats at the same place
-_LEAST_OWN = 1e-3  # Least share of a standard deviation that the place of a source does not have, too
-_LENGTH_M = 0.03  # Motion of one end, as the other sees it, after which its correlation is 1/e
 # Health; tuned on the scenarios of bench/integrity
 EXCLUDED, _MAX_EVIDENCE = 10.0, 15.0  # Evidence from which a link is excluded, and its maximum
 _OUTLIER = 6.0
@@ -259,7 +248,7 @@ def assess(
     if distance > limit:
         state.finding[robot, place] = ELSEWHERE if elsewhere else DEVIATES
         weight *= min(distance / limit, most)
-    elif mean > _DRIFT * _DRIFT:
+    elif mean > _DRIFT * _DRIFT and not measurements.systematic_share[k, 0] > 0.0:  # such errors repeat
         state.finding[robot, place] = DRIFTS
         weight *= _DRIFT_WEIGHT
     else:
@@ -582,137 +571,6 @@ def _is_off_its_fixes(belief: BeliefArrays, robot: int, now_ns: int) -> bool:
             return False
     state.score[fixes_of(belief, robot)] = SUSPECT  # they locate it again, and are suspect until they agree
     return True
-
-
-@cached_njit
-def note_update(
-    measurements: Measurements,
-    k: int,
-    belief: BeliefArrays,
-    before: FloatArray,
-    cross: FloatArray,
-    place: FloatArray,
-) -> None:
-    """Update the excess covariances of the robots of measurement k, which was used.
-
-    Args:
-        measurements: (m,).
-        k: Which one.
-        belief: Just updated; its sources are changed.
-        before: (2, 3, 3) covariances of the errors of observer and target before the update.
-        cross: (3, 3) of the error of the observer with that of the target, of kernels only.
-        place: (2,) where the observer sees the target.
-    """
-    sides, left = (measurements.observer[k], measurements.target[k]), np.zeros((2, 3, 3))
-    for i in range(2):
-        if sides[i] >= 0:
-            own = before[i] - _shared(measurements, k, belief, cross)
-            _learn(belief, sides[i], before[i], own, left[i])
-    weight = _weight(measurements, k, belief, place)
-    for i in range(2):
-        if sides[i] >= 0:
-            _carry_excess(belief, sides[i], before[i], left[i], weight)
-
-
-@cached_njit
-def note_batch(
-    measurements: Measurements,
-    used: BoolArray,
-    belief: BeliefArrays,
-    before: FloatArray,
-    cross: FloatArray,
-    place: FloatArray,
-) -> None:
-    """Do so for measurements (m,) fused together; `before` (N, 3, 3) is of robots, `cross` (m, 3, 6)."""
-    total, count = np.zeros(before.shape[0]), np.zeros(before.shape[0])
-    own, left = np.zeros(before.shape), np.zeros(before.shape)
-    for k in range(used.size):
-        for side in (measurements.observer[k], measurements.target[k]):
-            if used[k] and side >= 0:
-                count[side] += 1.0
-                own[side] += before[side] - _shared(measurements, k, belief, cross[k, :, :3])
-    for robot in range(count.size):
-        if count[robot] > 0.0:
-            _learn(belief, robot, before[robot], own[robot] / count[robot], left[robot])
-    for k in range(used.size):
-        if used[k]:
-            weight = _weight(measurements, k, belief, place[k])
-            for side in (measurements.observer[k], measurements.target[k]):
-                if side >= 0:
-                    total[side] += weight
-    for robot in range(count.size):
-        if count[robot] > 0.0:
-            _carry_excess(belief, robot, before[robot], left[robot], total[robot] / count[robot])
-
-
-@cached_njit
-def _shared(measurements: Measurements, k: int, belief: BeliefArrays, cross: FloatArray) -> FloatArray:
-    """Covariance (3, 3) of a robot's error with that of the estimated place of what it measures, or zero."""
-    body = max(measurements.landmark[k], measurements.mount[k])
-    if body < 0 or belief.table.survey_column[body] < 0:
-        return np.zeros((3, 3))
-    shared: FloatArray = cross.copy() if measurements.observer[k] >= 0 else cross.T.copy()
-    return shared
-
-
-@cached_njit
-def _learn(belief: BeliefArrays, robot: int, before: FloatArray, own: FloatArray, left: FloatArray) -> None:
-    """Write A (3, 3) of an update, and add the logarithm by which it reduces errors, their geometric mean.
-
-    It is I - K H, where K = (P0 - C) H^T S^-1 and K S K^T = P0 - P; without C, of a known place, P P0^-1.
-    The noise K R K^T that the update adds is then A (P0 - P).
-
-    Args:
-        belief: Just updated.
-        robot: Index of the robot.
-        before: (3, 3) P0.
-        own: (3, 3) P0 - C.
-        left: (3, 3) written.
-    """
-    difference = before.copy()
-    for i in range(3):
-        for j in range(3):
-            difference[i, j] -= covariance_within(belief, 3 * robot, i, j)
-    first, _, second, _, _, third = factor_numbers(0.5 * (own + own.T))
-    one, _, two, _, _, three = factor_numbers(before)
-    if not (first > _LEAST_OWN * one and second > _LEAST_OWN * two and third > _LEAST_OWN * three):
-        own = before  # rounding errors, or NaN
-    left[:] = np.eye(3) - np.dot(difference, np.linalg.inv(own.T))
-    learned = -math.log(max(np.linalg.det(left), 1e-300)) / 3.0
-    if 0.0 < learned < math.inf:  # False for NaN
-        belief.sources.learned[robot] += learned
-
-
-@cached_njit
-def _weight(measurements: Measurements, k: int, belief: BeliefArrays, seen: FloatArray) -> float:
-    """Twice the correlation of the error of measurement k with those of its link before, as they are left."""
-    place, state, robot = find_link(measurements, k, belief), belief.sources, robot_of(measurements, k)
-    if place < 0:
-        return 0.0
-    last = state.last_look[robot, place]
-    moved, since = math.hypot(seen[0] - last[0], seen[1] - last[1]), last[2] - state.learned[robot]
-    last[0], last[1], last[2] = seen[0], seen[1], state.learned[robot]
-    alone = is_fix(measurements, k) or measurements.systematic_share[k, 0] > 0.0
-    if alone or not has_kernel(measurements, k) or not moved >= 0.0:
-        return 0.0
-    left = math.exp(since - moved / _LENGTH_M)
-    return 2.0 * _REPEATED * left / max(1.0 - left, 1e-3)
-
-
-@cached_njit
-def _carry_excess(
-    belief: BeliefArrays, robot: int, before: FloatArray, left: FloatArray, weight: float
-) -> None:
-    """X <- A X A^T + w A (P0 - P)."""
-    excess, difference = belief.sources.excess[robot], before.copy()
-    for i in range(3):
-        for j in range(3):
-            difference[i, j] -= covariance_within(belief, 3 * robot, i, j)
-    new = np.dot(np.dot(left, excess), left.T) + weight * np.dot(left, difference)
-    if math.isfinite(np.sum(new)):
-        for i in range(3):
-            for j in range(3):
-                excess[i, j] = 0.5 * (new[i, j] + new[j, i])
 
 
 _GATED, _OFF_FIXES = int(LossReason.GATED), int(LossReason.OFF_FIXES)

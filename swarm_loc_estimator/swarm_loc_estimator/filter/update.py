@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.numerics import assign, assign_matrix
-from swarm_loc_estimator.filter.correlated_noise import inflate_fix, record_pair, use_mean
+from swarm_loc_estimator.filter.correlated_noise import inflate_fix, note_update, record_pair, use_mean
 from swarm_loc_estimator.filter.joint_filter import JointFilter, update_one
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.filter.models import (
@@ -61,7 +61,6 @@ from swarm_loc_estimator.filter.sources import (
     is_fix,
     is_suspended,
     is_uncertain,
-    note_update,
     robot_of,
     share_of,
     small_variances,

@@ -11,7 +11,12 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.filter.correlated_noise import at_initialization, record_constraint, without_repeats
+from swarm_loc_estimator.filter.correlated_noise import (
+    at_initialization,
+    note_batch,
+    record_constraint,
+    without_repeats,
+)
 from swarm_loc_estimator.filter.joint_filter import JointFilter, Robots
 from swarm_loc_estimator.filter.measurements import (
     NOBODY,
@@ -40,7 +45,6 @@ from swarm_loc_estimator.filter.sources import (
     LossLimits,
     bad_share,
     is_kidnapped,
-    note_batch,
 )
 from swarm_loc_estimator.filter.sparse.sparse_filter import SparseFilter
 from swarm_loc_estimator.filter.state import (
