@@ -233,7 +233,7 @@ def assess(
         place = _new_link(state, robot, source)
     now_ns = measurements.stamp_ns[k]
     state.seen_ns[robot, place] = max(now_ns, state.seen_ns[robot, place])
-    # What does it say? Outliers of fixes and radios are those that are gated.
+    # What does it say? Outliers of fixes and radios are those that are gated; what repeats its errors drifts.
     most = _MAX_LINK_WEIGHT if is_link else _MAX_WEIGHT
     limit = measurements.gate[k] if is_link or is_fix(measurements, k) else _OUTLIER
     drift, weight = state.drift[robot, place], share
@@ -248,7 +248,7 @@ def assess(
     if distance > limit:
         state.finding[robot, place] = ELSEWHERE if elsewhere else DEVIATES
         weight *= min(distance / limit, most)
-    elif mean > _DRIFT * _DRIFT and not measurements.systematic_share[k, 0] > 0.0:  # such errors repeat
+    elif mean > (_DRIFT if measurements.systematic_share[k, 0] == 0.0 else 2.0 * _DRIFT) ** 2:
         state.finding[robot, place] = DRIFTS
         weight *= _DRIFT_WEIGHT
     else:
