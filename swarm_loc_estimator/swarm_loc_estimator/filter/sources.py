@@ -248,7 +248,9 @@ def assess(
     if distance > limit:
         state.finding[robot, place] = ELSEWHERE if elsewhere else DEVIATES
         weight *= min(distance / limit, most)
-    elif mean > (_DRIFT if measurements.systematic_share[k, 0] == 0.0 else 2.0 * _DRIFT) ** 2:
+    elif mean > (
+        _DRIFT if measurements.systematic_share[k, 0] == 0.0 else 2.0 * _DRIFT
+    ) ** 2 and not _errs_alone(measurements, k, belief, max_fault_score):
         state.finding[robot, place] = DRIFTS
         weight *= _DRIFT_WEIGHT
     else:
@@ -563,14 +565,34 @@ def _is_off_its_fixes(belief: BeliefArrays, robot: int, now_ns: int) -> bool:
 
     Robots that were located by way of it agree with it wherever it is.
     """
-    state = belief.sources
-    for other in range(state.source.shape[1]):
-        ties = belief.tracked.size <= state.source[robot, other] < fixes_of(belief, 0)
-        recent = now_ns - state.seen_ns[robot, other] < _TIED_NS
-        if ties and recent and state.finding[robot, other] == AGREES:
-            return False
-    state.score[fixes_of(belief, robot)] = SUSPECT  # they locate it again, and are suspect until they agree
+    if _is_tied(belief, robot, now_ns):
+        return False
+    # they locate it again, and are suspect until they agree
+    belief.sources.score[fixes_of(belief, robot)] = SUSPECT
     return True
+
+
+@inlined_njit
+def _is_tied(belief: BeliefArrays, robot: int, now_ns: int) -> bool:
+    """Whether something surveyed has agreed with a robot recently."""
+    state, tied = belief.sources, False
+    for place in range(state.source.shape[1]):
+        ties = belief.tracked.size <= state.source[robot, place] < fixes_of(belief, 0)
+        recent = now_ns - state.seen_ns[robot, place] < _TIED_NS
+        tied = tied or (ties and recent and state.finding[robot, place] == AGREES)
+    return tied
+
+
+@inlined_njit
+def _errs_alone(measurements: Measurements, k: int, belief: BeliefArrays, max_fault_score: float) -> bool:
+    """Whether measurement k is a suspended fix, not sought near the pose, of a robot that nothing else ties.
+
+    The error of that robot lasts as long as fixes are not used: a mean of innovations tells of no drift.
+    """
+    robot = robot_of(measurements, k)
+    suspended = is_suspended(belief, source_of(measurements, k, belief), 1.5 * max_fault_score)
+    alone: bool = is_fix(measurements, k) and not measurements.has_second[k] and suspended
+    return alone and not _is_tied(belief, robot, measurements.stamp_ns[k])
 
 
 _GATED, _OFF_FIXES = int(LossReason.GATED), int(LossReason.OFF_FIXES)

@@ -412,8 +412,8 @@ def _calibrate(
 def _pose_noise(
     sensor: SensorModel, level: FloatArray, published: FloatArray, distance: float, noise: FloatArray
 ) -> None:
-    """Write the covariance (3, 3) of forward, left, heading; from the sensor model if unknown (-1)."""
-    if published[0, 0] < 0.0:
+    """Write the covariance (3, 3) of forward, left, heading; by the model if unknown (-1, 0)."""
+    if published[0, 0] <= 0.0:
         noise[0, 0], noise[1, 1] = sensor.forward_sigma**2, sensor.left_sigma**2
         noise[2, 2] = sensor.heading_sigma**2
         return
@@ -440,8 +440,8 @@ def _add_residual(sensor: SensorModel, distance: float, noise: FloatArray) -> No
 
 @cached_njit
 def _write_spread(sensor: SensorModel, content: int, published: FloatArray, spread: FloatArray) -> None:
-    """Write the covariance (6, 6) of a pose in the optical frame; from the sensor model if unknown (-1)."""
-    if content != CONTENT_POSITION and published[0, 0] >= 0.0:
+    """Write the covariance (6, 6) of a pose in the optical frame; by the model if unknown (-1, 0)."""
+    if content != CONTENT_POSITION and published[0, 0] > 0.0:
         spread[:] = published
         return
     spread[0, 0] = spread[1, 1] = sensor.left_sigma**2
