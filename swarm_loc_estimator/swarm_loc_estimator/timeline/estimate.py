@@ -373,7 +373,7 @@ _CHECKS = {
 def _suspended(name: str) -> Contradiction:
     what, _, robot = name.partition(" of ")
     check = _CHECKS[what if robot else ""].format(robot)
-    text = f"{name}: in contradiction with the rest, and not used until it agrees again: check {check}"
+    text = f"not using {name} until it agrees with the rest again: check {check}"
     return Contradiction(name, Contradicted.SUSPENDED, text)
 
 

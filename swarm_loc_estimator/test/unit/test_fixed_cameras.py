@@ -241,7 +241,8 @@ def in_map_of(one: Measurements, camera: FixedCamera) -> tuple[FloatArray, Float
 
     def slopes(of: Callable[[FloatArray], FloatArray]) -> FloatArray:
         ends = [wrapped(of(axis) - of(-axis)) / (2.0 * step) for axis in step * np.eye(3)]
-        return np.array(ends).T
+        found: FloatArray = np.array(ends).T
+        return found
 
     by_value = slopes(lambda change: placed(one.value[0] + change, sensor))
     by_camera = slopes(lambda change: placed(one.value[0], sensor + change))

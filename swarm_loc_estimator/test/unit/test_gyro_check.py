@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from core_messages import T0
@@ -75,7 +77,7 @@ class Drive:
         return np.array(found)
 
 
-FAULTS = {
+FAULTS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "zero": lambda values: 0.0 * values,
     "other axis": lambda values: 2e-3 * np.random.default_rng(9).standard_normal(values.size),
     "upside down": lambda values: -values,

@@ -77,7 +77,7 @@ def sighting(
 def test_a_constraint_lies_on_the_map_where_the_true_transform_puts_it(
     seed: int, sees: bool, model: int, yaw: float, stretch: float
 ) -> None:
-    rng, camera = np.random.default_rng(seed), np.array([yaw, stretch])
+    rng, camera = np.random.default_rng(seed), np.array([yaw, stretch, 0.0])
     one, robot = sighting(rng, sees, model, camera)
     transform = any_pose(rng)
     track = pose_of(np.linalg.inv(planar(transform)) @ planar(robot))
@@ -95,7 +95,7 @@ def test_a_constraint_lies_on_the_map_where_the_true_transform_puts_it(
 @pytest.mark.parametrize("model", [CARTESIAN, POLAR])
 def test_a_constraint_is_as_unsure_as_sampled_sightings_and_located_robots(model: int, sees: bool) -> None:
     rng = np.random.default_rng(model + 2 * sees)
-    camera = np.array([0.1, 0.3])
+    camera = np.array([0.1, 0.3, 0.0])
     one, robot = sighting(rng, sees, model, camera)
     spread = np.diag([1e-4, 2e-4, 3e-4])
     samples, value = [], one.value.copy()
