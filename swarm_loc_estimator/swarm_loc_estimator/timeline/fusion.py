@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.filter.correlated_noise import (
     at_initialization,
     note_batch,
@@ -310,7 +310,9 @@ class Fusion:
         outcome, own_nis = verdicts[good], nis[good]
         # Evaluate, links by their records, and attribute.
         belief = state.arrays()
-        places = Robots(self._poses(state, newest_ns)[:, :2], state.tracked.copy())
+        places = Robots(
+            self._poses(state, np.full(state.tracked.size, newest_ns))[:, :2], state.tracked.copy()
+        )
         state.filter.prepare_update(related_columns(rows, belief), places, work.cross_covariance)
         stage, why = EVALUATE, IS_LINK
         while why == IS_LINK:
@@ -345,10 +347,10 @@ class Fusion:
             state.deinitialize(robot, LossReason(int(work.lost[robot])), stamp_ns)
         work.lost[:] = 0
 
-    def _poses(self, state: SwarmState, stamp_ns: int) -> FloatArray:
-        """Poses (N, 3) of all robots in `map` at an instant."""
+    def _poses(self, state: SwarmState, stamps_ns: IntArray) -> FloatArray:
+        """Poses (N, 3) of all robots in `map` at instants (N,)."""
         robots = np.arange(state.tracked.size)
-        return se2.compose(state.transform, self._tracks.at(robots, np.full(robots.size, stamp_ns)).pose)
+        return se2.compose(state.transform, self._tracks.at(robots, stamps_ns).pose)
 
     def _note(self, state: SwarmState, one: Measurements, keep: Keep | None = None) -> Verdict:
         """Store a row of measurements as a constraint if it can initialize a robot, or what `keep` does."""
@@ -393,7 +395,11 @@ class Fusion:
                 score[direction] = max(score[direction], limit + 1.0)
             state.deinitialize(source, LossReason.KIDNAPPED, stamp_ns)
             return
-        poses, again_ns = self._poses(state, stamp_ns), state.contradicted_ns[source] + _SETTLING_NS
+        # where they are predicted to: later odometry would change other poses, and nothing would be fused again
+        poses, again_ns = (
+            self._poses(state, state.predicted_to_ns),
+            state.contradicted_ns[source] + _SETTLING_NS,
+        )
         state.contradicted_ns[source] = stamp_ns
         if source >= robots + self._first_mount:
             state.augment(source, poses[0])

@@ -45,9 +45,8 @@ def assert_same(a: Outcome, b: Outcome) -> None:
     np.testing.assert_array_equal(a.estimate.status, b.estimate.status)
     difference = wrapped(a.estimate.poses - b.estimate.poses)
     np.testing.assert_array_equal(np.isnan(a.estimate.poses), np.isnan(b.estimate.poses))
-    # rounding grows where a description is opened again
-    np.testing.assert_allclose(np.nan_to_num(difference), 0.0, atol=1e-7)
-    np.testing.assert_allclose(a.estimate.covariances, b.estimate.covariances, atol=1e-8)
+    np.testing.assert_allclose(np.nan_to_num(difference), 0.0, atol=1e-9)
+    np.testing.assert_allclose(a.estimate.covariances, b.estimate.covariances, atol=1e-9)
     np.testing.assert_allclose(a.estimate.fix_age_s, b.estimate.fix_age_s, atol=1e-9)
     assert settled(a.estimator) == settled(b.estimator)
 
@@ -143,6 +142,9 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     )
 
 
+@example(  # a description that is opened again
+    seed=1384, start_known=(True,), fusion_period_s=0.0, late_s=0.3, part=0.0, sparse=False
+)
 @settings(max_examples=15)
 @given(
     seed=st.integers(0, 10**6),
