@@ -422,15 +422,16 @@ def note_update(
         cross: (3, 3) of the error of the observer with that of the target, of kernels only.
         place: (2,) where the observer sees the target.
     """
-    sides, left = (measurements.observer[k], measurements.target[k]), np.zeros((2, 3, 3))
+    sides = (measurements.observer[k], measurements.target[k])
+    left, added = np.zeros((2, 3, 3)), np.zeros((2, 3, 3))
     for i in range(2):
         if sides[i] >= 0:
             own = before[i] - _shared(measurements, k, belief, cross)
-            _learn(belief, sides[i], before[i], own, left[i])
+            _learn(belief, sides[i], before[i], own, left[i], added[i])
     weight = _weight(measurements, k, belief, place)
     for i in range(2):
         if sides[i] >= 0:
-            _carry_excess(belief, sides[i], before[i], left[i], weight)
+            _carry_excess(belief.sources.excess[sides[i]], left[i], added[i], weight)
 
 
 @cached_njit
@@ -444,7 +445,7 @@ def note_batch(
 ) -> None:
     """Do so for measurements (m,) fused together; `before` (N, 3, 3) is of robots, `cross` (m, 3, 6)."""
     total, count = np.zeros(before.shape[0]), np.zeros(before.shape[0])
-    own, left = np.zeros(before.shape), np.zeros(before.shape)
+    own, left, added = np.zeros(before.shape), np.zeros(before.shape), np.zeros(before.shape)
     for k in range(used.size):
         for side in (measurements.observer[k], measurements.target[k]):
             if used[k] and side >= 0:
@@ -452,7 +453,7 @@ def note_batch(
                 own[side] += before[side] - _shared(measurements, k, belief, cross[k, :, :3])
     for robot in range(count.size):
         if count[robot] > 0.0:
-            _learn(belief, robot, before[robot], own[robot] / count[robot], left[robot])
+            _learn(belief, robot, before[robot], own[robot] / count[robot], left[robot], added[robot])
     for k in range(used.size):
         if used[k]:
             weight = _weight(measurements, k, belief, place[k])
@@ -461,7 +462,8 @@ def note_batch(
                     total[side] += weight
     for robot in range(count.size):
         if count[robot] > 0.0:
-            _carry_excess(belief, robot, before[robot], left[robot], total[robot] / count[robot])
+            weight = total[robot] / count[robot]
+            _carry_excess(belief.sources.excess[robot], left[robot], added[robot], weight)
 
 
 @cached_njit
@@ -475,10 +477,12 @@ def _shared(measurements: Measurements, k: int, belief: BeliefArrays, cross: Flo
 
 
 @cached_njit
-def _learn(belief: BeliefArrays, robot: int, before: FloatArray, own: FloatArray, left: FloatArray) -> None:
-    """Write A (3, 3) of an update, and add the logarithm by which it reduces errors, their geometric mean.
+def _learn(
+    belief: BeliefArrays, robot: int, before: FloatArray, own: FloatArray, left: FloatArray, added: FloatArray
+) -> None:
+    """Write what an update leaves of errors and the noise that it adds; add the logarithm of their reduction.
 
-    It is I - K H, where K = (P0 - C) H^T S^-1 and K S K^T = P0 - P; without C, of a known place, P P0^-1.
+    A is I - K H, where K = (P0 - C) H^T S^-1 and K S K^T = P0 - P; without C, of a known place, P P0^-1.
     The noise K R K^T that the update adds is then A (P0 - P).
 
     Args:
@@ -486,7 +490,8 @@ def _learn(belief: BeliefArrays, robot: int, before: FloatArray, own: FloatArray
         robot: Index of the robot.
         before: (3, 3) P0.
         own: (3, 3) P0 - C.
-        left: (3, 3) written.
+        left: (3, 3) A, written.
+        added: (3, 3) A (P0 - P), written.
     """
     difference = before.copy()
     for i in range(3):
@@ -497,6 +502,7 @@ def _learn(belief: BeliefArrays, robot: int, before: FloatArray, own: FloatArray
     if not (first > _LEAST_OWN * one and second > _LEAST_OWN * two and third > _LEAST_OWN * three):
         own = before  # rounding errors, or NaN
     left[:] = np.eye(3) - np.dot(difference, np.linalg.inv(own.T))
+    added[:] = np.dot(left, difference)
     learned = -math.log(max(np.linalg.det(left), 1e-300)) / 3.0
     if 0.0 < learned < math.inf:  # False for NaN
         belief.sources.learned[robot] += learned
@@ -519,16 +525,8 @@ def _weight(measurements: Measurements, k: int, belief: BeliefArrays, seen: Floa
 
 
 @cached_njit
-def _carry_excess(
-    belief: BeliefArrays, robot: int, before: FloatArray, left: FloatArray, weight: float
-) -> None:
+def _carry_excess(excess: FloatArray, left: FloatArray, added: FloatArray, weight: float) -> None:
     """X <- A X A^T + w A (P0 - P)."""
-    excess, difference = belief.sources.excess[robot], before.copy()
-    for i in range(3):
-        for j in range(3):
-            difference[i, j] -= covariance_within(belief, 3 * robot, i, j)
-    new = np.dot(np.dot(left, excess), left.T) + weight * np.dot(left, difference)
+    new = np.dot(np.dot(left, excess), left.T) + weight * added
     if math.isfinite(np.sum(new)):
-        for i in range(3):
-            for j in range(3):
-                excess[i, j] = 0.5 * (new[i, j] + new[j, i])
+        excess[:] = 0.5 * (new + new.T)

@@ -7,8 +7,7 @@ measured of each other. Four rules hold for all:
 **Floor.** No message makes the noise of a measurement smaller than the description allows (`sensors/`).
 
 **Rate.** Measurements of a link within its correlation time share their error: each counts by its share of
-that time, as information, as evidence, as confirmation and towards a loss. A range that comes
-again is none.
+that time, as information, as evidence, as confirmation and towards a loss. A repeated range counts once.
 
 **Systematic.** What errs in the same way again is a state (`swarm/calibration_states.py`), or is considered
 in the reported covariance (`correlated_noise.py`).
@@ -553,28 +552,17 @@ def count_gated(
         fixed = max(observer, target)
         belief.last_fix_ns[fixed] = max(belief.last_fix_ns[fixed], measurements.stamp_ns[k])
     if share > 0.0 and not accepted and is_fix(measurements, k):
-        score, limit = state.score[source_of(measurements, k, belief)], limits.max_fault_score
-        if limit <= score < 1.5 * limit and _is_off_its_fixes(belief, target, measurements.stamp_ns[k]):
-            lost, why = target, _OFF_FIXES
+        fixes, limit = source_of(measurements, k, belief), limits.max_fault_score
+        is_tied = _is_tied(belief, target, measurements.stamp_ns[k])
+        if limit <= state.score[fixes] < 1.5 * limit and not is_tied:
+            # They locate it again, and are suspect until they agree.
+            lost, why, state.score[fixes] = target, _OFF_FIXES, SUSPECT
     return lost, why
-
-
-@cached_njit
-def _is_off_its_fixes(belief: BeliefArrays, robot: int, now_ns: int) -> bool:
-    """Whether fixes deny a robot that nothing else ties to `map`.
-
-    Robots that were located by way of it agree with it wherever it is.
-    """
-    if _is_tied(belief, robot, now_ns):
-        return False
-    # they locate it again, and are suspect until they agree
-    belief.sources.score[fixes_of(belief, robot)] = SUSPECT
-    return True
 
 
 @inlined_njit
 def _is_tied(belief: BeliefArrays, robot: int, now_ns: int) -> bool:
-    """Whether something surveyed has agreed with a robot recently."""
+    """Whether something surveyed has agreed with a robot recently; other robots agree with it anywhere."""
     state, tied = belief.sources, False
     for place in range(state.source.shape[1]):
         ties = belief.tracked.size <= state.source[robot, place] < fixes_of(belief, 0)

@@ -395,7 +395,7 @@ class Fusion:
                 score[direction] = max(score[direction], limit + 1.0)
             state.deinitialize(source, LossReason.KIDNAPPED, stamp_ns)
             return
-        # where they are predicted to: later odometry would change other poses, and nothing would be fused again
+        # where they are predicted to: other poses change with later odometry, and nothing is fused again
         poses, again_ns = (
             self._poses(state, state.predicted_to_ns),
             state.contradicted_ns[source] + _SETTLING_NS,
