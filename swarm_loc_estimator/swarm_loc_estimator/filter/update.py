@@ -678,7 +678,9 @@ def _covariance(
             covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = joint.block(first + _BODY)
     if min(columns) >= 0:
         o, t = columns
-        shared = belief.covariance[o : o + 3, t : t + 3] if joint.is_dense else cross_covariance[:, :3]
+        if joint.is_dense:
+            cross_covariance[:, :3] = belief.covariance[o : o + 3, t : t + 3]
+        shared = cross_covariance[:, :3]
         covariance[:3, 3:], covariance[3:, :3] = shared, shared.T
     return covariance
 

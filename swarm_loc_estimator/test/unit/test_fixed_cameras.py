@@ -206,8 +206,12 @@ def test_a_camera_that_looks_to_the_sky_drops_what_lies_below_it() -> None:
     assert (found.size, dropped) == (0, {"face_down": [2]})
 
 
-def test_a_covariance_that_is_not_known_is_that_of_the_description() -> None:
+@pytest.mark.parametrize("first", [-1.0, 0.0])
+def test_a_covariance_that_is_not_known_is_that_of_the_description(first: float) -> None:
+    """In ROS, -1 says so, and drivers that fill in none send zeros."""
     one = detection(TOP.id, in_view(TOP, CAMERAS[0]))
+    one["covariance"] = 0.0
+    one["covariance"][..., 0, 0] = first
     found, _ = converted(one)
     sensor = CAMERAS[0].sensor
     heading = found.covariance[0, 2, 2] - sensor.residual_heading_sigma**2 - _FLOOR_RAD**2
