@@ -426,7 +426,8 @@ def note_update(
     left, added = np.zeros((2, 3, 3)), np.zeros((2, 3, 3))
     for i in range(2):
         if sides[i] >= 0:
-            own = before[i] - _shared(measurements, k, belief, cross)
+            own = before[i].copy()
+            _take_off_shared(measurements, k, belief, cross, 1.0, own)
             _learn(belief, sides[i], before[i], own, left[i], added[i])
     weight = _weight(measurements, k, belief, place)
     for i in range(2):
@@ -445,15 +446,18 @@ def note_batch(
 ) -> None:
     """Do so for measurements (m,) fused together; `before` (N, 3, 3) is of robots, `cross` (m, 3, 6)."""
     total, count = np.zeros(before.shape[0]), np.zeros(before.shape[0])
-    own, left, added = np.zeros(before.shape), np.zeros(before.shape), np.zeros(before.shape)
+    own, left, added = before.copy(), np.zeros(before.shape), np.zeros(before.shape)
     for k in range(used.size):
         for side in (measurements.observer[k], measurements.target[k]):
             if used[k] and side >= 0:
                 count[side] += 1.0
-                own[side] += before[side] - _shared(measurements, k, belief, cross[k, :, :3])
+    for k in range(used.size):
+        for side in (measurements.observer[k], measurements.target[k]):
+            if used[k] and side >= 0:
+                _take_off_shared(measurements, k, belief, cross[k], 1.0 / count[side], own[side])
     for robot in range(count.size):
         if count[robot] > 0.0:
-            _learn(belief, robot, before[robot], own[robot] / count[robot], left[robot], added[robot])
+            _learn(belief, robot, before[robot], own[robot], left[robot], added[robot])
     for k in range(used.size):
         if used[k]:
             weight = _weight(measurements, k, belief, place[k])
@@ -466,14 +470,17 @@ def note_batch(
             _carry_excess(belief.sources.excess[robot], left[robot], added[robot], weight)
 
 
-@cached_njit
-def _shared(measurements: Measurements, k: int, belief: BeliefArrays, cross: FloatArray) -> FloatArray:
-    """Covariance (3, 3) of a robot's error with that of the estimated place of what it measures, or zero."""
+@inlined_njit
+def _take_off_shared(
+    measurements: Measurements, k: int, belief: BeliefArrays, cross: FloatArray, share: float, own: FloatArray
+) -> None:
+    """Take a share of a robot's covariance with the estimated place of what it measures off `own` (3, 3)."""
     body = max(measurements.landmark[k], measurements.mount[k])
-    if body < 0 or belief.table.survey_column[body] < 0:
-        return np.zeros((3, 3))
-    shared: FloatArray = cross.copy() if measurements.observer[k] >= 0 else cross.T.copy()
-    return shared
+    if body >= 0 and belief.table.survey_column[body] >= 0:
+        sees = measurements.observer[k] >= 0
+        for i in range(3):
+            for j in range(3):
+                own[i, j] -= share * (cross[i, j] if sees else cross[j, i])
 
 
 @cached_njit
@@ -501,11 +508,29 @@ def _learn(
     one, _, two, _, _, three = factor_numbers(before)
     if not (first > _LEAST_OWN * one and second > _LEAST_OWN * two and third > _LEAST_OWN * three):
         own = before  # rounding errors, or NaN
-    left[:] = np.eye(3) - np.dot(difference, np.linalg.inv(own.T))
+    cofactors = np.empty((3, 3))
+    determinant = _write_cofactors(own, cofactors)  # the inverse of own^T is their matrix over it
+    for i in range(3):
+        for j in range(3):
+            left[i, j] = 1.0 if i == j else 0.0
+            for r in range(3):
+                left[i, j] -= difference[i, r] * cofactors[r, j] / determinant
     added[:] = np.dot(left, difference)
-    learned = -math.log(max(np.linalg.det(left), 1e-300)) / 3.0
+    learned = -math.log(max(_write_cofactors(left, cofactors), 1e-300)) / 3.0
     if 0.0 < learned < math.inf:  # False for NaN
         belief.sources.learned[robot] += learned
+
+
+@inlined_njit
+def _write_cofactors(matrix: FloatArray, out: FloatArray) -> float:
+    """Write the cofactors (3, 3) of a matrix (3, 3), return its determinant; faster than LAPACK."""
+    for i in range(3):
+        p, q = (i + 1) % 3, (i + 2) % 3
+        for j in range(3):
+            r, s = (j + 1) % 3, (j + 2) % 3
+            out[i, j] = matrix[p, r] * matrix[q, s] - matrix[p, s] * matrix[q, r]
+    determinant: float = matrix[0, 0] * out[0, 0] + matrix[0, 1] * out[0, 1] + matrix[0, 2] * out[0, 2]
+    return determinant
 
 
 @cached_njit
