@@ -142,16 +142,9 @@ def check_contents(evidence: Evidence) -> Iterator[Finding]:
 
 def check_estimate(evidence: Evidence) -> Iterator[Finding]:
     """The estimator locates all robots, where they should be, and contradicts nothing."""
-    estimated = evidence.estimated
-    groups: dict[tuple[Contradicted, bool], list[Contradiction]] = {}
-    for one in estimated.contradictions:
-        if one.kind is not Contradicted.GYROSCOPE:  # those are named by `check_motion`
-            groups.setdefault((one.kind, one.about.startswith("landmark")), []).append(one)
-    for (kind, _), some in groups.items():
-        problem, remedy = _CONTRADICTED[kind]
-        verb = "is" if len(some) == 1 else "are"
-        yield Finding(listed([one.about for one in some]), f"{verb} {problem}: {some[0].text}", remedy)
+    yield from _contradicted(evidence, {*Contradicted} - {Contradicted.GYROSCOPE} - _OUTER)
     yield from _other_starts(evidence)
+    estimated = evidence.estimated
     measures = [name not in ("odometry", "imu") for name in SENSORS]
     measured = _readings(evidence)[measures].sum(axis=0)
     seen = evidence.rows("detections").detection["id"]
@@ -163,6 +156,26 @@ def check_estimate(evidence: Evidence) -> Iterator[Finding]:
         if estimated.status[index] == Status.WAITING and is_helpless:
             problem = "cannot be located: it has no start, measures nothing, and nobody sees it"
             yield Finding(robot.name, problem, "Give it a start, or a sensor and something to see")
+
+
+_OUTER = {Contradicted.SUSPENDED, Contradicted.REPEATED}  # Faults of sources apart from their robots
+
+
+def check_sources(evidence: Evidence) -> Iterator[Finding]:
+    """Fixed cameras, fixes and radios agree with the rest, whatever else is wrong."""
+    return _contradicted(evidence, _OUTER)
+
+
+def _contradicted(evidence: Evidence, kinds: set[Contradicted]) -> Iterator[Finding]:
+    """What the estimator contradicts, a finding for each kind."""
+    groups: dict[tuple[Contradicted, bool], list[Contradiction]] = {}
+    for one in evidence.estimated.contradictions:
+        if one.kind in kinds:
+            groups.setdefault((one.kind, one.about.startswith("landmark")), []).append(one)
+    for (kind, _), some in groups.items():
+        problem, remedy = _CONTRADICTED[kind]
+        verb = "is" if len(some) == 1 else "are"
+        yield Finding(listed([one.about for one in some]), f"{verb} {problem}: {some[0].text}", remedy)
 
 
 def _other_starts(evidence: Evidence) -> Iterator[Finding]:
@@ -216,7 +229,7 @@ _CONTRADICTED = MappingProxyType(
         ),
         Contradicted.DESCRIPTION: ("other than described", "Measure it again, or use survey or calibrate"),
         Contradicted.REPEATED: ("repeated", "Let its driver publish each range once"),
-        Contradicted.SUSPENDED: ("at odds with the rest", "Check its place, its clock, and whose body it is"),
+        Contradicted.SUSPENDED: ("at odds with the rest", "Correct it, then run doctor again"),
     }
 )
 """What is contradicted, and what to do about it."""

@@ -17,6 +17,7 @@ from swarm_loc_estimator.doctor.contents import (
     check_estimate,
     check_motion,
     check_pictures,
+    check_sources,
 )
 from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, Message
 from swarm_loc_estimator.doctor.topics import DIAGNOSTICS, check_clocks, check_frames, check_topics
@@ -24,7 +25,10 @@ from swarm_loc_estimator.offline.recorded_bag import Progress, renamed_topics, s
 from swarm_loc_estimator.sensors.inputs import input_topics, kinds
 from swarm_loc_estimator.swarm.swarm import Swarm
 
-CHECKS = (check_topics, check_clocks, check_frames, check_pictures, check_motion, check_contents)
+CHECKS = (
+    *(check_topics, check_clocks, check_frames),
+    *(check_pictures, check_motion, check_contents, check_sources),
+)
 _LOOKED_AT = (
     *(kind.message_type for kind in kinds().values()),
     *(TRANSFORMS, DIAGNOSTICS, IMAGE, COMPRESSED_IMAGE, CAMERA_INFO),

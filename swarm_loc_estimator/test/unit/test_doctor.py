@@ -12,12 +12,14 @@ from wrong_setups import BAGS, BOTH, ROBOT, WRONG, Change, good, shifted, with_g
 from swarm_loc_estimator.cli import doctor as command
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.cdr import TRANSFORMS
+from swarm_loc_estimator.common.messages.cdr import ODOMETRY, POSE_WITH_COVARIANCE, TRANSFORMS
+from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_fix, encode_odometry
 from swarm_loc_estimator.doctor.contents import IMAGE
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag, examine, lines_of
 from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message
 from swarm_loc_estimator.offline.recorded_bag import unwatched
 from swarm_loc_estimator.swarm.error_models import ClockModel
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 
@@ -115,3 +117,25 @@ def test_wrong_options_end_with_one_sentence(
 ) -> None:
     assert command.main(options) == 1
     assert said in capsys.readouterr().err
+
+
+def test_exchanged_bodies_are_named_whatever_topics_are_missing(tmp_path: Path) -> None:
+    """Two robots drive side by side; their fixes are exchanged after ten seconds; no detections."""
+    robots = [Robot(name, start=(0.0, y, 0.0)) for name, y in (("a", 0.0), ("b", 1.0))]
+    with BagWriter(tmp_path / "bag") as bag:
+        for robot in robots:
+            bag.add_topic(f"{robot.name}/odom", ODOMETRY)
+            bag.add_topic(f"{robot.name}/fix", POSE_WITH_COVARIANCE)
+        for k in range(200):
+            stamp_ns = k * 100_000_000
+            for index, robot in enumerate(robots):
+                pose = np.array([[0.01 * k, 0.0, 0.0]])
+                odometry = np.array([stamp_ns]), pose, np.zeros((1, 3)), *[UNKNOWN_COVARIANCE] * 2
+                frames = f"{robot.name}/odom", f"{robot.name}/base_link"
+                bag.write(f"{robot.name}/odom", stamp_ns, encode_odometry(*frames, *odometry)[0])
+                seen = np.array([0.01 * k, float(index != (k >= 100)), 0.0])
+                fix = encode_fix("map", stamp_ns, seen, np.diag(np.square([0.01, 0.01, 0.02])))
+                bag.write(f"{robot.name}/fix", stamp_ns, fix)
+    said = lines_of(examine(evidence_of_bag(tmp_path / "bag", Swarm(tuple(robots)), 60.0, unwatched)))
+    assert any("a/detections" in line for line in said)
+    assert any("fixes of a, fixes of b" in line for line in said)
