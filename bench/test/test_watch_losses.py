@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from pathlib import Path
 
@@ -33,7 +34,7 @@ def test_the_page_says_why_a_robot_is_lost(
     report = lose(why, tmp_path).report()
     note = {"kind": "report", "robot": WAITING, "stamp": 1.0, "message": report.message, "values": {}}
     swarm.server.send_text(note, WAITING)
-    page.until(f"{MESSAGE}.startsWith('lost ') && {MESSAGE}.includes(' s ago: {CAUSES[why]}')")
+    page.until(f"{MESSAGE}.startsWith('lost ') && {MESSAGE}.includes({json.dumps(f' s ago: {CAUSES[why]}')})")
     assert page.page.inner_text("#panel h2").startswith("gamma")
     assert page.page.is_visible("#message")
 
@@ -49,7 +50,7 @@ def test_a_recording_says_why_a_robot_is_lost(browser: Browser, why: LossReason,
     page.page.click("#counts button:has-text('waiting')")
     (loss,) = lost.result.losses
     said = loss.text(int(lost.result.stamp_ns[-1]))
-    page.until(f"watch.selected === 0 && {MESSAGE} === '{said}'")
+    page.until(f"watch.selected === 0 && {MESSAGE} === {json.dumps(said)}")
     located = np.flatnonzero(lost.result.status[:, 0])
     if located.size:
         page.evaluate(f"watch.seek({located[-1] / (len(lost.result.stamp_ns) - 1)})")
