@@ -148,16 +148,18 @@ def _predict_bearing(one: Measurements, observer: FloatArray, target: FloatArray
 
 
 def _predict_range(one: Measurements, observer: FloatArray, target: FloatArray) -> Prediction:
-    """Predict the slant range of two antennas."""
+    """Predict the slant range of two antennas; the state of an anchor is a displacement and its bias."""
     (sz, mz), (mx, my, _) = one.height.tolist(), one.marker.tolist()
-    sx, sy = _moved(one.sensor, observer)
-    if one.target >= 0 or one.landmark >= 0:
+    (sx, sy), bias = _moved(one.sensor, observer), 0.0
+    if one.target >= 0:
         mx, my = _moved(one.marker, target)
+    elif one.landmark >= 0:
+        mx, my, bias = mx + target[0], my + target[1], float(target[2])
     distance, ux, uy = _direction(mx - sx, my - sy, mz - sz)
     return Prediction(
-        np.array([distance]),
+        np.array([distance + bias]),
         np.array([[-ux, -uy, ux * sy - uy * sx]]),
-        np.array([[ux, uy, uy * mx - ux * my]]),
+        np.array([[ux, uy, uy * mx - ux * my if one.target >= 0 else 1.0]]),
     )
 
 

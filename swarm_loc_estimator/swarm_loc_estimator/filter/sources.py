@@ -243,13 +243,14 @@ def assess(
     else:
         for i in range(2):
             drift[i] += _FORGETTING * share * (whitened[i] - drift[i])
+    repeats = is_link or measurements.systematic_share[k, 0] > 0.0
     mean = drift[0] * drift[0] + (0.0 if is_link else drift[1] * drift[1])
     if distance > limit:
         state.finding[robot, place] = ELSEWHERE if elsewhere else DEVIATES
         weight *= min(distance / limit, most)
-    elif mean > (
-        _DRIFT if measurements.systematic_share[k, 0] == 0.0 else 2.0 * _DRIFT
-    ) ** 2 and not _errs_alone(measurements, k, belief, max_fault_score):
+    elif mean > ((2.0 if repeats else 1.0) * _DRIFT) ** 2 and not _errs_alone(
+        measurements, k, belief, max_fault_score
+    ):
         state.finding[robot, place] = DRIFTS
         weight *= _DRIFT_WEIGHT
     else:
@@ -442,7 +443,8 @@ def is_contradicted(belief: BeliefArrays, robot: int) -> bool:
     """Whether the newest measurements contradict the pose of a robot; it is not tracked then.
 
     They do where at least half of its links deny it: links that are excluded or with a suspect source, fixes
-    and radios that deviate; or where its newest image says that it is elsewhere.
+    that deviate, radios that have deviated more than once; or where its newest image says that it is
+    elsewhere.
     """
     state, newest_ns, denied, count = belief.sources, NEVER_NS // 2, 0, 0
     if state.score[robot] >= SUSPECT or is_kidnapped(state, robot, _ONE_IMAGE_NS):
@@ -452,7 +454,9 @@ def is_contradicted(belief: BeliefArrays, robot: int) -> bool:
     for place in range(state.source.shape[1]):
         source, since_ns = state.source[robot, place], newest_ns - state.seen_ns[robot, place]
         finding, is_outer = state.finding[robot, place], source >= fixes_of(belief, 0)
-        denies = state.evidence[robot, place] >= EXCLUDED or (is_outer and finding >= DEVIATES)
+        evidence = state.evidence[robot, place]
+        repeated = source < state.score.size or evidence > _MAX_LINK_WEIGHT
+        denies = evidence >= EXCLUDED or (is_outer and finding >= DEVIATES and repeated)
         denies = denies or is_suspended(belief, source, SUSPECT)
         if source >= 0 and since_ns < (RECENT_NS if denies else _TIED_NS):
             count += 1

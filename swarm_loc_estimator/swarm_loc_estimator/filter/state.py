@@ -197,6 +197,9 @@ def correct(belief: BeliefArrays, correction: FloatArray) -> None:
         first = belief.table.survey_column[i]
         if first >= 0:
             mark, c = belief.landmark[i], correction[first : first + 3]
+            if belief.table.first_anchor <= i < belief.table.first_camera:
+                mark += c
+                continue
             mark[0], mark[1], mark[2] = moved_by_twist(c[0], c[1], c[2], mark[0], mark[1], mark[2])
 
 

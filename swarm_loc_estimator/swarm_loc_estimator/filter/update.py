@@ -216,7 +216,7 @@ def fuse(
                 before = _covariances(measurements, k, belief)
                 correction = update_one(belief.covariance, columns, jacobian, work.innovation[0], noise)
                 correct(belief, correction)
-                note_update(measurements, k, belief, before, work.cross_covariance[0, :, :3], work.place[0])
+                note_update(measurements, k, belief, before, correction, work)
         # 7. Count gated measurements.
         for i in range(k, end):
             robot, why = count_gated(measurements, i, belief, work.accepted[i - k], work.share[i - k], limits)

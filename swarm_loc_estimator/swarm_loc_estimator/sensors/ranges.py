@@ -48,7 +48,7 @@ class _Devices(NamedTuple):
     landmark: IntArray  # (d,) column `landmark` of measurements
     place: FloatArray  # (d, 3) antenna x, y, z in base_link or in `map`
     bias: FloatArray  # (d,) of its ranges [m]
-    variance: FloatArray  # (d,) of x and of y of an anchor [m^2]
+    variance: FloatArray  # (d,) of an anchor as the reference: of its place and its bias [m^2]
 
     @classmethod
     def of(cls, swarm: Swarm) -> _Devices:
@@ -61,7 +61,10 @@ class _Devices(NamedTuple):
             if (u := robot.uwb) is not None
         ]
         rows += [
-            (a.address, -1, first + k, (a.x, a.y, a.z), a.range_bias, a.position_sigma**2)
+            (
+                *(a.address, -1, first + k, (a.x, a.y, a.z), a.range_bias),
+                a.position_sigma**2 + a.range_bias_sigma**2,
+            )
             for k, a in enumerate(swarm.anchors)
         ]
         address, *columns = zip(*sorted(rows), strict=True)

@@ -3,7 +3,8 @@
 The first three parameters of a robot are errors of its motion, whose effect on the pose grows with distance
 and turn. The last three are the yaw offset, the scale error and the range offset of its camera: a range r is
 measured as (1 + scale) r + offset. A landmark with an inexact survey and a fixed camera are static bodies:
-their state is a correction of the survey, with a right-invariant error about the identity.
+their state is a correction of the survey, with a right-invariant error about the identity. That of an anchor
+is a displacement and the bias of its ranges.
 Parameters with a standard deviation in the description are estimated from the start, others only after a
 contradiction, with the standard deviations below. Their filter columns follow those of all poses, in the
 order in which they were added.
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import error_covariance
-from swarm_loc_estimator.swarm.swarm import FixedCamera, Robot, Surveyed
+from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Robot, Surveyed
 
 TURN_BIAS = 0  # Bias of the turn rate while moving, or of the gyroscope [rad/s]; it changes slowly
 DISTANCE_SCALE = 1  # Relative error of the distance driven
@@ -53,10 +54,11 @@ class ParameterTable(NamedTuple):
     time_s: FloatArray  # (N, PARAMETERS) time constants of parameters that vary; infinite for constant ones
     # (L,) first of the three filter columns of each landmark; -1: not estimated
     survey_column: NDArray[np.int64]
-    survey: FloatArray  # (L, 3, 3) prior covariance of its right-invariant error
+    survey: FloatArray  # (L, 3, 3) prior covariance of its error
     reopened: FloatArray  # (L, 3, 3) covariance that is added after a contradiction
     drives: BoolArray  # (N,) whether the robot has odometry
-    first_camera: int  # Index of the first fixed camera among what was surveyed
+    first_anchor: int  # Index of the first anchor among what was surveyed
+    first_camera: int  # Index of the first fixed camera, after all anchors
     in_blocks: bool  # True if a robot's parameters have blocks of three columns, some of them unused
 
     @classmethod
@@ -83,10 +85,20 @@ class ParameterTable(NamedTuple):
         surveys = np.array([_survey(mark) for mark in landmarks]).reshape(-1, 3, 3)
         drives = np.array([not robot.stands for robot in robots], dtype=bool)
         first_camera = sum(not isinstance(mark, FixedCamera) for mark in landmarks)
+        first_anchor = first_camera - sum(isinstance(mark, Anchor) for mark in landmarks)
         reopened = np.array([_reopened(mark) for mark in landmarks]).reshape(-1, 3, 3)
         column, survey_column = np.full(sigma.shape, -1), np.full(len(landmarks), -1)
         table = cls(
-            column, doubted, times, survey_column, surveys, reopened, drives, first_camera, in_blocks
+            column,
+            doubted,
+            times,
+            survey_column,
+            surveys,
+            reopened,
+            drives,
+            first_anchor,
+            first_camera,
+            in_blocks,
         ).with_parameters(wanted)
         surveyed = np.array([mark.is_estimated for mark in landmarks], dtype=bool)
         survey_column[surveyed] = table.filter_size + 3 * np.arange(surveyed.sum())
@@ -133,8 +145,9 @@ class ParameterTable(NamedTuple):
 
 
 def _survey(mark: Surveyed) -> FloatArray:
-    """Prior covariance (3, 3) of the right-invariant error of what was surveyed."""
-    given = mark.position_sigma, mark.yaw_sigma
+    """Prior covariance (3, 3) of the error of what was surveyed."""
+    third = mark.range_bias_sigma if isinstance(mark, Anchor) else mark.yaw_sigma
+    given = mark.position_sigma, third
     return _error(mark, given if mark.is_estimated else _CONTRADICTED_SURVEY_SIGMA)
 
 
@@ -144,6 +157,7 @@ def _reopened(mark: Surveyed) -> FloatArray:
 
 
 def _error(mark: Surveyed, sigma: tuple[float, float]) -> FloatArray:
-    """Covariance (3, 3) of a right-invariant error with standard deviations of position [m] and yaw [rad]."""
-    position, yaw = np.maximum(sigma, _MIN_SURVEY_SIGMA).tolist()
-    return error_covariance([mark.x, mark.y, mark.yaw or 0.0], np.diag([position**2, position**2, yaw**2]))
+    """Covariance (3, 3) of the error with standard deviations of position [m], and yaw [rad] or bias [m]."""
+    position, third = np.maximum(sigma, _MIN_SURVEY_SIGMA).tolist()
+    own = np.diag([position**2, position**2, third**2])
+    return own if isinstance(mark, Anchor) else error_covariance([mark.x, mark.y, mark.yaw or 0.0], own)

@@ -68,6 +68,14 @@ class Anchor:
         0.0, "m", 0.0, 100.0, "standard deviation of x and y; 0: exact, else estimated with the poses"
     )
     range_bias: float = number(0.0, "m", -10.0, 10.0, "added to each range to this anchor")
+    range_bias_sigma: float = number(
+        0.2, "m", 0.0, 10.0, "standard deviation of range_bias; 0: exact, else estimated with the poses"
+    )
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether its place or bias is estimated: any standard deviation is positive."""
+        return self.position_sigma > 0.0 or self.range_bias_sigma > 0.0
 
 
 Pose2 = tuple[float, float, float]  # x [m], y [m], heading [rad]
@@ -208,7 +216,7 @@ class FixedCamera:
         return True
 
 
-Surveyed = Landmark | FixedCamera  # A static body whose pose may be estimated
+Surveyed = Landmark | Anchor | FixedCamera  # A static body whose place may be estimated
 
 
 @dataclass(frozen=True)
@@ -276,9 +284,8 @@ class Swarm:
 
     @cached_property
     def surveyed(self) -> tuple[Surveyed, ...]:
-        """Static bodies whose places may be estimated: landmarks, anchors as such, and fixed cameras."""
-        anchors = (Landmark(a.address, a.x, a.y, a.z, position_sigma=a.position_sigma) for a in self.anchors)
-        return (*self.landmarks, *anchors, *self.cameras)
+        """Static bodies whose places may be estimated."""
+        return (*self.landmarks, *self.anchors, *self.cameras)
 
     @cached_property
     def owner_of(self) -> Mapping[int, MarkerOwner]:

@@ -328,7 +328,7 @@ class Fusion:
             correction = state.filter.update(work.columns[used], *evaluated)
             belief = state.arrays()  # the update may have reallocated them
             correct(belief, correction)
-            note_batch(rows, work.accepted, belief, covariances, work.cross_covariance, work.place)
+            note_batch(rows, belief, covariances, work)
         fuse(rows, 0, SETTLE, middle_ns, tracks, belief, limits, work, outcome, own_nis)
         lost = work.lost > 0
         self._deinitialize(state, work, newest_ns)

@@ -19,7 +19,7 @@ from swarm_loc_estimator.swarm.calibration_states import (
     TURN_SCALE,
     ParameterTable,
 )
-from swarm_loc_estimator.swarm.swarm import Robot, Surveyed, Swarm
+from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, Robot, Swarm
 
 
 def learns(swarm: Swarm) -> bool:
@@ -35,7 +35,11 @@ def learned(swarm: Swarm, state: SwarmState) -> Swarm:
     they include errors common to all landmarks.
     """
     surveyed: list[Any] = [
-        _placed(mark, index, state) if state.landmark_column(index) >= 0 else mark
+        mark
+        if state.landmark_column(index) < 0
+        else _calibrated(mark, index, state)
+        if isinstance(mark, Anchor)
+        else _placed(mark, index, state)
         for index, mark in enumerate(swarm.surveyed)
     ]
     marks, anchors = len(swarm.landmarks), len(swarm.landmarks) + len(swarm.anchors)
@@ -47,10 +51,7 @@ def learned(swarm: Swarm, state: SwarmState) -> Swarm:
         ),
         landmarks=tuple(surveyed[:marks]),
         cameras=tuple(surveyed[anchors:]),
-        anchors=tuple(
-            replace(anchor, x=place.x, y=place.y, position_sigma=place.position_sigma)
-            for anchor, place in zip(swarm.anchors, surveyed[marks:anchors], strict=True)
-        ),
+        anchors=tuple(surveyed[marks:anchors]),
     )
 
 
@@ -98,7 +99,20 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
     )
 
 
-def _placed(mark: Surveyed, number: int, state: SwarmState) -> Any:
+def _calibrated(anchor: Anchor, number: int, state: SwarmState) -> Anchor:
+    """An anchor with its estimated place and bias."""
+    (x, y, bias), variance = state.landmark[number].tolist(), np.diag(state.landmark_covariance(number))
+    return replace(
+        anchor,
+        x=anchor.x + x,
+        y=anchor.y + y,
+        position_sigma=math.sqrt(0.5 * (variance[0] + variance[1])),
+        range_bias=anchor.range_bias + bias,
+        range_bias_sigma=math.sqrt(variance[2]),
+    )
+
+
+def _placed(mark: Landmark | FixedCamera, number: int, state: SwarmState) -> Any:
     """A landmark or fixed camera at its estimated pose."""
     x, y, yaw = se2.compose(state.landmark[number], [mark.x, mark.y, mark.yaw or 0.0]).tolist()
     covariance = se2.pose_covariance([x, y, yaw], state.landmark_covariance(number))
