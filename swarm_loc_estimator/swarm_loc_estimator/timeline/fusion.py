@@ -86,6 +86,8 @@ _SURER_AT_FIRST = 1.5
 _PAIRS_PER_ROBOT = 32
 """Maximum number of observed robots per robot with a stored mean of infrared measurements."""
 _SETTLING_NS = 10_000_000_000  # A camera that is contradicted again so soon is suspended
+_AT_ONCE_NS, _MANY = 60_000_000_000, 3
+"""If so many sources are contradicted within this time, the description is wrong as a whole."""
 _NO: Any = np.False_
 
 
@@ -408,7 +410,10 @@ class Fusion:
         if (
             state.is_doubted
             or robots > self._policy.reopen_all_up_to
-            or bad_share(state.sources, stamp_ns) < DOUBTED_SHARE
+            or (
+                bad_share(state.sources, stamp_ns) < DOUBTED_SHARE
+                and np.sum(state.contradicted_ns > stamp_ns - _AT_ONCE_NS) < _MANY
+            )
         ):
             state.augment(source, poses[min(source, robots - 1)])
         else:
