@@ -216,7 +216,10 @@ def _sure_detections(seed: int) -> Fault:
     detection["position"][:, [0, 2]] += _aside(rng, 0.03)
     detection["covariance"] = 1e-10 * np.eye(6)
     wrong: DetectionRows = concatenate([good, again._replace(detection=detection)])
-    return _faulty(run, "detections", good, wrong, {f"epuck{observer + 1}"}, {observer, other})
+    # the fault begins where the two see each other first
+    first_s = float(faults.seconds(run, again.arrival_ns[_is_within(run, again, FAULT_S)]).min())
+    span_s = first_s - 1e-3, FAULT_S[1]
+    return _faulty(run, "detections", good, wrong, {f"epuck{observer + 1}"}, {observer, other}, span_s)
 
 
 def _gyroscopes(seed: int, break_it: Callable[[FloatArray], FloatArray], span_s: Span = FAULT_S) -> Fault:
