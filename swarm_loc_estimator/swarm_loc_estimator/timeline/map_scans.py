@@ -39,7 +39,7 @@ from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import TrackedLimits, estimate_at
-from swarm_loc_estimator.timeline.scan_delay import DelayBelief, at_odometry, described, learned
+from swarm_loc_estimator.timeline.scan_delay import at_odometry, described, learned
 from swarm_loc_estimator.timeline.settings import Settings
 
 # The constants of matching to a map are checked by `make bench-inputs`: lidars in a known map.
@@ -398,8 +398,9 @@ class MapScans:
         walls = self._walls._replace(variance=self._walls.variance + self._lidars[robot].map_sigma ** 2)
         # The scan may be older than its stamp says.
         delay = state.delays.get(robot) or described(self._lidars[robot].delay_s)
-        beams, (now, then, *rest) = self._beams(robot, stamp_ns, sweep, delay)
-        back, track = between(now, then), np.array(rest)
+        best = int(delay.chance.argmax())
+        beams, now, track = self._beams(robot, stamp_ns, sweep, delay.lag_s, best)
+        back = between(now, track[best])
         _, doubt = at_odometry(delay._replace(seen=compose(pose, back), track=track), now)
         found = match(walls, *beams, pose, covariance + doubt)
         confirmed = state.sources.confirmations[robot] >= CONFIRMED
@@ -424,17 +425,16 @@ class MapScans:
         return fix, Verdict.OPEN, found.determined >= _ALL and found.fitting >= _SURE_FIT
 
     def _beams(
-        self, robot: int, stamp_ns: int, sweep: LidarSweep, delay: DelayBelief
-    ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], FloatArray]:
-        """Beams of a sweep that met something, from the robot's pose at an instant, see `match`.
+        self, robot: int, stamp_ns: int, sweep: LidarSweep, lag_s: FloatArray, best: int
+    ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], FloatArray, FloatArray]:
+        """Beams of a sweep at a lag that met something, from the robot's pose at an instant, see `match`.
 
-        And poses (2 + L, 3) by odometry: then, and in the middle of the sweep at the mean lag and at each.
+        And poses by odometry: then (3,), and in the middle of the sweep at each lag (L, 3).
         """
         lidar, seen, beams = self._lidars[robot], sweep.seen, sweep.beam_ns.size
-        lag_ns = np.round(1e9 * np.append(delay.mean_s, delay.lag_s)).astype(np.int64)
-        middle_ns = int(sweep.beam_ns.mean())
-        at_ns = np.concatenate([sweep.beam_ns - lag_ns[0], [stamp_ns], middle_ns - lag_ns])
+        lag_ns, middle_ns = np.round(1e9 * lag_s).astype(np.int64), int(sweep.beam_ns.mean())
+        at_ns = np.concatenate([sweep.beam_ns - lag_ns[best], [stamp_ns], middle_ns - lag_ns])
         poses = self._tracks.at(np.full(at_ns.size, robot), at_ns).pose
         ends = sweep.ends(lidar, between(poses[beams], poses[:beams]))[seen]
         sigma = lidar.range_sigma + lidar.range_sigma_per_m * sweep.distance[seen]
-        return (ends, np.array([lidar.x, lidar.y]), sigma**2), poses[beams:]
+        return (ends, np.array([lidar.x, lidar.y]), sigma**2), poses[beams], poses[beams + 1 :]

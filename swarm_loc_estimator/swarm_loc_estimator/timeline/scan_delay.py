@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import between, compose, wrap_angle
 
 _STEP_S, _COUNT = 0.025, 25  # Lags that are compared
@@ -23,7 +23,6 @@ _NEW, _SLIP = 0.3, 0.05  # Share of a match's variance that the next one does no
 _DOF = 4.0  # Errors have Student's distribution: wheels slip
 _GAP_NS = 1_000_000_000  # Scans farther apart are not compared
 _NEAR_S, _REFUTED = 0.06, 0.05  # A delay is refuted if it, and those so near, have less chance than this
-_LAGS: IntArray = np.arange(_COUNT)
 
 
 class DelayBelief(NamedTuple):
@@ -55,7 +54,7 @@ class DelayBelief(NamedTuple):
 def described(delay_s: float) -> DelayBelief:
     """The belief before the first scan; the described delay [s] is negative if scans are stamped late."""
     before = min(_COUNT - 1, round(max(0.0, -delay_s) / _STEP_S))  # no scan is newer than its arrival
-    lag_s = _STEP_S * (_LAGS - before).astype(float)
+    lag_s = _STEP_S * (np.arange(_COUNT, dtype=float) - before)
     nothing = np.zeros(3), np.eye(3), np.zeros((_COUNT, 3))
     return DelayBelief(lag_s, _prior(lag_s), -_GAP_NS, *nothing)
 
@@ -75,12 +74,11 @@ def learned(
     turn[:2, :2] = [[cos, sin], [-sin, cos]]
     own, chance, since_ns = turn @ covariance @ turn.T, before.chance, stamp_ns - before.stamp_ns
     if 0 < since_ns < _GAP_NS:
-        # (L, L, 3) from the lag of the scan before to the one of this scan
-        moved = between(before.track[:, None], track)
-        error = between(moved, between(before.seen, seen))
-        slip = _SLIP * (chance @ moved[_LAGS, _LAGS])
+        # (L, L, 3) errors of the motion from a lag of the scan before to one of this scan
+        error = between(track, compose(before.track, between(before.seen, seen))[:, None])
+        slip = _SLIP * (chance @ between(before.track, track))
         noise = _NEW * (own + before.covariance) + np.diag(slip**2)
-        squares = np.einsum("abi,ij,abj->ab", error, np.linalg.inv(noise), error)
+        squares = (error @ np.linalg.inv(noise) * error).sum(axis=-1)
         # changes are rare, and more often to what is described
         change = 1.0 - math.exp(-1e-9 * since_ns * _CHANGES_PER_S)
         transition = (1.0 - change) * np.eye(_COUNT) + change * _prior(before.lag_s)
