@@ -20,6 +20,7 @@ from swarm_loc_estimator.common.se2 import between, compose, wrap_angle
 _STEP_S, _COUNT = 0.025, 25  # Lags that are compared
 _RIGHT, _CHANGES_PER_S = 0.9, 0.003  # Chance that the described delay is right, and rate of changes
 _NEW, _SLIP = 0.3, 0.05  # Share of a match's variance that the next one does not have; error of odometry
+_BENT = 0.25  # Error of the heading, as a share of the turn in a sweep that was straightened without it
 _DOF = 4.0  # Errors have Student's distribution: wheels slip
 _GAP_NS = 1_000_000_000  # Scans farther apart are not compared
 _NEAR_S, _REFUTED = 0.06, 0.05  # A delay is refuted if it, and those so near, have less chance than this
@@ -79,10 +80,15 @@ def learned(
         slip = _SLIP * (chance @ between(before.track, track))
         noise = _NEW * (own + before.covariance) + np.diag(slip**2)
         squares = (error @ np.linalg.inv(noise) * error).sum(axis=-1)
+        # a sweep that turned otherwise than at the likeliest lag was straightened wrongly
+        turned = np.gradient(np.unwrap(track[:, 2])) * (1e-9 * since_ns / _STEP_S)
+        bent = 1.0 + (_BENT * (turned - turned[chance.argmax()])) ** 2 / noise[2, 2]
         # changes are rare, and more often to what is described
         change = 1.0 - math.exp(-1e-9 * since_ns * _CHANGES_PER_S)
         transition = (1.0 - change) * np.eye(_COUNT) + change * _prior(before.lag_s)
-        chance = chance @ (transition * (1.0 + squares / _DOF) ** (-0.5 * (_DOF + 3.0)))
+        chance = chance @ (
+            transition * (1.0 + squares / (bent * _DOF)) ** (-0.5 * (_DOF + 3.0)) / np.sqrt(bent)
+        )
         chance /= chance.sum()
     return DelayBelief(before.lag_s, chance, stamp_ns, seen, own, track)
 
