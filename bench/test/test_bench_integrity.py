@@ -29,6 +29,7 @@ SEED = 23
         ("odometry_reset_origin_blind", "epuck1", Contradicted.RESET),
         ("heading_reset_blind", "epuck1", Contradicted.RESET),
         ("twist_only", "epuck1", Contradicted.CONSTANT),
+        ("scans_late", "lidar of turtlebot", Contradicted.LATE),
     ],
 )
 def test_a_fault_is_named_and_misleads_nobody(scenario: str, about: str, kind: Contradicted) -> None:

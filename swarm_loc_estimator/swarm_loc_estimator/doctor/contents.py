@@ -158,11 +158,12 @@ def check_estimate(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(robot.name, problem, "Give it a start, or a sensor and something to see")
 
 
-_OUTER = {Contradicted.SUSPENDED, Contradicted.REPEATED}  # Faults of sources apart from their robots
+_OUTER = {Contradicted.SUSPENDED, Contradicted.REPEATED, Contradicted.LATE}
+"""Faults of sources apart from their robots."""
 
 
 def check_sources(evidence: Evidence) -> Iterator[Finding]:
-    """Fixed cameras, fixes and radios agree with the rest, whatever else is wrong."""
+    """Fixed cameras, fixes, lidars and radios agree with the rest, whatever else is wrong."""
     return _contradicted(evidence, _OUTER)
 
 
@@ -229,6 +230,7 @@ _CONTRADICTED = MappingProxyType(
         ),
         Contradicted.DESCRIPTION: ("other than described", "Measure it again, or use survey or calibrate"),
         Contradicted.REPEATED: ("repeated", "Let its driver publish each range once"),
+        Contradicted.LATE: ("late", "Set its delay_s as it says, then run doctor again"),
         Contradicted.SUSPENDED: ("at odds with the rest", "Correct it, then run doctor again"),
     }
 )

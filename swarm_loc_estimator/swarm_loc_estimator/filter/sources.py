@@ -578,14 +578,15 @@ def _is_tied(belief: BeliefArrays, robot: int, now_ns: int) -> bool:
 
 @inlined_njit
 def _errs_alone(measurements: Measurements, k: int, belief: BeliefArrays, max_fault_score: float) -> bool:
-    """Whether measurement k is a suspended fix, not sought near the pose, of a robot that nothing else ties.
+    """Whether a mean of innovations tells of no drift of measurement k.
 
-    The error of that robot lasts as long as fixes are not used: a mean of innovations tells of no drift.
+    So it is with a scan in a map, since one wall tells what others did not: `timeline/scan_delay.py` tells
+    whether it is late. And with a suspended fix of a robot that nothing else ties, whose error lasts.
     """
     robot = robot_of(measurements, k)
     suspended = is_suspended(belief, source_of(measurements, k, belief), 1.5 * max_fault_score)
-    alone: bool = is_fix(measurements, k) and not measurements.has_second[k] and suspended
-    return alone and not _is_tied(belief, robot, measurements.stamp_ns[k])
+    alone: bool = suspended and not _is_tied(belief, robot, measurements.stamp_ns[k])
+    return is_fix(measurements, k) and (measurements.has_second[k] or alone)
 
 
 _GATED, _OFF_FIXES = int(LossReason.GATED), int(LossReason.OFF_FIXES)

@@ -206,7 +206,8 @@ def read_sweep(
         drops["scan_without_beams"] += 1
         return None
     # the others, each with its own time
-    beam_ns = scan.stamp_ns + np.round(used * (scan.time_increment * 1e9)).astype(np.int64)
+    begin_ns = scan.stamp_ns + round(1e9 * lidar.delay_s)
+    beam_ns = begin_ns + np.round(used * (scan.time_increment * 1e9)).astype(np.int64)
     distance = np.where(scan.ranges[used] > reach, math.inf, scan.ranges[used])
     angle = scan.angle_min + used.astype(float) * step
-    return LidarSweep(scan.stamp_ns, beam_ns, angle, distance, reach)
+    return LidarSweep(begin_ns, beam_ns, angle, distance, reach)

@@ -63,10 +63,11 @@ class SweepStore:
             if sweep is None:
                 usable[k] = False
                 continue
-            shift_ns = stamp_ns - sweep.stamp_ns  # of the robot's clock
-            sweep = sweep._replace(stamp_ns=stamp_ns, beam_ns=sweep.beam_ns + shift_ns)
+            shift_ns = stamp_ns - scan.stamp_ns  # of the robot's clock
+            sweep = sweep._replace(stamp_ns=sweep.stamp_ns + shift_ns, beam_ns=sweep.beam_ns + shift_ns)
             self.sweeps.setdefault((robot, stamp_ns), sweep)
-            added.stamp_ns[k], added.reading[k] = sweep.beam_ns[-1], stamp_ns
+            late_ns = round(1e9 * max(0.0, -self._lidars[robot].delay_s))
+            added.stamp_ns[k], added.reading[k] = sweep.beam_ns[-1] + late_ns, stamp_ns
         added.arrival_ns[:] = rows.arrival_ns
         return Change(select(added, usable), NO_MEASUREMENTS)
 

@@ -32,7 +32,8 @@ from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.track_arrays import TrackArrays, look_up, new_sample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.timeline.scan_delay import DelayBelief
 from swarm_loc_estimator.timeline.settings import Settings
 
 
@@ -268,6 +269,7 @@ class Contradicted(Enum):
     DESCRIPTION = "description"
     SUSPENDED = "suspended source"
     REPEATED = "repeated values"
+    LATE = "stamps of scans"
 
 
 GYROSCOPE_OF = "gyroscope of "  # Before the name of its robot
@@ -334,6 +336,7 @@ def contradictions(
             for robot, source in aside
         ),
         *(_suspended(names[source]) for source in suspended.tolist()),
+        *(_late(swarm.robots[robot], one) for robot, one in state.delays.items() if one.is_refuted),
         *(_description(names[source], source, state) for source in contradicted),
     ]
 
@@ -356,6 +359,14 @@ def _of_robot(name: str, kind: Contradicted) -> Contradiction:
     return Contradiction(_PART.get(kind, "") + name, kind, _TEXTS[kind].format(name))
 
 
+def _late(robot: Robot, delay: DelayBelief) -> Contradiction:
+    """Fault of a lidar whose delay is another than described."""
+    older = "older" if delay.mean_s > 0.0 else "newer"
+    text = f"the scans of {robot.name} are {abs(delay.mean_s):.2f} +- {delay.sigma_s:.2f} s {older} than"
+    text += f" described: set lidar.delay_s to {robot.lidar.delay_s - delay.mean_s:.2f}, or correct their"
+    return Contradiction(f"lidar of {robot.name}", Contradicted.LATE, f"{text} stamps")
+
+
 def _sightings(observer: str, source: str) -> Contradiction:
     text = f"excluding {observer}'s measurements of {source}: inconsistent with all others"
     return Contradiction(observer, Contradicted.SIGHTINGS, text)
@@ -364,7 +375,7 @@ def _sightings(observer: str, source: str) -> Contradiction:
 _CHECKS = {
     "": "its place (x, y, yaw), its topic and its clock",
     "fixes": "whose body it is, the place of its frame and the clock",
-    "lidar": "its mount (lidar.yaw), its stamps and the map",
+    "lidar": "its mount (lidar.yaw) and the map",
     "marker": "the yaw of the face of {}",
 }
 """What to check of a source that is not used."""

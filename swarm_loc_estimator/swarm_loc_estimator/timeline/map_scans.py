@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.se2 import between
+from swarm_loc_estimator.common.se2 import between, compose
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.filter.models import CARTESIAN, POSE_GATE
 from swarm_loc_estimator.filter.sources import CONFIRMED, RELIEF
@@ -39,6 +39,7 @@ from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import TrackedLimits, estimate_at
+from swarm_loc_estimator.timeline.scan_delay import at_odometry, described, learned
 from swarm_loc_estimator.timeline.settings import Settings
 
 # The constants of matching to a map are checked by `make bench-inputs`: lidars in a known map.
@@ -66,9 +67,9 @@ _MIN_BEAMS, _MIN_FIT, _MAX_THROUGH = 20, 0.5, 0.1
 _UNKNOWN, _FREE, _WALL = 0, 1, 2
 
 
-FITS, OFF_MAP, BLOCKED = 0, 1, 2
-"""Outcomes of a match: it fits; beams go through walls, or the match is far from the prediction; most beams
-end where the map is free, or too few are comparable."""
+FITS, OFF_MAP, BLOCKED, FAR = 0, 1, 2, 3
+"""Outcomes of a match: it fits; beams go through walls; most beams end where the map is free, or too few are
+comparable; it fits, but far from the prediction."""
 
 
 class WallMap(NamedTuple):
@@ -87,7 +88,7 @@ class WallMap(NamedTuple):
 class Match(NamedTuple):
     """A sweep matched to a map."""
 
-    outcome: int  # `FITS`, `OFF_MAP` or `BLOCKED`
+    outcome: int  # `FITS`, `OFF_MAP`, `BLOCKED` or `FAR`
     pose: FloatArray  # (3,) x [m], y [m], theta [rad]
     covariance: FloatArray  # (3, 3) of the pose, of `UNDETERMINED_SIGMA` where walls tell nothing
     determined: int  # Number of directions that walls tell, of 3
@@ -201,7 +202,7 @@ def match(
     elif fitting < _MIN_BEAMS or fitting < _MIN_FIT * tried:
         outcome = BLOCKED
     elif distance > POSE_GATE:
-        outcome = OFF_MAP
+        outcome = FAR
     return Match(outcome, pose, result, determined, fitting / tried, through / tried)
 
 
@@ -393,11 +394,20 @@ class MapScans:
         if self._walls is None or sweep is None or state.origin != IN_MAP or not state.tracked[robot]:
             return None, Verdict.NOT_LOCALIZED, False
         estimate = estimate_at(state, self._tracks.arrays, self._limits, stamp_ns)
-        beams = self._beams(robot, stamp_ns, sweep)
+        pose, covariance = estimate.poses[robot], estimate.covariances[robot]
         walls = self._walls._replace(variance=self._walls.variance + self._lidars[robot].map_sigma ** 2)
-        found = match(walls, *beams, estimate.poses[robot], estimate.covariances[robot])
-        if found.outcome == OFF_MAP:
-            confirmed = state.sources.confirmations[robot] >= CONFIRMED
+        # The scan may be older than its stamp says.
+        delay = state.delays.get(robot) or described(self._lidars[robot].delay_s)
+        best = int(delay.chance.argmax())
+        beams, now, track = self._beams(robot, stamp_ns, sweep, delay.lag_s, best)
+        back = between(now, track[best])
+        _, doubt = at_odometry(delay._replace(seen=compose(pose, back), track=track), now)
+        found = match(walls, *beams, pose, covariance + doubt)
+        confirmed = state.sources.confirmations[robot] >= CONFIRMED
+        if found.outcome == FITS or (found.outcome == FAR and confirmed):
+            delay = learned(delay, stamp_ns, compose(found.pose, back), found.covariance, track)
+            state.delays[robot] = delay
+        if found.outcome in (OFF_MAP, FAR):
             state.sources.score[robot] += 1.0
             if state.sources.score[robot] >= (_MAX_MISSED if confirmed else _MAX_AT_START):
                 state.deinitialize(
@@ -407,19 +417,24 @@ class MapScans:
         if found.outcome == BLOCKED:
             return None, Verdict.BLOCKED, False
         state.sources.score[robot] = max(0.0, state.sources.score[robot] - 4.0 * RELIEF)
-        fix = about_robots(robot, stamp_ns, found.pose[None], found.covariance[None], CARTESIAN)
+        pose, doubt = at_odometry(delay, now)
+        fix = about_robots(robot, stamp_ns, pose[None], (found.covariance + doubt)[None], CARTESIAN)
         fix.systematic_share[:] = _SYSTEMATIC_SHARE
         # with a second solution it locates no robot alone: it was sought near the pose that may be wrong
         fix.has_second[:], fix.second[:] = True, fix.value
         return fix, Verdict.OPEN, found.determined >= _ALL and found.fitting >= _SURE_FIT
 
     def _beams(
-        self, robot: int, stamp_ns: int, sweep: LidarSweep
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Beams of a sweep that met something, from the robot's pose at an instant, see `match`."""
-        lidar, seen = self._lidars[robot], sweep.seen
-        at_ns = np.append(sweep.beam_ns, stamp_ns)
+        self, robot: int, stamp_ns: int, sweep: LidarSweep, lag_s: FloatArray, best: int
+    ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], FloatArray, FloatArray]:
+        """Beams of a sweep at a lag that met something, from the robot's pose at an instant, see `match`.
+
+        And poses by odometry: then (3,), and in the middle of the sweep at each lag (L, 3).
+        """
+        lidar, seen, beams = self._lidars[robot], sweep.seen, sweep.beam_ns.size
+        lag_ns, middle_ns = np.round(1e9 * lag_s).astype(np.int64), int(sweep.beam_ns.mean())
+        at_ns = np.concatenate([sweep.beam_ns - lag_ns[best], [stamp_ns], middle_ns - lag_ns])
         poses = self._tracks.at(np.full(at_ns.size, robot), at_ns).pose
-        ends = sweep.ends(lidar, between(poses[-1], poses[:-1]))[seen]
+        ends = sweep.ends(lidar, between(poses[beams], poses[:beams]))[seen]
         sigma = lidar.range_sigma + lidar.range_sigma_per_m * sweep.distance[seen]
-        return ends, np.array([lidar.x, lidar.y]), sigma**2
+        return (ends, np.array([lidar.x, lidar.y]), sigma**2), poses[beams], poses[beams + 1 :]

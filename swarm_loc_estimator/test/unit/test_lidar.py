@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -152,6 +153,18 @@ def test_the_motion_during_a_sweep_is_taken_out_of_it() -> None:
     assert off[on_walls].max() < 1e-6
     moved = between(robot.pose(begin_ns), robot.pose(begin_ns + SWEEP_NS))
     assert stop.turn[-1] == pytest.approx(moved[2] * (BEAMS - 1) / BEAMS, abs=1e-6)
+
+
+@pytest.mark.parametrize("late_ns", [300_000_000, -300_000_000])
+def test_a_described_delay_puts_a_sweep_where_it_was_measured(late_ns: int) -> None:
+    robot, begin_ns = LidarRobot(), 1_000_000_000
+    pairer = SweepPairer(replace(LIDAR, delay_s=-1e-9 * late_ns))
+    pairer.add_scan(robot.scan(begin_ns)._replace(stamp_ns=begin_ns + late_ns))
+    for at_ns in range(0, 2_000_000_000, ODOMETRY_NS):
+        pairer.add_odometry(at_ns, robot.odometry(np.array([at_ns]))[0])
+    (stop,) = pairer.ready()
+    assert stop.stamp_ns[0] == begin_ns
+    assert stop.arrival == pytest.approx(robot.odometry(np.array([begin_ns]))[0], abs=1e-4)
 
 
 def test_a_robot_that_does_not_stop_makes_a_map() -> None:

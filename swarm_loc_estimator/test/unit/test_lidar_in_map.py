@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 from core_geometry import nees, wrapped
 from mapping_world import LIDAR, SWEEP_NS, LidarRobot, room_map, scan_bytes
+from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
@@ -40,9 +42,20 @@ def swarm_at(room: Path | None, start: FloatArray) -> Swarm:
     return Swarm((Robot("a", start=pose, start_sigma=SIGMA, lidar=LIDAR),), map=room)
 
 
-def sent(until_ns: int, seed: int, blocked: int = 0) -> list[tuple[str, int, bytes]]:
+class Weaver(LidarRobot):
+    """A robot that looks to the left and to the right and back."""
+
+    def odometry(self, stamp_ns: NDArray[np.int64]) -> FloatArray:
+        """Poses (n, 3) by odometry at times (n,)."""
+        time_s = 1e-9 * stamp_ns
+        return np.stack([0.1 * np.sin(time_s), 0.0 * time_s, 0.6 * np.sin(1.5 * time_s)], axis=-1)
+
+
+def sent(
+    until_ns: int, seed: int, blocked: int = 0, kind: type[LidarRobot] = LidarRobot, late_ns: int = 0
+) -> list[tuple[str, int, bytes]]:
     """Topic, arrival and bytes: odometry, and each sweep when it is over, with some beams at people."""
-    robot, unknown = LidarRobot(np.random.default_rng(seed)), UNKNOWN_COVARIANCE
+    robot, unknown = kind(np.random.default_rng(seed)), UNKNOWN_COVARIANCE
     found = []
     for at_ns in range(0, until_ns + 1, ODOMETRY_NS):
         pose = robot.odometry(np.array([at_ns]))
@@ -53,7 +66,8 @@ def sent(until_ns: int, seed: int, blocked: int = 0) -> list[tuple[str, int, byt
         scan = robot.scan(at_ns)
         beams = np.arange(7 * k, 7 * k + blocked) % len(scan.ranges)
         scan.ranges[beams] = np.minimum(scan.ranges[beams], 0.5)
-        found.append(("a/scan", at_ns + SWEEP_NS, scan_bytes(scan)))
+        scan = scan._replace(stamp_ns=at_ns + late_ns)
+        found.append(("a/scan", at_ns + late_ns + SWEEP_NS, scan_bytes(scan)))
     return sorted(found, key=lambda one: one[1])
 
 
@@ -82,6 +96,31 @@ def test_poses_are_right_within_their_covariance(room: Path) -> None:
         assert abs(error[2]) < 0.03
         assert estimator.used >= 18
         squares.append(float(nees(error[None], estimate.covariances)[0]))
+    assert np.mean(squares) < 4.5
+
+
+@pytest.mark.parametrize(("late_s", "described_s"), [(0.0, 0.0), (0.3, 0.0), (0.3, 0.3), (0.0, 0.3)])
+def test_scans_that_are_stamped_late_are_named_and_poses_are_right(
+    room: Path, late_s: float, described_s: float
+) -> None:
+    until_ns, squares = 6_000_000_000, []
+    for seed in range(4):
+        swarm = swarm_at(room, LidarRobot.start + np.random.default_rng(seed).standard_normal(3) * 0.05)
+        lidar = replace(LIDAR, delay_s=-described_s)
+        estimator = Estimator(replace(swarm, robots=(replace(swarm.robots[0], lidar=lidar),)))
+        messages = sent(until_ns, seed, kind=Weaver, late_ns=round(1e9 * late_s))
+        estimate = hand_in(estimator, [one for one in messages if one[1] <= until_ns])[-1]
+        error = wrapped(estimate.poses[0] - Weaver().pose(until_ns))
+        squares.append(float(nees(error[None], estimate.covariances)[0]))
+        assert estimate.status[0] == Status.TRACKED
+        named = {one.about: one for one in estimator.contradictions(until_ns)}
+        if late_s == described_s:
+            assert not named
+            continue
+        assert {one.kind for one in named.values()} == {Contradicted.LATE}
+        said = re.search(r"set lidar.delay_s to (\S+),", named["lidar of a"].text)
+        assert said is not None
+        assert float(said[1]) == pytest.approx(-late_s, abs=0.04)
     assert np.mean(squares) < 4.5
 
 
@@ -143,8 +182,8 @@ def test_a_robot_that_is_carried_away_is_contradicted_and_then_lost(room: Path) 
         odometry = encode_odometry(*frames, stamps, stands, np.zeros((1, 3)), unknown, unknown)[0]
         scan = scan_bytes(elsewhere._replace(stamp_ns=at_ns - SWEEP_NS))
         status += hand_in(estimator, [("a/odom", at_ns, odometry), ("a/scan", at_ns, scan)])
-        names |= {one.kind for one in estimator.contradictions(at_ns) if one.about == "a"}
-    assert Contradicted.POSE in names
+        names |= {(one.about, one.kind) for one in estimator.contradictions(at_ns)}
+    assert names == {("a", Contradicted.POSE)}
     assert status[-1].status[0] == Status.WAITING
 
 
