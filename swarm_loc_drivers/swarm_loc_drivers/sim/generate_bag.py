@@ -2,7 +2,6 @@
 
     generate_bag eight bags/eight_five_robots --seed 3 --duration 54 --world w0
     generate_bag pictures bags/eight_pictures --seed 1 --duration 9 --robots 2
-    generate_bag grid /tmp/grid100 --robots 100 --duration 20
     generate_bag droplets bags/droplets_twenty --seed 1 --duration 60
     generate_bag aerial bags/aerial_five --seed 1
     generate_bag pushbots /tmp/hallway --robots 2 --duration 300 --plan office
@@ -37,7 +36,6 @@ from swarm_loc_drivers.sim.scenarios.bags import (
 )
 from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, simulate_droplets
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight, simulate_eight_images
-from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.scenarios.pushbot_bag import PushbotBagSettings, write_pushbot_bag
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
@@ -78,11 +76,6 @@ def _images(options: argparse.Namespace, comment: str) -> int:
     return write_image_bag(
         simulate_eight_images(_eight_settings(options), CameraModel()), options.bag, comment
     )
-
-
-def _grid(options: argparse.Namespace, comment: str) -> int:
-    settings = GridSettings(seed=options.seed, duration_s=options.duration, robots=options.robots)
-    return write_bag(simulate_grid(settings), options.bag, comment)
 
 
 def _droplets(options: argparse.Namespace, comment: str) -> int:
@@ -156,9 +149,6 @@ def _parser() -> argparse.ArgumentParser:
         default=0.0,
         help="length of the events at the beginning [s]",
     )
-    # the grid
-    grid = _swarm(swarms, "grid", "many robots, each in its cell of a grid", 100, 10_000, 20.0)
-    grid.set_defaults(write=_grid)
     return parser
 
 
