@@ -50,6 +50,7 @@ class Program:
 
     module: str  # Full name of the module
     function: str = "main"  # The one to run
+    needs_ros: bool = False  # Whether it runs only with ROS 2
 
     def __call__(self) -> int:
         """Run the program; returns its exit status."""

@@ -33,7 +33,7 @@ from swarm_loc_drivers.sim.droplet.infrared import (
 )
 from swarm_loc_drivers.sim.link_host import ConsoleFirmware
 from swarm_loc_drivers.sim.run import START_NS
-from swarm_loc_drivers.sim.worlds import WorldError, start_of
+from swarm_loc_drivers.sim.worlds import WorldError, WorldParameters, start_of
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text, texts
@@ -334,17 +334,13 @@ def _check(ids: Sequence[int], platform: IrPlatform) -> None:
 
 
 @dataclass(frozen=True)
-class DropletWorldParameters:
+class DropletWorldParameters(WorldParameters):
     """Parameters of `droplet_world_node`."""
 
     swarm_file: str = text(
         "", "path of the swarm description; every robot needs a start and an infrared board", required=True
     )
     world: str = choice("d1", tuple(DROPLET_WORLDS), "how the robots err; see sim/droplet/world.py")
-    seed: int = number(1, "1", 0, 2**31 - 1, "fixes the errors")
-    rate: float = number(
-        1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
-    )
     link_folder: str = text("", "where each robot's serial port appears under its name", required=True)
     truth_rate: float = number(10.0, "1/s", 0.1, 200.0, "published true poses of each robot")
     fixed: tuple[str, ...] = texts("robots that a tracker above the table sees; it publishes <robot>/fix")

@@ -110,9 +110,6 @@ class EpuckWorldNode(WorldNode[EpuckWorldParameters]):
             self._names,
             STEP_NS,
             firmware_of,
-            rate=params.rate,
-            truth_rate=params.truth_rate,
-            link_folder=params.link_folder,
             first_port=params.first_port,
         )
         # cameras, on the robots and above
