@@ -27,11 +27,7 @@ class Session(Protocol):
 
 
 class TalkSession(ABC):
-    """A `Session` that is written as one generator.
-
-    Args:
-        counts: Counts what happens.
-    """
+    """A `Session` that is written as one generator, and counts what happens."""
 
     def __init__(self, counts: Counter[str]) -> None:
         self.ending = self.connected = self.ended = False

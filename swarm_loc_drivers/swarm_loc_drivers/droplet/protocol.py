@@ -253,8 +253,7 @@ _LINES: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Event]], ...] = t
 class ConsoleParser:
     """Parses the output of the console, in pieces of any size and after any stray bytes.
 
-    Args:
-        elements: Number of emitters and of sensors; matrices of another size are broken.
+    Matrices of another number of emitters and of sensors than `elements` are broken.
 
     Attributes:
         partial: The unfinished line, as a terminal would show it.

@@ -77,9 +77,6 @@ class _Drive:
 class StopAndGo:
     """Motion of one robot.
 
-    Args:
-        settings: Parameters of its motion.
-
     Attributes:
         goals: Number of accepted goals.
         halts: Number of drives that ended at an obstacle.

@@ -106,10 +106,7 @@ class StreamFirmware(ConsoleFirmware, Protocol):
 class _PtyPort:
     """A pseudo-terminal; it stays open while clients come and go, as a robot's Bluetooth module does.
 
-    Args:
-        firmware: Who answers.
-        link: A name for the terminal that stays the same; None for none.
-        waits: Whether the firmware waits for the client (RTS/CTS); else what it does not take is lost.
+    Arguments as of `FirmwareHost.serve_pty`.
     """
 
     def __init__(self, firmware: ConsoleFirmware, link: Path | None, *, waits: bool) -> None:

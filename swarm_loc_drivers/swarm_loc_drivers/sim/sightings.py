@@ -128,18 +128,9 @@ def observe_markers(
     view: View,
     errors: ErrorModel,
 ) -> tuple[Records, Records]:
-    """Frames and sightings of the cameras' images.
+    """Frames in order of arrival, of FRAME_DTYPE, and their sightings, of SIGHTING_DTYPE.
 
-    Args:
-        rng: Random generator.
-        swarm: Described geometry.
-        truth: True poses of the robots.
-        exposures: Robot and stamp of each image.
-        view: Limits of visibility.
-        errors: Simulated errors.
-
-    Returns:
-        Frames in order of arrival, of FRAME_DTYPE, and their sightings, of SIGHTING_DTYPE.
+    `swarm` is the described geometry; each exposure is of a robot at a stamp.
     """
     geometry = hidden_geometry(rng, swarm, errors)
     robot, stamp_ns = exposures

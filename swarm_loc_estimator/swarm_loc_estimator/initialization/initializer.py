@@ -195,12 +195,7 @@ def _fixed(one: Measurements, on_track: FloatArray) -> InitialPose:
 
 
 class ConfiguredStarts:
-    """Initializes robots at their configured starts.
-
-    Args:
-        swarm: Robots with their starts.
-        tracks: Odometry of the robots.
-    """
+    """Initializes robots, by their odometry, at their configured starts."""
 
     def __init__(self, swarm: Swarm, tracks: OdometryTracks) -> None:
         self._tracks = tracks

@@ -122,13 +122,10 @@ class LiveGraph:
         patience_s: float,
         needed: Collection[str] | None = None,
     ) -> None:
-        """Process messages until a condition holds.
+        """Process messages until a condition holds, which is checked after each event and every 50 ms.
 
-        Args:
-            condition: Checked after each event and every 50 ms.
-            what: The condition in words, following "did not".
-            patience_s: Timeout since the last poses.
-            needed: Nodes that must keep running; None: all that have started.
+        `what` is the condition in words, following "did not". The patience is since the last poses. All nodes
+        that have started, or those that are needed, must keep running.
 
         Raises:
             LiveError: A node has ended, or the timeout has passed.

@@ -103,12 +103,9 @@ class MapFigures(NamedTuple):
 
 
 def map_figures(mapper: CooperativeMapper, truth: Mapping[int, Trajectory], walls: FloatArray) -> MapFigures:
-    """Compare the map of a mapper with ground truth and floor plan.
+    """Compare the map and the stops of a mapper with true trajectories in map, by the index of the robot.
 
-    Args:
-        mapper: Holds the map and the stops.
-        truth: Index of a robot -> its true trajectory in map.
-        walls: (S, 4) segments x0, y0, x1, y1 of the floor plan [m]; may be empty.
+    `walls` (S, 4) are segments x0, y0, x1, y1 of the floor plan [m], if any.
     """
     off = _stop_errors(mapper, truth)
     position = math.sqrt(np.mean(np.square(off[:, :2]).sum(axis=1))) if len(off) else math.nan

@@ -439,12 +439,7 @@ Values = dict[str, Any]
 
 
 class IrSection:
-    """Reads the section of one file.
-
-    Args:
-        checks: Checks of the file.
-        folder: Folder of the file, to which platform paths are relative.
-    """
+    """Reads the section of one file; paths of platforms are relative to its folder."""
 
     def __init__(self, checks: TreeChecks, folder: Path) -> None:
         self._checks = checks
@@ -573,12 +568,9 @@ def load_ir_platform(name: str, folder: Path | None = None) -> IrPlatform:
 
 
 def save_ir_platform(platform: IrPlatform, path: Path, comment: str = "") -> None:
-    """Write a board that `load_ir_platform` reads back equal.
+    """Write a board that `load_ir_platform` reads back equal, with lines of comment at its top.
 
-    Args:
-        platform: Board to write.
-        path: The file; replaced when it exists, its folder created when missing.
-        comment: Comment lines for the top of the file.
+    An existing file is replaced, a missing folder created.
     """
     laws = dict(zip(platform.powers, platform.amplitudes, strict=True))
     tree = {

@@ -112,13 +112,9 @@ def aerial_frame(
     robot: npt.NDArray[np.integer],
     probability: npt.NDArray[np.float64],
 ) -> Frame:
-    """Detections of an aerial image.
+    """Detections of an aerial image: positions (n, 2) in map [m], and who each is with what probability (n,).
 
-    Args:
-        stamp_ns: Of the image.
-        position: (n, 2) of its detections in map [m].
-        robot: (n,) index of the robot that each is; -1: unknown.
-        probability: (n,) of these identities.
+    Robots are given by their index; -1: unknown.
     """
     columns: dict[str, npt.NDArray[Any]] = {
         "robot": robot.astype(np.int32),

@@ -103,12 +103,9 @@ class _Found(NamedTuple):
 
 
 class AerialDetector:
-    """Finds discs of one size on a level plane, and the mark on them.
+    """Finds discs of one size, of one of POLARITIES, on a level plane, and the mark on them.
 
-    Args:
-        settings: Its numbers; without a diameter it is estimated from the first images.
-        ground: The camera.
-        polarity: One of POLARITIES.
+    Without a diameter in the settings it is estimated from the first images.
 
     Attributes:
         diameter: Diameter of the robots [m]; 0: not known yet.
@@ -376,13 +373,10 @@ MAP = "map"
 
 
 class AerialCamera(CalibratedCamera):
-    """Finds robots in the images of one overhead camera.
+    """Finds robots in the images of one overhead camera; arguments as of `AerialDetector`.
 
-    Args:
-        settings: Numbers of the detector.
-        polarity: One of `POLARITIES`.
-        ground: Control points; its intrinsics, if any, replace camera_info.
-        gray_of: Reads an image message, see `TRANSPORTS`.
+    Intrinsics of the control points, if any, replace camera_info. `gray_of` reads an image message, see
+    `TRANSPORTS`.
 
     Attributes:
         used: Number of images that were searched.

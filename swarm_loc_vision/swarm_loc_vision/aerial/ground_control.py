@@ -50,13 +50,7 @@ class FloorMarker:
 
 
 class FloorMarkers:
-    """Finds floor markers, and averages their corners over the images of a static camera.
-
-    Args:
-        markers: The markers.
-        family: Family of the markers.
-        camera: The camera.
-    """
+    """Finds floor markers of a family, and averages their corners over the images of a static camera."""
 
     def __init__(self, markers: Sequence[FloorMarker], family: Family, camera: Camera) -> None:
         self._markers = {marker.id: marker for marker in markers}
@@ -116,12 +110,9 @@ class Ground:
 
 
 class GroundControl:
-    """Keeps the pose of one camera.
+    """Keeps the pose of one camera, by known references on the floor.
 
-    Args:
-        ground: Known references on the floor.
-        camera: The camera.
-        settings: Noise of the control points, and the limit of their residuals.
+    The settings are the noise of the control points, and the limit of their residuals.
 
     Attributes:
         fit: The pose; None: unknown.

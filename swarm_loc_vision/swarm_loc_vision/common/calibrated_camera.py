@@ -92,11 +92,7 @@ class Calibration:
 
 
 class CalibratedCamera(Calibration):
-    """The calibration of one camera, and its images.
-
-    Args:
-        gray_of: Reads an image message, see `TRANSPORTS`.
-    """
+    """The calibration of one camera, and its images; `gray_of` reads an image message, see `TRANSPORTS`."""
 
     def __init__(self, gray_of: GrayOf) -> None:
         super().__init__()

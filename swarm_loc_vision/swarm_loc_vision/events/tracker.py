@@ -70,10 +70,7 @@ class _Bursts(NamedTuple):
 class LightTracker:
     """Reports the lights of each window of events; windows begin at whole multiples of their length.
 
-    Args:
-        sources: The lights, at most `MAX_SOURCES`.
-        size: Width and height of the sensor [px].
-        settings: Numbers of the tracker.
+    There are at most `MAX_SOURCES` lights; `size` is width and height of the sensor [px].
 
     Attributes:
         time_jumps: How often time stepped back by more than a window, which resets the tracker.

@@ -87,12 +87,10 @@ class WallDrive:
 
 
 def recorded_drive(bag: Path, robot: str, drive: WallDrive) -> WallDrive:
-    """Fill a drive from a bag until it is done; returns the drive.
+    """Fill an empty drive from a bag until it is done; returns the drive.
 
-    Args:
-        bag: With `<robot>/odom` and `<robot>/laser`; `start_distance` is that at the first odometry.
-        robot: Name of the robot; "" for topics without a namespace.
-        drive: An empty drive.
+    The bag has `<robot>/odom` and `<robot>/laser`, or those topics without a namespace where the name is "";
+    `start_distance` is that at the first odometry.
 
     Raises:
         CalibrationError: A topic has no usable message, or the robot turns on its way.

@@ -208,15 +208,9 @@ def pages_of(stickers: Sequence[Sticker], family: Family, paper: str) -> list[Pa
 
 
 def board_page(first_id: int, columns: int, rows: int, side: float, family: Family, paper: str) -> Page:
-    """A grid of markers, as far apart as the paper allows, with ids row by row from the upper left.
+    """A grid of markers of a side [mm], as far apart as the paper allows.
 
-    Args:
-        first_id: Id of the upper left marker.
-        columns: Markers side by side.
-        rows: Markers one below the other.
-        side: Side of the markers [mm].
-        family: Their family.
-        paper: Name of the paper.
+    Ids begin with `first_id` at the upper left, and go row by row.
 
     Raises:
         SheetError: They do not fit, or the family does not have their ids.

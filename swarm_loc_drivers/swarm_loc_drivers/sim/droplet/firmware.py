@@ -95,12 +95,7 @@ def _braces(readings: NDArray[np.int64]) -> str:
 
 
 class DropletFirmware:
-    """Answers bytes as the robot does.
-
-    Args:
-        body: The robot.
-        print_matrix: What the user's program prints.
-    """
+    """Answers bytes as the robot does; `print_matrix` is what the user's program prints."""
 
     def __init__(self, body: DropletBody, print_matrix: Print = print_named) -> None:
         self._body = body

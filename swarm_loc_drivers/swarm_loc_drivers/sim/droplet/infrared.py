@@ -169,15 +169,7 @@ class InfraredSettings:
 
 
 class DropletInfrared:
-    """Transmits messages and light.
-
-    Args:
-        platform: The board of all robots.
-        light: Light on the sensors.
-        ids: (N,) ids of the robots.
-        settings: Losses and ambient light.
-        rng: Random generator.
-        now_ns: Start time.
+    """Transmits messages and light between robots with ids (N,).
 
     Attributes:
         heard: Per robot the commands and readings not fetched yet.

@@ -46,14 +46,9 @@ STRIDE_S = 2.0
 
 
 class Cable:
-    """A robot connected by cable: its console and the driver's session.
+    """A robot connected by cable: its console and the driver's session, with its model of motion errors.
 
-    Args:
-        world: The world of the robot.
-        robot: Its index.
-        settings: Settings of the session.
-        noise: The session's model of motion errors.
-        publish: Called with the matrices of exchanges.
+    `publish` is called with the matrices of exchanges.
 
     Attributes:
         firmware: The firmware at the console.
@@ -102,13 +97,9 @@ class Cable:
 def run(
     world: DropletWorld, robots: Sequence[Callable[[], object]], steps: int, control: Callable[[], None]
 ) -> None:
-    """Advance the simulation.
+    """Advance a world by steps, with a function that steps each robot, such as `Cable.step`.
 
-    Args:
-        world: The world.
-        robots: Step function of each robot, such as `Cable.step`.
-        steps: Number of steps of the world.
-        control: Called after every step, to set velocities and record data.
+    `control` is called after every step, to set velocities and record data.
     """
     for _ in range(steps):
         world.step()
@@ -127,14 +118,9 @@ class Fix:
 
 
 class Tracker:
-    """A tracker above the table: noisy absolute poses of some robots at a fixed rate.
+    """A tracker above the table: noisy absolute poses of some robots at a fixed rate of each.
 
-    Args:
-        robots: Their indices.
-        rate_hz: Of each [1/s].
-        sigma: Noise of a position along each axis, one standard deviation [m].
-        heading_sigma: Noise of a heading [rad].
-        seed: Fixes the noise.
+    Sigmas are of a position along each axis [m], and of a heading [rad].
     """
 
     def __init__(
@@ -196,12 +182,7 @@ class DropletWorldSettings:
 
 
 class DropletWorld:
-    """Droplets on a floor.
-
-    Args:
-        ids: (N,) of the robots, 1 to 65535, each once.
-        start: (N, 3) where they begin, in map.
-        settings: How the world is.
+    """Droplets with ids (N,), 1 to 65535, each once, on a floor in map, where they begin at poses (N, 3).
 
     Raises:
         WorldError: The robots cannot be simulated.
@@ -274,12 +255,7 @@ def nominal_gait(direction: int) -> Gait:
 
 
 class SimulatedDroplet:
-    """One robot of a world as seen by its firmware; see `DropletBody`.
-
-    Args:
-        world: The world of the robot.
-        robot: Its index.
-    """
+    """One robot of a world as seen by its firmware; see `DropletBody`."""
 
     trims = tuple(_WALK_TRIMS if direction in WALKS else _TURN_TRIMS for direction in DIRECTIONS)
     lengths = tuple(_WALK_MM if direction in WALKS else _TURN_DEG for direction in DIRECTIONS)

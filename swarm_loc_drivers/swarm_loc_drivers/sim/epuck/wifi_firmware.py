@@ -27,10 +27,7 @@ _ZOOM = 4
 class WifiFirmware:
     """Answers one client.
 
-    Args:
-        body: The robot.
-        counts_right_backwards: Whether the right counter falls when its wheel rolls ahead, as it did before
-            December 2018.
+    With `counts_right_backwards` the right counter falls when its wheel rolls ahead, as before December 2018.
 
     Attributes:
         exchange_fails: Set it to have the next exchange between the chips fail.

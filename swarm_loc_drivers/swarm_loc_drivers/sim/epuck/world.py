@@ -76,11 +76,7 @@ class Exposure:
 
 
 class EpuckWorld:
-    """The robots of a swarm in their arena.
-
-    Args:
-        swarm: As described; every robot needs a start pose and a camera, every marker a heading.
-        settings: How the world is.
+    """The robots of a swarm in their arena; each needs a start pose and a camera, every marker a heading.
 
     Raises:
         WorldError: The swarm cannot be simulated.
@@ -200,12 +196,7 @@ class EpuckWorld:
 
 
 class SimulatedEpuck:
-    """One robot of a world as seen by its firmware; see `EpuckBody`.
-
-    Args:
-        world: The world of the robot.
-        robot: Its index.
-    """
+    """One robot of a world as seen by its firmware; see `EpuckBody`."""
 
     def __init__(self, world: EpuckWorld, robot: int) -> None:
         self._world, self._robot = world, robot

@@ -76,13 +76,7 @@ class CameraEvents(NamedTuple):
 
 
 class EventCamera:
-    """One sensor of 128 x 128 pixels.
-
-    Args:
-        noise: Noise and limits.
-        rng: Random generator of events.
-        sensor: Seed of the fixed properties of its pixels.
-    """
+    """One sensor of 128 x 128 pixels; its seed gives the fixed properties of its pixels."""
 
     def __init__(self, noise: CameraNoise, rng: np.random.Generator, sensor: int) -> None:
         self._noise = noise

@@ -46,17 +46,9 @@ class PushBotNoise:
 
 
 class KinematicPushBot:
-    """One robot.
-
-    Args:
-        plan: Where it is.
-        pose: (3,) at the start.
-        noise: Its imperfections.
-        rng: Source of the noise.
+    """One robot in a floor plan, from a pose (3,) on.
 
     Attributes:
-        time_s: Current time [s].
-        trace: (n, 3) true pose every `PERIOD_S` so far.
         bumps: Number of stops by obstacles.
     """
 

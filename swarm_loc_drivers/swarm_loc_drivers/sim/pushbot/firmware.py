@@ -108,12 +108,9 @@ class EventRing:
         return len(self._words)
 
     def put(self, words: NDArray[np.uint16], times_us: NDArray[np.int64], sent: int) -> None:
-        """Take events `0yyyyyyy pxxxxxxx`, in order, with their board's time.
+        """Take events `0yyyyyyy pxxxxxxx` (N,), in order, with their board's time (N,) [us].
 
-        Args:
-            words: (N,).
-            times_us: (N,) [us].
-            sent: Number of events that are sent while these come, which leave their places.
+        `sent` events are sent while these come, which leave their places.
         """
         self._words = np.concatenate([self._words, words])
         self._times = np.concatenate([self._times, times_us])
@@ -213,12 +210,7 @@ TX_BUFFER = 4096
 
 
 class Board:
-    """State of a board since its last reset: clock, motors, timers of the lights, wheel ticks and events.
-
-    Args:
-        body: The robot.
-        generation: Which firmware it is.
-    """
+    """State of a board since its last reset: clock, motors, timers of the lights, wheel ticks and events."""
 
     def __init__(self, body: PushbotBody, generation: FirmwareGeneration) -> None:
         self._body = body
@@ -356,12 +348,7 @@ _MAX_LINE = 127  # Characters of a command
 
 
 class Console:
-    """Parses lines of text and acts on a board. It knows the commands that drivers send.
-
-    Args:
-        board: What commands act on.
-        generation: Which firmware it is.
-    """
+    """Parses lines of text and acts on a board. It knows the commands that drivers send."""
 
     def __init__(self, board: Board, generation: FirmwareGeneration) -> None:
         self._board = board

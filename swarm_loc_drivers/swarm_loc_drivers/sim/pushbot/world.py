@@ -31,11 +31,7 @@ _LAG_S = 0.02
 
 
 class Drivetrain:
-    """Two wheels of each of N robots.
-
-    Args:
-        count: N.
-        step_s: Time of a step [s].
+    """Two wheels of each of N robots, in steps of a time [s].
 
     Attributes:
         duties: (N, 2) share of the battery's voltage, left and right.
@@ -96,12 +92,7 @@ class StepsAlong(Protocol):
 
 
 class PushbotWorld:
-    """Robots in a hall.
-
-    Args:
-        starts: Start poses of the robots.
-        plan: The hall.
-        params: Errors of robots and cameras; files, links and the name of the plan are not used.
+    """Robots in a hall; of the parameters, files, links and the plan's name are not used.
 
     Raises:
         WorldError: A robot starts within a wall or another robot.
@@ -173,12 +164,7 @@ class PushbotWorld:
 
 
 class SimulatedPushbot:
-    """One robot of a world as seen by its firmware; see `PushbotBody`.
-
-    Args:
-        world: The world of the robot.
-        robot: Its index.
-    """
+    """One robot of a world as seen by its firmware; see `PushbotBody`."""
 
     def __init__(self, world: PushbotWorld, robot: int) -> None:
         self._world, self._robot = world, robot

@@ -85,12 +85,7 @@ class RobotCamera:
 
 
 class Renderer:
-    """Draws images of one scene; all cameras share its buffers, so use it from one thread.
-
-    Args:
-        scene: What is seen.
-        model: Of all cameras.
-    """
+    """Draws images of one scene; all cameras, of one model, share its buffers, so use it from one thread."""
 
     def __init__(self, scene: Scene, model: CameraModel) -> None:
         self._scene, self._model = scene, model
@@ -172,10 +167,7 @@ class Renderer:
     def instants(self, camera: RobotCamera, begin: FloatArray, end: FloatArray) -> int:
         """At how many instants of an exposure `light` needs the poses.
 
-        Args:
-            camera: The camera.
-            begin: (N, 3) poses of all robots in map when the shutter opens.
-            end: (N, 3) poses when it closes.
+        Poses (N, 3) of all robots in map are those when the shutter opens and when it closes.
         """
         poses = np.stack([begin, end])
         seen_from = poses[:, camera.robot]

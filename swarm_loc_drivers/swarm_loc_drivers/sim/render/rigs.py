@@ -70,11 +70,8 @@ class CameraRig:
     ) -> NDArray[np.uint8]:
         """The image (height, width) of a robot's camera, exposed around `middle_ns`.
 
-        Args:
-            robot: Its index.
-            middle_ns: Middle of the exposure.
-            track: True paths, from half an exposure before to half an exposure after.
-            rng: Source of the sensor's noise.
+        The track is of true paths, from half an exposure before to half an exposure after; `rng` is the
+        source of the sensor's noise.
         """
         return self._renderer.take(self.cameras[robot], middle_ns, track.all_at, rng)
 
@@ -171,11 +168,7 @@ def lying(marks: Sequence[FloorMarker | Face], family: Family) -> list[Patches]:
 class OverheadRig:
     """The overhead camera of one world; for use by one thread.
 
-    Args:
-        scene: What robots' own cameras see.
-        settings: The camera, and the light.
-        markers: Fiducials on the floor, for ground control.
-        family: Their kind.
+    It sees what the robots' own cameras see, and fiducials of a family on the floor, for ground control.
     """
 
     def __init__(

@@ -90,15 +90,8 @@ class PushbotBagSettings:
 def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) -> int:
     """Write `map`, and per robot `odom`, `laser`, `lights`, `fix`, `goal`, `events` and `ground_truth`.
 
-    Next to the bag come `swarm.yaml`, `walls.csv`, and `<robot>.yaml` with the calibration of each laser.
-
-    Args:
-        settings: Settings of a run.
-        folder: The bag, created; must not exist.
-        comment: First lines of `swarm.yaml`, where the run comes from.
-
-    Returns:
-        Number of messages.
+    Next to the bag come `swarm.yaml`, `walls.csv`, and `<robot>.yaml` with the calibration of each laser. See
+    `write_bag`.
 
     Raises:
         UserError: The floor plan cannot be used, or the folder is there already or cannot be created.

@@ -120,14 +120,10 @@ def unpack(stored: bytes, chunk: Chunk) -> bytes:
 def find_messages(
     data: NDArray[np.uint8], begin: int, numbers: IntArray, columns: IntArray, count: int
 ) -> MessageScan:
-    """Note the messages from an offset on up to a record that is none, or is not whole.
+    """Note the messages from `begin` on up to a record that is none, or is not whole.
 
-    Args:
-        data: Records.
-        begin: Where to begin.
-        numbers: Channel -> number of its topic, or UNWANTED, or UNKNOWN.
-        columns: (4, n) written: topic, log time, offset and length of each message.
-        count: How many stand there already.
+    `numbers` has of each channel the number of its topic, or UNWANTED, or UNKNOWN. `columns` (4, n) are
+    written: topic, log time, offset and length of each message; `count` of them stand there already.
     """
     offset, others, unknown, untimed = begin, 0, 0, 0
     while offset + _RECORD_HEAD + MESSAGE_HEAD <= data.size and data[offset] == _IS_MESSAGE:

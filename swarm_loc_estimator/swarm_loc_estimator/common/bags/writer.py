@@ -135,12 +135,8 @@ class BagWriter:
     def add_topic(self, name: str, message_type: str, *, is_latched: bool = False) -> None:
         """Announce a topic, such as robot1/odom of nav_msgs/msg/Odometry.
 
-        Names are written fully qualified, as a recorder writes them.
-
-        Args:
-            name: Of the topic.
-            message_type: Of its messages.
-            is_latched: Whether its publisher is said to have kept the newest for late subscribers.
+        Names are written fully qualified, as a recorder writes them. The publisher of a latched one is said
+        to have kept the newest message for late subscribers.
         """
         topic = "/" + name.lstrip("/")
         self._connections[name] = self._writer.add_connection(

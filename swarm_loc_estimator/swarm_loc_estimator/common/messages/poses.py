@@ -279,12 +279,7 @@ class SwarmPosesReader:
 
 
 class SwarmPosesEncoder:
-    """Serializes swarm_loc_msgs/SwarmPoses.
-
-    Args:
-        names: The robots'.
-        frame_id: Frame of the poses.
-    """
+    """Serializes swarm_loc_msgs/SwarmPoses of robots with these names, in one frame."""
 
     def __init__(self, names: list[str], frame_id: str) -> None:
         robots = [{"name": name} for name in names]
@@ -311,12 +306,7 @@ class SwarmPosesEncoder:
 
 
 class TransformsEncoder:
-    """Serializes tf2_msgs/TFMessage from one frame to those of some robots.
-
-    Args:
-        frame_id: The parent.
-        children: All robots' child frames.
-    """
+    """Serializes tf2_msgs/TFMessage from one frame to the child frames of all robots."""
 
     def __init__(self, frame_id: str, children: list[str]) -> None:
         self._header = {"frame_id": frame_id}

@@ -213,12 +213,9 @@ class PoseColumns:
 
 
 class PoseReader:
-    """Reads messages that begin with a header, names and a pose.
+    """Reads messages, of some number of topics, that begin with a header, names and a pose.
 
-    Args:
-        topics: How many there are.
-        decode: The complete reader of one message.
-        names: How many frame names lie before the pose, the header's among them.
+    `decode` reads one message completely. `names` frame names lie before the pose, that of the header, too.
 
     Attributes:
         frame_ids: Per topic the frame of the newest message, "" before the first.
@@ -276,10 +273,7 @@ class DetectionColumns:
 
 
 class DetectionReader:
-    """Reads swarm_loc_msgs/MarkerDetectionArray.
-
-    Args:
-        topics: How many there are.
+    """Reads swarm_loc_msgs/MarkerDetectionArray of some number of topics.
 
     Attributes:
         frame_ids: Per topic the frame of the newest message, "" before the first.
@@ -337,9 +331,7 @@ class Messages(Generic[Message]):
 class EachReader(Generic[Message]):
     """Reads messages one by one, which is enough for what comes some hundred times a second.
 
-    Args:
-        topics: How many there are.
-        decode: Decodes one message; raises ValueError, LookupError or struct.error if it is malformed.
+    `decode` raises ValueError, LookupError or struct.error if a message is malformed.
 
     Attributes:
         frame_ids: Per topic the frame of the newest message, "" before the first.

@@ -88,13 +88,10 @@ class BoardModel:
 
 
 def fit_board(start: IrPlatform, data: BoardReadings, robots: int, *, gains: bool = True) -> BoardModel:
-    """Fit a board, starting from an approximate platform.
+    """Fit a board to exchanges with finite poses, starting from an approximate platform.
 
-    Args:
-        start: Platform that defines arrangement, saturation and initial noise.
-        data: Exchanges; poses must be finite.
-        robots: Number of robots.
-        gains: Whether to estimate gains of sensors with enough exchanges.
+    The platform defines arrangement, saturation and initial noise. With `gains`, those of sensors with enough
+    exchanges are estimated, too.
     """
     noise = round(noise_floor(data), 2)
     platform = replace(start, noise=noise, curve_sigma=0.3, relative_noise=0.0, element_sigma=0.0)
@@ -477,12 +474,9 @@ class BoardCalibration:
 
 
 def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> BoardCalibration:
-    """Calibrate a board.
+    """Calibrate a board by exchanges with known poses.
 
-    Args:
-        start: Initial platform, which defines the arrangement and the saturation count.
-        data: Exchanges with known poses.
-        robots: Number of robots.
+    The initial platform defines the arrangement and the saturation count.
 
     Raises:
         CalibrationError: There are too few exchanges.
