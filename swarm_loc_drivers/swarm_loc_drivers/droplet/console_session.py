@@ -42,9 +42,6 @@ class ConsoleTalk:
     """The computer's end of the console of a robot with some number of emitters, and of sensors.
 
     `on_said` receives every printed line. Counts `lines`, `bad_echoes`, and unrequested lines by kind.
-
-    Attributes:
-        now_ns: Time of the last step [ns].
     """
 
     def __init__(
@@ -56,7 +53,7 @@ class ConsoleTalk:
         self._counts = counts
         self._output = bytearray()
         self._echoes: list[str] = []
-        self.now_ns = 0
+        self.now_ns = 0  # Time of the last step [ns]
 
     def hear(self, data: bytes, now_ns: int) -> None:
         """Take output of the console."""

@@ -254,15 +254,11 @@ class ConsoleParser:
     """Parses the output of the console, in pieces of any size and after any stray bytes.
 
     Matrices of another number of emitters and of sensors than `elements` are broken.
-
-    Attributes:
-        partial: The unfinished line, as a terminal would show it.
-        backspaces: Number of received backspaces.
     """
 
     def __init__(self, elements: int = ELEMENTS) -> None:
-        self.partial = ""
-        self.backspaces = 0
+        self.partial = ""  # The unfinished line, as a terminal would show it
+        self.backspaces = 0  # Number of received backspaces
         self._stamp_ns = 0
         row = r"\{" + ",".join([_NUMBER] * elements) + r"\}"
         rows = r"\{" + ",".join([row] * elements) + r"\}"

@@ -112,16 +112,12 @@ def decode_image(body: bytes, width: int, height: int) -> bytes | None:
 
 
 class ReplyParser:
-    """Finds the reply to one request in pieces of any size, after any stray bytes.
-
-    Attributes:
-        skipped: Number of bytes outside the reply.
-    """
+    """Finds the reply to one request in pieces of any size, after any stray bytes."""
 
     def __init__(self, request: Request) -> None:
         self._request = request
         self._buffer = bytearray()
-        self.skipped = 0
+        self.skipped = 0  # Number of bytes outside the reply
 
     def feed(self, data: bytes) -> bytes | None:
         """Take bytes; the body of the reply once it is complete. Bytes after it are skipped."""

@@ -60,13 +60,10 @@ class Health:
     """Counts drops, records when topics were received last, and limits the rate of log messages.
 
     `warn` logs a sentence as a warning; `now_s` is a steady clock [s].
-
-    Attributes:
-        drops: Count of dropped data by reason.
     """
 
     def __init__(self, warn: Callable[[str], object], now_s: Callable[[], float] = time.monotonic) -> None:
-        self.drops: Counter[str] = Counter()
+        self.drops: Counter[str] = Counter()  # Count of dropped data by reason
         self._warn = warn
         self._now_s = now_s
         self._details: dict[str, str] = {}

@@ -202,10 +202,6 @@ class ConfiguredNode(Node, Generic[Parameters]):
     Without `reads_parameters` they are not read, and `params` is not set. The name is the default one; other
     arguments are those of `rclpy.node.Node`.
 
-    Attributes:
-        params: Values of the parameters.
-        health: Drops and problems for the log and /diagnostics.
-
     Raises:
         UserError: A parameter, or a file that it names, cannot be used.
     """
@@ -216,8 +212,8 @@ class ConfiguredNode(Node, Generic[Parameters]):
         Node.__init__(self, name, **node_arguments)
         declare_parameters(self, parameters)
         if reads_parameters:
-            self.params = read_parameters(self, parameters)
-        self.health = Health(self.get_logger().warning)
+            self.params = read_parameters(self, parameters)  # Values of the parameters
+        self.health = Health(self.get_logger().warning)  # Drops and problems for the log and /diagnostics
 
     @property
     def status_name(self) -> str:
@@ -341,9 +337,6 @@ class Ticks:
     In simulated time, ticks are at the multiples of the period. rclpy's timers fail there on a busy machine:
     for each /clock that finds a timer due, the EventsExecutor queues the timer without bound, each entry
     advances the timer by a period, and each reset that brings it back queues two more.
-
-    Attributes:
-        stop: Ends the ticks, but for one that the executor has queued.
     """
 
     def __init__(self, node: Node, period_s: float, on_tick: Callable[[], None]) -> None:
@@ -354,6 +347,7 @@ class Ticks:
         self._is_due = False
         if node.get_clock().ros_time_is_active:
             jumps = node.get_clock().create_jump_callback(_EACH_CHANGE, post_callback=self._on_time)
+            # Ends the ticks, but for one that the executor has queued
             self.stop: Callable[[], object] = jumps.unregister
         else:  # a timer by a clock that nobody sets
             timer = node.create_timer(period_s, on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))

@@ -106,15 +106,12 @@ class AerialDetector:
     """Finds discs of one size, of one of POLARITIES, on a level plane, and the mark on them.
 
     Without a diameter in the settings it is estimated from the first images.
-
-    Attributes:
-        diameter: Diameter of the robots [m]; 0: not known yet.
     """
 
     def __init__(self, settings: AerialSettings, ground: GroundCamera, polarity: str = "auto") -> None:
         self._settings, self._ground = settings, ground
         self._polarities = POLARITIES[polarity]
-        self.diameter = settings.robot_diameter
+        self.diameter = settings.robot_diameter  # Diameter of the robots [m]; 0: not known yet
         self._grid: Rectification | None = None
 
     def detect(self, gray: Gray) -> AerialDetections:

@@ -169,13 +169,7 @@ class InfraredSettings:
 
 
 class DropletInfrared:
-    """Transmits messages and light between robots with ids (N,).
-
-    Attributes:
-        heard: Per robot the commands and readings not fetched yet.
-        deaf_until_ns: Per robot the end of its last exchange [ns].
-        counts: Events by name.
-    """
+    """Transmits messages and light between robots with ids (N,)."""
 
     def __init__(
         self,
@@ -195,9 +189,10 @@ class DropletInfrared:
         self._baseline = np.rint(self._ambient).astype(np.int64)
         self._drift_due_ns = now_ns
         self._baseline_due_ns = now_ns + rng.integers(0, _BASELINE_PERIOD_NS, len(ids))
+        # Per robot the commands and readings not fetched yet
         self.heard: list[list[InfraredCommand | ExchangeReadings]] = [[] for _ in ids]
-        self.deaf_until_ns = [0 for _ in ids]
-        self.counts: Counter[str] = Counter()
+        self.deaf_until_ns = [0 for _ in ids]  # Per robot the end of its last exchange [ns]
+        self.counts: Counter[str] = Counter()  # Events by name
 
     def send(self, sender: int, line: str, target: int, poses: FloatArray) -> None:
         """Start the transmission of a command."""

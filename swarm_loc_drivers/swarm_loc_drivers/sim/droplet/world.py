@@ -49,11 +49,6 @@ class Cable:
     """A robot connected by cable: its console and the driver's session, with its model of motion errors.
 
     `publish` is called with the matrices of exchanges.
-
-    Attributes:
-        firmware: The firmware at the console.
-        session: The session of the driver.
-        counts: Events of the session by name.
     """
 
     def __init__(
@@ -64,15 +59,16 @@ class Cable:
         noise: MotionNoise,
         publish: Callable[[Brightness], None],
     ) -> None:
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()  # Events of the session by name
         self._world = world
+        # The firmware at the console
         self.firmware: ConsoleFirmware = DropletFirmware(SimulatedDroplet(world, robot))
         self._command = VelocityCommand(
             _TIMEOUT_S, lambda: world.now_ns, self.counts, lambda: 1e-9 * world.now_ns
         )
         self._motion = CommandedMotion(noise)
         mover = DropletMover(self._command, self._motion, STRIDE_S)
-        self.session = DropletSession(settings, mover, (), publish, self.counts)
+        self.session = DropletSession(settings, mover, (), publish, self.counts)  # The session of the driver
 
     def set_velocity(self, velocity: Velocity) -> None:
         """Command a velocity."""

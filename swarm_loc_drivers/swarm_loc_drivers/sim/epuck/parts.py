@@ -64,16 +64,12 @@ _MICROPHONE = 40
 
 
 class Motors:
-    """The stepper motors: clamped and quantised speeds, counters of steps.
-
-    Attributes:
-        commanded: The speeds as they were commanded, left and right [steps/s].
-    """
+    """The stepper motors: clamped and quantised speeds, counters of steps."""
 
     def __init__(self, body: EpuckBody, model: EpuckModel) -> None:
         self._body = body
         self._model = model
-        self.commanded = (0, 0)
+        self.commanded = (0, 0)  # The speeds as they were commanded, left and right [steps/s]
 
     def set_speeds(self, left: int, right: int) -> None:
         """Turn the wheels [steps/s]; the firmware keeps speeds in 16 bits."""

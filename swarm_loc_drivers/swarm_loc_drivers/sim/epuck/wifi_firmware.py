@@ -28,16 +28,13 @@ class WifiFirmware:
     """Answers one client.
 
     With `counts_right_backwards` the right counter falls when its wheel rolls ahead, as before December 2018.
-
-    Attributes:
-        exchange_fails: Set it to have the next exchange between the chips fail.
     """
 
     def __init__(self, body: EpuckBody, *, counts_right_backwards: bool = False) -> None:
         self._body = body
         self._motors = Motors(body, EPUCK2)
         self._counts_right_backwards = counts_right_backwards
-        self.exchange_fails = False
+        self.exchange_fails = False  # Set it to have the next exchange between the chips fail
         self._command = b""
         self._exchange_due_ns = body.now_ns
         self._sensors: bytes | None = None

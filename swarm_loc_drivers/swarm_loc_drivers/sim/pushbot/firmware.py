@@ -92,14 +92,10 @@ _DELTA_LIMITS = (0x7F, 0x3FFF, 0x1FFFFF)
 
 
 class EventRing:
-    """Ring buffer of events to be sent.
-
-    Attributes:
-        dropped: Events that were overwritten, unnoticed by the board.
-    """
+    """Ring buffer of events to be sent."""
 
     def __init__(self) -> None:
-        self.dropped = 0
+        self.dropped = 0  # Events that were overwritten, unnoticed by the board
         self._words = np.zeros(0, np.uint16)
         self._times = np.zeros(0, np.int64)
         self._last = 0
@@ -435,15 +431,12 @@ class PushbotFirmware:
         generation: Which firmware it is.
         baud_rate: Of the wire to the host or its radio [bit/s].
         seed: Decides which bytes are parsed just after a tick of the clock, see `Motor`.
-
-    Attributes:
-        late_share: Share of these bytes.
     """
 
     def __init__(
         self, body: PushbotBody, generation: FirmwareGeneration, baud_rate: int = BAUD_RATE, seed: int = 0
     ) -> None:
-        self.late_share = LATE_SHARE
+        self.late_share = LATE_SHARE  # Share of bytes that are parsed just after a tick
         self._rng = np.random.default_rng(seed)
         self._body = body
         self.board = Board(body, generation)

@@ -31,16 +31,11 @@ _LAG_S = 0.02
 
 
 class Drivetrain:
-    """Two wheels of each of N robots, in steps of a time [s].
-
-    Attributes:
-        duties: (N, 2) share of the battery's voltage, left and right.
-        ticks: (N, 2) that the wheels have turned.
-    """
+    """Two wheels of each of N robots, in steps of a time [s]."""
 
     def __init__(self, count: int, step_s: float) -> None:
-        self.duties = np.zeros((count, 2))
-        self.ticks = np.zeros((count, 2))
+        self.duties = np.zeros((count, 2))  # (N, 2) share of the battery's voltage, left and right
+        self.ticks = np.zeros((count, 2))  # (N, 2) that the wheels have turned
         self._rates = np.zeros((count, 2))
         self._step_s = step_s
         self._kept = np.exp(-step_s / _LAG_S)

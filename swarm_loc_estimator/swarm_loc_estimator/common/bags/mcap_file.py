@@ -164,12 +164,7 @@ _DEFINITIONS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_I
 
 
 class McapFile:
-    """One open MCAP file.
-
-    Attributes:
-        message_count: Number of messages, as far as they can be counted before reading.
-        losses: What could not be read; more may come while reading.
-    """
+    """One open MCAP file."""
 
     def __init__(self, path: Path) -> None:
         """Open it; raises BagError if it is no MCAP file."""
@@ -182,8 +177,8 @@ class McapFile:
         self._whole = False
         self._bytes_read = 0
         self._skipped: Counter[str] = Counter()
-        self.losses = ReadErrors(path.name)
-        self.message_count = 0
+        self.losses = ReadErrors(path.name)  # What could not be read; more may come while reading
+        self.message_count = 0  # Number of messages, as far as they can be counted before reading
         if path.exists() and not path.is_file():
             raise BagError(f"{path} is no file.")  # opening a pipe would never return
         try:

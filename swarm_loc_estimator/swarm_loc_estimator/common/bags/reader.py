@@ -129,9 +129,6 @@ class BagReader:
         path: A rosbag2 folder, or an .mcap or .db3 file, plain or compressed.
         renamed: Topic of the bag -> the name that it has here; a topic of that name in the bag is hidden.
 
-    Attributes:
-        offered_qos: Topic -> what its publishers offered, as far as a folder's metadata know it.
-
     Raises:
         BagError: There is nothing to read.
     """
@@ -139,6 +136,7 @@ class BagReader:
     def __init__(self, path: Path, renamed: Mapping[str, str] = MappingProxyType({})) -> None:
         self._path = path
         self._renamed = renamed
+        # Topic -> what its publishers offered, as far as a folder's metadata know it
         self.offered_qos: dict[str, list[Qos]] = {}
         self._files: list[BagFile] = []
         self._own_losses = ReadErrors(path.name)

@@ -225,28 +225,21 @@ def _bytes_from(offsets: Sequence[int], size: int) -> NDArray[np.intp]:
 
 
 class _Layout:
-    """Where the numbers stand in a SwarmPoses, as long as its other bytes are the same.
-
-    Attributes:
-        frame_id: Frame of the poses.
-        names: N robots.
-        numbers: (N, 104) indices of the bytes of each robot's numbers.
-        states: (N, 2) indices of the status, and of whether the heading is known.
-        others: (m,) indices of all bytes but these and the stamp.
-        expected: (m,) these bytes.
-    """
+    """Where the numbers stand in a SwarmPoses, as long as its other bytes are the same."""
 
     def __init__(self, data: bytes) -> None:
         places: dict[str, list[int]] = {}
         message = decode(data, SWARM_POSES, places)
-        self.frame_id: str = message.header.frame_id
-        self.names = tuple(robot.name for robot in message.robots)
+        self.frame_id: str = message.header.frame_id  # Frame of the poses
+        self.names = tuple(robot.name for robot in message.robots)  # N robots
+        # (N, 104) indices of the bytes of each robot's numbers
         self.numbers = _bytes_from(places.get("robots.x", []), 8 * _DOUBLES)
+        # (N, 2) indices of the status, and of whether the heading is known
         self.states = _bytes_from(places.get("robots.status", []), 2)
         is_other = np.ones(len(data), dtype=np.bool_)
         is_other[_STAMP] = is_other[self.numbers] = is_other[self.states] = False
-        self.others = np.flatnonzero(is_other)
-        self.expected = np.frombuffer(data, np.uint8)[self.others]
+        self.others = np.flatnonzero(is_other)  # (m,) indices of all bytes but these and the stamp
+        self.expected = np.frombuffer(data, np.uint8)[self.others]  # (m,) these bytes
 
 
 class SwarmPosesReader:

@@ -216,15 +216,12 @@ class PoseReader:
     """Reads messages, of some number of topics, that begin with a header, names and a pose.
 
     `decode` reads one message completely. `names` frame names lie before the pose, that of the header, too.
-
-    Attributes:
-        frame_ids: Per topic the frame of the newest message, "" before the first.
     """
 
     def __init__(
         self, topics: int, decode: Callable[[bytes], OdometryMessage | PoseMessage | FixMessage], names: int
     ) -> None:
-        self.frame_ids = [""] * topics
+        self.frame_ids = [""] * topics  # Per topic the frame of the newest message, "" before the first
         self._decode = decode
         self._names = names
         self._models = _no_models(topics)
@@ -273,14 +270,10 @@ class DetectionColumns:
 
 
 class DetectionReader:
-    """Reads swarm_loc_msgs/MarkerDetectionArray of some number of topics.
-
-    Attributes:
-        frame_ids: Per topic the frame of the newest message, "" before the first.
-    """
+    """Reads swarm_loc_msgs/MarkerDetectionArray of some number of topics."""
 
     def __init__(self, topics: int) -> None:
-        self.frame_ids = [""] * topics
+        self.frame_ids = [""] * topics  # Per topic the frame of the newest message, "" before the first
         self._models = _no_models(topics)
 
     def read(self, batch: MessageBatch) -> DetectionColumns:
@@ -332,13 +325,10 @@ class EachReader(Generic[Message]):
     """Reads messages one by one, which is enough for what comes some hundred times a second.
 
     `decode` raises ValueError, LookupError or struct.error if a message is malformed.
-
-    Attributes:
-        frame_ids: Per topic the frame of the newest message, "" before the first.
     """
 
     def __init__(self, topics: int, decode: Callable[[bytes], Message]) -> None:
-        self.frame_ids = [""] * topics
+        self.frame_ids = [""] * topics  # Per topic the frame of the newest message, "" before the first
         self._decode: Callable[[bytes], Message] = decode
 
     def read(self, batch: MessageBatch) -> Messages[Message]:
