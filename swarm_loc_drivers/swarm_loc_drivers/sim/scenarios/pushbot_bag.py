@@ -29,7 +29,7 @@ from swarm_loc_drivers.sim.pushbot.optics import (
     lights_of,
 )
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
-from swarm_loc_drivers.sim.scenarios.bags import Stream, message_header, write_streams
+from swarm_loc_drivers.sim.scenarios.bags import message_header, write_swarm_bag
 from swarm_loc_estimator import (
     CooperativeMapper,
     Goal,
@@ -40,6 +40,7 @@ from swarm_loc_estimator import (
 )
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.bags.writer import Stream
 from swarm_loc_estimator.common.messages.cdr import (
     EVENT_PACKETS,
     LASER,
@@ -52,7 +53,6 @@ from swarm_loc_estimator.common.messages.cdr import (
 )
 from swarm_loc_estimator.common.messages.event_encoding import ENCODING, Events, encode_events
 from swarm_loc_estimator.common.messages.poses import (
-    UNKNOWN_COVARIANCE,
     encode_fix,
     encode_odometry,
     encode_pose_stamped,
@@ -141,7 +141,7 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
         traces = [exploration.robots[robot].trace for robot in robots]
         streams += _events(names, _poses(traces, settings.events_s), cameras)
     # the bag, and files next to it
-    count = write_streams(streams, Swarm(described), folder, comment)
+    count = write_swarm_bag(streams, Swarm(described), folder, comment)
     np.savetxt(folder / "walls.csv", plan.walls, fmt="%.4f", delimiter=",", header="x0,y0,x1,y1 [m]")
     calibrate_lasers(names, settings.seed, folder)
     return count
@@ -186,8 +186,7 @@ def _odometry(name: str, readings: list[Readings]) -> Stream:
     pose = np.concatenate([one.odometry for one in readings])
     twist = np.zeros_like(pose)
     twist[1:] = se2.log(se2.between(pose[:-1], pose[1:])) / PERIOD_S
-    frames = (f"{name}/odom", f"{name}/base_link")
-    data = encode_odometry(*frames, stamp_ns, pose, twist, UNKNOWN_COVARIANCE, UNKNOWN_COVARIANCE)
+    data = encode_odometry(f"{name}/odom", f"{name}/base_link", stamp_ns, pose, twist)
     return Stream(f"{name}/odom", ODOMETRY, stamp_ns, data)
 
 

@@ -131,8 +131,8 @@ def encode_odometry(
     stamp_ns: IntArray,
     pose: FloatArray,
     twist: FloatArray,
-    covariance: FloatArray,
-    twist_covariance: FloatArray,
+    covariance: FloatArray = UNKNOWN_COVARIANCE,
+    twist_covariance: FloatArray = UNKNOWN_COVARIANCE,
 ) -> list[bytes]:
     """Serialize nav_msgs/Odometry of one robot.
 
