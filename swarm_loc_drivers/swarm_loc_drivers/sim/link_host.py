@@ -156,12 +156,10 @@ class _PtyPort:
 class _TcpPort:
     """A TCP server for one client at a time; others wait, and sending blocks until it reads."""
 
-    def __init__(
-        self, firmware: StreamFirmware, host: str, port: int, selector: selectors.BaseSelector
-    ) -> None:
+    def __init__(self, firmware: StreamFirmware, port: int, selector: selectors.BaseSelector) -> None:
         self._firmware = firmware
         self._selector = selector
-        self._server = socket.create_server((host, port), backlog=1)
+        self._server = socket.create_server(("127.0.0.1", port), backlog=1)
         self._server.setblocking(False)
         self._client: socket.socket | None = None
         self._gone: list[socket.socket] = []
@@ -245,9 +243,9 @@ class FirmwareHost:
         self._add(port)
         return link or port.path
 
-    def serve_tcp(self, firmware: StreamFirmware, host: str = "127.0.0.1", port: int = 0) -> int:
+    def serve_tcp(self, firmware: StreamFirmware, port: int = 0) -> int:
         """Put a firmware at a TCP port, 0 for any that is free; returns the port."""
-        server = _TcpPort(firmware, host, port, self._selector)
+        server = _TcpPort(firmware, port, self._selector)
         self._add(server)
         return server.port
 

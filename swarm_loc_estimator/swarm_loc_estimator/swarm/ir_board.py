@@ -542,18 +542,14 @@ def packaged_platforms() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
 
 
-def load_ir_platform(name: str, folder: Path | None = None) -> IrPlatform:
-    """Read and check a platform.
-
-    Args:
-        name: Of a packaged platform, such as "droplet", or the path of a file (it ends in .yaml).
-        folder: Base of a relative path; None: the working folder.
+def load_ir_platform(name: str) -> IrPlatform:
+    """Read and check a packaged platform, such as "droplet", or that of a file, whose path ends in .yaml.
 
     Raises:
         IrPlatformFileError: One sentence with file, key, value and what is allowed.
     """
     if name.endswith((".yaml", ".yml")):
-        path = (folder or Path()) / name
+        path = Path(name)
     elif name in packaged_platforms():
         path = _FOLDER / f"{name}.yaml"
     else:
