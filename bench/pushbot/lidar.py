@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from swarm_loc_drivers.sim.pushbot.exploration import PERIOD_S, SPEED, Arrival, PushBotNoise
+from bench.pushbot.exploration import PERIOD_S, SPEED, Arrival, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, clearance, is_visible, wall_distance
 from swarm_loc_drivers.sim.scenarios.bags import message_header
 from swarm_loc_estimator.common.arrays import FloatArray

@@ -87,7 +87,7 @@ def test_an_existing_bag_is_not_overwritten(bag: Path, capsys: pytest.CaptureFix
         ("eight", "--duration", "1", "[2, 3600] s"),
         ("aerial", "--duration", "nan", "[2, 3600] s"),
         ("droplets", "--duration", "inf", "[2, 3600] s"),
-        ("pushbots", "--robots", "0", "[1, 5]"),
+        ("aerial", "--robots", "0", "[1, 20]"),
         ("eight", "--robots", "10", "[1, 9]"),
         ("pictures", "--seed", "-1", "[0, 2.14748e+09]"),
         ("droplets", "--boards", "-1", "[0, 2.14748e+09]"),

@@ -1,1 +1,1 @@
-"""Scenarios of simulated swarms: eight, wandering e-pucks, table of Droplets, mapping PushBots."""
+"""Scenarios of simulated swarms: eight, wandering e-pucks, table of Droplets."""

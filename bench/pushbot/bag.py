@@ -1,16 +1,24 @@
-"""Write a simulated exploration by PushBots as a bag, with the floor plan next to it."""
+"""Write a simulated exploration by PushBots as a bag, with the floor plan next to it.
+
+    python -m bench pushbot_bag bags/pushbots_two --seed 1 --duration 300 --robots 2 --events 2
+    python -m bench pushbot_bag /tmp/hallway --robots 2 --plan office
+
+The bag contains map, and per robot odom, laser, lights, fix, goal, ground_truth, and with --events events.
+The same arguments give the same bytes.
+"""
 
 from __future__ import annotations
 
+import argparse
 import math
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
-from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
-from swarm_loc_drivers.sim.pushbot.exploration import (
+from bench.pushbot.exploration import (
     FIRST_SIGMA,
     FOCAL_BASELINE,
     PERIOD_S,
@@ -19,7 +27,9 @@ from swarm_loc_drivers.sim.pushbot.exploration import (
     Exploration,
     PushBotNoise,
 )
-from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlanError, floor_plan
+from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
+from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
+from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, FloorPlanError, floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import (
     CAMERA_X_M,
     HallSight,
@@ -41,6 +51,7 @@ from swarm_loc_estimator import (
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.writer import Stream
+from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
 from swarm_loc_estimator.common.messages.cdr import (
     EVENT_PACKETS,
     LASER,
@@ -307,3 +318,47 @@ def _encode_map(stamp_ns: int, occupancy: OccupancyMap) -> bytes:
     }
     message = {"header": message_header(stamp_ns, "map"), "info": about, "data": cells}
     return encode(message, OCCUPANCY_GRID)
+
+
+@exit_with_message
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    options = _parser().parse_args(arguments)
+    words = [f"{name}={value}" for name, value in vars(options).items() if name != "bag"]
+    settings = PushbotBagSettings(
+        options.seed, options.duration, options.robots, options.plan, options.slip, options.events
+    )
+    count = write_pushbot_bag(settings, options.bag, f"Simulated: swarm=pushbots, {', '.join(words)}.")
+    print(f"{count} messages of {options.robots} robots written to {options.bag}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = command_parser(__doc__)
+    parser.add_argument("bag", type=Path, help="bag folder to create")
+    parser.add_argument(
+        "--seed", type=number_in(0, 2**31 - 1), default=1, help="the same seed gives the same bag"
+    )
+    parser.add_argument(
+        "--duration", type=number_in(2.0, 3600.0, "s"), default=300.0, help="simulated time [s]"
+    )
+    parser.add_argument("--robots", type=number_in(1, 5), default=1, help="number of robots")
+    parser.add_argument(
+        "--plan",
+        default="corridor",
+        help=f"the hall: {', '.join(FLOOR_PLANS)}, or the path of a floor plan (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--slip", type=number_in(0.0, 0.1), default=0.02, help="share of every turn that is lost by slip"
+    )
+    parser.add_argument(
+        "--events",
+        type=number_in(0.0, 60.0, "s"),
+        default=0.0,
+        help="length of the events at the beginning [s]",
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())
