@@ -60,17 +60,6 @@ def pack(kind: str, stamp_ns: int, columns: Mapping[str, npt.NDArray[Any]], **ex
     return Frame(kind, stamp_ns, b"".join(parts))
 
 
-def unpack(data: bytes) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
-    """Header and columns of a frame's bytes, as the page reads them."""
-    size = struct.unpack_from("<I", data)[0]
-    header: dict[str, Any] = json.loads(data[4 : 4 + size])
-    at, columns = 4 + size, {}
-    for name, kind, length in header["columns"]:
-        columns[name] = np.frombuffer(data, f"<{kind}", length, at)
-        at += -(-columns[name].nbytes // _ALIGNMENT) * _ALIGNMENT
-    return header, columns
-
-
 def poses_frame(estimate: EstimateMessage) -> Frame:
     """Estimated poses of all robots; those of unlocated robots are NaN."""
     pose, covariance = estimate.pose, estimate.covariance

@@ -204,7 +204,7 @@ def write_image_bag(recorded: ImageRun, folder: Path, comment: str) -> int:
     """
     run, frames = recorded.run, recorded.run.frames
     headers = [
-        message_header(stamp_ns, f"{run.swarm.robots[robot].name}/camera_optical_frame")
+        {"stamp": stamp_ns, "frame_id": f"{run.swarm.robots[robot].name}/camera_optical_frame"}
         for robot, stamp_ns in zip(frames["robot"].tolist(), frames["stamp_ns"].tolist(), strict=True)
     ]
     images = [_image(header, image) for header, image in zip(headers, recorded.images(), strict=True)]
@@ -340,11 +340,6 @@ def _fixes(run: DropletRun, robot: int) -> Stream:
     data = [encode_fix("map", fix.stamp_ns, fix.pose, covariance) for fix in own]
     stamps_ns = np.array([fix.stamp_ns for fix in own], dtype=np.int64)
     return Stream(f"{run.swarm.robots[robot].name}/fix", POSE_WITH_COVARIANCE, stamps_ns, data)
-
-
-def message_header(stamp_ns: int, frame: str) -> dict[str, Any]:
-    """A std_msgs/Header to encode."""
-    return {"stamp": stamp_ns, "frame_id": frame}
 
 
 def _image(header: dict[str, Any], image: NDArray[np.uint8]) -> bytes:
