@@ -25,9 +25,7 @@ SomeSession = TypeVar("SomeSession", bound=Session)
 class RobotDriver(ABC, Generic[SomeSession]):
     """Talks to one robot until the driver is stopped and the robot is known to stand.
 
-    Args:
-        name: Name of the robot's link in messages.
-        clock: The time [ns]; may be simulated, and 0 means no time.
+    `name` is that of the robot's link in messages. The clock [ns] may be simulated, and 0 means no time.
     """
 
     def __init__(self, name: str, clock: Callable[[], int]) -> None:

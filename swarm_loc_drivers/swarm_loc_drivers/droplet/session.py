@@ -32,14 +32,10 @@ class SessionSettings:
 
 
 class DropletSession:
-    """Session with one Droplet at a cable, and movers for those without.
+    """A `Session` with one Droplet at a cable, and movers for those without, which it stops, too.
 
-    `publish` receives the matrices of exchanges.
-
-    Attributes:
-        ending: Set it to stop all robots and end the conversation.
-        connected: Whether the robot has sent its id and its gaits.
-        ended: Whether the conversation has ended.
+    It is connected when the robot has sent its id and its gaits. `publish` receives the matrices of
+    exchanges.
     """
 
     def __init__(

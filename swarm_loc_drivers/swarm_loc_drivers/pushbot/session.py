@@ -130,26 +130,19 @@ _STOP_S = 1.0  # The wheels must stand so long after a stop, and two periods of 
 
 
 class PushbotSession(TalkSession):
-    """Session with one PushBot.
+    """A `Session` with one PushBot; it is connected when the robot has answered and sent wheel ticks.
 
     Counts `events`, `readings`, `refused_commands`, `other_lines`, `repeated_stops`, `ignored_stops`, and
     what `EventParser` counts.
-
-    Attributes:
-        ending: Set it to stop the robot and end the conversation.
-        connected: Whether the robot has answered and sent wheel ticks.
-        ended: Whether the conversation has ended; the robot stands.
-        found: Measurements; the reader empties the list.
-        generation: Its firmware, once it is known.
-        does_not_stop: Whether the wheels go on turning although the stop has been repeated for a second.
     """
 
     def __init__(self, params: PushbotParameters, velocities: Velocities, counts: Counter[str]) -> None:
         super().__init__(counts)
-        self.found: list[WheelTicks | EventPacket] = []
-        self.generation: FirmwareGeneration | None = None
+        self.found: list[WheelTicks | EventPacket] = []  # Measurements; the reader empties the list
+        self.generation: FirmwareGeneration | None = None  # Its firmware, once it is known
         self._params = params
         self._velocities = velocities
+        # Whether the wheels go on turning although the stop has been repeated for a second
         self.does_not_stop = False
         self._sent, self._sent_s = (0, 0), 0.0
         self._ticks: tuple[int, int] | None = None

@@ -229,15 +229,10 @@ class FirmwareHost:
         self._ports: list[_Port] = []
 
     def serve_pty(self, firmware: ConsoleFirmware, link: Path | None = None, *, waits: bool = False) -> Path:
-        """Put a firmware at a pseudo-terminal.
+        """Put a firmware at a pseudo-terminal; returns the path for a driver.
 
-        Args:
-            firmware: Who answers.
-            link: A name for the terminal that stays the same; None for none.
-            waits: Whether the firmware waits for the client (RTS/CTS); else what it does not take is lost.
-
-        Returns:
-            The path for a driver.
+        `link` is a name for the terminal that stays the same. A firmware may wait for the client (RTS/CTS);
+        else what it does not take is lost.
         """
         port = _PtyPort(firmware, link, waits=waits)
         self._add(port)

@@ -55,16 +55,11 @@ class WorldNode(ConfiguredNode[Parameters]):
         waits: bool = False,
         clock_steps: int = 1,
     ) -> None:
-        """Put all robots on their links and start publishing.
+        """Put all robots on their links and start publishing, the time every `clock_steps` steps.
 
-        Args:
-            names: Names of the robots.
-            step_ns: Simulated time of a step.
-            firmware_of: Makes the firmware of a robot by its index: a `ConsoleFirmware` with a link folder,
-                else a `StreamFirmware`.
-            first_port: TCP port of the first robot, the others follow; 0: any.
-            waits: Whether serial ports have flow control.
-            clock_steps: Number of steps between published times.
+        `firmware_of` makes the firmware of a robot by its index: a `ConsoleFirmware` with a link folder, else
+        a `StreamFirmware`. Serial ports have flow control if these wait. TCP ports follow the first one; 0:
+        any.
 
         Raises:
             ParameterError: A link cannot be made.

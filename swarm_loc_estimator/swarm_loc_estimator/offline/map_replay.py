@@ -36,13 +36,9 @@ def replay_map(
 ) -> tuple[CooperativeMapper, MapperFeed]:
     """Map a bag; returns the mapper after a last optimization, and its feed with the counts of used inputs.
 
-    Args:
-        bag: With `<robot>/odom`, `<robot>/laser` and, if frequencies are given, `<robot>/lights`; of robots
-            with a lidar `<robot>/scan`.
-        robots: The robots that map.
-        settings: Of the mapper.
-        frequencies: Robot -> frequency of its LEDs [Hz].
-        progress: Called now and then with the share done and what is being done.
+    The bag has `<robot>/odom`, `<robot>/laser` and, if frequencies of LEDs by robot [Hz] are given,
+    `<robot>/lights`; of robots with a lidar `<robot>/scan`. `progress` is called now and then with the share
+    done and what is being done.
 
     Raises:
         UserError: The bag cannot be read, or the robots cannot start.

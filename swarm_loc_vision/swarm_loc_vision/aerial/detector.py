@@ -374,18 +374,14 @@ class AerialCamera(CalibratedCamera):
 
     Intrinsics of the control points, if any, replace camera_info. `gray_of` reads an image message, see
     `TRANSPORTS`.
-
-    Attributes:
-        used: Number of images that were searched.
-        robots: Number of detections.
-        headings: Number of detections with a heading.
-        control: The camera's pose; None before the calibration.
     """
 
     def __init__(self, settings: AerialSettings, polarity: str, ground: Ground, gray_of: GrayOf) -> None:
         super().__init__(gray_of)
-        self.used = self.robots = self.headings = 0
-        self.control: GroundControl | None = None
+        self.used = 0  # Number of images that were searched
+        self.robots = 0  # Number of detections
+        self.headings = 0  # Number of detections with a heading
+        self.control: GroundControl | None = None  # The camera's pose; None before the calibration
         self._settings, self._polarity, self._ground = settings, polarity, ground
         self._detector: tuple[GroundCamera, AerialDetector] | None = None
         self._seeing_trouble = ""

@@ -228,10 +228,8 @@ def _check(depths: FloatArray) -> None:
 def fit_row_bias(rows: FloatArray, residuals: FloatArray, sigma: float) -> RowBias:
     """Fit the bias to residuals; empty unless a fit to either half lowers the residuals of the other half.
 
-    Args:
-        rows: (N,) tracked [px].
-        residuals: (N,) tracked rows minus those of the hyperbola [px].
-        sigma: Scale of the residuals for the Cauchy loss [px].
+    Residuals (N,) are tracked rows (N,) minus those of the hyperbola, and sigma is the scale of their Cauchy
+    loss [px].
     """
     edge = float((rows - residuals).min()) + _EDGE_SIGMAS * sigma
     usual = (np.abs(residuals) < _OUTLIER_SIGMAS * sigma) & (rows >= edge)

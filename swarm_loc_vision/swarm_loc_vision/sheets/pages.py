@@ -60,13 +60,8 @@ def sheet_figure(page: Page, family: Family, paper: str) -> Figure:
 def outline(black: NDArray[np.bool_], left: float, bottom: float, cell: float) -> Outline:
     """The border of the black cells (n, n), upper row first, as closed loops with black on their right.
 
-    One outline without seams: between squares that only touch, viewers and printers leave fine lines.
-
-    Args:
-        black: Which cells are black.
-        left: x of the left border.
-        bottom: y of the lower border.
-        cell: Side of a cell.
+    One outline without seams: between squares that only touch, viewers and printers leave fine lines. The
+    cells begin at `left` and at `bottom`, and have sides of `cell`.
     """
     padded = np.pad(black, 1)
     ways: dict[tuple[int, int], list[tuple[int, int]]] = {}

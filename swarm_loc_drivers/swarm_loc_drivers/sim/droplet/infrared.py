@@ -87,10 +87,8 @@ class Exchange:
 class DropletLight:
     """Light from one emitter on the sensors of other robots.
 
-    Args:
-        platform: The board of all robots.
-        gains: (2, N, n) true factors of the sensors and of the emitters of all robots.
-        near_power: Power at which the emitters follow the board's near model, below 256.
+    `gains` (2, N, n) are true factors of the sensors and of the emitters of all robots. Emitters follow the
+    board's near model at `near_power`, below 256.
     """
 
     def __init__(self, platform: IrPlatform, gains: FloatArray, near_power: int) -> None:
@@ -105,12 +103,7 @@ class DropletLight:
     ) -> FloatArray:
         """Counts (k, n) that the sensors of receivers (k,) would read without noise.
 
-        Args:
-            poses: (N, 3) of all robots in map.
-            receivers: Their indices.
-            transmitter: Index of the robot that emits.
-            emitter: Which of its emitters is lit.
-            power: How bright, 0 to 256.
+        Robots are at poses (N, 3) in map. One of the transmitter's emitters is lit, with a power of 0 to 256.
         """
         seen = se2.between(poses[receivers], poses[transmitter])
         distance, bearing = np.hypot(seen[:, 0], seen[:, 1]), np.arctan2(seen[:, 1], seen[:, 0])

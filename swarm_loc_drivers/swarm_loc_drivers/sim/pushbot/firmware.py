@@ -426,11 +426,8 @@ _MAX_GAP_S = 0.02  # A wire that was blocked for longer does not catch up
 class PushbotFirmware:
     """A robot's firmware, for any link that waits for whoever reads it (RTS/CTS, TCP).
 
-    Args:
-        body: The robot.
-        generation: Which firmware it is.
-        baud_rate: Of the wire to the host or its radio [bit/s].
-        seed: Decides which bytes are parsed just after a tick of the clock, see `Motor`.
+    `baud_rate` is that of the wire to the host or its radio [bit/s]. The seed decides which bytes are parsed
+    just after a tick of the clock, see `Motor`.
     """
 
     def __init__(

@@ -101,13 +101,7 @@ def led_place(pose: FloatArray, *, front: bool) -> tuple[float, float]:
 
 
 def led_pixel(observer: FloatArray, pose: FloatArray, *, front: bool) -> tuple[float, float, float] | None:
-    """Column, row [px] and distance [m] of an LED; None where it cannot be seen, walls aside.
-
-    Args:
-        observer: (3,) pose of the robot that looks.
-        pose: (3,) of the robot with the LED.
-        front: Which LED.
-    """
+    """Column, row [px] and distance [m] of an LED of a robot at `pose`; None if not seen, walls aside."""
     (cx, cy), (x, y) = camera_place(observer), led_place(pose, front=front)
     way = math.atan2(y - cy, x - cx)
     bearing = math.remainder(way - observer[2], 2.0 * math.pi)

@@ -99,12 +99,9 @@ class Renderer:
     def light(self, camera: RobotCamera, poses: FloatArray) -> NDArray[np.float32]:
         """The brightness of every pixel (height, width), without noise; overwritten by the next call.
 
-        What covers something else while it moves is averaged over the exposure before it is laid over what
-        it covers: exact but for the image's blurred rims in front of other blurred rims.
-
-        Args:
-            camera: The camera.
-            poses: (K, N, 3) of all robots in map, at the middles of K equal parts of the exposure.
+        What covers something else while it moves is averaged over the exposure before it is laid over what it
+        covers: exact but for the image's blurred rims in front of other blurred rims. Poses (K, N, 3) of all
+        robots in map are those at the middles of K equal parts of the exposure.
         """
         seen_from = poses[:, camera.robot]
         of_map = camera.view(se2.inverse(seen_from))

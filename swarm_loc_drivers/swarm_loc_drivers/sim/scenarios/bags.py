@@ -156,15 +156,10 @@ JPEG_QUALITY = 85
 
 
 def write_bag(run: SimulatedRun, folder: Path, comment: str) -> int:
-    """Write `<robot>/odom`, `<robot>/detections` and `<robot>/ground_truth` of all robots.
+    """Write `<robot>/odom`, `<robot>/detections` and `<robot>/ground_truth` of all robots to a new folder.
 
-    Args:
-        run: What to write; log times are times of arrival, so that lateness is real on replay.
-        folder: The bag, created; must not exist.
-        comment: First lines of `swarm.yaml`, where the run comes from.
-
-    Returns:
-        Number of messages.
+    Log times are times of arrival, so that lateness is real on replay. The comment, where the run comes from,
+    is the beginning of `swarm.yaml`. Returns the number of messages.
 
     Raises:
         BagError: The folder exists already, or cannot be created.
@@ -294,8 +289,7 @@ def as_detections(run: SimulatedRun) -> Records:
 def marker_orientation(heading: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:
     """Quaternions (S, 4) x y z w, in the optical frame, of upright markers.
 
-    Args:
-        heading: (S,) direction out of the face [rad], 0 along the optical axis, positive to the left.
+    `heading` (S,) is the direction out of the face [rad], 0 along the optical axis, positive to the left.
     """
     sin, cos, zero = np.sin(heading), np.cos(heading), np.zeros_like(heading)
     right = np.stack([-cos, zero, -sin], axis=-1)

@@ -115,9 +115,7 @@ class _Rosbag2Writer(Writer):
 class BagWriter:
     """A new bag; use it as a context manager, an error inside leaves no bag behind.
 
-    Args:
-        path: Folder to create; must not exist.
-        compress: Whether chunks are compressed with zstd.
+    Its folder must not exist. With `compress`, chunks are compressed with zstd.
 
     Raises:
         BagError: The folder is there already, or cannot be created.

@@ -164,16 +164,9 @@ def encode_pose_stamped(frame_id: str, stamp_ns: IntArray, pose: FloatArray) -> 
 
 
 def encode_poses(frame_id: str, stamp_ns: IntArray, pose: FloatArray, covariance: FloatArray) -> list[bytes]:
-    """Serialize geometry_msgs/PoseWithCovarianceStamped of the plane.
+    """Serialize N geometry_msgs/PoseWithCovarianceStamped of the plane.
 
-    Args:
-        frame_id: Frame of the poses, `map`.
-        stamp_ns: (N,) when the robots were there.
-        pose: (N, 3) x [m], y [m], yaw [rad].
-        covariance: (N, 3, 3) of them.
-
-    Returns:
-        N messages.
+    They are of stamps (N,), poses (N, 3) x [m], y [m], yaw [rad] and their covariances (N, 3, 3).
     """
     numbers = np.zeros((len(pose), POSE_DOUBLES + 36))
     numbers[:, :POSE_DOUBLES] = position_and_quaternion(pose)
