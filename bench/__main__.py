@@ -19,6 +19,7 @@ BENCHMARKS = {
     "live": "bench.graph.live",
     "mrclam": "bench.mrclam",
     "pushbot": "bench.pushbot",
+    "pushbot_bag": "bench.pushbot.bag",
     "reading": "bench.peers.reading",
     "scaling": "bench.peers.scaling",
     "soak": "bench.graph.soak",

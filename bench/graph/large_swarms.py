@@ -19,9 +19,9 @@ import numpy as np
 
 from bench.graph.shared_bag import write_shared_bag
 from bench.shared.common import OUT, plot_by_size, table, write_figures
+from bench.shared.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.run import SimulatedRun
 from swarm_loc_drivers.sim.scenarios.bags import write_bag
-from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.nodes.load import SHED_REASONS
 from swarm_loc_estimator.offline.live_run import play_live

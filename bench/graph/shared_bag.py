@@ -9,8 +9,9 @@ import numpy as np
 
 from bench.shared.bags import SharedHead, encode_shared_detections, encode_shared_numbers
 from swarm_loc_drivers.sim.run import SimulatedRun
-from swarm_loc_drivers.sim.scenarios.bags import Stream, as_detections, truth_stream, write_streams
+from swarm_loc_drivers.sim.scenarios.bags import as_detections, truth_stream, write_swarm_bag
 from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.bags.writer import Stream
 from swarm_loc_estimator.common.messages.cdr import SWARM_DETECTIONS, SWARM_ODOMETRY
 from swarm_loc_estimator.common.messages.detections import swarm_key
 
@@ -25,7 +26,7 @@ def write_shared_bag(run: SimulatedRun, folder: Path, comment: str) -> int:
     robots = run.swarm.robots
     truth = [truth_stream(run, index) for index in range(len(robots))]
     key = swarm_key(robot.name for robot in robots)
-    return write_streams([_odometry(run, key), _detections(run, key), *truth], run.swarm, folder, comment)
+    return write_swarm_bag([_odometry(run, key), _detections(run, key), *truth], run.swarm, folder, comment)
 
 
 def _odometry(run: SimulatedRun, key: int) -> Stream:

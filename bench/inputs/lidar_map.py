@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import scipy
 
+from bench.pushbot.exploration import PERIOD_S, PushBotNoise
 from bench.pushbot.lidar import (
     BEAMS,
     LIDAR,
@@ -34,7 +35,6 @@ from bench.pushbot.lidar import (
 from bench.pushbot.mapping import LIDAR_SLIPS, PLANS
 from bench.shared.common import ProgressLine
 from bench.shared.simulated_run import errors_of, inputs_between, odometry_rows
-from swarm_loc_drivers.sim.pushbot.exploration import PERIOD_S, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan
 from swarm_loc_drivers.sim.run import ODOMETRY_DTYPE, LivedRun, Trajectories
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from bench.integrity.scoring import Estimated, Score, scored
+from bench.pushbot.bag import PushbotBagSettings, write_pushbot_bag
 from bench.shared.bags import copy_part, first_log_ns
-from swarm_loc_drivers.sim.scenarios.pushbot_bag import PushbotBagSettings, write_pushbot_bag
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.offline.replay import replay

@@ -1,6 +1,6 @@
 """Large swarms whose robots are calibrated as they drive: what that costs, and how exact it is.
 
-The grid of `sim.scenarios.grid`, but each robot's odometry reports its path and its turn by another scale,
+The grid of `bench.shared.grid`, but each robot's odometry reports its path and its turn by another scale,
 its camera is turned, and the landmarks stand beside where the survey has them. All of that is estimated.
 Errors of the second half of a run count, of the poses told as tracked.
 """
@@ -15,8 +15,8 @@ import numpy as np
 
 from bench.peers.shapes import second_half
 from bench.shared.common import new_plot, save_plot, table, write_figures
+from bench.shared.grid import GridSettings, simulate_grid
 from bench.shared.simulated_run import run_core, ticks
-from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings

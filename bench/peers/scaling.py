@@ -1,6 +1,6 @@
 """How far one core carries: simulated swarms of growing size, beside filterpy and gtsam on the same data.
 
-The swarm is a grid with about three neighbours in view of each robot (`sim.scenarios.grid`):
+The swarm is a grid with about three neighbours in view of each robot (`bench.shared.grid`):
 odometry at 20 Hz, cameras at 7.5 Hz, 150-300 ms late; for one figure (`prompt_cpu_s_per_s`) nothing is late.
 Everybody gives all poses ten times a second; each uses measurements as often as suits it, the estimator as
 its default settings say. Measured is CPU time of this process per simulated second, without reading
@@ -21,8 +21,8 @@ from bench.graph import large_swarms
 from bench.peers import filterpy_ekf, gtsam_batch, gtsam_lag
 from bench.peers.shapes import ShapeRuns, measure_shape, scored, show
 from bench.shared.common import new_plot, save_plot, table, write_figures
+from bench.shared.grid import GridSettings, Shape, simulate_grid
 from bench.shared.simulated_run import errors_of, position_rmse, run_core, ticks, without_delay
-from swarm_loc_drivers.sim.scenarios.grid import GridSettings, Shape, simulate_grid
 from swarm_loc_estimator.timeline.settings import Settings
 
 if TYPE_CHECKING:

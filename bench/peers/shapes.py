@@ -11,9 +11,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bench.shared.common import table
+from bench.shared.grid import GridSettings, Shape, simulate_grid
 from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_core, ticks
 from swarm_loc_drivers.sim.run import SimulatedRun
-from swarm_loc_drivers.sim.scenarios.grid import GridSettings, Shape, simulate_grid
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.timeline.settings import Settings
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from swarm_loc_drivers.sim.pushbot.exploration import PERIOD_S, SPEED, Arrival, PushBotNoise
+from bench.pushbot.exploration import PERIOD_S, SPEED, Arrival, PushBotNoise
+from bench.shared.bags import message_header
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, clearance, is_visible, wall_distance
-from swarm_loc_drivers.sim.scenarios.bags import message_header
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, encode

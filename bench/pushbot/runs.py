@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from bench.pushbot.exploration import Arrival, Exploration, PushBotNoise
 from bench.pushbot.lidar import LidarDrive
-from swarm_loc_drivers.sim.pushbot.exploration import Arrival, Exploration, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray

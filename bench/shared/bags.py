@@ -97,3 +97,8 @@ def encode_shared_detections(head: SharedHead, detections: Rows) -> bytes:
 def _written(head: SharedHead) -> dict[str, Any]:
     header = {"stamp": head.stamp_ns, "frame_id": head.frame_id}
     return {"header": header, "swarm": head.swarm, "robot": head.robot, "stamp": stamp_rows(head.reading_ns)}
+
+
+def message_header(stamp_ns: int, frame: str) -> dict[str, Any]:
+    """A std_msgs/Header to encode."""
+    return {"stamp": stamp_ns, "frame_id": frame}

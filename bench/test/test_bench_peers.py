@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from bench.peers.problem import Moves, Odometry, no_moves, relative_poses, sightings_of, starts_of
+from bench.shared.grid import GridSettings, simulate_grid
 from bench.shared.simulated_run import without_delay
 from swarm_loc_drivers.sim.run import SimulatedRun
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
-from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray

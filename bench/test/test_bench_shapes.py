@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from bench.peers.shapes import ShapeRuns, measure_shape, scored
-from swarm_loc_drivers.sim.scenarios.grid import Shape
+from bench.shared.grid import Shape
 
 
 def test_a_pose_that_is_not_tracked_is_counted_and_not_scored() -> None:

@@ -27,10 +27,10 @@ from domain_coordinator import domain_id
 from playwright.sync_api import Browser
 
 from bench.shared.common import OUT, ProgressLine, new_plot, save_plot, table, write_figures
+from bench.shared.grid import GridSettings, simulate_grid
 from bench.watch.browser import WatchedPage, chromium, running_browser
 from bench.watch.publisher import homes
 from swarm_loc_drivers.sim.scenarios.bags import write_bag
-from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.common.launch import (
     Child,
     GraphOptions,

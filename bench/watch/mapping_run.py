@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from bench.pushbot.exploration import Arrival, Exploration, PushBotNoise
 from bench.pushbot.runs import RunSettings
-from swarm_loc_drivers.sim.pushbot.exploration import Arrival, Exploration, PushBotNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_estimator.common.messages.poses import EstimateMessage
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper

@@ -17,10 +17,10 @@ from playwright.sync_api import Browser
 
 from bench.pushbot.runs import RunSettings
 from bench.shared.common import OUT
+from bench.shared.grid import GridSettings, simulate_grid
 from bench.watch.browser import WatchedPage, chromium, running_browser
 from bench.watch.mapping_run import mapping_run
 from swarm_loc_drivers.sim.scenarios.bags import write_bag
-from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
 from swarm_loc_estimator.common.command_line import swarm_beside
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.report.report import recorded

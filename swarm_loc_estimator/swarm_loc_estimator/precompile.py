@@ -62,9 +62,7 @@ def size_of(swarm: Swarm, settings: Settings) -> Size:
 def precompile(size: Size, infrared: bool) -> None:
     """Run small estimators through all that a swarm of some size does; takes a second once compiled.
 
-    Args:
-        size: Of the swarm.
-        infrared: Whether its robots measure each other by infrared light, which takes as long again.
+    With infrared light, by which its robots measure each other, it takes as long again.
     """
     compiled = partial(precompile, size, infrared)
     if not is_precompiled(compiled):

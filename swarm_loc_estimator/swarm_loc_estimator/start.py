@@ -9,40 +9,24 @@ from swarm_loc_estimator.common.command_line import Program
 
 calibrate = Program("swarm_loc_estimator.cli.calibrate")
 calibrate_ir = Program("swarm_loc_estimator.cli.calibrate_ir")
-demo = Program("swarm_loc_estimator.cli.demo")
+demo = Program("swarm_loc_estimator.cli.demo", needs_ros=True)
 doctor = Program("swarm_loc_estimator.cli.doctor")
-estimator_node = Program("swarm_loc_estimator.nodes.estimator_node")
-graph = Program("swarm_loc_estimator.cli.graph")
+estimator_node = Program("swarm_loc_estimator.nodes.estimator_node", needs_ros=True)
+graph = Program("swarm_loc_estimator.cli.graph", needs_ros=True)
 import_droplets = Program("swarm_loc_estimator.cli.import_droplets")
 import_mrclam = Program("swarm_loc_estimator.cli.import_mrclam")
-localizer_bridge = Program("swarm_loc_estimator.nodes.localizer_bridge")
-mapper_node = Program("swarm_loc_estimator.nodes.mapper_node")
-markers_node = Program("swarm_loc_estimator.watch.markers_node")
+localizer_bridge = Program("swarm_loc_estimator.nodes.localizer_bridge", needs_ros=True)
+mapper_node = Program("swarm_loc_estimator.nodes.mapper_node", needs_ros=True)
+markers_node = Program("swarm_loc_estimator.watch.markers_node", needs_ros=True)
 new = Program("swarm_loc_estimator.cli.new")
-play = Program("swarm_loc_estimator.nodes.play_node")
+play = Program("swarm_loc_estimator.nodes.play_node", needs_ros=True)
 replay = Program("swarm_loc_estimator.cli.replay")
 replay_map = Program("swarm_loc_estimator.cli.replay_map")
 schema = Program("swarm_loc_estimator.cli.schema")
 survey = Program("swarm_loc_estimator.cli.survey")
 sweep = Program("swarm_loc_estimator.cli.sweep")
-watch = Program("swarm_loc_estimator.cli.watch")
-watch_node = Program("swarm_loc_estimator.watch.watch_node")
-
-WITHOUT_ROS = (
-    *(
-        calibrate,
-        calibrate_ir,
-        doctor,
-        import_droplets,
-        import_mrclam,
-        new,
-        replay,
-        replay_map,
-        schema,
-        survey,
-        sweep,
-    ),
-)
+watch = Program("swarm_loc_estimator.cli.watch", needs_ros=True)
+watch_node = Program("swarm_loc_estimator.watch.watch_node", needs_ros=True)
 
 
 def swarm_loc() -> int:
@@ -56,10 +40,10 @@ def swarm_loc() -> int:
         print(f"swarm-loc has no command '{name}'; swarm-loc --help lists them.", file=sys.stderr)
         return 2
     print("swarm-loc COMMAND ARGUMENTS...; swarm-loc COMMAND --help shows the arguments of a command.")
-    for title, has_ros in (("Without ROS 2", False), ("With ROS 2", True)):
+    for title, needs_ros in (("Without ROS 2", False), ("With ROS 2", True)):
         print(f"\n{title}:")
         for name, program in programs.items():
-            if (program not in WITHOUT_ROS) == has_ros:
+            if program.needs_ros == needs_ros:
                 print(f"  {name:16} {_summary(program.module)}")
     return 0
 

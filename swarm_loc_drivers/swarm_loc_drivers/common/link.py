@@ -73,12 +73,9 @@ def parse_address(text: str, default_port: int) -> Address:
 
 
 def open_link(address: Address, baud_rate: int, timeout_s: float) -> Link:
-    """Open a serial port or a TCP connection.
+    """Open a serial port with a baud rate [bit/s], or a TCP connection.
 
-    Args:
-        address: Where the robot answers.
-        baud_rate: Of a serial port [bit/s].
-        timeout_s: Timeout of a write; connecting by TCP may take twice as long [s].
+    A write has a timeout [s]; connecting by TCP may take twice as long.
 
     Raises:
         LinkError: It cannot be opened.
@@ -93,12 +90,9 @@ _BROKEN = (OSError, TypeError, termios.error)
 
 
 class SerialLink:
-    """An open serial port, 8N1, locked by this process.
+    """An open serial port with a baud rate [bit/s], 8N1, locked by this process.
 
-    Args:
-        device: Its path.
-        baud_rate: [bit/s].
-        write_timeout_s: Timeout of a write, which breaks the link [s].
+    A write that takes longer than its timeout breaks the link.
 
     Raises:
         LinkError: It cannot be opened.
@@ -140,12 +134,7 @@ _CHUNK = 1 << 16
 
 
 class TcpLink:
-    """A TCP connection; the robot is the server.
-
-    Args:
-        host: Name or number of the robot.
-        port: TCP port.
-        timeout_s: Timeout of connecting, and of a write [s].
+    """A TCP connection; the robot is the server. Connecting, and a write, have a timeout [s].
 
     Raises:
         LinkError: It cannot be opened.

@@ -42,13 +42,9 @@ class WheelGeometry:
     def commands_for(
         self, speed: float, turn_rate: float, limit: float, period_s: float = 1.0
     ) -> tuple[float, float]:
-        """Commands for the left and the right wheel [steps per period], not rounded.
+        """Commands for the left and the right wheel [steps per period], not rounded, of finite velocities.
 
-        Args:
-            speed: Forward [m/s], finite.
-            turn_rate: To the left [rad/s], finite.
-            limit: Largest command; beyond it both wheels slow down by the same factor, which keeps the curve.
-            period_s: Period of the commands [s].
+        Beyond the largest command both wheels slow down by the same factor, which keeps the curve.
         """
         half_turn, unit = 0.5 * self.wheel_separation * turn_rate, self.metres_per_step / period_s
         left, right = (speed - half_turn) / unit, (speed + half_turn) / unit
@@ -59,9 +55,7 @@ class WheelGeometry:
 class DeadReckoning:
     """Integrates the paths of two wheels to a pose with its covariance, starting at zero.
 
-    Args:
-        geometry: The wheels.
-        wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
+    `wheel_noise` is the variance of each wheel's path per metre it rolls [m^2/m].
     """
 
     def __init__(self, geometry: WheelGeometry, wheel_noise: float) -> None:

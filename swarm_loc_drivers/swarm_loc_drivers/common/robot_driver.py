@@ -25,24 +25,17 @@ SomeSession = TypeVar("SomeSession", bound=Session)
 class RobotDriver(ABC, Generic[SomeSession]):
     """Talks to one robot until the driver is stopped and the robot is known to stand.
 
-    Args:
-        name: Name of the robot's link in messages.
-        clock: The time [ns]; may be simulated, and 0 means no time.
-
-    Attributes:
-        counts: `connections`, `link_failures`, and the counts of the sessions.
-        trouble: Why there is no connection; "" while there is one.
-        warning: What is wrong with the connected robot; "" for nothing.
-        may_run: Whether the robot may be moving after the driver has been stopped.
+    `name` is that of the robot's link in messages. The clock [ns] may be simulated, and 0 means no time.
     """
 
     def __init__(self, name: str, clock: Callable[[], int]) -> None:
         self._clock = clock
+        # `connections`, `link_failures`, and the counts of the sessions
         self.counts: Counter[str] = Counter()
-        self.trouble = f"connecting to {name}"
-        self.warning = ""
+        self.trouble = f"connecting to {name}"  # Why there is no connection; "" while there is one
+        self.warning = ""  # What is wrong with the connected robot; "" for nothing
         self._stopping = threading.Event()
-        self.may_run = False
+        self.may_run = False  # Whether the robot may be moving after the driver has been stopped
         self._thread = threading.Thread(target=self._run, name=f"driver of {name}")
 
     def start(self) -> None:

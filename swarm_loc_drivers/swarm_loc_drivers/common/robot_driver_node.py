@@ -92,10 +92,8 @@ class RobotDriverNode(ConfiguredNode[Parameters]):
     def _start_reports(self, address: str, rates: Sequence[str], wrong: Mapping[str, str]) -> None:
         """Publish counts and rates of the driver once a second, and log errors and changes of the link.
 
-        Args:
-            address: Where the robot answers.
-            rates: Counts whose rates are published, too.
-            wrong: Counts of errors, which the log warns of, and what they mean.
+        Of the counts in `rates`, rates are published, too. Those in `wrong` are counts of errors, which the
+        log warns of, and what they mean.
         """
         self._address, self._rates, self._wrong = address, rates, wrong
         self._reported: Counter[str] = Counter()

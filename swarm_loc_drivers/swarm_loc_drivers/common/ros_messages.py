@@ -68,14 +68,9 @@ def odometry_transform(odometry: Odometry) -> TransformStamped:
 
 
 class OdometryOutput:
-    """Publishes the odometry of one robot.
+    """Publishes the odometry of one robot: the pose of `base_frame` in `odom_frame`.
 
-    Args:
-        node: Node of the publishers.
-        topic: Topic of the odometry.
-        odom_frame: Frame in which the pose is given.
-        base_frame: Frame whose pose it is.
-        transforms: Publisher of /tf; None publishes no transform.
+    `transforms` is the publisher of /tf; None publishes no transform.
     """
 
     def __init__(

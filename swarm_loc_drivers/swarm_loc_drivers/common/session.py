@@ -27,11 +27,7 @@ class Session(Protocol):
 
 
 class TalkSession(ABC):
-    """A `Session` that is written as one generator.
-
-    Args:
-        counts: Counts what happens.
-    """
+    """A `Session` that is written as one generator, and counts what happens."""
 
     def __init__(self, counts: Counter[str]) -> None:
         self.ending = self.connected = self.ended = False
@@ -45,15 +41,9 @@ class TalkSession(ABC):
         """Talk to the robot: append to `_output`, yield, and read `_received`."""
 
     def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
-        """Continue the conversation.
+        """Continue the conversation with the bytes received since the last step; returns bytes to send.
 
-        Args:
-            data: Bytes received since the last step.
-            now_ns: The time, which may be simulated, stand still or jump back; 0 means no time.
-            steady_s: Real time.
-
-        Returns:
-            Bytes to send.
+        The time [ns] may be simulated, stand still or jump back; 0 means no time. `steady_s` is real time.
 
         Raises:
             SessionError: The robot does not answer as it must.

@@ -16,13 +16,10 @@ STILL: Velocity = (0.0, 0.0, 0.0)
 
 
 class VelocityCommand:
-    """Holds the newest velocity; zero after a timeout.
+    """Holds the newest velocity; zero after a timeout [s].
 
-    Args:
-        timeout_s: How long a velocity is valid [s].
-        clock: The time [ns]; may be simulated, and 0 means no time.
-        counts: Counts `bad_cmd_vel` and `stale_cmd_vel`.
-        steady_s: Real time [s].
+    The clock [ns] may be simulated, and 0 means no time; `steady_s` is real time. Counts `bad_cmd_vel` and
+    `stale_cmd_vel`.
     """
 
     def __init__(

@@ -39,16 +39,9 @@ _COUNTED = {
 
 
 class ConsoleTalk:
-    """The computer's end of the console.
+    """The computer's end of the console of a robot with some number of emitters, and of sensors.
 
-    Args:
-        elements: Number of emitters and of sensors.
-        echo_timeout_ns: Timeout of an echo or an answer [ns].
-        on_said: Receives every printed line.
-        counts: Counts `lines`, `bad_echoes`, and unrequested lines by kind.
-
-    Attributes:
-        now_ns: Time of the last step [ns].
+    `on_said` receives every printed line. Counts `lines`, `bad_echoes`, and unrequested lines by kind.
     """
 
     def __init__(
@@ -60,7 +53,7 @@ class ConsoleTalk:
         self._counts = counts
         self._output = bytearray()
         self._echoes: list[str] = []
-        self.now_ns = 0
+        self.now_ns = 0  # Time of the last step [ns]
 
     def hear(self, data: bytes, now_ns: int) -> None:
         """Take output of the console."""

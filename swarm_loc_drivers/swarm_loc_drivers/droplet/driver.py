@@ -31,13 +31,7 @@ class DropletListeners:
 
 
 class DropletDriver(RobotDriver[DropletSession]):
-    """Drives Droplets in its own thread.
-
-    Args:
-        params: Parameters of the driver.
-        listeners: Receivers of their data.
-        clock: The time [ns]; may be simulated, and 0 means no time.
-    """
+    """Drives Droplets in its own thread, see `RobotDriver`."""
 
     def __init__(
         self, params: DropletParameters, listeners: DropletListeners, clock: Callable[[], int]

@@ -59,11 +59,9 @@ class PollingSettings:
 
 
 class MatrixValidator:
-    """Selects usable matrices, and counts the others by reason.
+    """Selects usable matrices, of any robots or of those with known ids.
 
-    Args:
-        known: Ids that may emit; empty: any.
-        counts: Counts `no_clock`, `self_heard`, `foreign_receiver`, `unknown_ids`, `overheard`.
+    Counts the others by reason: `no_clock`, `self_heard`, `foreign_receiver`, `unknown_ids`, `overheard`.
     """
 
     def __init__(self, known: Collection[int], counts: Counter[str]) -> None:
@@ -75,10 +73,7 @@ class MatrixValidator:
     def transmitter(self, said: Said, matrix: Matrix, asked: int | None) -> int | None:
         """Id of the emitting robot; None if the matrix cannot be used.
 
-        Args:
-            said: The printed line.
-            matrix: Its matrix.
-            asked: The robot that was asked to emit, if any: old formats lack it.
+        Old formats lack it: then it is the robot that was asked to emit, if any.
         """
         emitter = asked if matrix.emitter is None else matrix.emitter
         if not said.stamp_ns:
@@ -112,13 +107,8 @@ def publish_pair(ones: list[Brightness], publish: Publish) -> None:
 class PollingExchange:
     """Asks one robot after the other to emit.
 
-    Args:
-        console: Console of the receiver.
-        settings: Settings of the exchanges.
-        interlude: Handles urgent work; whether to continue.
-        publish: Receives the matrices of exchanges.
-        counts: Counts `exchanges`, `retries`, `failed_exchanges`, `busy_sends`, `dark_matrices`,
-            `equal_powers`, and what the validator counts.
+    `interlude` handles urgent work, and says whether to continue. Counts `exchanges`, `retries`,
+    `failed_exchanges`, `busy_sends`, `dark_matrices`, `equal_powers`, and what the validator counts.
     """
 
     def __init__(

@@ -47,11 +47,7 @@ class _Move:
 
 
 class CommandedMotion:
-    """Integrates commands to a pose.
-
-    Args:
-        noise: Noise of the motion.
-    """
+    """Integrates commands to a pose, with the noise of the motion."""
 
     def __init__(self, noise: MotionNoise) -> None:
         self._noise = noise
@@ -66,13 +62,9 @@ class CommandedMotion:
         return self._move is not None and stamp_ns < self._move.end_ns
 
     def begin(self, stamp_ns: int, gait: Gait, steps: int, doubt: float = 0.0) -> None:
-        """Begin a motion; a robot that is already moving continues its current motion.
+        """Begin a motion of some steps; a robot that is already moving continues its current motion.
 
-        Args:
-            stamp_ns: Time [ns].
-            gait: Motion of a step.
-            steps: Number of steps.
-            doubt: Variance in units of the motion: the probability that the command was lost.
+        `doubt` is a variance in units of the motion: the probability that the command was lost.
         """
         self._advance(stamp_ns)
         if not self.moving(stamp_ns):
@@ -81,12 +73,7 @@ class CommandedMotion:
             self._doubted = (self._pose, doubt)
 
     def stop(self, stamp_ns: int, doubt: float = 0.0) -> None:
-        """Stop the motion.
-
-        Args:
-            stamp_ns: Time [ns].
-            doubt: Probability that the command was lost and the robot completes its motion.
-        """
+        """Stop the motion; `doubt`: probability that the command was lost and the robot completes it."""
         move = self._move
         self._advance(stamp_ns)
         self._settle()

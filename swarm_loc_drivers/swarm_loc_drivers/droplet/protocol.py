@@ -219,10 +219,6 @@ def _range_bearing(match: re.Match[str]) -> RangeBearing:
     return RangeBearing(int(robot, 16), 1e-3 * int(range_mm), *angles)
 
 
-def _move_started(match: re.Match[str]) -> MoveStarted:
-    return MoveStarted(*_integers(match))
-
-
 def _motor_trims(match: re.Match[str]) -> MotorTrims:
     direction, *trims = _integers(match)
     return MotorTrims(direction, (trims[0], trims[1], trims[2]))
@@ -232,7 +228,7 @@ _LINES: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Event]], ...] = t
     (re.compile(pattern), make)
     for pattern, make in (
         (r"My ID is: ([0-9A-F]{1,4})", lambda m: Identity(int(m[1], 16))),
-        (r"walk direction (\d), num_steps (\d{1,5})", _move_started),
+        (r"walk direction (\d), num_steps (\d{1,5})", lambda m: MoveStarted(*_integers(m))),
         (rf'Broadcasting command to {_HEX}: "(.*)", of length (\d{{1,2}})\.', _relayed),
         (r'Broadcasting command()?: "(.*)", of length (\d{1,2})\.', _relayed),
         (r"Aborting IR send \[([0-9A-Fa-f]{2})\] while trying: .*", lambda m: SendAborted(int(m[1], 16))),
@@ -253,17 +249,12 @@ _LINES: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Event]], ...] = t
 class ConsoleParser:
     """Parses the output of the console, in pieces of any size and after any stray bytes.
 
-    Args:
-        elements: Number of emitters and of sensors; matrices of another size are broken.
-
-    Attributes:
-        partial: The unfinished line, as a terminal would show it.
-        backspaces: Number of received backspaces.
+    Matrices of another number of emitters and of sensors than `elements` are broken.
     """
 
     def __init__(self, elements: int = ELEMENTS) -> None:
-        self.partial = ""
-        self.backspaces = 0
+        self.partial = ""  # The unfinished line, as a terminal would show it
+        self.backspaces = 0  # Number of received backspaces
         self._stamp_ns = 0
         row = r"\{" + ",".join([_NUMBER] * elements) + r"\}"
         rows = r"\{" + ",".join([row] * elements) + r"\}"

@@ -32,19 +32,10 @@ class SessionSettings:
 
 
 class DropletSession:
-    """Session with one Droplet.
+    """A `Session` with one Droplet at a cable, and movers for those without, which it stops, too.
 
-    Args:
-        settings: Settings of the session.
-        mover: Mover of the robot itself.
-        relayed: Movers of robots without a cable.
-        publish: Receives the matrices of exchanges.
-        counts: Counts events.
-
-    Attributes:
-        ending: Set it to stop all robots and end the conversation.
-        connected: Whether the robot has sent its id and its gaits.
-        ended: Whether the conversation has ended.
+    It is connected when the robot has sent its id and its gaits. `publish` receives the matrices of
+    exchanges.
     """
 
     def __init__(
@@ -87,11 +78,7 @@ class DropletSession:
         self._exchanging.request()
 
     def step(self, data: bytes, now_ns: int) -> bytes:
-        """Continue the conversation; the bytes to send.
-
-        Args:
-            data: Output of the console since the last step.
-            now_ns: The time, which may be simulated, stand still or jump back; 0 means no time.
+        """Continue with what the console has said; the bytes to send. See `TalkSession.step`.
 
         Raises:
             SessionError: The robot does not answer as it must.
@@ -196,17 +183,11 @@ def nearest_motion(wanted: Velocity, gaits: Gaits) -> int | None:
 
 
 class DropletMover:
-    """Moves one Droplet.
+    """Moves one Droplet by velocities: that at the cable, or one with the id `target`, by infrared.
 
     A stride is a command of steps that lasts `stride_s`. A command during it would be acknowledged and
-    ignored, so every stride begins with a stop.
-
-    Args:
-        command: Velocities to follow.
-        motion: Dead reckoning of the robot.
-        stride_s: Duration of a command [s]; if the driver dies, the robot stops after it.
-        target: Id of a robot that is reached by infrared; None for the one at the cable.
-        relay_loss: Share of lost commands by infrared.
+    ignored, so every stride begins with a stop. If the driver dies, the robot stops after a stride. A share
+    of the commands by infrared is lost.
     """
 
     def __init__(

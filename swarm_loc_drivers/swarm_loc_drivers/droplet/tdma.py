@@ -44,12 +44,8 @@ class TdmaSettings:
 class TdmaExchange:
     """Emits in this robot's turn, and assigns matrices to the turns of others.
 
-    Args:
-        console: Console of the robot.
-        settings: Settings of the turns.
-        interlude: Handles urgent work; whether to continue.
-        publish: Receives the matrices of exchanges.
-        counts: Counts `emissions`, `late_turns`, `exchanges`, `half_exchanges`, and those of the validator.
+    `interlude` handles urgent work, and says whether to continue. Counts `emissions`, `late_turns`,
+    `exchanges`, `half_exchanges`, and what the validator counts.
     """
 
     def __init__(

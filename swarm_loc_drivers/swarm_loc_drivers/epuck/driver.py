@@ -47,12 +47,9 @@ class _RateLimits(NamedTuple):
 
 
 class WheelOdometry:
-    """Integrates steps to a pose, and checks them against the commands.
+    """Integrates steps to a pose, see `DeadReckoning`, and checks them against the commands.
 
-    Args:
-        geometry: Geometry of the wheels.
-        wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
-        counts: Counts `implausible_counters`, `counter_restarts`, `reversed_counters` and `time_jumps`.
+    Counts `implausible_counters`, `counter_restarts`, `reversed_counters` and `time_jumps`.
     """
 
     def __init__(self, geometry: WheelGeometry, wheel_noise: float, counts: Counter[str]) -> None:
@@ -191,13 +188,7 @@ class EpuckListeners:
 
 
 class EpuckDriver(RobotDriver[EpuckSession]):
-    """Drives one robot in its own thread.
-
-    Args:
-        params: Parameters of the driver.
-        listeners: Receivers of its data.
-        clock: The time [ns]; may be simulated, and 0 means no time.
-    """
+    """Drives one robot in its own thread, see `RobotDriver`."""
 
     def __init__(self, params: EpuckParameters, listeners: EpuckListeners, clock: Callable[[], int]) -> None:
         super().__init__(str(params.link_address), clock)

@@ -112,19 +112,12 @@ def decode_image(body: bytes, width: int, height: int) -> bytes | None:
 
 
 class ReplyParser:
-    """Finds the reply to one request in pieces of any size, after any stray bytes.
-
-    Args:
-        request: The request that was sent.
-
-    Attributes:
-        skipped: Number of bytes outside the reply.
-    """
+    """Finds the reply to one request in pieces of any size, after any stray bytes."""
 
     def __init__(self, request: Request) -> None:
         self._request = request
         self._buffer = bytearray()
-        self.skipped = 0
+        self.skipped = 0  # Number of bytes outside the reply
 
     def feed(self, data: bytes) -> bytes | None:
         """Take bytes; the body of the reply once it is complete. Bytes after it are skipped."""
@@ -153,11 +146,8 @@ _NS = 1_000_000_000
 class SerialSession(TalkSession):
     """Requests readings at every step that finds it idle, and images in between; see `EpuckSession`.
 
-    Args:
-        params: Parameters of the driver.
-        speeds: Commands of the wheels.
-        doubt: Called when it is unknown which commands the robot has received.
-        counts: Counts `exchanges`, `missed_replies`, `stray_bytes`, `resyncs`, `bad_images`.
+    `doubt` is called when it is unknown which commands the robot has received. Counts `exchanges`,
+    `missed_replies`, `stray_bytes`, `resyncs`, `bad_images`.
     """
 
     def __init__(

@@ -52,13 +52,4 @@ class EpuckSession(Session, Protocol):
     is_idle: bool  # Whether no answer is pending: the next step sends a request
 
     def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
-        """Go on; what to send.
-
-        Args:
-            data: What has come since the last step.
-            now_ns: The time, which may be simulated, stand still or jump back; 0 is none.
-            steady_s: Real time.
-
-        Raises:
-            SessionError: The robot does not answer, or not as it must.
-        """
+        """See `TalkSession.step`."""

@@ -102,12 +102,7 @@ def plausible(payload: bytes) -> bool:
 
 
 class StreamParser:
-    """Splits the stream into messages; after lost or stray bytes it finds the next sensor values.
-
-    Attributes:
-        skipped: Number of bytes outside messages.
-        resyncs: How often the stream had to be searched for a message.
-    """
+    """Splits the stream into messages; after lost or stray bytes it finds the next sensor values."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
@@ -115,8 +110,8 @@ class StreamParser:
         self._arrivals: deque[tuple[int, int]] = deque()
         self._synced = True
         self._searched = 0
-        self.skipped = 0
-        self.resyncs = 0
+        self.skipped = 0  # Number of bytes outside messages
+        self.resyncs = 0  # How often the stream had to be searched for a message
 
     def feed(self, data: bytes, stamp_ns: int) -> list[Message]:
         """Take bytes that arrived at `stamp_ns`; the messages that they complete."""

@@ -41,11 +41,7 @@ class WifiSession:
     The robot reads new values into a second buffer as soon as it has sent a message, and sends them with the
     next message of that kind. So the stamp of a message is the arrival of the previous one. Messages without
     a reliable stamp are not used: the first one of a connection, one that arrives late, and its successor.
-
-    Args:
-        params: Parameters of the driver.
-        speeds: Commands of the wheels.
-        counts: Counts `messages`, `stray_bytes`, `resyncs`.
+    Counts `messages`, `stray_bytes`, `resyncs`.
     """
 
     is_idle = False

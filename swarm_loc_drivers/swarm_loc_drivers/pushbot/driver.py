@@ -26,14 +26,10 @@ _MAX_CORRECTION_S = 0.5
 
 
 class PushbotOdometry:
-    """Integrates ticks to a pose.
+    """Integrates ticks to a pose, see `DeadReckoning`.
 
-    The wheels may also be turned by hand, so only readings that no motor can cause are rejected.
-
-    Args:
-        geometry: Geometry of the wheels.
-        wheel_noise: Variance of each wheel's path per metre it rolls [m^2/m].
-        counts: Counts `implausible_counters`, `counter_restarts`, `time_jumps` and `corrected_times`.
+    The wheels may also be turned by hand, so only readings that no motor can cause are rejected. Counts
+    `implausible_counters`, `counter_restarts`, `time_jumps` and `corrected_times`.
     """
 
     def __init__(self, geometry: WheelGeometry, wheel_noise: float, counts: Counter[str]) -> None:
@@ -95,13 +91,7 @@ class PushbotListeners:
 
 
 class PushbotDriver(RobotDriver[PushbotSession]):
-    """Drives one robot in its own thread.
-
-    Args:
-        params: Parameters of the driver.
-        listeners: Receivers of its data.
-        clock: The time [ns]; may be simulated, and 0 means no time.
-    """
+    """Drives one robot in its own thread, see `RobotDriver`."""
 
     def __init__(
         self, params: PushbotParameters, listeners: PushbotListeners, clock: Callable[[], int]

@@ -25,12 +25,7 @@ class EventPacket:
 
 
 class EventPackets:
-    """Collects events in packets.
-
-    Args:
-        period_s: Period of packets [s].
-        on_bit: The polarity bit of pixels that became brighter.
-    """
+    """Collects events in packets of a period [s]; `on_bit` is the polarity of pixels that became brighter."""
 
     def __init__(self, period_s: float, on_bit: int) -> None:
         self._period_ns = round(period_s * 1e9)

@@ -45,9 +45,8 @@ class Parsed(NamedTuple):
 class EventParser:
     """Parses bytes in pieces of any size; the sizes do not affect the result.
 
-    Args:
-        timestamps: A key of `TIMESTAMPS`.
-        counts: Counts `corrupt_events` (dropped), `time_jumps` (accepted), `skipped_bytes` and `long_lines`.
+    `timestamps` is a key of `TIMESTAMPS`. Counts `corrupt_events` (dropped), `time_jumps` (accepted),
+    `skipped_bytes` and `long_lines`.
     """
 
     def __init__(self, timestamps: str, counts: Counter[str]) -> None:

@@ -37,10 +37,8 @@ class EventClock:
     """Converts times of the board to stamps, by the smallest recent delay of its bytes.
 
     The bytes of an event arrive with a varying delay (buffers, wireless link), so the smallest difference
-    between the two clocks is the best estimate of their offset. A constant delay remains in the stamps.
-
-    Args:
-        span_us: The board's timestamps wrap after so long [us]; 0: never.
+    between the two clocks is the best estimate of their offset. A constant delay remains in the stamps. The
+    board's timestamps wrap after `span_us`; 0: never.
     """
 
     def __init__(self, span_us: int) -> None:
@@ -51,11 +49,9 @@ class EventClock:
         self._offsets_ns: list[int] = []  # the smallest of this window and of the previous one
 
     def stamps(self, time_us: IntArray, now_ns: int) -> IntArray:
-        """Stamps (N,) [ns] of events.
+        """Stamps (N,) [ns] of events that arrive now; N > 0.
 
-        Args:
-            time_us: (N,) the board's clock, unwrapped [us], N > 0.
-            now_ns: Arrival of their bytes [ns].
+        `time_us` (N,) is the board's clock, unwrapped.
         """
         if self._last is not None and now_ns < self._last[0]:
             self._last, self._offsets_ns = None, []  # the computer's clock was set back
@@ -82,14 +78,11 @@ class EventClock:
 
 
 class TickClock:
-    """Stamps wheel readings, which have a constant period.
+    """Stamps wheel readings, which have a constant period [ms].
 
     Text overtakes events in the transmit buffer: if the camera sees more than the link carries, the event
     before a reading is up to 50 ms older than the reading. But no reading is older than that event, or less
     than a period after the previous reading.
-
-    Args:
-        period_ms: Period of readings [ms].
     """
 
     def __init__(self, period_ms: int) -> None:
@@ -137,29 +130,19 @@ _STOP_S = 1.0  # The wheels must stand so long after a stop, and two periods of 
 
 
 class PushbotSession(TalkSession):
-    """Session with one PushBot.
+    """A `Session` with one PushBot; it is connected when the robot has answered and sent wheel ticks.
 
-    Args:
-        params: Parameters of the driver.
-        velocities: Commands of the wheels.
-        counts: Counts `events`, `readings`, `refused_commands`, `other_lines`, `repeated_stops`,
-            `ignored_stops`, and those of `EventParser`.
-
-    Attributes:
-        ending: Set it to stop the robot and end the conversation.
-        connected: Whether the robot has answered and sent wheel ticks.
-        ended: Whether the conversation has ended; the robot stands.
-        found: Measurements; the reader empties the list.
-        generation: Its firmware, once it is known.
-        does_not_stop: Whether the wheels go on turning although the stop has been repeated for a second.
+    Counts `events`, `readings`, `refused_commands`, `other_lines`, `repeated_stops`, `ignored_stops`, and
+    what `EventParser` counts.
     """
 
     def __init__(self, params: PushbotParameters, velocities: Velocities, counts: Counter[str]) -> None:
         super().__init__(counts)
-        self.found: list[WheelTicks | EventPacket] = []
-        self.generation: FirmwareGeneration | None = None
+        self.found: list[WheelTicks | EventPacket] = []  # Measurements; the reader empties the list
+        self.generation: FirmwareGeneration | None = None  # Its firmware, once it is known
         self._params = params
         self._velocities = velocities
+        # Whether the wheels go on turning although the stop has been repeated for a second
         self.does_not_stop = False
         self._sent, self._sent_s = (0, 0), 0.0
         self._ticks: tuple[int, int] | None = None

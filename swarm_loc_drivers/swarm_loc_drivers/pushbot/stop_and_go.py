@@ -75,27 +75,19 @@ class _Drive:
 
 
 class StopAndGo:
-    """Motion of one robot.
-
-    Args:
-        settings: Parameters of its motion.
-
-    Attributes:
-        goals: Number of accepted goals.
-        halts: Number of drives that ended at an obstacle.
-        restarts: Number of restarts of odometry.
-        ratio: Estimated true turn per turn by odometry.
-    """
+    """Motion of one robot."""
 
     def __init__(self, settings: StopAndGoSettings) -> None:
         self._settings = settings
-        self.goals = self.halts = self.restarts = 0
+        self.goals = 0  # Number of accepted goals
+        self.halts = 0  # Number of drives that ended at an obstacle
+        self.restarts = 0  # Number of restarts of odometry
         self._begin()
 
     def _begin(self) -> None:
         """Reset and begin with the first scan."""
         rate = self._settings.turn_rate
-        self.ratio = 1.0
+        self.ratio = 1.0  # Estimated true turn per turn by odometry
         self._moves: deque[_Turn | _Look | _Drive] = deque(
             [_Look(_SLOW_TURN, _SLOW_SHARE * rate), _Look(START_TURN - _SLOW_TURN, _FIRST_SHARE * rate)]
         )

@@ -47,18 +47,12 @@ class Driven:
 
 
 class LastingNoise:
-    """Unit noise that is correlated over several steps.
+    """Unit noise of some shape that is correlated over several steps [s].
 
     White noise would move a wheel abruptly at every step, visibly so in an exposure of 8 ms. Real wheels
     slip over millimetres, and a robot has inertia. So the noise is a moving average over `time_s`. The
     variance of sums over longer times equals that of white noise except for a third of `time_s`, so
     `wheel_noise` keeps its meaning.
-
-    Args:
-        rng: Random generator.
-        shape: Shape of one step's noise.
-        step_s: Time step [s].
-        time_s: Correlation time [s].
     """
 
     def __init__(

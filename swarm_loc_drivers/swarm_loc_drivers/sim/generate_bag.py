@@ -2,10 +2,8 @@
 
     generate_bag eight bags/eight_five_robots --seed 3 --duration 54 --world w0
     generate_bag pictures bags/eight_pictures --seed 1 --duration 9 --robots 2
-    generate_bag grid /tmp/grid100 --robots 100 --duration 20
     generate_bag droplets bags/droplets_twenty --seed 1 --duration 60
     generate_bag aerial bags/aerial_five --seed 1
-    generate_bag pushbots /tmp/hallway --robots 2 --duration 300 --plan office
     generate_bag droplets /tmp/same_boards --seed 2 --boards 1
 
 The bag contains <robot>/odom, <robot>/detections and <robot>/ground_truth, and its folder `swarm.yaml`.
@@ -13,8 +11,6 @@ In place of detections,
     pictures writes <robot>/image_raw/compressed (JPEG) and <robot>/camera_info
     droplets writes <robot>/brightness and <robot>/fix
     aerial writes aerial/detections
-    pushbots writes map, <robot>/laser, <robot>/lights, <robot>/fix and <robot>/goal, with --events also
-        <robot>/events, and next to the bag walls.csv and the calibrations of the lasers
 The same arguments give the same bytes.
 """
 
@@ -26,7 +22,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
-from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.scenarios.bags import (
     simulate_wandering,
@@ -37,8 +32,6 @@ from swarm_loc_drivers.sim.scenarios.bags import (
 )
 from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, simulate_droplets
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight, simulate_eight_images
-from swarm_loc_drivers.sim.scenarios.grid import GridSettings, simulate_grid
-from swarm_loc_drivers.sim.scenarios.pushbot_bag import PushbotBagSettings, write_pushbot_bag
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
 
@@ -80,11 +73,6 @@ def _images(options: argparse.Namespace, comment: str) -> int:
     )
 
 
-def _grid(options: argparse.Namespace, comment: str) -> int:
-    settings = GridSettings(seed=options.seed, duration_s=options.duration, robots=options.robots)
-    return write_bag(simulate_grid(settings), options.bag, comment)
-
-
 def _droplets(options: argparse.Namespace, comment: str) -> int:
     settings = DropletRunSettings(
         seed=options.seed,
@@ -101,13 +89,6 @@ def _droplets(options: argparse.Namespace, comment: str) -> int:
 def _aerial(options: argparse.Namespace, comment: str) -> int:
     settings = EightSettings(options.seed, options.duration, options.robots, start_known=options.start_known)
     return write_aerial_bag(simulate_wandering(settings), options.bag, comment)
-
-
-def _pushbots(options: argparse.Namespace, comment: str) -> int:
-    settings = PushbotBagSettings(
-        options.seed, options.duration, options.robots, options.plan, options.slip, options.events
-    )
-    return write_pushbot_bag(settings, options.bag, comment)
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -139,26 +120,6 @@ def _parser() -> argparse.ArgumentParser:
     aerial = _swarm(swarms, "aerial", "e-pucks that move at random under an overhead camera", 5, 20, 60.0)
     aerial.set_defaults(write=_aerial)
     aerial.add_argument("--start-known", action="store_true", help="write start poses to swarm.yaml")
-    # PushBots
-    pushbots = _swarm(swarms, "pushbots", "PushBots that map a hall", 1, 5, 300.0)
-    pushbots.set_defaults(write=_pushbots)
-    pushbots.add_argument(
-        "--plan",
-        default="corridor",
-        help=f"the hall: {', '.join(FLOOR_PLANS)}, or the path of a floor plan (default: %(default)s)",
-    )
-    pushbots.add_argument(
-        "--slip", type=number_in(0.0, 0.1), default=0.02, help="share of every turn that is lost by slip"
-    )
-    pushbots.add_argument(
-        "--events",
-        type=number_in(0.0, 60.0, "s"),
-        default=0.0,
-        help="length of the events at the beginning [s]",
-    )
-    # the grid
-    grid = _swarm(swarms, "grid", "many robots, each in its cell of a grid", 100, 10_000, 20.0)
-    grid.set_defaults(write=_grid)
     return parser
 
 

@@ -106,10 +106,7 @@ class StreamFirmware(ConsoleFirmware, Protocol):
 class _PtyPort:
     """A pseudo-terminal; it stays open while clients come and go, as a robot's Bluetooth module does.
 
-    Args:
-        firmware: Who answers.
-        link: A name for the terminal that stays the same; None for none.
-        waits: Whether the firmware waits for the client (RTS/CTS); else what it does not take is lost.
+    Arguments as of `FirmwareHost.serve_pty`.
     """
 
     def __init__(self, firmware: ConsoleFirmware, link: Path | None, *, waits: bool) -> None:
@@ -159,12 +156,10 @@ class _PtyPort:
 class _TcpPort:
     """A TCP server for one client at a time; others wait, and sending blocks until it reads."""
 
-    def __init__(
-        self, firmware: StreamFirmware, host: str, port: int, selector: selectors.BaseSelector
-    ) -> None:
+    def __init__(self, firmware: StreamFirmware, port: int, selector: selectors.BaseSelector) -> None:
         self._firmware = firmware
         self._selector = selector
-        self._server = socket.create_server((host, port), backlog=1)
+        self._server = socket.create_server(("127.0.0.1", port), backlog=1)
         self._server.setblocking(False)
         self._client: socket.socket | None = None
         self._gone: list[socket.socket] = []
@@ -234,23 +229,18 @@ class FirmwareHost:
         self._ports: list[_Port] = []
 
     def serve_pty(self, firmware: ConsoleFirmware, link: Path | None = None, *, waits: bool = False) -> Path:
-        """Put a firmware at a pseudo-terminal.
+        """Put a firmware at a pseudo-terminal; returns the path for a driver.
 
-        Args:
-            firmware: Who answers.
-            link: A name for the terminal that stays the same; None for none.
-            waits: Whether the firmware waits for the client (RTS/CTS); else what it does not take is lost.
-
-        Returns:
-            The path for a driver.
+        `link` is a name for the terminal that stays the same. A firmware may wait for the client (RTS/CTS);
+        else what it does not take is lost.
         """
         port = _PtyPort(firmware, link, waits=waits)
         self._add(port)
         return link or port.path
 
-    def serve_tcp(self, firmware: StreamFirmware, host: str = "127.0.0.1", port: int = 0) -> int:
+    def serve_tcp(self, firmware: StreamFirmware, port: int = 0) -> int:
         """Put a firmware at a TCP port, 0 for any that is free; returns the port."""
-        server = _TcpPort(firmware, host, port, self._selector)
+        server = _TcpPort(firmware, port, self._selector)
         self._add(server)
         return server.port
 

@@ -46,16 +46,9 @@ class View:
 
 
 def hidden(camera: FloatArray, marker: FloatArray, discs: FloatArray, radius: float) -> NDArray[np.bool_]:
-    """Whether a disc occludes a marker.
+    """Whether a disc occludes a marker (..., 2) from a camera (..., 2) [m].
 
-    Args:
-        camera: (..., 2) [m].
-        marker: (..., 2) [m].
-        discs: (..., D, 2) centres [m]; NaN: no disc.
-        radius: Radius of every disc [m].
-
-    Returns:
-        (...), broadcast.
+    All discs have a radius; (..., D, 2) are their centres, NaN: no disc.
     """
     ray = marker - camera
     length = np.maximum(np.linalg.norm(ray, axis=-1), 1e-12)
@@ -90,18 +83,10 @@ def deliver(
     end_ns: int,
     loss: float,
 ) -> tuple[Records, Records]:
-    """Delay and reorder images, and lose some of them.
+    """Delay and reorder images, and lose a share of them; those that arrive after `end_ns` are dropped.
 
-    Args:
-        rng: Source of delays and losses.
-        exposures: Robot and stamp of each image.
-        frame: (S,) image of each sighting, ascending.
-        sightings: (S,) of SIGHTING_DTYPE.
-        end_ns: Images that arrive later are dropped.
-        loss: Share of lost images.
-
-    Returns:
-        The images that arrive, of FRAME_DTYPE, in order of arrival, and their sightings.
+    Sightings (S,) are of SIGHTING_DTYPE, and `frame` (S,) the image of each, ascending. Returns the images
+    that arrive, of FRAME_DTYPE, in order of arrival, and their sightings.
     """
     robot, stamp_ns = exposures
     frames = np.zeros(len(robot), FRAME_DTYPE)
@@ -128,18 +113,9 @@ def observe_markers(
     view: View,
     errors: ErrorModel,
 ) -> tuple[Records, Records]:
-    """Frames and sightings of the cameras' images.
+    """Frames in order of arrival, of FRAME_DTYPE, and their sightings, of SIGHTING_DTYPE.
 
-    Args:
-        rng: Random generator.
-        swarm: Described geometry.
-        truth: True poses of the robots.
-        exposures: Robot and stamp of each image.
-        view: Limits of visibility.
-        errors: Simulated errors.
-
-    Returns:
-        Frames in order of arrival, of FRAME_DTYPE, and their sightings, of SIGHTING_DTYPE.
+    `swarm` is the described geometry; each exposure is of a robot at a stamp.
     """
     geometry = hidden_geometry(rng, swarm, errors)
     robot, stamp_ns = exposures

@@ -114,12 +114,9 @@ def simulated_swarm(options: SimulationOptions) -> Swarm:
 
 
 def graph_of(options: SimulationOptions, swarm: Swarm, links: str) -> list[NodeSpec]:
-    """The nodes that simulate a swarm, of whichever kind its robots are.
+    """The nodes that simulate a swarm, as `simulated_swarm` has it, of whichever kind its robots are.
 
-    Args:
-        options: What the user chose.
-        swarm: As `simulated_swarm` has it.
-        links: Folder for serial ports and files of the simulation; exists.
+    `links` is an existing folder for serial ports and files of the simulation.
     """
     kind = robot_type_of(swarm)
     chosen = replace(options, world=options.world or next(iter(kind.worlds), ""))

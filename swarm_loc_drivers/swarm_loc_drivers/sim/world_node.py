@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
@@ -17,9 +17,10 @@ from rosgraph_msgs.msg import Clock
 from swarm_loc_drivers.common.robot_driver import MAX_STOP_S
 from swarm_loc_drivers.common.ros_messages import stamp_message
 from swarm_loc_drivers.sim.link_host import FirmwareHost
+from swarm_loc_drivers.sim.worlds import WorldParameters
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.poses import encode_pose_stamped
-from swarm_loc_estimator.common.node import ConfiguredNode, Parameters, Stop
+from swarm_loc_estimator.common.node import ConfiguredNode, Stop
 from swarm_loc_estimator.common.parameters import ParameterError
 
 _CLOCK_QOS = QoSProfile(depth=10)
@@ -31,6 +32,8 @@ _QUIET_S, _FAREWELL_S = 0.5, MAX_STOP_S + 1.0
 
 The first is longer than a driver's pause before it connects again.
 """
+
+Parameters = TypeVar("Parameters", bound=WorldParameters)
 
 
 class WorldNode(ConfiguredNode[Parameters]):
@@ -48,30 +51,20 @@ class WorldNode(ConfiguredNode[Parameters]):
         step_ns: int,
         firmware_of: Callable[[int], Any],
         *,
-        rate: float,
-        truth_rate: float,
-        link_folder: str,
         first_port: int = 0,
         waits: bool = False,
         clock_steps: int = 1,
     ) -> None:
-        """Put all robots on their links and start publishing.
+        """Put all robots on their links and start publishing, the time every `clock_steps` steps.
 
-        Args:
-            names: Names of the robots.
-            step_ns: Simulated time of a step.
-            firmware_of: Makes the firmware of a robot by its index: a `ConsoleFirmware` with a link folder,
-                else a `StreamFirmware`.
-            rate: Simulated seconds per second, as far as the machine keeps up.
-            truth_rate: Published true poses of each robot [1/s].
-            link_folder: Folder for serial ports named like the robots; "": TCP ports.
-            first_port: TCP port of the first robot, the others follow; 0: any.
-            waits: Whether serial ports have flow control.
-            clock_steps: Number of steps between published times.
+        `firmware_of` makes the firmware of a robot by its index: a `ConsoleFirmware` with a link folder, else
+        a `StreamFirmware`. Serial ports have flow control if these wait. TCP ports follow the first one; 0:
+        any.
 
         Raises:
             ParameterError: A link cannot be made.
         """
+        link_folder = self.params.link_folder
         for robot, name in enumerate(names):
             firmware = firmware_of(robot)
             try:
@@ -86,8 +79,8 @@ class WorldNode(ConfiguredNode[Parameters]):
                     f"parameter {place} cannot be used for {name}: {error.strerror}."
                 ) from error
             self.get_logger().info(f"{name} answers at {address}")
-        self._step_s, self._rate, self._clock_steps = step_ns * 1e-9, rate, clock_steps
-        self._truth_steps = max(1, round(1.0 / (truth_rate * self._step_s)))
+        self._step_s, self._clock_steps = step_ns * 1e-9, clock_steps
+        self._truth_steps = max(1, round(1.0 / (self.params.truth_rate * self._step_s)))
         self._clock_publisher = self.create_publisher(Clock, "/clock", _CLOCK_QOS)
         self._truths = [
             self.create_publisher(PoseStamped, f"{name}/ground_truth", _TRUTH_QOS) for name in names
@@ -122,7 +115,7 @@ class WorldNode(ConfiguredNode[Parameters]):
         due_s = time.monotonic()
         while not stop.requested or self._is_needed():
             self.step()
-            due_s = max(due_s + self._step_s / self._rate, time.monotonic() - _MAX_LAG_S)
+            due_s = max(due_s + self._step_s / self.params.rate, time.monotonic() - _MAX_LAG_S)
             self.host.poll(0.0)
             while (left_s := due_s - time.monotonic()) > 0.0:
                 self.host.poll(left_s)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.common.parameters import UserError, number, text
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
 
@@ -93,6 +93,19 @@ def hidden_geometry(rng: np.random.Generator, swarm: Swarm, errors: ErrorModel) 
 
 class WorldError(UserError):
     """A swarm that cannot be simulated."""
+
+
+@dataclass(frozen=True)
+class WorldParameters:
+    """Parameters of the nodes of all worlds."""
+
+    swarm_file: str = text("", "path of the swarm description; every robot needs a start", required=True)
+    seed: int = number(1, "1", 0, 2**31 - 1, "fixes the errors")
+    rate: float = number(
+        1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
+    )
+    truth_rate: float = number(20.0, "1/s", 0.1, 200.0, "published true poses of each robot")
+    link_folder: str = text("", "where each robot's serial port appears under its name; empty: TCP")
 
 
 def start_of(robot: Robot) -> Pose2:

@@ -6,13 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from swarm_loc_drivers.droplet.exchange import Brightness, PollingSettings
 from swarm_loc_drivers.droplet.hardware import DROPLET, ELEMENTS, FULL_POWER
 from swarm_loc_drivers.droplet.odometry import MotionNoise
 from swarm_loc_drivers.droplet.session import SessionSettings
 from swarm_loc_drivers.droplet.tdma import TdmaSettings
-from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
+from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, _braces
 from swarm_loc_drivers.sim.droplet.infrared import InfraredSettings
 from swarm_loc_drivers.sim.droplet.world import (
     NEAR_POWER,
@@ -107,3 +108,14 @@ class Lab:
         """Itself, when all sessions know their robots."""
         self.until(lambda: all(cable.session.connected for cable in self.cables))
         return self
+
+
+def print_2014(_emitter: int, _receiver: int, readings: NDArray[np.int64]) -> str:
+    """The format of 2014: one line, unsigned."""
+    return f"{_braces(np.maximum(readings, 0))};\r\n"
+
+
+def print_2016(_emitter: int, _receiver: int, readings: NDArray[np.int64]) -> str:
+    """The format of 2016: one line per emitter, and the sum."""
+    rows = ["\t{" + ",".join(f"{cell:4d}" for cell in row) + "}" for row in readings.tolist()]
+    return "{\r\n" + ",\r\n".join(rows) + f"\r\n}}; sum={readings.sum()}\r\n"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from droplet_rig import IDS, TRIANGLE, world_of
+from droplet_rig import IDS, TRIANGLE, print_2014, print_2016, world_of
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,7 +17,7 @@ from swarm_loc_drivers.droplet.hardware import (
     message_ns,
 )
 from swarm_loc_drivers.droplet.protocol import ConsoleParser, Matrix
-from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print, print_2014, print_2016, print_named
+from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print, print_named
 from swarm_loc_drivers.sim.droplet.world import STEP_NS, DropletWorld, SimulatedDroplet, nominal_gait
 
 

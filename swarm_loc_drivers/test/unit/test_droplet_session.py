@@ -18,6 +18,8 @@ from droplet_rig import (
     TRIANGLE,
     Lab,
     asking,
+    print_2014,
+    print_2016,
     taking_turns,
     world_of,
 )
@@ -26,7 +28,7 @@ from numpy.typing import NDArray
 from swarm_loc_drivers.common.session import SessionError
 from swarm_loc_drivers.droplet.exchange import Brightness, Power
 from swarm_loc_drivers.droplet.hardware import FULL_POWER
-from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print, print_2014, print_2016
+from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print
 from swarm_loc_drivers.sim.droplet.world import NEAR_POWER, DropletErrors, SimulatedDroplet
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray

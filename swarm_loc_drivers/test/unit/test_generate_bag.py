@@ -84,12 +84,12 @@ def test_an_existing_bag_is_not_overwritten(bag: Path, capsys: pytest.CaptureFix
 @pytest.mark.parametrize(
     ("swarm", "option", "value", "limits"),
     [
-        ("grid", "--duration", "1", "[2, 3600] s"),
-        ("grid", "--duration", "nan", "[2, 3600] s"),
+        ("eight", "--duration", "1", "[2, 3600] s"),
+        ("aerial", "--duration", "nan", "[2, 3600] s"),
         ("droplets", "--duration", "inf", "[2, 3600] s"),
-        ("grid", "--robots", "0", "[1, 10000]"),
+        ("aerial", "--robots", "0", "[1, 20]"),
         ("eight", "--robots", "10", "[1, 9]"),
-        ("grid", "--seed", "-1", "[0, 2.14748e+09]"),
+        ("pictures", "--seed", "-1", "[0, 2.14748e+09]"),
         ("droplets", "--boards", "-1", "[0, 2.14748e+09]"),
         ("eight", "--speed", "nan", "[0.001, 0.12] m/s"),
         ("pictures", "--speed", "0", "[0.001, 0.12] m/s"),

@@ -1,70 +1,22 @@
 """The simulated bags of the repository are what their own first line says that they were made by."""
 
-import re
-from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
+from repository_bags import assert_same_messages, options_of, words_of
 
 from swarm_loc_drivers.sim.generate_bag import main
-from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.bags.writer import typestore
 
-BAGS = Path(__file__).parents[3] / "bags"
 SIMULATED = [
     "droplets_twenty",
     "eight_five_robots",
     "eight_five_robots_w2",
     "eight_one_robot_fast",
     "eight_one_robot_slow",
-    "pushbot_one",
-    "pushbots_two",
 ]
-ROUNDING = 1e-9  # numpy's sines differ by their last bits where a processor has wider registers
 
 
 @pytest.mark.parametrize("name", SIMULATED)
 def test_a_bag_comes_out_of_its_generator_again(name: str, tmp_path: Path) -> None:
-    first_line = (BAGS / name / "swarm.yaml").read_text(encoding="utf-8").splitlines()[0]
-    said = dict(re.findall(r"(\w+)=([^,\s]+?)[,.]?(?=\s|$)", first_line))
-    swarm = said.pop("swarm")
-    assert "True" not in said.values()
-    options = [word for key, value in said.items() if value != "False" for word in (f"--{key}", value)]
-    assert main([swarm, str(tmp_path / name), *options]) == 0
-    moved, stayed = Leaves(), Leaves()
-    with BagReader(tmp_path / name) as again, BagReader(BAGS / name) as kept:
-        for one, other in zip(again.messages(), kept.messages(), strict=True):
-            assert one[:3] == other[:3]
-            if one != other:
-                moved.add(typestore().deserialize_cdr(one[3], one[1]))
-                stayed.add(typestore().deserialize_cdr(other[3], other[1]))
-    assert moved.others == stayed.others
-    numbers, others = (np.concatenate([[0.0], *leaves.numbers]) for leaves in (moved, stayed))
-    np.testing.assert_allclose(numbers, others, rtol=0.0, atol=ROUNDING)
-
-
-class Leaves:
-    """The real numbers of messages, and their other values and texts."""
-
-    def __init__(self) -> None:
-        self.numbers: list[Any] = []
-        self.others: list[Any] = []
-
-    def add(self, part: Any) -> None:
-        """Take a message, or a part of one."""
-        if isinstance(part, str | int):
-            self.others.append(part)
-        elif isinstance(part, float):
-            self.numbers.append([part])
-        elif isinstance(part, np.ndarray) and part.dtype.kind == "f":
-            self.numbers.append(part.ravel())
-        elif isinstance(part, np.ndarray | list):
-            for one in part:
-                self.add(one)
-        elif is_dataclass(part):
-            for one in vars(part).values():
-                self.add(one)
-        else:
-            self.others.append(part)
+    assert main([options_of(name)["swarm"], str(tmp_path / name), *words_of(name)]) == 0
+    assert_same_messages(tmp_path / name, name)

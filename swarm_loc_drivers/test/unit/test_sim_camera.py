@@ -5,30 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from exact_sightings import exact_values
 
 from swarm_loc_drivers.sim.run import SIGHTING_DTYPE, SimulatedRun
 from swarm_loc_drivers.sim.scenarios.eight import VIEW, EightSettings, describe, simulate_eight, wall_markers
-from swarm_loc_drivers.sim.scenarios.grid import SENSOR, GridSettings, Shape, cells, simulate_grid
 from swarm_loc_drivers.sim.sightings import View, deliver, hidden, schedule_exposures
 from swarm_loc_drivers.sim.worlds import W0, W2
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray
-
-IntArray = NDArray[np.integer]
-
-
-def exact_values(run: SimulatedRun) -> tuple[FloatArray, IntArray, IntArray]:
-    """What noise-free sensors would have reported, and the owner (robot or -1) of every sighting."""
-    robot = np.repeat(run.frames["robot"], run.frames["count"])
-    stamp_ns = np.repeat(run.frames["stamp_ns"], run.frames["count"])
-    mounts = np.array([[r.camera.x, r.camera.y, r.camera.yaw] for r in run.swarm.robots if r.camera])
-    cameras = se2.compose(run.truth.at(robot, stamp_ns), mounts[robot])
-    owners = [run.swarm.owner_of[int(marker)] for marker in run.sightings["marker_id"]]
-    own = np.array([owner.robot_index for owner in owners])
-    marks = np.array([[owner.marker.x, owner.marker.y, owner.marker.yaw] for owner in owners], dtype=float)
-    marks[own >= 0] = se2.compose(run.truth.at(own[own >= 0], stamp_ns[own >= 0]), marks[own >= 0])
-    return se2.between(cameras, marks), robot, own
 
 
 @pytest.fixture(scope="module")
@@ -197,30 +180,6 @@ def test_the_same_seed_gives_the_same_run_and_another_does_not() -> None:
     for name in ("odometry", "frames", "sightings"):
         assert getattr(one, name).tobytes() == getattr(same, name).tobytes()
         assert getattr(one, name).tobytes() != getattr(other, name).tobytes()
-    grids = [simulate_grid(GridSettings(robots=9, seed=seed, duration_s=5.0)) for seed in (7, 7, 8)]
-    assert grids[0].sightings.tobytes() == grids[1].sightings.tobytes() != grids[2].sightings.tobytes()
-    assert grids[0].swarm == grids[1].swarm
-
-
-def test_a_grid_sees_about_three_neighbours_with_its_noise() -> None:
-    run = simulate_grid(GridSettings(robots=100, duration_s=6.0))
-    exact, robot, own = exact_values(run)
-    assert (own >= 0).sum() / len(run.frames) == pytest.approx(3.0, abs=0.3)
-    assert set(np.unique(robot[own < 0])) <= {i for i in range(100) if i % 10 in (0, 9) or i // 10 in (0, 9)}
-    error = run.sightings["value"] - exact
-    error[:, 2] = se2.wrap_angle(error[:, 2])
-    sigma = np.array([SENSOR.forward_sigma, SENSOR.left_sigma, SENSOR.heading_sigma])
-    np.testing.assert_allclose(error.std(axis=0), sigma, rtol=4.0 / math.sqrt(2 * len(error)))
-
-
-def test_grid_robots_stay_in_their_cells_among_a_closed_border() -> None:
-    run = simulate_grid(GridSettings(robots=20, duration_s=20.0))
-    away = np.linalg.norm(run.truth.poses[..., :2] - cells(20), axis=-1)
-    assert away.max() < 0.2
-    assert away.max(axis=0).min() > 0.05  # each one moves
-    marks = Shape.BORDER.landmarks(cells(20))
-    assert len(marks) == len(np.unique(marks, axis=0)) == 22
-    assert np.linalg.norm(marks[:, None] - cells(20), axis=-1).min() == pytest.approx(0.5)
 
 
 def test_an_unknown_start_stays_out_of_the_description() -> None:

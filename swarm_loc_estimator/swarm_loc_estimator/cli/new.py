@@ -52,13 +52,9 @@ class Dialog:
         return list(self._given)
 
     def answer(self, name: str, default: str, read: Callable[[str], Answer], choice: str = "") -> Answer:
-        """The answer to a question.
+        """The answer to the question `name` of `QUESTIONS`, which `choice` explains; Enter takes the default.
 
-        Args:
-            name: Of `QUESTIONS`.
-            default: Answer of those who only press Enter.
-            read: Converts an answer; raises ArgumentTypeError with what is allowed.
-            choice: Explains the answers.
+        `read` converts an answer, and raises ArgumentTypeError with what is allowed.
 
         Raises:
             UserError: An option cannot be used, or standard input has ended.

@@ -50,6 +50,7 @@ class Program:
 
     module: str  # Full name of the module
     function: str = "main"  # The one to run
+    needs_ros: bool = False  # Whether it runs only with ROS 2
 
     def __call__(self) -> int:
         """Run the program; returns its exit status."""
@@ -176,9 +177,7 @@ _DESCRIPTIONS = (".yaml", ".yml")
 def add_live_or_bag(parser: argparse.ArgumentParser, seconds: str) -> None:
     """Add the arguments of a command that listens to a live graph or reads a bag, see `is_live`.
 
-    Args:
-        parser: Of the command.
-        seconds: What --seconds says.
+    `seconds` is what --seconds says.
     """
     parser.add_argument("source", metavar="SWARM_FILE|BAG", type=Path, help="swarm description, or a bag")
     parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml next to the bag)")
@@ -233,10 +232,7 @@ def parameters_of(
 ) -> Parameters:
     """A dataclass of parameters from texts such as `horizon_s=1.0`, with defaults for the others.
 
-    Args:
-        cls: The dataclass, see `common/parameters.py`.
-        pairs: The texts.
-        given: Values, by name, that a user cannot set.
+    Users cannot set the values that are `given` by name.
 
     Raises:
         ParameterError: There is no such parameter, or a value cannot be used.
@@ -267,8 +263,7 @@ def _value(text: str, default: Value) -> object:
 class ProgressLine:
     """A progress bar in one line of a terminal, cleared at the end; silent where the stream is no terminal.
 
-    Args:
-        stream: Where it is drawn; None: standard error.
+    The stream is standard error by default.
     """
 
     def __init__(self, stream: TextIO | None = None) -> None:

@@ -59,16 +59,11 @@ def listed(names: Sequence[str]) -> str:
 class Health:
     """Counts drops, records when topics were received last, and limits the rate of log messages.
 
-    Args:
-        warn: Logs a sentence as a warning.
-        now_s: A steady clock [s].
-
-    Attributes:
-        drops: Count of dropped data by reason.
+    `warn` logs a sentence as a warning; `now_s` is a steady clock [s].
     """
 
     def __init__(self, warn: Callable[[str], object], now_s: Callable[[], float] = time.monotonic) -> None:
-        self.drops: Counter[str] = Counter()
+        self.drops: Counter[str] = Counter()  # Count of dropped data by reason
         self._warn = warn
         self._now_s = now_s
         self._details: dict[str, str] = {}
@@ -83,11 +78,9 @@ class Health:
         self._details[reason] = detail
 
     def warn_of_drops(self, drops: Mapping[str, int] | None = None, what: str = "dropped") -> None:
-        """Log the drop reasons whose counts have grown since they were logged last.
+        """Log the reasons whose counts have grown since they were logged last: of `drop`, or of `drops`.
 
-        Args:
-            drops: Counts by reason; None: those of `drop`.
-            what: What the counts are.
+        `what` says what the counts are.
         """
         drops = self.drops if drops is None else drops
         grown = [reason for reason, count in drops.items() if count > self._warned_drops[reason]]
@@ -118,10 +111,7 @@ class Health:
     def warn_of(self, kind: str, problems: Mapping[Any, str], patience_s: float = 0.0) -> None:
         """Log each problem of a kind once; again only if it has disappeared in between.
 
-        Args:
-            kind: Name of the kind.
-            problems: All present problems of this kind, each with its sentence.
-            patience_s: How long a problem must last before it is logged [s].
+        `problems` are all present ones, each with its sentence; each must last for `patience_s` before.
         """
         now_s, begun_s = self._now_s(), self._begun_s.setdefault(kind, {})
         for gone in begun_s.keys() - problems.keys():

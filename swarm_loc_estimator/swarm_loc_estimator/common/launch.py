@@ -209,9 +209,7 @@ def print_line(line: str) -> None:
 def run_graph(nodes: Sequence[NodeSpec], say: Callable[[str], None] = print_line) -> int:
     """Run nodes until a required one ends or this process gets SIGINT or SIGTERM; then end all of them.
 
-    Args:
-        nodes: The nodes, in the order in which they start.
-        say: Gets each line for the user.
+    They start in their order. `say` gets each line for the user.
 
     Returns:
         0 after a signal, else the exit status of the required node that ended (128 + n after signal n).
@@ -235,9 +233,7 @@ def run_graph(nodes: Sequence[NodeSpec], say: Callable[[str], None] = print_line
 def start(command: Sequence[str], output: IO[bytes] | None = None) -> subprocess.Popen[bytes]:
     """Start a process that a terminal's Ctrl-C does not reach directly and that dies with this one.
 
-    Args:
-        command: Program and arguments.
-        output: Its standard output and error; None: those of this process.
+    Its standard output and error go to `output`; None: to those of this process.
     """
     return subprocess.Popen(
         [sys.executable, "-S", "-c", _TIED_TO_PARENT, *command],

@@ -197,17 +197,10 @@ class Stop:
 
 
 class ConfiguredNode(Node, Generic[Parameters]):
-    """A node whose parameters are those of a dataclass.
+    """A node whose parameters are those of a dataclass, see `declare_parameters`.
 
-    Args:
-        name: Default name of the node.
-        parameters: The dataclass, see `declare_parameters`.
-        reads_parameters: Whether to read them now; else `params` is not set.
-        node_arguments: Further arguments of `rclpy.node.Node`.
-
-    Attributes:
-        params: Values of the parameters.
-        health: Drops and problems for the log and /diagnostics.
+    Without `reads_parameters` they are not read, and `params` is not set. The name is the default one; other
+    arguments are those of `rclpy.node.Node`.
 
     Raises:
         UserError: A parameter, or a file that it names, cannot be used.
@@ -219,8 +212,8 @@ class ConfiguredNode(Node, Generic[Parameters]):
         Node.__init__(self, name, **node_arguments)
         declare_parameters(self, parameters)
         if reads_parameters:
-            self.params = read_parameters(self, parameters)
-        self.health = Health(self.get_logger().warning)
+            self.params = read_parameters(self, parameters)  # Values of the parameters
+        self.health = Health(self.get_logger().warning)  # Drops and problems for the log and /diagnostics
 
     @property
     def status_name(self) -> str:
@@ -275,12 +268,10 @@ class ConfiguredNode(Node, Generic[Parameters]):
 
 
 def run_node(name: str, create: Callable[[], ConfiguredNode[Any]], *, leaves_at_once: bool = False) -> int:
-    """Create a node, run it until SIGINT or SIGTERM, and destroy it.
+    """Create a node once ROS is initialized, run it until SIGINT or SIGTERM, and destroy it.
 
-    Args:
-        name: Name of the executable, for errors.
-        create: Creates the node once ROS is initialized.
-        leaves_at_once: Whether the process ends soon after a signal whatever it is doing, see `Stop`.
+    Errors have the name, that of the executable. With `leaves_at_once` the process ends soon after a signal
+    whatever it is doing, see `Stop`.
 
     Returns:
         The exit status: that of the node's `run`, 0 when stopped before, 1 after a mistake of the user.
@@ -341,19 +332,11 @@ def spin(node: Node, stop: Stop, *companions: Node) -> int:
 
 
 class Ticks:
-    """Calls back once per period of a node's clock; missed periods are skipped, never queued.
+    """Calls back once per period [s] of a node's clock; missed periods are skipped, never queued.
 
     In simulated time, ticks are at the multiples of the period. rclpy's timers fail there on a busy machine:
     for each /clock that finds a timer due, the EventsExecutor queues the timer without bound, each entry
     advances the timer by a period, and each reset that brings it back queues two more.
-
-    Args:
-        node: Has the clock; its executor calls back.
-        period_s: Period [s].
-        on_tick: The callback.
-
-    Attributes:
-        stop: Ends the ticks, but for one that the executor has queued.
     """
 
     def __init__(self, node: Node, period_s: float, on_tick: Callable[[], None]) -> None:
@@ -364,6 +347,7 @@ class Ticks:
         self._is_due = False
         if node.get_clock().ros_time_is_active:
             jumps = node.get_clock().create_jump_callback(_EACH_CHANGE, post_callback=self._on_time)
+            # Ends the ticks, but for one that the executor has queued
             self.stop: Callable[[], object] = jumps.unregister
         else:  # a timer by a clock that nobody sets
             timer = node.create_timer(period_s, on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
@@ -427,12 +411,8 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode[Parameters]):
 
     What a transition has made, attributes as well as publishers, subscriptions and timers, exists until the
     opposite transition. So an activation starts from scratch. An executor may still handle events that it
-    had queued before: callbacks that need what is gone ask `is_active`.
-
-    Args:
-        name: Default name of the node.
-        parameters: The dataclass, which has the flag `autostart`.
-        node_arguments: Further arguments of `rclpy.node.Node`.
+    had queued before: callbacks that need what is gone ask `is_active`. The parameters have the flag
+    `autostart`; arguments as of `ConfiguredNode`.
 
     Raises:
         UserError: The parameter `autostart` cannot be used.

@@ -180,14 +180,9 @@ _WHOLE, _FIRST, _LAST = 0, 1, 2
 
 
 def invert_positive(numbers: FloatArray, size: int) -> bool:
-    """Invert a symmetric positive definite matrix (size, size) in place; only its lower triangle is used.
+    """Invert a symmetric positive definite matrix (size * size,), column by column, in place.
 
-    Args:
-        numbers: (size * size,) column by column.
-        size: Number of rows.
-
-    Returns:
-        Whether it is positive definite; if not, the content of the matrix is undefined.
+    Only its lower triangle is used. Returns whether it is positive definite; else its content is undefined.
     """
     return _invert(numbers, size, _plan(size))
 

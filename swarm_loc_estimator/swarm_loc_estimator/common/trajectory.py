@@ -38,12 +38,7 @@ class Trajectory:
 def interpolate(
     trajectory: Trajectory, query_ns: IntArray, max_gap_ns: int
 ) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
-    """Poses of a trajectory at other times, along the arc between the neighbours.
-
-    Args:
-        trajectory: The known poses.
-        query_ns: (M,) times of the interpolated poses.
-        max_gap_ns: Maximum time between two neighbours.
+    """Poses of a trajectory at other times (M,), along the arc between neighbours at most `max_gap_ns` apart.
 
     Returns:
         (M, 3) poses, NaN if undefined, and (M,) whether they are defined: a trajectory is not extrapolated

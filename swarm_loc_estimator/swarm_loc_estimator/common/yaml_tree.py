@@ -125,14 +125,7 @@ def read_file(path: Path, most_bytes: int) -> bytes:
 
 
 def read_tree(path: Path, most_bytes: int = MAX_BYTES) -> Tree:
-    """Read a YAML file.
-
-    Args:
-        path: The file.
-        most_bytes: Larger files are refused [byte].
-
-    Returns:
-        Nested dicts, lists and scalars.
+    """Read a YAML file of at most `most_bytes` as nested dicts, lists and scalars.
 
     Raises:
         YamlTreeError: It cannot be read, is too large, is not YAML, or has a key twice.
@@ -190,12 +183,7 @@ WHOLE_FILE = "the file"  # The key of the outermost mapping
 
 
 class TreeChecks:
-    """Takes values out of one file; what is wrong becomes one sentence with file, dotted key and value.
-
-    Args:
-        path: The file.
-        error: The kind of error that is raised.
-    """
+    """Takes values out of one file; what is wrong becomes one sentence with file, dotted key and value."""
 
     def __init__(self, path: Path, error: type[ValueError]) -> None:
         self._path = path

@@ -52,12 +52,9 @@ def log_ratios(
 
 
 def assign(ratios: FloatArray, detection_probability: float, least_probability: float) -> Assignment:
-    """Assign detections to robots.
+    """Assign detections to robots by ratios (r, n) as of `log_ratios`, and the probability to be detected.
 
-    Args:
-        ratios: (r, n) as of `log_ratios`.
-        detection_probability: Of a robot in the picture.
-        least_probability: Lowest probability of a contested assignment; below it the robot is AMBIGUOUS.
+    A robot whose assignment is contested and has less than `least_probability` is AMBIGUOUS.
     """
     costs = -(ratios + np.log(detection_probability) - np.log1p(-detection_probability))
     near = np.isfinite(ratios)

@@ -96,13 +96,7 @@ class Chains:
     reach: float = 0.0  # Longest displacement of the robot between images [m]
 
     def advanced(self, picture: Picture, point: TrackPoint, stamp_ns: int) -> Chains:
-        """The chains after one more image, later than all before.
-
-        Args:
-            picture: Its detections (n,).
-            point: The robot's own track there.
-            stamp_ns: When it was taken.
-        """
+        """The chains after a later image, taken where the robot's own track has come to a point."""
         reach, low, high = self.reach, self.low, self.high
         if self.point is not None:
             reach = max(reach, math.hypot(*(point.pose[:2] - self.point.pose[:2])))

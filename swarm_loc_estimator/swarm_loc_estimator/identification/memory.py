@@ -36,17 +36,12 @@ class Identities(NamedTuple):
 
 
 class IdentityMemory:
-    """Memory of the identification; part of the filter's state.
-
-    Attributes:
-        chains: Unidentified robots and their chains; chains are immutable.
-        newest: Identities in the newest image; None before the first.
-        outcomes: (len(Outcome),) number of searches with each outcome.
-    """
+    """Memory of the identification; part of the filter's state."""
 
     def __init__(self) -> None:
-        self.chains: dict[int, Chains] = {}
-        self.newest: Identities | None = None
+        self.chains: dict[int, Chains] = {}  # Unidentified robots and their chains; chains are immutable
+        self.newest: Identities | None = None  # Identities in the newest image; None before the first
+        # (len(Outcome),) number of searches with each outcome
         self.outcomes: IntArray = np.zeros(len(Outcome), dtype=np.int64)
         self._hulls = (_NOWHERE, _NOWHERE)
         self._generation_ns = 0

@@ -78,12 +78,9 @@ def predicted(tracks: Tracks, way: complex, noise: FloatArray, scale_variance: f
 
 
 def log_likelihoods(tracks: Tracks, picture: Picture, spread: float = 0.0) -> FloatArray:
-    """Log densities (h, n) of detected positions under the predictions of the tracks [1/m^2].
+    """Log densities (h, n) of detected positions (n,) under the predictions of the tracks (h,) [1/m^2].
 
-    Args:
-        tracks: (h,).
-        picture: (n,).
-        spread: Additional standard deviation of x and y [m].
+    `spread` is an additional standard deviation of x and y [m].
     """
     away = picture.pose[None, :, :2] - tracks.mean[:, None, :2]
     s = tracks.covariance[:, None, :2, :2] + picture.covariance[None, :, :2, :2] + spread**2 * np.eye(2)

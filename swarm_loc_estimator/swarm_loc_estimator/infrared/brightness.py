@@ -94,9 +94,7 @@ def _cubic_at(c: FloatArray, t: float, per_radian: float) -> tuple[float, float]
 def amplitude_at(law: FloatArray, r: float) -> tuple[float, float]:
     """The brightness [count] of an aligned pair at a distance [m], and its slope [count/m].
 
-    Args:
-        law: (5,) the fields of `Amplitude` in their order.
-        r: The distance.
+    `law` (5,) are the fields of `Amplitude` in their order.
     """
     closeness = _closeness(law, r)
     return _amplitude(law, r, closeness, closeness * closeness if law[2] == 2.0 else closeness ** law[2])

@@ -76,13 +76,9 @@ class GainsError(ValueError):
 def estimate_gains(
     platform: IrPlatform, robots: int, exchanges: Exchanges, progress: Progress = lambda _: None
 ) -> GainsFit:
-    """Estimate the gains of all robots.
+    """Estimate the gains of all robots; `element_sigma` of the platform is their prior standard deviation.
 
-    Args:
-        platform: Of all robots; its `element_sigma` is the prior standard deviation of gains.
-        robots: Number of robots.
-        exchanges: Their readings.
-        progress: Called with the name of each step.
+    `progress` is called with the name of each step.
 
     Raises:
         GainsError: `element_sigma` is 0, the platform's curves do not hold, or no exchange can be used.

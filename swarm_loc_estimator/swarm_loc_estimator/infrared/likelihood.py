@@ -68,11 +68,7 @@ _FOUND, _TOO_WEAK, _TOO_FEW, _UNDETERMINED, _MISFIT = (int(outcome) for outcome 
 
 
 class MaximumLikelihood:
-    """Maximum likelihood poses for one platform.
-
-    Args:
-        platform: The board of both robots.
-    """
+    """Maximum likelihood poses of robots that have one platform."""
 
     def __init__(self, platform: IrPlatform) -> None:
         self._platform = platform

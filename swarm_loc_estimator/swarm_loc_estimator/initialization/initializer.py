@@ -65,13 +65,10 @@ Located = Callable[[SwarmState, int, InitialPose, Preintegrated, float], None]
 
 
 class Initializer:
-    """Collects constraints and initializes robots.
+    """Collects constraints of robots, which are used up to an age of `window_s`, and initializes these.
 
-    Args:
-        tracks: The robots' odometry.
-        window_s: Age up to which a constraint is used.
-        heading_sigma: Largest standard deviation of the heading of a robot that is initialized [rad]; one
-            without odometry may have any, because its heading carries it nowhere.
+    `heading_sigma` is the largest standard deviation of the heading of a robot that is initialized [rad]; one
+    without odometry may have any, because its heading carries it nowhere.
     """
 
     def __init__(self, tracks: OdometryTracks, window_s: float, heading_sigma: float = HEADING_SIGMA) -> None:
@@ -95,17 +92,9 @@ class Initializer:
     def constrain(
         self, state: SwarmState, robot: int, other: int, one: Measurements, located: Located
     ) -> bool:
-        """Keep a measurement between a robot with odometry and a located side.
+        """Keep a measurement between a robot with odometry and a located side: a robot, or NOBODY for `map`.
 
-        Args:
-            state: Keeps it.
-            robot: The robot.
-            other: The located side: a robot, or NOBODY for `map`.
-            one: The measurement.
-            located: Called when the measurements determine the pose of the robot.
-
-        Returns:
-            True.
+        `located` is called when the measurements determine the pose of the robot. Returns True.
         """
         observer, now_ns = int(one.observer), int(one.stamp_ns)
         track = self._tracks.at(np.array([robot]), np.array([now_ns]))
@@ -195,12 +184,7 @@ def _fixed(one: Measurements, on_track: FloatArray) -> InitialPose:
 
 
 class ConfiguredStarts:
-    """Initializes robots at their configured starts.
-
-    Args:
-        swarm: Robots with their starts.
-        tracks: Odometry of the robots.
-    """
+    """Initializes robots, by their odometry, at their configured starts."""
 
     def __init__(self, swarm: Swarm, tracks: OdometryTracks) -> None:
         self._tracks = tracks
@@ -273,13 +257,10 @@ def is_absolute(measurements: Measurements) -> BoolArray:
 
 
 class LocalFrame:
-    """Begins a local frame, and moves its robots to `map`.
+    """Begins a local frame, unless a robot has a start, and moves its robots to `map`.
 
-    Args:
-        swarm: Robots; where one has a start, there is never a local frame.
-        tracks: Odometry of the robots.
-        initializer: Locates robots in `map`.
-        after_s: Time of sightings between robots after which a local frame begins [s]; 0: never.
+    `initializer` locates robots there. The frame begins `after_s` after first sightings between robots [s];
+    0: never.
     """
 
     def __init__(

@@ -94,15 +94,12 @@ class Graph(Protocol):
 
 
 class Diagnostics:
-    """Creates the diagnostic reports of an interval; inputs and `sole` topics should have one publisher each.
-
-    Attributes:
-        duplicate_publishers: One sentence for each topic that has more publishers, at the newest reports.
-    """
+    """Creates the diagnostic reports of an interval; inputs and `sole` topics should have one publisher."""
 
     def __init__(
         self, swarm: Swarm, ingest: Ingest, parameters: EstimatorParameters, graph: Graph, sole: Sequence[str]
     ) -> None:
+        # One sentence for each topic that has more publishers, at the newest reports
         self.duplicate_publishers: list[str] = []
         self._swarm = swarm
         self._ingest = ingest

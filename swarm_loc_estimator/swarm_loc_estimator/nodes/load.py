@@ -162,13 +162,10 @@ class Shedding:
     A node that is busy for a while and catches up again, as at its start, drops nothing. Using less saves
     only the time of fusing: where fusing takes no more than its guaranteed share of a core, `fusion_load`,
     the share is not cut further; where it takes less than half of that, the share grows.
-
-    Attributes:
-        share: Share of the measurements to use, in [MIN_SHARE, 1].
     """
 
     def __init__(self, fusion_load: float, horizon_s: float) -> None:
-        self.share = 1.0
+        self.share = 1.0  # Share of the measurements to use, in [MIN_SHARE, 1]
         self._fusion_load = fusion_load
         self._max_wait_s = _MAX_WAIT * horizon_s
         self._ticked_s: float | None = None

@@ -172,20 +172,12 @@ class LocalizedRobots:
 
     Raises:
         ParameterError: A parameter cannot be used.
-
-    Attributes:
-        robot_of: Body -> robot.
-        topic: The topic, with `BODY` if each body has its own.
-        topics: Topic -> the body that it is about, "" for a topic that names bodies itself.
-        label_of: Body -> what its poses come from, for messages to users.
-        strangers: Names of bodies of no robot.
-        used: Number of poses that were converted.
     """
 
     def __init__(self, parameters: BridgeParameters, robots: Collection[str], health: Health) -> None:
         self._parameters, self._health = parameters, health
         # which body is which robot, and where on it
-        self.robot_of = _robots_of_bodies(parameters.bodies, robots)
+        self.robot_of = _robots_of_bodies(parameters.bodies, robots)  # Body -> robot
         offsets = _offsets(parameters.offsets, self.robot_of.values())
         self._to_robot = {
             robot: se2.inverse(offsets.get(robot, np.zeros(3))) for robot in self.robot_of.values()
@@ -194,6 +186,7 @@ class LocalizedRobots:
         self._frames = (
             [parameters.source_frame] if parameters.source_frame else [parameters.map_frame, "world"]
         )
+        # The topic, with `BODY` if each body has its own
         self.topic = topic = parameters.topic or SOURCES[parameters.source].topic
         has_own = BODY in SOURCES[parameters.source].topic
         if has_own != (BODY in topic):
@@ -201,7 +194,9 @@ class LocalizedRobots:
                 f"parameter topic = '{topic}' must {'' if has_own else 'not '}contain {BODY}:"
                 f" messages of the source '{parameters.source}' {'do not ' if has_own else ''}name bodies."
             )
+        # Topic -> the body that it is about, "" for a topic that names bodies itself
         self.topics = {topic.replace(BODY, body): body for body in self.robot_of} if has_own else {topic: ""}
+        # Body -> what its poses come from, for messages to users
         self.label_of = {
             body: topic.replace(BODY, body) if has_own else f"{topic} about body '{body}'"
             for body in self.robot_of
@@ -212,8 +207,8 @@ class LocalizedRobots:
                     f"parameter bodies: '{body}' cannot be part of a topic; name the body as its topic does."
                 )
         # what is counted, and the noise of poses without covariance
-        self.strangers: set[str] = set()
-        self.used = 0
+        self.strangers: set[str] = set()  # Names of bodies of no robot
+        self.used = 0  # Number of poses that were converted
         self._variances = np.diag(
             [parameters.position_sigma**2, parameters.position_sigma**2, parameters.heading_sigma**2]
         )

@@ -59,12 +59,8 @@ def play(
 ) -> None:
     """Publish messages in time with a steady clock; a delay does not shift later messages.
 
-    Args:
-        messages: In order of log time; messages before `begin_ns` are skipped.
-        begin_ns: Log time at which playback begins.
-        rate: Bag seconds per second.
-        output: Publishes the messages.
-        so_far: Updated during playback.
+    They are in order of log time; those before `begin_ns` are skipped. `rate` is bag seconds per second, and
+    `so_far` is updated during playback.
     """
     step_ns = clock_step_ns(rate)
     # finding the first one takes a while in a large bag: not after the clock has begun to run

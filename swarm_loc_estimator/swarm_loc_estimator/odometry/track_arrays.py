@@ -112,12 +112,9 @@ def add_step_noise(model: OdometryModel, step: OdometryStep, covariance: FloatAr
 
 @cached_njit
 def add_step_jacobian(model: OdometryModel, step: OdometryStep, jacobian: FloatArray) -> None:
-    """Add the Jacobian of a step's motion by the parameters: Ad(O) times their body directions.
+    """Add the Jacobian (3, 3) of a step's motion by the parameters: Ad(O) times their body directions.
 
-    Args:
-        model: Gives the position of the axle.
-        step: The step.
-        jacobian: (3, 3) sum to add to.
+    The model gives the position of the axle.
     """
     forward, left, turn = step.forward, step.left, step.turn
     if forward == 0.0 and left == 0.0 and turn == 0.0:

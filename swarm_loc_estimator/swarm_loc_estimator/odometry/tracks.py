@@ -81,11 +81,7 @@ class TrackChange:
 
 
 class OdometryTracks:
-    """Recent odometry of all robots; rows may arrive in any order.
-
-    Args:
-        robots: All robots; their odometry models and motion responses are used.
-    """
+    """Recent odometry of robots, by their models and motion responses; rows may arrive in any order."""
 
     def __init__(self, robots: Sequence[Robot]) -> None:
         models = [robot.odometry for robot in robots]
@@ -202,12 +198,9 @@ class OdometryTracks:
         return TrackChange(changed_from, found.duplicates, too_old, found.jumps, found.resets)
 
     def extend_turns(self, robots: IntArray, stamps_ns: IntArray, rates: FloatArray) -> TrackChange:
-        """Add turn rates of gyroscopes in any order and of any age.
+        """Add turn rates of gyroscopes in any order and of any age: (k,) of robots with an IMU.
 
-        Args:
-            robots: (k,) index of robots with an IMU.
-            stamps_ns: (k,) acquisition stamps.
-            rates: (k,) finite turn rates about the vertical as measured [rad/s].
+        They are finite, and about the vertical as measured [rad/s].
         """
         young = stamps_ns >= self._oldest_ns
         too_old = robots[~young]
@@ -223,12 +216,7 @@ class OdometryTracks:
         return TrackChange(changed_from, duplicates, too_old, 0, 0)
 
     def at(self, robots: IntArray, stamps_ns: IntArray) -> OdometrySample:
-        """Look up tracks, see `look_up`.
-
-        Args:
-            robots: (m,) robot indices.
-            stamps_ns: (m,) instants.
-        """
+        """Look up the tracks of robots (m,) at instants (m,), see `look_up`."""
         return look_up_all(self.arrays, robots, stamps_ns)
 
     def trim(self, oldest_ns: int, kept_ns: int) -> None:

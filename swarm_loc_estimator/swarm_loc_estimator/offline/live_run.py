@@ -122,13 +122,10 @@ class LiveGraph:
         patience_s: float,
         needed: Collection[str] | None = None,
     ) -> None:
-        """Process messages until a condition holds.
+        """Process messages until a condition holds, which is checked after each event and every 50 ms.
 
-        Args:
-            condition: Checked after each event and every 50 ms.
-            what: The condition in words, following "did not".
-            patience_s: Timeout since the last poses.
-            needed: Nodes that must keep running; None: all that have started.
+        `what` is the condition in words, following "did not". The patience is since the last poses. All nodes
+        that have started, or those that are needed, must keep running.
 
         Raises:
             LiveError: A node has ended, or the timeout has passed.
@@ -208,28 +205,21 @@ _RECEIVED = {f"{kind.topic} received": kind for kind in kinds().values()}
 
 
 class Recorder(Node):
-    """Records all messages of swarm/poses with their times of reception, and counts from /diagnostics.
-
-    Attributes:
-        raw: Serialized messages in order of reception.
-        received_ns: Time of each reception by the graph's clock, which advances in steps of /clock.
-        taken: Stamp of poses -> topic -> messages that the estimator had received by then, from /diagnostics,
-            about once a second.
-        inputs: Messages that the estimator has received, of all topics.
-        drops: Dropped inputs of the estimator, by reason.
-        diagnostics: Number of /diagnostics messages from the estimator.
-    """
+    """Records all messages of swarm/poses with their times of reception, and counts from /diagnostics."""
 
     def __init__(self, **node_arguments: Any) -> None:
         simulated = Parameter("use_sim_time", value=True)
         super().__init__("recorder", parameter_overrides=[simulated], **node_arguments)
-        self.raw: list[bytes] = []
+        self.raw: list[bytes] = []  # Serialized messages in order of reception
+        # Time of each reception by the graph's clock, which advances in steps of /clock
         self.received_ns: list[int] = []
         self._poses: list[EstimateMessage] = []
+        # Stamp of poses -> topic -> messages that the estimator had received by then, from /diagnostics,
+        # about once a second
         self.taken: dict[int, dict[str, int]] = {}
-        self.inputs = 0
-        self.drops: dict[str, int] = {}
-        self.diagnostics = 0
+        self.inputs = 0  # Messages that the estimator has received, of all topics
+        self.drops: dict[str, int] = {}  # Dropped inputs of the estimator, by reason
+        self.diagnostics = 0  # Number of /diagnostics messages from the estimator
         self.create_subscription(SwarmPoses, "swarm/poses", self._on_poses, _DEEP, raw=True)
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, _DEEP)
 

@@ -36,13 +36,9 @@ def replay_map(
 ) -> tuple[CooperativeMapper, MapperFeed]:
     """Map a bag; returns the mapper after a last optimization, and its feed with the counts of used inputs.
 
-    Args:
-        bag: With `<robot>/odom`, `<robot>/laser` and, if frequencies are given, `<robot>/lights`; of robots
-            with a lidar `<robot>/scan`.
-        robots: The robots that map.
-        settings: Of the mapper.
-        frequencies: Robot -> frequency of its LEDs [Hz].
-        progress: Called now and then with the share done and what is being done.
+    The bag has `<robot>/odom`, `<robot>/laser` and, if frequencies of LEDs by robot [Hz] are given,
+    `<robot>/lights`; of robots with a lidar `<robot>/scan`. `progress` is called now and then with the share
+    done and what is being done.
 
     Raises:
         UserError: The bag cannot be read, or the robots cannot start.
@@ -103,12 +99,9 @@ class MapFigures(NamedTuple):
 
 
 def map_figures(mapper: CooperativeMapper, truth: Mapping[int, Trajectory], walls: FloatArray) -> MapFigures:
-    """Compare the map of a mapper with ground truth and floor plan.
+    """Compare the map and the stops of a mapper with true trajectories in map, by the index of the robot.
 
-    Args:
-        mapper: Holds the map and the stops.
-        truth: Index of a robot -> its true trajectory in map.
-        walls: (S, 4) segments x0, y0, x1, y1 of the floor plan [m]; may be empty.
+    `walls` (S, 4) are segments x0, y0, x1, y1 of the floor plan [m], if any.
     """
     off = _stop_errors(mapper, truth)
     position = math.sqrt(np.mean(np.square(off[:, :2]).sum(axis=1))) if len(off) else math.nan

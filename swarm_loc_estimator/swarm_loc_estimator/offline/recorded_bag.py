@@ -69,13 +69,10 @@ class TruthReader:
     """Collects `<robot>/ground_truth`: PoseStamped, PoseWithCovarianceStamped, Odometry or TransformStamped.
 
     The recorded topics declare the types.
-
-    Attributes:
-        topics: The index of a topic is its number in a batch.
     """
 
     def __init__(self, swarm: Swarm, recorded: Iterable[BagTopic]) -> None:
-        self.topics = truth_topics(swarm)
+        self.topics = truth_topics(swarm)  # The index of a topic is its number in a batch
         self._names = [robot.name for robot in swarm.robots]
         declared = {topic.name: topic.type for topic in recorded}
         self._types = [declared.get(topic, "") for topic in self.topics]
@@ -167,14 +164,10 @@ NOTHING_LOST = Loss()
 
 
 class Network:
-    """Passes on the messages that are not lost; the index of a topic is its number in a batch.
-
-    Attributes:
-        lost: Number of messages.
-    """
+    """Passes on the messages that are not lost; the index of a topic is its number in a batch."""
 
     def __init__(self, loss: Loss, topics: Sequence[str]) -> None:
-        self.lost = 0
+        self.lost = 0  # Number of messages that were lost
         self._share = loss.share
         self._draws = [np.random.default_rng([loss.seed, zlib.crc32(name.encode())]) for name in topics]
 
@@ -363,14 +356,11 @@ MAX_GOALS = 20_000  # Maximum number of stored goals per robot
 
 
 class MapReader:
-    """Collects the maps and goals of a bag for display; the estimator does not see them.
-
-    Attributes:
-        topics: The index of a topic is its number in a batch.
-    """
+    """Collects the maps and goals of a bag for display; the estimator does not see them."""
 
     def __init__(self, swarm: Swarm, max_bytes: int = MAX_MAP_BYTES) -> None:
         self._names = [robot.name for robot in swarm.robots]
+        # The index of a topic is its number in a batch
         self.topics = ["map", *(f"{name}/goal" for name in self._names)]
         self._max_bytes = max_bytes
         self._maps: list[RecordedMap] = []

@@ -148,14 +148,10 @@ class Schedule(Protocol):
 
 
 class PeriodicSchedule:
-    """Outputs at every whole multiple of a period, except while the clock jumps ahead.
-
-    Attributes:
-        jumps: Number of forward jumps of the clock by more than `MAX_PAUSE_NS`.
-    """
+    """Outputs at every whole multiple of a period, except while the clock jumps ahead."""
 
     def __init__(self, period_ns: int) -> None:
-        self.jumps = 0
+        self.jumps = 0  # Number of forward jumps of the clock by more than `MAX_PAUSE_NS`
         self._period_ns = period_ns
         self._next_ns: int | None = None
 

@@ -439,12 +439,7 @@ Values = dict[str, Any]
 
 
 class IrSection:
-    """Reads the section of one file.
-
-    Args:
-        checks: Checks of the file.
-        folder: Folder of the file, to which platform paths are relative.
-    """
+    """Reads the section of one file; paths of platforms are relative to its folder."""
 
     def __init__(self, checks: TreeChecks, folder: Path) -> None:
         self._checks = checks
@@ -547,18 +542,14 @@ def packaged_platforms() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
 
 
-def load_ir_platform(name: str, folder: Path | None = None) -> IrPlatform:
-    """Read and check a platform.
-
-    Args:
-        name: Of a packaged platform, such as "droplet", or the path of a file (it ends in .yaml).
-        folder: Base of a relative path; None: the working folder.
+def load_ir_platform(name: str) -> IrPlatform:
+    """Read and check a packaged platform, such as "droplet", or that of a file, whose path ends in .yaml.
 
     Raises:
         IrPlatformFileError: One sentence with file, key, value and what is allowed.
     """
     if name.endswith((".yaml", ".yml")):
-        path = (folder or Path()) / name
+        path = Path(name)
     elif name in packaged_platforms():
         path = _FOLDER / f"{name}.yaml"
     else:
@@ -573,12 +564,9 @@ def load_ir_platform(name: str, folder: Path | None = None) -> IrPlatform:
 
 
 def save_ir_platform(platform: IrPlatform, path: Path, comment: str = "") -> None:
-    """Write a board that `load_ir_platform` reads back equal.
+    """Write a board that `load_ir_platform` reads back equal, with lines of comment at its top.
 
-    Args:
-        platform: Board to write.
-        path: The file; replaced when it exists, its folder created when missing.
-        comment: Comment lines for the top of the file.
+    An existing file is replaced, a missing folder created.
     """
     laws = dict(zip(platform.powers, platform.amplitudes, strict=True))
     tree = {

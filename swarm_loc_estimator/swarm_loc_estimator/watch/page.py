@@ -60,17 +60,6 @@ def pack(kind: str, stamp_ns: int, columns: Mapping[str, npt.NDArray[Any]], **ex
     return Frame(kind, stamp_ns, b"".join(parts))
 
 
-def unpack(data: bytes) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
-    """Header and columns of a frame's bytes, as the page reads them."""
-    size = struct.unpack_from("<I", data)[0]
-    header: dict[str, Any] = json.loads(data[4 : 4 + size])
-    at, columns = 4 + size, {}
-    for name, kind, length in header["columns"]:
-        columns[name] = np.frombuffer(data, f"<{kind}", length, at)
-        at += -(-columns[name].nbytes // _ALIGNMENT) * _ALIGNMENT
-    return header, columns
-
-
 def poses_frame(estimate: EstimateMessage) -> Frame:
     """Estimated poses of all robots; those of unlocated robots are NaN."""
     pose, covariance = estimate.pose, estimate.covariance
@@ -112,13 +101,9 @@ def aerial_frame(
     robot: npt.NDArray[np.integer],
     probability: npt.NDArray[np.float64],
 ) -> Frame:
-    """Detections of an aerial image.
+    """Detections of an aerial image: positions (n, 2) in map [m], and who each is with what probability (n,).
 
-    Args:
-        stamp_ns: Of the image.
-        position: (n, 2) of its detections in map [m].
-        robot: (n,) index of the robot that each is; -1: unknown.
-        probability: (n,) of these identities.
+    Robots are given by their index; -1: unknown.
     """
     columns: dict[str, npt.NDArray[Any]] = {
         "robot": robot.astype(np.int32),

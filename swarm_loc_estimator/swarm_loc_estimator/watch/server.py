@@ -396,12 +396,7 @@ class LeftOut(NamedTuple):
 
 
 class Viewer:
-    """Sends to one page; a slow page gets fewer frames, and its queues are bounded.
-
-    Attributes:
-        selected: Index of the robot whose numbers the page shows; -1: none.
-        left_out: Numbers of dropped messages.
-    """
+    """Sends to one page; a slow page gets fewer frames, and its queues are bounded."""
 
     def __init__(self, socket: web.WebSocketResponse, rate: float) -> None:
         self._socket = socket
@@ -410,8 +405,8 @@ class Viewer:
         self._notes: deque[str] = deque(maxlen=MAX_NOTES)
         self._wake = asyncio.Event()
         self._on_the_way = 0
-        self.selected = -1
-        self.left_out = LeftOut(0, 0)
+        self.selected = -1  # Index of the robot whose numbers the page shows; -1: none
+        self.left_out = LeftOut(0, 0)  # Numbers of dropped messages
 
     def offer(self, frame: Frame) -> None:
         """Queue a frame, replacing an older one of its kind."""

@@ -62,11 +62,7 @@ _DRIVEN_NS = 400_000_000  # Time without a command after which a driven robot is
 
 
 class RobotCommands:
-    """Executes commands one after the other, in the node's thread; `now_ns` is a steady clock.
-
-    Attributes:
-        dropped: Number of commands dropped from the full queue.
-    """
+    """Executes commands one after the other, in the node's thread; `now_ns` is a steady clock."""
 
     def __init__(
         self, node: Node, names: Sequence[str], parameters: WatchParameters, now_ns: Callable[[], int]
@@ -75,7 +71,7 @@ class RobotCommands:
         self._names = names
         self._parameters = parameters
         self._now_ns = now_ns
-        self.dropped = 0
+        self.dropped = 0  # Number of commands dropped from the full queue
         self._waiting: queue.Queue[tuple[Command, Answer]] = queue.Queue(_MAX_WAITING)
         self._reset = node.create_client(Trigger, f"{parameters.estimator}/reset")
         self._set_pose = node.create_client(SetRobotPose, f"{parameters.estimator}/set_robot_pose")

@@ -18,12 +18,12 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import OccupancyGrid, Odometry
 from node_world import STEP_NS, T0_NS, TRUE_POSES, Robots, Ros, overrides
+from page_frames import unpack
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
 from visualization_msgs.msg import MarkerArray
 
 from swarm_loc_estimator.watch.markers_node import MarkersNode
-from swarm_loc_estimator.watch.page import unpack
 from swarm_loc_estimator.watch.watch_node import AerialNames, WatchNode
 from swarm_loc_msgs.msg import (
     AnonymousDetection,

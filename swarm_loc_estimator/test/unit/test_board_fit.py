@@ -48,7 +48,7 @@ def values(curve: FloatArray) -> FloatArray:
 
 
 def test_slopes_are_those_of_differences() -> None:
-    problem = _Problem(replace(PLATFORM, curve_sigma=0.2), recorded(120, 1), ROBOTS, gains=True)
+    problem = _Problem(replace(PLATFORM, curve_sigma=0.2), recorded(120, 1), ROBOTS)
     rng = np.random.default_rng(1)
     at = problem.first_unknowns()
     at = at + 0.03 * rng.standard_normal(at.size)

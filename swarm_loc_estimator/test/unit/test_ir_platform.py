@@ -180,9 +180,10 @@ def test_every_packaged_platform_loads(name: str) -> None:
     assert platform.powers == (("far", "near") if name == "droplet" else ("far",))
 
 
-def test_a_path_starts_from_the_folder_that_is_given(tmp_path: Path) -> None:
+def test_a_file_may_be_named_by_a_path_from_here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mine.yaml").write_text(DROPLET_FILE.read_text())
-    assert load_ir_platform("mine.yaml", tmp_path) == load_ir_platform("droplet")
+    monkeypatch.chdir(tmp_path)
+    assert load_ir_platform("mine.yaml") == load_ir_platform("droplet")
 
 
 @pytest.mark.parametrize(
@@ -211,7 +212,7 @@ def test_a_wrong_file_says_which_key(tmp_path: Path, old: str, new: str, words: 
     assert old in text
     (tmp_path / "wrong.yaml").write_text(text.replace(old, new, 1))
     with pytest.raises(IrPlatformFileError) as raised:
-        load_ir_platform("wrong.yaml", tmp_path)
+        load_ir_platform(str(tmp_path / "wrong.yaml"))
     assert words in str(raised.value)
     assert str(raised.value).startswith(str(tmp_path / "wrong.yaml"))
 

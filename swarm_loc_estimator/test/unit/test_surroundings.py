@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from page_frames import unpack
 
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
@@ -27,7 +28,6 @@ from swarm_loc_estimator.offline.replay import AerialImages, replay
 from swarm_loc_estimator.offline.report.report import recorded
 from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.watch.page import unpack
 
 SECOND = 1_000_000_000
 SWARM = Swarm(robots=(Robot("a", start=(0.0, 0.0, 0.0)), Robot("b", start=(1.0, 0.0, 0.0))))

@@ -13,12 +13,13 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from page_frames import unpack
 from processor_wait import THIS_THREAD, waited_s
 
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
 from swarm_loc_estimator.watch.markers import _COLOURS
-from swarm_loc_estimator.watch.page import Frame, History, about, content_security_policy, pack, page, unpack
+from swarm_loc_estimator.watch.page import Frame, History, about, content_security_policy, pack, page
 from swarm_loc_estimator.watch.server import (
     Access,
     AccessError,

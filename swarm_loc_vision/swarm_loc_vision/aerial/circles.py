@@ -122,12 +122,9 @@ _BLUR_SHARE, _APART_SHARE = 0.08, 0.3  # Smoothing of votes and least distance o
 
 
 class Edges:
-    """Edges of an image.
+    """Edges of an image, of the logarithm of brightness (rows, columns) where it is `seen` (rows, columns).
 
-    Args:
-        log: (rows, columns) logarithm of brightness.
-        seen: (rows, columns) where the image is valid.
-        contrast: Least step of an edge.
+    `contrast` is the least step of an edge.
     """
 
     def __init__(self, log: Plain, seen: NDArray[np.bool_], contrast: float) -> None:

@@ -103,21 +103,15 @@ class _Found(NamedTuple):
 
 
 class AerialDetector:
-    """Finds discs of one size on a level plane, and the mark on them.
+    """Finds discs of one size, of one of POLARITIES, on a level plane, and the mark on them.
 
-    Args:
-        settings: Its numbers; without a diameter it is estimated from the first images.
-        ground: The camera.
-        polarity: One of POLARITIES.
-
-    Attributes:
-        diameter: Diameter of the robots [m]; 0: not known yet.
+    Without a diameter in the settings it is estimated from the first images.
     """
 
     def __init__(self, settings: AerialSettings, ground: GroundCamera, polarity: str = "auto") -> None:
         self._settings, self._ground = settings, ground
         self._polarities = POLARITIES[polarity]
-        self.diameter = settings.robot_diameter
+        self.diameter = settings.robot_diameter  # Diameter of the robots [m]; 0: not known yet
         self._grid: Rectification | None = None
 
     def detect(self, gray: Gray) -> AerialDetections:
@@ -376,25 +370,18 @@ MAP = "map"
 
 
 class AerialCamera(CalibratedCamera):
-    """Finds robots in the images of one overhead camera.
+    """Finds robots in the images of one overhead camera; arguments as of `AerialDetector`.
 
-    Args:
-        settings: Numbers of the detector.
-        polarity: One of `POLARITIES`.
-        ground: Control points; its intrinsics, if any, replace camera_info.
-        gray_of: Reads an image message, see `TRANSPORTS`.
-
-    Attributes:
-        used: Number of images that were searched.
-        robots: Number of detections.
-        headings: Number of detections with a heading.
-        control: The camera's pose; None before the calibration.
+    Intrinsics of the control points, if any, replace camera_info. `gray_of` reads an image message, see
+    `TRANSPORTS`.
     """
 
     def __init__(self, settings: AerialSettings, polarity: str, ground: Ground, gray_of: GrayOf) -> None:
         super().__init__(gray_of)
-        self.used = self.robots = self.headings = 0
-        self.control: GroundControl | None = None
+        self.used = 0  # Number of images that were searched
+        self.robots = 0  # Number of detections
+        self.headings = 0  # Number of detections with a heading
+        self.control: GroundControl | None = None  # The camera's pose; None before the calibration
         self._settings, self._polarity, self._ground = settings, polarity, ground
         self._detector: tuple[GroundCamera, AerialDetector] | None = None
         self._seeing_trouble = ""

@@ -50,13 +50,7 @@ class FloorMarker:
 
 
 class FloorMarkers:
-    """Finds floor markers, and averages their corners over the images of a static camera.
-
-    Args:
-        markers: The markers.
-        family: Family of the markers.
-        camera: The camera.
-    """
+    """Finds floor markers of a family, and averages their corners over the images of a static camera."""
 
     def __init__(self, markers: Sequence[FloorMarker], family: Family, camera: Camera) -> None:
         self._markers = {marker.id: marker for marker in markers}
@@ -116,24 +110,18 @@ class Ground:
 
 
 class GroundControl:
-    """Keeps the pose of one camera.
+    """Keeps the pose of one camera, by known references on the floor.
 
-    Args:
-        ground: Known references on the floor.
-        camera: The camera.
-        settings: Noise of the control points, and the limit of their residuals.
-
-    Attributes:
-        fit: The pose; None: unknown.
-        trouble: Why it is unknown, a sentence; empty: it is known, or there was no image yet.
-        moves: Number of detected motions of the camera.
+    The settings are the noise of the control points, and the limit of their residuals.
     """
 
     def __init__(self, ground: Ground, camera: Camera, settings: AerialSettings) -> None:
         self._ground, self._camera, self._settings = ground, camera, settings
         self._markers = FloorMarkers(ground.markers, ground.family, camera) if ground.markers else None
-        self._images = self.moves = 0
-        self.fit: PoseFit | None = None
+        self._images = 0
+        self.moves = 0  # Number of detected motions of the camera
+        self.fit: PoseFit | None = None  # The pose; None: unknown
+        # Why it is unknown, a sentence; empty: it is known, or there was no image yet
         self.trouble = NO_GROUND if ground.is_empty else ""
         if len(ground.points) >= MIN_POINTS or (ground.points.names and not ground.markers):
             self._solve(ground.points)

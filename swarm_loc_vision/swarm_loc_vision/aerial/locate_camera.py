@@ -52,14 +52,10 @@ class LocateError(UserError):
 
 
 def fixed_camera(name: str, ground: GroundCamera, height: float = 0.0) -> FixedCamera:
-    """The description of a camera over the floor.
+    """The description of a camera over the floor, named like the namespace of its topics.
 
-    Its sigmas are the largest in its image, by the covariance of the pose.
-
-    Args:
-        name: Namespace of its topics.
-        ground: The camera with its pose.
-        height: Of the markers on the robots above the floor [m].
+    Its sigmas are the largest in its image, by the covariance of the pose, for markers on robots at a height
+    above the floor [m].
 
     Raises:
         LocateError: The camera does not see markers that lie at this height.

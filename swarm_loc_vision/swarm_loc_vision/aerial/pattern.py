@@ -65,13 +65,9 @@ class _Inside(NamedTuple):
 
 
 def find_marks(plain: Plain, centre: FloatArray, radius: FloatArray, polarity: float) -> Marks:
-    """Find the marks of discs.
+    """Find the marks of discs with centres (C, 2) and radii (C,) [px] in an image (rows, columns) [counts].
 
-    Args:
-        plain: The image (rows, columns) [counts].
-        centre: (C, 2) centres of the discs [px].
-        radius: (C,) [px].
-        polarity: Polarity of the discs; the mark has the opposite one.
+    A mark has the opposite polarity of its disc.
     """
     if not len(centre):
         return Marks(*np.zeros((4, 0)))

@@ -16,20 +16,13 @@ GrayOf = Callable[[Any], Gray]
 
 
 class Calibration:
-    """The calibration of one camera; subclasses use its images, or what was found in them.
-
-    Attributes:
-        images: Number of images received.
-        drops: Number of drops by reason.
-        camera: The calibration; None: none was received, or it cannot be used.
-        trouble: What is wrong with the calibration, a sentence; empty: nothing.
-    """
+    """The calibration of one camera; subclasses use its images, or what was found in them."""
 
     def __init__(self) -> None:
-        self.images = 0
-        self.drops: Counter[str] = Counter()
-        self.camera: Camera | None = None
-        self.trouble = ""
+        self.images = 0  # Number of images received
+        self.drops: Counter[str] = Counter()  # Number of drops by reason
+        self.camera: Camera | None = None  # The calibration; None: none was received, or it cannot be used
+        self.trouble = ""  # What is wrong with the calibration, a sentence; empty: nothing
 
     def calibrate(self, message: Any) -> None:
         """Use a sensor_msgs/CameraInfo from now on.
@@ -92,11 +85,7 @@ class Calibration:
 
 
 class CalibratedCamera(Calibration):
-    """The calibration of one camera, and its images.
-
-    Args:
-        gray_of: Reads an image message, see `TRANSPORTS`.
-    """
+    """The calibration of one camera, and its images; `gray_of` reads an image message, see `TRANSPORTS`."""
 
     def __init__(self, gray_of: GrayOf) -> None:
         super().__init__()

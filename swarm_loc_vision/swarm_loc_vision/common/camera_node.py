@@ -41,13 +41,7 @@ class CameraNode(ManagedNode[Parameters]):
         return Input(_MESSAGES[transport.message_type], topic, IMAGE_QOS)
 
     def use(self, camera: Calibration, source: Input, detections: type) -> None:
-        """Publish what is found in messages while the node is active.
-
-        Args:
-            camera: Finds it.
-            source: Its messages.
-            detections: Class of the messages published.
-        """
+        """Publish what a camera finds in messages of a source, as `detections`, while the node is active."""
         self._source, self._input, self._found = camera, source, detections
         self._cost_s = 0.0
 

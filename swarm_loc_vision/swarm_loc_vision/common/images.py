@@ -16,15 +16,11 @@ Pixels = NDArray[np.uint8] | NDArray[np.uint16]
 
 
 class ImageError(ValueError):
-    """An image that cannot be used; the message is one sentence.
-
-    Attributes:
-        reason: In one word, for counting.
-    """
+    """An image that cannot be used; the message is one sentence."""
 
     def __init__(self, reason: str, message: str) -> None:
         super().__init__(message)
-        self.reason = reason
+        self.reason = reason  # In one word, for counting
 
 
 @dataclass(frozen=True)

@@ -70,13 +70,7 @@ class _Bursts(NamedTuple):
 class LightTracker:
     """Reports the lights of each window of events; windows begin at whole multiples of their length.
 
-    Args:
-        sources: The lights, at most `MAX_SOURCES`.
-        size: Width and height of the sensor [px].
-        settings: Numbers of the tracker.
-
-    Attributes:
-        time_jumps: How often time stepped back by more than a window, which resets the tracker.
+    There are at most `MAX_SOURCES` lights; `size` is width and height of the sensor [px].
     """
 
     def __init__(
@@ -84,7 +78,7 @@ class LightTracker:
     ) -> None:
         if len(sources) > MAX_SOURCES:
             raise ValueError(f"{len(sources)} lights are more than {MAX_SOURCES}")
-        self.time_jumps = 0
+        self.time_jumps = 0  # How often time stepped back by more than a window, which resets the tracker
         self._settings, (self._width, self._height) = settings, size
         self._window_ns = round(1e9 * settings.window)
         self._begin_ns: int | None = None

@@ -87,12 +87,10 @@ class WallDrive:
 
 
 def recorded_drive(bag: Path, robot: str, drive: WallDrive) -> WallDrive:
-    """Fill a drive from a bag until it is done; returns the drive.
+    """Fill an empty drive from a bag until it is done; returns the drive.
 
-    Args:
-        bag: With `<robot>/odom` and `<robot>/laser`; `start_distance` is that at the first odometry.
-        robot: Name of the robot; "" for topics without a namespace.
-        drive: An empty drive.
+    The bag has `<robot>/odom` and `<robot>/laser`, or those topics without a namespace where the name is "";
+    `start_distance` is that at the first odometry.
 
     Raises:
         CalibrationError: A topic has no usable message, or the robot turns on its way.
@@ -230,10 +228,8 @@ def _check(depths: FloatArray) -> None:
 def fit_row_bias(rows: FloatArray, residuals: FloatArray, sigma: float) -> RowBias:
     """Fit the bias to residuals; empty unless a fit to either half lowers the residuals of the other half.
 
-    Args:
-        rows: (N,) tracked [px].
-        residuals: (N,) tracked rows minus those of the hyperbola [px].
-        sigma: Scale of the residuals for the Cauchy loss [px].
+    Residuals (N,) are tracked rows (N,) minus those of the hyperbola, and sigma is the scale of their Cauchy
+    loss [px].
     """
     edge = float((rows - residuals).min()) + _EDGE_SIGMAS * sigma
     usual = (np.abs(residuals) < _OUTLIER_SIGMAS * sigma) & (rows >= edge)

@@ -60,13 +60,8 @@ def sheet_figure(page: Page, family: Family, paper: str) -> Figure:
 def outline(black: NDArray[np.bool_], left: float, bottom: float, cell: float) -> Outline:
     """The border of the black cells (n, n), upper row first, as closed loops with black on their right.
 
-    One outline without seams: between squares that only touch, viewers and printers leave fine lines.
-
-    Args:
-        black: Which cells are black.
-        left: x of the left border.
-        bottom: y of the lower border.
-        cell: Side of a cell.
+    One outline without seams: between squares that only touch, viewers and printers leave fine lines. The
+    cells begin at `left` and at `bottom`, and have sides of `cell`.
     """
     padded = np.pad(black, 1)
     ways: dict[tuple[int, int], list[tuple[int, int]]] = {}
@@ -208,15 +203,9 @@ def pages_of(stickers: Sequence[Sticker], family: Family, paper: str) -> list[Pa
 
 
 def board_page(first_id: int, columns: int, rows: int, side: float, family: Family, paper: str) -> Page:
-    """A grid of markers, as far apart as the paper allows, with ids row by row from the upper left.
+    """A grid of markers of a side [mm], as far apart as the paper allows.
 
-    Args:
-        first_id: Id of the upper left marker.
-        columns: Markers side by side.
-        rows: Markers one below the other.
-        side: Side of the markers [mm].
-        family: Their family.
-        paper: Name of the paper.
+    Ids begin with `first_id` at the upper left, and go row by row.
 
     Raises:
         SheetError: They do not fit, or the family does not have their ids.

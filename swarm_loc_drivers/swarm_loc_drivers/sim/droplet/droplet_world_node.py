@@ -45,9 +45,6 @@ class DropletWorldNode(WorldNode[DropletWorldParameters]):
             names,
             STEP_NS,
             lambda robot: DropletFirmware(SimulatedDroplet(self._world, robot)),
-            rate=params.rate,
-            truth_rate=params.truth_rate,
-            link_folder=params.link_folder,
             clock_steps=_CLOCK_STEPS,
         )
         fixed = tuple(swarm.index_of[name] for name in params.fixed)

@@ -79,28 +79,12 @@ def print_named(emitter: int, receiver: int, readings: NDArray[np.int64]) -> str
     return f'{{"{emitter:04X}", "{receiver:04X}", {_braces(readings)}}},\r\n'
 
 
-def print_2014(_emitter: int, _receiver: int, readings: NDArray[np.int64]) -> str:
-    """The format of 2014: one line, unsigned."""
-    return f"{_braces(np.maximum(readings, 0))};\r\n"
-
-
-def print_2016(_emitter: int, _receiver: int, readings: NDArray[np.int64]) -> str:
-    """The format of 2016: one line per emitter, and the sum."""
-    rows = ["\t{" + ",".join(f"{cell:4d}" for cell in row) + "}" for row in readings.tolist()]
-    return "{\r\n" + ",\r\n".join(rows) + f"\r\n}}; sum={readings.sum()}\r\n"
-
-
 def _braces(readings: NDArray[np.int64]) -> str:
     return "{" + ",".join("{" + ",".join(map(str, row)) + "}" for row in readings.tolist()) + "}"
 
 
 class DropletFirmware:
-    """Answers bytes as the robot does.
-
-    Args:
-        body: The robot.
-        print_matrix: What the user's program prints.
-    """
+    """Answers bytes as the robot does; `print_matrix` is what the user's program prints."""
 
     def __init__(self, body: DropletBody, print_matrix: Print = print_named) -> None:
         self._body = body

@@ -87,10 +87,8 @@ class Exchange:
 class DropletLight:
     """Light from one emitter on the sensors of other robots.
 
-    Args:
-        platform: The board of all robots.
-        gains: (2, N, n) true factors of the sensors and of the emitters of all robots.
-        near_power: Power at which the emitters follow the board's near model, below 256.
+    `gains` (2, N, n) are true factors of the sensors and of the emitters of all robots. Emitters follow the
+    board's near model at `near_power`, below 256.
     """
 
     def __init__(self, platform: IrPlatform, gains: FloatArray, near_power: int) -> None:
@@ -105,12 +103,7 @@ class DropletLight:
     ) -> FloatArray:
         """Counts (k, n) that the sensors of receivers (k,) would read without noise.
 
-        Args:
-            poses: (N, 3) of all robots in map.
-            receivers: Their indices.
-            transmitter: Index of the robot that emits.
-            emitter: Which of its emitters is lit.
-            power: How bright, 0 to 256.
+        Robots are at poses (N, 3) in map. One of the transmitter's emitters is lit, with a power of 0 to 256.
         """
         seen = se2.between(poses[receivers], poses[transmitter])
         distance, bearing = np.hypot(seen[:, 0], seen[:, 1]), np.arctan2(seen[:, 1], seen[:, 0])
@@ -169,21 +162,7 @@ class InfraredSettings:
 
 
 class DropletInfrared:
-    """Transmits messages and light.
-
-    Args:
-        platform: The board of all robots.
-        light: Light on the sensors.
-        ids: (N,) ids of the robots.
-        settings: Losses and ambient light.
-        rng: Random generator.
-        now_ns: Start time.
-
-    Attributes:
-        heard: Per robot the commands and readings not fetched yet.
-        deaf_until_ns: Per robot the end of its last exchange [ns].
-        counts: Events by name.
-    """
+    """Transmits messages and light between robots with ids (N,)."""
 
     def __init__(
         self,
@@ -203,9 +182,10 @@ class DropletInfrared:
         self._baseline = np.rint(self._ambient).astype(np.int64)
         self._drift_due_ns = now_ns
         self._baseline_due_ns = now_ns + rng.integers(0, _BASELINE_PERIOD_NS, len(ids))
+        # Per robot the commands and readings not fetched yet
         self.heard: list[list[InfraredCommand | ExchangeReadings]] = [[] for _ in ids]
-        self.deaf_until_ns = [0 for _ in ids]
-        self.counts: Counter[str] = Counter()
+        self.deaf_until_ns = [0 for _ in ids]  # Per robot the end of its last exchange [ns]
+        self.counts: Counter[str] = Counter()  # Events by name
 
     def send(self, sender: int, line: str, target: int, poses: FloatArray) -> None:
         """Start the transmission of a command."""

@@ -33,7 +33,7 @@ from swarm_loc_drivers.sim.droplet.infrared import (
 )
 from swarm_loc_drivers.sim.link_host import ConsoleFirmware
 from swarm_loc_drivers.sim.run import START_NS
-from swarm_loc_drivers.sim.worlds import WorldError, start_of
+from swarm_loc_drivers.sim.worlds import WorldError, WorldParameters, start_of
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text, texts
@@ -46,19 +46,9 @@ STRIDE_S = 2.0
 
 
 class Cable:
-    """A robot connected by cable: its console and the driver's session.
+    """A robot connected by cable: its console and the driver's session, with its model of motion errors.
 
-    Args:
-        world: The world of the robot.
-        robot: Its index.
-        settings: Settings of the session.
-        noise: The session's model of motion errors.
-        publish: Called with the matrices of exchanges.
-
-    Attributes:
-        firmware: The firmware at the console.
-        session: The session of the driver.
-        counts: Events of the session by name.
+    `publish` is called with the matrices of exchanges.
     """
 
     def __init__(
@@ -69,15 +59,16 @@ class Cable:
         noise: MotionNoise,
         publish: Callable[[Brightness], None],
     ) -> None:
-        self.counts: Counter[str] = Counter()
+        self.counts: Counter[str] = Counter()  # Events of the session by name
         self._world = world
+        # The firmware at the console
         self.firmware: ConsoleFirmware = DropletFirmware(SimulatedDroplet(world, robot))
         self._command = VelocityCommand(
             _TIMEOUT_S, lambda: world.now_ns, self.counts, lambda: 1e-9 * world.now_ns
         )
         self._motion = CommandedMotion(noise)
         mover = DropletMover(self._command, self._motion, STRIDE_S)
-        self.session = DropletSession(settings, mover, (), publish, self.counts)
+        self.session = DropletSession(settings, mover, (), publish, self.counts)  # The session of the driver
 
     def set_velocity(self, velocity: Velocity) -> None:
         """Command a velocity."""
@@ -102,13 +93,9 @@ class Cable:
 def run(
     world: DropletWorld, robots: Sequence[Callable[[], object]], steps: int, control: Callable[[], None]
 ) -> None:
-    """Advance the simulation.
+    """Advance a world by steps, with a function that steps each robot, such as `Cable.step`.
 
-    Args:
-        world: The world.
-        robots: Step function of each robot, such as `Cable.step`.
-        steps: Number of steps of the world.
-        control: Called after every step, to set velocities and record data.
+    `control` is called after every step, to set velocities and record data.
     """
     for _ in range(steps):
         world.step()
@@ -127,14 +114,9 @@ class Fix:
 
 
 class Tracker:
-    """A tracker above the table: noisy absolute poses of some robots at a fixed rate.
+    """A tracker above the table: noisy absolute poses of some robots at a fixed rate of each.
 
-    Args:
-        robots: Their indices.
-        rate_hz: Of each [1/s].
-        sigma: Noise of a position along each axis, one standard deviation [m].
-        heading_sigma: Noise of a heading [rad].
-        seed: Fixes the noise.
+    Sigmas are of a position along each axis [m], and of a heading [rad].
     """
 
     def __init__(
@@ -196,12 +178,7 @@ class DropletWorldSettings:
 
 
 class DropletWorld:
-    """Droplets on a floor.
-
-    Args:
-        ids: (N,) of the robots, 1 to 65535, each once.
-        start: (N, 3) where they begin, in map.
-        settings: How the world is.
+    """Droplets with ids (N,), 1 to 65535, each once, on a floor in map, where they begin at poses (N, 3).
 
     Raises:
         WorldError: The robots cannot be simulated.
@@ -274,12 +251,7 @@ def nominal_gait(direction: int) -> Gait:
 
 
 class SimulatedDroplet:
-    """One robot of a world as seen by its firmware; see `DropletBody`.
-
-    Args:
-        world: The world of the robot.
-        robot: Its index.
-    """
+    """One robot of a world as seen by its firmware; see `DropletBody`."""
 
     trims = tuple(_WALK_TRIMS if direction in WALKS else _TURN_TRIMS for direction in DIRECTIONS)
     lengths = tuple(_WALK_MM if direction in WALKS else _TURN_DEG for direction in DIRECTIONS)
@@ -334,17 +306,13 @@ def _check(ids: Sequence[int], platform: IrPlatform) -> None:
 
 
 @dataclass(frozen=True)
-class DropletWorldParameters:
+class DropletWorldParameters(WorldParameters):
     """Parameters of `droplet_world_node`."""
 
     swarm_file: str = text(
         "", "path of the swarm description; every robot needs a start and an infrared board", required=True
     )
     world: str = choice("d1", tuple(DROPLET_WORLDS), "how the robots err; see sim/droplet/world.py")
-    seed: int = number(1, "1", 0, 2**31 - 1, "fixes the errors")
-    rate: float = number(
-        1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
-    )
     link_folder: str = text("", "where each robot's serial port appears under its name", required=True)
     truth_rate: float = number(10.0, "1/s", 0.1, 200.0, "published true poses of each robot")
     fixed: tuple[str, ...] = texts("robots that a tracker above the table sees; it publishes <robot>/fix")

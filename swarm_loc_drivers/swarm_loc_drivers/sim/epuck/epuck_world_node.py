@@ -48,13 +48,7 @@ _CAMERA_QOS = QoSProfile(depth=5)  # Reliable, so that subscribers can choose: e
 
 
 class CameraOutput:
-    """Publishes `image_raw` and `camera_info` of one simulated camera.
-
-    Args:
-        node: Owner of the publishers.
-        robot: Name of the robot, or of the camera's namespace.
-        calibration: Of the camera.
-    """
+    """Publishes `image_raw` and `camera_info` of one simulated camera, in a robot's namespace or its own."""
 
     def __init__(self, node: Node, robot: str, calibration: CameraCalibration) -> None:
         self._calibration = calibration
@@ -64,13 +58,10 @@ class CameraOutput:
         self._sent_to = self._received_by = 0  # subscribers to camera_info: at the last, at a received one
 
     def publish(self, stamp_ns: int, draw: Callable[[], NDArray[np.uint8]]) -> bool:
-        """Publish the calibration, and the image if it has subscribers; returns whether it was published.
+        """Publish the calibration, and an image if it has subscribers; returns whether it was published.
 
         Images are held back until all subscribers have a calibration, since they would drop them without.
-
-        Args:
-            stamp_ns: Of the exposure.
-            draw: Makes the image (height, width).
+        `draw` makes the image (height, width).
         """
         listeners = self._infos.get_subscription_count()
         if self._infos.wait_for_all_acked(Duration()):
@@ -110,9 +101,6 @@ class EpuckWorldNode(WorldNode[EpuckWorldParameters]):
             self._names,
             STEP_NS,
             firmware_of,
-            rate=params.rate,
-            truth_rate=params.truth_rate,
-            link_folder=params.link_folder,
             first_port=params.first_port,
         )
         # cameras, on the robots and above

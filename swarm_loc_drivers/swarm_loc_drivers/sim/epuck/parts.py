@@ -64,20 +64,12 @@ _MICROPHONE = 40
 
 
 class Motors:
-    """The stepper motors: clamped and quantised speeds, counters of steps.
-
-    Args:
-        body: The robot.
-        model: Its generation.
-
-    Attributes:
-        commanded: The speeds as they were commanded, left and right [steps/s].
-    """
+    """The stepper motors: clamped and quantised speeds, counters of steps."""
 
     def __init__(self, body: EpuckBody, model: EpuckModel) -> None:
         self._body = body
         self._model = model
-        self.commanded = (0, 0)
+        self.commanded = (0, 0)  # The speeds as they were commanded, left and right [steps/s]
 
     def set_speeds(self, left: int, right: int) -> None:
         """Turn the wheels [steps/s]; the firmware keeps speeds in 16 bits."""
@@ -133,14 +125,7 @@ _RAYS = np.array([-0.5, 0.0, 0.5]) * FIELD_OF_VIEW
 def proximity_values(
     poses: FloatArray, robot: int, arena: tuple[float, float], rng: np.random.Generator
 ) -> NDArray[np.int64]:
-    """Raw values (8,) of one robot.
-
-    Args:
-        poses: (N, 3) of all robots in map.
-        robot: Index of the one.
-        arena: Its size along x and y, around map's origin [m].
-        rng: Source of the noise.
-    """
+    """Raw values (8,) of one of the robots at poses (N, 3) in map; the arena lies around map's origin [m]."""
     x, y, heading = poses[robot]
     outwards = heading + np.array(PROXIMITY_BEARINGS)
     origins = np.array([x, y]) + PROXIMITY_RADIUS_M * np.column_stack([np.cos(outwards), np.sin(outwards)])
@@ -177,8 +162,7 @@ def _to_discs(origins: FloatArray, rays: FloatArray, centres: FloatArray) -> Flo
 class Unanswered:
     """Images that wait for their detections, so that simulated time can wait for them, too.
 
-    Args:
-        within_s: How old an image may get without an answer [s]; 0: any age.
+    An image may get `within_s` old without an answer [s]; 0: any age.
     """
 
     def __init__(self, within_s: float) -> None:

@@ -38,10 +38,6 @@ class SerialFirmware:
     """Answers bytes one after the other as the robot does, without any timeout.
 
     It knows the commands that drivers send, and ignores others.
-
-    Args:
-        body: The robot.
-        model: Its generation.
     """
 
     def __init__(self, body: EpuckBody, model: EpuckModel) -> None:

@@ -27,20 +27,14 @@ _ZOOM = 4
 class WifiFirmware:
     """Answers one client.
 
-    Args:
-        body: The robot.
-        counts_right_backwards: Whether the right counter falls when its wheel rolls ahead, as it did before
-            December 2018.
-
-    Attributes:
-        exchange_fails: Set it to have the next exchange between the chips fail.
+    With `counts_right_backwards` the right counter falls when its wheel rolls ahead, as before December 2018.
     """
 
     def __init__(self, body: EpuckBody, *, counts_right_backwards: bool = False) -> None:
         self._body = body
         self._motors = Motors(body, EPUCK2)
         self._counts_right_backwards = counts_right_backwards
-        self.exchange_fails = False
+        self.exchange_fails = False  # Set it to have the next exchange between the chips fail
         self._command = b""
         self._exchange_due_ns = body.now_ns
         self._sensors: bytes | None = None

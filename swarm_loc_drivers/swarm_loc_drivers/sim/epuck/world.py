@@ -21,7 +21,14 @@ from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena, CameraRig, OverheadRig, OverheadSettings
 from swarm_loc_drivers.sim.run import START_NS, Trajectories
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, CAMERA_RATE_HZ, FAMILY
-from swarm_loc_drivers.sim.worlds import WORLDS, ErrorModel, WorldError, hidden_geometry, start_of
+from swarm_loc_drivers.sim.worlds import (
+    WORLDS,
+    ErrorModel,
+    WorldError,
+    WorldParameters,
+    hidden_geometry,
+    start_of,
+)
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text
 from swarm_loc_estimator.swarm.error_models import OdometryModel
@@ -69,11 +76,7 @@ class Exposure:
 
 
 class EpuckWorld:
-    """The robots of a swarm in their arena.
-
-    Args:
-        swarm: As described; every robot needs a start pose and a camera, every marker a heading.
-        settings: How the world is.
+    """The robots of a swarm in their arena; each needs a start pose and a camera, every marker a heading.
 
     Raises:
         WorldError: The swarm cannot be simulated.
@@ -193,12 +196,7 @@ class EpuckWorld:
 
 
 class SimulatedEpuck:
-    """One robot of a world as seen by its firmware; see `EpuckBody`.
-
-    Args:
-        world: The world of the robot.
-        robot: Its index.
-    """
+    """One robot of a world as seen by its firmware; see `EpuckBody`."""
 
     def __init__(self, world: EpuckWorld, robot: int) -> None:
         self._world, self._robot = world, robot
@@ -248,20 +246,12 @@ def check_swarm(swarm: Swarm) -> None:
 
 
 @dataclass(frozen=True)
-class EpuckWorldParameters:
+class EpuckWorldParameters(WorldParameters):
     """Parameters of `epuck_world_node`; the cameras' are those of `CameraModel` and `OverheadSettings`."""
 
-    swarm_file: str = text("", "path of the swarm description; every robot needs a start", required=True)
     world: str = choice("w2", tuple(WORLDS), "which errors robots and cameras have; see sim/worlds.py")
-    seed: int = number(1, "1", 0, 2**31 - 1, "fixes the errors")
-    rate: float = number(
-        1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
-    )
     answer_within: float = number(
         0.0, "s", 0.0, 10.0, "simulated time waits for <robot>/detections of images older than this; 0: never"
-    )
-    link_folder: str = text(
-        "", "where each robot's serial port appears under its name; empty: robots on WiFi"
     )
     first_port: int = number(0, "1", 0, 65000, "TCP port of the first robot on WiFi, the others follow")
     model: str = choice("epuck2", tuple(EPUCK_MODELS), "generation of the robots; only epuck2 has WiFi")
@@ -273,7 +263,6 @@ class EpuckWorldParameters:
     arena_y: float = number(ARENA[1], "m", 0.1, 1000.0, "size of the arena along y")
     family: str = choice(FAMILY, tuple(families()), "kind of the markers")
     camera_rate: float = number(CAMERA_RATE_HZ, "1/s", 2.0, 60.0, "images of each camera")
-    truth_rate: float = number(20.0, "1/s", 0.1, 200.0, "published true poses of each robot")
     control_points_file: str = text(
         "", "path of the floor markers that the overhead camera sees; empty: none are on the floor"
     )

@@ -76,13 +76,7 @@ class CameraEvents(NamedTuple):
 
 
 class EventCamera:
-    """One sensor of 128 x 128 pixels.
-
-    Args:
-        noise: Noise and limits.
-        rng: Random generator of events.
-        sensor: Seed of the fixed properties of its pixels.
-    """
+    """One sensor of 128 x 128 pixels; its seed gives the fixed properties of its pixels."""
 
     def __init__(self, noise: CameraNoise, rng: np.random.Generator, sensor: int) -> None:
         self._noise = noise
@@ -94,13 +88,10 @@ class EventCamera:
         self._later: _Raw = (np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), np.zeros(0))
 
     def look(self, begin_us: int, end_us: int, spots: Sequence[Spot], edges: FloatArray) -> CameraEvents:
-        """The events of a step.
+        """The events of a step between two times [us].
 
-        Args:
-            begin_us: Begin of the step [us].
-            end_us: Its end.
-            spots: Images of lights.
-            edges: (E, 3) upright edges: column at the begin, at the end [px], brightness left minus right.
+        `spots` are images of lights. Upright edges (E, 3) have columns at the begin and at the end [px], and
+        brightness left minus right.
         """
         parts = [self._noise_events(begin_us, end_us), self._edge_events(begin_us, end_us, edges)]
         parts += [self._later, *(self._spot_events(begin_us, end_us, spot) for spot in spots)]

@@ -92,14 +92,10 @@ _DELTA_LIMITS = (0x7F, 0x3FFF, 0x1FFFFF)
 
 
 class EventRing:
-    """Ring buffer of events to be sent.
-
-    Attributes:
-        dropped: Events that were overwritten, unnoticed by the board.
-    """
+    """Ring buffer of events to be sent."""
 
     def __init__(self) -> None:
-        self.dropped = 0
+        self.dropped = 0  # Events that were overwritten, unnoticed by the board
         self._words = np.zeros(0, np.uint16)
         self._times = np.zeros(0, np.int64)
         self._last = 0
@@ -108,12 +104,9 @@ class EventRing:
         return len(self._words)
 
     def put(self, words: NDArray[np.uint16], times_us: NDArray[np.int64], sent: int) -> None:
-        """Take events `0yyyyyyy pxxxxxxx`, in order, with their board's time.
+        """Take events `0yyyyyyy pxxxxxxx` (N,), in order, with their board's time (N,) [us].
 
-        Args:
-            words: (N,).
-            times_us: (N,) [us].
-            sent: Number of events that are sent while these come, which leave their places.
+        `sent` events are sent while these come, which leave their places.
         """
         self._words = np.concatenate([self._words, words])
         self._times = np.concatenate([self._times, times_us])
@@ -213,12 +206,7 @@ TX_BUFFER = 4096
 
 
 class Board:
-    """State of a board since its last reset: clock, motors, timers of the lights, wheel ticks and events.
-
-    Args:
-        body: The robot.
-        generation: Which firmware it is.
-    """
+    """State of a board since its last reset: clock, motors, timers of the lights, wheel ticks and events."""
 
     def __init__(self, body: PushbotBody, generation: FirmwareGeneration) -> None:
         self._body = body
@@ -356,12 +344,7 @@ _MAX_LINE = 127  # Characters of a command
 
 
 class Console:
-    """Parses lines of text and acts on a board. It knows the commands that drivers send.
-
-    Args:
-        board: What commands act on.
-        generation: Which firmware it is.
-    """
+    """Parses lines of text and acts on a board. It knows the commands that drivers send."""
 
     def __init__(self, board: Board, generation: FirmwareGeneration) -> None:
         self._board = board
@@ -443,20 +426,14 @@ _MAX_GAP_S = 0.02  # A wire that was blocked for longer does not catch up
 class PushbotFirmware:
     """A robot's firmware, for any link that waits for whoever reads it (RTS/CTS, TCP).
 
-    Args:
-        body: The robot.
-        generation: Which firmware it is.
-        baud_rate: Of the wire to the host or its radio [bit/s].
-        seed: Decides which bytes are parsed just after a tick of the clock, see `Motor`.
-
-    Attributes:
-        late_share: Share of these bytes.
+    `baud_rate` is that of the wire to the host or its radio [bit/s]. The seed decides which bytes are parsed
+    just after a tick of the clock, see `Motor`.
     """
 
     def __init__(
         self, body: PushbotBody, generation: FirmwareGeneration, baud_rate: int = BAUD_RATE, seed: int = 0
     ) -> None:
-        self.late_share = LATE_SHARE
+        self.late_share = LATE_SHARE  # Share of bytes that are parsed just after a tick
         self._rng = np.random.default_rng(seed)
         self._body = body
         self.board = Board(body, generation)

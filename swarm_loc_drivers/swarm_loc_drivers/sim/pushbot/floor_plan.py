@@ -76,11 +76,9 @@ def _within(x: FloatArray, y: FloatArray, rectangles: Sequence[Rectangle]) -> Bo
 
 
 def floor_plan(plan: str) -> FloorPlan:
-    """A floor plan by its name, or from a file.
+    """A floor plan by its name in `FLOOR_PLANS`, or from a YAML or JSON file.
 
-    Args:
-        plan: A key of `FLOOR_PLANS`, or the path of a YAML or JSON file: either walls with the keys of
-            `floor_plans.json`, or a map of ROS's map_server.
+    A file has either walls with the keys of `floor_plans.json`, or a map of ROS's map_server.
 
     Raises:
         UserError: There is no such plan, or the file cannot be used.

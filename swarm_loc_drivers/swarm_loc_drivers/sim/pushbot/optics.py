@@ -101,13 +101,7 @@ def led_place(pose: FloatArray, *, front: bool) -> tuple[float, float]:
 
 
 def led_pixel(observer: FloatArray, pose: FloatArray, *, front: bool) -> tuple[float, float, float] | None:
-    """Column, row [px] and distance [m] of an LED; None where it cannot be seen, walls aside.
-
-    Args:
-        observer: (3,) pose of the robot that looks.
-        pose: (3,) of the robot with the LED.
-        front: Which LED.
-    """
+    """Column, row [px] and distance [m] of an LED of a robot at `pose`; None if not seen, walls aside."""
     (cx, cy), (x, y) = camera_place(observer), led_place(pose, front=front)
     way = math.atan2(y - cy, x - cx)
     bearing = math.remainder(way - observer[2], 2.0 * math.pi)
@@ -131,14 +125,7 @@ Lights = tuple[Blinking, Blinking, Blinking]  # Laser, rear and front LED of a r
 
 
 class HallSight:
-    """The event cameras of robots in a hall.
-
-    Args:
-        walls: (S, 4) of the hall [m].
-        built: Optics of the robots.
-        noise: Of their cameras.
-        rng: Source of all that is random.
-    """
+    """The event cameras of robots in a hall with walls (S, 4) [m]."""
 
     def __init__(
         self, walls: FloatArray, built: Sequence[LaserOptics], noise: CameraNoise, rng: np.random.Generator
@@ -158,14 +145,9 @@ class HallSight:
         span_us: tuple[int, int],
         lights: Sequence[Lights],
     ) -> CameraEvents:
-        """The events of a robot's camera during a step.
+        """The events of a robot's camera during a step between two times [us].
 
-        Args:
-            robot: Its index.
-            before: (N, 3) poses of all robots at the begin, in map.
-            after: (N, 3) poses at the end.
-            span_us: Begin and end [us].
-            lights: Of all robots.
+        Poses (N, 3) of all robots before and after it are in map; lights are those of all robots.
         """
         spots = self._laser_spot(robot, before, after, lights[robot][0])
         for other in range(len(after)):

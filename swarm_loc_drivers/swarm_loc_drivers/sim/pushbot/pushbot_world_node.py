@@ -35,9 +35,6 @@ class PushbotWorldNode(WorldNode[PushbotWorldParameters]):
             [robot.name for robot in swarm.robots],
             STEP_NS,
             self._firmware_of,
-            rate=params.rate,
-            truth_rate=params.truth_rate,
-            link_folder=params.link_folder,
             first_port=params.first_port,
             waits=True,
         )

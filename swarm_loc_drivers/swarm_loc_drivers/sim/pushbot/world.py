@@ -19,7 +19,7 @@ from swarm_loc_drivers.sim.differential_drive import Drive, LastingNoise, roll
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, FloorPlan, clearance, floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import BODY_RADIUS_M, HallSight, Lights, assembled_robots
-from swarm_loc_drivers.sim.worlds import WorldError, start_of
+from swarm_loc_drivers.sim.worlds import WorldError, WorldParameters, start_of
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text
 from swarm_loc_estimator.swarm.swarm import Pose2, Swarm
@@ -31,20 +31,11 @@ _LAG_S = 0.02
 
 
 class Drivetrain:
-    """Two wheels of each of N robots.
-
-    Args:
-        count: N.
-        step_s: Time of a step [s].
-
-    Attributes:
-        duties: (N, 2) share of the battery's voltage, left and right.
-        ticks: (N, 2) that the wheels have turned.
-    """
+    """Two wheels of each of N robots, in steps of a time [s]."""
 
     def __init__(self, count: int, step_s: float) -> None:
-        self.duties = np.zeros((count, 2))
-        self.ticks = np.zeros((count, 2))
+        self.duties = np.zeros((count, 2))  # (N, 2) share of the battery's voltage, left and right
+        self.ticks = np.zeros((count, 2))  # (N, 2) that the wheels have turned
         self._rates = np.zeros((count, 2))
         self._step_s = step_s
         self._kept = np.exp(-step_s / _LAG_S)
@@ -66,15 +57,11 @@ WHEEL_NOISE, TURN_NOISE = 1e-7, math.radians(0.64)
 
 
 @dataclass(frozen=True)
-class PushbotWorldParameters:
+class PushbotWorldParameters(WorldParameters):
     """Parameters of `pushbot_world_node`; the event cameras' are those of `CameraNoise`."""
 
-    swarm_file: str = text("", "path of the swarm description; every robot needs a start", required=True)
     plan: str = text("corridor", f"the hall: {', '.join(FLOOR_PLANS)}, or the path of a floor plan")
     seed: int = number(1, "1", 0, 2**31 - 1, "fixes the assembly of the robots, and all noise")
-    rate: float = number(
-        1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
-    )
     turn_slip: float = number(0.02, "1", 0.0, 0.5, "share of every turn that slips")
     wheel_noise: float = number(
         WHEEL_NOISE, "m", 0.0, 0.01, "variance of each wheel's path per metre it rolls [m^2/m]"
@@ -82,12 +69,10 @@ class PushbotWorldParameters:
     turn_noise: float = number(
         TURN_NOISE, "rad", 0.0, 1.0, "further error of a whole turn, one standard deviation"
     )
-    link_folder: str = text("", "where each robot's serial port appears under its name; empty: TCP")
     first_port: int = number(0, "1", 0, 65000, "TCP port of the first robot, the others follow; 0: any")
     firmware: str = choice(SECOND_FIRMWARE.name, tuple(GENERATIONS), "generation of the robots' firmware")
     metres_per_tick: float = number(1e-4, "m", 1e-6, 1e-2, "path of a wheel per tick")
     wheel_separation: float = number(0.085, "m", 0.01, 1.0, "distance between the two wheels")
-    truth_rate: float = number(20.0, "1/s", 0.1, 200.0, "published true poses of each robot")
     camera: CameraNoise = field(default_factory=CameraNoise, metadata={"numbers_of": CameraNoise})
 
 
@@ -102,12 +87,7 @@ class StepsAlong(Protocol):
 
 
 class PushbotWorld:
-    """Robots in a hall.
-
-    Args:
-        starts: Start poses of the robots.
-        plan: The hall.
-        params: Errors of robots and cameras; files, links and the name of the plan are not used.
+    """Robots in a hall; of the parameters, files, links and the plan's name are not used.
 
     Raises:
         WorldError: A robot starts within a wall or another robot.
@@ -179,12 +159,7 @@ class PushbotWorld:
 
 
 class SimulatedPushbot:
-    """One robot of a world as seen by its firmware; see `PushbotBody`.
-
-    Args:
-        world: The world of the robot.
-        robot: Its index.
-    """
+    """One robot of a world as seen by its firmware; see `PushbotBody`."""
 
     def __init__(self, world: PushbotWorld, robot: int) -> None:
         self._world, self._robot = world, robot

@@ -85,12 +85,7 @@ class RobotCamera:
 
 
 class Renderer:
-    """Draws images of one scene; all cameras share its buffers, so use it from one thread.
-
-    Args:
-        scene: What is seen.
-        model: Of all cameras.
-    """
+    """Draws images of one scene; all cameras, of one model, share its buffers, so use it from one thread."""
 
     def __init__(self, scene: Scene, model: CameraModel) -> None:
         self._scene, self._model = scene, model
@@ -104,12 +99,9 @@ class Renderer:
     def light(self, camera: RobotCamera, poses: FloatArray) -> NDArray[np.float32]:
         """The brightness of every pixel (height, width), without noise; overwritten by the next call.
 
-        What covers something else while it moves is averaged over the exposure before it is laid over what
-        it covers: exact but for the image's blurred rims in front of other blurred rims.
-
-        Args:
-            camera: The camera.
-            poses: (K, N, 3) of all robots in map, at the middles of K equal parts of the exposure.
+        What covers something else while it moves is averaged over the exposure before it is laid over what it
+        covers: exact but for the image's blurred rims in front of other blurred rims. Poses (K, N, 3) of all
+        robots in map are those at the middles of K equal parts of the exposure.
         """
         seen_from = poses[:, camera.robot]
         of_map = camera.view(se2.inverse(seen_from))
@@ -172,10 +164,7 @@ class Renderer:
     def instants(self, camera: RobotCamera, begin: FloatArray, end: FloatArray) -> int:
         """At how many instants of an exposure `light` needs the poses.
 
-        Args:
-            camera: The camera.
-            begin: (N, 3) poses of all robots in map when the shutter opens.
-            end: (N, 3) poses when it closes.
+        Poses (N, 3) of all robots in map are those when the shutter opens and when it closes.
         """
         poses = np.stack([begin, end])
         seen_from = poses[:, camera.robot]

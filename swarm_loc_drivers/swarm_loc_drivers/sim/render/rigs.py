@@ -31,26 +31,18 @@ class Arena:
 
 
 class CameraRig:
-    """The cameras of all robots; for use by one thread.
+    """The cameras of all robots, of one model as calibrated; for use by one thread.
 
-    Args:
-        swarm: As described; every robot has a camera, and every marker shows a heading.
-        truth: Where cameras and markers truly are.
-        arena: Arena around the robots.
-        model: Of all cameras, as calibrated.
-        seed: Draws the look of walls and floor.
-
-    Attributes:
-        scene: What there is to be seen.
-        faces: Of each robot the markers on it, in its base_link.
-        ids: (M,) of all landmarks, and then of the faces of robot after robot.
-        cameras: Of the robots.
+    In the swarm as described, every robot has a camera, and every marker shows a heading; the truth is where
+    these truly are. The seed draws the look of walls and floor.
     """
 
     def __init__(
         self, swarm: Swarm, truth: HiddenGeometry, arena: Arena, model: CameraModel, seed: int
     ) -> None:
-        self.faces, self.ids = _faces(swarm, truth, arena.family), truth.ids
+        self.faces = _faces(swarm, truth, arena.family)  # Of each robot the markers on it, in its base_link
+        self.ids = truth.ids  # (M,) of all landmarks, and then of the faces of robot after robot
+        # What there is to be seen
         self.scene = _scene(swarm, truth, arena, self.faces, np.random.default_rng(seed))
         self._renderer = Renderer(self.scene, model)
         self.cameras = [
@@ -70,11 +62,8 @@ class CameraRig:
     ) -> NDArray[np.uint8]:
         """The image (height, width) of a robot's camera, exposed around `middle_ns`.
 
-        Args:
-            robot: Its index.
-            middle_ns: Middle of the exposure.
-            track: True paths, from half an exposure before to half an exposure after.
-            rng: Source of the sensor's noise.
+        The track is of true paths, from half an exposure before to half an exposure after; `rng` is the
+        source of the sensor's noise.
         """
         return self._renderer.take(self.cameras[robot], middle_ns, track.all_at, rng)
 
@@ -171,11 +160,7 @@ def lying(marks: Sequence[FloorMarker | Face], family: Family) -> list[Patches]:
 class OverheadRig:
     """The overhead camera of one world; for use by one thread.
 
-    Args:
-        scene: What robots' own cameras see.
-        settings: The camera, and the light.
-        markers: Fiducials on the floor, for ground control.
-        family: Their kind.
+    It sees what the robots' own cameras see, and fiducials of a family on the floor, for ground control.
     """
 
     def __init__(

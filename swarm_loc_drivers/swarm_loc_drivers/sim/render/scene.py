@@ -31,12 +31,9 @@ _TOWER_RADIUS, _TOWER_HEIGHT, _TOWER_SIDES = 0.036, TOP_HEIGHT, 5
 
 
 class Surface:
-    """A flat surface that grows by patches on it.
+    """A flat surface that grows by patches on it, from its origin (3,) [m].
 
-    Args:
-        origin: (3,) [m].
-        right: (3,) unit vector, as seen from the front.
-        down: (3,) unit vector, as seen from the front.
+    Right (3,) and down (3,) are unit vectors, as seen from the front.
     """
 
     def __init__(self, origin: FloatArray, right: FloatArray, down: FloatArray) -> None:
@@ -106,13 +103,10 @@ def patches(surfaces: Sequence[Surface]) -> Patches:
 
 
 def marker(pose: Sequence[float], height: float, cells: NDArray[np.bool_], size: float) -> Patches:
-    """A marker on its sheet, one cell wider all round.
+    """A marker on its sheet, one cell wider all round, at x, y [m] and the direction out of its face [rad].
 
-    Args:
-        pose: x, y [m] and the direction out of its face [rad].
-        height: Of its centre [m].
-        cells: (n, n) of the black square, border included; True is white.
-        size: Side of the black square [m].
+    The cells (n, n) are those of the black square, border included; True is white. The square's side, and the
+    height of its centre, are in m.
     """
     return _printed(upright(pose[0], pose[1], height, pose[2]), cells, size)
 
@@ -201,10 +195,8 @@ def top_pattern() -> Patches:
 def shadow(strength: float, towards: float, slope: float) -> Patches:
     """The shadow of an e-puck on the floor, around its centre, with a soft rim.
 
-    Args:
-        strength: Share of the light that it takes.
-        towards: Direction in which it falls, in the frame of the patches [rad].
-        slope: Its length per height.
+    It takes a share of the light, and falls in a direction in the frame of the patches [rad]; `slope` is its
+    length per height.
     """
     floor = level(0.0)
     for grown in _PENUMBRA:

@@ -1,1 +1,1 @@
-"""Scenarios of simulated swarms: eight, grid, dense crowd, table of Droplets."""
+"""Scenarios of simulated swarms: eight, wandering e-pucks, table of Droplets."""

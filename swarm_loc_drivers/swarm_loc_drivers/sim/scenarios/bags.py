@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import cv2
 import numpy as np
@@ -34,7 +34,7 @@ from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator import CONTENT_POSE
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.bags.writer import Stream, write_streams
 from swarm_loc_estimator.common.messages.cdr import (
     ANONYMOUS_DETECTIONS,
     BRIGHTNESS,
@@ -52,7 +52,6 @@ from swarm_loc_estimator.common.messages.detections import (
     encode_detections,
 )
 from swarm_loc_estimator.common.messages.poses import (
-    UNKNOWN_COVARIANCE,
     encode_fix,
     encode_odometry,
     encode_pose_stamped,
@@ -156,25 +155,11 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 JPEG_QUALITY = 85
 
 
-class Stream(NamedTuple):
-    """The messages of one topic with their times of arrival."""
-
-    topic: str
-    type: str
-    arrival_ns: IntArray
-    data: list[bytes]
-
-
 def write_bag(run: SimulatedRun, folder: Path, comment: str) -> int:
-    """Write `<robot>/odom`, `<robot>/detections` and `<robot>/ground_truth` of all robots.
+    """Write `<robot>/odom`, `<robot>/detections` and `<robot>/ground_truth` of all robots to a new folder.
 
-    Args:
-        run: What to write; log times are times of arrival, so that lateness is real on replay.
-        folder: The bag, created; must not exist.
-        comment: First lines of `swarm.yaml`, where the run comes from.
-
-    Returns:
-        Number of messages.
+    Log times are times of arrival, so that lateness is real on replay. The comment, where the run comes from,
+    is the beginning of `swarm.yaml`. Returns the number of messages.
 
     Raises:
         BagError: The folder exists already, or cannot be created.
@@ -214,7 +199,7 @@ def write_image_bag(recorded: ImageRun, folder: Path, comment: str) -> int:
     """
     run, frames = recorded.run, recorded.run.frames
     headers = [
-        message_header(stamp_ns, f"{run.swarm.robots[robot].name}/camera_optical_frame")
+        {"stamp": stamp_ns, "frame_id": f"{run.swarm.robots[robot].name}/camera_optical_frame"}
         for robot, stamp_ns in zip(frames["robot"].tolist(), frames["stamp_ns"].tolist(), strict=True)
     ]
     images = [_image(header, image) for header, image in zip(headers, recorded.images(), strict=True)]
@@ -238,24 +223,14 @@ def _write_run(
     streams = list(shared)
     for robot in range(len(run.swarm.robots)):
         streams += [odometry_stream(run, robot), *sensors(robot), truth_stream(run, robot)]
-    return write_streams(streams, run.swarm, folder, comment)
+    return write_swarm_bag(streams, run.swarm, folder, comment)
 
 
-def write_streams(streams: Sequence[Stream], swarm: Swarm, folder: Path, comment: str) -> int:
+def write_swarm_bag(streams: Sequence[Stream], swarm: Swarm, folder: Path, comment: str) -> int:
     """Write topics in order of arrival, and `swarm.yaml`; arguments and errors as for `write_bag`."""
-    arrival_ns = np.concatenate([stream.arrival_ns for stream in streams])
-    owner = np.repeat(np.arange(len(streams)), [len(stream.data) for stream in streams])
-    place = np.concatenate([np.arange(len(stream.data)) for stream in streams])
-    order = np.argsort(arrival_ns, kind="stable")
-    with BagWriter(folder, compress=True) as bag:
-        for stream in streams:
-            bag.add_topic(stream.topic, stream.type)
-        for which, at_ns, one in zip(
-            owner[order].tolist(), arrival_ns[order].tolist(), place[order].tolist(), strict=True
-        ):
-            bag.write(streams[which].topic, at_ns, streams[which].data[one])
+    count = write_streams(folder, streams)
     save_swarm(swarm, folder / "swarm.yaml", comment)
-    return len(order)
+    return count
 
 
 def odometry_stream(run: LivedRun, robot: int) -> Stream:
@@ -268,15 +243,7 @@ def odometry_stream(run: LivedRun, robot: int) -> Stream:
     twist = np.zeros((len(rows), 3))
     motion = se2.log(se2.between(pose[:-1], pose[1:]))
     twist[by_stamp[1:]] = motion / np.diff(stamps_s)[:, None]
-    data = encode_odometry(
-        f"{name}/odom",
-        f"{name}/base_link",
-        rows["stamp_ns"],
-        rows["pose"],
-        twist,
-        UNKNOWN_COVARIANCE,
-        UNKNOWN_COVARIANCE,
-    )
+    data = encode_odometry(f"{name}/odom", f"{name}/base_link", rows["stamp_ns"], rows["pose"], twist)
     return Stream(f"{name}/odom", ODOMETRY, rows["arrival_ns"], data)
 
 
@@ -322,8 +289,7 @@ def as_detections(run: SimulatedRun) -> Records:
 def marker_orientation(heading: np.typing.NDArray[np.float64]) -> np.typing.NDArray[np.float64]:
     """Quaternions (S, 4) x y z w, in the optical frame, of upright markers.
 
-    Args:
-        heading: (S,) direction out of the face [rad], 0 along the optical axis, positive to the left.
+    `heading` (S,) is the direction out of the face [rad], 0 along the optical axis, positive to the left.
     """
     sin, cos, zero = np.sin(heading), np.cos(heading), np.zeros_like(heading)
     right = np.stack([-cos, zero, -sin], axis=-1)
@@ -337,9 +303,9 @@ def marker_orientation(heading: np.typing.NDArray[np.float64]) -> np.typing.NDAr
 
 def _arriving(rng: np.random.Generator, run: DropletRun, stream: Stream) -> Stream:
     """The part of a stream that arrives, with times of arrival in place of times of publication."""
-    late_ns = arrival_ns(rng, stream.arrival_ns, CAMERA_LATENESS)
+    late_ns = arrival_ns(rng, stream.log_ns, CAMERA_LATENESS)
     kept = np.flatnonzero(survivors(rng, len(stream.data), LOSS) & (late_ns <= run.end_ns))
-    return stream._replace(arrival_ns=late_ns[kept], data=[stream.data[k] for k in kept])
+    return stream._replace(log_ns=late_ns[kept], data=[stream.data[k] for k in kept])
 
 
 def _brightness(run: DropletRun, robot: int) -> Stream:
@@ -368,11 +334,6 @@ def _fixes(run: DropletRun, robot: int) -> Stream:
     data = [encode_fix("map", fix.stamp_ns, fix.pose, covariance) for fix in own]
     stamps_ns = np.array([fix.stamp_ns for fix in own], dtype=np.int64)
     return Stream(f"{run.swarm.robots[robot].name}/fix", POSE_WITH_COVARIANCE, stamps_ns, data)
-
-
-def message_header(stamp_ns: int, frame: str) -> dict[str, Any]:
-    """A std_msgs/Header to encode."""
-    return {"stamp": stamp_ns, "frame_id": frame}
 
 
 def _image(header: dict[str, Any], image: NDArray[np.uint8]) -> bytes:

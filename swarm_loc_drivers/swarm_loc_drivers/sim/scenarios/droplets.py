@@ -80,12 +80,9 @@ def starts(settings: DropletRunSettings) -> FloatArray:
 def describe_droplets(
     settings: DropletRunSettings, start: FloatArray, gains: Sequence[IrGains] = ()
 ) -> Swarm:
-    """The swarm description.
+    """The swarm description of robots that begin at poses (N, 3) in map.
 
-    Args:
-        settings: Which swarm.
-        start: (N, 3) in map.
-        gains: What is known of each robot's elements; empty: nothing.
+    Gains are what is known of each robot's elements; empty: nothing.
     """
     platform = load_ir_platform("droplet")
     return Swarm(
@@ -104,12 +101,9 @@ def describe_droplets(
 
 
 class Wander:
-    """Steers each robot to places around its home, one after the other, with turns in between.
+    """Steers each robot to places around its home (N, 3) in map, one after the other, with turns in between.
 
-    Args:
-        homes: (N, 3) around which they wander, in map.
-        walking: (N,) which robots wander; the others stand.
-        seed: Fixes the places.
+    Only those that are `walking` (N,) wander; the others stand. The seed fixes the places.
     """
 
     def __init__(self, homes: FloatArray, walking: FloatArray, seed: int) -> None:
@@ -120,10 +114,7 @@ class Wander:
     def command(self, robot: int, stamp_ns: int, pose: FloatArray) -> tuple[float, float, float]:
         """The velocity of a robot: forward [m/s], to the left [m/s], turning to the left [rad/s].
 
-        Args:
-            robot: Its index.
-            stamp_ns: When it was at `pose`.
-            pose: (3,) in map.
+        At `stamp_ns` it was at the pose (3,) in map.
         """
         if not self._walking[robot]:
             return 0.0, 0.0, 0.0

@@ -35,11 +35,7 @@ _TABLE_SIZE = 20001
 
 
 class Lemniscate:
-    """x = a cos t / (1 + sin^2 t), y = x sin t, by the length travelled from its right end.
-
-    Args:
-        half_width: a [m].
-    """
+    """x = a cos t / (1 + sin^2 t), y = x sin t, by the length travelled from its right end; a is in m."""
 
     def __init__(self, half_width: float) -> None:
         self.half_width = half_width
@@ -204,11 +200,9 @@ def follow(path: Lemniscate, offset: FloatArray, speed: float, step_s: float) ->
 
 
 class EightSteering:
-    """Keeps each robot at its place on the eight, which moves on at constant speed.
+    """Keeps each robot at its place on the eight, which moves on at constant speed [m/s].
 
-    Args:
-        robots: How many; robot i begins i-th of as many equal parts along the eight.
-        speed: [m/s].
+    Robot i begins i-th of as many equal parts along the eight as there are robots.
     """
 
     def __init__(self, robots: int, speed: float) -> None:
@@ -217,12 +211,9 @@ class EightSteering:
         self._begin_ns: int | None = None
 
     def command(self, robot: int, stamp_ns: int, pose: FloatArray) -> Velocity:
-        """The velocity of a robot now.
+        """The velocity of a robot now, from the pose (3,) in map that it had at a stamp.
 
-        Args:
-            robot: Its index.
-            stamp_ns: When it was at `pose`; the first one of all robots is when the eight begins.
-            pose: (3,) in map.
+        The first stamp of all robots is when the eight begins.
         """
         if self._begin_ns is None or stamp_ns < self._begin_ns:
             self._begin_ns = stamp_ns

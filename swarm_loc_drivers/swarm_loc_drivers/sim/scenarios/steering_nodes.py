@@ -41,12 +41,7 @@ class TruthSteering:
     """Turns `<robot>/ground_truth` into `<robot>/cmd_vel` once all robots have sent odometry.
 
     A driver may subscribe before its robot is connected; the target would then move on without that robot.
-
-    Args:
-        node: Owner of the subscriptions.
-        names: Of the robots.
-        steer: Computes the commands.
-        awaited: Topics that must have publishers before the robots drive.
+    `steer` computes the commands; awaited topics must have publishers before the robots drive.
     """
 
     def __init__(self, node: Node, names: Sequence[str], steer: Steer, awaited: Sequence[str] = ()) -> None:

@@ -120,14 +120,10 @@ def unpack(stored: bytes, chunk: Chunk) -> bytes:
 def find_messages(
     data: NDArray[np.uint8], begin: int, numbers: IntArray, columns: IntArray, count: int
 ) -> MessageScan:
-    """Note the messages from an offset on up to a record that is none, or is not whole.
+    """Note the messages from `begin` on up to a record that is none, or is not whole.
 
-    Args:
-        data: Records.
-        begin: Where to begin.
-        numbers: Channel -> number of its topic, or UNWANTED, or UNKNOWN.
-        columns: (4, n) written: topic, log time, offset and length of each message.
-        count: How many stand there already.
+    `numbers` has of each channel the number of its topic, or UNWANTED, or UNKNOWN. `columns` (4, n) are
+    written: topic, log time, offset and length of each message; `count` of them stand there already.
     """
     offset, others, unknown, untimed = begin, 0, 0, 0
     while offset + _RECORD_HEAD + MESSAGE_HEAD <= data.size and data[offset] == _IS_MESSAGE:
@@ -168,12 +164,7 @@ _DEFINITIONS = {Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS, Opcode.CHUNK_I
 
 
 class McapFile:
-    """One open MCAP file.
-
-    Attributes:
-        message_count: Number of messages, as far as they can be counted before reading.
-        losses: What could not be read; more may come while reading.
-    """
+    """One open MCAP file."""
 
     def __init__(self, path: Path) -> None:
         """Open it; raises BagError if it is no MCAP file."""
@@ -186,8 +177,8 @@ class McapFile:
         self._whole = False
         self._bytes_read = 0
         self._skipped: Counter[str] = Counter()
-        self.losses = ReadErrors(path.name)
-        self.message_count = 0
+        self.losses = ReadErrors(path.name)  # What could not be read; more may come while reading
+        self.message_count = 0  # Number of messages, as far as they can be counted before reading
         if path.exists() and not path.is_file():
             raise BagError(f"{path} is no file.")  # opening a pipe would never return
         try:

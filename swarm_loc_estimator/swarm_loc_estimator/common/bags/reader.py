@@ -41,12 +41,9 @@ _ERRORS = (zstandard.ZstdError, EOFError, RuntimeError)
 
 
 def unpack_file(path: Path, folder: Path, losses: list[str]) -> Path:
-    """Unpack a compressed file into a folder; of a damaged one, the part before the damage.
+    """Unpack a file with a suffix of `PACKED` into a folder; of a damaged one, the part before the damage.
 
-    Args:
-        path: The file, with a suffix of `PACKED`.
-        folder: Where to write.
-        losses: One sentence is added about a damaged file.
+    A sentence about a damaged file is added to `losses`.
 
     Raises:
         BagError: It is no file, or needs more than half of the free disk space.
@@ -132,9 +129,6 @@ class BagReader:
         path: A rosbag2 folder, or an .mcap or .db3 file, plain or compressed.
         renamed: Topic of the bag -> the name that it has here; a topic of that name in the bag is hidden.
 
-    Attributes:
-        offered_qos: Topic -> what its publishers offered, as far as a folder's metadata know it.
-
     Raises:
         BagError: There is nothing to read.
     """
@@ -142,6 +136,7 @@ class BagReader:
     def __init__(self, path: Path, renamed: Mapping[str, str] = MappingProxyType({})) -> None:
         self._path = path
         self._renamed = renamed
+        # Topic -> what its publishers offered, as far as a folder's metadata know it
         self.offered_qos: dict[str, list[Qos]] = {}
         self._files: list[BagFile] = []
         self._own_losses = ReadErrors(path.name)
@@ -182,14 +177,7 @@ class BagReader:
         return sum(file.progress for file in self._files) / len(self._files)
 
     def messages(self, topics: Collection[str] | None = None) -> Iterator[RawMessage]:
-        """All messages in order of log time.
-
-        Args:
-            topics: Names of the topics to read; all when left out.
-
-        Yields:
-            (topic, type, log time [ns], serialized message).
-        """
+        """Messages, of all or of some topics, by log time: topic, type, log time [ns], serialized message."""
         wanted = None if topics is None else {name.lstrip("/") for name in topics}
         read = [topic for topic in self.topics if wanted is None or topic.name in wanted]
         for batch in self._batches({topic: number for number, topic in enumerate(read)}):
@@ -197,11 +185,7 @@ class BagReader:
                 yield read[number].name, read[number].type, log_ns, data
 
     def batches(self, topics: Sequence[str]) -> Iterator[MessageBatch]:
-        """All messages of some topics in order of log time, many at once.
-
-        Args:
-            topics: Names; their place here is the topic's number in the batches.
-        """
+        """Messages in order of log time, many at once; topics are numbered by their place in `topics`."""
         number_of = {name.lstrip("/"): number for number, name in enumerate(topics)}
         return self._batches({t: number_of[t.name] for t in self.topics if t.name in number_of})
 
@@ -344,9 +328,8 @@ def _part_number(path: Path) -> tuple[int, str]:
 def offered_qos(metadata: dict[str, Any]) -> dict[str, list[Qos]]:
     """The profiles of each topic's publishers, by its name without the leading slash.
 
-    Args:
-        metadata: What stands below `rosbag2_bagfile_information`; topics that are not described as they
-            should be have no profiles.
+    `metadata` is what stands below `rosbag2_bagfile_information`; topics that are not described as they
+    should be have no profiles.
     """
     topics = metadata.get("topics_with_message_count")
     profiles: dict[str, list[Qos]] = {}

@@ -7,12 +7,13 @@ Equal input gives equal bytes, so that a bag can be compared and kept in version
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
@@ -21,6 +22,7 @@ from rosbags.rosbag2.enums import CompressionFormat, CompressionMode
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from typing_extensions import Self
 
+from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.bag_file import BagError
 from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS, MESSAGE_PACKAGE, message_folder
 
@@ -113,9 +115,7 @@ class _Rosbag2Writer(Writer):
 class BagWriter:
     """A new bag; use it as a context manager, an error inside leaves no bag behind.
 
-    Args:
-        path: Folder to create; must not exist.
-        compress: Whether chunks are compressed with zstd.
+    Its folder must not exist. With `compress`, chunks are compressed with zstd.
 
     Raises:
         BagError: The folder is there already, or cannot be created.
@@ -135,12 +135,8 @@ class BagWriter:
     def add_topic(self, name: str, message_type: str, *, is_latched: bool = False) -> None:
         """Announce a topic, such as robot1/odom of nav_msgs/msg/Odometry.
 
-        Names are written fully qualified, as a recorder writes them.
-
-        Args:
-            name: Of the topic.
-            message_type: Of its messages.
-            is_latched: Whether its publisher is said to have kept the newest for late subscribers.
+        Names are written fully qualified, as a recorder writes them. The publisher of a latched one is said
+        to have kept the newest message for late subscribers.
         """
         topic = "/" + name.lstrip("/")
         self._connections[name] = self._writer.add_connection(
@@ -165,3 +161,40 @@ class BagWriter:
         else:
             self._writer.abort()
             shutil.rmtree(self._path, ignore_errors=True)
+
+
+class Stream(NamedTuple):
+    """The messages of one topic with their log times."""
+
+    topic: str
+    type: str
+    log_ns: IntArray
+    data: list[bytes]
+
+
+_REPORT_EVERY = 5000
+
+
+def write_streams(
+    folder: Path, streams: Sequence[Stream], progress: Callable[[float], None] = lambda _: None
+) -> int:
+    """Write messages as a new, compressed bag in order of log time, equal times in the order of the streams.
+
+    `progress` is called now and then with the share done. Returns the number of messages.
+
+    Raises:
+        BagError: The folder is there already, or cannot be created.
+    """
+    log_ns = np.concatenate([stream.log_ns for stream in streams])
+    owner = np.repeat(np.arange(len(streams)), [len(stream.data) for stream in streams])
+    place = np.concatenate([np.arange(len(stream.data)) for stream in streams])
+    order = np.argsort(log_ns, kind="stable")
+    columns = (column[order].tolist() for column in (log_ns, owner, place))
+    with BagWriter(folder, compress=True) as bag:
+        for stream in streams:
+            bag.add_topic(stream.topic, stream.type)
+        for done, (at_ns, which, one) in enumerate(zip(*columns, strict=True)):
+            bag.write(streams[which].topic, at_ns, streams[which].data[one])
+            if done % _REPORT_EVERY == 0:
+                progress(done / len(order))
+    return len(order)

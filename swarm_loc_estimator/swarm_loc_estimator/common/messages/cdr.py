@@ -245,12 +245,10 @@ def decode(data: bytes, message_type: str, places: dict[str, list[int]] | None =
 
 
 def encode(message: object, message_type: str) -> bytes:
-    """Serialize a message.
+    """Serialize a mapping, or an object with attributes, as `decode` returns it, as a message of a type.
 
-    Args:
-        message: A mapping, or an object with attributes, as `decode` returns it. Fields that it lacks are
-            zero or empty. A stamp may be given in nanoseconds, points or colours as an array (n, fields).
-        message_type: Its type.
+    Fields that it lacks are zero or empty. A stamp may be given in nanoseconds, points or colours as an array
+    (n, fields).
     """
     writer = _CdrWriter()
     writer.message(message, message_type)

@@ -121,14 +121,9 @@ def encode_anonymous(frame_id: str, stamp_ns: int, detections: Rows) -> bytes:
 def encode_identities(
     frame_id: str, stamp_ns: int, names: Sequence[str], place: IntArray, probability: FloatArray
 ) -> bytes:
-    """Serialize one swarm_loc_msgs/RobotIdentities.
+    """Serialize one swarm_loc_msgs/RobotIdentities of N robots in an aerial image.
 
-    Args:
-        frame_id: Frame of the aerial detections.
-        stamp_ns: Of the image.
-        names: N robots.
-        place: (N,) which detection each is; -1: not known.
-        probability: (N,) of that.
+    `place` (N,) is which detection each is, -1 for not known, and `probability` (N,) that of it.
     """
     columns = zip(names, place.tolist(), probability.tolist(), strict=True)
     identities = [{"name": name, "detection": which, "probability": sure} for name, which, sure in columns]
@@ -174,9 +169,7 @@ def swarm_key(names: Iterable[str]) -> int:
 def decode_shared_numbers(data: bytes, widths: tuple[int, ...]) -> SharedMessage:
     """Read a swarm_loc_msgs/SwarmOdometry or SwarmFixes.
 
-    Args:
-        data: The serialized message.
-        widths: How many numbers a reading has in each column.
+    `widths` are the numbers that a reading has in each column.
 
     Raises:
         CdrError: The bytes are not one whole message, or its columns differ in length.

@@ -42,13 +42,9 @@ def encode_events(events: Events) -> bytes:
 def decode_events(
     data: bytes | bytearray | memoryview, encoding: str, size: tuple[int, int], *, is_bigendian: bool = False
 ) -> Events:
-    """The events of a packet.
+    """The events of a packet in anything that has a buffer; `size` is width and height of the sensor [px].
 
-    Args:
-        data: Its bytes; anything that has a buffer.
-        encoding: Its encoding; only `mono` is known.
-        size: Width and height of the sensor [px].
-        is_bigendian: Order of the bytes of an event.
+    Only the encoding `mono` is known.
 
     Raises:
         EventError: Another encoding, a cut event, one outside of the sensor, or times that step back.

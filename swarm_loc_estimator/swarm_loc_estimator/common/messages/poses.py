@@ -131,8 +131,8 @@ def encode_odometry(
     stamp_ns: IntArray,
     pose: FloatArray,
     twist: FloatArray,
-    covariance: FloatArray,
-    twist_covariance: FloatArray,
+    covariance: FloatArray = UNKNOWN_COVARIANCE,
+    twist_covariance: FloatArray = UNKNOWN_COVARIANCE,
 ) -> list[bytes]:
     """Serialize nav_msgs/Odometry of one robot.
 
@@ -164,16 +164,9 @@ def encode_pose_stamped(frame_id: str, stamp_ns: IntArray, pose: FloatArray) -> 
 
 
 def encode_poses(frame_id: str, stamp_ns: IntArray, pose: FloatArray, covariance: FloatArray) -> list[bytes]:
-    """Serialize geometry_msgs/PoseWithCovarianceStamped of the plane.
+    """Serialize N geometry_msgs/PoseWithCovarianceStamped of the plane.
 
-    Args:
-        frame_id: Frame of the poses, `map`.
-        stamp_ns: (N,) when the robots were there.
-        pose: (N, 3) x [m], y [m], yaw [rad].
-        covariance: (N, 3, 3) of them.
-
-    Returns:
-        N messages.
+    They are of stamps (N,), poses (N, 3) x [m], y [m], yaw [rad] and their covariances (N, 3, 3).
     """
     numbers = np.zeros((len(pose), POSE_DOUBLES + 36))
     numbers[:, :POSE_DOUBLES] = position_and_quaternion(pose)
@@ -225,28 +218,21 @@ def _bytes_from(offsets: Sequence[int], size: int) -> NDArray[np.intp]:
 
 
 class _Layout:
-    """Where the numbers stand in a SwarmPoses, as long as its other bytes are the same.
-
-    Attributes:
-        frame_id: Frame of the poses.
-        names: N robots.
-        numbers: (N, 104) indices of the bytes of each robot's numbers.
-        states: (N, 2) indices of the status, and of whether the heading is known.
-        others: (m,) indices of all bytes but these and the stamp.
-        expected: (m,) these bytes.
-    """
+    """Where the numbers stand in a SwarmPoses, as long as its other bytes are the same."""
 
     def __init__(self, data: bytes) -> None:
         places: dict[str, list[int]] = {}
         message = decode(data, SWARM_POSES, places)
-        self.frame_id: str = message.header.frame_id
-        self.names = tuple(robot.name for robot in message.robots)
+        self.frame_id: str = message.header.frame_id  # Frame of the poses
+        self.names = tuple(robot.name for robot in message.robots)  # N robots
+        # (N, 104) indices of the bytes of each robot's numbers
         self.numbers = _bytes_from(places.get("robots.x", []), 8 * _DOUBLES)
+        # (N, 2) indices of the status, and of whether the heading is known
         self.states = _bytes_from(places.get("robots.status", []), 2)
         is_other = np.ones(len(data), dtype=np.bool_)
         is_other[_STAMP] = is_other[self.numbers] = is_other[self.states] = False
-        self.others = np.flatnonzero(is_other)
-        self.expected = np.frombuffer(data, np.uint8)[self.others]
+        self.others = np.flatnonzero(is_other)  # (m,) indices of all bytes but these and the stamp
+        self.expected = np.frombuffer(data, np.uint8)[self.others]  # (m,) these bytes
 
 
 class SwarmPosesReader:
@@ -279,12 +265,7 @@ class SwarmPosesReader:
 
 
 class SwarmPosesEncoder:
-    """Serializes swarm_loc_msgs/SwarmPoses.
-
-    Args:
-        names: The robots'.
-        frame_id: Frame of the poses.
-    """
+    """Serializes swarm_loc_msgs/SwarmPoses of robots with these names, in one frame."""
 
     def __init__(self, names: list[str], frame_id: str) -> None:
         robots = [{"name": name} for name in names]
@@ -311,12 +292,7 @@ class SwarmPosesEncoder:
 
 
 class TransformsEncoder:
-    """Serializes tf2_msgs/TFMessage from one frame to those of some robots.
-
-    Args:
-        frame_id: The parent.
-        children: All robots' child frames.
-    """
+    """Serializes tf2_msgs/TFMessage from one frame to the child frames of all robots."""
 
     def __init__(self, frame_id: str, children: list[str]) -> None:
         self._header = {"frame_id": frame_id}

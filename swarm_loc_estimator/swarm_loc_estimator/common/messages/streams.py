@@ -213,21 +213,15 @@ class PoseColumns:
 
 
 class PoseReader:
-    """Reads messages that begin with a header, names and a pose.
+    """Reads messages, of some number of topics, that begin with a header, names and a pose.
 
-    Args:
-        topics: How many there are.
-        decode: The complete reader of one message.
-        names: How many frame names lie before the pose, the header's among them.
-
-    Attributes:
-        frame_ids: Per topic the frame of the newest message, "" before the first.
+    `decode` reads one message completely. `names` frame names lie before the pose, that of the header, too.
     """
 
     def __init__(
         self, topics: int, decode: Callable[[bytes], OdometryMessage | PoseMessage | FixMessage], names: int
     ) -> None:
-        self.frame_ids = [""] * topics
+        self.frame_ids = [""] * topics  # Per topic the frame of the newest message, "" before the first
         self._decode = decode
         self._names = names
         self._models = _no_models(topics)
@@ -276,17 +270,10 @@ class DetectionColumns:
 
 
 class DetectionReader:
-    """Reads swarm_loc_msgs/MarkerDetectionArray.
-
-    Args:
-        topics: How many there are.
-
-    Attributes:
-        frame_ids: Per topic the frame of the newest message, "" before the first.
-    """
+    """Reads swarm_loc_msgs/MarkerDetectionArray of some number of topics."""
 
     def __init__(self, topics: int) -> None:
-        self.frame_ids = [""] * topics
+        self.frame_ids = [""] * topics  # Per topic the frame of the newest message, "" before the first
         self._models = _no_models(topics)
 
     def read(self, batch: MessageBatch) -> DetectionColumns:
@@ -337,16 +324,11 @@ class Messages(Generic[Message]):
 class EachReader(Generic[Message]):
     """Reads messages one by one, which is enough for what comes some hundred times a second.
 
-    Args:
-        topics: How many there are.
-        decode: Decodes one message; raises ValueError, LookupError or struct.error if it is malformed.
-
-    Attributes:
-        frame_ids: Per topic the frame of the newest message, "" before the first.
+    `decode` raises ValueError, LookupError or struct.error if a message is malformed.
     """
 
     def __init__(self, topics: int, decode: Callable[[bytes], Message]) -> None:
-        self.frame_ids = [""] * topics
+        self.frame_ids = [""] * topics  # Per topic the frame of the newest message, "" before the first
         self._decode: Callable[[bytes], Message] = decode
 
     def read(self, batch: MessageBatch) -> Messages[Message]:

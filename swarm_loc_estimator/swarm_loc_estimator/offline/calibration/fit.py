@@ -347,13 +347,10 @@ class Calibration:
 
 
 def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> Calibration:
-    """Fit cameras, motion and noise.
+    """Fit cameras, motion and noise to a recording with ground truth of at least one robot.
 
-    Args:
-        recording: With ground truth of at least one robot.
-        swarm: The description to begin with.
-        options: What is fitted.
-        progress: Called now and then with the share done and what is being done.
+    `swarm` is the description to begin with. `progress` is called now and then with the share done and what
+    is being done.
 
     Raises:
         CalibrationError: There is no or too little ground truth, or the clock of the recording jumps.

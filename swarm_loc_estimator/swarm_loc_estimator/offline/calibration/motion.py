@@ -311,12 +311,10 @@ def fit_lateness(drives: Sequence[Drive]) -> Lateness:
 
 
 def nodes_of(values: FloatArray, duration_s: FloatArray, count: int) -> FloatArray:
-    """Grid points for reported values (n,): 0, and points evenly spaced over the frequent ones.
+    """Grid points for reported values (n,): 0, and `count` points evenly spaced over the frequent ones.
 
-    Args:
-        values: Absolute speeds or turn rates.
-        duration_s: (n,) how long each held.
-        count: Points above 0; fewer where the values hardly vary.
+    Values are absolute speeds or turn rates, which held for durations (n,). There are fewer points where they
+    hardly vary.
     """
     used = values > _MOVING
     if not used.any():

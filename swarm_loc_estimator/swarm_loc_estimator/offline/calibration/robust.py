@@ -27,15 +27,9 @@ def softened(residuals: FloatArray) -> FloatArray:
 def fit_with_prior(
     residuals: Callable[[FloatArray], FloatArray], mean: FloatArray, sigma: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Robust least squares about a normal prior.
+    """Robust least squares of residuals (m,) in sigmas about a normal prior of the parameters (p,).
 
-    Args:
-        residuals: From parameters (p,) to residuals (m,) in sigmas.
-        mean: (p,) of the prior, where the search begins.
-        sigma: (p,) of the prior; positive.
-
-    Returns:
-        The parameters (p,) and their standard deviations (p,).
+    The search begins at the mean of the prior. Returns the parameters and their standard deviations (p,).
     """
 
     def cost(scaled: FloatArray) -> FloatArray:

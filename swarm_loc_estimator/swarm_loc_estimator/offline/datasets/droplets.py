@@ -301,12 +301,10 @@ class Fiducials:
 def find_fiducials(
     exchanges: Sequence[Exchange], poses: Sequence[Mapping[int, CameraPose]], angles: FloatArray
 ) -> Fiducials:
-    """Find the orientation of all fiducials.
+    """Find the orientation of all fiducials of a recording.
 
-    Args:
-        exchanges: All of a recording.
-        poses: One mapping per exchange: robot -> pose in the image.
-        angles: (n,) directions of the elements in base_link [rad].
+    `poses` has one mapping per exchange: robot -> pose in the image; angles (n,) are directions of the
+    elements in base_link [rad].
 
     Raises:
         DropletRecordingError: Matrices and camera contradict each other however the image is turned.

@@ -20,7 +20,7 @@ from scipy.optimize import linear_sum_assignment
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.bags.writer import Stream, write_streams
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry, encode_pose_stamped
@@ -236,7 +236,6 @@ TIMEOUT_S = 2.0
 """The logs pause for just over a second about every two minutes, while the robots keep driving."""
 
 _FAMILY_OTHER = 255
-_REPORT_EVERY = 5000
 _SERIALIZING = 0.3  # Share of the progress before writing
 
 _MAX_CUT_NS = 120_000_000_000
@@ -260,16 +259,6 @@ class MrclamImport:
     remarks: tuple[str, ...]  # Missing data, corrected barcodes and late starts, one sentence each
 
 
-@dataclass(frozen=True)
-class _Stream:
-    """The messages of one topic in order of log time."""
-
-    topic: str
-    type: str
-    log_ns: IntArray
-    data: list[bytes]
-
-
 def convert(
     dataset: Dataset, folder: Path, delay: Delay, progress: Callable[[float, str], None]
 ) -> MrclamImport:
@@ -279,7 +268,7 @@ def convert(
         BagError: The folder is there already, or cannot be created.
     """
     rng = np.random.default_rng(delay.seed)
-    streams: list[_Stream] = []
+    streams: list[Stream] = []
     robots = [from_truth_on(robot) for robot in dataset.robots]
     begin_ns = min(int(robot.odometry.stamp_ns[0]) for robot in robots) - _MARGIN_NS
     end_ns = max(int(robot.odometry.stamp_ns[-1]) for robot in robots) + _MARGIN_NS
@@ -288,7 +277,9 @@ def convert(
         streams += [_odometry(robot), _detections(robot, delay, rng)]
         if robot.truth is not None:
             streams.append(_truth(robot.subject, robot.truth, begin_ns, end_ns))
-    count = _write(folder, streams, progress)
+    count = write_streams(
+        folder, streams, lambda share: progress(_SERIALIZING + (1.0 - _SERIALIZING) * share, "writing")
+    )
     pairs = zip(dataset.robots, robots, strict=True)
     remarks = [*dataset.remarks, *(remark for whole, used in pairs for remark in _start_remarks(whole, used))]
     save_swarm(describe(dataset, robots), folder / "swarm.yaml", "\n".join(remarks))
@@ -369,23 +360,15 @@ def _start(robot: RobotLog) -> Pose2 | None:
     return x, y, theta
 
 
-def _odometry(robot: RobotLog) -> _Stream:
+def _odometry(robot: RobotLog) -> Stream:
     """Commands as odometry; arrival equals stamp."""
     name, stamp_ns = f"robot{robot.subject}", robot.odometry.stamp_ns
     twist = np.column_stack([robot.twist[:, 0], np.zeros(len(stamp_ns)), robot.twist[:, 1]])
-    data = encode_odometry(
-        f"{name}/odom",
-        f"{name}/base_link",
-        stamp_ns,
-        robot.odometry.pose,
-        twist,
-        UNKNOWN_COVARIANCE,
-        UNKNOWN_COVARIANCE,
-    )
-    return _Stream(f"{name}/odom", ODOMETRY, stamp_ns, data)
+    data = encode_odometry(f"{name}/odom", f"{name}/base_link", stamp_ns, robot.odometry.pose, twist)
+    return Stream(f"{name}/odom", ODOMETRY, stamp_ns, data)
 
 
-def _detections(robot: RobotLog, delay: Delay, rng: np.random.Generator) -> _Stream:
+def _detections(robot: RobotLog, delay: Delay, rng: np.random.Generator) -> Stream:
     """Sightings of one stamp as one message, late by the delay."""
     name = f"robot{robot.subject}"
     stamp_ns, first = np.unique(robot.sighting_ns, return_index=True)
@@ -398,7 +381,7 @@ def _detections(robot: RobotLog, delay: Delay, rng: np.random.Generator) -> _Str
     ]
     late_ns = rng.integers(delay.low_ns, delay.high_ns, len(stamp_ns), endpoint=True)
     order = np.argsort(stamp_ns + late_ns, kind="stable")
-    return _Stream(
+    return Stream(
         f"{name}/detections", DETECTIONS, (stamp_ns + late_ns)[order], [data[index] for index in order]
     )
 
@@ -419,28 +402,9 @@ def _detection_rows(robot: RobotLog) -> npt.NDArray[np.void]:
     return rows
 
 
-def _truth(subject: int, truth: Trajectory, begin_ns: int, end_ns: int) -> _Stream:
+def _truth(subject: int, truth: Trajectory, begin_ns: int, end_ns: int) -> Stream:
     """Ground truth between the first and the last odometry."""
     inside = (truth.stamp_ns >= begin_ns) & (truth.stamp_ns <= end_ns)
     stamp_ns = truth.stamp_ns[inside]
     data = encode_pose_stamped("map", stamp_ns, truth.pose[inside])
-    return _Stream(f"robot{subject}/ground_truth", POSE_STAMPED, stamp_ns, data)
-
-
-def _write(folder: Path, streams: list[_Stream], progress: Callable[[float, str], None]) -> int:
-    """Write all messages in order of arrival, equal times in the order of the streams."""
-    log_ns = np.concatenate([stream.log_ns for stream in streams])
-    source = np.repeat(np.arange(len(streams)), [len(stream.data) for stream in streams])
-    order = np.argsort(log_ns, kind="stable")
-    readers = [iter(stream.data) for stream in streams]
-    names = [stream.topic for stream in streams]
-    with BagWriter(folder, compress=True) as bag:
-        for stream in streams:
-            bag.add_topic(stream.topic, stream.type)
-        for done, (at_ns, index) in enumerate(
-            zip(log_ns[order].tolist(), source[order].tolist(), strict=True)
-        ):
-            bag.write(names[index], at_ns, next(readers[index]))
-            if done % _REPORT_EVERY == 0:
-                progress(_SERIALIZING + (1.0 - _SERIALIZING) * done / len(order), "writing")
-    return len(order)
+    return Stream(f"robot{subject}/ground_truth", POSE_STAMPED, stamp_ns, data)

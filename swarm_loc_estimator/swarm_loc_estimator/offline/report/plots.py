@@ -122,13 +122,7 @@ _MARGIN = 0.05  # Margin around the world, as a share of its size
 
 
 class WorldMap:
-    """Draws a result on a map; all lengths in metres.
-
-    Attributes:
-        x: Limits from truth and landmarks; without truth, from estimates.
-        y: Limits in y.
-        radius: Of the disc of a robot.
-    """
+    """Draws a result on a map; all lengths in metres."""
 
     def __init__(self, result: ReplayResult) -> None:
         self._result = result
@@ -140,8 +134,10 @@ class WorldMap:
         every = every[np.isfinite(every).all(axis=1)]
         low, high = (every.min(axis=0), every.max(axis=0)) if len(every) else (np.zeros(2), np.zeros(2))
         margin = _MARGIN * max(float((high - low).max()), 0.5)
+        # Limits from truth and landmarks; without truth, from estimates
         self.x = (float(low[0]) - margin, float(high[0]) + margin)
-        self.y = (float(low[1]) - margin, float(high[1]) + margin)
+        self.y = (float(low[1]) - margin, float(high[1]) + margin)  # Limits in y
+        # Of the disc of a robot
         self.radius = 0.014 * self.width / max(1.0, len(result.swarm.robots) / 30) ** 0.5
 
     @property

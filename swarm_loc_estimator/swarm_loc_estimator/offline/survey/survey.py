@@ -385,12 +385,8 @@ def survey(
 ) -> Surveyed:
     """Find the landmarks and anchors of a recording in which robots drove around.
 
-    Args:
-        recording: Odometry, detections and ranges.
-        swarm: The robots. Landmarks that it describes, and starts, give the frame; without any, the first
-            pose of the robot that has seen most is the origin.
-        progress: Called now and then.
-        cameras: Whether described fixed cameras are placed again.
+    Landmarks that `swarm` describes, and starts, give the frame; without any, the first pose of the robot
+    that has seen most is the origin. With `cameras`, described fixed cameras are placed again.
 
     Raises:
         CalibrationError: Nobody has moved, or no marker that belongs to nobody was seen often enough.

@@ -87,20 +87,17 @@ class BoardModel:
     angles: FloatArray  # (2, k, n, n) angles of the paths at sensors and emitters [rad]
 
 
-def fit_board(start: IrPlatform, data: BoardReadings, robots: int, *, gains: bool = True) -> BoardModel:
-    """Fit a board, starting from an approximate platform.
+def fit_board(start: IrPlatform, data: BoardReadings, robots: int) -> BoardModel:
+    """Fit a board to exchanges with finite poses, starting from an approximate platform.
 
-    Args:
-        start: Platform that defines arrangement, saturation and initial noise.
-        data: Exchanges; poses must be finite.
-        robots: Number of robots.
-        gains: Whether to estimate gains of sensors with enough exchanges.
+    The platform defines arrangement, saturation and initial noise. Gains of sensors with enough exchanges are
+    estimated, too.
     """
     noise = round(noise_floor(data), 2)
     platform = replace(start, noise=noise, curve_sigma=0.3, relative_noise=0.0, element_sigma=0.0)
-    unknowns = _Problem(platform, data, robots, gains=gains).first_unknowns()
+    unknowns = _Problem(platform, data, robots).first_unknowns()
     for _ in range(_ROUNDS):
-        problem = _Problem(platform, data, robots, gains=gains)
+        problem = _Problem(platform, data, robots)
         unknowns = least_squares(
             problem.residuals, unknowns, problem.slopes, x_scale="jac", max_nfev=_MAX_EVALUATIONS
         ).x
@@ -143,11 +140,10 @@ def noise_floor(data: BoardReadings) -> float:
 class _Problem:
     """The least-squares problem for a platform with fixed noise."""
 
-    def __init__(self, platform: IrPlatform, data: BoardReadings, robots: int, *, gains: bool) -> None:
+    def __init__(self, platform: IrPlatform, data: BoardReadings, robots: int) -> None:
         self._platform, self._data, self._robots = platform, data, robots
-        often = np.bincount(data.receiver, minlength=robots) >= _MIN_MEASURED
-        self._often = np.flatnonzero(often & gains)
-        self.gains_sought: NDArray[np.bool_] = often & gains
+        self.gains_sought: NDArray[np.bool_] = np.bincount(data.receiver, minlength=robots) >= _MIN_MEASURED
+        self._often = np.flatnonzero(self.gains_sought)
         count = len(_KNOTS)
         flat = ((1, np.zeros(count)), (1, np.zeros(count)))
         self._spline = CubicSpline(_KNOTS, np.eye(count), bc_type=flat)
@@ -477,12 +473,9 @@ class BoardCalibration:
 
 
 def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> BoardCalibration:
-    """Calibrate a board.
+    """Calibrate a board by exchanges with known poses.
 
-    Args:
-        start: Initial platform, which defines the arrangement and the saturation count.
-        data: Exchanges with known poses.
-        robots: Number of robots.
+    The initial platform defines the arrangement and the saturation count.
 
     Raises:
         CalibrationError: There are too few exchanges.

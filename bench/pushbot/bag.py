@@ -1,16 +1,24 @@
-"""Write a simulated exploration by PushBots as a bag, with the floor plan next to it."""
+"""Write a simulated exploration by PushBots as a bag, with the floor plan next to it.
+
+    python -m bench pushbot_bag bags/pushbots_two --seed 1 --duration 300 --robots 2 --events 2
+    python -m bench pushbot_bag /tmp/hallway --robots 2 --plan office
+
+The bag contains map, and per robot odom, laser, lights, fix, goal, ground_truth, and with --events events.
+The same arguments give the same bytes.
+"""
 
 from __future__ import annotations
 
+import argparse
 import math
+import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
-from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
-from swarm_loc_drivers.sim.pushbot.exploration import (
+from bench.pushbot.exploration import (
     FIRST_SIGMA,
     FOCAL_BASELINE,
     PERIOD_S,
@@ -19,7 +27,10 @@ from swarm_loc_drivers.sim.pushbot.exploration import (
     Exploration,
     PushBotNoise,
 )
-from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlanError, floor_plan
+from bench.shared.bags import message_header
+from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
+from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
+from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, FloorPlanError, floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import (
     CAMERA_X_M,
     HallSight,
@@ -29,7 +40,7 @@ from swarm_loc_drivers.sim.pushbot.optics import (
     lights_of,
 )
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
-from swarm_loc_drivers.sim.scenarios.bags import Stream, message_header, write_streams
+from swarm_loc_drivers.sim.scenarios.bags import write_swarm_bag
 from swarm_loc_estimator import (
     CooperativeMapper,
     Goal,
@@ -40,6 +51,8 @@ from swarm_loc_estimator import (
 )
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.bags.writer import Stream
+from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
 from swarm_loc_estimator.common.messages.cdr import (
     EVENT_PACKETS,
     LASER,
@@ -52,7 +65,6 @@ from swarm_loc_estimator.common.messages.cdr import (
 )
 from swarm_loc_estimator.common.messages.event_encoding import ENCODING, Events, encode_events
 from swarm_loc_estimator.common.messages.poses import (
-    UNKNOWN_COVARIANCE,
     encode_fix,
     encode_odometry,
     encode_pose_stamped,
@@ -90,15 +102,8 @@ class PushbotBagSettings:
 def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) -> int:
     """Write `map`, and per robot `odom`, `laser`, `lights`, `fix`, `goal`, `events` and `ground_truth`.
 
-    Next to the bag come `swarm.yaml`, `walls.csv`, and `<robot>.yaml` with the calibration of each laser.
-
-    Args:
-        settings: Settings of a run.
-        folder: The bag, created; must not exist.
-        comment: First lines of `swarm.yaml`, where the run comes from.
-
-    Returns:
-        Number of messages.
+    Next to the bag come `swarm.yaml`, `walls.csv`, and `<robot>.yaml` with the calibration of each laser. See
+    `write_bag`.
 
     Raises:
         UserError: The floor plan cannot be used, or the folder is there already or cannot be created.
@@ -148,7 +153,7 @@ def write_pushbot_bag(settings: PushbotBagSettings, folder: Path, comment: str) 
         traces = [exploration.robots[robot].trace for robot in robots]
         streams += _events(names, _poses(traces, settings.events_s), cameras)
     # the bag, and files next to it
-    count = write_streams(streams, Swarm(described), folder, comment)
+    count = write_swarm_bag(streams, Swarm(described), folder, comment)
     np.savetxt(folder / "walls.csv", plan.walls, fmt="%.4f", delimiter=",", header="x0,y0,x1,y1 [m]")
     calibrate_lasers(names, settings.seed, folder)
     return count
@@ -193,8 +198,7 @@ def _odometry(name: str, readings: list[Readings]) -> Stream:
     pose = np.concatenate([one.odometry for one in readings])
     twist = np.zeros_like(pose)
     twist[1:] = se2.log(se2.between(pose[:-1], pose[1:])) / PERIOD_S
-    frames = (f"{name}/odom", f"{name}/base_link")
-    data = encode_odometry(*frames, stamp_ns, pose, twist, UNKNOWN_COVARIANCE, UNKNOWN_COVARIANCE)
+    data = encode_odometry(f"{name}/odom", f"{name}/base_link", stamp_ns, pose, twist)
     return Stream(f"{name}/odom", ODOMETRY, stamp_ns, data)
 
 
@@ -315,3 +319,47 @@ def _encode_map(stamp_ns: int, occupancy: OccupancyMap) -> bytes:
     }
     message = {"header": message_header(stamp_ns, "map"), "info": about, "data": cells}
     return encode(message, OCCUPANCY_GRID)
+
+
+@exit_with_message
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns its exit status."""
+    options = _parser().parse_args(arguments)
+    words = [f"{name}={value}" for name, value in vars(options).items() if name != "bag"]
+    settings = PushbotBagSettings(
+        options.seed, options.duration, options.robots, options.plan, options.slip, options.events
+    )
+    count = write_pushbot_bag(settings, options.bag, f"Simulated: swarm=pushbots, {', '.join(words)}.")
+    print(f"{count} messages of {options.robots} robots written to {options.bag}")
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = command_parser(__doc__)
+    parser.add_argument("bag", type=Path, help="bag folder to create")
+    parser.add_argument(
+        "--seed", type=number_in(0, 2**31 - 1), default=1, help="the same seed gives the same bag"
+    )
+    parser.add_argument(
+        "--duration", type=number_in(2.0, 3600.0, "s"), default=300.0, help="simulated time [s]"
+    )
+    parser.add_argument("--robots", type=number_in(1, 5), default=1, help="number of robots")
+    parser.add_argument(
+        "--plan",
+        default="corridor",
+        help=f"the hall: {', '.join(FLOOR_PLANS)}, or the path of a floor plan (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--slip", type=number_in(0.0, 0.1), default=0.02, help="share of every turn that is lost by slip"
+    )
+    parser.add_argument(
+        "--events",
+        type=number_in(0.0, 60.0, "s"),
+        default=0.0,
+        help="length of the events at the beginning [s]",
+    )
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

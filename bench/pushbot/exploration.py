@@ -46,19 +46,7 @@ class PushBotNoise:
 
 
 class KinematicPushBot:
-    """One robot.
-
-    Args:
-        plan: Where it is.
-        pose: (3,) at the start.
-        noise: Its imperfections.
-        rng: Source of the noise.
-
-    Attributes:
-        time_s: Current time [s].
-        trace: (n, 3) true pose every `PERIOD_S` so far.
-        bumps: Number of stops by obstacles.
-    """
+    """One robot in a floor plan, from a pose (3,) on."""
 
     def __init__(
         self, plan: FloorPlan, pose: FloatArray, noise: PushBotNoise, rng: np.random.Generator
@@ -69,7 +57,7 @@ class KinematicPushBot:
         self._traces = [np.asarray(pose, dtype=float)[None]]
         self._odometry = np.zeros(3)
         self._steps = 0
-        self.bumps = 0
+        self.bumps = 0  # Number of stops by obstacles
 
     @property
     def pose(self) -> FloatArray:

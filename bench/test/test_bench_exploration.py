@@ -1,4 +1,4 @@
-"""PushBots in floor plans: rays, motion and readings, a short exploration, and its bag through the mapper."""
+"""PushBots in floor plans: motion and readings, a short exploration, and its bag through the mapper."""
 
 from __future__ import annotations
 
@@ -8,22 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from repository_bags import assert_same_messages, options_of, words_of
 
-from bench.pushbot.runs import wall_points
-from swarm_loc_drivers.sim.pushbot.exploration import Exploration, KinematicPushBot, PushBotNoise
-from swarm_loc_drivers.sim.pushbot.floor_plan import (
-    FLOOR_PLANS,
-    FloorPlan,
-    FloorPlanError,
-    clearance,
-    floor_plan,
-    is_visible,
-    outline,
-    polygon,
-    ray_distance,
-)
+from bench.pushbot.bag import PushbotBagSettings, main, write_pushbot_bag
+from bench.pushbot.exploration import Exploration, KinematicPushBot, PushBotNoise
+from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan, outline
 from swarm_loc_drivers.sim.pushbot.optics import laser_hz
-from swarm_loc_drivers.sim.scenarios.pushbot_bag import PushbotBagSettings, write_pushbot_bag
 from swarm_loc_estimator.cli.replay_map import main as replay_map
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
@@ -42,40 +32,6 @@ EXACT = PushBotNoise(turn=0.0, distance=0.0, heading=0.0, pixel=1e-9, dropout=0.
 
 def robot(noise: PushBotNoise, heading: float = 0.0, seed: int = 1) -> KinematicPushBot:
     return KinematicPushBot(ROOM, np.array([1.0, 1.5, heading]), noise, np.random.default_rng(seed))
-
-
-def test_rays_end_at_walls_and_robots() -> None:
-    discs = np.array([[1.0, 2.5]])
-    assert ray_distance(ROOM.walls, discs, 0.06, 1.0, 1.5, 0.0) == pytest.approx(1.0)
-    assert ray_distance(ROOM.walls, discs, 0.06, 1.0, 1.5, math.pi / 2) == pytest.approx(0.94)
-    assert ray_distance(ROOM.walls, discs, 0.06, 1.0, 1.5, math.pi) == pytest.approx(1.0)
-    assert clearance(ROOM.walls, discs, 0.06, 1.8, 1.5) == pytest.approx(0.2)
-    assert clearance(ROOM.walls, discs, 0.06, 1.0, 2.3) == pytest.approx(0.14)
-    assert is_visible(ROOM.walls, 1.0, 2.5, 3.5, 2.5)
-    assert not is_visible(ROOM.walls, 1.0, 1.5, 3.5, 1.5)
-
-
-def test_rays_end_at_slanted_walls() -> None:
-    walls = polygon([(0, 0), (2, 0), (0, 2)])
-    assert ray_distance(walls, np.zeros((0, 2)), 0.06, 0.5, 0.5, math.pi / 4) == pytest.approx(math.sqrt(0.5))
-
-
-@pytest.mark.parametrize("name", sorted(FLOOR_PLANS))
-def test_robots_start_inside_closed_halls(name: str) -> None:
-    plan = floor_plan(name)
-    nobody = np.zeros((0, 2))
-    for x, y in plan.starts:
-        assert clearance(plan.walls, nobody, 0.0, x, y) > 0.3
-        assert all(
-            math.isfinite(ray_distance(plan.walls, nobody, 0.0, x, y, a)) for a in np.linspace(0, 6, 50)
-        )
-    lengths = np.hypot(*(plan.walls[:, 2:] - plan.walls[:, :2]).T)
-    assert len(wall_points(plan, 0.1)) >= lengths.sum() / 0.1
-
-
-def test_an_unknown_hall_is_told() -> None:
-    with pytest.raises(FloorPlanError, match="no floor plan 'cave': it must be one of corridor,"):
-        floor_plan("cave")
 
 
 def test_turns_are_short_by_the_slip_and_distances_exact_without_noise() -> None:
@@ -213,3 +169,18 @@ def test_the_events_of_a_bag_show_the_distances_of_the_bag(tmp_path: Path) -> No
     sigma = np.array([one[2] for one in read])
     assert abs(np.nanmedian(off / sigma)) < 1.0
     assert np.nanmedian(np.abs(off)) < 0.05
+
+
+def test_a_plan_without_starts_for_the_robots_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "plan.yaml").write_text("free: [[0, 0, 2, 2]]\n")
+    assert main([str(tmp_path / "bag"), "--robots", "1", "--plan", str(tmp_path / "plan.yaml")]) == 1
+    assert "has starts for 0 robots" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["pushbot_one", "pushbots_two"])
+def test_a_bag_of_the_repository_comes_out_again(name: str, tmp_path: Path) -> None:
+    assert options_of(name).pop("swarm") == "pushbots"
+    assert main([str(tmp_path / name), *words_of(name)]) == 0
+    assert_same_messages(tmp_path / name, name)
