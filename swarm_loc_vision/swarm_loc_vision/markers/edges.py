@@ -7,9 +7,8 @@ interpolation, which would shift edges along rows or columns by up to a tenth of
 behind the border, known from the word of the marker, are part of the model, because their light blurs into
 the border. The fit gives the covariance, which is larger for blurred markers.
 
-Tone curves and sharpening of cameras displace edges, which the edge itself does not show. They also displace
-the inner edge of the border, whose place the outer one predicts: how far, in this picture and those before,
-measures the trust in the corners.
+Tone curves and sharpening of cameras displace edges, which the edge itself does not show. How far the inner
+edge of the border is off the place that the outer one predicts, in recent pictures, measures the trust.
 
 Before a marker is decoded, and where that fit fails, lines are fitted to the edges that profiles across each
 side cross. The spread of the crossings around their line gives the covariance of the lines and corners.
@@ -74,9 +73,7 @@ _BY_CHANCE, _CLEARLY_WHITE = 3.0, 0.7
 _OF_CORNERS = 0.6  # Variance of corners over squares of these displacements; from photographs of a board
 _OWN_PX = 0.06  # Error of a displacement without noise, from rendered images
 _MAX_ERROR_PX, _RECENT_SIDES = 0.12, 300.0  # Maximum error and number of displacements in their mean square
-NEW_CAMERA = 0.25 * np.array([0.2**2, 1.0])
-"""Sum of squared displacements in recent pictures and their number, before the first: 0.2 px, a quarter of a
-side [px^2]."""
+NEW_CAMERA = 0.25 * np.array([0.2**2, 1.0])  # Before the first picture: 0.2 px, a quarter of a displacement
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
 
 
@@ -109,15 +106,10 @@ def fit_sides(
         ends: (N, 8) filled with the distance of each line outside of its side at both corners [px].
         covariance: (N, 8, 8) filled with their covariance [px^2].
         contrast: (N,) filled with light minus dark [counts]; 0: no fit.
-        displaced: (2,) of this camera, see `NEW_CAMERA`; updated.
+        displaced: (2,) sum of squared displacements by this camera [px^2] and their number; updated.
     """
-    work = _Work(
-        np.empty(_PARAMETERS),
-        np.empty((_PARAMETERS, _PARAMETERS)),
-        np.empty(_PARAMETERS),
-        np.empty((4, 5)),
-        np.empty((4, 2)),
-    )
+    row, normal = np.empty(_PARAMETERS), np.empty((_PARAMETERS, _PARAMETERS))
+    work = _Work(row, normal, row.copy(), np.empty((4, 5)), np.empty((4, 2)))
     usual = max(displaced[0] - NEW_CAMERA[0], 0.0) / displaced[1]  # no cover in this picture counts
     for n in range(len(strips)):
         contrast[n] = _fit_sides(pixels, n, strips[n], border, usual, work)
@@ -176,10 +168,7 @@ def _add_doubts(frames: FloatArray, border: int, usual: float, work: _Work) -> N
         blur = max(work.windows[k, 0], work.windows[k, 1])
         gap = max(abs(work.gaps[k, 0]) - _BY_CHANCE * math.sqrt(work.gaps[k, 1] ** 2 + usual), 0.0)
         together = (_NEIGHBOURS * blur**3 / cell**2) ** 2 + gap**2
-        for i in (2 * k, 2 * k + 1):
-            work.normal[i, i] += _MIN_STEP_PX**2
-            for j in (2 * k, 2 * k + 1):
-                work.normal[i, j] += together
+        work.normal[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += together + _MIN_STEP_PX**2 * np.eye(2)
 
 
 @cached_njit
@@ -468,11 +457,7 @@ def refine_read(
 
 @cached_njit
 def _fit_lines(
-    crossings: FloatArray,
-    lengths: FloatArray,
-    ends: FloatArray,
-    covariance: FloatArray,
-    contrast: FloatArray,
+    crossings: FloatArray, lengths: FloatArray, ends: FloatArray, covariance: FloatArray, contrast: FloatArray
 ) -> None:
     """Fit a line to the crossings of each side; fills the last three arguments as `sides.fit_sides`."""
     line = np.empty(5)
