@@ -64,15 +64,15 @@ _CLEAR_OF_CORNERS = 1.8
 _MAX_SHIFT_PX = 1.5  # Maximum motion of a corner in the fit
 _OUTLIER = 4.0  # Residual above which the weight of a pixel decreases, in standard deviations
 _MIN_NOISE = 0.5  # Minimum standard deviation of a pixel [counts]
-_MIN_STEP_PX = 0.005  # Error of an end without noise: blur is not exactly Gaussian
+_MIN_STEP_PX = 0.004  # Error of an end without noise: blur is not exactly Gaussian
 _NEIGHBOURS = 0.2  # Times the largest blur^3 / cell^2: shift of a side, as blur by motion is not Gaussian
 _TABLE_END, _TABLE_STEPS = 5.0, 256.0
 _NORMAL = ndtr(np.arange(-_TABLE_END, _TABLE_END, 1.0 / _TABLE_STEPS))
 _BY_CHANCE, _CLEARLY_WHITE = 3.0, 0.7
 """Maximum displacement of white cells behind the border by errors [sigma]; minimum whiteness."""
 _OF_CORNERS = 0.6  # Variance of corners over squares of these displacements; from photographs of a board
-_OWN_PX = 0.06  # Error of a displacement without noise, from rendered images
-_MAX_ERROR_PX, _RECENT_SIDES = 0.12, 300.0  # Maximum error and number of displacements in their mean square
+_BY_FIT, _OWN_PX = 1.4, 0.03  # Their error over that by noise, and without noise; from rendered images
+_MAX_ERROR_PX, _RECENT_SIDES = 0.15, 300.0  # Maximum error and number of displacements in their mean square
 NEW_CAMERA = 0.25 * np.array([0.2**2, 1.0])  # Before the first picture: 0.2 px, a quarter of a displacement
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
 
@@ -205,7 +205,7 @@ def _set_gaps(pixels: SidePixels, n: int, strips: Bits, border: int, noise: floa
         if determinant > 1e-9:
             work.gaps[k, 0] = (sums[k, 1] * sums[k, 4] - sums[k, 2] * sums[k, 3]) / determinant
             by_noise = noise / p[_CONTRAST] * math.sqrt(sums[k, 2] / determinant)
-            work.gaps[k, 1] = math.hypot(by_noise, _OWN_PX)
+            work.gaps[k, 1] = math.hypot(_BY_FIT * by_noise, _OWN_PX)
 
 
 @cached_njit

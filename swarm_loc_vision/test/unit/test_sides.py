@@ -135,17 +135,19 @@ def test_a_picture_and_those_before_tell_how_a_camera_displaces_edges() -> None:
         return math.sqrt(np.diag(found.covariance[0]).mean())
 
     new, known = NEW_CAMERA.copy(), NEW_CAMERA.copy()
-    assert sigma(straight, 1, new) < 0.02
+    assert 0.02 < sigma(straight, 1, new) < 0.05  # alone a marker hardly shows that edges are straight
     assert sigma(bent, 20, known) > 0.1
     assert sigma(straight, 1, known) > 0.1
-    assert sigma(straight, 1000, known) < 0.02  # another tone curve: what was long ago is forgotten
+    later = [sigma(straight, 100, known) for _ in range(10)]
+    assert later[-1] < 0.02  # another tone curve: what was long ago is forgotten
 
 
 def test_motion_makes_the_sides_across_it_less_sure() -> None:
     at = (20.3, 20.6)
+    linear = np.array([0.0, 300.0])  # many displacements, all of them zero
     still, moving = (
-        np.diag(fitted(rendered(at, 6.0, motion=motion, noise=1.0), corners_of(at, 6.0), 0).covariance[0])
-        for motion in (0.0, 6.0)
+        np.diag(fitted(rendered(at, 6.0, motion=m, noise=1.0), corners_of(at, 6.0), 0, linear).covariance[0])
+        for m in (0.0, 6.0)
     )
     assert (moving[::2] > 3.0 * still[::2]).all()
     # light of the cells, which motion carries along the other sides, displaces these, too
