@@ -3,11 +3,12 @@
 The photographs are no part of the workspace. They lie next to it, in `../shared/data/photos`. The lens is
 calibrated by the corners of the chessboard in the same pictures. They also give the pose of the whole board,
 with which the pose of each of its markers is compared. The better of the two solutions of a marker counts.
+Rendered images are also changed as cameras change theirs: by a tone curve, sharpening, scaling and JPEG.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -48,6 +49,42 @@ SETS = {
 """Name of figures -> pictures."""
 
 
+def _curved(image: FloatArray, gamma: float) -> FloatArray:
+    return np.asarray(255.0 * (np.clip(image, 0.0, 255.0) / 255.0) ** gamma)
+
+
+def _sharpened(image: FloatArray, share: float) -> FloatArray:
+    return np.asarray(image + share * (image - cv2.GaussianBlur(image, (0, 0), 1.0)))
+
+
+def _enlarged(image: FloatArray) -> FloatArray:
+    """An image of half as many rows and columns, enlarged to its size."""
+    half = cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+    return np.asarray(cv2.resize(half, image.shape[::-1], interpolation=cv2.INTER_LINEAR))
+
+
+def _compressed(image: FloatArray, quality: int) -> FloatArray:
+    data = cv2.imencode(".jpg", _counts(image), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), float)
+
+
+def _counts(image: FloatArray) -> Gray:
+    return np.asarray(np.clip(np.rint(image), 0, 255), np.uint8)
+
+
+CHANGES: Mapping[str, Callable[[FloatArray], FloatArray]] = {
+    "gamma_0.45": lambda image: _curved(image, 0.45),
+    "gamma_0.6": lambda image: _curved(image, 0.6),
+    "sharpened_1": lambda image: _sharpened(image, 1.0),
+    "sharpened_2": lambda image: _sharpened(image, 2.0),
+    "all": lambda image: _compressed(_sharpened(_curved(image, 0.6), 1.5), 70),
+    "enlarged_all": lambda image: _compressed(_sharpened(_curved(_enlarged(image), 0.6), 1.5), 70),
+    "enlarged": _enlarged,
+    "jpeg_60": lambda image: _compressed(image, 60),
+}
+"""Name of figures -> what a camera does to a rendered image (height, width) [counts]."""
+
+
 @dataclass(frozen=True)
 class _Scored:
     """One marker."""
@@ -61,6 +98,7 @@ def measure_covariances(seeds: Sequence[int], photos: Path = PHOTOS) -> Mapping[
     """Print a table of the markers' NEES; the figures by name. Sets without pictures are left out."""
     scored = {name: list(_of_board(of_set, photos)) for name, of_set in SETS.items()}
     scored |= {f"rendered_{look}": list(_rendered(look, seeds)) for look in LOOKS}
+    scored |= {f"changed_{name}": list(_rendered("still", seeds, change)) for name, change in CHANGES.items()}
     figures: dict[str, float] = {}
     for name, markers in scored.items():
         if markers:
@@ -126,12 +164,16 @@ def _calibrated(
     return camera, [(image, *pose) for image, pose in zip(used, poses, strict=True)]
 
 
-def _rendered(look: str, seeds: Sequence[int]) -> Iterator[_Scored]:
-    """The markers in rendered images of one look."""
+def _rendered(
+    look: str, seeds: Sequence[int], change: Callable[[FloatArray], FloatArray] | None = None
+) -> Iterator[_Scored]:
+    """The markers in rendered images of one look, changed by one camera."""
     family = family_named("aruco_mip_36h12")
     detector = own_detector(family, marker_length=1.0)
     for seed in seeds:
         image, truths = random_scene(np.random.default_rng([5, seed]), family, MARKERS, LOOKS[look])
+        if change is not None:
+            image = _counts(change(image.astype(float)))
         found, used = detector.detect(image), set[int]()
         for truth in truths:
             row = match(as_found(found), truth, used)

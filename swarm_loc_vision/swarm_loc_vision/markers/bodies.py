@@ -20,7 +20,7 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, Face, FixedCamera, Robo
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.pose import Poses, Upright, body_pose, marker_poses, square
 
-_SHIFT_PX = 0.15  # Displacement of a marker by what is left of the lens; from photographs of a board
+SHIFT = 0.15**2 * np.tile(np.eye(2), (4, 4))  # Of corners, by what a calibration leaves of a lens [px^2]
 # Checked by the NEES of test_bodies.py.
 _MIN_SIGMA = 0.0005  # Minimum of `position_sigma` [m]
 _MAX_CHI2 = 25.0
@@ -220,7 +220,6 @@ class PoseSolver:
             covariance: (N, 8, 8) of the corners [px^2].
         """
         lengths = np.array([self._lengths.get(int(i), self._length) for i in ids], dtype=float)
-        covariance = covariance + _SHIFT_PX**2 * np.tile(np.eye(2), (4, 4))
         poses, is_misfit = marker_poses(corners, covariance, lengths, self._intrinsics, self._upright)
         lies = np.isin(ids, self._lying)
         if self._upright is not None and lies.any():

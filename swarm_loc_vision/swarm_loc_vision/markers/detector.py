@@ -23,12 +23,12 @@ from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
 from swarm_loc_estimator.common.parameters import number
 from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, GrayOf
-from swarm_loc_vision.common.camera import LENS_SIZE, Camera
+from swarm_loc_vision.common.camera import LENS_KIND, LENS_SIZE, STRAIGHT, Camera
 from swarm_loc_vision.common.images import Gray
 from swarm_loc_vision.common.sampling import homographies, read_cells
-from swarm_loc_vision.markers.bodies import Body, Placement, PoseSettings, PoseSolver
+from swarm_loc_vision.markers.bodies import SHIFT, Body, Placement, PoseSettings, PoseSolver
 from swarm_loc_vision.markers.decoder import Dictionary
-from swarm_loc_vision.markers.edges import refine, refine_read
+from swarm_loc_vision.markers.edges import NEW_CAMERA, refine, refine_read
 from swarm_loc_vision.markers.families import Family, draw_marker, family_named
 from swarm_loc_vision.markers.layouts import Layout
 from swarm_loc_vision.markers.pose import Poses
@@ -112,6 +112,7 @@ class MarkerDetector:
         self._settings = settings
         self._camera = camera
         self._lens = camera.lens if camera else np.zeros(LENS_SIZE)
+        self._displaced = NEW_CAMERA.copy()
         self._solver = PoseSolver(settings, camera, lengths or {}, up, lying, bodies) if camera else None
         by_layout: dict[Layout, dict[Family, IntArray]] = {}
         for family, ids in families.items():
@@ -170,6 +171,7 @@ class MarkerDetector:
             np.take_along_axis(corners[good], own[..., None], axis=1),
             dictionary.strips[word],
             layout.border,
+            self._displaced,
         )
         markers = _Markers(
             dictionary.codes[word],
@@ -186,7 +188,8 @@ class MarkerDetector:
         """Poses of all markers, jointly for bodies, and the number of misfits."""
         if self._solver is None:
             return None, 0
-        return self._solver.solve(markers.id, markers.corners, markers.covariance)
+        shift = 0.0 if self._lens[LENS_KIND] == STRAIGHT else SHIFT
+        return self._solver.solve(markers.id, markers.corners, markers.covariance + shift)
 
 
 def _best(markers: _Markers) -> _Markers:

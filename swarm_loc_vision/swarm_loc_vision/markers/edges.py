@@ -7,8 +7,8 @@ interpolation, which would shift edges along rows or columns by up to a tenth of
 behind the border, known from the word of the marker, are part of the model, because their light blurs into
 the border. The fit gives the covariance, which is larger for blurred markers.
 
-Tone curves and sharpening of cameras displace edges, which the edge itself does not show. They also displace
-the inner edge of the border, whose place the outer one predicts: how far measures the trust in the corners.
+Tone curves and sharpening of cameras displace edges, which the edge itself does not show. How far the inner
+edge of the border is off the place that the outer one predicts, in recent pictures, measures the trust.
 
 Before a marker is decoded, and where that fit fails, lines are fitted to the edges that profiles across each
 side cross. The spread of the crossings around their line gives the covariance of the lines and corners.
@@ -64,17 +64,16 @@ _CLEAR_OF_CORNERS = 1.8
 _MAX_SHIFT_PX = 1.5  # Maximum motion of a corner in the fit
 _OUTLIER = 4.0  # Residual above which the weight of a pixel decreases, in standard deviations
 _MIN_NOISE = 0.5  # Minimum standard deviation of a pixel [counts]
-_MIN_STEP_PX = 0.01
-"""Error of an end without noise. Blur is not exactly Gaussian: that of a shutter or of a defocused lens
-shifts edges by about 0.01 px, depending on their place in the pixels."""
-_NEIGHBOURS = 0.7  # Times blur^3 / cell^2: shift of a side by light from beyond the next cells
+_MIN_STEP_PX = 0.004  # Error of an end without noise: blur is not exactly Gaussian
+_NEIGHBOURS = 0.2  # Times the largest blur^3 / cell^2: shift of a side, as blur by motion is not Gaussian
 _TABLE_END, _TABLE_STEPS = 5.0, 256.0
 _NORMAL = ndtr(np.arange(-_TABLE_END, _TABLE_END, 1.0 / _TABLE_STEPS))
 _BY_CHANCE, _CLEARLY_WHITE = 3.0, 0.7
-"""Maximum displacement of white cells behind the border by noise [sigma]; minimum whiteness."""
-_OF_CORNERS = 0.3  # Variance of corners over squares of these displacements; from photographs of a board
-_USUAL_PX = 0.2  # Displacement that is assumed, with the weight of one side
-_MAX_PX, _MAX_CHANCE_PX = 1.0, 0.1  # Bounds on a displacement, which may be of a cover, and on its noise
+"""Maximum displacement of white cells behind the border by errors [sigma]; minimum whiteness."""
+_OF_CORNERS = 0.6  # Variance of corners over squares of these displacements; from photographs of a board
+_BY_FIT, _OWN_PX = 1.4, 0.03  # Their error over that by noise, and without noise; from rendered images
+_MAX_ERROR_PX, _RECENT_SIDES = 0.15, 300.0  # Maximum error and number of displacements in their mean square
+NEW_CAMERA = 0.25 * np.array([0.2**2, 1.0])  # Before the first picture: 0.2 px, a quarter of a displacement
 _ROOT_2PI = math.sqrt(2.0 * math.pi)
 
 
@@ -96,6 +95,7 @@ def fit_sides(
     ends: FloatArray,
     covariance: FloatArray,
     contrast: FloatArray,
+    displaced: FloatArray,
 ) -> float:
     """Fit the four sides of each marker; returns the variance of corners by displaced edges [px^2].
 
@@ -106,29 +106,27 @@ def fit_sides(
         ends: (N, 8) filled with the distance of each line outside of its side at both corners [px].
         covariance: (N, 8, 8) filled with their covariance [px^2].
         contrast: (N,) filled with light minus dark [counts]; 0: no fit.
+        displaced: (2,) sum of squared displacements by this camera [px^2] and their number; updated.
     """
-    work = _Work(
-        np.empty(_PARAMETERS),
-        np.empty((_PARAMETERS, _PARAMETERS)),
-        np.empty(_PARAMETERS),
-        np.empty((4, 5)),
-        np.empty((4, 2)),
-    )
-    squares, sides = _USUAL_PX**2, 1.0
+    row, normal = np.empty(_PARAMETERS), np.empty((_PARAMETERS, _PARAMETERS))
+    work = _Work(row, normal, row.copy(), np.empty((4, 5)), np.empty((4, 2)))
+    usual = max(displaced[0] - NEW_CAMERA[0], 0.0) / displaced[1]  # no cover in this picture counts
     for n in range(len(strips)):
-        contrast[n] = _fit_sides(pixels, n, strips[n], border, work)
+        contrast[n] = _fit_sides(pixels, n, strips[n], border, usual, work)
         if contrast[n] > 0.0:
             ends[n] = work.p[:_ENDS]
             covariance[n] = work.normal[:_ENDS, :_ENDS]
-            for gap, chance in work.gaps:
-                if 0.0 < chance < _MAX_CHANCE_PX:
-                    squares += min(abs(gap), _MAX_PX) ** 2 - chance**2
-                    sides += 1.0
-    return _OF_CORNERS * max(squares / sides, 0.0)
+            for gap, error in work.gaps:
+                if 0.0 < error < _MAX_ERROR_PX:
+                    most = _BY_CHANCE**2 * (error**2 + max(displaced[0], 0.0) / displaced[1])
+                    displaced[0] += min(gap**2, most) - error**2
+                    displaced[1] += 1.0
+    displaced *= min(1.0, _RECENT_SIDES / displaced[1])
+    return float(_OF_CORNERS * max(displaced[0], 0.0) / displaced[1])
 
 
 @cached_njit
-def _fit_sides(pixels: SidePixels, n: int, strips: Bits, border: int, work: _Work) -> float:
+def _fit_sides(pixels: SidePixels, n: int, strips: Bits, border: int, usual: float, work: _Work) -> float:
     """Fit one marker; returns the contrast, 0: no fit. `work.normal` becomes the covariance."""
     p = work.p
     p[:] = 0.0
@@ -154,33 +152,32 @@ def _fit_sides(pixels: SidePixels, n: int, strips: Bits, border: int, work: _Wor
             break
     work.normal[:] *= noise * noise
     _set_gaps(pixels, n, strips, border, noise, work)
-    _add_doubts(pixels.frames[n], border, work)
+    _add_doubts(pixels.frames[n], border, usual, work)
     return float(p[_CONTRAST])
 
 
 @cached_njit
-def _add_doubts(frames: FloatArray, border: int, work: _Work) -> None:
+def _add_doubts(frames: FloatArray, border: int, usual: float, work: _Work) -> None:
     """Add model errors to the covariance of the ends.
 
     Displaced cells behind the border indicate an occluded side, which may be displaced by the same amount.
+    Those of the camera itself have the mean square `usual`.
     """
     for k in range(4):
         cell = min(frames[k, NEAR], frames[k, FAR]) / border
-        gap = max(abs(work.gaps[k, 0]) - _BY_CHANCE * work.gaps[k, 1], 0.0)
-        together = (_NEIGHBOURS * work.windows[k, 0] ** 3 / cell**2) ** 2 + gap**2
-        for i in (2 * k, 2 * k + 1):
-            work.normal[i, i] += _MIN_STEP_PX**2
-            for j in (2 * k, 2 * k + 1):
-                work.normal[i, j] += together
+        blur = max(work.windows[k, 0], work.windows[k, 1])
+        gap = max(abs(work.gaps[k, 0]) - _BY_CHANCE * math.sqrt(work.gaps[k, 1] ** 2 + usual), 0.0)
+        together = (_NEIGHBOURS * blur**3 / cell**2) ** 2 + gap**2
+        work.normal[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] += together + _MIN_STEP_PX**2 * np.eye(2)
 
 
 @cached_njit
 def _set_gaps(pixels: SidePixels, n: int, strips: Bits, border: int, noise: float, work: _Work) -> None:
-    """Set `work.gaps` to the displacement of white cells behind the border and its noise [px]; 0: none there.
+    """Set `work.gaps` to the displacement of white cells behind the border and its error [px]; 0: none there.
 
-    The residuals across an edge add up to its displacement.
+    Displacement and brightness of the white cells are fitted to the residuals of each side.
     """
-    p, counts = work.p, np.zeros(4)
+    p, sums = work.p, np.zeros((4, 5))
     work.gaps[:] = 0.0
     for i in range(pixels.counts[n]):
         k, a = pixels.side[n, i] - INNER, pixels.along[n, i]
@@ -195,16 +192,20 @@ def _set_gaps(pixels: SidePixels, n: int, strips: Bits, border: int, noise: floa
             continue
         white = _white(a + frame[SHEAR] * (d + gap), along, strips[k], border, pixels.boundaries[n, k])
         if white > _CLEARLY_WHITE:
-            level, _, _ = _profile(d, gap, across, white)
+            level, slope, _ = _profile(d, gap, across, white)
             light = 1.0 + p[_LIGHT_X] * pixels.place[n, i, 0] + p[_LIGHT_Y] * pixels.place[n, i, 1]
-            paint = p[_DARK] + p[_CONTRAST] * level
-            work.gaps[k, 0] += (pixels.value[n, i] / light - paint) / white
-            counts[k] += 1.0
+            rest = (pixels.value[n, i] / light - p[_DARK]) / p[_CONTRAST] - level
+            sums[k, 0] += slope * slope
+            sums[k, 1] += slope * level
+            sums[k, 2] += level * level
+            sums[k, 3] += slope * rest
+            sums[k, 4] += level * rest
     for k in range(4):
-        if counts[k] > 0.0:
-            reach = 2.0 * _inner_reach(pixels.frames[n, k], border, work.windows[k, 0]) / p[_CONTRAST]
-            work.gaps[k, 0] *= reach / counts[k]
-            work.gaps[k, 1] = reach * noise / math.sqrt(counts[k])
+        determinant = sums[k, 0] * sums[k, 2] - sums[k, 1] ** 2
+        if determinant > 1e-9:
+            work.gaps[k, 0] = (sums[k, 1] * sums[k, 4] - sums[k, 2] * sums[k, 3]) / determinant
+            by_noise = noise / p[_CONTRAST] * math.sqrt(sums[k, 2] / determinant)
+            work.gaps[k, 1] = math.hypot(_BY_FIT * by_noise, _OWN_PX)
 
 
 @cached_njit
@@ -428,7 +429,7 @@ def refine(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, spacing
 
 
 def refine_read(
-    image: Gray, lens: FloatArray, quads: FloatArray, strips: NDArray[np.uint8], border: int
+    image: Gray, lens: FloatArray, quads: FloatArray, strips: Bits, border: int, displaced: FloatArray
 ) -> Corners:
     """Move the corners of decoded markers to their edges by a fit to pixels.
 
@@ -438,12 +439,13 @@ def refine_read(
         quads: (N, 4, 2) clockwise from each marker's own upper left, within a pixel [ideal px].
         strips: (N, 4, cells) the row of cells behind the border along each side; 1 is white.
         border: Width of the border [cells].
+        displaced: See `fit_sides`.
     """
     cells = strips.shape[2]
     corners, covariance = quads.copy(), np.zeros((len(quads), 8, 8))
     ends, of_ends, contrast = np.zeros((len(quads), 8)), np.zeros((len(quads), 8, 8)), np.empty(len(quads))
     pixels = side_pixels(image, lens, quads, cells, border)
-    unsure = fit_sides(pixels, strips, border, ends, of_ends, contrast)
+    unsure = fit_sides(pixels, strips, border, ends, of_ends, contrast, displaced)
     _intersect(corners, ends, of_ends, covariance, contrast)
     lost = np.flatnonzero(contrast == 0.0)
     if len(lost):
@@ -455,11 +457,7 @@ def refine_read(
 
 @cached_njit
 def _fit_lines(
-    crossings: FloatArray,
-    lengths: FloatArray,
-    ends: FloatArray,
-    covariance: FloatArray,
-    contrast: FloatArray,
+    crossings: FloatArray, lengths: FloatArray, ends: FloatArray, covariance: FloatArray, contrast: FloatArray
 ) -> None:
     """Fit a line to the crossings of each side; fills the last three arguments as `sides.fit_sides`."""
     line = np.empty(5)

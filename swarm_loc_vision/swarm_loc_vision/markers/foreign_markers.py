@@ -20,7 +20,7 @@ from swarm_loc_estimator.common.parameters import ParameterError, autostart, cho
 from swarm_loc_vision.common.calibrated_camera import Calibration, camera_of
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.common.images import ImageError
-from swarm_loc_vision.markers.bodies import PoseSettings, PoseSolver
+from swarm_loc_vision.markers.bodies import SHIFT, PoseSettings, PoseSolver
 from swarm_loc_vision.markers.detector import Detections, detection_rows
 from swarm_loc_vision.markers.families import families
 from swarm_loc_vision.markers.parameters import MarkersInUse, known_markers
@@ -202,7 +202,7 @@ class ForeignMarkers(Calibration):
         count = len(markers)
         ids = np.array([marker.id for marker in markers], np.int64)
         corners = np.array([marker.corners for marker in markers]).reshape(-1, 4, 2)
-        covariance = np.tile(self._parameters.corner_sigma_px**2 * np.eye(8), (count, 1, 1))
+        covariance = np.tile(self._parameters.corner_sigma_px**2 * np.eye(8) + SHIFT, (count, 1, 1))
         poses, misfits = self._solver.solve(ids, corners, covariance)
         codes, unknown = np.full(count, self._known.family.code), np.full(count, np.nan)
         return Detections(codes, ids, unknown, unknown, unknown, camera.to_raw(corners), poses, misfits, {})

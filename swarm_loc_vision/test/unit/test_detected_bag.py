@@ -94,7 +94,7 @@ def test_markers_in_view_are_found_and_no_others(detected: Path, replayed: Repla
 
 
 def test_the_detections_locate_the_robots(replayed: ReplayResult) -> None:
-    """To 4.8 mm and 1.1 degrees, NEES 1.1."""
+    """To 4.7 mm and 1.1 degrees, NEES 1.1."""
     errors = replayed.overall
     assert errors.position_rmse < 0.0065
     assert np.degrees(errors.heading_rmse) < 1.6

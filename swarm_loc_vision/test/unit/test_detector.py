@@ -150,11 +150,8 @@ def test_corners_and_poses_are_as_sure_as_they_say() -> None:
             error = np.concatenate([poses.position[row, 0] - truth.position, turn])
             nees.append(error @ np.linalg.solve(poses.covariance[row, 0], error))
             assert np.linalg.eigvalsh(poses.covariance[row, 0])[0] > 0.0
-            # no lens is calibrated to less than about a tenth of a pixel
-            assert math.sqrt(poses.covariance[row, 0, 0, 0]) > 0.1 * truth.position[2] / CAMERA[0, 0]
     assert len(nees) > 50
-    # 5.35 were white noise of the corners all that there is; lens and tone curve of a camera are allowed for
-    assert 0.2 < np.median(nees) < 9.0
+    assert 0.8 < np.median(nees) < 9.0  # 5.35 were the corners' noise all that there is, and white
 
 
 def test_a_distorting_lens_does_not_matter() -> None:
@@ -174,6 +171,9 @@ def test_a_distorting_lens_does_not_matter() -> None:
             continue
         assert camera.to_ideal(detections.corners[rows[0]]) == pytest.approx(truth.corners, abs=0.3)
         assert detections.poses.position[rows[0], 0] == pytest.approx(truth.position, rel=0.01, abs=0.003)
+        # no lens is calibrated to less than about a tenth of a pixel
+        sideways = math.sqrt(detections.poses.covariance[rows[0], 0, 0, 0])
+        assert sideways > 0.1 * truth.position[2] / CAMERA[0, 0]
         checked += 1
     assert checked >= 6
 

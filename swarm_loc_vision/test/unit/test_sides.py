@@ -14,7 +14,7 @@ from scipy.special import ndtr
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.common.camera import LENS_SIZE, Camera
 from swarm_loc_vision.markers.decoder import Dictionary
-from swarm_loc_vision.markers.edges import Corners, refine, refine_read
+from swarm_loc_vision.markers.edges import NEW_CAMERA, Corners, refine, refine_read
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.side_pixels import INNER, side_pixels
 
@@ -72,8 +72,11 @@ def corners_of(at: tuple[float, float], cell: float) -> FloatArray:
     return np.array(at) + side * np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 
 
-def fitted(image: NDArray[np.uint8], near: FloatArray, marker_id: int) -> Corners:
-    return refine_read(image, STRAIGHT, near[None], strips(marker_id), FAMILY.layout.border)
+def fitted(
+    image: NDArray[np.uint8], near: FloatArray, marker_id: int, displaced: FloatArray | None = None
+) -> Corners:
+    known = NEW_CAMERA.copy() if displaced is None else displaced
+    return refine_read(image, STRAIGHT, near[None], strips(marker_id), FAMILY.layout.border, known)
 
 
 @settings(max_examples=60)
@@ -93,14 +96,15 @@ def test_edges_along_rows_and_columns_are_found_wherever_they_lie(
 
 
 def nees_of(cell: float, motion: float = 0.0, gamma: float = 1.0) -> FloatArray:
-    """(100,) of the corners of markers, each alone in a picture; 8 is ideal."""
+    """(100,) of the corners of markers, each alone in a picture of one camera; 8 is ideal."""
     rng = np.random.default_rng(1)
-    nees = []
+    nees, displaced = [], NEW_CAMERA.copy()
     for marker_id in range(100):
         at = tuple(rng.uniform(20.0, 21.0, 2).tolist())
         true = corners_of(at, cell)
         near = true + rng.normal(0.0, 0.1, (4, 2))
-        found = fitted(rendered(at, cell, 0.5, motion, 2.5, marker_id, gamma=gamma), near, marker_id)
+        image = rendered(at, cell, 0.5, motion, 2.5, marker_id, gamma=gamma)
+        found = fitted(image, near, marker_id, displaced)
         error = (found.corners[0] - true).ravel()
         nees.append(error @ np.linalg.solve(found.covariance[0], error))
     return np.array(nees)
@@ -109,8 +113,8 @@ def nees_of(cell: float, motion: float = 0.0, gamma: float = 1.0) -> FloatArray:
 @pytest.mark.parametrize(("cell", "motion"), [(2.6, 0.0), (6.0, 0.0), (6.0, 3.0), (6.0, 6.0)])
 def test_corners_are_as_sure_as_they_say(cell: float, motion: float) -> None:
     nees = nees_of(cell, motion)
-    # 8 were the noise all that there is; alone a marker hardly shows that its camera displaces no edge
-    assert 0.2 < np.mean(nees) < 9.0
+    # 8 were the noise all that there is; what it leaves out is there for worse images than these
+    assert 1.0 < np.mean(nees) < 9.0
     assert np.max(nees) < 40.0
 
 
@@ -121,27 +125,33 @@ def test_corners_that_a_tone_curve_displaces_are_as_sure_as_they_say(gamma: floa
     assert np.max(nees) < 20.1  # the 99 % bound
 
 
-def test_all_markers_in_a_picture_tell_how_its_camera_displaces_edges() -> None:
-    at, cell, count = (20.3, 20.6), 6.0, 20
-    sigmas = {}
-    for name, gamma in (("straight", 1.0), ("bent", 0.45)):
-        image = rendered(at, cell, noise=1.0, seed=100, gamma=gamma)
+def test_a_picture_and_those_before_tell_how_a_camera_displaces_edges() -> None:
+    at, cell = (20.3, 20.6), 6.0
+    straight, bent = (rendered(at, cell, noise=1.0, seed=100, gamma=gamma) for gamma in (1.0, 0.45))
+
+    def sigma(image: NDArray[np.uint8], count: int, displaced: FloatArray) -> float:
         quads = np.tile(corners_of(at, cell), (count, 1, 1))
-        for n in (1, count):
-            many = refine_read(image, STRAIGHT, quads[:n], np.repeat(strips(100), n, axis=0), 1)
-            sigmas[name, n] = math.sqrt(np.diag(many.covariance[0]).mean())
-    assert sigmas["straight", count] < 0.5 * sigmas["straight", 1] < 0.05
-    assert sigmas["bent", count] > 0.1
+        found = refine_read(image, STRAIGHT, quads, np.repeat(strips(100), count, axis=0), 1, displaced)
+        return math.sqrt(np.diag(found.covariance[0]).mean())
+
+    new, known = NEW_CAMERA.copy(), NEW_CAMERA.copy()
+    assert 0.02 < sigma(straight, 1, new) < 0.05  # alone a marker hardly shows that edges are straight
+    assert sigma(bent, 20, known) > 0.1
+    assert sigma(straight, 1, known) > 0.1
+    later = [sigma(straight, 100, known) for _ in range(10)]
+    assert later[-1] < 0.02  # another tone curve: what was long ago is forgotten
 
 
 def test_motion_makes_the_sides_across_it_less_sure() -> None:
     at = (20.3, 20.6)
+    linear = np.array([0.0, 300.0])  # many displacements, all of them zero
     still, moving = (
-        np.diag(fitted(rendered(at, 6.0, motion=motion, noise=1.0), corners_of(at, 6.0), 0).covariance[0])
-        for motion in (0.0, 6.0)
+        np.diag(fitted(rendered(at, 6.0, motion=m, noise=1.0), corners_of(at, 6.0), 0, linear).covariance[0])
+        for m in (0.0, 6.0)
     )
     assert (moving[::2] > 3.0 * still[::2]).all()
-    assert (moving[1::2] < 0.2 * moving[::2]).all()
+    # light of the cells, which motion carries along the other sides, displaces these, too
+    assert (moving[1::2] < moving[::2]).all()
 
 
 @pytest.mark.parametrize("cover", [0.1, 0.3, 0.6])
