@@ -52,7 +52,7 @@ _MAX_WEIGHT, _MAX_LINK_WEIGHT, _DRIFT_WEIGHT, RELIEF = 3.5, 2.0, 0.5, 0.25
 """Largest weights of an outlier and one of radios, weight of a drift, and decrease by what agrees."""
 _FORGETTING, _DRIFT = 0.125, 0.6
 """Weight of the newest in the mean of whitened innovations, and the mean from which they drift."""
-SUSPECT, WELL_CONFIRMED = 7.5, 30.0
+SUSPECT, WELL_CONFIRMED = 7.5, 12.0
 """Fault score from which a robot is not tracked, and confirmations up to which its covariance is widened."""
 _SUSPECT_SIGMA = (0.03, 0.03, 0.06)
 """Standard deviations added while a pose is suspect or little confirmed: x [m], y [m], heading [rad]."""
@@ -532,11 +532,15 @@ def depends_on_heading(position: float, sideways: tuple[float, float], heading: 
 
 @inlined_njit
 def widen_suspect_covariance(state: SourceArrays, robot: int, covariance: FloatArray) -> None:
-    """Widen the covariance (3, 3) of a pose that is suspect or little confirmed, the less the more it is."""
-    doubt = 1.0 if state.score[robot] > CONFIRMED else 1.0 - state.confirmations[robot] / WELL_CONFIRMED
-    if doubt > 0.0:
+    """Widen the covariance (3, 3) of a pose that is little confirmed, or suspect as what it measures is."""
+    doubted = state.score[robot] > CONFIRMED or state.confirmations[robot] < WELL_CONFIRMED
+    for place in range(state.source.shape[1]):
+        source, since_ns = state.source[robot, place], state.measured_ns[robot] - state.seen_ns[robot, place]
+        if 0 <= source < state.score.size and since_ns < RECENT_NS:
+            doubted = doubted or state.score[source] > 0.5 * SUSPECT
+    if doubted:
         for i in range(3):
-            covariance[i, i] += doubt * _SUSPECT_SIGMA[i] ** 2
+            covariance[i, i] += _SUSPECT_SIGMA[i] ** 2
 
 
 @inlined_njit

@@ -32,8 +32,8 @@ from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.track_arrays import TrackArrays, look_up, new_sample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.sensors.lidar import DelayBelief
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
-from swarm_loc_estimator.timeline.scan_delay import DelayBelief
 from swarm_loc_estimator.timeline.settings import Settings
 
 

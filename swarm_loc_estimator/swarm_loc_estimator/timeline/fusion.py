@@ -87,7 +87,7 @@ _PAIRS_PER_ROBOT = 32
 """Maximum number of observed robots per robot with a stored mean of infrared measurements."""
 _SETTLING_NS = 10_000_000_000  # A camera that is contradicted again so soon is suspended
 _AT_ONCE_NS, _MANY = 60_000_000_000, 3
-"""If so many sources are contradicted within this time, the description is wrong as a whole."""
+"""If so many exact landmarks are contradicted within this time, the description is wrong as a whole."""
 _NO: Any = np.False_
 
 
@@ -407,12 +407,13 @@ class Fusion:
             state.augment(source, poses[0])
             state.sources.score[source] = 2.0 * limit if stamp_ns < again_ns else 0.0
             return
+        exact = self._table.survey_column < 0
         if (
             state.is_doubted
             or robots > self._policy.reopen_all_up_to
             or (
                 bad_share(state.sources, stamp_ns) < DOUBTED_SHARE
-                and np.sum(state.contradicted_ns > stamp_ns - _AT_ONCE_NS) < _MANY
+                and np.sum(exact & (state.contradicted_ns[robots:] > stamp_ns - _AT_ONCE_NS)) < _MANY
             )
         ):
             state.augment(source, poses[min(source, robots - 1)])

@@ -37,9 +37,9 @@ from swarm_loc_estimator.mapping.map_file import MapFileError, load_map
 from swarm_loc_estimator.mapping.messages import LidarSweep
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.fix import about_robots
+from swarm_loc_estimator.sensors.lidar import at_odometry, described_delay, learned_delay
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import TrackedLimits, estimate_at
-from swarm_loc_estimator.timeline.scan_delay import at_odometry, described, learned
 from swarm_loc_estimator.timeline.settings import Settings
 
 # The constants of matching to a map are checked by `make bench-inputs`: lidars in a known map.
@@ -397,7 +397,7 @@ class MapScans:
         pose, covariance = estimate.poses[robot], estimate.covariances[robot]
         walls = self._walls._replace(variance=self._walls.variance + self._lidars[robot].map_sigma ** 2)
         # The scan may be older than its stamp says.
-        delay = state.delays.get(robot) or described(self._lidars[robot].delay_s)
+        delay = state.delays.get(robot) or described_delay(self._lidars[robot].delay_s)
         best = int(delay.chance.argmax())
         beams, now, track = self._beams(robot, stamp_ns, sweep, delay.lag_s, best)
         back = between(now, track[best])
@@ -405,7 +405,7 @@ class MapScans:
         found = match(walls, *beams, pose, covariance + doubt)
         confirmed = state.sources.confirmations[robot] >= CONFIRMED
         if found.outcome == FITS or (found.outcome == FAR and confirmed):
-            delay = learned(delay, stamp_ns, compose(found.pose, back), found.covariance, track)
+            delay = learned_delay(delay, stamp_ns, compose(found.pose, back), found.covariance, track)
             state.delays[robot] = delay
         if found.outcome in (OFF_MAP, FAR):
             state.sources.score[robot] += 1.0

@@ -10,7 +10,7 @@ from core_geometry import nees, wrapped
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import compose, exp
-from swarm_loc_estimator.timeline.scan_delay import DelayBelief, at_odometry, described, learned
+from swarm_loc_estimator.sensors.lidar import DelayBelief, at_odometry, described_delay, learned_delay
 
 PERIOD_S, COVARIANCE = 0.2, np.diag([0.01, 0.01, 0.005]) ** 2
 START = np.array([2.0, -1.0, 2.5])
@@ -40,14 +40,14 @@ def after(
     for time_s in np.arange(begin_s, until_s, PERIOD_S).tolist():
         true = compose(START, path(np.array([time_s - late_s]))[0])
         seen = true + np.sqrt(0.3) * np.sqrt(np.diag(COVARIANCE)) * rng.standard_normal(3)
-        belief = learned(belief, round(1e9 * time_s), seen, COVARIANCE, path(time_s - belief.lag_s))
+        belief = learned_delay(belief, round(1e9 * time_s), seen, COVARIANCE, path(time_s - belief.lag_s))
     return belief
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.1, 0.237, 0.4])
 def test_a_robot_that_turns_to_and_fro_tells_the_delay(late_s: float) -> None:
     for seed in range(5):
-        belief = after(described(0.0), weaving, late_s, seed)
+        belief = after(described_delay(0.0), weaving, late_s, seed)
         assert belief.mean_s == pytest.approx(late_s, abs=0.02)
         assert belief.sigma_s < 0.02
         assert belief.is_refuted == (late_s > 0.06)
@@ -55,7 +55,7 @@ def test_a_robot_that_turns_to_and_fro_tells_the_delay(late_s: float) -> None:
 
 @pytest.mark.parametrize("late_s", [0.0, 0.3])
 def test_a_described_delay_is_compared_with_the_true_one(late_s: float) -> None:
-    belief = after(described(-0.3), weaving, late_s - 0.3, 1)
+    belief = after(described_delay(-0.3), weaving, late_s - 0.3, 1)
     assert belief.mean_s == pytest.approx(late_s - 0.3, abs=0.02)
     assert belief.is_refuted == (late_s == 0.0)
 
@@ -64,7 +64,7 @@ def test_a_described_delay_is_compared_with_the_true_one(late_s: float) -> None:
 def test_steady_motion_tells_nothing_and_poses_are_right_within_that(path: Path) -> None:
     now = np.array([14.8])
     for seed in range(5):
-        belief = after(described(0.0), path, 0.3, seed)
+        belief = after(described_delay(0.0), path, 0.3, seed)
         assert not belief.is_refuted
         pose, covariance = at_odometry(belief, path(now)[0])
         error = wrapped(pose - compose(START, path(now)[0]))
@@ -74,7 +74,7 @@ def test_steady_motion_tells_nothing_and_poses_are_right_within_that(path: Path)
 
 def test_a_lidar_that_begins_to_lag_is_found_and_so_is_its_recovery() -> None:
     for seed in range(5):
-        belief = after(described(0.0), weaving, 0.0, seed)
+        belief = after(described_delay(0.0), weaving, 0.0, seed)
         for late_s, begin_s in ((0.25, 15.0), (0.0, 25.0)):
             belief = after(belief, weaving, late_s, seed, begin_s, begin_s + 5.0)
             assert belief.mean_s == pytest.approx(late_s, abs=0.03)
@@ -82,14 +82,14 @@ def test_a_lidar_that_begins_to_lag_is_found_and_so_is_its_recovery() -> None:
 
 
 def test_the_pose_is_that_of_the_delay() -> None:
-    belief = after(described(0.0), weaving, 0.4, 3)
+    belief = after(described_delay(0.0), weaving, 0.4, 3)
     pose, covariance = at_odometry(belief, weaving(np.array([14.8]))[0])
     assert pose == pytest.approx(compose(START, weaving(np.array([14.8]))[0]), abs=0.03)
     assert np.sqrt(np.diag(covariance)).max() < 0.02
 
 
 def test_scans_of_one_stamp_and_after_a_gap_are_not_compared() -> None:
-    belief = after(described(0.0), weaving, 0.0, 1)
+    belief = after(described_delay(0.0), weaving, 0.0, 1)
     there, track = np.array([9.0, 9.0, 0.0]), belief.track
     for stamp_ns in (belief.stamp_ns, belief.stamp_ns + 2_000_000_000):
-        assert (learned(belief, stamp_ns, there, COVARIANCE, track).chance == belief.chance).all()
+        assert (learned_delay(belief, stamp_ns, there, COVARIANCE, track).chance == belief.chance).all()
