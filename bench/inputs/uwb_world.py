@@ -52,6 +52,7 @@ class Plan:
     known_starts: int = 99  # Number of robots with a start, the first ones
     nlos: float = 0.0  # Share of ranges that are too long, for seconds per link
     sigma: float = 0.05  # Noise of a range [m]
+    bias_sigma: float = 0.0  # Unknown biases of anchors; 0: they are calibrated [m]
     steps_per_range: int = 4  # Of one link: five ranges a second
 
 
@@ -147,7 +148,10 @@ def simulate(plan: Plan, seed: int) -> UwbWorld:
             )
             for k, (x, y, theta) in enumerate(start)
         ),
-        anchors=tuple(Anchor(_FIRST_ANCHOR + k, *_ANCHORS[k]) for k in range(plan.anchors)),
+        anchors=tuple(
+            Anchor(_FIRST_ANCHOR + k, *_ANCHORS[k], range_bias_sigma=plan.bias_sigma)
+            for k in range(plan.anchors)
+        ),
     )
     world = UwbWorld(plan, swarm, truth, odometry, Ranges(*np.zeros((5, 0))))
     return UwbWorld(plan, swarm, truth, odometry, _measured(world, rng))
@@ -180,11 +184,13 @@ def _measured(world: UwbWorld, rng: np.random.Generator) -> Ranges:
     links = [(robot, n + k) for robot in range(n) for k in range(plan.anchors)]
     if plan.between_robots:
         links += [(robot, other) for robot in range(n) for other in range(robot)]
-    parts = []
+    bias, parts = np.zeros(n + plan.anchors), []
+    if plan.bias_sigma:
+        bias[n:] = plan.bias_sigma * rng.standard_normal(plan.anchors)
     for number, (robot, device) in enumerate(links):
         steps = np.arange(1 + number % plan.steps_per_range, len(world.truth), plan.steps_per_range)
         distance = np.linalg.norm(antenna(world, steps, device) - antenna(world, steps, robot), axis=1)
-        distance += _nlos(plan, steps.size, rng) + plan.sigma * rng.standard_normal(steps.size)
+        distance += bias[device] + _nlos(plan, steps.size, rng) + plan.sigma * rng.standard_normal(steps.size)
         arrivals_ns = arrival_ns(rng, START_NS + steps * STEP_NS, CAMERA_LATENESS)
         parts.append(
             Ranges(steps, np.full_like(steps, robot), np.full_like(steps, device), distance, arrivals_ns)

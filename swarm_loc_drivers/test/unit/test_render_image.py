@@ -204,7 +204,7 @@ def test_a_picture_shows_what_its_rays_meet(seed: int, model: CameraModel, tilt:
     shown = light[pixels[:, 1].astype(int), pixels[:, 0].astype(int)]
     wrong = plain & (np.abs(shown - met[:, 0]) > 1e-4)
     assert plain.mean() > 0.8
-    assert wrong.mean() < 0.002  # a thin thing may pass between a pixel's rays
+    assert wrong.mean() <= 0.002  # a thin thing may pass between a pixel's rays
     mixed = np.clip(shown, met.min(axis=1) - 1e-4, met.max(axis=1) + 1e-4)
     assert (np.abs(shown - mixed) < 0.1).mean() > 0.995
 
