@@ -162,6 +162,20 @@ def test_where_descriptions_contradict_everything_is_estimated_anew() -> None:
     assert distances(world, estimates)[:, [0, 1, 3, 4]].max() < 0.1
 
 
+@pytest.mark.parametrize(("others", "ago_s", "is_doubted"), [(1, 30, False), (2, 30, True), (2, 61, False)])
+def test_a_survey_is_doubted_as_a_whole_where_a_third_landmark_contradicts_it_within_a_minute(
+    others: int, ago_s: int, is_doubted: bool
+) -> None:
+    world = simulate(Plan(3, 4.0, landmarks=8), 720)
+    estimator, _ = run(world)
+    state, now_ns = estimator._timeline.state.copy(), int(world.stamp_ns[-1])
+    state.contradicted_ns[3 : 3 + others] = now_ns - ago_s * SECOND
+    estimator._fusion._augment(state, 3 + others, now_ns)
+    assert state.is_doubted == is_doubted
+    opened = [state.landmark_column(k) >= 0 for k in range(8)]
+    assert opened == [is_doubted or k == others for k in range(8)]
+
+
 def test_a_robot_that_leaves_does_not_hold_the_others_up() -> None:
     world = simulate(Plan(4, 10.0), 3)
     left = [e for e in world.events if e.robot != 2 or e.stamp_ns < T0 + 3 * SECOND]
