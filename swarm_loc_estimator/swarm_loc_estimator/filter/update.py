@@ -646,7 +646,8 @@ def evaluate_link(
     work.whitened[k], work.elsewhere[k] = 0.0, False
     work.place[k] = one.value[0], 0.0
     # Gate; what is not finite at these poses is gated, too.
-    if np.isfinite(s).all() and np.isfinite(innovation).all() and np.isfinite(jacobian).all():
+    finite = np.isfinite(s).all() and np.isfinite(innovation).all() and np.isfinite(jacobian).all()
+    if finite and s[0, 0] > 0.0:  # covariances of a sparse filter are approximate
         work.distance[k] = innovation[gated] @ np.linalg.solve(s[gated, gated], innovation[gated])
         work.accepted[k] = work.distance[k] <= one.gate
         work.nis[k] = innovation @ np.linalg.solve(s, innovation)

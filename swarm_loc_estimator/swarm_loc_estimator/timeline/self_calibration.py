@@ -100,16 +100,16 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
 
 
 def _calibrated(anchor: Anchor, number: int, state: SwarmState) -> Anchor:
-    """An anchor with its estimated place and bias."""
+    """An anchor with its estimated place and bias; what was exact stays so."""
     (x, y, bias), variance = state.landmark[number].tolist(), np.diag(state.landmark_covariance(number))
-    return replace(
-        anchor,
-        x=anchor.x + x,
-        y=anchor.y + y,
-        position_sigma=math.sqrt(0.5 * (variance[0] + variance[1])),
-        range_bias=anchor.range_bias + bias,
-        range_bias_sigma=math.sqrt(variance[2]),
-    )
+    found: dict[str, Any] = {}
+    if anchor.position_sigma > 0.0:
+        sigma = math.sqrt(0.5 * (variance[0] + variance[1]))
+        found |= {"x": anchor.x + x, "y": anchor.y + y, "position_sigma": sigma}
+    if anchor.range_bias_sigma > 0.0:
+        sigma = math.sqrt(variance[2])
+        found |= {"range_bias": anchor.range_bias + bias, "range_bias_sigma": sigma}
+    return replace(anchor, **found)
 
 
 def _placed(mark: Landmark | FixedCamera, number: int, state: SwarmState) -> Any:

@@ -419,6 +419,6 @@ def test_the_biases_of_anchors_are_estimated(settings: Settings, seed: int) -> N
         )
         assert anchor.range_bias == pytest.approx(true, abs=0.06)
         assert anchor.range_bias_sigma < 0.5 * before.range_bias_sigma
-        assert (anchor.x, anchor.y) == pytest.approx((before.x, before.y), abs=1e-3)
+        assert (anchor.x, anchor.y, anchor.position_sigma) == (before.x, before.y, 0.0)
     error = errors(world, estimates)[20:]
     assert np.sqrt(np.square(error[..., :2]).sum(axis=-1).mean()) < 0.06
