@@ -19,6 +19,7 @@ from ruamel.yaml.nodes import Node, ScalarNode
 from ruamel.yaml.representer import SafeRepresenter
 from ruamel.yaml.resolver import VersionedResolver
 
+from swarm_loc_estimator.common.files import write_whole
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError
 
 Tree = Any  # dict, list, str, int, float, bool or None
@@ -153,11 +154,7 @@ def tree_text(tree: Tree) -> str:
 
 def write_tree(tree: Tree, path: Path, comments: Iterable[str] = ()) -> None:
     """Write a tree with lines of comments above it, whole or not at all; creates the folder where missing."""
-    text = "".join(f"# {line}\n" for line in comments) + tree_text(tree)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
+    write_whole(path, "".join(f"# {line}\n" for line in comments) + tree_text(tree))
 
 
 def _yaml() -> YAML:

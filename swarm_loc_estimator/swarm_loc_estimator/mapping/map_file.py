@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError
-from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, TreeChecks, read_file, read_tree, tree_text
+from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, TreeChecks, read_file, read_tree, write_tree
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
@@ -29,18 +30,17 @@ _PLACE = NumberSpec("m", -1e6, 1e6, False, "of the lower left corner")
 
 
 class MapFileError(UserError):
-    """A map file that cannot be used or written."""
+    """A map file that cannot be used."""
 
 
 def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
-    """Write PATH.yaml and PATH.pgm; returns both, raises MapFileError if they cannot be written."""
+    """Write PATH.yaml and PATH.pgm; returns both, raises FileError if they cannot be written."""
     from PIL import Image  # noqa: PLC0415 - an estimator without a map starts without it
 
     image_path, yaml_path = path.with_suffix(".pgm"), path.with_suffix(".yaml")
     pixels = np.full(occupancy.log_odds.shape, _UNKNOWN, dtype=np.uint8)
     pixels[occupancy.free], pixels[occupancy.occupied] = _FREE, _OCCUPIED
-    image = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels.T[::-1])).save(image, "PPM")  # the first row is the uppermost
+    image = Image.fromarray(np.ascontiguousarray(pixels.T[::-1]))  # the first row is the uppermost
     about = {
         "image": image_path.name,
         "mode": "trinary",
@@ -50,14 +50,9 @@ def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
         "occupied_thresh": _OCCUPIED_THRESHOLD,
         "free_thresh": _FREE_THRESHOLD,
     }
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for target, data in ((image_path, image.getvalue()), (yaml_path, tree_text(about).encode())):
-            part = target.with_name(f"{target.name}.part")
-            part.write_bytes(data)
-            part.replace(target)
-    except OSError as error:
-        raise MapFileError(f"The map cannot be written to '{path}': {error.strerror}.") from error
+    with replacing(image_path) as part:
+        image.save(part, "PPM")
+    write_tree(about, yaml_path)
     return yaml_path, image_path
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from decimal import Decimal, InvalidOperation
@@ -13,6 +12,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.common.messages.cdr import (
     MARKERS,
     OCCUPANCY_GRID,
@@ -49,7 +49,6 @@ def write_tum(result: ReplayResult, folder: Path) -> None:
     `<robot>.tum` has the estimated poses, `<robot>.truth.tum` the ground truth at the same instants, as far
     as it is known there. So evo, which pairs the nearest stamps, finds the errors of the report.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     for index, robot in enumerate(result.swarm.robots):
         pose = result.poses[:, index]
         _write(folder / f"{robot.name}.tum", result.stamp_ns, pose)
@@ -61,7 +60,7 @@ def write_tum(result: ReplayResult, folder: Path) -> None:
 
 def _write(path: Path, stamp_ns: IntArray, pose: FloatArray) -> None:
     """Write the finite ones of poses (T, 3)."""
-    with path.open("w", encoding="utf-8") as file:
+    with replacing(path) as part, part.open("w", encoding="utf-8") as file:
         for at_ns, (x, y, theta) in zip(stamp_ns.tolist(), pose.tolist(), strict=True):
             if math.isfinite(x + y + theta):
                 seconds, rest = divmod(at_ns, 10**9)
@@ -136,7 +135,7 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
     Transforms lead from map directly to `<robot>/base_link`; the file holds no odom frames.
 
     Raises:
-        BagError: It cannot be written.
+        UserError: It cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".mcap_") as folder:
@@ -149,7 +148,8 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
                 writer.add_topic("map", OCCUPANCY_GRID, is_latched=True)
             for one in result.maps:
                 writer.write("map", one.log_ns, one.data)
-        shutil.move(bag / "run.mcap", path)
+        with replacing(path) as part:
+            (bag / "run.mcap").replace(part)
 
 
 def _add_tracks(topic: str, tracks: Mapping[str, Trajectory], writer: BagWriter) -> None:

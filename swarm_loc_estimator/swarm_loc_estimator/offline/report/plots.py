@@ -21,6 +21,7 @@ from matplotlib.patheffects import withStroke
 from PIL import Image
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.offline.metrics import Errors, pool
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Landmark
@@ -100,7 +101,8 @@ def save(figure: Figure, path: Path, margins: Margins | None = None) -> None:
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()  # savefig would draw twice, the first time only to arrange the axes
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    image.quantize(_PALETTE).save(path, format="png")
+    with replacing(path) as part:
+        image.quantize(_PALETTE).save(part, format="png")
 
 
 def _place(figure: Figure, margins: Margins) -> None:
