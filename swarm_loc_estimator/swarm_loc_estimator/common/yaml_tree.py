@@ -59,6 +59,12 @@ class _Resolver(VersionedResolver):
         return 1, 2  # whatever a %YAML directive says
 
 
+class _Yaml(YAML):
+    """Whatever version 1 a %YAML directive names."""
+
+    version: Any = None  # the library's refuses 1.0
+
+
 class _Constructor(SafeConstructor):
     """Only the types above; no merge keys, whose expansion is unbounded."""
 
@@ -159,7 +165,7 @@ def write_tree(tree: Tree, path: Path, comments: Iterable[str] = ()) -> None:
 
 def _yaml() -> YAML:
     """The library, in Python alone: in its parser in C, deeply nested brackets crash the process."""
-    yaml = YAML(typ="safe", pure=True)
+    yaml = _Yaml(typ="safe", pure=True)
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # the library's is too narrow
     yaml.width = 1000
     yaml.Resolver, yaml.Constructor, yaml.Representer = _Resolver, _Constructor, _Representer

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,12 @@ _NUMBERS = {
     "occupied_thresh": NumberSpec("1", 0.0, 1.0, False, "cells above are occupied"),
     "free_thresh": NumberSpec("1", 0.0, 1.0, False, "cells below are free"),
 }
+_MAX_YAW = 1e-6  # Of a map [rad], as rounding leaves it: less than a millimetre in a kilometre
+_HEADER_BYTES = 1 << 18
+_COMMENTS = 1000
+_SEPARATOR = rb"(?:\s|#[^\r\n]*[\r\n])+"
+_PNM = re.compile(rb"P(?:[14]|[2356]" + _SEPARATOR + rb"\d+)" + 2 * (_SEPARATOR + rb"\d+") + rb"\s")
+_FORMATS = ("PPM", "PNG", "BMP")  # Other decoders of Pillow start programs, or have seen less care
 _PLACE = NumberSpec("m", -1e6, 1e6, False, "of the lower left corner")
 
 
@@ -69,7 +76,7 @@ def load_map(path: Path, cell: float | None = None) -> OccupancyMap:
     numbers = {name: checks.number(about[name], name, spec) or 0.0 for name, spec in _NUMBERS.items()}
     places = checks.items(about["origin"], "origin")
     origin = [checks.number(value, "origin", _PLACE) or 0.0 for value in places]
-    if len(origin) != 3 or origin[2] != 0.0:
+    if len(origin) != 3 or abs(origin[2]) > _MAX_YAW:
         raise checks.error("origin", about["origin"], "must be x, y and a yaw of 0")
     mode, negate = about.get("mode", "trinary"), about.get("negate", 0)
     if mode not in _MODES:
@@ -122,17 +129,28 @@ def _resampled(log_odds: FloatArray, scale: float, checks: TreeChecks) -> FloatA
     return np.asarray(log_odds[::-1][rows][::-1][:, columns])
 
 
+def _check_header(data: bytes) -> None:
+    """Raise ValueError if much is before the pixels, which Pillow reads byte by byte or chunk by chunk."""
+    head = data[:_HEADER_BYTES]
+    is_short = head.startswith(b"BM") or b"IDAT" in head
+    if head.startswith(b"P"):  # digits have comments between them, too
+        is_short = bool(_PNM.match(head)) and (head[1:2] > b"3" or data.count(b"#") <= _COMMENTS)
+    if not is_short:
+        raise ValueError("it is no PGM, PNG or BMP with a header of a usual length")
+
+
 def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Gray values (height, width) of an image of any usual format, and which pixels are opaque.
+    """Gray values (height, width) of an image as map_server writes it, and which pixels are opaque.
 
     Raises:
-        UserError: It cannot be read, or is too large.
+        UserError: It cannot be read, is too large, or is no PGM, PPM, PBM, PNG or BMP.
     """
     from PIL import Image  # noqa: PLC0415 - as above
 
     data = read_file(path, _MAX_BYTES)
     try:
-        with Image.open(io.BytesIO(data)) as opened:
+        _check_header(data)
+        with Image.open(io.BytesIO(data), formats=_FORMATS) as opened:
             image: Any = opened
             small_enough = 0 < image.width * image.height <= _MAX_CELLS
             if small_enough and image.mode.startswith("I"):  # 16 bits, which `convert` would cut off
