@@ -91,28 +91,33 @@ def read_truth(folder: Path | None, swarm: Swarm) -> dict[str, Trajectory]:
 def read_tum(path: Path) -> Trajectory:
     """The poses of a file by their stamps; lines that begin with # are comments.
 
+    Poses that are not finite are left out, and counted.
+
     Raises:
         TumError: A line is no pose, or there is none.
         YamlTreeError: The file cannot be read.
     """
-    stamps_ns, poses = [], []
-    for number, line in enumerate(read_file(path, _MAX_BYTES).decode("utf-8", "replace").splitlines(), 1):
-        if not line.strip() or line.startswith("#"):
+    stamps_ns, poses, left_out = [], [], 0
+    lines = read_file(path, _MAX_BYTES).decode("utf-8-sig", "replace").splitlines()
+    for number, line in enumerate(map(str.strip, lines), 1):
+        if not line or line.startswith("#"):
             continue
         try:
             at_s, *numbers = line.split()
             x, y, z, *turn = map(float, numbers)
-            yaw, stamp_ns = yaw_of(*turn), _nanoseconds(at_s)
+            yaw = yaw_of(*turn)
+            if not math.isfinite(float(at_s) + x + y + z + yaw):
+                left_out += 1
+                continue
+            stamp_ns = _nanoseconds(at_s)
         except (ValueError, TypeError, InvalidOperation) as error:
             raise TumError(f"'{path}', line {number}: '{line[:60]}' is no pose: {_FORMAT}.") from error
-        if not math.isfinite(x + y + z + yaw):
-            raise TumError(f"'{path}', line {number}: '{line[:60]}' is not finite, or has no heading.")
         stamps_ns.append(stamp_ns)
         poses.append((x, y, yaw))
     if not poses:
         raise TumError(f"'{path}' has no pose; one line each: {_FORMAT}.")
     stamp_ns_of, order = np.array(stamps_ns), np.argsort(stamps_ns, kind="stable")
-    return Trajectory(stamp_ns_of[order], np.array(poses)[order])
+    return Trajectory(stamp_ns_of[order], np.array(poses)[order], left_out)
 
 
 _FORMAT = "seconds x y z qx qy qz qw"

@@ -229,7 +229,8 @@ def plot_overview(result: ReplayResult, path: Path) -> None:
     """Draw paths, landmarks and the last poses until the truth ends; to the right, errors over time."""
     # sensors may stop when all ground truth has ended
     ends = [int(track.stamp_ns[-1]) for track in result.truth.values() if len(track.stamp_ns)]
-    result = result.select(result.stamp_ns <= max(ends)) if ends else result
+    while_true = result.stamp_ns <= max(ends, default=-1)
+    result = result.select(while_true) if while_true.any() else result
     world = WorldMap(result)
     judged = any(len(errors.stamp_ns) for errors in result.errors.values())
     widths = [_MAP_IN, _ERRORS_IN] if judged else [_MAP_IN + _ERRORS_IN]
