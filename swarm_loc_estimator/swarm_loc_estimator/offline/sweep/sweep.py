@@ -12,6 +12,7 @@ import hashlib
 import itertools
 import json
 import math
+import os
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
@@ -384,7 +385,9 @@ def _loky(_count: int, _address: str | None) -> Iterator[dict[str, Any]]:
 
 @contextmanager
 def _ray(count: int, address: str | None) -> Iterator[dict[str, Any]]:
-    """Actors of Ray."""
+    """Actors of Ray; a cluster that is started here listens on loopback addresses only."""
+    if not address:
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # read on import; else it listens on all
     ray, backend = loaded("ray", "ray"), loaded("ray.util.joblib.ray_backend", "ray")
     options = {"address": address} if address else {"num_cpus": None if count < 0 else count}
     with _reached(address):
