@@ -76,7 +76,7 @@ def test_byte_code_is_kept_where_nobody_wants_it_beside_the_sources(monkeypatch:
 def locked(python: str) -> dict[str, str]:
     """Name -> version of what the lock installs for a version of Python on Linux; all have hashes."""
     environment = {"python_version": python, "python_full_version": f"{python}.1", "sys_platform": "linux"}
-    found = {}
+    found: dict[str, str] = {}
     for entry in re.split(r"\n(?=\S)", install.LOCK.read_text(encoding="utf-8")):
         requirement = Requirement(entry.partition(" \\\n")[0])
         assert "--hash=sha256:" in entry

@@ -184,10 +184,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--rate", type=number_in(0.1, 100.0), default=RATE, help=f"speed of the bag (default: {RATE:g})"
     )
-    parser.add_argument(
-        "--out",
-        type=folder_to_write(*REPORT_FILES, "*.log"),
-        default="out/demo",
-        help="folder for the report",
-    )
+    folder = folder_to_write(*REPORT_FILES, "*.log")
+    parser.add_argument("--out", type=folder, default="out/demo", help="folder for the report")
     return parser

@@ -118,12 +118,8 @@ def _parser() -> argparse.ArgumentParser:
     add_bag(parser)
     add_remap(parser)
     add_truth(parser)
-    parser.add_argument(
-        "--out",
-        type=folder_to_write(*REPORT_FILES, "poses.csv"),
-        default="out/replay",
-        help="folder for the report",
-    )
+    folder = folder_to_write(*REPORT_FILES, "poses.csv")
+    parser.add_argument("--out", type=folder, default="out/replay", help="folder for the report")
     parser.add_argument(
         "--learned", type=yaml_to_write, metavar="FILE", help="where to write what was learned"
     )

@@ -108,12 +108,8 @@ def write_stops(mapper: CooperativeMapper, name_of: Mapping[int, str], path: Pat
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(__doc__)
     add_bag(parser)
-    parser.add_argument(
-        "--out",
-        type=folder_to_write("map.*", "stops.csv"),
-        default="out/map",
-        help="folder for map and picture",
-    )
+    folder = folder_to_write("map.*", "stops.csv")
+    parser.add_argument("--out", type=folder, default="out/map", help="folder for map and picture")
     parser.add_argument("--walls", type=Path, help="floor plan to draw below the map: x0,y0,x1,y1 a line")
     parser.add_argument("--led", action="append", default=[], metavar="ROBOT=HZ", help="frequency of LEDs")
     add_set(parser, "a number of the mapper; may be given several times")

@@ -23,11 +23,7 @@ class FileError(UserError):
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Name a file in the errors of the system, which do not, such as that of a full disk.
-
-    Raises:
-        FileError: The system refuses what is done inside.
-    """
+    """Raise FileError, with the path, in place of the system's errors, such as that of a full disk."""
     try:
         yield
     except OSError as error:
@@ -36,9 +32,7 @@ def naming(path: Path) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Path of a new file beside `path`, whose folder is created, to replace it at the end.
-
-    After an error inside, the old file is as it was, and the new one deleted.
+    """Path of a new file beside `path`, whose folder is created, to replace it at the end without an error.
 
     Raises:
         FileError: The file cannot be written, or is a link or no regular file.
@@ -69,22 +63,17 @@ def check_file(path: Path) -> None:
 
 
 def check_folder(folder: Path, *patterns: str) -> None:
-    """Raise FileError if a folder does not exist and cannot be created, cannot be written, or has no room.
-
-    Files in it that match a pattern will be replaced, see `check_file`.
-    """
+    """Raise FileError if a folder cannot be written or has no room, or files of these patterns cannot."""
     nearest = next(one for one in (folder, *folder.absolute().parents) if os.path.lexists(one))
     with naming(nearest), tempfile.TemporaryFile(dir=nearest) as probe:
         os.posix_fallocate(probe.fileno(), 0, _ROOM_BYTES)
-    if patterns and folder.is_dir():
-        for path in folder.iterdir():
-            if any(fnmatch(path.name, pattern) for pattern in patterns):
-                check_file(path)
+    for path in folder.iterdir() if folder.is_dir() else ():
+        if any(fnmatch(path.name, pattern) for pattern in patterns):
+            check_file(path)
 
 
 def is_private(*states: os.stat_result) -> bool:
     """Whether only this user or root own files or folders, and nobody else can write to them."""
-    return all(
-        one.st_uid in {0, os.geteuid()} and (stat.S_ISLNK(one.st_mode) or not one.st_mode & _OTHERS_WRITE)
-        for one in states
-    )
+    modes = [one.st_mode for one in states if not stat.S_ISLNK(one.st_mode)]
+    owners = {one.st_uid for one in states}
+    return owners <= {0, os.geteuid()} and not any(mode & _OTHERS_WRITE for mode in modes)

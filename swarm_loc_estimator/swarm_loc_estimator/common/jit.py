@@ -369,8 +369,5 @@ def _private_folder(folder: Path) -> Path:
 
 @cache
 def _say_unsafe(folder: Path) -> None:
-    print(
-        f"Compiled code in {folder} that others than this user and root own or can write is not used;"
-        " it is compiled again into a folder of this user.",
-        file=sys.stderr,
-    )
+    what = f"Compiled code in {folder} that others than this user and root own or can write"
+    print(f"{what} is not used: it is compiled again into a folder of this user.", file=sys.stderr)

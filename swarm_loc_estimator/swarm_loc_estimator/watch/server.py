@@ -44,10 +44,9 @@ class AccessError(UserError):
 class WrongTokens:
     """Limits the rate at which clients guess the token.
 
-    Its memory is fixed: addresses share slots by their hash, but a block of addresses, such as one network's,
-    has only a share of those of the wider block, so whoever has many addresses locks out few others. A
-    repeated token does not count as a guess, so that a page which reconnects with an old token does not lock
-    out clients of the same slot.
+    Its memory is bounded: addresses share slots by hash, but a block, such as one network's, has only a share
+    of those of the wider block: many addresses lock out few others. A repeated token is no guess, so that a
+    page which reconnects with an old one does not lock out clients of the same slot.
     """
 
     def __init__(self) -> None:
@@ -194,8 +193,7 @@ class _OneLine(logging.Filter):
             return False
         self._next_s = now_s + _LOG_PERIOD_S
         reason = record.exc_info[1] if record.exc_info else ""
-        record.msg, record.args = f"{record.getMessage()} {reason!r:.200}", ()
-        record.exc_info = None
+        record.msg, record.args, record.exc_info = f"{record.getMessage()} {reason!r:.200}", (), None
         return True
 
 

@@ -79,9 +79,8 @@ _ENCODINGS = {
 def _check_size(found: Size, size: Size) -> None:
     if found != size:
         shown, wanted = (f"{width} x {height}" for width, height in (found, size))
-        raise ImageError(
-            "size", f"the image has {shown} pixels, but must have {wanted}, as the calibration says."
-        )
+        said = f"the image has {shown} pixels, but must have {wanted}, as the calibration says."
+        raise ImageError("size", said)
 
 
 def _png_size(data: bytes) -> Size | None:
@@ -176,10 +175,10 @@ def decoded_image(message: Any, size: Size) -> Gray:
         raise ImageError(
             "encoding", f"the image's format is '{how}', but must be one of {names}, or empty for these."
         )
-    found = known.size(data) if known.is_whole(data) else None
-    if found is not None:
+    gray = None
+    if known.is_whole(data) and (found := known.size(data)):
         _check_size(found, size)
-    gray = _decoded(raw) if found else None
+        gray = _decoded(raw)
     if gray is None or gray.shape[::-1] != size:
         raise ImageError(
             "corrupt", f"the image's data has {raw.size} bytes, but must be a whole image in '{known.name}'."
