@@ -2,6 +2,7 @@
 # make test     lint, types, unit tests without ROS, node tests over DDS
 # make bench-NAME [ARGS="..."]   prints a table, draws it under out/, writes out/bench/NAME.json
 # make test-lowest   unit tests with the oldest versions that requirements/workspace.txt allows
+# make lock      writes the versions and hashes of the wheels that the set-up installs
 # make house     prints the figures of the layout, writes out/bench/house.json
 # make docs      builds the documentation site: out/docs/index.html
 # make setup | lint | types | unit | node | clean
@@ -13,7 +14,7 @@ MYPY := ./run -- mypy --num-workers 2
 PYTEST := ./run -- env PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 pytest \
     -p xdist.plugin -p pytest_timeout -p _hypothesis_pytestplugin --numprocesses 2 --dist worksteal
 
-.PHONY: demo test lint types unit node test-lowest house docs setup clean
+.PHONY: demo test lint types unit node test-lowest lock house docs setup clean
 
 demo: setup
 	@./run swarm_loc_estimator demo $(ARGS)
@@ -48,6 +49,13 @@ test-lowest: setup
 
 setup:
 	@$(PYTHON) tools/setup_workspace.py
+
+# The same versions as before where they still fit; UPGRADE=--upgrade takes the newest.
+LOCK := ./run -- uv pip compile --quiet --generate-hashes --no-annotate --no-header $(UPGRADE)
+lock: setup
+	@$(LOCK) --universal --python-version 3.10 --override requirements/overrides.txt \
+	    --output-file requirements/workspace.lock requirements/ros.txt requirements/workspace.txt
+	@echo 'uv>=0.5,<1' | $(LOCK) --universal --python-version 3.10 --output-file requirements/uv.lock -
 
 house: setup
 	@./run -- python tools/house.py $(ARGS)

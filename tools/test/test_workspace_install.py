@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from workspace import host, install
-from workspace.layout import STATE, VENV, WorkspaceError
+from workspace.layout import REQUIREMENTS, STATE, VENV, WorkspaceError
 
 
 @pytest.mark.parametrize(
@@ -68,6 +71,55 @@ def test_byte_code_is_kept_where_nobody_wants_it_beside_the_sources(monkeypatch:
 
     monkeypatch.delenv("PYTHONDONTWRITEBYTECODE")
     assert "PYTHONPYCACHEPREFIX" not in install.base_environment()
+
+
+def locked(python: str) -> dict[str, str]:
+    """Name -> version of what the lock installs for a version of Python on Linux; all have hashes."""
+    environment = {"python_version": python, "python_full_version": f"{python}.1", "sys_platform": "linux"}
+    found: dict[str, str] = {}
+    for entry in re.split(r"\n(?=\S)", install.LOCK.read_text(encoding="utf-8")):
+        requirement = Requirement(entry.partition(" \\\n")[0])
+        assert "--hash=sha256:" in entry
+        if requirement.marker is None or requirement.marker.evaluate(
+            {**environment, "platform_system": "Linux"}
+        ):
+            (pin,) = requirement.specifier
+            assert pin.operator == "=="
+            found[canonicalize_name(requirement.name)] = pin.version
+    return found
+
+
+@pytest.mark.parametrize("python", ["3.10", "3.11", "3.12", "3.13"])
+def test_the_lock_has_a_version_within_each_range(python: str) -> None:
+    versions = locked(python)
+    for group in ("ros", "workspace"):
+        text = (REQUIREMENTS / f"{group}.txt").read_text(encoding="utf-8")
+        for line in (one for one in text.splitlines() if one and not one.startswith("#")):
+            requirement = Requirement(line)
+            assert requirement.specifier.contains(versions[canonicalize_name(requirement.name)]), line
+
+
+@pytest.mark.parametrize("case", ["wheels", "wheels and extra", "sourced", "no lock"])
+def test_wheels_are_installed_by_their_hashes_where_the_lock_fits(
+    case: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commands: list[list[str]] = []
+    monkeypatch.setattr(install, "_run_installer", lambda command, *_: commands.append([*map(str, command)]))
+    monkeypatch.setattr(host, "ros_prefix", lambda: tmp_path if case == "sourced" else None)
+    if case == "no lock":
+        monkeypatch.setattr(install, "LOCK", tmp_path / "none")
+    groups = ("workspace",) if case == "sourced" else ("ros", "workspace")
+    install._install((*groups, "docs") if "extra" in case else groups, host.ros_prefix())
+
+    text = [" ".join(one) for one in commands]
+    assert len(text) == 2 + ("extra" in case)
+    is_locked = case.startswith("wheels")
+    assert [("--require-hashes --no-deps" in one) for one in text[:2]] == [is_locked] * 2
+    assert ("workspace.lock" in text[1], "workspace.txt" in text[1]) == (is_locked, not is_locked)
+    if "extra" in case:
+        assert "docs.txt" in text[2]
+        assert "workspace" not in text[2].partition("--requirement")[2]
+    assert ("lock" in install._wanted(groups)) == is_locked
 
 
 def _install_rclpy(prefix: Path, python: str) -> None:

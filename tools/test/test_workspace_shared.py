@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from pathlib import Path
 
@@ -54,6 +55,43 @@ def test_what_is_kept_twice_or_damaged_hurts_nobody(tmp_path: Path, cache: Path)
     (cache / "key/b").symlink_to("nowhere")
     assert not shared.take("key", tmp_path / "taken")
     assert not (tmp_path / "taken").exists()
+
+
+@pytest.mark.parametrize("place", ["", "key", "key/lib", "key/lib/a"])
+@pytest.mark.parametrize("fault", ["mode", "group", "owner"])
+def test_what_others_can_write_is_neither_taken_nor_kept_there(
+    tmp_path: Path, cache: Path, place: str, fault: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "package/lib").mkdir(parents=True)
+    (tmp_path / "package/lib/a").touch(0o666)
+    before = os.umask(0)
+    shared.keep("key", tmp_path / "package")
+    os.umask(before)
+    assert shared.take("key", tmp_path / "first")
+    if fault == "owner":
+        if os.geteuid():
+            pytest.skip("only root can give files away")
+        os.chown(cache / place, 65534, 65534)
+    else:
+        (cache / place).chmod(0o777 if fault == "mode" else 0o775)
+
+    assert not shared.take("key", tmp_path / "second")
+    assert not (tmp_path / "second").exists()
+    assert "is not used, since others" in capsys.readouterr().out
+    shared.keep("key", tmp_path / "package")
+    assert shared.take("key", tmp_path / "third") == bool(place)
+
+
+def test_a_link_of_others_to_a_cache_is_not_followed(tmp_path: Path, cache: Path) -> None:
+    if os.geteuid():
+        pytest.skip("only root can give files away")
+    (tmp_path / "package").mkdir()
+    shared.keep("key", tmp_path / "package")
+    cache.rename(tmp_path / "elsewhere")
+    cache.symlink_to(tmp_path / "elsewhere")
+    assert shared.take("key", tmp_path / "first")
+    os.chown(cache, 65534, 65534, follow_symlinks=False)
+    assert not shared.take("key", tmp_path / "second")
 
 
 def test_the_key_follows_messages_and_versions_but_not_the_folder(

@@ -25,6 +25,9 @@ EXTRAS = ("bench", "docs")
 UV = "uv>=0.5,<1"
 """Installs all wheels in ten seconds, where pip asks for one after the other and takes two minutes."""
 
+LOCK, UV_LOCK = REQUIREMENTS / "workspace.lock", REQUIREMENTS / "uv.lock"
+"""Versions and hashes of all wheels, for each Python that those of ROS 2 support; `make lock` writes them."""
+
 NETWORK_TROUBLE = re.compile(
     r"NewConnectionError|NameResolutionError|ConnectTimeoutError|ReadTimeoutError|ProxyError|ConnectionError"
     r"|Connection refused|Network is unreachable|Temporary failure in name resolution|Could not fetch URL"
@@ -41,7 +44,14 @@ def _wanted(groups: tuple[str, ...]) -> dict[str, str]:
     """Required state of the environment for its stamp: folder, origin, a hash per requirements file."""
     facts = {"venv": str(VENV), "ros": str(host.ros_prefix() or "wheels")}
     facts |= {f"group.{group}": digest([REQUIREMENTS / f"{group}.txt"]) for group in groups}
+    if _is_locked():
+        facts["lock"] = digest([LOCK, UV_LOCK])
     return facts
+
+
+def _is_locked() -> bool:
+    """Whether locked wheels are installed: not with a sourced ROS 2, nor where someone deleted the lock."""
+    return host.ros_prefix() is None and LOCK.exists()
 
 
 def ensure(*, extra: str | None) -> None:
@@ -110,19 +120,25 @@ def _install(groups: tuple[str, ...], ros: Path | None) -> None:
     """Install requirements files; shows one line of progress and writes all output to a log."""
     pip: list[str | Path] = [VENV_PYTHON, "-m", "pip"]
     options = ["--disable-pip-version-check", "--no-input", "--retries", "2", "--progress-bar", "off"]
-    _run_installer([*pip, "install", *options, UV], "pip.log")
-    command: list[str | Path] = [VENV / "bin" / "uv", "pip", "install", "--python", VENV_PYTHON]
-    command += ["--override", REQUIREMENTS / "overrides.txt"]
-    for group in groups:
-        command += ["--requirement", REQUIREMENTS / f"{group}.txt"]
-    if ros:
-        command += ["--constraint", _system_constraints()]
+    hashed: list[str | Path] = ["--require-hashes", "--no-deps", "--requirement"]
+    _run_installer([*pip, "install", *options, *([*hashed, UV_LOCK] if _is_locked() else [UV])], "pip.log")
     # pip's own index, where this machine has one, holds for uv, too
     index = subprocess.run(
         [*pip, "config", "get", "global.index-url"], capture_output=True, text=True, check=False
     )
     url = os.environ.get("PIP_INDEX_URL") or index.stdout.strip()
-    _run_installer(command, "uv.log", {**os.environ, "UV_DEFAULT_INDEX": url} if url else None)
+    env = {**os.environ, "UV_DEFAULT_INDEX": url} if url else None
+    command: list[str | Path] = [VENV / "bin" / "uv", "pip", "install", "--python", VENV_PYTHON]
+    if _is_locked():
+        _run_installer([*command, *hashed, LOCK], "uv.log", env)
+        groups = tuple(name for name in groups if name in EXTRAS)
+    command += ["--override", REQUIREMENTS / "overrides.txt"]
+    for group in groups:
+        command += ["--requirement", REQUIREMENTS / f"{group}.txt"]
+    if ros:
+        command += ["--constraint", _system_constraints()]
+    if groups:
+        _run_installer(command, "uv.log", env)
 
 
 def _run_installer(command: list[str | Path], log_name: str, env: Mapping[str, str] | None = None) -> None:

@@ -39,7 +39,7 @@ from swarm_loc_estimator.offline.live_run import (
     play_live,
     read_poses,
 )
-from swarm_loc_estimator.offline.report.report import write_report
+from swarm_loc_estimator.offline.report.report import REPORT_FILES, write_report
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Status
@@ -184,5 +184,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--rate", type=number_in(0.1, 100.0), default=RATE, help=f"speed of the bag (default: {RATE:g})"
     )
-    parser.add_argument("--out", type=folder_to_write, default="out/demo", help="folder for the report")
+    folder = folder_to_write(*REPORT_FILES, "*.log")
+    parser.add_argument("--out", type=folder, default="out/demo", help="folder for the report")
     return parser

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TypeVar
 
 from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
+from swarm_loc_estimator.common.files import write_whole
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.swarm.new_swarm import FAMILY_IDS, KNOWN_ROBOTS, SENSORS, SwarmPlan, planned_swarm
 from swarm_loc_estimator.swarm.schema import schema_text
@@ -193,8 +194,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     given = {name: answer for name, answer in answers.items() if answer is not None}
     plan = asked_plan(Dialog(given, asks=not options.yes))
     swarm = planned_swarm(plan)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    (path.parent / SCHEMA_FILE).write_text(schema_text(), encoding="utf-8")
+    write_whole(path.parent / SCHEMA_FILE, schema_text())
     save_swarm(swarm, path, remarks(plan, swarm))
     print(f"{path} describes {len(swarm.robots)} robots and {len(swarm.landmarks)} landmarks. To start it:\n")
     print("\n".join(start_lines(plan, shlex.quote(str(path)))))

@@ -38,9 +38,10 @@ from swarm_loc_estimator.common.command_line import (
     swarm_beside,
     yaml_to_write,
 )
+from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.offline.export import read_truth, write_mcap, write_tum
 from swarm_loc_estimator.offline.replay import TICK_S, TICKS_S, replay
-from swarm_loc_estimator.offline.report.report import write_report
+from swarm_loc_estimator.offline.report.report import REPORT_FILES, write_report
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_estimator.timeline.self_calibration import swapped_signs
@@ -74,8 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             progress=progress,
         )
         progress(1.0, "writing the report")
-        files = write_report(result, options.out)
         write_poses(result, options.out / "poses.csv")
+        files = write_report(result, options.out)
         if options.mcap:
             write_mcap(result, options.mcap)
         if options.tum:
@@ -101,7 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def write_poses(result: ReplayResult, path: Path) -> None:
     """Write all poses: stamp_ns, robot, x, y, theta, and the upper triangle of their covariance."""
     upper = np.triu_indices(3)
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with replacing(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(_COLUMNS)
         for stamp_ns, poses, covariances in zip(
@@ -117,7 +118,8 @@ def _parser() -> argparse.ArgumentParser:
     add_bag(parser)
     add_remap(parser)
     add_truth(parser)
-    parser.add_argument("--out", type=folder_to_write, default="out/replay", help="folder for the report")
+    folder = folder_to_write(*REPORT_FILES, "poses.csv")
+    parser.add_argument("--out", type=folder, default="out/replay", help="folder for the report")
     parser.add_argument(
         "--learned", type=yaml_to_write, metavar="FILE", help="where to write what was learned"
     )
@@ -129,7 +131,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument(
         "--tum",
-        type=folder_to_write,
+        type=folder_to_write("*.tum"),
         metavar="FOLDER",
         help="where to write trajectories and ground truth for evo",
     )

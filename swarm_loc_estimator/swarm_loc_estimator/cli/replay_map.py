@@ -30,6 +30,7 @@ from swarm_loc_estimator.common.command_line import (
     parameters_of,
     swarm_beside,
 )
+from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
@@ -97,7 +98,7 @@ def read_walls(path: Path) -> FloatArray:
 def write_stops(mapper: CooperativeMapper, name_of: Mapping[int, str], path: Path) -> None:
     """Write the stops of the robots: robot, x, y, theta on arrival."""
     robots = mapper.graph.robot[: mapper.graph.count].tolist()
-    with path.open("w", newline="", encoding="utf-8") as file:
+    with replacing(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         writer.writerow(["robot", "x_m", "y_m", "theta_rad"])
         for robot, pose in zip(robots, mapper.graph.poses.tolist(), strict=True):
@@ -107,7 +108,8 @@ def write_stops(mapper: CooperativeMapper, name_of: Mapping[int, str], path: Pat
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(__doc__)
     add_bag(parser)
-    parser.add_argument("--out", type=folder_to_write, default="out/map", help="folder for map and picture")
+    folder = folder_to_write("map.*", "stops.csv")
+    parser.add_argument("--out", type=folder, default="out/map", help="folder for map and picture")
     parser.add_argument("--walls", type=Path, help="floor plan to draw below the map: x0,y0,x1,y1 a line")
     parser.add_argument("--led", action="append", default=[], metavar="ROBOT=HZ", help="frequency of LEDs")
     add_set(parser, "a number of the mapper; may be given several times")

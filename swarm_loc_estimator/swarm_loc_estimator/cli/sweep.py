@@ -24,7 +24,7 @@ from swarm_loc_estimator.common.command_line import (
     folder_to_write,
 )
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.offline.sweep.report import rows_of, write_results
+from swarm_loc_estimator.offline.sweep.report import SWEEP_FILES, rows_of, write_results
 from swarm_loc_estimator.offline.sweep.sweep import NAMES, Backend, Best, Line, read_sweep, run_fit, run_sweep
 
 
@@ -33,7 +33,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     parser = command_parser(__doc__)
     parser.add_argument("file", metavar="SWEEP_FILE", type=Path, help="what is replayed")
-    parser.add_argument("--out", type=folder_to_write, default="out/sweep", help="folder for the results")
+    folder = folder_to_write(*SWEEP_FILES)
+    parser.add_argument("--out", type=folder, default="out/sweep", help="folder for the results")
     parser.add_argument("--backend", choices=NAMES, default=NAMES[0], help="what runs the replays")
     parser.add_argument("--cluster", metavar="ADDRESS", help="a running cluster of Ray or Dask")
     options = parser.parse_args(arguments)

@@ -73,7 +73,9 @@ def parser() -> argparse.ArgumentParser:
         "--port", type=number_in(0, 65535), default=_DEFAULT.port, help="where (default: 8420; 0: any)"
     )
     parser.add_argument(
-        "--token", default="", help="token that browsers must send as ?token=, 8 characters or more"
+        "--token",
+        default="",
+        help="token that browsers must send as ?token=, 8 characters or more, 5 different",
     )
     parser.add_argument(
         "--rate", type=number_in(0.01, 1000.0), default=1.0, help="speed of the bag (default: 1)"

@@ -18,6 +18,7 @@ from typing import Any, ParamSpec, TextIO, TypeVar
 
 from typing_extensions import Self
 
+from swarm_loc_estimator.common.files import check_folder
 from swarm_loc_estimator.common.parameters import (
     ParameterError,
     UserError,
@@ -118,13 +119,17 @@ def number_in(low: Number, high: Number, unit: str = "") -> Callable[[str], Numb
     return read
 
 
-def folder_to_write(text: str) -> Path:
-    """A type for argparse: a folder that exists or can be created. It is not created yet."""
-    path = Path(text)
-    nearest = next(one for one in (path, *path.absolute().parents) if one.exists())
-    if not nearest.is_dir() or not os.access(nearest, os.W_OK | os.X_OK):
-        raise argparse.ArgumentTypeError(f"{path} cannot be written: {nearest} is no folder that is writable")
-    return path
+def folder_to_write(*patterns: str) -> Callable[[str], Path]:
+    """A type for argparse: a folder whose files of these patterns can be written, see `check_folder`."""
+
+    def read(text: str) -> Path:
+        try:
+            check_folder(Path(text), *patterns)
+        except UserError as error:
+            raise argparse.ArgumentTypeError(str(error).rstrip(".")) from error
+        return Path(text)
+
+    return read
 
 
 def file_to_write(*suffixes: str) -> Callable[[str], Path]:
@@ -134,9 +139,7 @@ def file_to_write(*suffixes: str) -> Callable[[str], Path]:
         path = Path(text)
         if path.suffix not in suffixes:
             raise argparse.ArgumentTypeError(f"'{text}' must end in {' or '.join(suffixes)}")
-        if path.is_dir():
-            raise argparse.ArgumentTypeError(f"{path} cannot be written: it is a folder")
-        folder_to_write(str(path.parent))
+        folder_to_write(path.name)(str(path.parent))
         return path
 
     return read

@@ -7,18 +7,20 @@ are in docs/decisions/0001-numba.md.
 
 from __future__ import annotations
 
+import atexit
 import enum
 import hashlib
 import inspect
 import os
 import pickle
 import re
+import shutil
 import sys
-import threading
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, TypeVar, cast
@@ -30,12 +32,16 @@ from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 
+from swarm_loc_estimator.common.files import FileError, is_private, replacing
+
 Function = TypeVar("Function", bound=Callable[..., object])
 
 _NUMBERS = {"None", "bool", "int", "float", "tuple"}
 _KEPT_S = 30 * 86400.0
 _DAY_S = 86400.0
 _DIGEST_SIZE = 32
+_HOME = Path.home() / ".cache"
+_ROOTS = ("_SWARM_LOC_PRIVATE_CACHE", "NUMBA_CACHE_DIR", "XDG_CACHE_HOME")
 _FOREIGN = {*sys.stdlib_module_names, "numpy", "numba", "scipy", "llvmlite"}
 _PLAIN = (int, float, complex, str, bytes, type(None), type(...), np.generic, np.dtype)
 _core: Any = core  # most of it has no types
@@ -85,7 +91,6 @@ def note_precompiled(precompile: Callable[[], None]) -> None:
     """Record that a function and all that it calls are compiled; delete code unused for a month."""
     mark = _mark(precompile)
     with suppress(OSError):  # where nothing can be kept, the next start compiles again
-        mark.parent.mkdir(parents=True, exist_ok=True)
         mark.touch()
         for file in mark.parent.iterdir():
             if file.stat().st_mtime < time.time() - _KEPT_S:
@@ -181,7 +186,11 @@ class _ContentCache(NullCache):
         _core.runtime.rtsys.initialize(target_context)
         file = self._file(sig, target_context.codegen())
         try:
-            data = file.read_bytes()
+            with file.open("rb") as opened:
+                data = opened.read()
+                if not is_private(os.fstat(opened.fileno())):
+                    _say_unsafe(file.parent)
+                    return None
             if hashlib.sha256(data[_DIGEST_SIZE:]).digest() != data[:_DIGEST_SIZE]:
                 return None  # damaged: it is compiled again
             rebuild: Any = CompileResult._rebuild  # noqa: SLF001
@@ -198,10 +207,10 @@ class _ContentCache(NullCache):
         if data.library.has_dynamic_globals:
             raise TypeError(f"{self._dispatcher.py_func.__qualname__} uses a global that cannot be cached")
         file = self._file(sig, data.codegen)
-        with suppress(OSError):  # where nothing can be kept, the next start compiles again
-            file.parent.mkdir(parents=True, exist_ok=True)
-            code = _core.serialize.dumps(data._reduce())  # noqa: SLF001
-            write_whole(file, hashlib.sha256(code).digest() + code)
+        code = _core.serialize.dumps(data._reduce())  # noqa: SLF001
+        with suppress(FileError), replacing(file) as part:  # else the next start compiles again
+            part.write_bytes(hashlib.sha256(code).digest() + code)
+            part.chmod(0o644)  # whatever the umask, see `is_private`
 
     def _file(self, sig: Any, codegen: Any) -> Path:
         arguments, _ = _core.sigutils.normalize_signature(sig)
@@ -213,16 +222,6 @@ class _ContentCache(NullCache):
         ]
         name = re.sub(r"\W", "", self._dispatcher.py_func.__name__)
         return _folder() / f"{name}-{_digest(parts, codegen)}.nbc"
-
-
-def write_whole(file: Path, data: bytes) -> None:
-    """Write a file so that whoever reads it sees all of it, or the one before."""
-    part = file.with_name(f"{file.name}.{os.getpid()}-{threading.get_ident()}.tmp")
-    try:
-        part.write_bytes(data)
-        part.replace(file)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _contents(functions: Iterable[Any]) -> list[str]:
@@ -346,5 +345,29 @@ def _digest(parts: list[str], codegen: Any) -> str:
 
 
 def _folder() -> Path:
-    root = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(root) / "swarm_loc_estimator"
+    root = next(filter(None, map(os.environ.get, _ROOTS)), _HOME)
+    return _private_folder(Path(root) / "swarm_loc_estimator")
+
+
+@cache
+def _private_folder(folder: Path) -> Path:
+    """The folder, or that in the home or a temporary one, for child processes too: code in it is executed."""
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if is_private(folder.lstat(), folder.stat()):
+            return folder
+    except OSError:
+        return folder  # nothing is read from there, or kept
+    _say_unsafe(folder)
+    root = _HOME
+    if folder.parent == root:
+        root = Path(tempfile.mkdtemp(prefix="swarm_loc_estimator_"))
+        atexit.register(shutil.rmtree, root, ignore_errors=True)
+    os.environ[_ROOTS[0]] = str(root)  # numba reads its settings again when its own variables change
+    return _folder()
+
+
+@cache
+def _say_unsafe(folder: Path) -> None:
+    what = f"Compiled code in {folder} that others than this user and root own or can write"
+    print(f"{what} is not used: it is compiled again into a folder of this user.", file=sys.stderr)

@@ -27,6 +27,7 @@ class Trajectory:
 
     stamp_ns: IntArray  #: (N,) not decreasing
     pose: FloatArray  #: (N, 3) x [m], y [m], theta [rad] in map
+    left_out: int = 0  #: Number of poses of its source that are not finite
 
     def __post_init__(self) -> None:
         if self.pose.shape != (len(self.stamp_ns), 3):

@@ -19,6 +19,7 @@ from ruamel.yaml.nodes import Node, ScalarNode
 from ruamel.yaml.representer import SafeRepresenter
 from ruamel.yaml.resolver import VersionedResolver
 
+from swarm_loc_estimator.common.files import write_whole
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError
 
 Tree = Any  # dict, list, str, int, float, bool or None
@@ -56,6 +57,12 @@ class _Resolver(VersionedResolver):
     @property
     def processing_version(self) -> tuple[int, int]:
         return 1, 2  # whatever a %YAML directive says
+
+
+class _Yaml(YAML):
+    """Whatever version 1 a %YAML directive names."""
+
+    version: Any = None  # the library's refuses 1.0
 
 
 class _Constructor(SafeConstructor):
@@ -153,16 +160,12 @@ def tree_text(tree: Tree) -> str:
 
 def write_tree(tree: Tree, path: Path, comments: Iterable[str] = ()) -> None:
     """Write a tree with lines of comments above it, whole or not at all; creates the folder where missing."""
-    text = "".join(f"# {line}\n" for line in comments) + tree_text(tree)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(path.name + ".part")
-    temporary.write_text(text, encoding="utf-8")
-    temporary.replace(path)
+    write_whole(path, "".join(f"# {line}\n" for line in comments) + tree_text(tree))
 
 
 def _yaml() -> YAML:
     """The library, in Python alone: in its parser in C, deeply nested brackets crash the process."""
-    yaml = YAML(typ="safe", pure=True)
+    yaml = _Yaml(typ="safe", pure=True)
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]  # the library's is too narrow
     yaml.width = 1000
     yaml.Resolver, yaml.Constructor, yaml.Representer = _Resolver, _Constructor, _Representer

@@ -105,6 +105,10 @@ _REASONS = MappingProxyType(
         "no_odometry": ("publishes odometry but has none in the description", "Remove odometry: null"),
         "odometry_non_finite": ("publishes odometry that is not finite", "Look for NaN in its driver"),
         "odometry_absurd": ("publishes odometry beyond 1000 km", "Look at its driver and its units"),
+        "imu_no_rate": (
+            "says by a covariance of -1 that its IMU measures no turn rates",
+            "Set it in the driver if there is a gyroscope; else remove imu from the description",
+        ),
         "imu_non_finite": (
             "publishes turn rates that are not finite",
             "Look for NaN in the driver of the IMU",

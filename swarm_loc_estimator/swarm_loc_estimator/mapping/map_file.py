@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError
-from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, TreeChecks, read_file, read_tree, tree_text
+from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, TreeChecks, read_file, read_tree, write_tree
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
@@ -25,22 +27,27 @@ _NUMBERS = {
     "occupied_thresh": NumberSpec("1", 0.0, 1.0, False, "cells above are occupied"),
     "free_thresh": NumberSpec("1", 0.0, 1.0, False, "cells below are free"),
 }
+_MAX_YAW = 1e-6  # Of a map [rad], as rounding leaves it: less than a millimetre in a kilometre
+_HEADER_BYTES = 1 << 18
+_COMMENTS = 1000
+_SEPARATOR = rb"(?:\s|#[^\r\n]*[\r\n])+"
+_PNM = re.compile(rb"P(?:[14]|[2356]" + _SEPARATOR + rb"\d+)" + 2 * (_SEPARATOR + rb"\d+") + rb"\s")
+_FORMATS = ("PPM", "PNG", "BMP")  # Other decoders of Pillow start programs, or have seen less care
 _PLACE = NumberSpec("m", -1e6, 1e6, False, "of the lower left corner")
 
 
 class MapFileError(UserError):
-    """A map file that cannot be used or written."""
+    """A map file that cannot be used."""
 
 
 def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
-    """Write PATH.yaml and PATH.pgm; returns both, raises MapFileError if they cannot be written."""
+    """Write PATH.yaml and PATH.pgm; returns both, raises FileError if they cannot be written."""
     from PIL import Image  # noqa: PLC0415 - an estimator without a map starts without it
 
     image_path, yaml_path = path.with_suffix(".pgm"), path.with_suffix(".yaml")
     pixels = np.full(occupancy.log_odds.shape, _UNKNOWN, dtype=np.uint8)
     pixels[occupancy.free], pixels[occupancy.occupied] = _FREE, _OCCUPIED
-    image = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(pixels.T[::-1])).save(image, "PPM")  # the first row is the uppermost
+    image = Image.fromarray(np.ascontiguousarray(pixels.T[::-1]))  # the first row is the uppermost
     about = {
         "image": image_path.name,
         "mode": "trinary",
@@ -50,14 +57,9 @@ def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
         "occupied_thresh": _OCCUPIED_THRESHOLD,
         "free_thresh": _FREE_THRESHOLD,
     }
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        for target, data in ((image_path, image.getvalue()), (yaml_path, tree_text(about).encode())):
-            part = target.with_name(f"{target.name}.part")
-            part.write_bytes(data)
-            part.replace(target)
-    except OSError as error:
-        raise MapFileError(f"The map cannot be written to '{path}': {error.strerror}.") from error
+    with replacing(image_path) as part:
+        image.save(part, "PPM")
+    write_tree(about, yaml_path)
     return yaml_path, image_path
 
 
@@ -74,7 +76,7 @@ def load_map(path: Path, cell: float | None = None) -> OccupancyMap:
     numbers = {name: checks.number(about[name], name, spec) or 0.0 for name, spec in _NUMBERS.items()}
     places = checks.items(about["origin"], "origin")
     origin = [checks.number(value, "origin", _PLACE) or 0.0 for value in places]
-    if len(origin) != 3 or origin[2] != 0.0:
+    if len(origin) != 3 or abs(origin[2]) > _MAX_YAW:
         raise checks.error("origin", about["origin"], "must be x, y and a yaw of 0")
     mode, negate = about.get("mode", "trinary"), about.get("negate", 0)
     if mode not in _MODES:
@@ -127,17 +129,28 @@ def _resampled(log_odds: FloatArray, scale: float, checks: TreeChecks) -> FloatA
     return np.asarray(log_odds[::-1][rows][::-1][:, columns])
 
 
+def _check_header(data: bytes) -> None:
+    """Raise ValueError if much is before the pixels, which Pillow reads byte by byte or chunk by chunk."""
+    head = data[:_HEADER_BYTES]
+    is_short = head.startswith(b"BM") or b"IDAT" in head
+    if head.startswith(b"P"):  # digits have comments between them, too
+        is_short = bool(_PNM.match(head)) and (head[1:2] > b"3" or data.count(b"#") <= _COMMENTS)
+    if not is_short:
+        raise ValueError("it is no PGM, PNG or BMP with a header of a usual length")
+
+
 def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Gray values (height, width) of an image of any usual format, and which pixels are opaque.
+    """Gray values (height, width) of an image as map_server writes it, and which pixels are opaque.
 
     Raises:
-        UserError: It cannot be read, or is too large.
+        UserError: It cannot be read, is too large, or is no PGM, PPM, PBM, PNG or BMP.
     """
     from PIL import Image  # noqa: PLC0415 - as above
 
     data = read_file(path, _MAX_BYTES)
     try:
-        with Image.open(io.BytesIO(data)) as opened:
+        _check_header(data)
+        with Image.open(io.BytesIO(data), formats=_FORMATS) as opened:
             image: Any = opened
             small_enough = 0 < image.width * image.height <= _MAX_CELLS
             if small_enough and image.mode.startswith("I"):  # 16 bits, which `convert` would cut off

@@ -27,8 +27,9 @@ from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, l
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_pose_stamped
 from swarm_loc_estimator.common.node import BACKWARDS, ConfiguredNode, message_class, run_node
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.grid import CELL, OccupancyMap
-from swarm_loc_estimator.mapping.map_file import MapFileError, load_map, save_map
+from swarm_loc_estimator.mapping.map_file import load_map, save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper, Located
 from swarm_loc_estimator.mapping.mapper_feed import (
     MapperFeed,
@@ -146,7 +147,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         try:
             path, image = save_map(self._mapper.occupancy(), Path(self.params.save_map))
             response.success, response.message = True, f"The map is in '{path}' and '{image}'."
-        except MapFileError as error:
+        except UserError as error:
             response.success, response.message = False, str(error)
         return response
 

@@ -98,7 +98,9 @@ class WatchParameters:
         "127.0.0.1", "what to listen on; any but a loopback address needs a token", required=True
     )
     port: int = number(8420, "1", 0, 65535, "where to listen; 0: any port that is free")
-    token: str = text("", "token that browsers must send as ?token=, 8 characters or more; empty: none")
+    token: str = text(
+        "", "token that browsers must send as ?token=, 8 characters or more, 5 different; empty: none"
+    )
     rate: float = number(20.0, "Hz", 0.5, 60.0, "how often a page gets new poses, at most")
     commands: bool = flag(
         True, "whether pages may reset the estimator and set poses, each time after a question"

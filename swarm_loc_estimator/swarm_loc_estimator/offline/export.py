@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 import tempfile
 from collections.abc import Iterator, Mapping
 from decimal import Decimal, InvalidOperation
@@ -13,6 +12,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.common.messages.cdr import (
     MARKERS,
     OCCUPANCY_GRID,
@@ -49,7 +49,6 @@ def write_tum(result: ReplayResult, folder: Path) -> None:
     `<robot>.tum` has the estimated poses, `<robot>.truth.tum` the ground truth at the same instants, as far
     as it is known there. So evo, which pairs the nearest stamps, finds the errors of the report.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     for index, robot in enumerate(result.swarm.robots):
         pose = result.poses[:, index]
         _write(folder / f"{robot.name}.tum", result.stamp_ns, pose)
@@ -61,7 +60,7 @@ def write_tum(result: ReplayResult, folder: Path) -> None:
 
 def _write(path: Path, stamp_ns: IntArray, pose: FloatArray) -> None:
     """Write the finite ones of poses (T, 3)."""
-    with path.open("w", encoding="utf-8") as file:
+    with replacing(path) as part, part.open("w", encoding="utf-8") as file:
         for at_ns, (x, y, theta) in zip(stamp_ns.tolist(), pose.tolist(), strict=True):
             if math.isfinite(x + y + theta):
                 seconds, rest = divmod(at_ns, 10**9)
@@ -92,28 +91,33 @@ def read_truth(folder: Path | None, swarm: Swarm) -> dict[str, Trajectory]:
 def read_tum(path: Path) -> Trajectory:
     """The poses of a file by their stamps; lines that begin with # are comments.
 
+    Poses that are not finite are left out, and counted.
+
     Raises:
         TumError: A line is no pose, or there is none.
         YamlTreeError: The file cannot be read.
     """
-    stamps_ns, poses = [], []
-    for number, line in enumerate(read_file(path, _MAX_BYTES).decode("utf-8", "replace").splitlines(), 1):
-        if not line.strip() or line.startswith("#"):
+    stamps_ns, poses, left_out = [], [], 0
+    lines = read_file(path, _MAX_BYTES).decode("utf-8-sig", "replace").splitlines()
+    for number, line in enumerate(map(str.strip, lines), 1):
+        if not line or line.startswith("#"):
             continue
         try:
             at_s, *numbers = line.split()
             x, y, z, *turn = map(float, numbers)
-            yaw, stamp_ns = yaw_of(*turn), _nanoseconds(at_s)
+            yaw = yaw_of(*turn)
+            if not math.isfinite(float(at_s) + x + y + z + yaw):
+                left_out += 1
+                continue
+            stamp_ns = _nanoseconds(at_s)
         except (ValueError, TypeError, InvalidOperation) as error:
             raise TumError(f"'{path}', line {number}: '{line[:60]}' is no pose: {_FORMAT}.") from error
-        if not math.isfinite(x + y + z + yaw):
-            raise TumError(f"'{path}', line {number}: '{line[:60]}' is not finite, or has no heading.")
         stamps_ns.append(stamp_ns)
         poses.append((x, y, yaw))
     if not poses:
         raise TumError(f"'{path}' has no pose; one line each: {_FORMAT}.")
     stamp_ns_of, order = np.array(stamps_ns), np.argsort(stamps_ns, kind="stable")
-    return Trajectory(stamp_ns_of[order], np.array(poses)[order])
+    return Trajectory(stamp_ns_of[order], np.array(poses)[order], left_out)
 
 
 _FORMAT = "seconds x y z qx qy qz qw"
@@ -136,7 +140,7 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
     Transforms lead from map directly to `<robot>/base_link`; the file holds no odom frames.
 
     Raises:
-        BagError: It cannot be written.
+        UserError: It cannot be written.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=".mcap_") as folder:
@@ -149,7 +153,8 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
                 writer.add_topic("map", OCCUPANCY_GRID, is_latched=True)
             for one in result.maps:
                 writer.write("map", one.log_ns, one.data)
-        shutil.move(bag / "run.mcap", path)
+        with replacing(path) as part:
+            (bag / "run.mcap").replace(part)
 
 
 def _add_tracks(topic: str, tracks: Mapping[str, Trajectory], writer: BagWriter) -> None:

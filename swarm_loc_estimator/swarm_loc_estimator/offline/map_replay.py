@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.mapping.grid import OccupancyMap
@@ -158,6 +159,6 @@ def draw_map(
     axes.add_collection(LineCollection(segments, colors="C0", linewidths=1.0, alpha=0.7))
     axes.plot(stops[:, 0], stops[:, 1], ".", color="C3", markersize=3.0)
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title or f"{len(stops)} stops")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, metadata={"Software": None})
+    with replacing(path) as part:
+        figure.savefig(part, format="png", metadata={"Software": None})
     return path

@@ -16,9 +16,10 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.bags.bag_file import BagError
 from swarm_loc_estimator.common.command_line import swarm_beside
+from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.identification.memory import Identities
@@ -91,6 +92,8 @@ def replay(
         remarks.append(f"{jumps}; no poses are given meanwhile.")
     remarks += runner.notes(summary.range_ns)
     result = runner.result(bag.name, summary.range_ns, {**summary.truth, **truth}, summary.received)
+    compared, said = _compared(result.truth, result.stamp_ns)
+    remarks += said
     if estimator.origin:
         remarks.append(
             f"No start, landmark or fix: poses are relative to {estimator.origin}, without errors."
@@ -100,7 +103,24 @@ def replay(
     if result.self_calibrated:
         remarks += swapped_signs(result.self_calibrated)
     remarks += result.loss_remarks
-    return replace(result, remarks=tuple(remarks), maps=summary.maps, goals=summary.goals)
+    found = replace(result, truth=compared, remarks=tuple(remarks))
+    return replace(found, maps=summary.maps, goals=summary.goals)
+
+
+def _compared(truth: Mapping[str, Trajectory], stamp_ns: IntArray) -> tuple[dict[str, Trajectory], list[str]]:
+    """The ground truth that overlaps poses (T,) in time, and sentences about all that is not used."""
+    said = [
+        f"Ground truth of {name}: {track.left_out} poses that are not finite are left out."
+        for name, track in truth.items()
+        if track.left_out
+    ]
+    early, late = (stamp_ns[0], stamp_ns[-1]) if stamp_ns.size else (0, 0)
+    apart = [name for name, one in truth.items() if one.stamp_ns[-1] < early or one.stamp_ns[0] > late]
+    if apart and stamp_ns.size:
+        off_s = 1e-9 * int(truth[apart[0]].stamp_ns[0] - early)
+        where = f"begins {abs(off_s):.1f} s {'after' if off_s > 0.0 else 'before'} the first pose"
+        said.append(f"Ground truth of {listed(apart)} is of another time, {where}, and is not used.")
+    return {name: track for name, track in truth.items() if name not in apart}, said
 
 
 class ScheduleError(UserError):

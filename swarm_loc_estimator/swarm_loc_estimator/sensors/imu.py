@@ -28,7 +28,7 @@ class TurnRateRows(NamedTuple):
     robot: IntArray  #: (k,) index of the robot
     stamp_ns: IntArray  #: (k,) acquisition stamps
     velocity: FloatArray  #: (k, 3) angular velocity in the frame of the IMU [rad/s]
-    #: (k,) turn rate about the vertical, without calibration [rad/s]; NaN before the conversion
+    #: (k,) turn rate about the vertical, without calibration [rad/s]; before the conversion NaN, -inf: none
     rate: FloatArray
     arrival_ns: IntArray  #: (k,) arrival times
 
@@ -62,20 +62,25 @@ class TurnRateSensor(Sensor):
         """Convert decoded messages (n,); a first covariance of -1 says that there is no rate."""
         velocity = np.array(
             [
-                (math.nan,) * 3
-                if message.angular_velocity_covariance[0] == -1.0  # the convention of sensor_msgs
-                else (message.angular_velocity.x, message.angular_velocity.y, message.angular_velocity.z)
+                (message.angular_velocity.x, message.angular_velocity.y, message.angular_velocity.z)
                 for message in messages.decoded
             ],
             dtype=float,
         ).reshape(-1, 3)
-        rate = np.full(len(velocity), np.nan)
+        # the convention of sensor_msgs
+        has_none = [message.angular_velocity_covariance[0] == -1.0 for message in messages.decoded]
+        rate = np.where(has_none, -np.inf, np.nan)
         return TurnRateRows(messages.robot, messages.stamp_ns, velocity, rate, messages.arrival_ns)
 
     def measure(self, rows: TurnRateRows) -> TurnRateRows:
         """Select finite turn rates of robots with an IMU, turned to the vertical."""
+        has_none = rows.rate == -np.inf
         rows = rows._replace(rate=np.sum(self._vertical[rows.robot] * rows.velocity, axis=1))
-        reasons = {"imu_non_finite": ~np.isfinite(rows.rate), "imu_absurd": ~(np.abs(rows.rate) <= _MAX_RATE)}
+        reasons = {
+            "imu_no_rate": has_none,
+            "imu_non_finite": ~np.isfinite(rows.rate),
+            "imu_absurd": ~(np.abs(rows.rate) <= _MAX_RATE),
+        }
         good = self.drops.screen(rows.robot, reasons)
         return rows if good.all() else select(rows, good)
 

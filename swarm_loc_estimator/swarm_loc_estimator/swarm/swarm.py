@@ -248,9 +248,10 @@ class Swarm:
     map: Path | None = None
 
     def __post_init__(self) -> None:
-        names = Counter(one.name for one in self.sources)
+        names = Counter(one.name.lower() for one in self.sources)
         if twice := [name for name, count in names.items() if count > 1]:
-            raise SwarmError(f"name '{twice[0]}' is given to two robots or cameras; names must be unique.")
+            what = "two robots or cameras, which must differ by more than capitals"
+            raise SwarmError(f"name '{twice[0]}' is given to {what}.")
         faces = [(f"face '{f.name}' of robot '{r.name}'", f.id) for r in self.robots for f in r.faces]
         marks = [(f"landmark {mark.id}", mark.id) for mark in self.landmarks]
         boards = [(f"robot '{r.name}'", r.ir.id) for r in self.robots if r.ir is not None]

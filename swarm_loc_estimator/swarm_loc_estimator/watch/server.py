@@ -10,6 +10,7 @@ import asyncio
 import hmac
 import ipaddress
 import json
+import logging
 import re
 import socket
 import threading
@@ -28,7 +29,9 @@ MIN_TOKEN_LENGTH = 8
 GUESS_PERIOD_S = 1.0
 """A client that has used its free guesses may send one wrong token per period of this length [s]."""
 _FREE_GUESSES = 5
-_SLOTS = 256
+MIN_DISTINCT = 5  # Least number of different characters of a token
+_BLOCKS = (1, 2, 3, 4), (4, 6, 8, 16)  # Bytes of blocks of IPv4 and IPv6 addresses, from wide to narrow
+_SHARES = (8, 8, 16, 256)  # Numbers of parts into which the slots of each such block are divided
 _LOCAL_NAMES = {"localhost", "127.0.0.1", "::1"}
 _HOST = re.compile(r"(?:\[(?P<v6>[0-9a-f:.]+)\]|(?P<name>[0-9a-z._-]+))(?::[0-9]{1,5})?", re.ASCII)
 _WRONG = "The token is missing or wrong: open the address that the log shows, with ?token=."
@@ -41,17 +44,18 @@ class AccessError(UserError):
 class WrongTokens:
     """Limits the rate at which clients guess the token.
 
-    Its memory is fixed: clients whose names have the same hash share a slot. A repeated token does not count
-    as a guess, so that a page which reconnects with an old token does not lock out clients of the same slot.
+    Its memory is bounded: addresses share slots by hash, but a block, such as one network's, has only a share
+    of those of the wider block: many addresses lock out few others. A repeated token is no guess, so that a
+    page which reconnects with an old one does not lock out clients of the same slot.
     """
 
     def __init__(self) -> None:
-        self._slots = [_Slot(0.0, 0)] * _SLOTS
+        self._slots: dict[int, _Slot] = {}
 
     def refusal(self, client: str, given: str, token: str) -> str:
         """Reason to refuse what a client gave as token, "" for none, one sentence; "" if it is right."""
-        place, guess = hash(client) % _SLOTS, hash((client, given))
-        slot, now_s = self._slots[place], time.monotonic()
+        place, guess = _place(client), hash((client, given))
+        slot, now_s = self._slots.get(place, _Slot(0.0, 0)), time.monotonic()
         if not given or guess == slot.guess:
             return _WRONG
         if slot.clear_s > now_s + (_FREE_GUESSES - 1) * GUESS_PERIOD_S:
@@ -60,6 +64,19 @@ class WrongTokens:
             return ""
         self._slots[place] = _Slot(max(slot.clear_s, now_s) + GUESS_PERIOD_S, guess)
         return _WRONG
+
+
+def _place(client: str) -> int:
+    """Index of the slot of an IP address; other names are taken for addresses."""
+    try:
+        address = ipaddress.ip_address(client)
+        data = (getattr(address, "ipv4_mapped", None) or address).packed
+    except ValueError:
+        data = client.encode(errors="replace")
+    place = 0
+    for length, parts in zip(_BLOCKS[len(data) > 4], _SHARES, strict=True):
+        place = place * parts + hash(data[:length]) % parts
+    return place
 
 
 class _Slot(NamedTuple):
@@ -87,10 +104,9 @@ class Access:
                 f"parameter address = '{self.address}' can be reached by others: set the parameter token,"
                 " which their browsers must then give as ?token=."
             )
-        if self.token and len(self.token) < MIN_TOKEN_LENGTH:
-            raise AccessError(
-                f"parameter token is too short: it needs {MIN_TOKEN_LENGTH} characters or more."
-            )
+        if self.token and (len(self.token) < MIN_TOKEN_LENGTH or len(set(self.token)) < MIN_DISTINCT):
+            need = f"{MIN_TOKEN_LENGTH} characters or more, of which {MIN_DISTINCT} differ"
+            raise AccessError(f"parameter token is too weak: it needs {need}.")
 
     def refusal(self, host: str, origin: str | None, token: str, client: str = "") -> str:
         """Reason to refuse a request by its headers Host and Origin and its ?token=; "" if it is accepted.
@@ -132,6 +148,7 @@ _HEARTBEAT_S = 10.0
 _START_PATIENCE_S = 10.0
 REQUEST_PATIENCE_S = 10.0  # Timeout after which a connection that is not a page's WebSocket is closed
 _SWEEP_PERIOD_S = 1.0
+_LOG_PERIOD_S = 1.0
 
 Command = Mapping[str, Any]
 MAX_NOTES = 64  # Maximum number of texts queued for a slow page; the oldest are dropped first
@@ -165,6 +182,25 @@ class ServerLoad(NamedTuple):
     refused: int  # Total number of refused requests
 
 
+class _OneLine(logging.Filter):
+    """Passes one record a second, without its traceback: others decide how many requests cannot be read."""
+
+    _next_s = 0.0
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        now_s = time.monotonic()
+        if now_s < self._next_s:
+            return False
+        self._next_s = now_s + _LOG_PERIOD_S
+        reason = record.exc_info[1] if record.exc_info else ""
+        record.msg, record.args, record.exc_info = f"{record.getMessage()} {reason!r:.200}", (), None
+        return True
+
+
+_LOG = logging.getLogger(__name__)
+_LOG.addFilter(_OneLine())
+
+
 class WatchServer:
     """Serves the page.
 
@@ -188,7 +224,10 @@ class WatchServer:
         self._refused = 0
         self._known_left_out: dict[int, int] = {}
         self._loop = asyncio.new_event_loop()
-        self._runner = web.AppRunner(self._application(), access_log=None, shutdown_timeout=1.0)
+        self._loop.set_exception_handler(
+            lambda _, about: _LOG.error(about["message"], exc_info=about.get("exception"))
+        )
+        self._runner = web.AppRunner(self._application(), access_log=None, shutdown_timeout=1.0, logger=_LOG)
         self._listening = threading.Event()
         self._faults: list[OSError] = []
         self._thread = threading.Thread(target=self._run, args=(port,), name="watch_server", daemon=True)
@@ -291,10 +330,10 @@ class WatchServer:
 
     def _check(self, request: web.Request) -> None:
         """Refuse requests without access."""
-        hosts = request.headers.getall("Host", [])
+        hosts, origins = (request.headers.getall(name, []) for name in ("Host", "Origin"))
         refusal = self._access.refusal(
             hosts[0] if len(hosts) == 1 else "",
-            request.headers.get("Origin"),
+            " and ".join(origins) if origins else None,
             request.query.get("token", ""),
             request.remote or "",
         )

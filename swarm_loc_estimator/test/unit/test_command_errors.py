@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from argparse import ArgumentTypeError
 from collections.abc import Callable
 from pathlib import Path
@@ -53,7 +54,7 @@ def test_a_bag_that_is_not_there_is_said(
 
 
 def test_folders_are_not_made_before_there_is_anything_to_write(tmp_path: Path) -> None:
-    assert folder_to_write(str(tmp_path / "a" / "b")) == tmp_path / "a" / "b"
+    assert folder_to_write()(str(tmp_path / "a" / "b")) == tmp_path / "a" / "b"
     assert file_to_write(".mcap")(str(tmp_path / "a" / "b.mcap")) == tmp_path / "a" / "b.mcap"
     assert not (tmp_path / "a").exists()
 
@@ -62,13 +63,21 @@ def test_folders_are_not_made_before_there_is_anything_to_write(tmp_path: Path) 
     ("name", "said"),
     [
         ("run.bag", "must end in .yaml or .yml"),
-        ("folder.yaml", "cannot be written: it is a folder"),
-        ("file/run.yml", "cannot be written: .*file is no folder that is writable"),
+        ("folder.yaml", "folder.yaml cannot be written: it is a folder"),
+        ("link.yaml", "link.yaml cannot be written: it is a symbolic link"),
+        ("nowhere.yaml", "nowhere.yaml cannot be written: it is a symbolic link"),
+        ("pipe.yaml", "pipe.yaml cannot be written: it is no regular file"),
+        ("gone/run.yml", "gone cannot be written: No such file"),
+        ("file/run.yml", "file cannot be written: Not a directory"),
     ],
 )
 def test_a_file_that_cannot_be_written_is_said(name: str, said: str, tmp_path: Path) -> None:
     (tmp_path / "folder.yaml").mkdir()
     (tmp_path / "file").touch()
+    (tmp_path / "link.yaml").symlink_to(tmp_path / "file")
+    (tmp_path / "nowhere.yaml").symlink_to(tmp_path / "none")
+    (tmp_path / "gone").symlink_to(tmp_path / "none")
+    os.mkfifo(tmp_path / "pipe.yaml")
     with pytest.raises(ArgumentTypeError, match=said):
         file_to_write(".yaml", ".yml")(str(tmp_path / name))
 

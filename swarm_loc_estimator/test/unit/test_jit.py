@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import pickle
 import shutil
 import subprocess
 import sys
@@ -51,13 +53,17 @@ note_precompiled(precompile)
 
 
 def run(folder: Path, cache: Path, used: str = USED) -> list[str]:
+    return run_with_errors(folder, cache, used).stdout.split()
+
+
+def run_with_errors(folder: Path, cache: Path, used: str = USED) -> subprocess.CompletedProcess[str]:
     folder.mkdir(exist_ok=True)
     (folder / "used.py").write_text(used, encoding="utf-8")
     (folder / "using.py").write_text(USING, encoding="utf-8")
     env = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
     # Without byte code: Python takes that of a source of the same second and size for its own.
     command = [sys.executable, "-B", str(folder / "using.py")]
-    return subprocess.run(command, env=env, capture_output=True, text=True, check=True).stdout.split()
+    return subprocess.run(command, env=env, capture_output=True, text=True, check=True)
 
 
 @pytest.fixture(scope="module")
@@ -117,6 +123,75 @@ def test_a_damaged_file_is_compiled_again(tmp_path: Path, cache: Path, damage: s
     assert run(tmp_path / "first", cache)[1:] == ["3.0", "1"]
 
 
+class Planted:
+    """Data that run a command where they are read."""
+
+    def __init__(self, mark: Path) -> None:
+        self._command = f"touch '{mark}'"
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.system, (self._command,)
+
+
+def given_away(path: Path) -> None:
+    """Make a path another user's, which only root can."""
+    if os.geteuid():
+        pytest.skip("only root can give files away")
+    os.chown(path, 65534, 65534, follow_symlinks=False)
+
+
+@pytest.mark.parametrize("place", ["folder", "file", "link"])
+@pytest.mark.parametrize("fault", ["all", "group", "owner"])
+def test_code_that_others_could_have_planted_does_not_run(
+    tmp_path: Path, cache: Path, place: str, fault: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    code, mark = pickle.dumps(Planted(tmp_path / "ran")), tmp_path / "ran"
+    files, folder = [*cache.rglob("*.nbc")], cache / "swarm_loc_estimator"
+    for file in files:
+        file.write_bytes(hashlib.sha256(code).digest() + code)
+    if place == "link":
+        folder.rename(tmp_path / "elsewhere")
+        folder.symlink_to(tmp_path / "elsewhere")
+    for path in files if place == "file" else [folder]:
+        if fault == "owner":
+            given_away(path)
+        else:
+            path.chmod(0o777 if fault == "all" else 0o775)
+
+    said = run_with_errors(tmp_path / "first", cache)
+    assert said.stdout.split()[1:] == ["3.0", "0"]
+    assert not mark.exists()
+    assert said.stderr.count("that others than this user and root own or can write") == 1
+    if place == "file":  # replaced by own ones
+        assert run_with_errors(tmp_path / "first", cache).stderr == ""
+    else:  # that in the home is used
+        assert (tmp_path / "home/.cache/swarm_loc_estimator").stat().st_mode & 0o777 == 0o700
+        assert run(tmp_path / "first", cache)[2] == "1"
+
+
+@pytest.mark.parametrize("umask", [0o002, 0o000, 0o077])
+def test_own_code_is_found_again_whatever_the_umask(tmp_path: Path, umask: int) -> None:
+    before = os.umask(umask)
+    try:
+        assert run(tmp_path / "first", tmp_path / "new")[2] == "0"
+        assert run(tmp_path / "first", tmp_path / "new")[2] == "1"
+    finally:
+        os.umask(before)
+
+
+def test_without_a_safe_folder_code_is_kept_for_one_process(
+    tmp_path: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    for folder in (cache / "swarm_loc_estimator", tmp_path / "home/.cache/swarm_loc_estimator"):
+        folder.mkdir(parents=True, exist_ok=True)
+        folder.chmod(0o777)
+    assert run(tmp_path / "first", cache) == ["False", "3.0", "0"]
+    assert not [*tmp_path.glob("swarm_loc_estimator_*")]
+
+
 def test_processes_that_compile_at_once_leave_whole_files(tmp_path: Path, compiled: Path) -> None:
     cache = tmp_path / "cache"
     env = {**os.environ, "NUMBA_CACHE_DIR": str(cache)}
@@ -124,7 +199,7 @@ def test_processes_that_compile_at_once_leave_whole_files(tmp_path: Path, compil
     together = [subprocess.Popen(command, env=env, stdout=subprocess.PIPE, text=True) for _ in range(4)]
     assert {process.communicate()[0].split()[1] for process in together} == {"3.0"}
     assert [process.returncode for process in together] == [0] * 4
-    assert not [*cache.rglob("*.tmp")]
+    assert not [*cache.rglob("*.part")]
     assert run(tmp_path / "first", cache)[1:] == ["3.0", "1"]
 
 

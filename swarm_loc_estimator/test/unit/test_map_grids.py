@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import io
 import math
 import os
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
+from PIL import EpsImagePlugin, Image
 
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.exploration import goal_by_odometry, next_stop, paths_from
@@ -175,6 +177,85 @@ def test_a_broken_image_is_refused_in_a_sentence(tmp_path: Path, data: bytes) ->
     image.write_bytes(data)
     with pytest.raises(UserError, match=r"^The image '.*hall.pgm' of a map cannot be decoded"):
         load_map(path, CELL)
+
+
+def test_a_program_of_postscript_is_not_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ghost = tmp_path / "bin" / "gs"
+    ghost.parent.mkdir()
+    ghost.write_text(f"#!/bin/sh\ntouch {tmp_path}/ran\n")
+    ghost.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{ghost.parent}:{os.environ['PATH']}")
+    monkeypatch.setattr(EpsImagePlugin, "gs_binary", None)
+    path, image = save_map(hall(), tmp_path / "hall")
+    for suffix in ("EPS", "TIFF", "GIF", "JPEG", "WEBP"):
+        Image.new("L", (160, 110)).save(image, suffix)
+        with pytest.raises(UserError, match=r"^The image '.*hall.pgm' of a map cannot be decoded"):
+            load_map(path, CELL)
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize("kind", ["PNG", "BMP", "PPM"])
+def test_what_map_server_writes_is_read(tmp_path: Path, kind: str) -> None:
+    path, image = save_map(hall(), tmp_path / "hall")
+    expected = load_map(path, CELL)
+    for colours in ("L", "RGB"):
+        Image.open(io.BytesIO(image.read_bytes())).convert(colours).save(image, kind)
+        assert np.array_equal(load_map(path, CELL).log_odds, expected.log_odds)
+
+
+@pytest.mark.parametrize(
+    "head", [b"P5\n# by hand\n160 110\n255\n", b"P5 #\r160#x\n#\n 110\t255\n", b"P6 160 110 255\n"]
+)
+def test_usual_comments_of_an_image_are_ignored(tmp_path: Path, head: bytes) -> None:
+    path, image = save_map(hall(), tmp_path / "hall")
+    expected = load_map(path, CELL)
+    pixels = np.frombuffer(image.read_bytes()[-160 * 110 :], np.uint8)
+    image.write_bytes(head + pixels.repeat(3 if head[1:2] == b"6" else 1).tobytes())
+    assert np.array_equal(load_map(path, CELL).log_odds, expected.log_odds)
+
+
+@pytest.mark.parametrize(
+    "kind", ["P5", "P2", "P1", "P4", "in a number", "between numbers", "before pixels", "PNG"]
+)
+def test_endless_comments_are_refused_and_not_read(
+    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Image, "open", pytest.fail)
+    path, image = save_map(hall(), tmp_path / "hall")
+    long, many = b"#" + b"x" * 1_000_000 + b"\n", b"#\n" * 500_000
+    chunk = bytes(4) + b"tEXt" + zlib.crc32(b"tEXt").to_bytes(4, "big")
+    png = io.BytesIO()
+    Image.new("L", (160, 110)).save(png, "PNG")
+    texts = {
+        "in a number": b"P5 16" + long + b"0 110 255\n",
+        "between numbers": b"P5 160 " + many + b"110 255\n",
+        "before pixels": b"P5 160 110 255" + long,
+        "PNG": png.getvalue()[:33] + 100_000 * chunk + png.getvalue()[33:],
+    }
+    numbers = b"160 110" if kind in {"P1", "P4"} else b"160 110 255"
+    within = many if kind in {"P1", "P2"} else b""
+    image.write_bytes(
+        texts.get(kind, kind.encode() + b"\n" + (b"" if within else long) + numbers + b"\n" + within)
+        + bytes(160 * 110)
+    )
+    with pytest.raises(UserError, match="with a header of a usual length"):
+        load_map(path, CELL)
+
+
+@pytest.mark.parametrize("yaw", ["1e-9", "-1.0e-7", "0", "-0.0"])
+def test_a_yaw_that_rounding_left_is_none(tmp_path: Path, yaw: str) -> None:
+    path, _ = save_map(hall(), tmp_path / "hall")
+    path.write_text(path.read_text().replace("0.0, 0.0]", f"0.0, {yaw}]"))
+    assert np.array_equal(load_map(path, CELL).occupied, hall().occupied)
+
+
+@pytest.mark.parametrize(
+    "head", ["%YAML 1.0\n---\n", "%YAML 1.1\n---\n", "%YAML 1.2\n---\n", "\ufeff", "\ufeff%YAML 1.0\n---\n"]
+)
+def test_heads_of_other_writers_of_yaml_are_read(tmp_path: Path, head: str) -> None:
+    path, _ = save_map(hall(), tmp_path / "hall")
+    path.write_text(head + path.read_text(), encoding="utf-8")
+    assert np.array_equal(load_map(path, CELL).occupied, hall().occupied)
 
 
 def write_map(folder: Path, pixels: Image.Image, **changes: object) -> Path:

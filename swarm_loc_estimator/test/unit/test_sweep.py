@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import socket
 import subprocess
@@ -22,7 +23,16 @@ from swarm_loc_estimator.offline.recorded_bag import Loss
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.sweep import sweep as sweeping
 from swarm_loc_estimator.offline.sweep.report import Row, _span, write_results
-from swarm_loc_estimator.offline.sweep.sweep import FIGURES, Job, SweepFileError, outcome, read_sweep
+from swarm_loc_estimator.offline.sweep.sweep import (
+    FIGURES,
+    Backend,
+    BackendError,
+    Job,
+    SweepFileError,
+    outcome,
+    read_sweep,
+    workers,
+)
 from swarm_loc_estimator.timeline.settings import Settings
 
 DEMO = Path(__file__).parents[3] / "bags" / "eight_one_robot_fast"
@@ -341,6 +351,42 @@ def test_a_missing_package_is_one_sentence(
     error = capsys.readouterr().err
     assert f"pip install 'swarm_loc_estimator[{backend}]'" in error
     assert error.count("\n") == 1
+
+
+def listening() -> set[tuple[str, str]]:
+    """Sockets of this machine that listen: address and port, and inode."""
+    lines = [
+        line.split()
+        for name in ("tcp", "tcp6")
+        for line in Path(f"/proc/net/{name}").read_text().splitlines()
+    ]
+    return {(line[1], line[9]) for line in lines if line[3] == "0A"}
+
+
+def test_a_cluster_of_ray_that_is_started_here_listens_on_loopback_only() -> None:
+    pytest.importorskip("ray")
+    before = listening()
+    with workers(1, Backend("ray")):
+        opened = {place.partition(":")[0] for place, _ in listening() - before}
+    assert opened
+    loopback = {"0100007F", f"{'0' * 24}01000000", f"{'0' * 16}FFFF00000100007F"}
+    assert opened <= loopback
+
+
+@pytest.mark.parametrize(("address", "setting"), [(None, "0"), ("127.0.0.1:1", None)])
+def test_ray_is_imported_for_this_machine_only_unless_a_cluster_is_given(
+    address: str | None, setting: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the test above, where Ray is not installed."""
+
+    def found(*_: str) -> None:
+        raise BackendError(str(os.environ.get("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER")))
+
+    monkeypatch.setenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "1")
+    monkeypatch.delenv("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER")
+    monkeypatch.setattr(sweeping, "loaded", found)
+    with pytest.raises(BackendError, match=f"^{setting}$"), workers(1, Backend("ray", address)):
+        pass
 
 
 def test_a_cluster_needs_a_back_end(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -65,11 +65,8 @@ def test_poses_are_sorted_and_comments_ignored(tmp_path: Path) -> None:
         (f"{LINE} 9\n", "line 1"),
         ("stamp x y z qx qy qz qw\n", "line 1"),
         ("-1 1 2 0 0 0 0 1\n", "line 1"),
-        ("nan 1 2 0 0 0 0 1\n", "line 1"),
-        ("inf 1 2 0 0 0 0 1\n", "line 1"),
-        ("1 nan 2 0 0 0 0 1\n", "is not finite"),
-        ("1 1 2 0 0 0 0 0\n", "has no heading"),
-        ("1 1 2 0 0 0 0 1e999\n", "is not finite"),
+        ("1 nan 2 0 0 0 0 1\n", "has no pose"),
+        ("nan 1 2 0 0 0 0\n", "line 1"),
         ("timestamp,x,y,z\n", "line 1"),
         ("\x00\x01", "line 1"),
     ],
@@ -82,6 +79,56 @@ def test_what_is_no_trajectory_is_refused(tmp_path: Path, text: str, said: str) 
     assert said in str(refused.value)
     assert "a.truth.tum" in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+def test_poses_that_are_not_finite_are_left_out_and_counted(
+    result: ReplayResult, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    name = result.swarm.robots[0].name
+    write_tum(result, tmp_path)
+    path = tmp_path / f"{name}.truth.tum"
+    clean = read_tum(path)
+    bad = [
+        "1 nan 2 0 0 0 0 1",
+        "nan 1 2 0 0 0 0 1",
+        "inf 1 2 0 0 0 0 1",
+        "1 1 2 0 0 0 0 0",
+        "1 1 2 0 0 0 0 1e999",
+    ]
+    path.write_text("\n".join([*bad, *path.read_text().splitlines()]))
+    found = read_tum(path)
+    assert found.left_out == len(bad)
+    assert np.array_equal(found.stamp_ns, clean.stamp_ns)
+    assert np.array_equal(found.pose, clean.pose)
+    assert main([str(BAG), "--out", str(tmp_path / "out"), "--truth", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert f"Ground truth of {name}: {len(bad)} poses that are not finite are left out." in said
+    assert "No ground truth" not in said
+
+
+def test_marks_of_editors_and_indented_comments_are_ignored(tmp_path: Path) -> None:
+    path = tmp_path / "a.tum"
+    path.write_text(f"\ufeff# x\n  # y\n\t{LINE}\r\n \t \n", encoding="utf-8")
+    assert read_tum(path).stamp_ns.tolist() == [12_500_000_000]
+    path.write_text(f"\ufeff{LINE}\n", encoding="utf-8")
+    assert read_tum(path).stamp_ns.tolist() == [12_500_000_000]
+
+
+@pytest.mark.parametrize(("off_s", "where"), [(-500, "before"), (1000, "after")])
+def test_truth_of_another_clock_is_said_and_the_poses_are_written(
+    result: ReplayResult, tmp_path: Path, capsys: pytest.CaptureFixture[str], off_s: int, where: str
+) -> None:
+    robot = result.swarm.robots[0].name
+    moved = replace(result, stamp_ns=result.stamp_ns + off_s * 10**9, truth={})
+    write_tum(moved, tmp_path)
+    (tmp_path / f"{robot}.tum").rename(tmp_path / f"{robot}.truth.tum")
+    assert main([str(BAG), "--out", str(tmp_path / "out"), "--truth", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    assert said.count(f"Ground truth of {robot} is of another time, begins ") == 1
+    assert f" s {where} the first pose, and is not used." in said
+    assert "No ground truth to compare with." in said
+    assert len((tmp_path / "out/poses.csv").read_text().splitlines()) > 100
+    assert (tmp_path / "out/report.html").exists()
 
 
 def test_ground_truth_replaces_that_of_the_bag(

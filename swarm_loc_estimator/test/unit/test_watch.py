@@ -7,6 +7,7 @@ import re
 import socket
 import time
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import aiohttp
 import numpy as np
@@ -28,6 +29,7 @@ from swarm_loc_estimator.watch.server import (
     ServerError,
     ServerLoad,
     WatchServer,
+    WrongTokens,
 )
 
 SECOND = 1_000_000_000
@@ -115,9 +117,77 @@ def test_an_address_that_others_reach_needs_a_token() -> None:
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1", "0.0.0.0"])  # noqa: S104
-def test_a_short_token_is_refused(address: str) -> None:
-    with pytest.raises(AccessError, match="parameter token is too short: it needs 8 characters or more"):
-        Access(address, "seven77")
+@pytest.mark.parametrize(
+    "token", ["seven77", "aaaaaaaa", "        ", "abababababab", "11223344", "äääääääääää"]
+)
+def test_a_weak_token_is_refused(address: str, token: str) -> None:
+    with pytest.raises(AccessError, match="parameter token is too weak: it needs 8 characters or more"):
+        Access(address, token)
+
+
+def locked_out(wrong: WrongTokens, clients: list[str]) -> float:
+    """Share of clients whose right token is refused."""
+    return sum(wrong.refusal(client, "a secret", "a secret") != "" for client in clients) / len(clients)
+
+
+@pytest.mark.parametrize(
+    "guessers",
+    [
+        [f"203.0.113.{k}" for k in range(256)],
+        [f"::ffff:203.0.113.{k}" for k in range(256)],
+        [f"203.0.{k >> 8}.{k & 255}" for k in range(0, 65536, 7)],
+        [f"2001:db8::{k:x}" for k in range(5000)],
+        [f"2001:db8:0:{k:x}::1" for k in range(5000)],
+    ],
+)
+def test_a_guesser_with_many_addresses_locks_few_others_out(
+    guessers: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    standing = SimpleNamespace(monotonic=lambda: 1.0)
+    monkeypatch.setattr("swarm_loc_estimator.watch.server.time", standing)
+    wrong = WrongTokens()
+    for guesser in guessers:
+        for k in range(20):
+            wrong.refusal(guesser, f"guess{k}", "a secret")
+    assert locked_out(wrong, guessers) == 1.0
+    others = [f"{k % 223 + 1}.{k * 7 % 256}.{k * 13 % 256}.{k * 29 % 256}" for k in range(2000)]
+    others += [f"{0x2000 + k % 4096:x}:{k * 7:x}:{k * 11:x}:{k:x}::{k * 3:x}" for k in range(2000)]
+    assert locked_out(wrong, others) < 0.05
+
+
+def test_few_words_in_the_log_for_many_requests_that_cannot_be_read(
+    server: WatchServer, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    begin_s = time.monotonic()
+    for k in range(100):
+        with socket.create_connection(("127.0.0.1", server.port), 10.0) as one:
+            one.sendall(
+                [b"\x16\x03\x01\x02\r\n\r\n", b"GET / HTTP/9.x\r\n\r\n", b"GET / HTTP/1.1\r\n: \r\n\r\n"][
+                    k % 3
+                ]
+            )
+            read_all(one)
+    assert len(caplog.records) <= 1 + (time.monotonic() - begin_s)
+    assert all(record.exc_info is None and "\n" not in record.getMessage() for record in caplog.records)
+    assert "Traceback" not in capfd.readouterr().err
+    assert " 200 " in head(server)
+
+
+@pytest.mark.parametrize(
+    "origins",
+    [
+        ("http://HOST", "http://evil.com"),
+        ("http://evil.com", "http://HOST"),
+        ("http://HOST",) * 2,
+        ("", "http://HOST"),
+        ("",),
+    ],
+)
+def test_two_origin_headers_are_refused(server: WatchServer, origins: tuple[str, ...]) -> None:
+    host = f"127.0.0.1:{server.port}"
+    lines = "".join(f"\r\nOrigin: {one.replace('HOST', host)}" for one in origins)
+    assert re.match(r"HTTP/1\.[01] 40[03] ", head(server, host=f"{host}{lines}".encode()))
+    assert " 200 " in head(server, host=f"{host}\r\nOrigin: http://{host}".encode())
 
 
 def test_page_and_markers_show_each_status() -> None:

@@ -260,19 +260,18 @@ def started_turned(swarm: Swarm) -> Swarm:
     return replace(swarm, robots=(one, replace(other, start=(x, y, theta - 0.5 * np.pi)), *rest))
 
 
-def with_gyroscope(factor: float) -> Change:
+def with_gyroscope(factor: float, first_variance: float = 0.0) -> Change:
     """A robot with a gyroscope that measures the turn rates of its odometry, times a factor."""
 
     def change(evidence: Evidence) -> Evidence:
-        types, messages = typestore().types, []
+        types, messages, variances = typestore().types, [], np.zeros(9)
+        variances[0] = first_variance
         zero: Any = types["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
         turn: Any = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0)
         for arrival_ns, data in evidence.topics[ODOM].messages:
             odometry: Any = typestore().deserialize_cdr(data, ODOMETRY)
             rate: Any = types["geometry_msgs/msg/Vector3"](0.0, 0.0, factor * odometry.twist.twist.angular.z)
-            message: Any = types[IMU](
-                odometry.header, turn, np.zeros(9), rate, np.zeros(9), zero, np.zeros(9)
-            )
+            message: Any = types[IMU](odometry.header, turn, np.zeros(9), rate, variances, zero, np.zeros(9))
             messages.append(Message(arrival_ns, bytes(typestore().serialize_cdr(message, IMU))))
         one, other, *rest = evidence.swarm.robots
         other = replace(other, imu=ImuModel(turn_noise_density=1e-3))
@@ -355,6 +354,11 @@ WRONG: dict[str, tuple[Change, str, str]] = {
     "gyroscope in degrees": (with_gyroscope(57.3), f"{ROBOT}'s gyroscope", "Publish radians per second"),
     "gyroscope upside down": (with_gyroscope(-1.0), f"{ROBOT}'s gyroscope", "positive to the left"),
     "silent gyroscope": (with_gyroscope(0.0), f"{ROBOT}'s gyroscope", "is angular_velocity set"),
+    "gyroscope without rates": (
+        with_gyroscope(1.0, -1.0),
+        ROBOT,
+        "by a covariance of -1 that its IMU measures no turn rates",
+    ),
     "late stamps of images": (
         shifted([SEEN], -1.5),
         f"{ROBOT}'s detections",

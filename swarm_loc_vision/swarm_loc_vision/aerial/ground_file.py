@@ -15,7 +15,7 @@ from swarm_loc_estimator.common.yaml_tree import (
     YamlTreeError,
     nearest,
     read_tree,
-    tree_text,
+    write_tree,
 )
 from swarm_loc_vision.aerial.control_points import ControlPointError, ControlPoints, check_points
 from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground
@@ -61,8 +61,7 @@ def save_ground(ground: Ground, path: Path, comment: str = "") -> None:
             one.id: {name: getattr(one, name) for name in number_specs(FloorMarker)} for one in ground.markers
         },
     }
-    text = "".join(f"# {line}\n" for line in comment.splitlines()) + tree_text(tree)
-    path.write_text(text, encoding="utf-8")
+    write_tree(tree, path, comment.splitlines())
 
 
 class _Reader(TreeChecks):

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from swarm_loc_vision.common.camera import Camera, CameraError
-from swarm_loc_vision.common.images import Gray, ImageError
+from swarm_loc_vision.common.images import Gray, ImageError, Size
 
-GrayOf = Callable[[Any], Gray]
+GrayOf = Callable[[Any, Size], Gray]
 
 
 class Calibration:
@@ -98,14 +98,7 @@ class CalibratedCamera(Calibration):
             ImageError: There is no calibration, or the image cannot be read or does not fit it.
         """
         camera = self.known_camera()
-        gray = self._gray_of(message)
-        size, calibrated = gray.shape[::-1], (camera.width, camera.height)
-        if size != calibrated:
-            shown, wanted = (f"{width} x {height}" for width, height in (size, calibrated))
-            raise ImageError(
-                "size", f"the image has {shown} pixels, but must have {wanted}, as the calibration says."
-            )
-        return gray
+        return self._gray_of(message, (camera.width, camera.height))
 
 
 def camera_of(message: Any, *, rectified: bool = False) -> Camera:

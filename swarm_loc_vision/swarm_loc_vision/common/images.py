@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 
 Gray = NDArray[np.uint8]
 Pixels = NDArray[np.uint8] | NDArray[np.uint16]
+Size = tuple[int, int]  # Width and height [px]
+
+_MAX_SEGMENTS = 256
+_NO_FRAMES = (0xC4, 0xC8, 0xCC)  # Markers of tables among those of frame headers
 
 
 class ImageError(ValueError):
@@ -72,6 +76,32 @@ _ENCODINGS = {
 """By the names of sensor_msgs/image_encodings."""
 
 
+def _check_size(found: Size, size: Size) -> None:
+    if found != size:
+        shown, wanted = (f"{width} x {height}" for width, height in (found, size))
+        said = f"the image has {shown} pixels, but must have {wanted}, as the calibration says."
+        raise ImageError("size", said)
+
+
+def _png_size(data: bytes) -> Size | None:
+    """Width and height in the header of a PNG; None: there is none."""
+    numbers = int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")
+    return numbers if data[12:16] == b"IHDR" else None
+
+
+def _jpeg_size(data: bytes) -> Size | None:
+    """Width and height in the frame header of a JPEG; None: there is none soon."""
+    place = 2
+    for _ in range(_MAX_SEGMENTS):
+        head = data[place : place + 9]
+        if len(head) < 9 or head[0] != 0xFF:
+            break
+        if head[1] & 0xF0 == 0xC0 and head[1] not in _NO_FRAMES:
+            return int.from_bytes(head[7:9], "big"), int.from_bytes(head[5:7], "big")
+        place += 1 if head[1] == 0xFF else 2 + int.from_bytes(head[2:4], "big")
+    return None
+
+
 @dataclass(frozen=True)
 class _Compression:
     """Markers in the bytes of a compressed image."""
@@ -80,25 +110,27 @@ class _Compression:
     begin: bytes  # First bytes
     data: bytes  # Mark before pixel data; `end` must follow its last occurrence
     end: bytes  # Mark after all pixel data
+    size: Callable[[bytes], Size | None]  # Width and height in its header
 
     def is_whole(self, data: bytes) -> bool:
         """Whether bytes are a whole image; cameras may append bytes."""
         return data.startswith(self.begin) and data.rfind(self.end) > data.rfind(self.data) > 0
 
 
-_JPEG = _Compression("jpeg", b"\xff\xd8\xff", b"\xff\xda", b"\xff\xd9")
-_PNG = _Compression("png", b"\x89PNG\r\n\x1a\n", b"IDAT", b"IEND")
+_JPEG = _Compression("jpeg", b"\xff\xd8\xff", b"\xff\xda", b"\xff\xd9", _jpeg_size)
+_PNG = _Compression("png", b"\x89PNG\r\n\x1a\n", b"IDAT", b"IEND", _png_size)
 _COMPRESSIONS = {"jpeg": _JPEG, "jpg": _JPEG, "png": _PNG}
 _COMPRESSED_DEPTH = "compressedDepth"  # The format of image_transport whose bytes are no plain image
 
 
-def gray_image(message: Any) -> Gray:
-    """The brightness (height, width) of a sensor_msgs/Image.
+def gray_image(message: Any, size: Size) -> Gray:
+    """The brightness (height, width) of a sensor_msgs/Image of the camera's size.
 
     Raises:
-        ImageError: Unknown encoding (`encoding`), or the bytes are not those of such an image (`size`).
+        ImageError: Unknown encoding (`encoding`), or of another size, also by its bytes (`size`).
     """
     encoding, width, height, step = message.encoding, message.width, message.height, message.step
+    _check_size((width, height), size)
     known = _ENCODINGS.get(encoding) or _ENCODINGS.get(encoding.lower())  # some drivers write NV12
     if known is None:
         raise ImageError(
@@ -121,13 +153,15 @@ def gray_image(message: Any) -> Gray:
     return gray if gray.flags.writeable else gray.copy()  # a read-only array would be compiled for separately
 
 
-def decoded_image(message: Any) -> Gray:
+def decoded_image(message: Any, size: Size) -> Gray:
     """The brightness (height, width) of a sensor_msgs/CompressedImage; an EXIF orientation is ignored.
 
-    Where the format is empty, the first bytes say what it is.
+    Where the format is empty, the first bytes say what it is. An image of another size than the camera's is
+    not decoded: a small one may say that it has a billion pixels.
 
     Raises:
-        ImageError: The format is unknown (`encoding`), or the bytes are no whole image of it (`corrupt`).
+        ImageError: The format is unknown (`encoding`), the bytes are no whole image of it (`corrupt`), or it
+            has another size (`size`).
     """
     how = message.format
     raw = np.frombuffer(message.data, np.uint8)
@@ -141,8 +175,11 @@ def decoded_image(message: Any) -> Gray:
         raise ImageError(
             "encoding", f"the image's format is '{how}', but must be one of {names}, or empty for these."
         )
-    gray = _decoded(raw) if known.is_whole(data) else None
-    if gray is None:
+    gray = None
+    if known.is_whole(data) and (found := known.size(data)):
+        _check_size(found, size)
+        gray = _decoded(raw)
+    if gray is None or gray.shape[::-1] != size:
         raise ImageError(
             "corrupt", f"the image's data has {raw.size} bytes, but must be a whole image in '{known.name}'."
         )
@@ -163,7 +200,7 @@ class Transport:
 
     suffix: str  # Suffix of the topic `image_raw`
     message_type: str  # Type of its messages
-    gray_of: Callable[[Any], Gray]  # Reads a message
+    gray_of: Callable[[Any, Size], Gray]  # Reads a message of the camera's size
 
 
 TRANSPORTS = {

@@ -25,6 +25,7 @@ from rclpy.clock_type import ClockType
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.qos import QoSProfile
 
+from swarm_loc_estimator.common.files import check_folder
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node
 from swarm_loc_estimator.common.parameters import ParameterError, number, text
@@ -71,6 +72,8 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
                 f"parameter stop_distance = {params.stop_distance} must be less than half of"
                 f" start_distance = {params.start_distance}."
             )
+        output = Path(params.output)
+        check_folder(output.parent, output.name)
         self._drive = WallDrive(params.start_distance, params.stop_distance)
         self._heard_s = {"odom": -math.inf, "laser": -math.inf}
         self._command = self.create_publisher(Twist, "cmd_vel", QoSProfile(depth=1))

@@ -24,6 +24,7 @@ from scipy.optimize import least_squares
 
 from swarm_loc_estimator import decode_laser
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.files import write_whole
 from swarm_loc_estimator.common.messages.cdr import LASER, ODOMETRY, CdrError
 from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number, number_specs
@@ -369,7 +370,7 @@ def save_laser(path: Path, calibration: LaserCalibration) -> None:
     """Write a calibration.
 
     Raises:
-        LaserFileError: It cannot be written there.
+        FileError: It cannot be written there.
     """
     lines = _lines(calibration)
     bias = calibration.row_bias
@@ -377,10 +378,7 @@ def save_laser(path: Path, calibration: LaserCalibration) -> None:
         offsets = ", ".join(f"{offset:.4f}" for offset in bias.offsets)
         within = [*_lines(bias), f"offsets: [{offsets}]  # {_OFFSET.doc} [px]"]
         lines += [f"{_BIAS}:", *(f"  {line}" for line in within)]
-    try:
-        path.write_text(_HEAD + "\n".join(lines) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise LaserFileError(f"{path} cannot be written: {error.strerror}.") from error
+    write_whole(path, _HEAD + "\n".join(lines) + "\n")
 
 
 def _lines(numbers: LaserCalibration | RowBias) -> list[str]:

@@ -5,6 +5,7 @@ Sheets as figures: one unit of a figure's axes is 1 mm, and each marker is one c
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
 from swarm_loc_vision.aerial.ground_control import FloorMarker
@@ -36,10 +38,12 @@ _WIDTH_OF_LETTER = 0.62  # Of its height, at most
 
 def save_pdf(pages: list[Page], family: Family, paper: str, path: Path) -> None:
     """Write sheets as a PDF of vector graphics; the same sheets give the same bytes."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with PdfPages(path, metadata={"CreationDate": None}) as file:
+    data = io.BytesIO()  # PdfPages hides errors of files
+    with PdfPages(data, metadata={"CreationDate": None}) as file:
         for page in pages:
             file.savefig(sheet_figure(page, family, paper))
+    with replacing(path) as part:
+        part.write_bytes(data.getvalue())
 
 
 def sheet_figure(page: Page, family: Family, paper: str) -> Figure:

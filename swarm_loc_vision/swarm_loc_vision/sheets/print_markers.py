@@ -21,6 +21,7 @@ from swarm_loc_estimator.common.command_line import (
     file_to_write,
     number_in,
 )
+from swarm_loc_estimator.common.files import check_file
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.aerial.ground_control import Ground
@@ -63,10 +64,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{options.swarm_file} has no markers" if options.swarm_file else "name a description, or --board"
         )
         raise SheetError(f"There is nothing to print: {why}.")
+    file = options.out.with_name(f"{options.out.stem}_board.yaml")
+    check_file(file)
     save_pdf(pages, family, options.paper, options.out)
     print(f"{sum(len(page.pieces) for page in pages)} markers on {len(pages)} sheets in {options.out}")
     if options.board:
-        file = options.out.with_name(f"{options.out.stem}_board.yaml")
         origin = (
             f"{pages[-1].title}. The middle of the board is the origin of map, x to the right of its text."
         )
@@ -81,7 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--out",
         type=file_to_write(".pdf"),
-        default=Path("markers.pdf"),
+        default="markers.pdf",
         help="the PDF (default: markers.pdf)",
     )
     parser.add_argument(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from types import SimpleNamespace
 
 import cv2
@@ -21,11 +22,11 @@ def gray(
     encoding: str, width: int, height: int, step: int, data: bytes, *, is_bigendian: bool = False
 ) -> Gray:
     fields = {"encoding": encoding, "width": width, "height": height, "step": step, "data": data}
-    return gray_image(SimpleNamespace(**fields, is_bigendian=is_bigendian))
+    return gray_image(SimpleNamespace(**fields, is_bigendian=is_bigendian), (width, height))
 
 
 def decoded(how: str, data: object) -> Gray:
-    return decoded_image(SimpleNamespace(format=how, data=data))
+    return decoded_image(SimpleNamespace(format=how, data=data), (WIDTH, HEIGHT))
 
 
 def wide(order: str, pixels: NDArray[np.uint8] = SHADES) -> NDArray[np.uint8]:
@@ -162,6 +163,38 @@ def test_an_image_is_not_turned_by_what_its_exif_says() -> None:
     data = file_of(SHADES, ".jpg")
     data = data[:2] + b"\xff\xe1" + (len(turned) + 2).to_bytes(2, "big") + turned + data[2:]
     assert decoded("jpeg", data).shape == SHADES.shape
+
+
+def resized(data: bytes, width: int, height: int) -> bytes:
+    """A PNG or JPEG that says it has another size."""
+    if data.startswith(b"\x89PNG"):
+        head = b"IHDR" + width.to_bytes(4, "big") + height.to_bytes(4, "big") + data[24:29]
+        return data[:12] + head + zlib.crc32(head).to_bytes(4, "big") + data[33:]
+    place = data.index(b"\xff\xc0")
+    return data[: place + 5] + height.to_bytes(2, "big") + width.to_bytes(2, "big") + data[place + 9 :]
+
+
+@pytest.mark.parametrize("suffix", [".jpg", ".png"])
+@pytest.mark.parametrize("size", [(60000, 60000), (WIDTH + 1, HEIGHT), (WIDTH, HEIGHT - 1), (0, 0)])
+def test_an_image_of_another_size_is_not_decoded(
+    suffix: str, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cv2, "imdecode", pytest.fail)
+    with pytest.raises(ImageError) as caught:
+        decoded(suffix, resized(file_of(SHADES, suffix), *size))
+    assert caught.value.reason == "size"
+
+
+@pytest.mark.parametrize("segment", [b"\xff\xfe\x00\x02", b"\xff"])
+def test_a_header_without_end_is_not_searched_for_ever(
+    segment: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = file_of(SHADES, ".jpg")
+    assert (decoded("jpeg", data[:2] + 3 * segment + data[2:]) == decoded("jpeg", data)).all()
+    monkeypatch.setattr(cv2, "imdecode", pytest.fail)
+    with pytest.raises(ImageError) as caught:
+        decoded("jpeg", data[:2] + 5_000_000 * segment + data[2:])
+    assert caught.value.reason == "corrupt"
 
 
 @pytest.mark.parametrize("suffix", [".jpg", ".png"])

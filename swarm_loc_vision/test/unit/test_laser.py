@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
+from swarm_loc_estimator.common.files import FileError
 from swarm_loc_estimator.common.messages.cdr import LASER, ODOMETRY
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_vision.laser.calibration import (
@@ -225,9 +226,10 @@ def test_a_number_out_of_its_range_is_named(tmp_path: Path, key: str, value: str
         load_laser(path)
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
-    with pytest.raises(LaserFileError, match="cannot be written"):
-        save_laser(tmp_path / "none" / "laser.yaml", LaserCalibration())
+def test_a_place_that_cannot_be_written_is_named(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(FileError, match=r"laser\.yaml cannot be written: File exists"):
+        save_laser(tmp_path / "file" / "laser.yaml", LaserCalibration())
 
 
 def write_drive(folder: Path, one: Drive, robot: str = "a") -> None:

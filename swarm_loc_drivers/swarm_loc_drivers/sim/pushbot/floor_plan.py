@@ -142,7 +142,7 @@ def _plan_of_map(path: Path, about: dict[str, Tree]) -> FloorPlan:
     cell = checks.number(about["resolution"], "resolution", _RESOLUTION) or 0.0
     threshold = checks.number(about.get("occupied_thresh", 0.65), "occupied_thresh", _THRESHOLD) or 0.0
     origin = checks.list_of_numbers(about["origin"], "origin")
-    if len(origin) != 3 or origin[2] != 0.0:
+    if len(origin) != 3 or abs(origin[2]) > 1e-6:
         raise checks.error("origin", list(origin), "must be x, y and a yaw of 0")
     if about.get("mode", "trinary") == "raw" or about.get("negate", 0) not in (0, 1):
         raise checks.said("mode must be trinary or scale, and negate 0 or 1")

@@ -24,6 +24,7 @@ from typing_extensions import Self
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.bag_file import BagError
+from swarm_loc_estimator.common.files import naming
 from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS, MESSAGE_PACKAGE, message_folder
 
 if TYPE_CHECKING:
@@ -97,9 +98,9 @@ class _McapStorage:
     def close(self, version: int, metadata: str) -> None:
         """End the file."""
         del version
-        self._writer.add_metadata("rosbag2", {"serialized_metadata": metadata})
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self._file.close()
+        with self._file:
+            self._writer.add_metadata("rosbag2", {"serialized_metadata": metadata})
+            self._writer.finish()  # type: ignore[no-untyped-call]
 
     def abort(self) -> None:
         """Close the file as it is."""
@@ -119,6 +120,7 @@ class BagWriter:
 
     Raises:
         BagError: The folder is there already, or cannot be created.
+        FileError: It cannot be written, later.
     """
 
     def __init__(self, path: Path, *, compress: bool = False) -> None:
@@ -148,7 +150,8 @@ class BagWriter:
 
     def write(self, topic: str, log_ns: int, data: bytes) -> None:
         """Add a serialized message of an announced topic."""
-        self._writer.write(self._connections[topic], log_ns, data)
+        with naming(self._path):
+            self._writer.write(self._connections[topic], log_ns, data)
 
     def __enter__(self) -> Self:
         return self
@@ -156,11 +159,14 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if kind is None:
-            self._writer.close()
-        else:
-            self._writer.abort()
-            shutil.rmtree(self._path, ignore_errors=True)
+        is_whole = False
+        try:
+            with naming(self._path):
+                (self._writer.close if kind is None else self._writer.abort)()
+            is_whole = kind is None
+        finally:
+            if not is_whole:
+                shutil.rmtree(self._path, ignore_errors=True)
 
 
 class Stream(NamedTuple):

@@ -21,6 +21,7 @@ from matplotlib.patheffects import withStroke
 from PIL import Image
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.offline.metrics import Errors, pool
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Landmark
@@ -100,7 +101,8 @@ def save(figure: Figure, path: Path, margins: Margins | None = None) -> None:
     canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()  # savefig would draw twice, the first time only to arrange the axes
     image = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")
-    image.quantize(_PALETTE).save(path, format="png")
+    with replacing(path) as part:
+        image.quantize(_PALETTE).save(part, format="png")
 
 
 def _place(figure: Figure, margins: Margins) -> None:
@@ -227,7 +229,8 @@ def plot_overview(result: ReplayResult, path: Path) -> None:
     """Draw paths, landmarks and the last poses until the truth ends; to the right, errors over time."""
     # sensors may stop when all ground truth has ended
     ends = [int(track.stamp_ns[-1]) for track in result.truth.values() if len(track.stamp_ns)]
-    result = result.select(result.stamp_ns <= max(ends)) if ends else result
+    while_true = result.stamp_ns <= max(ends, default=-1)
+    result = result.select(while_true) if while_true.any() else result
     world = WorldMap(result)
     judged = any(len(errors.stamp_ns) for errors in result.errors.values())
     widths = [_MAP_IN, _ERRORS_IN] if judged else [_MAP_IN + _ERRORS_IN]

@@ -13,6 +13,7 @@ from typing import TypeVar
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.files import write_whole
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.offline.export import estimates
 from swarm_loc_estimator.offline.metrics import ErrorSummary
@@ -196,6 +197,9 @@ def _line(texts: list[str], widths: list[int]) -> str:
     ).rstrip()
 
 
+REPORT_FILES = ("report.*", "overview.png", "paths.png", "errors.png")
+
+
 @dataclass(frozen=True)
 class ReportFiles:
     """Files of a report."""
@@ -213,17 +217,17 @@ def write_report(result: ReplayResult, folder: Path | str) -> ReportFiles:
     The folder is created if missing; files of an earlier report are replaced.
     """
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
     text, page, overview = (folder / name for name in ("report.txt", "report.html", "overview.png"))
-    text.write_text(text_report(result), encoding="utf-8")
+    write_whole(text, text_report(result))
     plot_overview(result, overview)
     paths, errors = folder / "paths.png", folder / "errors.png"
     pictures = {"Overview": overview}
     for heading, path, plot in (("Paths", paths, plot_paths), ("Errors over time", errors, plot_errors)):
-        path.unlink(missing_ok=True)
         if plot(result, path):
             pictures[heading] = path
-    page.write_text(html_report(result, pictures), encoding="utf-8")
+        else:
+            path.unlink(missing_ok=True)
+    write_whole(page, html_report(result, pictures))
     return ReportFiles(text, page, overview, pictures.get("Paths"), pictures.get("Errors over time"))
 
 

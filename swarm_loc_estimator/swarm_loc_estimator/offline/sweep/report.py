@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.files import replacing, write_whole
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.offline.report.plots import INK, SOFT, colour_of, length_unit, save, style
 from swarm_loc_estimator.offline.report.report import html_table, page_of, picture
@@ -49,6 +50,9 @@ _REPORTED = (
 )
 
 
+SWEEP_FILES = ("jobs.jsonl", "table.csv", "*.png", "sweep.html")
+
+
 def rows_of(sweep: Sweep, finished: Mapping[str, Line]) -> list[Row]:
     """The rows of the table, in the order of the grid."""
     rows: list[Row] = []
@@ -65,7 +69,7 @@ def write_results(rows: Sequence[Row], varied: Sequence[str], folder: Path) -> P
     The folder must exist; files of the same names are replaced.
     """
     cells = [[*rows[0]], *([_text(value) for value in row.values()] for row in rows)]
-    with (folder / "table.csv").open("w", newline="", encoding="utf-8") as file:
+    with replacing(folder / "table.csv") as part, part.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows(cells)
     judged = any(row["position_rmse_m"] is not None for row in rows)
     pictures = {f"Against {name}": folder / f"{name}.png" for name in varied}
@@ -77,7 +81,7 @@ def write_results(rows: Sequence[Row], varied: Sequence[str], folder: Path) -> P
     remark = "".join(f"<p>{one}</p>" for one in remarks)
     shown = [picture(heading, path) for heading, path in pictures.items()]
     table = f"<h2>All replays</h2>{html_table(cells[1:], cells[0])}"
-    page.write_text(page_of("Sweep", ["<h1>Sweep</h1>", remark, *shown, table]), encoding="utf-8")
+    write_whole(page, page_of("Sweep", ["<h1>Sweep</h1>", remark, *shown, table]))
     return page
 
 

@@ -12,6 +12,7 @@ import hashlib
 import itertools
 import json
 import math
+import os
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
@@ -28,6 +29,7 @@ import joblib
 import numpy as np
 
 from swarm_loc_estimator.common.bags.reader import is_storage
+from swarm_loc_estimator.common.files import check_file, naming
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.parameters import (
     NumberSpec,
@@ -262,14 +264,16 @@ def run_sweep(sweep: Sweep, path: Path, backend: Backend, progress: Progress) ->
     jobs = {job.key: job for job in sweep.jobs if job.key not in finished}
     _compile(jobs)
     path.parent.mkdir(parents=True, exist_ok=True)
+    check_file(path)
     began = time.monotonic()
     with path.open("a", encoding="utf-8") as file:
         if file.tell() and not path.read_bytes().endswith(b"\n"):
             file.write("\n")  # ends the line in which the last run was killed
         progress(0.0, f"0 of {len(jobs)} replays")
         for done, line in enumerate(_outcomes(jobs, sweep.workers, backend), 1):
-            file.write(json.dumps(line) + "\n")
-            file.flush()
+            with naming(path):
+                file.write(json.dumps(line) + "\n")
+                file.flush()
             left_s = (time.monotonic() - began) / done * (len(jobs) - done)
             progress(done / len(jobs), f"{done} of {len(jobs)} replays, {left_s:.0f} s left")
     return _read(path)
@@ -381,7 +385,9 @@ def _loky(_count: int, _address: str | None) -> Iterator[dict[str, Any]]:
 
 @contextmanager
 def _ray(count: int, address: str | None) -> Iterator[dict[str, Any]]:
-    """Actors of Ray."""
+    """Actors of Ray; a cluster that is started here listens on loopback addresses only."""
+    if not address:
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"  # read on import; else it listens on all
     ray, backend = loaded("ray", "ray"), loaded("ray.util.joblib.ray_backend", "ray")
     options = {"address": address} if address else {"num_cpus": None if count < 0 else count}
     with _reached(address):

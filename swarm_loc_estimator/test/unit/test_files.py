@@ -1,0 +1,180 @@
+"""Outputs: whole or not at all, named where they cannot be written, and never through a link of others."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.shared.bags import copy_part
+from bench.shared.full_disk import full_after
+from swarm_loc_estimator.cli import calibrate, new, replay, replay_map, survey, sweep
+from swarm_loc_estimator.common.bags.writer import Stream, write_streams
+from swarm_loc_estimator.common.files import FileError, check_folder, replacing, write_whole
+from swarm_loc_estimator.common.messages.cdr import POSE_STAMPED
+from swarm_loc_estimator.common.yaml_tree import write_tree
+from swarm_loc_estimator.mapping.grid import OccupancyMap
+from swarm_loc_estimator.mapping.map_file import save_map
+from swarm_loc_estimator.offline.export import write_mcap, write_tum
+from swarm_loc_estimator.offline.replay import replay as run
+from swarm_loc_estimator.offline.report.report import write_report
+from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.offline.sweep.report import Row, write_results
+
+DEMO = Path(__file__).parents[3] / "bags" / "eight_one_robot_fast"
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first seconds of a bag with one robot."""
+    folder = tmp_path_factory.mktemp("files") / "short"
+    copy_part(DEMO, folder, 3.0)
+    shutil.copy(DEMO / "swarm.yaml", folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(short: Path) -> ReplayResult:
+    return run(short)
+
+
+def text(_: ReplayResult, folder: Path) -> None:
+    write_whole(folder / "a.txt", "x" * 100_000)
+
+
+def tree(_: ReplayResult, folder: Path) -> None:
+    write_tree({f"key{k}": k for k in range(10_000)}, folder / "a.yaml")
+
+
+def report(result: ReplayResult, folder: Path) -> None:
+    write_report(result, folder)
+
+
+def poses(result: ReplayResult, folder: Path) -> None:
+    replay.write_poses(result, folder / "poses.csv")
+
+
+def tum(result: ReplayResult, folder: Path) -> None:
+    write_tum(result, folder)
+
+
+def mcap(result: ReplayResult, folder: Path) -> None:
+    write_mcap(result, folder / "a.mcap")
+
+
+def occupancy(_: ReplayResult, folder: Path) -> None:
+    save_map(OccupancyMap(np.zeros(2), 0.02, np.zeros((300, 300))), folder / "map")
+
+
+def results(_: ReplayResult, folder: Path) -> None:
+    row: Row = {
+        "bag": "a",
+        "seed": 1,
+        "lost": 0.5,
+        "position_rmse_m": 0.1,
+        "heading_rmse_deg": 1.0,
+        "nees": 3.0,
+    }
+    write_results([{**row, "failure": "x" * 100}] * 200, ["lost"], folder)
+
+
+Write = Callable[[ReplayResult, Path], None]
+WRITERS = [text, tree, report, poses, tum, mcap, occupancy, results]
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_a_full_disk_leaves_the_old_files_and_is_said_with_the_path(
+    write: Write, result: ReplayResult, tmp_path: Path
+) -> None:
+    write(result, tmp_path / "out")
+    old = {file: file.read_bytes() for file in (tmp_path / "out").iterdir()}
+    with full_after(100), pytest.raises(FileError) as said:
+        write(result, tmp_path / "out")
+    assert {file: file.read_bytes() for file in (tmp_path / "out").iterdir()} == old
+    assert str(said.value).endswith(" cannot be written: File too large.")
+    assert str(tmp_path / "out") in str(said.value)
+
+    with full_after(100), pytest.raises(FileError):
+        write(result, tmp_path / "new")
+    assert [*(tmp_path / "new").iterdir()] == []
+
+
+@pytest.mark.parametrize("write", WRITERS)
+def test_nothing_is_written_through_links(write: Write, result: ReplayResult, tmp_path: Path) -> None:
+    write(result, tmp_path / "out")
+    for file in [*(tmp_path / "out").iterdir()]:
+        (tmp_path / "other").write_text("of others")
+        file.unlink()
+        file.symlink_to(tmp_path / "other")
+        with pytest.raises(FileError, match="cannot be written: it is a symbolic link") as said:
+            write(result, tmp_path / "out")
+        assert str(file) in str(said.value)
+        assert (tmp_path / "other").read_text() == "of others"
+        file.unlink()
+
+
+@pytest.mark.parametrize("full_bytes", [0, 100, 20_000])
+def test_a_bag_is_whole_or_not_there(full_bytes: int, tmp_path: Path) -> None:
+    noise = np.random.default_rng(3).bytes
+    stream = Stream("a", POSE_STAMPED, np.arange(400), [noise(100) for _ in range(400)])
+    with full_after(full_bytes), pytest.raises(FileError, match="bag cannot be written: File too large"):
+        write_streams(tmp_path / "bag", [stream])
+    assert [*tmp_path.iterdir()] == []
+
+
+def test_what_fails_inside_is_passed_on_and_leaves_nothing(tmp_path: Path) -> None:
+    def fail(part: Path) -> None:
+        part.touch()
+        raise KeyError
+
+    with pytest.raises(KeyError), replacing(tmp_path / "a") as part:
+        fail(part)
+    assert [*tmp_path.iterdir()] == []
+
+
+@pytest.mark.parametrize(
+    ("main", "more"),
+    [
+        (replay.main, ["--out", "FOLDER"]),
+        (replay.main, ["--tum", "FOLDER"]),
+        (replay.main, ["--mcap", "FOLDER/a.mcap"]),
+        (replay.main, ["--learned", "FOLDER/a.yaml"]),
+        (replay_map.main, ["--out", "FOLDER"]),
+        (sweep.main, ["--out", "FOLDER"]),
+        (calibrate.main, ["--out", "FOLDER/a.yaml"]),
+        (survey.main, ["--out", "FOLDER/a.yaml"]),
+    ],
+)
+def test_a_full_disk_is_found_before_the_work_begins(
+    main: Callable[[list[str]], int],
+    more: list[str],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    options = [one.replace("FOLDER", str(tmp_path)) for one in more]
+    with full_after(100_000), pytest.raises(SystemExit):
+        main([str(tmp_path / "none"), *options])
+    said = capsys.readouterr().err.splitlines()[-1]
+    assert f"{tmp_path} cannot be written: File too large" in said
+
+
+@pytest.mark.parametrize("name", ["report.html", "paths.png", "poses.csv", "report.txt"])
+def test_links_in_the_folder_of_a_report_are_found_before_the_work_begins(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "unrelated").symlink_to("elsewhere")
+    check_folder(tmp_path, "*.txt")
+    (tmp_path / name).symlink_to("elsewhere")
+    with pytest.raises(SystemExit):
+        replay.main([str(tmp_path / "none"), "--out", str(tmp_path)])
+    assert f"{tmp_path / name} cannot be written: it is a symbolic link" in capsys.readouterr().err
+
+
+def test_a_new_description_is_whole_or_not_there(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with full_after(100):
+        assert new.main([str(tmp_path / "lab" / "swarm.yaml"), "--yes"]) == 1
+    assert "cannot be written: File too large" in capsys.readouterr().err
+    assert [*(tmp_path / "lab").iterdir()] == []
