@@ -27,7 +27,9 @@ robots:
     start: {x: 0.1, y: -0.1, theta: 0.0}
     start_sigma: {x: 0.2, y: 0.2}
 anchors:
-""" + "".join(f"  - {{address: {a}, x: {x}, y: {y}, z: 1.0, range_bias_sigma: 0.0}}\n" for a, (x, y) in ANCHORS.items())
+""" + "".join(
+    f"  - {{address: {a}, x: {x}, y: {y}, z: 1.0, range_bias_sigma: 0.0}}\n" for a, (x, y) in ANCHORS.items()
+)
 
 
 def is_estimated(poses: list[SwarmPoses], before: int, now_ns: int) -> bool:
