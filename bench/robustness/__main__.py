@@ -1,0 +1,29 @@
+"""Robustness: drivers of all protocols under corrupted bytes, and odometry with wrong stamps.
+
+`protocols` runs drivers in simulated time, with robots whose bytes are lost, doubled, swapped, flipped or
+inserted (.01 to 10 %), shuffled, flooded or replaced for some seconds. A thread is dead when it ends or never
+connects again. "False connected" is the longest time in which a robot is connected although none of its
+answers makes sense.
+"""
+
+from __future__ import annotations
+
+import argparse
+
+from bench.robustness import protocols
+from bench.shared.common import ProgressLine, table, write_figures
+
+
+def main() -> None:
+    """Measure, print the table, write the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--streams", type=int, default=10_000, help="corrupted streams of each protocol")
+    arguments = parser.parse_args()
+    figures = protocols.measure(arguments.streams, ProgressLine("protocols"))
+    print()
+    print(table(("figure", "value"), list(figures.items())))
+    print(write_figures("robustness", figures))
+
+
+if __name__ == "__main__":
+    main()
