@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.integrity.fault import CLEAN, settings_of
+from bench.integrity.faults import simulate
 from bench.robustness.protocols import Stream
 from bench.robustness.robots import PROTOCOLS
+from bench.robustness.stamps import CHANGES, misleading_share, with_stamps
 from bench.robustness.wire import NONSENSE, PARTIAL
 
 SEEDS = st.integers(0, 2**31)
@@ -48,3 +52,11 @@ def test_a_defect_of_a_driver_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     outcome = stream.run()
     assert "StopIteration" in outcome.traceback
     assert outcome.is_dead
+
+
+@pytest.mark.parametrize("name", ["jitter_90", "early", "late", "twice"])
+def test_wrong_stamps_of_odometry_make_no_pose_misleading(name: str) -> None:
+    run = simulate(settings_of(3, CLEAN, 6.0))
+    share, worst_m = misleading_share(with_stamps(run, CHANGES[name], np.random.default_rng(3)))
+    assert share <= 0.001
+    assert worst_m < 0.02
