@@ -21,6 +21,7 @@ BENCHMARKS = {
     "pushbot": "bench.pushbot",
     "pushbot_bag": "bench.pushbot.bag",
     "reading": "bench.peers.reading",
+    "robustness": "bench.robustness",
     "scaling": "bench.peers.scaling",
     "soak": "bench.graph.soak",
     "sweep": "bench.sweep",

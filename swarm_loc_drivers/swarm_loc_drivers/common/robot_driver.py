@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 import threading
 import time
+import traceback
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Generic, TypeVar
 
 from swarm_loc_drivers.common.link import Link, LinkError
@@ -25,7 +27,8 @@ SomeSession = TypeVar("SomeSession", bound=Session)
 class RobotDriver(ABC, Generic[SomeSession]):
     """Talks to one robot until the driver is stopped and the robot is known to stand.
 
-    `name` is that of the robot's link in messages. The clock [ns] may be simulated, and 0 means no time.
+    After a defect of the driver, any exception, it stops the robot and connects again. `name` is that of the
+    robot's link in messages. The clock [ns] may be simulated, and 0 means no time.
     """
 
     def __init__(self, name: str, clock: Callable[[], int]) -> None:
@@ -34,6 +37,7 @@ class RobotDriver(ABC, Generic[SomeSession]):
         self.counts: Counter[str] = Counter()
         self.trouble = f"connecting to {name}"  # Why there is no connection; "" while there is one
         self.warning = ""  # What is wrong with the connected robot; "" for nothing
+        self.defects: dict[str, str] = {}  # Traceback of the first defect of the driver at each place
         self._stopping = threading.Event()
         self.may_run = False  # Whether the robot may be moving after the driver has been stopped
         self._thread = threading.Thread(target=self._run, name=f"driver of {name}")
@@ -80,15 +84,17 @@ class RobotDriver(ABC, Generic[SomeSession]):
         self.trouble = connecting
         pause_s, give_up_s = _MIN_PAUSE_S, math.inf
         while True:
-            connections = self.counts["connections"]
+            connections, defects = self.counts["connections"], self.counts["defects"]
             try:
                 self._converse()
             except (LinkError, SessionError) as error:
                 self.trouble = str(error)
                 self.counts["link_failures"] += 1
-            except Exception as error:  # a defect of the driver ends the thread: report it
+            except Exception as error:  # noqa: BLE001 # a defect, which the next session may not meet
                 self.trouble = f"the driver has failed: {error!r}"
-                raise
+                self.counts["defects"] += 1
+                place = "".join(traceback.format_tb(error.__traceback__))
+                self.defects.setdefault(place, traceback.format_exc())
             else:
                 return
             is_ending, now_s = self._stopping.is_set(), time.monotonic()
@@ -96,8 +102,8 @@ class RobotDriver(ABC, Generic[SomeSession]):
                 give_up_s = min(give_up_s, now_s + MAX_STOP_S)
                 if not self.may_run or now_s > give_up_s:
                     return
-            connected = self.counts["connections"] > connections
-            pause_s = _MIN_PAUSE_S if connected or is_ending else min(2.0 * pause_s, _MAX_PAUSE_S)
+            is_sound = self.counts["connections"] > connections and self.counts["defects"] == defects
+            pause_s = _MIN_PAUSE_S if is_sound or is_ending else min(2.0 * pause_s, _MAX_PAUSE_S)
             if is_ending:
                 time.sleep(pause_s)
             else:
@@ -113,21 +119,24 @@ class RobotDriver(ABC, Generic[SomeSession]):
             self.may_run = False
         except (LinkError, SessionError):
             raise
-        except BaseException:  # a defect of the driver must not leave the robot moving
-            self._stopping.set()
-            self._talk(self._begin(), link, lambda _: None)
+        except Exception:  # a defect of the driver must neither leave the robot moving nor be hidden
+            with suppress(Exception):
+                last = self._begin()
+                last.ending = True
+                self._talk(last, link, lambda _: None)
+                self.may_run = False
             raise
         finally:
             self.warning = ""
-            self._lose(session)
             link.close()
+            self._lose(session)
 
     def _talk(self, session: SomeSession, link: Link, serve: Callable[[SomeSession], None]) -> None:
         """Exchange bytes until the conversation has ended."""
         end_s = math.inf
         while not session.ended:
-            if self._stopping.is_set():
-                session.ending = True
+            session.ending |= self._stopping.is_set()
+            if session.ending:
                 end_s = min(end_s, time.monotonic() + MAX_STOP_S)
             if time.monotonic() > end_s:
                 raise SessionError("the robot does not confirm that it has stopped")

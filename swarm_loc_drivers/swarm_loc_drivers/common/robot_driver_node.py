@@ -106,6 +106,7 @@ class RobotDriverNode(ConfiguredNode[Parameters]):
         counts = Counter(self._driver.counts)
         self._log(trouble, counts)
         self.health.warn_of("robot", {warning: warning} if warning else {})
+        self.health.warn_of("defect", dict(self._driver.defects))
         now_s = time.monotonic()
         elapsed_s, self._reported_s = now_s - self._reported_s, now_s
         values: dict[str, object] = dict(sorted(counts.items()))

@@ -8,6 +8,8 @@ from collections import Counter
 from collections.abc import Generator
 from typing import Protocol, TypeVar
 
+MAX_NONSENSE_S = 2.5  # A robot whose answers make no sense for so long is no longer connected [s]
+NONSENSE = "what the robot sends makes no sense"
 _MAX_RECEIVED = 1 << 16  # Bytes kept while an answer is awaited: a camera may still be streaming
 
 Result = TypeVar("Result")
@@ -22,7 +24,7 @@ class Session(Protocol):
     """A conversation with one robot."""
 
     ending: bool  # Set it to stop the robot and end the conversation
-    connected: bool  # Whether the robot has answered
+    connected: bool  # Whether the robot has answered; `step` fails soon after answers make no sense
     ended: bool  # Whether the conversation has ended; the robot stands
 
 

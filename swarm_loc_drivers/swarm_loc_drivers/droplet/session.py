@@ -7,18 +7,28 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
-from swarm_loc_drivers.common.session import SessionError
+from swarm_loc_drivers.common.session import MAX_NONSENSE_S, NONSENSE, SessionError
 from swarm_loc_drivers.common.velocity_command import STILL, Velocity, VelocityCommand
 from swarm_loc_drivers.droplet import protocol
 from swarm_loc_drivers.droplet.console_session import ConsoleTalk, Talk, relay
 from swarm_loc_drivers.droplet.exchange import PollingExchange, PollingSettings, Publish
 from swarm_loc_drivers.droplet.hardware import DIRECTIONS, RADIUS_M, DropletModel, Gait, gait
 from swarm_loc_drivers.droplet.odometry import CommandedMotion
-from swarm_loc_drivers.droplet.protocol import Identity, MotorTrims, MoveStarted, Said, StepLength
+from swarm_loc_drivers.droplet.protocol import (
+    Broken,
+    Echo,
+    Identity,
+    MotorTrims,
+    MoveStarted,
+    Said,
+    StepLength,
+    Unknown,
+)
 from swarm_loc_drivers.droplet.tdma import TdmaExchange, TdmaSettings
 
 _TRIES = 3
 _IDLE_NS = 20_000_000  # Period of checks for new work while the console is silent [ns]
+_SILENCE_NS = 1_000_000_000  # A robot that has said nothing for so long is asked for its id [ns]
 
 
 @dataclass(frozen=True)
@@ -60,6 +70,8 @@ class DropletSession:
         self._gaits: dict[int, Gait] = {}
         self._talk = self._run()
         self._due_ns = 0
+        self._sense_ns = 0  # When the robot last said what makes sense
+        self._patience_ns = round(1e9 * max(MAX_NONSENSE_S, 2.0 * settings.reply_timeout_s))
 
     def _exchanges(
         self, settings: PollingSettings | TdmaSettings, publish: Publish
@@ -84,12 +96,15 @@ class DropletSession:
             SessionError: The robot does not answer as it must.
         """
         jumped_back = now_ns < self._console.now_ns
+        self._sense_ns = min(self._sense_ns, now_ns)
         self._console.hear(data, now_ns)
         if data or jumped_back or now_ns >= self._due_ns:
             try:
                 self._due_ns = next(self._talk)
             except StopIteration:
                 self.ended = True
+        if self.connected and now_ns > self._sense_ns + self._patience_ns:
+            raise SessionError(NONSENSE)
         return self._console.take_output()
 
     def abandon(self, now_ns: int) -> None:
@@ -104,10 +119,17 @@ class DropletSession:
         while (yield from self._interlude()):
             if self._exchanging.is_due(self._console.now_ns):
                 yield from self._exchanging.talk()
+            elif self._is_silent():
+                yield from self._console.enter(protocol.GET_ID)
             else:
                 yield self._console.now_ns + _IDLE_NS
         for mover in self._movers:
             yield from mover.stop(self._console)
+
+    def _is_silent(self) -> bool:
+        """Whether the robot has said nothing for long, and may be asked."""
+        now_ns = self._console.now_ns
+        return now_ns > self._sense_ns + _SILENCE_NS and self._exchanging.is_quiet(now_ns)
 
     def _identify(self) -> Talk[None]:
         """Stop the robot and read its id and its gaits."""
@@ -142,6 +164,8 @@ class DropletSession:
 
     def _on_said(self, said: Said) -> None:
         event = said.event
+        if not isinstance(event, Echo | Unknown | Broken):
+            self._sense_ns = self._console.now_ns
         if isinstance(event, Identity):
             self._exchanging.validator.robot = event.robot
         elif isinstance(event, MotorTrims):

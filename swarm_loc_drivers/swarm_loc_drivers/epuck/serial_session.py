@@ -19,8 +19,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_drivers.common.session import SessionError, Talk, TalkSession
-from swarm_loc_drivers.epuck.hardware import decode_rgb565
+from swarm_loc_drivers.common.session import MAX_NONSENSE_S, NONSENSE, SessionError, Talk, TalkSession
+from swarm_loc_drivers.epuck.hardware import as_counter, decode_rgb565
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, Reading, Speeds
 
@@ -33,7 +33,7 @@ _IMAGE_HEADER = 3
 _MAX_ARGUMENTS = 40
 
 ASCII_CAMERA_SET = re.compile(rb"j\r\n")
-ASCII_CAMERA_REPLY = re.compile(rb"i,(\d+),(\d+),(\d+),(\d+),(\d+)\r\n")
+ASCII_CAMERA_REPLY = re.compile(rb"i,(\d{1,5}),(\d{1,5}),(\d{1,5}),(\d{1,5}),(\d{1,10})\r\n")
 
 ASCII_CAMERA_QUERY = b"I\r"
 
@@ -139,7 +139,8 @@ class ReplyParser:
         return None
 
 
-_MAX_MISSED = 5  # Missed replies in a row after which the link is reopened
+_TRIES = 5  # Tries of a request
+_SLACK_S, _ROUNDING_STEPS = 0.1, 2  # Uncertainty of the time between two readings, and of counters
 _NS = 1_000_000_000
 
 
@@ -160,16 +161,27 @@ class SerialSession(TalkSession):
         self._wanted_speeds = speeds
         self._doubt = doubt
         self._sent = (0, 0)
-        self._missed = 0
+        self._sense: Reading | None = None  # The last reading that makes sense, and when it came
+        self._sense_s = 0.0
+        self._may_have_moved = False  # Since that reading
+        image_bytes = 2 * camera.width * camera.height if (camera := params.images) else 0
+        self._patience_s = max(MAX_NONSENSE_S, 2.0 * self._timeout_s(_READINGS.size + image_bytes))
         self._image_due_ns = 0
         self._way_ns = 0
+
+    def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
+        """See `TalkSession.step`."""
+        output = super().step(data, now_ns, steady_s)
+        if self.connected and steady_s > self._sense_s + self._patience_s:
+            raise SessionError(NONSENSE)
+        return output
 
     def _run(self) -> Talk[None]:
         yield from self._resync()
         camera = self._params.images
         if camera is not None:
             yield from self._set_camera(camera)
-        self.connected = True
+        self.connected, self._sense_s = True, self._steady_s
         while True:
             self.is_idle = True
             yield
@@ -189,15 +201,11 @@ class SerialSession(TalkSession):
         is_answered = yield from self._read(speeds)
         if is_answered and camera is not None and self._image_is_due(camera):
             is_answered = yield from self._take_image(speeds, camera)
-        if is_answered:
-            self._missed = 0
-            return
-        self._doubt()
-        self._counts["missed_replies"] += 1
-        self._missed += 1
-        if self._missed >= _MAX_MISSED:
-            raise SessionError(f"the robot missed {self._missed} requests in a row")
-        yield from self._resync()
+        if not is_answered:
+            self._doubt()
+            self._may_have_moved = True
+            self._counts["missed_replies"] += 1
+            yield from self._resync()
 
     def _read(self, speeds: tuple[int, int]) -> Talk[bool]:
         """Read counters and proximity; the stamp is the middle between request and reply."""
@@ -205,12 +213,23 @@ class SerialSession(TalkSession):
         body = yield from self._ask(readings_request(*speeds, is_new=speeds != self._sent))
         if body is None:
             return False
-        self._sent = speeds
         self._way_ns = max(0, self._now_ns - asked_ns) // 2
         left, right, proximity = decode_readings(body)
         stamp_ns, sensors = asked_ns + self._way_ns, np.array(proximity, dtype=np.int64)
-        self.found.append(Reading(stamp_ns, self._way_ns, left, right, sensors))
+        reading = Reading(stamp_ns, self._way_ns, left, right, sensors)
+        self.found.append(reading)
+        self._may_have_moved |= any(self._sent) or any(speeds)
+        if self._sense is None or self._can_follow(self._sense, reading):
+            self._sense, self._sense_s, self._may_have_moved = reading, self._steady_s, False
+        self._sent = speeds
         return True
+
+    def _can_follow(self, before: Reading, after: Reading) -> bool:
+        """Whether the wheels can have moved from one reading to another one."""
+        elapsed_s = 1e-9 * abs(after.stamp_ns - before.stamp_ns)
+        most = self._params.epuck_model.max_rate * (elapsed_s + _SLACK_S) * self._may_have_moved
+        left, right = after.left_counter - before.left_counter, after.right_counter - before.right_counter
+        return max(abs(as_counter(left)), abs(as_counter(right))) <= most + _ROUNDING_STEPS
 
     def _image_is_due(self, camera: CameraSettings) -> bool:
         period_ns = round(camera.period_s * _NS)
@@ -271,7 +290,7 @@ class SerialSession(TalkSession):
 
         Each attempt sends the speeds of its moment, since the robot may hear and not be heard.
         """
-        for _ in range(_MAX_MISSED):
+        for _ in range(_TRIES):
             self._counts["resyncs"] += 1
             self._sent = self._speeds()
             line = resync(*self._sent)
@@ -283,7 +302,7 @@ class SerialSession(TalkSession):
 
     def _answer(self, line: bytes, answer: re.Pattern[bytes]) -> Talk[re.Match[bytes]]:
         """The answer to an ASCII line, which is sent several times."""
-        for _ in range(_MAX_MISSED):
+        for _ in range(_TRIES):
             if (match := (yield from self._ask_once(line, answer, self._timeout_s(len(line))))) is not None:
                 self._received = b""
                 return match

@@ -63,10 +63,14 @@ class WifiSession:
 
     def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
         """See `EpuckSession.step`."""
-        self._check_silence(bool(data), now_ns, steady_s)
+        messages, awaited = self._parsed(data, now_ns), protocol.SENSORS_ID
+        if self.ending:
+            awaited = protocol.NOTHING_ID
+        is_heard = any(message.id == awaited for message in messages)
+        self._check_silence(is_heard, now_ns, steady_s)
         newest: dict[int, protocol.Message] = {}
-        for message in self._parsed(data, now_ns):
-            self.connected = True
+        for message in messages:
+            self.connected |= message.id == protocol.SENSORS_ID
             self.ended |= self.ending and message.id == protocol.NOTHING_ID
             before = self._arrivals.get(message.id)
             arrival = before.next(message.stamp_ns) if before else _Arrival(message.stamp_ns)
@@ -77,7 +81,7 @@ class WifiSession:
         return self._command(steady_s)
 
     def _check_silence(self, is_heard: bool, now_ns: int, steady_s: float) -> None:
-        """Check that the robot sends, by real time and by the clock, which may be simulated and stand still.
+        """Check that the robot sends what it shall, by real time and by the clock, which may stand still.
 
         Raises:
             SessionError: It has been silent for too long.
@@ -87,7 +91,7 @@ class WifiSession:
         heard_ns, heard_s = min(self._heard[0], now_ns), self._heard[1]  # the clock may jump back
         self._heard = heard_ns, heard_s
         if min(steady_s - heard_s, (now_ns - heard_ns) * 1e-9) > self._silence_s:
-            raise SessionError(f"the robot has been silent for {self._silence_s:g} s")
+            raise SessionError(f"the robot has been silent for {self._silence_s:g} s, or made no sense")
 
     def _parsed(self, data: bytes, now_ns: int) -> list[protocol.Message]:
         skipped, resyncs = self._parser.skipped, self._parser.resyncs

@@ -105,8 +105,8 @@ def _parse(
                 continue
             if run_at >= 0:  # invalid bytes: the events of the run did not begin at a boundary
                 tally[_CORRUPT] += events - run_events
-                events, run_at = run_events, -1
-                state[:] = before
+                spans[run_lines:lines, 2] = events = run_events
+                run_at, state[:] = -1, before
             tally[_LONG if verdict == 3 else _SKIPPED] += 1 if verdict == 3 else end - at
             at = end
             continue
@@ -122,7 +122,8 @@ def _parse(
             elapsed = _elapsed(stamp, state, stamp_bytes)
             if run_at >= 0 and not _is_plausible(elapsed, stamp_bytes):
                 tally[_CORRUPT] += events - run_events
-                events, state[:] = run_events, before
+                spans[run_lines:lines, 2] = events = run_events
+                state[:] = before
                 elapsed = _elapsed(stamp, state, stamp_bytes)
                 if state[_STARTED] == 0 or not _is_plausible(elapsed, stamp_bytes):
                     at, lines, run_at = run_at + 1, run_lines, -1  # no boundary: search after it

@@ -63,7 +63,7 @@ BANNER = re.compile(rb"EDVS-4337[^\n]*\n")  # Line of a board that has started
 FORMAT = re.compile(rb"-E(\d)\n")  # The answer to `?E`
 LAST_SENSORS = re.compile(rb"(?:EVENTS.RATE|MOTOR.SENSORS)[^\n]*\n\n")  # The end of the answer to `??S`
 
-_TICK_SENSOR = re.compile(rb"^ *(\d+) [\d ]*MOTOR.SENSORS", re.MULTILINE)
+_TICK_SENSOR = re.compile(rb"^ *(\d{1,2}) [\d ]*MOTOR.SENSORS", re.MULTILINE)
 _TICKS = re.compile(rb"-S(\d+) (-?\d{1,10}) (-?\d{1,10})\r?")
 _REFUSALS = (b"?", b"Set: parsing error", b"Get: parsing error", b"Error ", b"Channel not recognized")
 

@@ -323,3 +323,16 @@ def test_the_errors_of_the_named_worlds_leave_most_exchanges_whole() -> None:
     assert counts["exchanges"] > 4 * counts["half_exchanges"]
     assert lab.found[0][0].stamp_ns > START_NS
     assert len(POWERS) == 2
+
+
+def test_a_droplet_that_has_nothing_to_do_and_says_nothing_is_found_out() -> None:
+    """One that still answers is asked for its id again and again, without any trouble."""
+    lab = Lab(world_of(), asking()).connected()
+    cable = lab.cables[0]
+    lines = cable.counts["lines"]
+    lab.run(10.0)
+    assert 5 <= cable.counts["lines"] - lines <= 10
+    assert not cable.counts["bad_echoes"]
+    cable.firmware.receive = lambda _: b""  # type: ignore[method-assign]
+    with pytest.raises(SessionError):
+        lab.run(3.0)

@@ -250,3 +250,37 @@ def test_speeds_are_commanded_when_they_change_and_no_more() -> None:
     told = bytes([serial_session.code("D")])
     assert wire.sent.count(told) == 2
     assert all(wire.sent.count(told + struct.pack("<2h", 200, right)) == 1 for right in (200, 190))
+
+
+def test_bytes_of_a_stream_that_make_no_sense_are_no_sign_of_life() -> None:
+    wire = Wire(WIFI)
+    wire.run(0.5)
+    assert wire.session.connected
+    rng = np.random.default_rng(1)
+    wire.firmware.stream = lambda: rng.bytes(20)
+    with pytest.raises(SessionError, match="made no sense"):
+        wire.run(3.0)
+
+
+def test_counters_that_jump_about_are_no_sign_of_life() -> None:
+    """The replies are whole, as those of a shuffled line sometimes are, and say what no wheel can do."""
+    wire = Wire(SERIAL)
+    wire.run(0.5)
+    assert wire.session.connected
+    rng = np.random.default_rng(1)
+    wire.body.wheel_steps = lambda: tuple(rng.integers(0, 1 << 16, 2).tolist())  # type: ignore[method-assign]
+    with pytest.raises(SessionError, match="no sense"):
+        wire.run(3.0)
+
+
+def test_a_counter_that_jumps_once_costs_no_more_than_a_new_connection() -> None:
+    wire = Wire(SERIAL)
+    wire.reconnects = True
+    wire.run(0.5)
+    steps = wire.body.wheel_steps
+    wire.body.wheel_steps = lambda: tuple(one + 9000 for one in steps())  # type: ignore[method-assign,assignment,return-value]
+    wire.run(6.0)
+    count = len(wire.states)
+    wire.run(3.0)
+    assert wire.session.connected
+    assert len(wire.states) >= count + 140

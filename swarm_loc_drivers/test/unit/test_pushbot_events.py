@@ -171,3 +171,38 @@ def test_noise_of_any_kind_is_survived(data: bytes, timestamps: str) -> None:
     sent = random_events(9, 300)
     got = [parser.feed(piece) for piece in event_pieces(sent, timestamps)]
     assert sum(len(one.x) for one in got) >= 200
+
+
+@pytest.mark.parametrize("timestamps", STAMPED)
+@pytest.mark.parametrize("spoils", [b"\x01", b"an invalid\xfe\xfebyte", b"\xff\xff\xff\xff\xff\xff"])
+def test_lines_after_events_that_are_taken_back_come_after_those_that_are_left(
+    timestamps: str, spoils: bytes
+) -> None:
+    """An event after a jump of time, a line of text, and bytes that show that it was none."""
+    good = event_pieces(random_events(1, 40), timestamps)
+    wrong = event_pieces(random_events(2, 1, start_us=1 << 30), timestamps)
+    counts: Counter[str] = Counter()
+    data = b"".join(good[:20]) + wrong[0] + LINE + spoils + b"".join(good[20:])
+    parsed = parse(data, timestamps, counts)
+    assert (
+        any(before == 20 and line.endswith(LINE[:-1]) for before, line in parsed.lines)
+        or timestamps == "delta"
+    )
+    assert all(before <= len(parsed.x) for before, _ in parsed.lines)
+
+
+@pytest.mark.parametrize("timestamps", TIMESTAMPS)
+@settings(max_examples=100)
+@given(seed=st.integers(0, 2**31), share=st.floats(1e-4, 0.1))
+def test_lines_never_lie_after_more_events_than_there_are(timestamps: str, seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    pieces = event_pieces(random_events(seed, 300), timestamps)
+    array = np.frombuffer(b"".join(one + LINE * (k % 10 == 0) for k, one in enumerate(pieces)), np.uint8)
+    hit = rng.random(len(array)) < share
+    array = np.where(hit, rng.integers(0, 256, len(array)), array)[~hit | (rng.random(len(array)) < 0.5)]
+    parser = EventParser(timestamps, Counter())
+    for piece in np.array_split(array.astype(np.uint8), 20):
+        parsed = parser.feed(piece.tobytes())
+        places = [before for before, _ in parsed.lines]
+        assert places == sorted(places)
+        assert max(places, default=0) <= len(parsed.x)

@@ -13,6 +13,7 @@ import pytest
 
 from swarm_loc_drivers.common.link import LinkError, SerialLink
 from swarm_loc_drivers.common.robot_driver import NO_CLOCK, RobotDriver
+from swarm_loc_drivers.common.session import SessionError
 
 
 @pytest.mark.parametrize("call", ["tcsetattr", "tcflush"])
@@ -72,13 +73,44 @@ class Failing(RobotDriver[Still]):
         raise ValueError("seven is no even number")
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_mistake_that_ends_the_conversation_for_ever_is_told_and_the_robot_stands() -> None:
+def test_a_defect_is_told_with_its_traceback_and_the_robot_stands() -> None:
     driver = Failing()
     driver.start()
     driver.stop()
     assert driver.trouble == "the driver has failed: ValueError('seven is no even number')"
     assert driver.sent[-1] == b"stand"
+    assert not driver.may_run
+
+
+class Recovering(Failing):
+    """A driver that fails in its first two sessions, whose robot does not confirm a stop after a defect."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.healthy = threading.Event()
+
+    def _step(self, session: Still, link: object) -> bytes:
+        if session.ending and not self._stopping.is_set():
+            raise SessionError("the robot does not confirm that it has stopped")
+        return super()._step(session, link)
+
+    def _serve(self, session: Still) -> None:
+        if self.counts["defects"] < 2:
+            super()._serve(session)
+        if not self.trouble:
+            self.healthy.set()
+
+
+def test_a_defect_restarts_the_session_and_is_told_once_at_its_place() -> None:
+    driver = Recovering()
+    driver.start()
+    assert driver.healthy.wait(10.0)
+    driver.stop()
+    assert driver.counts["defects"] == 2
+    assert driver.counts["link_failures"] == 0
+    (told,) = driver.defects.values()
+    assert told.startswith("Traceback")
+    assert told.rstrip().endswith("ValueError: seven is no even number")
 
 
 def test_a_driver_connects_when_time_begins_and_not_before() -> None:

@@ -177,6 +177,9 @@ def add_in_track_frame(
             covariance[i, j] += cross * (forward[i] * turning[j] + turning[i] * forward[j])
 
 
+_LEAST_STEP = 0.75  # Shortest step whose rate is extrapolated, in usual ones: the median of the three before
+_RATE_STEPS = 4  # Steps whose rate is extrapolated instead
+
 BEFORE_ALL_NS, LATEST_NS = np.iinfo(np.int64).min, np.iinfo(np.int64).max
 
 MODEL_DTYPE = np.dtype([(f.name, np.float64) for f in fields(OdometryModel)])
@@ -255,8 +258,9 @@ def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample,
     """Look a robot's track up at an instant, and write row k of a sample.
 
     Within a step the twist is constant. Past the newest row the last twist is extrapolated with growing
-    covariance; after `timeout_s` the motion since that row is unknown. Before the first row the robot is
-    stationary. A robot without odometry is stationary or a random walk in its body frame.
+    covariance, that of several steps if the last one is much shorter than usual, as after a wrong stamp;
+    after `timeout_s` the motion since that row is unknown. Before the first row the robot is stationary.
+    A robot without odometry is stationary or a random walk in its body frame.
     """
     count = tracks.filled[robot]
     out.silence_s[k] = 0.0
@@ -269,17 +273,17 @@ def look_up(tracks: TrackArrays, robot: int, stamp_ns: int, out: OdometrySample,
         for i in range(3):  # for a random walk, only differences between instants matter
             out.covariance[k, i, i] = tracks.walk[robot, i // 2] * (1e-9 * stamp_ns)
         return
-    row, fraction = _find_step(tracks, robot, stamp_ns)
+    row, end, fraction = _find_step(tracks, robot, stamp_ns)
     if fraction < 0.0:
         assign(out.pose[k], tracks.pose[robot, row])
         assign(out.raw[k], tracks.raw[robot, row])
         assign_matrix(out.covariance[k], tracks.covariance[robot, row])
         assign_matrix(out.jacobian[k], tracks.jacobian[robot, row])
     else:
-        _along_step(tracks, robot, row, fraction, out, k)
+        _along_step(tracks, robot, (row, end), fraction, out, k)
         if fraction < 1.0:
             return
-        row += 1
+        row = end
     model, pose, rate = tracks.model[robot], tracks.pose[robot, row], tracks.rate[robot, row]
     silence_ns = max(0, stamp_ns - tracks.stamp_ns[robot, row])
     unknown = silence_ns > model.timeout_s * 1e9
@@ -293,16 +297,16 @@ def look_up_pose(tracks: TrackArrays, robot: int, stamp_ns: int, out: FloatArray
     if tracks.filled[robot] == 0:
         out.fill(0.0)
         return
-    row, fraction = _find_step(tracks, robot, stamp_ns)
+    row, end, fraction = _find_step(tracks, robot, stamp_ns)
     if fraction < 0.0:
         assign(out, tracks.pose[robot, row])
     else:
-        _interpolate(tracks.pose[robot, row], tracks.pose[robot, row + 1], fraction, out)
+        _interpolate(tracks.pose[robot, row], tracks.pose[robot, end], fraction, out)
 
 
 @inlined_njit
-def _find_step(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[int, float]:
-    """Row before an instant on a track that is not empty, and the fraction of the step to the next row.
+def _find_step(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[int, int, float]:
+    """Rows before and after an instant on a track that is not empty, and the fraction of the step between.
 
     A fraction of 1 or more extrapolates past the newest row; below 0, the robot is stationary at the row.
     """
@@ -310,11 +314,26 @@ def _find_step(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[int, flo
     stamps, timeout_ns = tracks.stamp_ns[robot, :count], tracks.model[robot].timeout_s * 1e9
     row = max(0, np.searchsorted(stamps, stamp_ns, side="right") - 1)
     if row + 1 < count and stamps[row + 1] - stamps[row] <= timeout_ns:
-        return row, max(0, stamp_ns - stamps[row]) / (stamps[row + 1] - stamps[row])
+        return row, row + 1, max(0, stamp_ns - stamps[row]) / (stamps[row + 1] - stamps[row])
     silence_ns = max(0, stamp_ns - stamps[row])
     if row > 0 and silence_ns <= timeout_ns and stamps[row] - stamps[row - 1] <= timeout_ns:
-        return row - 1, 1.0 + silence_ns / (stamps[row] - stamps[row - 1])
-    return row, -1.0
+        begin = _rate_row(stamps, row)
+        return begin, row, 1.0 + silence_ns / (stamps[row] - stamps[begin])
+    return row, row, -1.0
+
+
+@inlined_njit
+def _rate_row(stamps: IntArray, row: int) -> int:
+    """Row from which on the rate at a row is measured: the one before, or several, see `look_up`."""
+    if row <= _RATE_STEPS:
+        return row - 1
+    one, two, three = (
+        stamps[row - 1] - stamps[row - 2],
+        stamps[row - 2] - stamps[row - 3],
+        stamps[row - 3] - stamps[row - 4],
+    )
+    usual = max(min(one, two), min(max(one, two), three))
+    return row - 1 if stamps[row] - stamps[row - 1] >= _LEAST_STEP * usual else row - _RATE_STEPS
 
 
 @inlined_njit
@@ -341,15 +360,16 @@ def rate_at(tracks: TrackArrays, robot: int, stamp_ns: int) -> tuple[float, floa
 
 @inlined_njit
 def _along_step(
-    tracks: TrackArrays, robot: int, row: int, fraction: float, out: OdometrySample, k: int
+    tracks: TrackArrays, robot: int, rows: tuple[int, int], fraction: float, out: OdometrySample, k: int
 ) -> None:
-    """Write row k of `look_up` at a fraction of the step from a row to the next; may exceed 1."""
-    _interpolate(tracks.pose[robot, row], tracks.pose[robot, row + 1], fraction, out.pose[k])
-    _interpolate(tracks.raw[robot, row], tracks.raw[robot, row + 1], fraction, out.raw[k])
+    """Write row k of `look_up` at a fraction of the motion from a row to a later one; may exceed 1."""
+    row, end = rows
+    _interpolate(tracks.pose[robot, row], tracks.pose[robot, end], fraction, out.pose[k])
+    _interpolate(tracks.raw[robot, row], tracks.raw[robot, end], fraction, out.raw[k])
     for i in range(3):
         for j in range(3):
             for table, target in ((tracks.covariance, out.covariance), (tracks.jacobian, out.jacobian)):
-                before, after = table[robot, row, i, j], table[robot, row + 1, i, j]
+                before, after = table[robot, row, i, j], table[robot, end, i, j]
                 target[k, i, j] = before + fraction * (after - before)
 
 

@@ -242,6 +242,41 @@ def test_what_noise_is_preintegrated_between_any_two_instants_is_a_covariance(
     assert least > -1e-3 * PLAIN.wheel_noise  # the motion of a silent robot is not known better than a step's
 
 
+@pytest.mark.parametrize("early", [0.3, 0.6, 0.9, 0.99])
+@pytest.mark.parametrize(("speed", "turn_rate"), [(0.2, 0.0), (0.2, 1.5)])
+def test_a_stamp_that_is_too_early_or_late_makes_no_rate(
+    speed: float, turn_rate: float, early: float
+) -> None:
+    """Past the newest row a robot is off by no more than the stamp's error and .4 of its motion since."""
+    stamps = stamps_until(1.0)
+    raw = arc(speed, turn_rate, (stamps - T0) * 1e-9)
+    for wrong, sign in ((-1, -1), (-2, 1)):  # the last stamp is early, or the one before it late
+        moved, track = stamps.copy(), tracks()
+        moved[wrong] += sign * round(early * STEP_NS)
+        feed(track, moved, raw)
+        for ahead_s in (0.0, 0.05, 0.1):
+            at_ns = max(int(moved[-1]), int(stamps[-1])) + round(ahead_s * 1e9)
+            truth = arc(speed, turn_rate, np.array([(at_ns - T0) * 1e-9]))[0]
+            error = look(track, at_ns).pose[0] - truth
+            elapsed_s = (at_ns - moved[-1]) * 1e-9
+            allowed_s = early * STEP_NS * 1e-9 + 0.4 * elapsed_s
+            assert math.hypot(*error[:2]) <= speed * allowed_s
+            assert abs(error[2]) <= turn_rate * allowed_s + 1e-9
+
+
+@pytest.mark.parametrize("short", [0.1, 0.5, 0.9])
+def test_steps_of_different_length_give_the_same_rate(short: float) -> None:
+    """A reading in between, with a right stamp, changes nothing; nor does a silence before it."""
+    track = tracks()
+    stamps = np.append(stamps_until(1.0), T0 + SECOND + round(short * STEP_NS))
+    stamps = np.delete(stamps, slice(14, 17))
+    feed(track, stamps, arc(0.2, 0.7, (stamps - T0) * 1e-9))
+    at_ns = int(stamps[-1]) + STEP_NS
+    np.testing.assert_allclose(
+        look(track, at_ns).pose[0], arc(0.2, 0.7, np.array([(at_ns - T0) * 1e-9]))[0], atol=1e-4
+    )
+
+
 def test_a_silent_robot_runs_on_for_its_timeout_and_then_may_be_anywhere() -> None:
     track, stamps = tracks(), stamps_until(1.0)
     feed(track, stamps, arc(0.1, 0.0, (stamps - T0) * 1e-9))

@@ -1,0 +1,1 @@
+"""Robustness: robots whose bytes are corrupted, and odometry with wrong stamps."""
