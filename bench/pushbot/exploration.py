@@ -117,6 +117,10 @@ class KinematicPushBot:
         reported = self._odometry + step * np.arange(1, len(poses) + 1)[:, None] * ahead * (free > 0)
         return self._moved(poses, reported, others)
 
+    def restart_odometry(self) -> None:
+        """Begin odometry at zero, as a new driver does."""
+        self._odometry = np.zeros(3)
+
     def lights(self, stamp_ns: IntArray, others: dict[int, KinematicPushBot]) -> LightSightings:
         """Sightings of the lights of other robots, by number, at times (n,) that all robots have lived."""
         steps = np.round(stamp_ns / (1e9 * PERIOD_S)).astype(np.int64)

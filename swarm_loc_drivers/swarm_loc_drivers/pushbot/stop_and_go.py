@@ -27,6 +27,7 @@ _GAIN, _MIN_RATE, _MIN_SPEED, _COURSE_GAIN = 2.0, 0.15, 0.04, 1.5
 """[1/s], [rad/s], [m/s], [1/s]: slower towards the end, but fast enough to turn the wheels."""
 _TURNED, _ARRIVED = 0.01, 0.002
 _MAX_REMEMBERED = 1000
+_BLIND_DRIVE = 0.4  # Way ahead of a robot that gets no goal after a restart [m]
 _MAX_JUMP, _MAX_PAUSE_NS = 0.5, 2_000_000_000
 """Odometry that jumps further [m], or that pauses or steps back for longer, has restarted."""
 _MIN_RATIO_TURN = math.pi
@@ -140,6 +141,8 @@ class StopAndGo:
             self._moves.popleft()
             self._anchor, self._since_ns = None, stamp_ns
         if stamp_ns - self._since_ns > 1e9 * self._settings.patience_s:
+            # after a restart, scans of several places tell the mapper where it is
+            self._moves += [_Drive(_BLIND_DRIVE)] if self.restarts and self._goal_ns < 0 else []
             self._moves.append(_Look(SCAN_TURN, self._settings.turn_rate))
         return STILL
 

@@ -173,3 +173,15 @@ def test_odometry_that_begins_anew_makes_a_first_scan(shift: float, pause_s: flo
     robot.until_still()
     assert robot.turned - before == pytest.approx(START_TURN, abs=0.03)
     assert robot.motion.restarts == 1
+
+
+def test_after_a_restart_it_looks_from_another_place_while_it_gets_no_goal() -> None:
+    robot = looked_around()
+    robot.odometry[0] += 1.0
+    robot.until_still()
+    before, place = robot.turned, robot.pose[:2].copy()
+    while not robot.step():
+        pass
+    robot.until_still()
+    assert math.dist(robot.pose[:2], place) == pytest.approx(0.4, abs=0.01)
+    assert robot.turned - before == pytest.approx(SCAN_TURN, abs=0.03)

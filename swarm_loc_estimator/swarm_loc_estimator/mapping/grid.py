@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -110,7 +111,11 @@ class OccupancyMap:
 
 
 def draw_map(
-    scans: Scans, count: int, max_cells: int, background: OccupancyMap | None = None
+    scans: Scans,
+    count: int,
+    max_cells: int,
+    background: OccupancyMap | None = None,
+    without: Collection[int] = (),
 ) -> OccupancyMap:
     """Draw the map of the first stops; its size follows from their positions.
 
@@ -119,6 +124,7 @@ def draw_map(
         count: Number of stops to draw.
         max_cells: Maximum number of cells; a larger map is cropped around its centre.
         background: A map with the same cell size, drawn below the stops.
+        without: Stops that are not drawn.
     """
     reach = scans.beams.reach[:count].max(initial=0.0) + 0.1
     places = scans.states[:count, :2]
@@ -129,7 +135,7 @@ def draw_map(
     log_odds = np.zeros(shape)
     if background is not None:
         _lay_below(log_odds, corner, background)
-    for stop in range(count):
+    for stop in (one for one in range(count) if one not in without):
         draw_stop(log_odds, corner, CELL, scans.states[stop, :3], stop, scans.lines, scans.beams.free[stop])
     return OccupancyMap(corner, CELL, np.clip(log_odds, -LOG_ODDS_CAP, LOG_ODDS_CAP))
 

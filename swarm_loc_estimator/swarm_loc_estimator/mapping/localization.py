@@ -64,8 +64,10 @@ def _align_alone(graph: PoseGraph, stop: int, path: float) -> bool:
     return False
 
 
-def align_start(graph: PoseGraph, parts: Sequence[int], sigma: FloatArray) -> None:
+def align_start(graph: PoseGraph, parts: Sequence[int], sigma: FloatArray) -> bool:
     """Align the parts of a robot's first scan with each other and, as one body, with older scans.
+
+    Returns whether older scans agree with the start pose.
 
     Args:
         graph: The graph; modified.
@@ -82,13 +84,14 @@ def align_start(graph: PoseGraph, parts: Sequence[int], sigma: FloatArray) -> No
         if found.score > _MIN_START_SCORE:
             graph.states[parts, :3] += found.offset
     _match_parts(graph, parts, 0)
-    if (
-        np.abs(graph.states[parts[0], :3] - given[:3]) > _MAX_START_SIGMAS * sigma + _LEAST_START_SHIFT
-    ).any():
-        graph.states[:], graph.slip = states, slip
-        for one, targets in graph.targets.items():
-            graph.targets[one] = [other for other in targets if (one in parts) == (other in parts)]
-        _match_parts(graph, parts, parts[0])
+    off = np.abs(graph.states[parts[0], :3] - given[:3])
+    if (off <= _MAX_START_SIGMAS * sigma + _LEAST_START_SHIFT).all():
+        return True
+    graph.states[:], graph.slip = states, slip
+    for one, targets in graph.targets.items():
+        graph.targets[one] = [other for other in targets if (one in parts) == (other in parts)]
+    _match_parts(graph, parts, parts[0])
+    return False
 
 
 def _match_parts(graph: PoseGraph, parts: Sequence[int], oldest: int) -> None:
@@ -242,6 +245,7 @@ def _unconnected(graph: PoseGraph, stop: int) -> list[int]:
         int(one)
         for one in np.argsort(away, kind="stable")
         if one not in connected
+        and graph.scans.beams.counts[one]
         and away[one] < _RADIUS
         and (robot[one] != robot[stop] or stop - one > _MIN_AGE)
     ]

@@ -28,6 +28,7 @@ from swarm_loc_estimator.mapping.localization import (
     find_slip,
 )
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
+from swarm_loc_estimator.mapping.relocation import RATES, Search, agreement
 from swarm_loc_estimator.mapping.scans import (
     MIN_TURN,
     UNSEEN,
@@ -66,6 +67,8 @@ class Track:
     goal: Goal | None = None  # Its next stop
     located: Located | None = None  # Where its newest scan says that it was
     home: FloatArray | None = None  # (2,) old stop to which it returns to reduce its position uncertainty [m]
+    last_ns: int = 0  # Its newest reading
+    search: Search | None = None  # Since its odometry restarted, until it is found and later stops agree
 
 
 START_TURN = 4.5 * math.pi
@@ -84,7 +87,10 @@ _PART_SIGMA = np.array([0.002, 0.002, 0.002])
 _LEAST_SIGMA = 0.003  # Minimum standard deviation of a drive, along and across [m]
 _LOST_SIGMA, _CHECK_EVERY = 0.15, 4
 """Maximum position standard deviation [m]; above it a robot returns to an old stop nearby (home)."""
-_RESTART_SIGMA = np.array([0.10, 0.10, math.radians(5.0)])
+_FOUND_SIGMA, _UNKNOWN_HEADING = np.array([0.10, 0.10, math.radians(5.0)]), 1.8
+"""Standard deviations of a place found after a restart [m, m, rad], and of a heading that nothing tells."""
+_CONFIRMED, _MIN_AGREEMENT = 4, 0.7
+"""Number of stops that must agree with that place, and share of their walls that must fit those of others."""
 _HOME_AGE, _HOME_RADIUS, _AT_HOME = 10, 4.0, 0.5
 """Minimum age in stops and maximum distance [m] of that stop, and the distance at which it is reached [m]."""
 
@@ -106,6 +112,7 @@ class CooperativeMapper:
         self.graph = PoseGraph(self.settings)
         self.visits = VisitationMap()
         self.counters = {"scans": 0, "scans_refused": 0, "loops_closed": 0, "odometry_restarts": 0}
+        self.counters |= {"scans_not_located": 0, "places_taken_back": 0}
         self._tracks: dict[int, Track] = {}
         self._lights = LightBook()
         self.background: OccupancyMap | None = None
@@ -130,7 +137,7 @@ class CooperativeMapper:
             if run.arrives or not run.stands:
                 self._depart(robot, track)
             if run.jumps:
-                track = self._restart_track(robot, track)
+                self._restart_track(robot, track, int(run.readings.stamp_ns[0]))
             elif run.arrives:
                 self._drive(track, run.readings.odometry[:1])
             if run.arrives:
@@ -142,31 +149,82 @@ class CooperativeMapper:
             else:
                 self._drive(track, run.readings.odometry)
                 self._lights.note_time(robot, int(run.readings.stamp_ns[-1]))
+            track.last_ns = int(run.readings.stamp_ns[-1])
 
     def add_sweep(self, robot: int, sweep: ScanStop) -> None:
         """Process a sweep of a robot's lidar, newer than all before, if the robot has moved since."""
         track, place = self._tracks[robot], sweep.arrival[None]
         step = Readings(sweep.stamp_ns[:1], place, np.full(1, UNSEEN), math.nan)
         if any(run.jumps for run in track.motion.runs(step)):
-            track = self._restart_track(robot, track)
+            self._restart_track(robot, track, int(sweep.stamp_ns[0]))
         self._drive(track, place)
-        if track.node is not None:
+        track.last_ns = int(sweep.stamp_ns[0])
+        if track.node is not None or (track.search is not None and track.search.left is not None):
             x, y, turn = between(track.left, sweep.arrival)
             if math.hypot(x, y) < _SWEEP_STEP and abs(turn) < _SWEEP_TURN:
                 return
         self.graph.known_slips.add(robot)  # no turn by odometry is in a sweep
         self._enter(robot, track, sweep, len(sweep.turn))
         track.is_known, track.left, track.path = False, sweep.arrival, 0.0
-        track.located = Located(int(sweep.stamp_ns[0]), self.graph.poses[track.node].copy())
+        if track.node is not None:
+            track.located = Located(track.last_ns, self.graph.poses[track.node].copy())
 
-    def _restart_track(self, robot: int, track: Track) -> Track:
-        """Restart a robot's track near its last pose after odometry jumped, as by a restart of its driver."""
+    def _restart_track(self, robot: int, track: Track, stamp_ns: int) -> None:
+        """Lose a robot, whose odometry has jumped, as by a restart of its driver."""
         self.counters["odometry_restarts"] += 1
-        pose = self.pose(robot)
-        fresh = Track(track.prior, track.prior_sigma) if pose is None else Track(pose, _RESTART_SIGMA)
-        fresh.motion = track.motion
-        self._tracks[robot] = fresh
-        return fresh
+        pose, lost, pause_s = self.pose(robot), track.search, (stamp_ns - track.last_ns) * 1e-9
+        if pose is None and lost is not None:
+            pose, pause_s = lost.near, pause_s + lost.pause_s + track.path / RATES[0]
+        self._lose(track, Search(track.prior if pose is None else pose, pause_s))
+        track.last = None
+
+    def _lose(self, track: Track, search: Search) -> None:
+        """Begin to search a robot, none of whose scans is used until it is found."""
+        track.search, track.node, track.path, track.home, track.target = search, None, 0.0, None, None
+        track.is_known = track.passes = False
+
+    def _is_found(self, robot: int, track: Track, stop: ScanStop) -> bool:
+        """Whether the one place is found that fits the scans of a lost robot; it becomes its prior."""
+        search, known = track.search, self.graph.known_slips
+        if search is None:
+            return True
+        ratio = math.nan if stop.reach or robot in known else turn_ratio(stop.turn, stop.inverse, stop.sigma)
+        search.add(stop, 1.0 - self.graph.slip[robot] if math.isnan(ratio) else ratio)
+        if not stop.reach and stop.turned < 2.0 * math.pi:
+            return False
+        if not self.graph.count and all(one.search is not None for one in self._tracks.values()):
+            track.prior_sigma = np.array([*track.prior_sigma[:2], _UNKNOWN_HEADING])
+            track.search = None  # it begins the map
+            return True
+        found = search.place(self.occupancy())
+        if found is None:
+            return False
+        track.prior, track.prior_sigma = found, _FOUND_SIGMA
+        search.first = self.graph.count
+        return True
+
+    def _check_place(self, robot: int, track: Track, stop: ScanStop, *, fits: bool = True) -> None:
+        """Take back the place where a robot was found, and all scans since, if its newest one contradicts."""
+        search, graph = track.search, self.graph
+        if search is None or track.node is None:
+            return
+        since = np.flatnonzero(graph.robot[: graph.count] == robot)
+        since = since[since >= search.first]
+        limit = self.settings.max_cells
+        others = draw_map(graph.scans, graph.count, limit, self.background, frozenset(since.tolist()))
+        share = agreement(others, stop, graph.states[track.node if search.is_entered else search.first])
+        search.is_entered = True
+        if fits and not share < _MIN_AGREEMENT:
+            search.checks += not math.isnan(share)
+            track.search = search if search.checks < _CONFIRMED else None
+            return
+        self.counters["places_taken_back"] += 1
+        for one in since.tolist():
+            graph.drop_stop(one)
+            self._lights.forget_node(one)
+            self.begin_ns.pop(one)
+        graph.solve(4)
+        self._lose(track, Search(search.near, search.pause_s))
 
     def add_lights(self, robot: int, sightings: LightSightings) -> None:
         """Process sightings (m,) of other robots by one robot."""
@@ -244,6 +302,8 @@ class CooperativeMapper:
             if count:
                 self._enter(robot, track, stop, count)
                 self._choose_goal(robot, track, stop)
+                if not track.is_known:
+                    track.stop = ScanStop(stop.departure)
         again = stop.split(around) if track.is_known else None
         if again is not None:  # the robot could not leave and turned again: a new stop and a new goal
             self._depart(robot, track)
@@ -285,11 +345,15 @@ class CooperativeMapper:
 
     def _enter(self, robot: int, track: Track, stop: ScanStop, count: int) -> None:
         """Add the first `count` readings of a stop as a node (several for a first scan) and align it."""
+        if track.node is None and not self._is_found(robot, track, stop):
+            self.counters["scans_not_located"] += 1
+            return
         self.counters["scans"] += 1
         self._map = None
         track.is_known, stop.looked = True, count
         if track.node is None:
-            self._enter_first(robot, track, stop, count)
+            fits = self._enter_first(robot, track, stop, count)
+            self._check_place(robot, track, stop, fits=fits)
             return
         motion = between(track.left, stop.arrival)
         sigma = self._motion_sigma(track.path, abs(float(motion[2])))
@@ -311,6 +375,7 @@ class CooperativeMapper:
             self.counters["scans_refused"] += 1
         if close_loop(self.graph, node):
             self.counters["loops_closed"] += 1
+        self._check_place(robot, track, stop)
 
     def _replace(self, node: int, pose: FloatArray, motion_sigma: FloatArray, stop: ScanStop) -> int:
         """Replace a robot's newest stop by its next one, since the graph is full; returns its number."""
@@ -333,8 +398,8 @@ class CooperativeMapper:
             ]
         )
 
-    def _enter_first(self, robot: int, track: Track, stop: ScanStop, count: int) -> None:
-        """Add the parts of a first scan as nodes; the first part fixes the start heading."""
+    def _enter_first(self, robot: int, track: Track, stop: ScanStop, count: int) -> bool:
+        """Add the parts of a first scan as nodes, of which the first fixes the heading; see `align_start`."""
         turn, inverse = stop.turn[:count], stop.inverse[:count]
         furthest = np.maximum.accumulate(np.abs(turn))
         ratio = turn_ratio(turn, inverse, stop.sigma)
@@ -360,7 +425,7 @@ class CooperativeMapper:
         track.node = nodes[-1]
         self.graph.starts.update(nodes)
         self.graph.place[nodes] = nodes[0]
-        align_start(self.graph, nodes, track.prior_sigma)
+        return align_start(self.graph, nodes, track.prior_sigma)
 
     def _choose_goal(self, robot: int, track: Track, stop: ScanStop) -> None:
         node = track.node

@@ -390,6 +390,19 @@ class PoseGraph:
 
     def reuse_stop(self, stop: int, pose: FloatArray, sigma: float, reach: float = 0.0) -> None:
         """Replace a stop by a new one of the same robot under the same number; see `add_stop`."""
+        self._disconnect(stop)
+        self.states[stop] = (*pose[:3], 1.0 - self.slip[self.robot[stop]])
+        self._set_laser(stop, sigma, reach)
+
+    def drop_stop(self, stop: int) -> None:
+        """Take back all that a stop tells; its number and its place stay."""
+        self._disconnect(stop)
+        self.constraints.add_prior(stop, self.states[stop, :3].copy(), np.ones(3))
+        self.turned[stop] = self._turned_all[stop] = self._beams.counts[stop] = 0
+        self.fit(stop)
+
+    def _disconnect(self, stop: int) -> None:
+        """Remove all constraints and matches of a stop."""
         self.constraints.remove_stop(stop)
         self.targets = {
             one: [other for other in others if other != stop]
@@ -397,8 +410,6 @@ class PoseGraph:
             if one != stop
         }
         self.starts.discard(stop)
-        self.states[stop] = (*pose[:3], 1.0 - self.slip[self.robot[stop]])
-        self._set_laser(stop, sigma, reach)
         self._factored = -1
 
     def set_scan(self, stop: int, scan: Scan) -> None:

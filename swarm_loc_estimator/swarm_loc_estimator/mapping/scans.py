@@ -313,6 +313,7 @@ _REST_NS, _REST_TURN = 1_000_000_000, 0.01  # A robot rests if it turns less tha
 _DRIVES, _STANDS, _ARRIVES, _JUMPS = 0, 1, 2, 3
 _MAX_SPEED, _MAX_STEP, _MAX_RATE, _MAX_TURN = 3.0, 0.05, 20.0, 0.3
 """Limits beyond which odometry counts as restarted: rate and offset of position, and of heading."""
+_PAUSE_S = 0.5  # Pause after which odometry near zero has restarted, since its driver has [s]
 
 
 class ScanStop:
@@ -461,7 +462,9 @@ def _labels(stamp_ns: IntArray, odometry: FloatArray, state: FloatArray, before_
         elapsed_s = (stamp_ns[k] - before_ns) * 1e-9
         step = math.hypot(x - state[2], y - state[3])
         turn = abs((odometry[k, 2] - state[5] + math.pi) % (2.0 * math.pi) - math.pi)
-        if step > _MAX_SPEED * elapsed_s + _MAX_STEP or turn > _MAX_RATE * elapsed_s + _MAX_TURN:
+        at_zero = math.hypot(x, y) < _MAX_STEP and abs(odometry[k, 2]) < _MAX_TURN
+        restarts = at_zero and elapsed_s > _PAUSE_S and step + turn > 0.0
+        if restarts or step > _MAX_SPEED * elapsed_s + _MAX_STEP or turn > _MAX_RATE * elapsed_s + _MAX_TURN:
             labels[k] = _JUMPS
             state[0], state[1], state[4] = x, y, 1.0
         elif state[4] == 1.0 and math.hypot(x - state[0], y - state[1]) <= _DEPARTED:

@@ -12,6 +12,7 @@ from swarm_loc_estimator.common.messages.poses import yaw_of
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, START_TURN, CooperativeMapper
 from swarm_loc_estimator.mapping.matching import Lattice, search_offsets
+from swarm_loc_estimator.mapping.relocation import Search
 from swarm_loc_estimator.mapping.scans import Readings
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
@@ -40,6 +41,10 @@ def precompile() -> None:
         mapper.visits.on(mapper.occupancy())
     # what is called where a robot comes to an old stop again
     search_offsets(mapper.graph.scans, np.array([1]), np.array([0]), Lattice(0.06, 0.06, 0.03, 0.03))
+    # what is called where odometry has restarted
+    search = Search(pose, 1.0)
+    search.parts.append(mapper.graph.poses[:, :2].repeat(10, axis=0))
+    search.place(mapper.occupancy())
     yaw_of(0.0, 0.0, 0.0, 1.0)  # what reads odometry
     note_precompiled(precompile)
 

@@ -24,11 +24,11 @@ NICHE = (1.2, 2.6, 2.0, 3.1)
 _SPEED, _TURN_RATE = 0.2, 1.0
 
 
-def distance_in_room(x: float, y: float, angle: float) -> float:
+def distance_in_room(x: float, y: float, angle: float, *, has_niche: bool = True) -> float:
     """Distance along a ray from inside the room, out to its wall or that of the niche [m]."""
     best = _leave(ROOM, x, y, angle)
     at_x, at_y = x + best * math.cos(angle), y + best * math.sin(angle)
-    if abs(at_y - ROOM[3]) < 1e-9 and NICHE[0] < at_x < NICHE[2]:
+    if has_niche and abs(at_y - ROOM[3]) < 1e-9 and NICHE[0] < at_x < NICHE[2]:
         best += _leave(NICHE, at_x, at_y + 1e-12, angle)
     return best
 
@@ -40,9 +40,11 @@ def _leave(box: tuple[float, float, float, float], x: float, y: float, angle: fl
     return min(along_x, along_y)
 
 
-def inverse_distances(pose: FloatArray, angles: FloatArray, rng: np.random.Generator | None) -> FloatArray:
+def inverse_distances(
+    pose: FloatArray, angles: FloatArray, rng: np.random.Generator | None, *, has_niche: bool = True
+) -> FloatArray:
     """Inverse distances (n,) in directions (n,) of map, 0 beyond the range; with noise if it has a source."""
-    distances = np.array([distance_in_room(pose[0], pose[1], angle) for angle in angles])
+    distances = np.array([distance_in_room(pose[0], pose[1], angle, has_niche=has_niche) for angle in angles])
     noise = rng.standard_normal(len(angles)) * SIGMA if rng is not None else 0.0
     return np.where(distances < MAX_RANGE, np.maximum(1.0 / distances + noise, 1e-3), 0.0)
 
@@ -55,6 +57,8 @@ class RoomRobot:
         slip: Share of turns that is lost.
         rng: Of the laser's noise; None: exact.
     """
+
+    has_niche = True  # Whether its room has the niche
 
     def __init__(
         self, pose: tuple[float, float, float], slip: float, rng: np.random.Generator | None
@@ -74,6 +78,16 @@ class RoomRobot:
         readings = self._read(odometry, np.tile(self.pose[:2], (count, 1)), headings)
         self.pose[2] = headings[-1]
         return readings
+
+    def rest(self, duration_s: float) -> Readings:
+        """Stand still [s]."""
+        count = round(1e9 * duration_s / PERIOD_NS)
+        places = np.tile(self.pose[:2], (count, 1))
+        return self._read(np.tile(self.odometry, (count, 1)), places, np.full(count, self.pose[2]))
+
+    def pass_time(self, duration_s: float) -> None:
+        """Let a time pass without readings [s]."""
+        self._stamp_ns += round(1e9 * duration_s)
 
     def drive(self, length: float) -> Readings:
         """Drive ahead [m]."""
@@ -98,7 +112,7 @@ class RoomRobot:
         self.odometry = odometry[-1].copy()
         inverse = np.concatenate(
             [
-                inverse_distances(place, np.array([heading]), self._rng)
+                inverse_distances(place, np.array([heading]), self._rng, has_niche=self.has_niche)
                 for place, heading in zip(places, headings, strict=True)
             ]
         )

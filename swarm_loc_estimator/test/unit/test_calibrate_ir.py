@@ -261,7 +261,7 @@ def test_a_saturation_that_is_lower_than_described_is_told_where_gains_fail_by_i
     [
         ("gains.png", "'gains.png' must end in .yaml"),
         ("bag/x.yaml", "bag/x.yaml cannot be written: it is a folder"),
-        ("file/deep/x.yaml", "file/deep cannot be written: "),
+        ("file/deep/x.yaml", "file cannot be written: "),
     ],
 )
 def test_what_cannot_be_written_is_said_before_the_work(

@@ -11,11 +11,13 @@ from mapping_world import ROOM, RoomRobot, distance_in_room
 
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
+from swarm_loc_estimator.mapping.relocation import Search
 from swarm_loc_estimator.mapping.scans import LightSightings, MotionTracker, Readings, ScanStop
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
 START = (1.0, 1.0, 0.3)
 KNOWN = np.full(3, 1e-3)
+MIDDLE = (1.7, 1.3)
 FIRST_TURNS = ((0.5 * math.pi, 0.25), (4.0 * math.pi, 0.6))
 
 
@@ -132,6 +134,99 @@ def test_odometry_that_begins_anew_is_no_drive() -> None:
     position, heading = error_of(mapper, 0, robot)
     assert position < 0.03
     assert heading < math.radians(2.0)
+
+
+def restart(robot: RoomRobot, turn: float, drive: float, pause_s: float = 3.0) -> None:
+    """Its driver restarts; unheard it turns and drives."""
+    robot.turn(turn)
+    robot.drive(drive)
+    robot.pass_time(pause_s)
+    robot.odometry = np.zeros(3)
+
+
+def seek(mapper: CooperativeMapper, robot: RoomRobot) -> None:
+    """Look around, and at more places until it is found."""
+    feed(mapper, 0, look_around(robot))
+    for _ in range(8):
+        if mapper.goal(0) is not None:
+            return
+        while distance_in_room(*robot.pose) < 0.6:
+            feed(mapper, 0, [robot.turn(1.0)])
+        feed(mapper, 0, [robot.drive(0.4), robot.turn(SCAN_TURN)])
+        feed(mapper, 0, [robot.rest(1.2)])
+
+
+@pytest.mark.parametrize(
+    ("turn", "drive", "times"), [(2.1, 0.0, 1), (-0.7, 0.0, 2), (0.3, 0.4, 1), (0.0, 0.0, 2)]
+)
+@pytest.mark.parametrize("seed", [20, 21])
+def test_a_robot_that_moves_unheard_while_its_driver_restarts_is_found_by_its_scan(
+    turn: float, drive: float, times: int, seed: int
+) -> None:
+    mapper, robot = CooperativeMapper(), RoomRobot(START, 0.02, np.random.default_rng(seed))
+    explore(mapper, mapper.join(np.array(START), KNOWN), robot, 3)
+    before = mapper.graph.poses.copy()
+    for _ in range(times):
+        restart(robot, turn, drive)
+        seek(mapper, robot)
+    assert mapper.counters["odometry_restarts"] == times
+    assert mapper.counters["places_taken_back"] == 0
+    position, heading = error_of(mapper, 0, robot)
+    assert position < 0.03
+    assert heading < math.radians(2.0)
+    assert np.abs((mapper.graph.poses[: len(before)] - before)[:, :2]).max() < 0.04
+
+
+def test_a_robot_whose_scan_fits_two_places_leaves_the_map_as_it_is() -> None:
+    mapper, robot = CooperativeMapper(), RoomRobot((*MIDDLE, 0.3), 0.0, np.random.default_rng(22))
+    robot.has_niche = False
+    explore(mapper, mapper.join(np.array([*MIDDLE, 0.3]), KNOWN), robot, 2)
+    located = mapper.located(0)
+    restart(robot, 2.0, 0.0)
+    feed(mapper, 0, [robot.turn(0.1)])
+    before, walls = mapper.graph.poses.copy(), mapper.occupancy().log_odds.copy()
+    feed(mapper, 0, [*look_around(robot), robot.drive(0.3), robot.turn(SCAN_TURN)])
+    assert mapper.counters["scans_not_located"] > 0
+    assert mapper.pose(0) is None
+    assert mapper.goal(0) is None
+    assert mapper.located(0) is located
+    assert np.array_equal(mapper.graph.poses, before)
+    assert np.array_equal(mapper.occupancy().log_odds, walls)
+
+
+def test_a_place_that_later_stops_contradict_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper, robot = CooperativeMapper(), RoomRobot(START, 0.02, np.random.default_rng(23))
+    explore(mapper, mapper.join(np.array(START), KNOWN), robot, 3)
+    before = mapper.graph.poses.copy()
+    restart(robot, 2.1, 0.0)
+    wrong = [np.array([0.8, 1.9, 2.0])]
+    with monkeypatch.context() as patch:
+        find = Search.place
+        patch.setattr(Search, "place", lambda *given: wrong.pop() if wrong else find(*given))
+        seek(mapper, robot)
+        for _ in range(3):
+            goal = mapper.goal(0)
+            if goal is None:
+                seek(mapper, robot)
+            else:
+                feed(mapper, 0, [*robot.go_to(goal.odometry), robot.turn(SCAN_TURN)])
+    assert mapper.counters["places_taken_back"] == 1
+    position, heading = error_of(mapper, 0, robot)
+    assert position < 0.03
+    assert heading < math.radians(2.0)
+    assert np.abs((mapper.graph.poses[: len(before)] - before)[:, :2]).max() < 0.04
+    assert len(mapper.begin_ns) < mapper.graph.count  # the stops at the wrong place count no more
+
+
+@pytest.mark.parametrize(
+    ("pause_s", "odometry", "jumps"), [(3.0, 0.0, True), (3.0, 1.0, False), (0.1, 0.0, False)]
+)
+def test_odometry_near_zero_after_a_pause_is_a_restart(pause_s: float, odometry: float, jumps: bool) -> None:
+    robot, tracker = RoomRobot(START, 0.0, None), MotionTracker()
+    assert not any(run.jumps for part in (robot.drive(0.3), robot.turn(1.0)) for run in tracker.runs(part))
+    robot.pass_time(pause_s)
+    robot.odometry *= odometry
+    assert any(run.jumps for run in tracker.runs(robot.turn(0.2))) == jumps
 
 
 def test_a_robot_that_cannot_leave_looks_again_and_gets_another_goal() -> None:
