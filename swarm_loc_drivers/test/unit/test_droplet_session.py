@@ -333,6 +333,6 @@ def test_a_droplet_that_has_nothing_to_do_and_says_nothing_is_found_out() -> Non
     lab.run(10.0)
     assert 5 <= cable.counts["lines"] - lines <= 10
     assert not cable.counts["bad_echoes"]
-    cable.firmware.receive = lambda _: b""  # type: ignore[method-assign]
+    cable.firmware.receive = lambda _: b""  # type: ignore[method-assign, assignment]
     with pytest.raises(SessionError):
         lab.run(3.0)
