@@ -416,6 +416,8 @@ def note_update(
 ) -> None:
     """Update the excess covariances of the robots of measurement k, which was used.
 
+    What an update by one number leaves follows from its gain, the correction over the innovation.
+
     Args:
         measurements: (m,).
         k: Which one.
@@ -432,11 +434,8 @@ def note_update(
     for i in range(2):
         if sides[i] >= 0 and by_gain:
             gain = correction[3 * sides[i] : 3 * sides[i] + 3] / innovation
-            own_jacobian = work.jacobian[0, 0, 3 * i : 3 * i + 3]
-            left[i], added[i] = (
-                np.eye(3) - np.outer(gain, own_jacobian),
-                work.noise[0, 0, 0] * np.outer(gain, gain),
-            )
+            left[i] = np.eye(3) - np.outer(gain, work.jacobian[0, 0, 3 * i : 3 * i + 3])
+            added[i] = work.noise[0, 0, 0] * np.outer(gain, gain)
             _count_learned(belief, sides[i], left[i])
         elif sides[i] >= 0:
             own = before[i].copy()

@@ -248,7 +248,7 @@ def assess(
     if distance > limit:
         state.finding[robot, place] = ELSEWHERE if elsewhere else DEVIATES
         weight *= min(distance / limit, most)
-    elif mean > ((2.0 if repeats else 1.0) * _DRIFT) ** 2 and not _errs_alone(
+    elif mean > ((2.0 if repeats else 1.0) * _DRIFT) ** 2 and not _is_no_drift(
         measurements, k, belief, max_fault_score
     ):
         state.finding[robot, place] = DRIFTS
@@ -581,11 +581,11 @@ def _is_tied(belief: BeliefArrays, robot: int, now_ns: int) -> bool:
 
 
 @inlined_njit
-def _errs_alone(measurements: Measurements, k: int, belief: BeliefArrays, max_fault_score: float) -> bool:
-    """Whether a mean of innovations tells of no drift of measurement k.
+def _is_no_drift(measurements: Measurements, k: int, belief: BeliefArrays, max_fault_score: float) -> bool:
+    """Whether a mean of innovations far from zero is no evidence of a drift of the source of measurement k.
 
-    So it is with a scan in a map, since one wall tells what others did not: `timeline/scan_delay.py` tells
-    whether it is late. And with a suspended fix of a robot that nothing else ties, whose error lasts.
+    Scans in a map show errors of earlier scans, which saw other walls; late ones are found by their delay,
+    see `sensors/lidar.py`. While fixes of a robot that nothing else ties are suspended, its own error lasts.
     """
     robot = robot_of(measurements, k)
     suspended = is_suspended(belief, source_of(measurements, k, belief), 1.5 * max_fault_score)

@@ -284,7 +284,7 @@ class SwarmState:
         windows: Stored measurements of one degree of freedom per such robot (see `window.py`).
         next_window_ns: (N,) earliest instant of the next attempt with them.
         images: Memory of aerial images; None before the first.
-        delays: What is known of the delays of lidars, by robot, see `timeline/scan_delay.py`.
+        delays: What is known of the delays of lidars, by robot, see `sensors/lidar.py`.
         origin: Robot whose pose was the origin when a local frame began, see `initializer.py`; IN_MAP: none.
         frame_moves: How often all poses have moved from a local frame to `map`.
         meetings: Robots that have met while nobody was located.
@@ -319,7 +319,7 @@ class SwarmState:
         self.windows: dict[int, Any] = {}  # of `window.Window`
         self.next_window_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.images: IdentityMemory | None = None
-        self.delays: dict[int, Any] = {}  # of `scan_delay.DelayBelief`
+        self.delays: dict[int, Any] = {}  # of `lidar.DelayBelief`
         self.origin, self.frame_moves, self.meetings = IN_MAP, 0, Meetings()
         self.lost_why: IntArray = np.zeros(robots, dtype=np.int64)
         self.lost_ns: IntArray = np.full(robots, NEVER_NS)

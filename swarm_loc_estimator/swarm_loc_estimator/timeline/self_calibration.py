@@ -19,7 +19,7 @@ from swarm_loc_estimator.swarm.calibration_states import (
     TURN_SCALE,
     ParameterTable,
 )
-from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Anchor, Robot, Surveyed, Swarm
 
 
 def learns(swarm: Swarm) -> bool:
@@ -34,14 +34,7 @@ def learned(swarm: Swarm, state: SwarmState) -> Swarm:
     The bias of the turn rate is omitted, because it changes. Standard deviations of landmarks are marginal:
     they include errors common to all landmarks.
     """
-    surveyed: list[Any] = [
-        mark
-        if state.landmark_column(index) < 0
-        else _calibrated(mark, index, state)
-        if isinstance(mark, Anchor)
-        else _placed(mark, index, state)
-        for index, mark in enumerate(swarm.surveyed)
-    ]
+    surveyed: list[Any] = [_placed(mark, index, state) for index, mark in enumerate(swarm.surveyed)]
     marks, anchors = len(swarm.landmarks), len(swarm.landmarks) + len(swarm.anchors)
     return replace(
         swarm,
@@ -112,8 +105,12 @@ def _calibrated(anchor: Anchor, number: int, state: SwarmState) -> Anchor:
     return replace(anchor, **found)
 
 
-def _placed(mark: Landmark | FixedCamera, number: int, state: SwarmState) -> Any:
-    """A landmark or fixed camera at its estimated pose."""
+def _placed(mark: Surveyed, number: int, state: SwarmState) -> Any:
+    """A landmark, anchor or fixed camera at its estimated place, if that is estimated."""
+    if state.landmark_column(number) < 0:
+        return mark
+    if isinstance(mark, Anchor):
+        return _calibrated(mark, number, state)
     x, y, yaw = se2.compose(state.landmark[number], [mark.x, mark.y, mark.yaw or 0.0]).tolist()
     covariance = se2.pose_covariance([x, y, yaw], state.landmark_covariance(number))
     moved: Any = mark
