@@ -17,8 +17,11 @@ from swarm_loc_estimator.cli import survey as command
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.measurements import select
+from swarm_loc_estimator.offline.batch.parameters import SURVEY
+from swarm_loc_estimator.offline.batch.problem import problem_of
+from swarm_loc_estimator.offline.batch.solver import Solver
+from swarm_loc_estimator.offline.batch.start import start_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
-from swarm_loc_estimator.offline.survey.solve import Solver, problem_of, start_of
 from swarm_loc_estimator.offline.survey.survey import survey
 from swarm_loc_estimator.sensors.camera import FROM_OPTICAL, NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
@@ -244,20 +247,20 @@ def test_what_cannot_be_surveyed_is_said_in_a_sentence() -> None:
 
 def test_the_gradient_is_that_of_the_cost() -> None:
     world = simulate(PLAN, 1)
-    problem = problem_of(recording_of(world), unplaced(world.swarm))
+    problem = problem_of(recording_of(world), unplaced(world.swarm), SURVEY)
     solver = Solver(problem, start_of(problem))
     solver.solve(lambda _share, _what: None)
     rng = np.random.default_rng(0)
-    matrix, gradient, _ = solver._normal(1e6)  # without weights
-    solver._apply(rng.standard_normal(gradient.size) / np.sqrt(matrix.diagonal()))  # away from the minimum
-    matrix, gradient, _ = solver._normal(1e6)
-    step = 1e-3 * gradient / matrix.diagonal()
+    normal, _ = solver._normal(1e6)  # without weights
+    solver._apply(rng.standard_normal(normal.gradient.size) / np.sqrt(normal.diagonal()))  # off the minimum
+    normal, _ = solver._normal(1e6)
+    step = 1e-3 * normal.gradient / normal.diagonal()
     before, cost = (solver._knot, solver._landmark, solver._parameter), []
     for sign in (1.0, -1.0):
         solver._apply(sign * step)
-        cost.append(solver._normal(1e6)[2])
+        cost.append(solver._normal(1e6)[1])
         solver._knot, solver._landmark, solver._parameter = before
-    assert cost[0] - cost[1] == pytest.approx(-4.0 * gradient @ step, rel=1e-2)
+    assert cost[0] - cost[1] == pytest.approx(-4.0 * normal.gradient @ step, rel=1e-2)
 
 
 def test_the_command_surveys_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

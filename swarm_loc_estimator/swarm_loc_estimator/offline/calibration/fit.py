@@ -17,25 +17,30 @@ those of a first-order Gauss-Markov process. What remains is noise.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from scipy.optimize import least_squares, minimize
 
+from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.common.se2 import wrap_angle
-from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
+from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.offline.calibration.camera import CameraFit, fit_cameras
+from swarm_loc_estimator.offline.batch.parameters import all_changed, calibrated_parameters, values_of
+from swarm_loc_estimator.offline.batch.problem import Problem, problem_of
+from swarm_loc_estimator.offline.batch.solver import Solution, Solver
+from swarm_loc_estimator.offline.batch.start import started_at
+from swarm_loc_estimator.offline.calibration.camera import CameraFit, camera_fits
 from swarm_loc_estimator.offline.calibration.motion import (
+    DENSE_GAP_NS,
     WINDOW_S,
     Drive,
     Lateness,
     explained,
     fit_lateness,
-    fit_offsets,
     fit_response,
     steps_of,
     true_motion,
@@ -47,7 +52,7 @@ from swarm_loc_estimator.offline.calibration.recording import (
     rerun,
     started_at_truth,
 )
-from swarm_loc_estimator.offline.calibration.robust import spread
+from swarm_loc_estimator.offline.calibration.robust import population, spread
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.result import ReplayResult
@@ -208,7 +213,6 @@ _MAX_STEPS = 60  # Sightings after each one that are compared with it
 _CUT = 4.0  # Errors are cut at this many spreads, so that outliers have no weight
 _MIN_SHARE = 0.05  # Smallest share of the variance of bearings that counts as sway
 _TIMES_S = (1.0, 60.0)  # Smallest and largest time constant
-_MIN_SIGHTINGS = 100
 
 
 def with_scatter(fits: Sequence[CameraFit]) -> list[Robot]:
@@ -217,7 +221,7 @@ def with_scatter(fits: Sequence[CameraFit]) -> list[Robot]:
     Robots with few sightings get the median of the others. The noise is that of single sightings; `fit_noise`
     scales it for all robots together.
     """
-    found = {fit.robot.name: _numbers(fit) for fit in fits if fit.after.shape[0] >= _MIN_SIGHTINGS}
+    found = {fit.robot.name: _numbers(fit) for fit in fits if fit.is_enough}
     if not found:
         return [fit.robot for fit in fits]
     names = {name for one in found.values() for name in one}
@@ -237,11 +241,11 @@ def _with(robot: Robot, numbers: dict[str, float]) -> Robot:
 
 def _numbers(fit: CameraFit) -> dict[str, float]:
     """Standard deviations of a robot's sightings and its sway."""
-    polar, value = fit.sightings.polar, fit.sightings.value
+    polar, value = fit.polar, fit.sightings.value
     far = np.maximum(value[:, 0], 0.1)
     bearing = np.where(polar, fit.after[:, 1], fit.after[:, 1] / far)
     seconds = np.multiply(fit.sightings.stamp_ns, 1e-9, dtype=float)
-    sway, time_s = sway_of(seconds, fit.sightings.marker_id, bearing)
+    sway, time_s = sway_of(seconds, fit.sightings.reading, bearing)
     own = np.sqrt(max(spread(bearing) ** 2 - sway**2, 0.1 * spread(bearing) ** 2))
     numbers = {"yaw_sigma": sway, "yaw_time_s": time_s}
     if polar.any():
@@ -289,6 +293,15 @@ def sway_of(time_s: FloatArray, marker: IntArray, bearing: FloatArray) -> tuple[
 EVALUATIONS = 80  # Runs of the estimator to fit the noise
 
 _MIN_WINDOWS = 50
+_ROUNDS, _ROUNDS_ALONE = 2, 5  # Of the batch, with and without ground truth
+_SIGHTED = {
+    True: ("range_sigma_per_m", "bearing_sigma"),
+    False: ("forward_sigma", "left_sigma", "heading_sigma"),
+}
+"""Noise of ranges and bearings, and of poses."""
+_GOOD = 0.5  # Least weight of a sighting that counts
+_MOVED_M = 0.02
+_SAMPLES = 60  # Windows of each robot, and sightings, whose variances by the batch are computed
 _CORRELATION = 2.7  # Initial ratio of the white noise that represents correlated errors to their scatter
 _TICK_S = 0.5
 _FLOORS = {"wheel_noise": 0.0, "distance_drift": 1e-5, "range_sigma": 1e-3}
@@ -321,6 +334,7 @@ class DriveFit:
     response: MotionResponse | None  # Scale factors; None if only noise is fitted
     before: FloatArray  # (m, 2) errors of path [m] and turn [rad] of 5 s windows as reported
     after: FloatArray  # (m, 2) the same errors, calibrated
+    doubt: FloatArray = field(default_factory=lambda: np.zeros(2))  # (2,) variances of the path itself there
 
 
 @dataclass(frozen=True)
@@ -331,6 +345,8 @@ class FittedModels:
     cameras: tuple[CameraFit, ...]  # Of all robots, ordered by type
     motion: tuple[DriveFit, ...]  # One per type
     remarks: tuple[str, ...]  # Parameters that could not be fitted, one sentence each
+    noise: dict[str, float]  # First noise by name, from the scatter of sightings and of motion
+    paths: Mapping[str, Trajectory]  # By which motion and noise were fitted
 
 
 @dataclass(frozen=True)
@@ -366,21 +382,26 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
         )
     whole = fit_models(recording, swarm, options, progress)
     folds = _folds(recording, swarm, whole, options)
-    begin = _first_noise(whole, plain=options.plain)
+    begin = whole.noise
 
     def report(count: int, found: Score) -> None:
         rmse_mm = 1e3 * found.position_rmse
         share = 0.2 + 0.75 * min(1.0, count / options.evaluations)
         progress(share, f"noise, run {count}: {rmse_mm:.1f} mm, NEES {found.nees:.2f}")
 
-    separation = max(robot.odometry.wheel_separation for robot in swarm.robots)
-    fixed = {**_FLOORS, "lateral_drift": float(f"{(_LATERAL_SLIP * separation) ** 2:.3g}")}
+    fixed = _fixed_noise(swarm)
     noise = {**fixed, **fit_noise(folds, begin, fixed, options.evaluations, report)}
     progress(0.96, "before and after")
     calibrated = with_noise(whole.swarm, noise)
     scores = [score([rerun(recording, started_at_truth(s, recording), _TICK_S)]) for s in (swarm, calibrated)]
     warning = "" if options.plain else _warning(folds, swarm, noise)
     return Calibration(calibrated, whole, noise, scores[0], scores[1], warning)
+
+
+def _fixed_noise(swarm: Swarm) -> dict[str, float]:
+    """Noise parameters that are not fitted, by name."""
+    separation = max(robot.odometry.wheel_separation for robot in swarm.robots)
+    return {**_FLOORS, "lateral_drift": float(f"{(_LATERAL_SLIP * separation) ** 2:.3g}")}
 
 
 def _warning(folds: Sequence[Fold], swarm: Swarm, noise: dict[str, float]) -> str:
@@ -403,53 +424,141 @@ def _warning(folds: Sequence[Fold], swarm: Swarm, noise: dict[str, float]) -> st
 
 
 def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> FittedModels:
-    """Fit cameras and motion type by type; with `plain` compute only the errors.
+    """Fit cameras, motion and first noise; with `plain` compute only the errors.
+
+    Each round solves the recording as a batch, in which ground truth is one more measurement, and fits motion
+    and noise to its paths. Without ground truth the noise follows from the batch's own residuals, so there
+    are more rounds.
 
     Raises:
-        CalibrationError: There is too little ground truth.
+        CalibrationError: Too little is known about the poses of robots.
     """
-    robots = list(swarm.robots)
-    cameras: list[CameraFit] = []
+    begin, truth = problem_of(recording, swarm), recording.truth
+    if options.plain:
+        return _fitted(recording, begin, begin, truth, options)
+    current = started_at_truth(swarm, recording) if truth else swarm
+    online = rerun(recording, current, _TICK_S)
+    known = {robot.name: online.track(index) for index, robot in enumerate(swarm.robots)} | dict(truth)
+    polar = bool(begin.is_polar.any())
+    parameters = calibrated_parameters(polar=polar, poses=not begin.is_polar.all())
+    mean, wide = values_of(swarm, parameters), np.array([one.sigma for one in parameters])
+    sigma = np.tile(wide, (len(mean), 1))
+    # motion begins anew in each round: a table of speeds takes its place
+    is_fixed = np.array([not one.moves for one in parameters])
+    rounds = _ROUNDS if truth else _ROUNDS_ALONE
+    for number in range(rounds):
+        progress(0.2 * number / rounds, f"models, round {number + 1} of {rounds}")
+        # the batch, with parameters about those of the type
+        about = np.where(is_fixed, np.nan_to_num(mean - values_of(current, parameters)), 0.0)
+        prior = (about, np.where(is_fixed, sigma, wide)) if number else None
+        problem = problem_of(recording, current, parameters, truth)
+        solution = Solver(problem, started_at(problem, known), prior).solve(unwatched)
+        found = all_changed(current, parameters, np.round(solution.parameter, 5))
+        mean, sigma = _of_types(swarm, found, solution)
+        # motion and noise by its paths
+        known = solution.paths() | {name: one for name, one in truth.items() if _is_dense(one)}
+        paths = {name: one for name, one in known.items() if not truth or name in truth}
+        models = _fitted(recording, begin, problem_of(recording, found), paths, options, solution)
+        current = with_noise(models.swarm, {**_fixed_noise(swarm), **models.noise})
+    starts = [
+        replace(one, start=old.start) for one, old in zip(models.swarm.robots, swarm.robots, strict=True)
+    ]
+    return replace(models, swarm=replace(models.swarm, robots=tuple(starts)))
+
+
+def _of_types(described: Swarm, found: Swarm, solution: Solution) -> tuple[FloatArray, FloatArray]:
+    """Mean (N, p) and standard deviation (N, p) of parameters by type, as priors of the next round."""
+    parameters = solution.problem.parameters
+    mean, old = (
+        np.array([[one.of(robot) for one in parameters] for robot in swarm.robots])
+        for swarm in (found, described)
+    )
+    sigma = np.tile(np.array([one.sigma for one in parameters]), (len(mean), 1))
+    for name in dict.fromkeys(robot.type for robot in found.robots):
+        rows = np.flatnonzero([robot.type == name and robot.camera is not None for robot in found.robots])
+        if rows.size == 1:
+            mean[rows] = old[rows]
+        elif rows.size:
+            typical, apart = population(mean[rows], solution.parameter_sigma[rows], sigma[0])
+            mean[rows] = typical
+            sigma[rows] = apart
+    return mean, sigma
+
+
+def _is_dense(path: Trajectory) -> bool:
+    """Whether most of a path is known without gaps."""
+    return path.stamp_ns.size > 1 and float(np.median(np.diff(path.stamp_ns))) <= DENSE_GAP_NS
+
+
+def _fitted(
+    recording: Recording,
+    begin: Problem,
+    found: Problem,
+    paths: Mapping[str, Trajectory],
+    options: Options,
+    solution: Solution | None = None,
+) -> FittedModels:
+    """Motion and noise by the paths of the robots, type by type, and the errors of their sightings."""
+    robots, cameras = list(found.swarm.robots), camera_fits(begin, found, paths)
     motion: list[DriveFit] = []
     remarks: list[str] = []
-    types = list(dict.fromkeys(robot.type for robot in robots))
-    for number, name in enumerate(types):
-        members = [index for index, robot in enumerate(swarm.robots) if robot.type == name]
-        progress(0.1 * number / len(types), f"cameras of type '{name}'")
-        fits = fit_cameras(recording, swarm, members)
-        cameras += fits
-        progress(0.1 * (number + 0.5) / len(types), f"motion of type '{name}'")
-        drive = _fit_drive(recording, swarm, members, options)
-        motion += [] if drive is None else [drive]
-        remarks += _remarks(swarm, members, fits, drive)
+    for name in dict.fromkeys(robot.type for robot in robots):
+        members = [index for index, robot in enumerate(robots) if robot.type == name]
+        fits = [fit for fit in cameras if fit.robot.type == name]
+        drive = _fit_drive(recording, found.swarm, paths, members, options)
+        remarks += _remarks(found.swarm, members, fits, drive)
+        if drive is not None:
+            motion.append(drive if solution is None else replace(drive, doubt=_doubt(solution, members)))
         if options.plain:
             continue
         sensed = {robot.name: robot for robot in with_scatter(fits)}
         for index in members:
             seen = sensed.get(robots[index].name, robots[index])
             robots[index] = seen if drive is None else _with_motion(seen, drive)
-        moved = fit_offsets(recording, replace(swarm, robots=tuple(robots)), members) if drive else {}
-        for index, robot in moved.items():
-            robots[index] = robot
-    if not motion and not any(fit.count for fit in cameras):
+    if not motion and not any(fit.is_enough for fit in cameras):
         raise CalibrationError(
             f"recording '{recording.name}' holds too little ground truth together with odometry or sightings;"
             " at least a minute of a moving robot that sees markers is needed."
         )
-    return FittedModels(replace(swarm, robots=tuple(robots)), tuple(cameras), tuple(motion), tuple(remarks))
+    swarm = replace(found.swarm, robots=tuple(robots))
+    models = FittedModels(swarm, tuple(cameras), tuple(motion), tuple(remarks), {}, paths)
+    noise = _first_noise(models, plain=options.plain)
+    return replace(models, noise=noise if solution is None else _with_leverage(noise, solution))
+
+
+def _with_leverage(noise: dict[str, float], solution: Solution) -> dict[str, float]:
+    """Noise of sightings, whose errors by a path that follows them are too small by its own variance."""
+    used, residual = np.flatnonzero(solution.used), solution.sightings[0]
+    is_good = solution.weight[used] > _GOOD
+    is_polar, rng = solution.problem.is_polar[used], np.random.default_rng(0)
+    larger = dict(noise)
+    for polar, names in _SIGHTED.items():
+        rows = np.flatnonzero(is_good & (is_polar == polar))
+        if not rows.size or names[0] not in noise:
+            continue
+        some = rng.choice(rows, min(_SAMPLES * len(solution.problem.swarm.robots), rows.size), replace=False)
+        own = np.median(solution.leverages(some), axis=0)
+        for component, name in enumerate(names):
+            scatter = (_CORRELATION * max(spread(residual[rows, component]), 1e-3)) ** 2
+            larger[name] = noise[name] * math.sqrt(1.0 + float(own[component]) / scatter)
+    return larger
 
 
 def _fit_drive(
-    recording: Recording, swarm: Swarm, members: Sequence[int], options: Options
+    recording: Recording,
+    swarm: Swarm,
+    paths: Mapping[str, Trajectory],
+    members: Sequence[int],
+    options: Options,
 ) -> DriveFit | None:
-    """Fit the motion of a type; None without a robot with dense ground truth."""
+    """Fit the motion of a type; None without a robot whose path is known."""
     drives = []
     for index in members:
-        track, truth = recording.track(index), recording.truth.get(swarm.robots[index].name)
-        if truth is None or track.stamp_ns.size < 2:
+        track, path = recording.track(index), paths.get(swarm.robots[index].name)
+        if path is None or track.stamp_ns.size < 2:
             continue
         begin_ns, end_ns = int(track.stamp_ns[0]), int(track.stamp_ns[-1])
-        drive = Drive(steps_of(track, swarm.robots[index].odometry), true_motion(truth, begin_ns, end_ns))
+        drive = Drive(steps_of(track, swarm.robots[index].odometry), true_motion(path, begin_ns, end_ns))
         if windows(drive.motion, WINDOW_S)[0].size >= _MIN_WINDOWS:
             drives.append(drive)
     if not drives:
@@ -461,6 +570,24 @@ def _fit_drive(
     late = fit_lateness(drives)
     response = fit_response(drives, late, table=options.response)
     return DriveFit(tuple(members), tuple(drives), late, response, before, explained(drives, late, response))
+
+
+def _doubt(solution: Solution, members: Sequence[int]) -> FloatArray:
+    """Mean variances (2,) of path and turn over a window in which a robot moves, by the batch itself."""
+    knots, rng = solution.problem.knots, np.random.default_rng(0)
+    first, last = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    for index in members:
+        own = np.flatnonzero((knots.robot == index) & (solution.column >= 0))
+        end = np.searchsorted(knots.stamp_ns[own], knots.stamp_ns[own] + round(1e9 * WINDOW_S))
+        begin = np.flatnonzero(end < own.size)
+        track = knots.sample.pose[own]
+        moved = se2.between(track[begin], track[end[begin]])
+        begin = begin[np.hypot(moved[:, 0], moved[:, 1]) > _MOVED_M]
+        some = rng.choice(begin, min(_SAMPLES, begin.size), replace=False)
+        first.append(own[some])
+        last.append(own[end[some]])
+    variances = solution.moved_variances(np.concatenate(first), np.concatenate(last))
+    return np.asarray(variances[:, [0, 2]].mean(axis=0)) if len(variances) else np.zeros(2)
 
 
 def _with_motion(robot: Robot, drive: DriveFit) -> Robot:
@@ -498,7 +625,7 @@ def _folds(recording: Recording, swarm: Swarm, whole: FittedModels, options: Opt
 
 def _first_noise(models: FittedModels, *, plain: bool) -> dict[str, float]:
     """Initial noise parameters, from the scatter of sightings and the errors of motion windows."""
-    polar = np.concatenate([fit.sightings.polar for fit in models.cameras] or [np.zeros(0, dtype=bool)])
+    polar = np.concatenate([fit.polar for fit in models.cameras] or [np.zeros(0, dtype=bool)])
     errors = [fit.before if plain else fit.after for fit in models.cameras]
     error = np.concatenate(errors or [np.zeros((0, 3))])
     begin: dict[str, float] = {}
@@ -526,8 +653,9 @@ def _first_motion_noise(motion: Sequence[DriveFit], *, plain: bool) -> dict[str,
             path += float(np.sum(np.abs(drive.motion.path[last] - drive.motion.path[first])))
             turn += float(np.sum(np.abs(drive.motion.turn[last] - drive.motion.turn[first])))
             seconds += WINDOW_S * first.size
-        path2 += float(np.sum(fit.after[:, 0] ** 2))
-        turn2 += float(np.sum(fit.after[:, 1] ** 2))
+        # errors by a path that follows the odometry are too small by its own variance
+        path2 += float(np.sum(fit.after[:, 0] ** 2 + fit.doubt[0]))
+        turn2 += float(np.sum(fit.after[:, 1] ** 2 + fit.doubt[1]))
     path, turn, path2, turn2 = max(path, 1e-3), max(turn, 1e-3), max(path2, 1e-7), max(turn2, 1e-7)
     begin = {} if plain else {"turn_bias_sigma": np.sqrt(0.1 * turn2 / (seconds * WINDOW_S))}
     return begin | {
@@ -544,11 +672,13 @@ def _remarks(
     swarm: Swarm, members: Sequence[int], fits: Sequence[CameraFit], drive: DriveFit | None
 ) -> list[str]:
     """One sentence for everything that could not be fitted."""
-    poor = [fit.robot.name for fit in fits if not fit.count]
+    poor = [fit.robot.name for fit in fits if not fit.is_enough]
     remarks = [
         f"{name} has too few sightings with ground truth: it gets the mean of its type." for name in poor
     ]
-    if not fits and any(swarm.robots[index].camera is not None for index in members):
+    if not any(fit.is_enough for fit in fits) and any(
+        swarm.robots[index].camera is not None for index in members
+    ):
         names = ", ".join(swarm.robots[index].name for index in members)
         remarks.append(f"no camera of {names} could be calibrated: too few sightings with ground truth.")
     if drive is None:

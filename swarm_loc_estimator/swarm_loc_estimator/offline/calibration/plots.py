@@ -34,7 +34,7 @@ def text_of(done: Calibration) -> str:
     """The residuals before and after, the fitted noise and the remarks."""
     lines = [f"{'':34}{'before':>10}{'after':>10}"]
     for fit in done.models.cameras:
-        errors = _sighting_errors([fit] if fit.count else [])
+        errors = _sighting_errors([fit] if fit.is_enough else [])
         lines += [
             _line(f"{fit.robot.name} {label}", spread(before), spread(after))
             for label, before, after in errors
@@ -86,7 +86,7 @@ def draw(done: Calibration, path: Path) -> Path:
 def _sighting_errors(fits: Sequence[CameraFit]) -> Iterator[tuple[str, FloatArray, FloatArray]]:
     """Label, errors before and errors after of the sightings of some cameras."""
     for polar, labels in _SIGHTING_LABELS.items():
-        rows = [fit.sightings.polar == polar for fit in fits]
+        rows = [fit.polar == polar for fit in fits]
         for k, label in enumerate(labels if any(one.any() for one in rows) else ()):
             before, after = (
                 np.concatenate([getattr(fit, name)[one, k] for fit, one in zip(fits, rows, strict=True)])

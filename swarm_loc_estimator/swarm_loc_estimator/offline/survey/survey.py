@@ -14,7 +14,6 @@ import math
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,19 +24,15 @@ from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.offline.batch.parameters import SURVEY, all_changed
+from swarm_loc_estimator.offline.batch.problem import MIN_SIGHTINGS, Problem, problem_of
+from swarm_loc_estimator.offline.batch.solver import Solution, Solver
+from swarm_loc_estimator.offline.batch.start import start_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.report.plots import INK, SOFT, colour_of, label_map, save, style
-from swarm_loc_estimator.offline.survey.solve import (
-    MIN_SIGHTINGS,
-    Solution,
-    Solver,
-    SurveyProblem,
-    problem_of,
-    start_of,
-)
 from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
-from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, Robot, Swarm, UwbDevice
+from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, Swarm, UwbDevice
 
 # Checked by test_survey_cameras_and_anchors.py.
 MIN_MEASUREMENTS = 30  # Minimum number of sightings or ranges that place a camera or an anchor
@@ -374,7 +369,7 @@ class Surveyed:
     """What was found."""
 
     swarm: Swarm  # The description with all connected landmarks and corrected parameters
-    problem: SurveyProblem  # What was solved
+    problem: Problem  # What was solved
     solution: Solution  # How
     path: FloatArray  # (k, 3) poses in map of the robots at the knots; NaN: not connected
     text: str  # Table of the landmarks, corrected parameters, and what is badly determined
@@ -394,38 +389,22 @@ def survey(
     if not recording.odometry.robot.size:
         raise CalibrationError(f"'{recording.name}' has no odometry, which a survey needs.")
     progress(0.0, "reading")
-    problem = problem_of(recording, swarm)
+    problem = problem_of(recording, swarm, SURVEY)
     if not problem.swarm.landmarks or not np.any(problem.sightings.landmark >= 0):
         raise CalibrationError(
             f"'{recording.name}' has no marker that belongs to nobody and was seen {MIN_SIGHTINGS} times."
         )
     solution = Solver(problem, start_of(problem)).solve(progress)
-    found = replace(
-        swarm,
-        landmarks=tuple(_landmarks(problem, solution)),
-        robots=tuple(_calibrated(robot, index, solution) for index, robot in enumerate(swarm.robots)),
-    )
+    found = replace(_calibrated(swarm, solution), landmarks=tuple(_landmarks(problem, solution)))
     frame = max(1.0, solution.variance_ratio) * solution.frame_covariance
-    paths = Paths(partial(_poses, problem, solution), frame)
+    paths = Paths(solution.at, frame)
     placed = place_fixed(recording, found, paths, cameras=cameras)
     found = replace(found, cameras=placed.cameras, anchors=placed.anchors)
     path = se2.compose(solution.knot, problem.knots.sample.pose)
     return Surveyed(found, problem, solution, path, _text(problem, solution, swarm, found, placed))
 
 
-def _poses(problem: SurveyProblem, solution: Solution, robots: IntArray, stamps_ns: IntArray) -> FloatArray:
-    """Poses (k, 3) in map of robots (k,) at instants (k,); NaN: not known."""
-    knots, poses = problem.knots.nearest(robots, stamps_ns), np.full((robots.size, 3), np.nan)
-    end_ns = np.zeros(len(problem.swarm.robots), dtype=np.int64)
-    np.maximum.at(end_ns, problem.knots.robot, problem.knots.stamp_ns)
-    known = (knots >= 0) & (stamps_ns <= end_ns[robots])
-    known[known] = problem.odometry.has_started(robots[known], stamps_ns[known])
-    track = problem.odometry.at(robots[known], stamps_ns[known]).pose
-    poses[known] = se2.compose(solution.knot[knots[known]], track)
-    return poses
-
-
-def _landmarks(problem: SurveyProblem, solution: Solution) -> list[Landmark]:
+def _landmarks(problem: Problem, solution: Solution) -> list[Landmark]:
     """All landmarks that are connected, with standard deviations for those that were estimated."""
     factor = max(1.0, solution.variance_ratio)
     found = []
@@ -447,23 +426,14 @@ def _landmarks(problem: SurveyProblem, solution: Solution) -> list[Landmark]:
     return found
 
 
-def _calibrated(robot: Robot, index: int, solution: Solution) -> Robot:
-    """A robot with those parameters corrected that differ significantly from the description."""
-    value, sigma = solution.parameter[index], solution.parameter_sigma[index]
-    _, path, turn, yaw, scale = np.where(np.abs(value) > _SIGNIFICANT * sigma, value, 0.0).tolist()
-    camera, sensor = robot.camera, robot.sensor
-    turn_scale = (1.0 + turn) * robot.turn_sensor.turn_scale
-    odometry = replace(robot.odometry, distance_scale=(1.0 + path) * robot.odometry.distance_scale)
-    return replace(
-        robot,
-        odometry=odometry if robot.imu.is_used else replace(odometry, turn_scale=turn_scale),
-        imu=replace(robot.imu, turn_scale=turn_scale) if robot.imu.is_used else robot.imu,
-        camera=camera and replace(camera, yaw=float(se2.wrap_angle(camera.yaw + yaw))),
-        sensor=replace(sensor, distance_scale=(1.0 + scale) * sensor.distance_scale),
-    )
+def _calibrated(swarm: Swarm, solution: Solution) -> Swarm:
+    """The swarm with those parameters corrected that differ significantly; turn biases are not constant."""
+    is_clear = np.abs(solution.parameter) > _SIGNIFICANT * solution.parameter_sigma
+    is_clear &= np.array([one.name != "turn_bias" for one in SURVEY])
+    return all_changed(swarm, SURVEY, np.where(is_clear, solution.parameter, 0.0))
 
 
-def _text(problem: SurveyProblem, solution: Solution, before: Swarm, found: Swarm, placed: Placed) -> str:
+def _text(problem: Problem, solution: Solution, before: Swarm, found: Swarm, placed: Placed) -> str:
     places = {mark.id: mark for mark in found.landmarks}
     lines = ["landmark        x [m]     y [m]  yaw [deg]  sigma [mm]  sightings  contradicting"]
     for index, mark in enumerate(problem.swarm.landmarks):
@@ -492,21 +462,14 @@ def _corrections(before: Swarm, found: Swarm) -> list[str]:
     """A sentence for each robot whose parameters were corrected."""
     lines = []
     for old, new in zip(before.robots, found.robots, strict=True):
-        pairs = {
-            "odometry.distance_scale": (old.odometry.distance_scale, new.odometry.distance_scale),
-            "odometry.turn_scale": (old.odometry.turn_scale, new.odometry.turn_scale),
-            "imu.turn_scale": (old.imu.turn_scale, new.imu.turn_scale),
-            "sensor.distance_scale": (old.sensor.distance_scale, new.sensor.distance_scale),
-        }
-        if old.camera is not None and new.camera is not None:
-            pairs["camera.yaw"] = (old.camera.yaw, new.camera.yaw)
-        said = [f"{key} {a:.4f} -> {b:.4f}" for key, (a, b) in pairs.items() if a != b]
+        pairs = [(f"{one.section}.{one.name}", one.of(old), one.of(new)) for one in SURVEY]
+        said = [f"{key} {a:.4f} -> {b:.4f}" for key, a, b in pairs if abs(b - a) > 0.0]
         if said:
             lines.append(f"Corrected for {new.name}: {', '.join(said)}.")
     return lines
 
 
-def _frame(problem: SurveyProblem) -> list[str]:
+def _frame(problem: Problem) -> list[str]:
     """What gives the frame."""
     if problem.is_known.any():
         return [f"The frame is that of the {int(problem.is_known.sum())} described landmarks."]
@@ -515,7 +478,7 @@ def _frame(problem: SurveyProblem) -> list[str]:
     return ["The origin is the first pose of one robot, since no landmark and no start is described."]
 
 
-def _remarks(problem: SurveyProblem, solution: Solution) -> list[str]:
+def _remarks(problem: Problem, solution: Solution) -> list[str]:
     """What is badly determined, a sentence each with a remedy."""
     sightings, remarks = problem.sightings, []
     # markers that were seen rarely

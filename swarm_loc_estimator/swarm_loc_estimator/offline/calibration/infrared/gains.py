@@ -30,7 +30,6 @@ from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import POSE_SIGMA, Exchanges, GainsError, GainsFit, estimate_gains
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.infrared.search import DARKEST, IrSolutions
-from swarm_loc_estimator.offline.calibration.camera import DENSE_GAP_NS
 from swarm_loc_estimator.offline.calibration.infrared.elements import (
     BRIGHT_SPAN,
     LOWEST,
@@ -42,6 +41,7 @@ from swarm_loc_estimator.offline.calibration.infrared.elements import (
     find_dead_elements,
     find_reading_limits,
 )
+from swarm_loc_estimator.offline.calibration.motion import DENSE_GAP_NS
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.sensors.infrared import ExchangeKey, MatrixScreening, Readings

@@ -1,0 +1,272 @@
+"""What a batch solves: the instants at which it estimates poses, sightings, and their derivatives.
+
+A robot's pose is X(t) = T(t) O(t) with the odometry track O, see `odometry/tracks.py`. Where wheels do not
+slip, T is constant, so it is estimated only at a few instants per second, the knots. A sighting in between
+uses the nearest of them; what the wheels may have slipped since then is added to its noise.
+
+Derivatives by parameters of the description are differences of the product's own models, from readings to
+tracks and measurements, so that whatever a description states can be estimated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.filter.measurements import Measurements, select
+from swarm_loc_estimator.filter.models import POLAR, is_compiled
+from swarm_loc_estimator.odometry.track_arrays import OdometrySample
+from swarm_loc_estimator.odometry.tracks import OdometryTracks
+from swarm_loc_estimator.offline.batch.parameters import Parameter, all_changed
+from swarm_loc_estimator.offline.calibration.recording import Recording
+from swarm_loc_estimator.sensors.camera import (
+    CONTENT_POSE,
+    CONTENT_POSE_TWO,
+    DetectionRows,
+    SightingConverter,
+)
+from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
+
+STEP_NS = 100_000_000  # Shortest time between two instants at which the transform of a track is estimated
+MAX_KNOTS = 12_000
+"""Maximum number of these instants, of all robots; those of long recordings are farther apart."""
+_WITH_POSE = (CONTENT_POSE, CONTENT_POSE_TWO)
+MIN_SIGHTINGS = 5  # Minimum number of sightings of a marker that is to be a landmark
+
+
+@dataclass(frozen=True)
+class Knots:
+    """Instants at which transforms of tracks are estimated (k,), by robot and stamp."""
+
+    robot: IntArray  # (k,) index of the robot
+    stamp_ns: IntArray  # (k,) the instants
+    sample: OdometrySample  # (k,) the tracks there
+    step_ns: int  # Time between them
+
+    def nearest(self, robots: IntArray, stamps_ns: IntArray) -> IntArray:
+        """The nearest knots (m,) of robots at instants (m,); -1 for a robot without any, or none (-1)."""
+        found = np.full(robots.size, -1)
+        for robot in np.unique(robots[robots >= 0]).tolist():
+            own = np.flatnonzero(self.robot == robot)
+            rows = np.flatnonzero(robots == robot)
+            if own.size:
+                edges = (self.stamp_ns[own][1:] + self.stamp_ns[own][:-1]) // 2
+                found[rows] = own[np.searchsorted(edges, stamps_ns[rows])]
+        return found
+
+
+class TruePoses(NamedTuple):
+    """True poses (t,), at most one near a knot."""
+
+    knot: IntArray  # (t,) nearest knot
+    track: FloatArray  # (t, 3) poses on the tracks at their stamps
+    pose: FloatArray  # (t, 3) in `map`
+
+
+class Derivatives(NamedTuple):
+    """Derivatives by the p parameters of the robot, or of the observer."""
+
+    knots: FloatArray  # (k, 3, p) right-invariant errors of tracks at knots
+    value: FloatArray  # (m, 3, p) values of sightings
+    # (m, p) growth of a corrected distance with the measured one; noise grows as much
+    growth: FloatArray
+    # (2, m, 3, p) right-invariant errors of the poses on tracks of observer and target, by mount and exposure
+    tracks: FloatArray
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What is to be solved."""
+
+    # The description with a landmark for each marker that belongs to nobody, at the origin where its place is
+    # not known
+    swarm: Swarm
+    is_known: BoolArray  # (L,) whether the place of a landmark is described
+    knots: Knots  # Instants at which transforms are estimated
+    true: TruePoses  # By ground truth
+    # (m,) measurements of cameras; markers of landmarks are in the landmark's own frame
+    sightings: Measurements
+    source: IntArray  # (m,) their indices among all sightings by robots
+    sides: IntArray  # (m, 2) knots of observer and target; -1: a landmark
+    tracks: FloatArray  # (2, m, 3) poses of observer and target on their tracks
+    slip: FloatArray  # (2, m, 3, 3) covariance of their slip since the knot, in the frame of the track
+    odometry: OdometryTracks  # The tracks
+    rare: dict[int, int]  # Number of sightings by id, of markers that were seen too rarely
+    parameters: tuple[Parameter, ...]  # Of robots, that are estimated
+    by_parameter: Derivatives
+
+    @property
+    def is_polar(self) -> BoolArray:
+        """Whether sightings (m,) are range and bearing."""
+        return np.asarray(self.sightings.model == POLAR)
+
+
+def problem_of(
+    recording: Recording,
+    swarm: Swarm,
+    parameters: tuple[Parameter, ...] = (),
+    truth: Mapping[str, Trajectory] | None = None,
+) -> Problem:
+    """Set up the problem of a recording; landmarks in the description, and poses of `truth`, are known."""
+    # knots, and sightings by robots whose tracks are known then
+    described, rare = _with_landmarks(recording, swarm)
+    seen = select(recording.detections, ~np.isin(recording.detections.detection["id"], list(rare)))
+    tracks, sightings = _tracks(recording, swarm), _sighted(seen, described)
+    knots = _knots(tracks, recording)
+    robots = np.stack([sightings.observer, sightings.target])
+    sides = np.stack([knots.nearest(one, sightings.stamp_ns) for one in robots])
+    started = np.array([tracks.has_started(np.maximum(one, 0), sightings.stamp_ns) for one in robots])
+    near = np.abs(sightings.stamp_ns - knots.stamp_ns[sides]) <= 2 * knots.step_ns
+    kept: BoolArray = np.asarray(((robots < 0) | (started & (sides >= 0) & near)).all(axis=0))
+    sightings, sides = select(sightings, kept), sides[:, kept]
+    # where these robots are on their tracks, and the slip since the knot
+    poses, slip = _on_tracks(tracks, sightings, sightings.stamp_ns), np.zeros((2, sightings.size, 3, 3))
+    for side, robot in enumerate((sightings.observer, sightings.target)):
+        moves = sides[side] >= 0
+        at = tracks.at(robot[moves], sightings.stamp_ns[moves])
+        since = at.covariance - knots.sample.covariance[sides[side][moves]]
+        slip[side, moves] = since * np.sign(np.trace(since, axis1=1, axis2=2))[:, None, None]
+    known = {mark.id for mark in swarm.landmarks}
+    problem = Problem(
+        described,
+        np.array([mark.id in known for mark in described.landmarks], dtype=bool),
+        knots,
+        _true(truth or {}, swarm, knots, tracks),
+        sightings,
+        np.flatnonzero(kept),
+        sides.T,
+        poses,
+        slip,
+        tracks,
+        rare,
+        parameters,
+        Derivatives(
+            np.zeros((knots.robot.size, 3, len(parameters))),
+            np.zeros((sightings.size, 3, len(parameters))),
+            np.zeros((sightings.size, len(parameters))),
+            np.zeros((2, sightings.size, 3, len(parameters))),
+        ),
+    )
+    for index in range(len(parameters)):
+        _differentiate(problem, recording, seen, kept, index)
+    return problem
+
+
+_STEP = 0.01  # Step of a difference, in standard deviations of the prior
+
+
+def _differentiate(
+    problem: Problem, recording: Recording, seen: DetectionRows, kept: BoolArray, index: int
+) -> None:
+    """Write the derivatives by one parameter."""
+    parameter, by = problem.parameters[index], problem.by_parameter
+    step = _STEP * parameter.sigma
+    other = all_changed(problem.swarm, (parameter,), np.full((len(problem.swarm.robots), 1), step))
+    if parameter.moves:
+        sample = problem.knots.sample.pose
+        moved = _tracks(recording, other).at(problem.knots.robot, problem.knots.stamp_ns).pose
+        by.knots[:, :, index] = se2.log(se2.compose(moved, se2.inverse(sample))) / step
+        return
+    before, after = problem.sightings, select(_sighted(seen, other), kept)
+    change = after.value - before.value
+    change[:, 2] = se2.wrap_angle(change[:, 2])
+    by.value[:, :, index] = change / step
+    # how the change differs farther along the ray: of the range, or of forward and left
+    far = seen._replace(detection=seen.detection.copy())
+    far.detection["position"] *= 1.0 + _STEP
+    farther = select(_sighted(far, other), kept).value - select(_sighted(far, problem.swarm), kept).value
+    ray = before.value[:, :2] * np.where(problem.is_polar[:, None], [1.0, 0.0], 1.0)
+    along = np.sum((farther - change)[:, :2] * ray, axis=1) / np.maximum(np.sum(ray**2, axis=1), 1e-6)
+    by.growth[:, index] = along / (_STEP * step)
+    # another mount or exposure is that of an observer, or a target, that is elsewhere on its track
+    later = _on_tracks(problem.odometry, before, after.stamp_ns)
+    later[0] = se2.compose(later[0], se2.compose(after.sensor, se2.inverse(before.sensor)))
+    by.tracks[:, :, :, index] = se2.log(se2.compose(later, se2.inverse(problem.tracks))) / step
+
+
+def _tracks(recording: Recording, swarm: Swarm) -> OdometryTracks:
+    tracks = OdometryTracks(swarm.robots)
+    rows, turns = recording.odometry, recording.turn_rates
+    tracks.extend_turns(turns.robot, turns.stamp_ns, turns.rate)
+    tracks.extend(rows.robot, rows.stamp_ns, rows.pose, rows.twist)
+    return tracks
+
+
+def _sighted(seen: DetectionRows, swarm: Swarm) -> Measurements:
+    """Sightings (m,) by robots; markers of landmarks are in the landmark's own frame."""
+    at_origin = [replace(one, x=0.0, y=0.0, yaw=None if one.yaw is None else 0.0) for one in swarm.landmarks]
+    sightings = SightingConverter(replace(swarm, landmarks=tuple(at_origin))).convert(seen)
+    # not directions alone, and not what fixed cameras see
+    return select(sightings, is_compiled(sightings.model) & (sightings.observer >= 0))
+
+
+def _true(truth: Mapping[str, Trajectory], swarm: Swarm, knots: Knots, tracks: OdometryTracks) -> TruePoses:
+    found, track, pose = [np.zeros(0, dtype=np.int64)], [np.zeros((0, 3))], [np.zeros((0, 3))]
+    for index, robot in enumerate(swarm.robots):
+        if robot.name not in truth or not (knots.robot == index).any():
+            continue
+        stamps = truth[robot.name].stamp_ns
+        who = np.full(stamps.size, index)
+        nearest, rows = np.unique(knots.nearest(who, stamps), return_index=True)
+        rows = rows[np.abs(stamps[rows] - knots.stamp_ns[nearest]) <= knots.step_ns]
+        found.append(knots.nearest(who[rows], stamps[rows]))
+        track.append(tracks.at(who[rows], stamps[rows]).pose)
+        pose.append(truth[robot.name].pose[rows])
+    return TruePoses(np.concatenate(found), np.concatenate(track), np.concatenate(pose))
+
+
+def _on_tracks(tracks: OdometryTracks, sightings: Measurements, stamps_ns: IntArray) -> FloatArray:
+    """Poses (2, m, 3) of observers and targets on their tracks at instants (m,)."""
+    poses = np.zeros((2, sightings.size, 3))
+    for side, robot in enumerate((sightings.observer, sightings.target)):
+        poses[side, robot >= 0] = tracks.at(robot[robot >= 0], stamps_ns[robot >= 0]).pose
+    return poses
+
+
+def _with_landmarks(recording: Recording, swarm: Swarm) -> tuple[Swarm, dict[int, int]]:
+    """The swarm with a landmark for each marker that belongs to nobody; and those that were seen rarely."""
+    detections = recording.detections.detection
+    ids, counts = np.unique(detections["id"], return_counts=True)
+    unknown = {int(i): int(n) for i, n in zip(ids, counts, strict=True) if int(i) not in swarm.owner_of}
+    rare = {marker_id: count for marker_id, count in unknown.items() if count < MIN_SIGHTINGS}
+    with_heading = set(np.unique(detections["id"][np.isin(detections["content"], _WITH_POSE)]).tolist())
+    new = [
+        Landmark(marker_id, yaw=0.0 if marker_id in with_heading else None)
+        for marker_id in unknown
+        if marker_id not in rare
+    ]
+    return replace(swarm, landmarks=(*swarm.landmarks, *new)), rare
+
+
+def _knots(tracks: OdometryTracks, recording: Recording) -> Knots:
+    rows, robots, stamps = recording.odometry, [], []
+    spans = {}
+    for robot in np.unique(rows.robot).tolist():
+        own = rows.stamp_ns[rows.robot == robot]
+        spans[robot] = (int(own.min()), int(own.max()))
+    whole_ns = sum(end - begin for begin, end in spans.values())
+    step_ns = max(STEP_NS, whole_ns // MAX_KNOTS)
+    for robot, (begin_ns, end_ns) in spans.items():
+        # at common times, so that poses of robots that see each other are near in the matrix
+        between = np.arange(begin_ns // step_ns + 1, -(-end_ns // step_ns)) * step_ns
+        at_ns = np.unique(np.concatenate([[begin_ns], between, [end_ns]]))
+        robots.append(np.full(at_ns.size, robot))
+        stamps.append(at_ns)
+    robot, stamp_ns = np.concatenate(robots), np.concatenate(stamps)
+    return Knots(robot, stamp_ns, tracks.at(robot, stamp_ns), step_ns)
+
+
+def innovation(
+    measured: FloatArray, predicted: FloatArray, is_polar: BoolArray, has_heading: BoolArray
+) -> FloatArray:
+    """Measured minus predicted (k, 3), angles wrapped, zero for a heading that was not measured."""
+    found = measured - predicted
+    found[:, 2] = np.where(has_heading, se2.wrap_angle(found[:, 2]), 0.0)
+    found[is_polar, 1] = se2.wrap_angle(found[is_polar, 1])
+    return found

@@ -1,0 +1,423 @@
+"""Poses, landmarks and parameters of a recording by robust batch least squares over SE(2).
+
+Errors are right-invariant, X = exp(xi) X_hat, as in the filter, whose measurement models and odometry noise
+are used. Weights of Geman and McClure of whole sightings limit the influence of wrong ids; they are wide at
+first, when places are far off (graduated non-convexity). Steps are those of Levenberg and Marquardt.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.filter.measurements import select
+from swarm_loc_estimator.filter.models import predict
+from swarm_loc_estimator.offline.batch.normal import Factor, NormalEquations
+from swarm_loc_estimator.offline.batch.problem import Problem, innovation
+from swarm_loc_estimator.offline.batch.start import Start
+
+# The steps are checked by test_survey.py and make bench-commissioning, also with wrong scales of wheels.
+_SCALES = (50.0, 20.0, 10.0, 5.0)
+"""Residuals at which the weight of a sighting is a quarter [sigma], one after the other."""
+_ITERATIONS, _CONVERGED, _NEARLY = 15, 1e-2, 1e-3
+"""Most steps of each scale, and the decrease of the cost that ends them: of the last scale and, as a share of
+the cost, of the others."""
+_RISES = 2  # Most steps in a row that may raise the cost
+_ORIGIN_SIGMA = 1e-5
+_TRUE_SIGMA: FloatArray = np.array([0.002, 0.002, 0.01])  # Of ground truth [m, m, rad]
+_YAW_SIGMA = 1.0  # Of the heading of a landmark without one, which nothing determines [rad]
+_DAMPING = (1e-14, 1e-2)
+_LEAST_VARIANCE = 1e-10
+"""Added to the variances of a step, so that the covariance of a standing robot is regular [m^2, rad^2]."""
+
+_PATH_NS = 50_000_000
+
+Progress = Callable[[float, str], None]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Estimates with the covariance of their right-invariant errors."""
+
+    problem: Problem  # What was solved
+    knot: FloatArray  # (k, 3) transforms of the tracks at the knots; NaN: not connected
+    landmark: FloatArray  # (L, 3) poses; NaN: not connected
+    parameter: FloatArray  # (N, p) changes of parameters of the description
+    parameter_sigma: FloatArray  # (N, p) their standard deviations
+    landmark_covariance: FloatArray  # (L, 3, 3) of x, y, yaw
+    frame_covariance: FloatArray  # (3, 3) of a knot in the middle: what is common to all is as uncertain
+    weight: FloatArray  # (m,) of the sightings, from 0 for wrong ones to 1
+    used: BoolArray  # (m,) whether both sides of the sighting are connected with the origin
+    variance_ratio: float  # Mean squared residual of sightings by the described noise; 1 is ideal
+    factor: Factor  # Of the normal equations
+    column: IntArray  # (k,) first of the three unknowns of each knot; -1: not connected
+    # Whitened residuals (u, 3) of used sightings, their Jacobians (u, 3, c) and unknowns (u, c), -1: none
+    sightings: tuple[FloatArray, FloatArray, IntArray]
+
+    def at(self, robots: IntArray, stamps_ns: IntArray) -> FloatArray:
+        """Poses (k, 3) in `map` of robots (k,) at instants (k,); NaN: not known."""
+        knots, poses = self.problem.knots, np.full((robots.size, 3), np.nan)
+        for robot in np.unique(robots).tolist():
+            own, rows = np.flatnonzero(knots.robot == robot), np.flatnonzero(robots == robot)
+            if own.size < 2:
+                continue
+            stamps = knots.stamp_ns[own]
+            rows = rows[(stamps_ns[rows] >= stamps[0]) & (stamps_ns[rows] <= stamps[-1])]
+            rows = rows[self.problem.odometry.has_started(robots[rows], stamps_ns[rows])]
+            before = own[np.clip(np.searchsorted(stamps, stamps_ns[rows], side="right") - 1, 0, own.size - 2)]
+            first_ns, last_ns = knots.stamp_ns[before], knots.stamp_ns[before + 1]
+            share = (stamps_ns[rows] - first_ns) / (last_ns - first_ns)
+            step = se2.log(se2.compose(self.knot[before + 1], se2.inverse(self.knot[before])))
+            transform = se2.compose(se2.exp(step * share[:, None]), self.knot[before])
+            poses[rows] = se2.compose(transform, self.problem.odometry.at(robots[rows], stamps_ns[rows]).pose)
+        return poses
+
+    def paths(self) -> dict[str, Trajectory]:
+        """Paths by the names of robots, every `_PATH_NS`."""
+        found = {}
+        for index, robot in enumerate(self.problem.swarm.robots):
+            own = self.problem.knots.stamp_ns[(self.problem.knots.robot == index) & (self.column >= 0)]
+            if own.size:
+                stamps = np.arange(own[0], own[-1], _PATH_NS)
+                poses = self.at(np.full(stamps.size, index), stamps)
+                known = np.isfinite(poses[:, 0])
+                found[robot.name] = Trajectory(stamps[known], poses[known])
+        return found
+
+    def covariances(self, knots: IntArray) -> FloatArray:
+        """Covariances (c, 3, 3) of x, y, yaw of the poses at connected knots (c,)."""
+        poses = se2.compose(self.knot[knots], self.problem.knots.sample.pose[knots])
+        errors = [self.factor.covariance(self.column[one] + np.arange(3)) for one in knots.tolist()]
+        return se2.pose_covariance(poses, np.array(errors).reshape(-1, 3, 3))
+
+    def leverages(self, rows: IntArray) -> FloatArray:
+        """Variances (c, 3) of predictions of used sightings (c,), in units of their noise."""
+        _, jacobian, columns = self.sightings
+        return self.factor.variances(jacobian[rows], columns[rows])
+
+    def moved_variances(self, first: IntArray, last: IntArray) -> FloatArray:
+        """Variances (c, 3) of motion from knots (c,) to later ones (c,), in the frame of the first."""
+        poses = se2.compose(self.knot[first], self.problem.knots.sample.pose[first])
+        to_body = se2.adjoint(se2.inverse(poses))
+        columns = self.column[np.stack([first, last], axis=1)][:, :, None] + np.arange(3)
+        return self.factor.variances(
+            np.concatenate([-to_body, to_body], axis=2), columns.reshape(first.size, 6)
+        )
+
+
+class Solver:
+    """Solves one problem; what is not connected at the start is left out.
+
+    Args:
+        problem: To be solved.
+        start: Where to begin.
+        prior: (N, p) mean of the changes of parameters, and their standard deviations; by default none, and
+            those of the parameters.
+    """
+
+    def __init__(
+        self, problem: Problem, start: Start, prior: tuple[FloatArray, FloatArray] | None = None
+    ) -> None:
+        self._problem, knots = problem, problem.knots
+        robots, landmarks = len(problem.swarm.robots), len(problem.swarm.landmarks)
+        self._is_near, self._landmark = start.knot is not None, start.landmark.copy()
+        self._knot = start.transform[knots.robot] if start.knot is None else start.knot.copy()
+        wide = np.tile(np.array([one.sigma for one in problem.parameters]), (robots, 1))
+        self._mean: FloatArray
+        self._prior: FloatArray
+        self._mean, self._prior = (np.zeros_like(wide), wide) if prior is None else prior
+        self._parameter = self._mean.copy()
+        is_placed = np.isfinite(self._knot[:, 0])
+        self._mark = problem.sightings.landmark
+        targets = np.where(self._mark >= 0, np.isfinite(self._landmark[self._mark, 0]), True)
+        for side in range(2):
+            targets &= (problem.sides[:, side] < 0) | is_placed[problem.sides[:, side]]
+        self.used: BoolArray = np.asarray(targets)
+        self._rows = np.flatnonzero(self.used)
+        # exactly described landmarks have no columns
+        is_exact = np.array([not mark.is_estimated for mark in problem.swarm.landmarks], dtype=bool)
+        free = np.isfinite(self._landmark[:, 0]) & ~(problem.is_known & is_exact)
+        self._pairs = _steps(problem, is_placed)
+        in_time = np.lexsort((knots.robot, knots.stamp_ns))
+        self._knot_column = np.full(knots.robot.size, -1)
+        self._knot_column[in_time], self._band = _numbered(is_placed[in_time], 0)
+        self._landmark_column, next_column = _numbered(free, self._band)
+        self._parameter_column = next_column + np.arange(self._prior.size).reshape(robots, -1)
+        self._size = next_column + self._prior.size
+        self._weight, self._is_rigid = np.ones(self._rows.size), True
+        self._robots, self._landmarks = robots, landmarks
+        self._origin: FloatArray | None = None
+
+    def solve(self, progress: Progress) -> Solution:
+        """Solve, and compute covariances."""
+        if not self._is_near:
+            self._solve_rigid()
+        self._is_rigid = False
+        for k, scale in enumerate(_SCALES):
+            progress(k / len(_SCALES), "solving")
+            self._descend(scale)
+        normal, _ = self._normal(_SCALES[-1])
+        return self._solution(normal.factored(0.0))
+
+    def _solve_rigid(self) -> None:
+        """Solve with exact odometry: one transform of each robot's track, in the border."""
+        columns, whole = (self._knot_column, self._landmark_column, self._parameter_column), self._size
+        placed = np.unique(self._problem.knots.robot[self._knot_column >= 0])
+        robot = np.searchsorted(placed, self._problem.knots.robot)
+        self._knot_column = np.where(self._knot_column >= 0, 3 * robot, -1)
+        shift = self._band - 3 * placed.size
+        self._landmark_column = np.where(self._landmark_column >= 0, self._landmark_column - shift, -1)
+        self._parameter_column = self._parameter_column - shift
+        self._band, self._size, band = 0, self._size - shift, self._band
+        self._descend(_SCALES[0])
+        self._knot_column, self._landmark_column, self._parameter_column = columns
+        self._band, self._size = band, whole
+
+    def _descend(self, scale: float) -> None:
+        """Minimize the cost at one scale of the weights.
+
+        Large turns of the odometry frames leave errors of second order, which noise of steps makes expensive.
+        The next steps remove them, so some of these may follow before a step is taken back.
+        """
+        damping, rises = _DAMPING[0], 0
+        normal, least = self._normal(scale)
+        best = self._knot, self._landmark, self._parameter, normal
+        for _ in range(_ITERATIONS):
+            self._apply(normal.factored(damping).solve(normal.gradient))
+            normal, cost = self._normal(scale)
+            enough = _CONVERGED if scale == _SCALES[-1] else _NEARLY * least
+            has_converged = abs(least - cost) < enough
+            if cost <= least:
+                least, rises = cost, 0
+                best = self._knot, self._landmark, self._parameter, normal
+                damping = max(_DAMPING[0], 0.01 * damping)
+            if has_converged:
+                break
+            if cost > least and rises < _RISES:
+                rises += 1
+            elif cost > least:
+                self._knot, self._landmark, self._parameter, normal = best
+                damping, rises = 100.0 * damping, 0
+                if damping > _DAMPING[1]:
+                    return
+        self._knot, self._landmark, self._parameter, _ = best
+
+    def _apply(self, step: FloatArray) -> None:
+        """Move all estimates by a step (n,)."""
+        self._knot, self._landmark = self._knot.copy(), self._landmark.copy()
+        for pose, column in ((self._knot, self._knot_column), (self._landmark, self._landmark_column)):
+            rows = np.flatnonzero(column >= 0)
+            twist = step[column[rows][:, None] + np.arange(3)]
+            pose[rows] = se2.compose(se2.exp(twist), pose[rows])
+        self._parameter = self._parameter + step[self._parameter_column]
+
+    def _normal(self, scale: float) -> tuple[NormalEquations, float]:
+        """Normal equations and robust cost, linearized at the estimates."""
+        normal = NormalEquations(self._band, self._width(), self._size - self._band)
+        cost = self._add_priors(normal) + (0.0 if self._is_rigid else self._add_odometry(normal))
+        residual, jacobian, columns = self._sightings()
+        square = np.sum(residual**2, axis=1)
+        self._weight = 1.0 / np.square(1.0 + square / scale**2)
+        root = np.sqrt(self._weight)
+        normal.add(jacobian * root[:, None, None], columns, residual * root[:, None])
+        return normal, cost + float(np.sum(square / (1.0 + square / scale**2)))
+
+    def _width(self) -> int:
+        """Largest distance of two columns of the band that share a residual."""
+        if not self._band:
+            return 0
+        sides = self._problem.sides[self._rows]
+        both = sides[(sides >= 0).all(axis=1)].T
+        pairs = np.concatenate(
+            [self._knot_column[both], self._knot_column[np.array(self._pairs[:2])]], axis=1
+        )
+        return int(np.abs(np.diff(pairs, axis=0)).max(initial=0)) + 2
+
+    def _add_odometry(self, normal: NormalEquations) -> float:
+        """Steps between consecutive knots: r = log(T_b T_a^-1) - Ad(T_a) D p."""
+        a, b, root, response = self._pairs
+        drift = se2.log(se2.compose(self._knot[b], se2.inverse(self._knot[a])))
+        robot = self._problem.knots.robot[a]
+        moved = np.einsum("kij,kj->ki", response, self._parameter[robot])
+        back = se2.adjoint(se2.inverse(self._knot[a]))  # to the frame of the track, where the noise is given
+        residual = np.einsum("kij,kj->ki", root, np.einsum("kij,kj->ki", back, drift) - moved)
+        by_pose = np.einsum("kij,kjl->kil", root, back)
+        by_parameter = -np.einsum("kij,kjl->kil", root, response)
+        jacobian = np.concatenate([-by_pose, by_pose, by_parameter], axis=2)
+        columns = np.concatenate(
+            [
+                self._knot_column[a][:, None] + np.arange(3),
+                self._knot_column[b][:, None] + np.arange(3),
+                self._parameter_column[robot],
+            ],
+            axis=1,
+        )
+        normal.add(jacobian, columns, residual)
+        return float(np.sum(residual**2))
+
+    def _add_priors(self, normal: NormalEquations) -> float:
+        """Priors of parameters, described landmarks, starts and the origin."""
+        scaled = (self._parameter - self._mean) / self._prior
+        normal.add(np.eye(scaled.shape[1]) / self._prior[:, :, None], self._parameter_column, scaled)
+        cost = float(np.sum(scaled**2))
+        cost += 0.0 if self._is_rigid else self._add_truth(normal)
+        for column, pose, prior, sigma in self._anchors():
+            # the error of the pose in map, linearized: xi = log(X X_prior^-1)
+            residual = se2.log(se2.compose(pose, se2.inverse(prior)))
+            root = np.linalg.inv(np.linalg.cholesky(se2.error_covariance(prior, np.diag(sigma**2))))
+            normal.add(root[None], (column + np.arange(3))[None], (root @ residual)[None])
+            cost += float(np.sum((root @ residual) ** 2))
+        return cost
+
+    def _add_truth(self, normal: NormalEquations) -> float:
+        """Poses by ground truth, with noise in the frame of the robot."""
+        rows = np.flatnonzero(self._knot_column[self._problem.true.knot] >= 0)
+        knot, track, true = (column[rows] for column in self._problem.true)
+        root = se2.adjoint(se2.inverse(true)) / _TRUE_SIGMA[:, None]
+        pose = se2.compose(self._knot[knot], track)
+        residual = np.einsum("kij,kj->ki", root, se2.log(se2.compose(pose, se2.inverse(true))))
+        normal.add(root, self._knot_column[knot][:, None] + np.arange(3), residual)
+        return float(np.sum(residual**2))
+
+    def _anchors(self) -> list[tuple[int, FloatArray, FloatArray, FloatArray]]:
+        """Columns, poses, described poses and standard deviations of what is described."""
+        problem, found = self._problem, []
+        for index, mark in enumerate(problem.swarm.landmarks):
+            column = int(self._landmark_column[index])
+            if column < 0:
+                continue
+            described = np.array([mark.x, mark.y, mark.yaw or 0.0])
+            if problem.is_known[index]:
+                sigma = np.array([mark.position_sigma, mark.position_sigma, mark.yaw_sigma])
+                if mark.yaw is None:
+                    sigma[2] = _YAW_SIGMA
+                found.append((column, self._landmark[index], described, np.maximum(sigma, _ORIGIN_SIGMA)))
+            elif mark.yaw is None:
+                pose = self._landmark[index]
+                found.append((column, pose, pose * [1.0, 1.0, 0.0], np.array([1e3, 1e3, _YAW_SIGMA])))
+        has_frame = bool(problem.is_known.any())
+        for index, robot in enumerate(problem.swarm.robots):
+            own = np.flatnonzero((problem.knots.robot == index) & (self._knot_column >= 0))
+            if not own.size or robot.start is None:
+                continue
+            has_frame = True
+            spread = robot.start_sigma
+            sigma = np.array([spread.x, spread.y, spread.theta])
+            found.append(self._first_pose(int(own[0]), np.array(robot.start), sigma))
+        if not has_frame:
+            first = int(np.flatnonzero(self._knot_column >= 0)[0])
+            track = problem.knots.sample.pose[first]
+            origin = se2.compose(self._knot[first], track) if self._origin is None else self._origin
+            self._origin = origin
+            found.append(self._first_pose(first, origin, np.full(3, _ORIGIN_SIGMA)))
+        return found
+
+    def _first_pose(
+        self, knot: int, pose: FloatArray, sigma: FloatArray
+    ) -> tuple[int, FloatArray, FloatArray, FloatArray]:
+        # the error of X = T O is that of T
+        track = self._problem.knots.sample.pose[knot]
+        return int(self._knot_column[knot]), se2.compose(self._knot[knot], track), pose, sigma
+
+    def _sightings(self) -> tuple[FloatArray, FloatArray, IntArray]:
+        """Whitened residuals (u, 3), Jacobians (u, 3, 8) and columns (u, 8) of the used sightings."""
+        problem, rows = self._problem, self._rows
+        some, (observer, target) = select(problem.sightings, rows), problem.sides[rows].T
+        mark, robot = self._mark[rows], problem.sightings.observer[rows]
+        change, by = self._parameter[robot], problem.by_parameter
+        moved = se2.exp(np.einsum("skij,kj->ski", by.tracks[:, rows], change))
+        track = se2.compose(moved, problem.tracks[:, rows])
+        poses = [se2.compose(self._knot[observer], track[0])]
+        target_pose = se2.compose(self._knot[target], track[1])
+        poses.append(np.where((target >= 0)[:, None], target_pose, self._landmark[mark]))
+        correction = np.einsum("kij,kj->ki", by.value[rows], change)
+        some = some._replace(value=some.value + correction, second=some.second + correction)
+        value, jacobian = predict(some, poses[0], poses[1], np.zeros((rows.size, 3)))
+        by_pose = jacobian[:, :, :3]
+        noise = some.covariance.copy()
+        for side, knot in enumerate((observer, target)):
+            carried = np.where((knot >= 0)[:, None, None], by_pose @ se2.adjoint(self._knot[knot]), 0.0)
+            noise += carried @ problem.slip[side, rows] @ carried.transpose(0, 2, 1)
+        root = np.linalg.inv(np.linalg.cholesky(noise))
+        is_polar, has_heading = problem.is_polar[rows], some.has_heading > 0
+        apart = innovation(some.value, value, is_polar, has_heading)
+        other = innovation(some.second, value, is_polar, has_heading)
+        square, mirrored = (
+            np.sum(np.square(np.einsum("kij,kj->ki", root, one)), axis=1) for one in (apart, other)
+        )
+        better = (some.has_second > 0) & (mirrored < square)
+        apart[better] = other[better]
+        # distances in units of the reading, lest all become small for their noise to be small
+        growth, change_of = np.ones((rows.size, 3)), np.zeros((rows.size, 3, self._prior.shape[1]))
+        for component in range(2):
+            scaled = ~is_polar | (component == 0)
+            change_of[scaled, component] = by.growth[rows][scaled]
+        growth += np.einsum("kij,kj->ki", change_of, change)
+        apart /= growth
+        by_change = -by.value[rows]
+        for side, (knot, sign) in enumerate(((observer, -1.0), (target, 1.0))):
+            carried = by_pose @ se2.adjoint(self._knot[knot]) @ by.tracks[side, rows]
+            by_change = by_change + np.where((knot >= 0)[:, None, None], sign * carried, 0.0)
+        whole = np.concatenate([-by_pose, by_pose, by_change], axis=2)
+        columns = np.full((rows.size, 6 + self._prior.shape[1]), -1)
+        columns[:, :3] = self._knot_column[observer][:, None] + np.arange(3)
+        first = np.where(target >= 0, self._knot_column[target], self._landmark_column[mark])
+        columns[:, 3:6] = np.where(first[:, None] >= 0, first[:, None] + np.arange(3), -1)
+        columns[:, 6:] = self._parameter_column[robot]
+        whole /= growth[:, :, None]
+        whole[:, :, 6:] += (apart / growth)[:, :, None] * change_of
+        return -np.einsum("kij,kj->ki", root, apart), root @ whole, columns
+
+    def _solution(self, factor: Factor) -> Solution:
+        sightings = self._sightings()
+        residual = sightings[0]
+        good = self._weight > 0.5
+        degrees = 2.0 + self._problem.sightings.has_heading[self._rows]
+        ratio = float(np.sum(residual[good] ** 2) / max(1.0, np.sum(degrees[good])))
+        covariance = np.zeros((self._landmarks, 3, 3))
+        for index in np.flatnonzero(self._landmark_column >= 0).tolist():
+            error = factor.covariance(self._landmark_column[index] + np.arange(3))
+            covariance[index] = se2.pose_covariance(self._landmark[index], error)
+        sigma = np.array([np.sqrt(np.diag(factor.covariance(one))) for one in self._parameter_column])
+        placed = self._knot_column[self._knot_column >= 0]
+        frame = factor.covariance(placed[placed.size // 2] + np.arange(3))
+        weight = np.zeros(self.used.size)
+        weight[self._rows] = self._weight
+        return Solution(
+            self._problem,
+            self._knot,
+            self._landmark,
+            self._parameter,
+            sigma,
+            covariance,
+            frame,
+            weight,
+            self.used,
+            ratio,
+            factor,
+            self._knot_column,
+            sightings,
+        )
+
+
+def _numbered(wanted: BoolArray, first: int) -> tuple[IntArray, int]:
+    """First columns (k,) of bodies of three columns, -1 where not wanted; and the next free column."""
+    columns = np.where(wanted, first + 3 * (np.cumsum(wanted) - 1), -1)
+    return columns, first + 3 * int(wanted.sum())
+
+
+def _steps(problem: Problem, is_placed: BoolArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+    """Pairs of consecutive knots (p,), whitening of their steps, and Jacobians by parameters."""
+    knots = problem.knots
+    same = (knots.robot[1:] == knots.robot[:-1]) & is_placed[1:]
+    a = np.flatnonzero(same)
+    covariance = knots.sample.covariance[a + 1] - knots.sample.covariance[a]
+    covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1)) + np.eye(3) * _LEAST_VARIANCE
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    by = problem.by_parameter.knots
+    return a, a + 1, root, by[a + 1] - by[a]
