@@ -1,7 +1,11 @@
-"""Fit sensors, motion and noise to a bag with ground truth.
+"""Fit sensors, motion and noise to a bag with ground truth, or to itself.
 
     calibrate bags/mrclam1 --out calibrated.yaml
     calibrate recording.mcap --swarm swarm.yaml --out calibrated.yaml --plain
+    calibrate recording.mcap --self --out calibrated.yaml
+
+Without ground truth, --self fits the recording to itself: landmarks must be where the description says, and
+robots should drive straight and turn both ways past many of them for some minutes.
 
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. A
 picture of the same name as --out shows the errors before and after.
@@ -34,7 +38,12 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     options = _parser().parse_args(arguments)
-    chosen = Options(plain=options.plain, response=not options.no_response, evaluations=options.evaluations)
+    chosen = Options(
+        plain=options.plain,
+        response=not options.no_response,
+        evaluations=options.evaluations,
+        alone=options.alone,
+    )
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
     with ProgressLine() as progress:
         truth = read_truth(options.truth, swarm)
@@ -55,10 +64,11 @@ def _unused(recording: Recording) -> list[str]:
 
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(__doc__)
-    add_bag(parser, " with <robot>/ground_truth, or with --truth")
+    add_bag(parser, " with <robot>/ground_truth, with --truth or --self")
     add_remap(parser)
     add_truth(parser)
     parser.add_argument("--out", type=yaml_to_write, required=True, help="swarm description to write")
+    parser.add_argument("--self", dest="alone", action="store_true", help="use no ground truth")
     parser.add_argument("--plain", action="store_true", help="fit only noise, calibrate nothing")
     parser.add_argument(
         "--no-response",

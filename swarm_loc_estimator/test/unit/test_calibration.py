@@ -30,7 +30,6 @@ from swarm_loc_estimator.offline.calibration.fit import (
 from swarm_loc_estimator.offline.calibration.motion import (
     Drive,
     Lateness,
-    fit_offsets,
     fit_response,
     nodes_of,
     steps_of,
@@ -93,14 +92,6 @@ def test_models_are_recovered(seed: int) -> None:
         wanted = np.interp(response.turn_rates, [0.0, 0.6], [1.02, 0.8])
         np.testing.assert_allclose(speed_share[-1], wanted, atol=0.03)
         np.testing.assert_allclose(turn_share[1:, -1], 0.95, atol=0.02)
-
-
-def test_a_described_turn_bias_is_corrected_not_replaced() -> None:
-    biased = replace(HONEST, odometry=OdometryModel(turn_bias=-0.004))
-    recording, swarm = record(World((robot(1, biased),), seed=6))
-    described = replace(swarm.robots[0], odometry=replace(swarm.robots[0].odometry, turn_bias=-0.003))
-    (found,) = fit_offsets(recording, replace(swarm, robots=(described,)), [0]).values()
-    assert found.odometry.turn_bias == pytest.approx(-0.004, abs=0.001)
 
 
 @pytest.mark.parametrize("seed", [4, 5])

@@ -39,6 +39,7 @@ from swarm_loc_estimator.offline.calibration.motion import (
     WINDOW_S,
     Drive,
     Lateness,
+    biased,
     explained,
     fit_lateness,
     fit_response,
@@ -301,6 +302,7 @@ _SIGHTED = {
 """Noise of ranges and bearings, and of poses."""
 _GOOD = 0.5  # Least weight of a sighting that counts
 _MOVED_M = 0.02
+_BIAS_ROUNDS = 3  # Of scale factors of motion, and turn biases
 _SAMPLES = 60  # Windows of each robot, and sightings, whose variances by the batch are computed
 _CORRELATION = 2.7  # Initial ratio of the white noise that represents correlated errors to their scatter
 _TICK_S = 0.5
@@ -322,6 +324,7 @@ class Options:
     # Whether a table of scale factors may be fitted, else one of speed and one of turn rate
     response: bool = True
     evaluations: int = EVALUATIONS  # Limit of runs of the estimator to fit the noise
+    alone: bool = False  # Whether the recording is fitted to itself, without ground truth
 
 
 @dataclass(frozen=True)
@@ -329,7 +332,7 @@ class DriveFit:
     """Calibrated motion of a type of robot."""
 
     members: tuple[int, ...]  # Indices of its robots
-    drives: tuple[Drive, ...]  # Motion of the robots with dense ground truth
+    drives: Mapping[int, Drive]  # Motion of the robots whose paths are known, by index
     late: Lateness  # Delay and lag
     response: MotionResponse | None  # Scale factors; None if only noise is fitted
     before: FloatArray  # (m, 2) errors of path [m] and turn [rad] of 5 s windows as reported
@@ -363,17 +366,20 @@ class Calibration:
 
 
 def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> Calibration:
-    """Fit cameras, motion and noise to a recording with ground truth of at least one robot.
+    """Fit cameras, motion and noise to a recording with ground truth of at least one robot, or to itself.
 
-    `swarm` is the description to begin with. `progress` is called now and then with the share done and what
+    Without ground truth the paths of the batch take its place; where half of them is not better predicted
+    with what the other half tells, the description stays as it is. `swarm` is the description to begin with. `progress` is called now and then with the share done and what
     is being done.
 
     Raises:
         CalibrationError: There is no or too little ground truth, or the clock of the recording jumps.
     """
-    if not recording.truth:
+    if options.alone:
+        recording = replace(recording, truth={})
+    elif not recording.truth:
         raise CalibrationError(
-            f"recording '{recording.name}' holds no <robot>/ground_truth; a calibration needs it."
+            f"recording '{recording.name}' holds no <robot>/ground_truth; a calibration needs it, or --self."
         )
     if recording.longest_pause_ns > MAX_PAUSE_NS:
         raise CalibrationError(
@@ -390,12 +396,15 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
         progress(share, f"noise, run {count}: {rmse_mm:.1f} mm, NEES {found.nees:.2f}")
 
     fixed = _fixed_noise(swarm)
-    noise = {**fixed, **fit_noise(folds, begin, fixed, options.evaluations, report)}
+    found = begin if options.alone else fit_noise(folds, begin, fixed, options.evaluations, report)
+    noise = {**fixed, **{name: float(f"{value:.3g}") for name, value in found.items()}}
     progress(0.96, "before and after")
     calibrated = with_noise(whole.swarm, noise)
+    recording = replace(recording, truth=whole.paths)
     scores = [score([rerun(recording, started_at_truth(s, recording), _TICK_S)]) for s in (swarm, calibrated)]
     warning = "" if options.plain else _warning(folds, swarm, noise)
-    return Calibration(calibrated, whole, noise, scores[0], scores[1], warning)
+    kept = swarm if options.alone and warning else calibrated
+    return Calibration(kept, whole, noise, scores[0], scores[1], warning)
 
 
 def _fixed_noise(swarm: Swarm) -> dict[str, float]:
@@ -514,7 +523,7 @@ def _fitted(
         sensed = {robot.name: robot for robot in with_scatter(fits)}
         for index in members:
             seen = sensed.get(robots[index].name, robots[index])
-            robots[index] = seen if drive is None else _with_motion(seen, drive)
+            robots[index] = seen if drive is None else _with_motion(seen, index, drive)
     if not motion and not any(fit.is_enough for fit in cameras):
         raise CalibrationError(
             f"recording '{recording.name}' holds too little ground truth together with odometry or sightings;"
@@ -552,7 +561,7 @@ def _fit_drive(
     options: Options,
 ) -> DriveFit | None:
     """Fit the motion of a type; None without a robot whose path is known."""
-    drives = []
+    drives: dict[int, Drive] = {}
     for index in members:
         track, path = recording.track(index), paths.get(swarm.robots[index].name)
         if path is None or track.stamp_ns.size < 2:
@@ -560,16 +569,19 @@ def _fit_drive(
         begin_ns, end_ns = int(track.stamp_ns[0]), int(track.stamp_ns[-1])
         drive = Drive(steps_of(track, swarm.robots[index].odometry), true_motion(path, begin_ns, end_ns))
         if windows(drive.motion, WINDOW_S)[0].size >= _MIN_WINDOWS:
-            drives.append(drive)
+            drives[index] = drive
     if not drives:
         return None
-    prompt = Lateness(0.0, 0.0)
-    before = explained(drives, prompt, None)
+    own, prompt = [*drives.values()], Lateness(0.0, 0.0)
+    before = explained(own, prompt, None)
     if options.plain:
-        return DriveFit(tuple(members), tuple(drives), prompt, None, before, before)
-    late = fit_lateness(drives)
-    response = fit_response(drives, late, table=options.response)
-    return DriveFit(tuple(members), tuple(drives), late, response, before, explained(drives, late, response))
+        return DriveFit(tuple(members), drives, prompt, None, before, before)
+    late = fit_lateness(own)
+    for _ in range(_BIAS_ROUNDS):
+        response = fit_response(own, late, table=options.response)
+        own = [biased(drive, late, response) for drive in own]
+    drives = dict(zip(drives, own, strict=True))
+    return DriveFit(tuple(members), drives, late, response, before, explained(own, late, response))
 
 
 def _doubt(solution: Solution, members: Sequence[int]) -> FloatArray:
@@ -590,7 +602,7 @@ def _doubt(solution: Solution, members: Sequence[int]) -> FloatArray:
     return np.asarray(variances[:, [0, 2]].mean(axis=0)) if len(variances) else np.zeros(2)
 
 
-def _with_motion(robot: Robot, drive: DriveFit) -> Robot:
+def _with_motion(robot: Robot, index: int, drive: DriveFit) -> Robot:
     """The robot with the delay, lag and scale factors of its type."""
     late, response = drive.late, drive.response
     numbers = {
@@ -599,6 +611,9 @@ def _with_motion(robot: Robot, drive: DriveFit) -> Robot:
         "distance_scale": 1.0,
         "turn_scale": 1.0,
     }
+    if index in drive.drives:
+        bias = drive.drives[index].steps.turn_bias
+        numbers["turn_bias"] = round(float(bias[np.argmax(np.abs(bias))]), 5)
     if response is not None and len(response.speeds) == len(response.turn_rates) == 1:
         numbers["distance_scale"] = response.speed_share[0][0]
         numbers["turn_scale"] = response.turn_share[0][0]
@@ -614,7 +629,8 @@ def _folds(recording: Recording, swarm: Swarm, whole: FittedModels, options: Opt
     middle_ns = (first_ns + last_ns) // 2
     halves = [recording.between(first_ns, middle_ns), recording.between(middle_ns, last_ns + 1)]
     folds = []
-    for run, fitted in ((halves[0], halves[1]), (halves[1], halves[0])):
+    for half, fitted in ((halves[0], halves[1]), (halves[1], halves[0])):
+        run = replace(half, truth=whole.paths)
         try:
             models = fit_models(fitted, swarm, options, unwatched)
         except CalibrationError:
@@ -648,7 +664,7 @@ def _first_motion_noise(motion: Sequence[DriveFit], *, plain: bool) -> dict[str,
     """Initial noise of motion: each parameter explains a part of the mean squared errors of windows."""
     path = turn = seconds = path2 = turn2 = 0.0
     for fit in motion:
-        for drive in fit.drives:
+        for drive in fit.drives.values():
             first, last = windows(drive.motion, WINDOW_S)
             path += float(np.sum(np.abs(drive.motion.path[last] - drive.motion.path[first])))
             turn += float(np.sum(np.abs(drive.motion.turn[last] - drive.motion.turn[first])))

@@ -8,7 +8,7 @@ lag are searched. Offsets are those of the turn rate, of the course and of the a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,7 +20,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.offline.calibration.robust import ridge
+from swarm_loc_estimator.offline.calibration.robust import ridge, spread
 from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel
 
 DENSE_GAP_NS = 200_000_000  # Longest gap of ground truth that is interpolated
@@ -41,6 +41,7 @@ _SMOOTHNESS, _TO_ONE = 0.02, 0.001
 """Weights of the priors that neighbouring scale factors are equal, and that they are 1."""
 _FIRST_LATENESS = (0.05, 0.1)
 GRID_S = 0.02
+_BIAS_SIGMA, _OVERLAP = 0.01, 8  # Prior of a turn bias [rad/s]; windows that share a part of their time
 _SETTLING_S = 5.0
 
 
@@ -51,6 +52,7 @@ class Steps:
     stamp_ns: IntArray  # (n + 1,) of the messages
     speed: FloatArray  # (n,) reported [m/s]
     turn_rate: FloatArray  # (n,) reported [rad/s]
+    turn_bias: FloatArray  # (n,) true minus scaled turn rate [rad/s], the same while the robot moves
     duration_s: FloatArray  # (n,)
 
 
@@ -92,7 +94,19 @@ def steps_of(track: Trajectory, model: OdometryModel) -> Steps:
         np.hypot(dx, dy) <= model.max_speed * duration_s + 0.5 * model.wheel_separation
     )
     zero = np.where(plausible, 1.0 / duration_s, 0.0)
-    return Steps(track.stamp_ns, distance * zero, turn * zero, duration_s)
+    return Steps(track.stamp_ns, distance * zero, turn * zero, np.zeros(duration_s.size), duration_s)
+
+
+def biased(drive: Drive, late: Lateness, response: MotionResponse) -> Drive:
+    """The drive with the turn bias that its turns show with a table of scale factors, by regression."""
+    steps = drive.steps
+    moves = np.where((np.abs(steps.speed) > _MOVING) | (np.abs(steps.turn_rate) > _MOVING), 1.0, 0.0)
+    first, last = windows(drive.motion, WINDOW_S)
+    integral = gathered(moves[:, None], drive, late)
+    moving_s, missed = integral[last] - integral[first], explained([drive], late, response)[:, 1]
+    penalty = np.array([[_OVERLAP * (spread(missed) / _BIAS_SIGMA) ** 2 / max(1, missed.size)]])
+    change = ridge(moving_s, missed, penalty, np.zeros(1))[0]
+    return replace(drive, steps=replace(steps, turn_bias=steps.turn_bias + change * moves))
 
 
 def true_motion(truth: Trajectory, begin_ns: int, end_ns: int) -> TrueMotion:
@@ -261,7 +275,9 @@ def _regression(
         reported = steps.turn_rate if column else steps.speed
         values = weight.reshape(reported.size, -1) * reported[:, None]
         integral = gathered(values, drive, late)
-        true = motion.turn if column else motion.path
+        true = motion.path
+        if column:
+            true = motion.turn - gathered(steps.turn_bias[:, None], drive, late)[:, 0]
         first, last = windows(motion, WINDOW_S)
         bases.append(integral[last] - integral[first])
         targets.append(true[last] - true[first])
@@ -307,6 +323,7 @@ def explained(drives: Sequence[Drive], late: Lateness, response: MotionResponse 
             turn_rate = hats(np.abs(steps.turn_rate), np.array(response.turn_rates))
             for column, table in enumerate((response.speed_share, response.turn_share)):
                 reported[:, column] *= np.einsum("nv,vw,nw->n", speed, np.array(table), turn_rate)
+            reported[:, 1] += steps.turn_bias
         integral = gathered(reported, drive, late)
         first, last = windows(motion, WINDOW_S)
         true = np.column_stack([motion.path, motion.turn])
