@@ -369,8 +369,8 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
     """Fit cameras, motion and noise to a recording with ground truth of at least one robot, or to itself.
 
     Without ground truth the paths of the batch take its place; where half of them is not better predicted
-    with what the other half tells, the description stays as it is. `swarm` is the description to begin with. `progress` is called now and then with the share done and what
-    is being done.
+    with what the other half tells, the description stays as it is. `swarm` is the description to begin with.
+    `progress` is called now and then with the share done and what is being done.
 
     Raises:
         CalibrationError: There is no or too little ground truth, or the clock of the recording jumps.
@@ -400,7 +400,7 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
     noise = {**fixed, **{name: float(f"{value:.3g}") for name, value in found.items()}}
     progress(0.96, "before and after")
     calibrated = with_noise(whole.swarm, noise)
-    recording = replace(recording, truth=whole.paths)
+    recording = replace(recording, truth=whole.paths) if options.alone else recording
     scores = [score([rerun(recording, started_at_truth(s, recording), _TICK_S)]) for s in (swarm, calibrated)]
     warning = "" if options.plain else _warning(folds, swarm, noise)
     kept = swarm if options.alone and warning else calibrated
@@ -630,7 +630,7 @@ def _folds(recording: Recording, swarm: Swarm, whole: FittedModels, options: Opt
     halves = [recording.between(first_ns, middle_ns), recording.between(middle_ns, last_ns + 1)]
     folds = []
     for half, fitted in ((halves[0], halves[1]), (halves[1], halves[0])):
-        run = replace(half, truth=whole.paths)
+        run = replace(half, truth=whole.paths) if options.alone else half
         try:
             models = fit_models(fitted, swarm, options, unwatched)
         except CalibrationError:
