@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import select
 import shutil
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -123,6 +129,61 @@ def test_a_bag_is_whole_or_not_there(full_bytes: int, tmp_path: Path) -> None:
     with full_after(full_bytes), pytest.raises(FileError, match="bag cannot be written: File too large"):
         write_streams(tmp_path / "bag", [stream])
     assert [*tmp_path.iterdir()] == []
+
+
+HOLD = """
+import sys
+from swarm_loc_estimator.common.files import temporary_folder
+with temporary_folder("links-") as folder:
+    (folder / "epuck1").symlink_to("/dev/null")
+    print(folder, flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_a_temporary_folder_goes_with_its_process(number: signal.Signals, tmp_path: Path) -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+        env={**os.environ, "TMPDIR": str(tmp_path)},
+    ) as process:
+        assert process.stdout is not None
+        folder = Path(process.stdout.readline().strip())
+        assert [*tmp_path.iterdir()] == [folder]
+        (remover,) = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+        handle = os.pidfd_open(int(remover))
+        process.send_signal(number)
+    assert select.select([handle], [], [], 60.0)[0]  # it has ended
+    os.close(handle)
+    assert not folder.exists()
+
+
+def test_a_file_that_is_written_has_no_name(tmp_path: Path) -> None:
+    with replacing(tmp_path / "a") as part:
+        part.write_text("whole")
+        assert not [*tmp_path.iterdir()]
+    assert (tmp_path / "a").read_text() == "whole"
+
+
+def test_a_file_system_without_nameless_files_has_whole_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened = os.open
+
+    def without(path: Path, flags: int, *mode: int) -> int:
+        if flags & os.O_TMPFILE == os.O_TMPFILE:
+            raise OSError(errno.EOPNOTSUPP, "not supported")
+        return opened(path, flags, *mode)
+
+    monkeypatch.setattr(os, "open", without)
+    with replacing(tmp_path / "a") as part:
+        part.write_text("whole")
+        assert [*tmp_path.iterdir()] == [part]
+    assert [*tmp_path.iterdir()] == [tmp_path / "a"]
 
 
 def test_what_fails_inside_is_passed_on_and_leaves_nothing(tmp_path: Path) -> None:

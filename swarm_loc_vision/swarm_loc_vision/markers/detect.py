@@ -26,6 +26,7 @@ from swarm_loc_estimator.common.command_line import (
     ProgressLine,
     add_bag,
     add_set,
+    bag_to_write,
     command_parser,
     exit_with_message,
     parameters_of,
@@ -78,12 +79,13 @@ class ImageBag:
             for space, (_, transport) in sorted(self._images.items())
         }
 
-    def detect(self, folder: Path, progress: Progress) -> int:
+    def detect(self, folder: Path, progress: Progress, add: Callable[[Path], object] = lambda _: None) -> int:
         """Write a bag with detections in place of images.
 
         Args:
             folder: The new bag; must not exist.
             progress: Called with the share done and a word for the activity.
+            add: As of `BagWriter`.
 
         Returns:
             Number of messages.
@@ -96,7 +98,7 @@ class ImageBag:
         info_at = {f"{space}camera_info": self.cameras[space.rstrip("/")] for space in self._images}
         written = {f"{space}detections" for space in self._images}
         replaced = {f"{space}image_raw{t.suffix}" for space in self._images for t in TRANSPORTS.values()}
-        with BagReader(self._bag) as reader, BagWriter(folder) as writer:
+        with BagReader(self._bag) as reader, BagWriter(folder, add=add) as writer:
             kept = [topic for topic in reader.topics if topic.name not in written | replaced]
             for topic in (*kept, *(BagTopic(name, DETECTIONS) for name in sorted(written))):
                 writer.add_topic(topic.name, topic.type)
@@ -166,9 +168,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parameters = parameters_of(DetectorParameters, options.set, given)
     images = ImageBag(options.bag, camera_maker(parameters))
     with ProgressLine() as progress:
-        count = images.detect(options.output, progress)
-    if swarm_file is not None:
-        shutil.copyfile(swarm_file, options.output / "swarm.yaml")
+        count = images.detect(
+            options.output,
+            progress,
+            lambda part: swarm_file and shutil.copyfile(swarm_file, part / "swarm.yaml"),
+        )
     for loss in images.losses:
         print(loss)
     for name, camera in images.cameras.items():
@@ -201,7 +205,7 @@ def _summary(name: str, camera: CameraDetector) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(__doc__)
     add_bag(parser)
-    parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="the new bag")
+    parser.add_argument("--output", type=bag_to_write, required=True, metavar="FOLDER", help="the new bag")
     add_set(parser, "parameter of marker_detector_node")
     return parser
 

@@ -27,6 +27,7 @@ from urllib.parse import urlsplit
 
 import joblib
 import numpy as np
+from joblib._parallel_backends import LokyBackend
 
 from swarm_loc_estimator.common.bags.reader import is_storage
 from swarm_loc_estimator.common.files import check_file, naming
@@ -39,6 +40,7 @@ from swarm_loc_estimator.common.parameters import (
     Value,
     parameter_specs,
 )
+from swarm_loc_estimator.common.processes import end_with, uninterrupted
 from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, read_tree
 from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.offline.metrics import pool
@@ -287,7 +289,9 @@ def _outcomes(jobs: Mapping[str, Job], count: int, backend: Backend) -> Iterator
         with workers(count, backend):
             as_done = "generator" if _IN_ORDER else "generator_unordered"
             calls = (joblib.delayed(outcome)(job) for job in jobs.values())
-            yield from joblib.Parallel(return_as=as_done, batch_size=1)(calls)
+            with uninterrupted():
+                lines = joblib.Parallel(return_as=as_done, batch_size=1)(calls)
+            yield from lines
     except BrokenProcessPool as error:
         reason = "A worker was killed, perhaps for its memory: give fewer workers; the next run goes on here."
         raise UserError(reason) from error
@@ -380,7 +384,16 @@ def workers(count: int, backend: Backend) -> Iterator[None]:
 @contextmanager
 def _loky(_count: int, _address: str | None) -> Iterator[dict[str, Any]]:
     """Processes of one thread each."""
-    yield {"backend": "loky", "inner_max_num_threads": 1}
+    yield {"backend": _Loky(inner_max_num_threads=1)}
+
+
+class _Loky(LokyBackend):
+    """Workers that end with this process; older versions of joblib have no argument for that."""
+
+    def configure(self, **options: Any) -> int:
+        """Start the workers; their number."""
+        started: int = super().configure(**options, initializer=end_with, initargs=(os.getpid(),))
+        return started
 
 
 @contextmanager
