@@ -163,7 +163,7 @@ class Ended(NamedTuple):
 
 def run(line: list[str], scratch: Path) -> Ended:
     """Run a command to its end, with `scratch` for its temporary files."""
-    env = {**os.environ, "TMPDIR": str(scratch), "OMP_NUM_THREADS": "1"}
+    env = {**os.environ, "TMPDIR": str(scratch), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
     done = subprocess.run(
         line, env=env, cwd=scratch, capture_output=True, text=True, errors="replace", check=False
     )

@@ -105,7 +105,7 @@ def test_the_hall_ends_where_a_map_ends(tmp_path: Path) -> None:
         (MAP.replace("0.0]", "1.0e-5]"), "origin is .* but must be x, y and a yaw of 0"),
         (MAP + "mode: raw", "mode must be trinary or scale"),
         (MAP, "room.png cannot be read"),
-        (MAP.replace("room.png", "plan.yaml"), "image is 'plan.yaml' but is no image that can be decoded"),
+        (MAP.replace("room.png", "plan.yaml"), "The image '.*plan.yaml' of a map cannot be decoded"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named_in_one_sentence(

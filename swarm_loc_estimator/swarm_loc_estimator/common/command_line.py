@@ -146,20 +146,24 @@ def bag_to_write(text: str) -> Path:
     return folder_to_write()(str(path.parent)) / path.name
 
 
-def file_to_write(*suffixes: str) -> Callable[[str], Path]:
-    """A type for argparse: a file with one of these suffixes that can be written. Nothing is created yet."""
+def file_to_write(*suffixes: str, picture: str = "") -> Callable[[str], Path]:
+    """A type for argparse: a file with one of these suffixes that can be written. Nothing is created yet.
+
+    A `picture` of the same name and this suffix can be written, too.
+    """
 
     def read(text: str) -> Path:
         path = Path(text)
         if path.suffix not in suffixes:
             raise argparse.ArgumentTypeError(f"'{text}' must end in {' or '.join(suffixes)}")
-        folder_to_write(path.name)(str(path.parent))
+        folder_to_write(path.name, path.with_suffix(picture or path.suffix).name)(str(path.parent))
         return path
 
     return read
 
 
 yaml_to_write = file_to_write(".yaml", ".yml")
+yaml_and_picture_to_write = file_to_write(".yaml", ".yml", picture=".png")
 
 
 def add_bag(parser: argparse.ArgumentParser, content: str = "") -> None:

@@ -29,7 +29,7 @@ AWAITED_SIGNALS = STOP_SIGNALS | {signal.SIGCHLD}
 _ARGUMENTS = {"parameter_file": "params_file"}
 _TIED_TO_PARENT = """
 import ctypes, os, signal, sys
-signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM, signal.SIGCHLD})
+signal.pthread_sigmask(signal.SIG_SETMASK, {signal.SIGINT})
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # shells start background jobs with it ignored
 PR_SET_PDEATHSIG = 1
 ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)

@@ -11,6 +11,8 @@ from contextlib import contextmanager
 from multiprocessing import active_children, get_context
 
 _PR_SET_PDEATHSIG = 1
+# a process that watches semaphores removes those of a command that was stopped, and would warn of them
+os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker")
 
 
 @contextmanager

@@ -31,7 +31,9 @@ _MAX_YAW = 1e-6  # Of a map [rad], as rounding leaves it: less than a millimetre
 _HEADER_BYTES = 1 << 18
 _COMMENTS = 1000
 _SEPARATOR = rb"(?:\s|#[^\r\n]*[\r\n])+"
-_PNM = re.compile(rb"P(?:[14]|[2356]" + _SEPARATOR + rb"\d+)" + 2 * (_SEPARATOR + rb"\d+") + rb"\s")
+_SIZE = 2 * (_SEPARATOR + rb"(\d{1,9})")
+_PNM = re.compile(rb"P(?:[14]" + _SIZE + rb"|[2356]" + _SIZE + _SEPARATOR + rb"\d+)\s")
+_PLAIN_BYTES = 16  # Maximum number of characters of a number in a plain PNM, with the space around it
 _FORMATS = ("PPM", "PNG", "BMP")  # Other decoders of Pillow start programs, or have seen less care
 _PLACE = NumberSpec("m", -1e6, 1e6, False, "of the lower left corner")
 
@@ -85,7 +87,7 @@ def load_map(path: Path, cell: float | None = None) -> OccupancyMap:
         raise checks.error("negate", negate, "must be 0 or 1")
     if not isinstance(about["image"], str):
         raise checks.error("image", about["image"], "must be the path of a file")
-    pixels, seen = _read_image(path.parent / about["image"])
+    pixels, seen = read_image(path.parent / about["image"])
     shade = np.arange(256) if negate or mode == "raw" else 255 - np.arange(256)
     occupied, free = numbers["occupied_thresh"], numbers["free_thresh"]
     log_odds = _log_odds(shade, mode, free, occupied)[pixels]
@@ -134,12 +136,20 @@ def _check_header(data: bytes) -> None:
     head = data[:_HEADER_BYTES]
     is_short = head.startswith(b"BM") or b"IDAT" in head
     if head.startswith(b"P"):  # digits have comments between them, too
-        is_short = bool(_PNM.match(head)) and (head[1:2] > b"3" or data.count(b"#") <= _COMMENTS)
+        match = _PNM.match(head)
+        is_short = match is not None and (head[1:2] > b"3" or _is_dense(data, match))
     if not is_short:
-        raise ValueError("it is no PGM, PNG or BMP with a header of a usual length")
+        raise ValueError("it is no PGM, PNG or BMP with a header and spaces of a usual length")
 
 
-def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def _is_dense(data: bytes, head: re.Match[bytes]) -> bool:
+    """Whether a plain PNM has few comments, and no more space between its numbers than they need."""
+    width, height = (int(number) for number in head.groups() if number is not None)
+    most = _HEADER_BYTES + _PLAIN_BYTES * width * height * (3 if data[1:2] == b"3" else 1)
+    return len(data) <= most and data.count(b"#") <= _COMMENTS
+
+
+def read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Gray values (height, width) of an image as map_server writes it, and which pixels are opaque.
 
     Raises:

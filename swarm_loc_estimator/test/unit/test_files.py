@@ -17,8 +17,8 @@ import pytest
 
 from bench.shared.bags import copy_part
 from bench.shared.full_disk import full_after
-from swarm_loc_estimator.cli import calibrate, new, replay, replay_map, survey, sweep
-from swarm_loc_estimator.common.bags.writer import Stream, write_streams
+from swarm_loc_estimator.cli import calibrate, calibrate_ir, new, replay, replay_map, survey, sweep
+from swarm_loc_estimator.common.bags.writer import BagWriter, Stream, write_streams
 from swarm_loc_estimator.common.files import FileError, check_folder, replacing, write_whole
 from swarm_loc_estimator.common.messages.cdr import POSE_STAMPED
 from swarm_loc_estimator.common.yaml_tree import write_tree
@@ -28,6 +28,7 @@ from swarm_loc_estimator.offline.export import write_mcap, write_tum
 from swarm_loc_estimator.offline.replay import replay as run
 from swarm_loc_estimator.offline.report.report import write_report
 from swarm_loc_estimator.offline.result import ReplayResult
+from swarm_loc_estimator.offline.sweep import sweep as sweeping
 from swarm_loc_estimator.offline.sweep.report import Row, write_results
 
 DEMO = Path(__file__).parents[3] / "bags" / "eight_one_robot_fast"
@@ -184,6 +185,43 @@ def test_a_file_system_without_nameless_files_has_whole_ones(
         part.write_text("whole")
         assert [*tmp_path.iterdir()] == [part]
     assert [*tmp_path.iterdir()] == [tmp_path / "a"]
+
+
+def test_a_bag_appears_with_all_its_files(tmp_path: Path) -> None:
+    with BagWriter(tmp_path / "bag", add=lambda part: (part / "swarm.yaml").touch()) as bag:
+        bag.add_topic("a", POSE_STAMPED)
+        assert not (tmp_path / "bag").exists()
+    assert {path.name for path in (tmp_path / "bag").iterdir()} == {"bag.mcap", "metadata.yaml", "swarm.yaml"}
+    assert [*tmp_path.iterdir()] == [tmp_path / "bag"]
+
+    def full(_: Path) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with pytest.raises(FileError, match="other cannot be written: No space left"):
+        BagWriter(tmp_path / "other", add=full).__exit__(None, None, None)
+    assert [*tmp_path.iterdir()] == [tmp_path / "bag"]
+
+
+@pytest.mark.parametrize("room", [0, 3, 8])
+def test_a_line_of_a_sweep_is_whole_or_not_there(room: int, tmp_path: Path) -> None:
+    (tmp_path / "log").write_bytes(b"line\n")
+    with (tmp_path / "log").open("ab", buffering=0) as file:
+        with full_after(5 + room), pytest.raises(OSError, match="File too large"):
+            sweeping._append(file, b"new line\n")
+        assert (tmp_path / "log").read_bytes() == b"line\n"
+        sweeping._append(file, b"new line\n")
+    assert (tmp_path / "log").read_bytes() == b"line\nnew line\n"
+
+
+@pytest.mark.parametrize("main", [calibrate.main, calibrate_ir.main, survey.main])
+def test_a_link_at_the_picture_is_found_before_the_work_begins(
+    main: Callable[[list[str]], int], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "a.png").symlink_to("elsewhere")
+    (tmp_path / "a").symlink_to("elsewhere")
+    with pytest.raises(SystemExit):
+        main([str(tmp_path / "none"), "--out", str(tmp_path / "a.yaml")])
+    assert f"{tmp_path / 'a.png'} cannot be written: it is a symbolic link" in capsys.readouterr().err
 
 
 def test_what_fails_inside_is_passed_on_and_leaves_nothing(tmp_path: Path) -> None:

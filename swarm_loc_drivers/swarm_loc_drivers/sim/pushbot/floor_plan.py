@@ -11,21 +11,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError
-from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, read_file, read_tree
+from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, read_tree
+from swarm_loc_estimator.mapping.map_file import read_image
 
 Rectangle = tuple[float, float, float, float]  # Left, lower, right and upper edge [m]
 _SUFFIXES = (".yaml", ".yml", ".json")
 _KEYS = ("about", "free", "solid", "polygons", "columns", "segments", "starts")
 _RESOLUTION = NumberSpec("m", 0.001, 10.0, False, "side of a pixel")
 _THRESHOLD = NumberSpec("1", 0.0, 1.0, False, "darker pixels are occupied")
-_MAX_IMAGE_BYTES = 50_000_000
 _MAX_WALLS, _MAX_RECTANGLES = 2000, 200  # Each step of a world compares every corner with every wall
 
 
@@ -146,13 +145,7 @@ def _plan_of_map(path: Path, about: dict[str, Tree]) -> FloorPlan:
         raise checks.error("origin", list(origin), "must be x, y and a yaw of 0")
     if about.get("mode", "trinary") == "raw" or about.get("negate", 0) not in (0, 1):
         raise checks.said("mode must be trinary or scale, and negate 0 or 1")
-    data = read_file(path.parent / str(about["image"]), _MAX_IMAGE_BYTES)
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except cv2.error:  # an empty file, or one with too many pixels
-        pixels = None
-    if pixels is None:
-        raise checks.error("image", about["image"], "is no image that can be decoded")
+    pixels, _ = read_image(path.parent / str(about["image"]))
     darkness = (pixels if about.get("negate", 0) else 255 - pixels) / 255.0
     occupied = (darkness > threshold)[::-1].T
     corner = np.array(origin[:2])

@@ -20,6 +20,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
+from io import FileIO
 from pathlib import Path
 from socket import create_connection
 from typing import Any, Literal, NamedTuple, get_args
@@ -268,17 +269,27 @@ def run_sweep(sweep: Sweep, path: Path, backend: Backend, progress: Progress) ->
     path.parent.mkdir(parents=True, exist_ok=True)
     check_file(path)
     began = time.monotonic()
-    with path.open("a", encoding="utf-8") as file:
+    with path.open("ab", buffering=0) as file:
         if file.tell() and not path.read_bytes().endswith(b"\n"):
-            file.write("\n")  # ends the line in which the last run was killed
+            file.write(b"\n")  # ends the line in which the last run was killed
         progress(0.0, f"0 of {len(jobs)} replays")
         for done, line in enumerate(_outcomes(jobs, sweep.workers, backend), 1):
             with naming(path):
-                file.write(json.dumps(line) + "\n")
-                file.flush()
+                _append(file, f"{json.dumps(line)}\n".encode())
             left_s = (time.monotonic() - began) / done * (len(jobs) - done)
             progress(done / len(jobs), f"{done} of {len(jobs)} replays, {left_s:.0f} s left")
     return _read(path)
+
+
+def _append(file: FileIO, data: bytes) -> None:
+    """Append all of the data or, where there is no room, nothing."""
+    begin = file.tell()
+    try:
+        while data:
+            data = data[file.write(data) :]
+    except OSError:
+        file.truncate(begin)
+        raise
 
 
 def _outcomes(jobs: Mapping[str, Job], count: int, backend: Backend) -> Iterator[Line]:
