@@ -110,6 +110,15 @@ def test_a_full_disk_leaves_the_old_files_and_is_said_with_the_path(
 
 
 @pytest.mark.parametrize("write", WRITERS)
+def test_a_file_is_not_cut_wherever_the_disk_ends(write: Write, result: ReplayResult, tmp_path: Path) -> None:
+    write(result, tmp_path / "out")
+    largest = max(file.stat().st_size for file in (tmp_path / "out").iterdir())
+    for count in [*np.random.default_rng(4).integers(largest // 2, largest, 6).tolist(), largest - 1]:
+        with full_after(count), pytest.raises(FileError):
+            write(result, tmp_path / "new")
+
+
+@pytest.mark.parametrize("write", WRITERS)
 def test_nothing_is_written_through_links(write: Write, result: ReplayResult, tmp_path: Path) -> None:
     write(result, tmp_path / "out")
     for file in [*(tmp_path / "out").iterdir()]:
