@@ -89,7 +89,8 @@ def kill(line: list[str], place: Place, number: signal.Signals, at_s: float, env
         while (living := _living(mark)) and time.monotonic() < began_s + _PATIENCE_S:
             process.poll()
             time.sleep(_POLL_S)
-        status, after_s = process.poll(), time.monotonic() - began_s
+        after_s = time.monotonic() - began_s
+        status = process.poll() if living else process.wait()
         for pid in living:
             os.kill(pid, signal.SIGKILL)
         process.wait()
@@ -157,7 +158,7 @@ class Kills:
             if not is_whole(name, data, self._whole):
                 self._count("cut_files", trial, name)
         hidden = [path for path in self._place.out.rglob("*") if path.name.startswith(".")]
-        for path in (*self._place.scratch.iterdir(), *hidden, *_SHARED.glob(f"*{done.pid}*")):
+        for path in (*self._place.scratch.iterdir(), *hidden, *_SHARED.glob(f"*[-_]{done.pid}[-_]*")):
             self._count("left", trial, str(path))
 
     def _count(self, kind: str, trial: str, said: str) -> None:

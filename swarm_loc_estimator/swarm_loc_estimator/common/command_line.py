@@ -61,13 +61,15 @@ class Program:
         try:
             main: Callable[[], int] = getattr(import_module(self.module), self.function)
             signal.signal(signal.SIGTERM, before)
-            return main()
+            status = main()
         except ModuleNotFoundError as error:
             missing = (error.name or "").partition(".")[0]
             if missing == self.module.partition(".")[0]:
                 raise
             print(f"{Path(sys.argv[0]).name} {_needs(missing)}.", file=sys.stderr)
             return 1
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done, and Python's end gives up handlers
+        return status
 
 
 def _leave(number: int, _frame: object) -> None:

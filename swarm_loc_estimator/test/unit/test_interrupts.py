@@ -43,6 +43,14 @@ def main():
     sweeping.outcome = wait
     list(sweeping._outcomes({"a": 1, "b": 2}, 2, sweeping.Backend()))
 """
+ENDS = """
+import atexit, signal
+
+def main():
+    atexit.register(signal.raise_signal, signal.SIGINT)
+    print("done")
+    return 7
+"""
 CALLED_BACK = """
 import ctypes, signal
 
@@ -97,6 +105,12 @@ def test_ctrl_c_where_a_compiler_has_called_back_is_not_swallowed(tmp_path: Path
     with started(tmp_path, CALLED_BACK) as command:
         _, said = command.communicate(timeout=60)
     assert (command.returncode, said) == (130, "Stopped by SIGINT.\n")
+
+
+def test_ctrl_c_while_python_ends_changes_nothing(tmp_path: Path) -> None:
+    with started(tmp_path, ENDS) as command:
+        output, said = command.communicate(timeout=60)
+    assert (command.returncode, output, said) == (7, "done\n", "")
 
 
 def test_a_program_of_a_graph_is_not_interrupted_before_it_asks_for_it() -> None:
