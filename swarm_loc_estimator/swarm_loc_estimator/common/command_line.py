@@ -165,7 +165,7 @@ def file_to_write(*suffixes: str, picture: str = "") -> Callable[[str], Path]:
 
 
 yaml_to_write = file_to_write(".yaml", ".yml")
-yaml_and_picture_to_write = file_to_write(".yaml", ".yml", picture=".png")
+yaml_and_picture = file_to_write(".yaml", ".yml", picture=".png")
 
 
 def add_bag(parser: argparse.ArgumentParser, content: str = "") -> None:

@@ -73,7 +73,8 @@ def load_map(path: Path, cell: float | None = None) -> OccupancyMap:
         UserError: It cannot be read, or is not such a map.
     """
     checks = TreeChecks(path, MapFileError)
-    about = checks.mapping(read_tree(path), WHOLE_FILE, required=("image", "origin", *_NUMBERS))
+    given = checks.mapping(read_tree(path), WHOLE_FILE, required=("image", "origin", "resolution"))
+    about = {"occupied_thresh": _OCCUPIED_THRESHOLD, "free_thresh": _FREE_THRESHOLD, **given}
     numbers = {name: checks.number(about[name], name, spec) or 0.0 for name, spec in _NUMBERS.items()}
     places = checks.items(about["origin"], "origin")
     origin = [checks.number(value, "origin", _PLACE) or 0.0 for value in places]
@@ -86,7 +87,7 @@ def load_map(path: Path, cell: float | None = None) -> OccupancyMap:
         raise checks.error("negate", negate, "must be 0 or 1")
     if not isinstance(about["image"], str):
         raise checks.error("image", about["image"], "must be the path of a file")
-    pixels, seen = read_image(path.parent / about["image"])
+    pixels, seen = _read_image(path.parent / about["image"])
     shade = np.arange(256) if negate or mode == "raw" else 255 - np.arange(256)
     occupied, free = numbers["occupied_thresh"], numbers["free_thresh"]
     log_odds = _log_odds(shade, mode, free, occupied)[pixels]
@@ -148,7 +149,7 @@ def _is_dense(data: bytes, head: re.Match[bytes]) -> bool:
     return len(data) <= most and data.count(b"#") <= _COMMENTS
 
 
-def read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     """Gray values (height, width) of an image as map_server writes it, and which pixels are opaque.
 
     Raises:

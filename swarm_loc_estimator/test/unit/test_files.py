@@ -197,7 +197,8 @@ def test_a_file_system_without_nameless_files_has_whole_ones(
 
 
 def test_a_bag_appears_with_all_its_files(tmp_path: Path) -> None:
-    with BagWriter(tmp_path / "bag", add=lambda part: (part / "swarm.yaml").touch()) as bag:
+    with BagWriter(tmp_path / "bag") as bag:
+        (bag.folder / "swarm.yaml").touch()
         bag.add_topic("a", POSE_STAMPED)
         assert not (tmp_path / "bag").exists()
     assert {path.name for path in (tmp_path / "bag").iterdir()} == {"bag.mcap", "metadata.yaml", "swarm.yaml"}
@@ -207,7 +208,7 @@ def test_a_bag_appears_with_all_its_files(tmp_path: Path) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
     with pytest.raises(FileError, match="other cannot be written: No space left"):
-        BagWriter(tmp_path / "other", add=full).__exit__(None, None, None)
+        write_streams(tmp_path / "other", [Stream("a", POSE_STAMPED, np.arange(1), [b""])], add=full)
     assert [*tmp_path.iterdir()] == [tmp_path / "bag"]
 
 

@@ -117,26 +117,24 @@ class _Rosbag2Writer(Writer):
 class BagWriter:
     """A new bag; use it as a context manager, after whose end without an error it is there.
 
-    Its folder must not exist. With `compress`, chunks are compressed with zstd. `add` writes other files to
-    it.
+    Its folder must not exist. With `compress`, chunks are compressed with zstd. Other files of it are written
+    to `folder` before the end.
 
     Raises:
         BagError: The folder is there already, or cannot be created.
         FileError: It cannot be written, later.
     """
 
-    def __init__(
-        self, path: Path, *, compress: bool = False, add: Callable[[Path], object] = lambda _: None
-    ) -> None:
-        self._path, self._add = path, add
+    def __init__(self, path: Path, *, compress: bool = False) -> None:
+        self._path = path
         self._connections: dict[str, Connection] = {}
         if os.path.lexists(path):
             raise BagError(f"The bag '{path}' cannot be created: it exists already.")
         with ExitStack() as stack:
             try:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                self._part = stack.enter_context(temporary_folder(parent=path.parent)) / path.name
-                self._writer = _Rosbag2Writer(self._part, version=9, storage_plugin=StoragePlugin.MCAP)
+                self.folder = stack.enter_context(temporary_folder(parent=path.parent)) / path.name
+                self._writer = _Rosbag2Writer(self.folder, version=9, storage_plugin=StoragePlugin.MCAP)
                 if compress:
                     self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
                 self._writer.open()
@@ -172,8 +170,7 @@ class BagWriter:
         with self._stack, naming(self._path):
             if kind is None:
                 self._writer.close()
-                self._add(self._part)
-                self._part.rename(self._path)
+                self.folder.rename(self._path)
             else:
                 self._writer.abort()
 
@@ -198,8 +195,8 @@ def write_streams(
 ) -> int:
     """Write messages as a new, compressed bag in order of log time, equal times in the order of the streams.
 
-    `progress` is called now and then with the share done, `add` as by `BagWriter`. Returns the number of
-    messages.
+    `progress` is called now and then with the share done, `add` with the folder for other files. Returns the
+    number of messages.
 
     Raises:
         BagError: The folder is there already, or cannot be created.
@@ -209,7 +206,9 @@ def write_streams(
     place = np.concatenate([np.arange(len(stream.data)) for stream in streams])
     order = np.argsort(log_ns, kind="stable")
     columns = (column[order].tolist() for column in (log_ns, owner, place))
-    with BagWriter(folder, compress=True, add=add) as bag:
+    with BagWriter(folder, compress=True) as bag:
+        with naming(folder):
+            add(bag.folder)
         for stream in streams:
             bag.add_topic(stream.topic, stream.type)
         for done, (at_ns, which, one) in enumerate(zip(*columns, strict=True)):

@@ -480,9 +480,8 @@ def _write_bag(
 ) -> None:
     """Write all messages and `swarm.yaml`; exchanges with equal stamps are spaced by a microsecond."""
     covariance = np.diag(np.square(FIX_SIGMA))
-    with BagWriter(
-        folder, compress=True, add=lambda part: save_swarm(swarm, part / "swarm.yaml", comment)
-    ) as bag:
+    with BagWriter(folder, compress=True) as bag:
+        save_swarm(swarm, bag.folder / "swarm.yaml", comment)
         for robot in swarm.robots:
             for kind in (_BRIGHTNESS, _FIXES):
                 bag.add_topic(f"{robot.name}/{kind.topic}", kind.message_type)

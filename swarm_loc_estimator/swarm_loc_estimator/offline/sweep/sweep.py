@@ -16,7 +16,7 @@ import os
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
@@ -387,15 +387,13 @@ def workers(count: int, backend: Backend) -> Iterator[None]:
     Raises:
         BackendError: A package is missing, or the cluster is not reached.
     """
-    start = {"loky": _loky, "ray": _ray, "dask": _dask}[backend.name]
-    with start(count, backend.address) as options, joblib.parallel_config(n_jobs=count, **options):
+    start = {"ray": _ray, "dask": _dask}.get(backend.name)
+    local = nullcontext({"backend": _Loky(inner_max_num_threads=1)})
+    with (
+        start(count, backend.address) if start else local as options,
+        joblib.parallel_config(n_jobs=count, **options),
+    ):
         yield
-
-
-@contextmanager
-def _loky(_count: int, _address: str | None) -> Iterator[dict[str, Any]]:
-    """Processes of one thread each."""
-    yield {"backend": _Loky(inner_max_num_threads=1)}
 
 
 class _Loky(LokyBackend):
