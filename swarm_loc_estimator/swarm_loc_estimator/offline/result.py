@@ -61,9 +61,9 @@ class Spool:
         begin = -(-self._end // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
         if not size:
             return np.zeros((0, *shape), dtype=dtype)
-        self._file.seek(begin)
-        self._end = begin
-        with naming(self._place):
+        with naming(self._place):  # already this `seek` writes what is buffered
+            self._file.seek(begin)
+            self._end = begin
             for offset, length in blocks:
                 self._copy(offset, length)
             self._file.flush()

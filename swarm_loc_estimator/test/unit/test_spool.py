@@ -32,16 +32,18 @@ def test_rows_come_back_by_key_in_their_order() -> None:
         arrays["a"][0] = 0.0
 
 
+@pytest.mark.parametrize("rows", [20_001, 10])
 def test_a_full_disk_is_said_with_its_folder_and_no_traceback(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, rows: int
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     unraised: list[object] = []
     monkeypatch.setattr(sys, "unraisablehook", unraised.append)
     spool = Spool()
-    with full_after(100_000):
+    with full_after(8 * rows - 8):
         with pytest.raises(FileError, match=f"{tmp_path} cannot be written: File too large"):
-            spool.append("a", np.ones(20_001))
+            spool.append("a", np.ones(rows))
+            spool.array("a", float)
         del spool
         gc.collect()
     assert not unraised
