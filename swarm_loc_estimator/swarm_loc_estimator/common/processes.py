@@ -8,7 +8,7 @@ import signal
 from collections.abc import Iterator
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import contextmanager
-from multiprocessing import active_children, get_context
+from multiprocessing import active_children, get_context, resource_tracker
 
 _PR_SET_PDEATHSIG = 1
 # a process that watches semaphores removes those of a command that was stopped, and would warn of them
@@ -18,6 +18,7 @@ os.environ.setdefault("PYTHONWARNINGS", "ignore:resource_tracker")
 @contextmanager
 def uninterrupted() -> Iterator[None]:
     """Hold back Ctrl-C; processes and threads that are started inside never get it."""
+    resource_tracker.ensure_running()  # its start lets Ctrl-C through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

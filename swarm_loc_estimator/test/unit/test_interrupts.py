@@ -19,10 +19,11 @@ from swarm_loc_estimator.common.command_line import Program
 sys.exit(Program("interrupted")())
 """
 WAITS = """
-import os, time
+import os, signal, time
 
 def wait(*_):
-    os.write(1, f"{os.getpid()} {os.getppid()}\\n".encode())
+    blocked = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
+    os.write(1, f"{os.getpid()} {blocked}\\n".encode())
     time.sleep(1000)
 """
 BESIDE = """
@@ -86,8 +87,8 @@ def test_workers_end_with_their_command(
 ) -> None:
     with started(tmp_path, text) as command:
         assert command.stdout is not None
-        workers = [int(command.stdout.readline().split()[0]) for _ in range(count)]
-        handles = [os.pidfd_open(worker) for worker in workers]
+        workers = [command.stdout.readline().split() for _ in range(count)]
+        handles = [os.pidfd_open(int(worker)) for worker, _ in workers]
         if number == signal.SIGINT:
             os.killpg(command.pid, number)  # as a terminal does
         else:
@@ -99,6 +100,7 @@ def test_workers_end_with_their_command(
     if number == signal.SIGINT:
         assert (command.returncode, said) == (130, "Stopped by SIGINT.\n")
     assert "Traceback" not in said
+    assert all(blocked == "True" for _, blocked in workers)  # else Ctrl-C while they start is a traceback
 
 
 def test_ctrl_c_where_a_compiler_has_called_back_is_not_swallowed(tmp_path: Path) -> None:
