@@ -32,6 +32,12 @@ def test_rows_come_back_by_key_in_their_order() -> None:
         arrays["a"][0] = 0.0
 
 
+def filled(spool: Spool, rows: int) -> None:
+    """Write rows, and read them."""
+    spool.append("a", np.ones(rows))
+    spool.array("a", float)
+
+
 @pytest.mark.parametrize("rows", [20_001, 10])
 def test_a_full_disk_is_said_with_its_folder_and_no_traceback(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, rows: int
@@ -42,8 +48,7 @@ def test_a_full_disk_is_said_with_its_folder_and_no_traceback(
     spool = Spool()
     with full_after(8 * rows - 8):
         with pytest.raises(FileError, match=f"{tmp_path} cannot be written: File too large"):
-            spool.append("a", np.ones(rows))
-            spool.array("a", float)
+            filled(spool, rows)
         del spool
         gc.collect()
     assert not unraised
