@@ -94,11 +94,6 @@ def _request(left: int, right: int, letters: str, size: int) -> Request:
     return Request(queries, _SPEEDS.pack(left, right), size)
 
 
-def camera_setting(width: int, height: int, zoom: int) -> bytes:
-    """The line that sets the camera to RGB565; the robot answers `ASCII_CAMERA_SET`, even when it refuses."""
-    return f"J,{RGB565_MODE},{width},{height},{zoom}\r".encode()
-
-
 def decode_readings(body: bytes) -> Readings:
     """Decode a reply to `readings_request`."""
     left, right, *proximity = _READINGS.unpack(body)
@@ -277,8 +272,8 @@ class SerialSession(TalkSession):
 
     def _set_camera(self, camera: CameraSettings) -> Talk[None]:
         """Set the size of images, and check that the robot has accepted it."""
-        setting = camera_setting(camera.width, camera.height, camera.zoom)
-        yield from self._answer(setting, ASCII_CAMERA_SET)
+        setting = f"J,{RGB565_MODE},{camera.width},{camera.height},{camera.zoom}\r".encode()
+        yield from self._answer(setting, ASCII_CAMERA_SET)  # the answer even when it refuses
         answer = yield from self._answer(ASCII_CAMERA_QUERY, ASCII_CAMERA_REPLY)
         wanted = (RGB565_MODE, camera.width, camera.height, camera.zoom)
         taken = tuple(int(number) for number in answer.groups()[:4])
