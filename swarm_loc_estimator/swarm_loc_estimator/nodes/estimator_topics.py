@@ -154,6 +154,9 @@ would get ever older data, which cost more to fuse, and never catch up."""
 
 _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
 """Drop reason of messages that are missing in a publisher's sequence."""
+_MAX_SEQUENCES = (
+    100  # Of a topic with several publishers; of fewer, a rare message would seem to follow a loss
+)
 _TF_STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _MAX_FRAME_LENGTH = 64  # Longer names of foreign frames are cut
 _RELIABLE = QoSProfile(depth=10)
@@ -173,7 +176,9 @@ class EstimatorInputs:
         self._node = node
         self._topics = topics
         self._drop = drop
-        self._newest: list[int | None] = [None] * len(topics)
+        # Of each topic, the newest sequence numbers of its publishers, and these when a number was left out
+        self._newest: list[list[int]] = [[] for _ in topics]
+        self._publishers: list[set[tuple[int, ...]]] = [set() for _ in topics]
         self._looked_ns = 0
         self._quota = max(_MIN_PER_TOPIC, _MAX_PER_TAKE // len(topics))
         self._subscriptions = [self._subscribe(k, ReliabilityPolicy.RELIABLE) for k in range(len(topics))]
@@ -187,13 +192,15 @@ class EstimatorInputs:
         taken = []
         for handle, subscription in enumerate(self._subscriptions):
             take, message_class = subscription.handle.take_message, subscription.msg_type
+            numbers = []
             for _ in range(self._quota):
                 message = take(message_class, True)
                 if message is None:
                     break
                 data, info = message
-                self._count_gap(handle, info["publication_sequence_number"])
+                numbers.append(info["publication_sequence_number"])
                 taken.append((info["received_timestamp"], handle, data))
+            self._count_gaps(handle, numbers)
         taken.sort(key=lambda one: one[0])
         now_ns = time_ns()
         # time must not seem to go back to where it was looked at before
@@ -204,13 +211,26 @@ class EstimatorInputs:
             for at_ns, handle, data in taken
         ]
 
-    def _count_gap(self, handle: int, number: int | None) -> None:
-        """Count what is missing between the newest message and this one, if one publisher numbers them."""
-        before, self._newest[handle] = self._newest[handle], number
-        if before is None or number is None or number <= before + 1:
+    def _count_gaps(self, handle: int, numbers: Sequence[int | None]) -> None:
+        """Count what is missing in the sequences of a topic's publishers, which messages do not name.
+
+        A number that continues no sequence is the first of a new publisher, or follows the nearest one.
+        """
+        newest, gaps = self._newest[handle], []
+        for number in filter(None, numbers):
+            if number - 1 in newest:
+                newest.remove(number - 1)
+            else:
+                gaps.append(number - 1 - max((one for one in newest if one < number), default=number - 1))
+            newest.append(number)
+        if not gaps:
             return
-        if len(self._node.get_publishers_info_by_topic(self._topics[handle].name)) == 1:
-            self._drop(_LOST[self._subscriptions[handle].qos_profile.reliability], number - before - 1)
+        known, infos = self._publishers[handle], self._node.get_publishers_info_by_topic
+        now = {tuple(one.endpoint_gid) for one in infos(self._topics[handle].name)}
+        self._publishers[handle] = now
+        del newest[: -1 if len(now | known) == 1 else -_MAX_SEQUENCES]
+        if lost := sum(sorted(gaps)[: max(0, len(gaps) - len(now - known))]):
+            self._drop(_LOST[self._subscriptions[handle].qos_profile.reliability], lost)
 
     def _subscribe(self, handle: int, reliability: ReliabilityPolicy) -> Subscription:
         topic = self._topics[handle]
