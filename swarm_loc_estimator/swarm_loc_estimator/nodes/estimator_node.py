@@ -158,7 +158,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             return
         self._shedding.begin_tick(begin_s, self._pace.waited_s(self._time_ns()))
         self._receive(partial(newest_time_ns, self))
-        now_ns = self._time_ns()
+        self._inputs.looked_ns = now_ns = self._time_ns()
         self._estimate, fusing_s = self._estimate_at(now_ns, begin_s)
         if self._estimator.time_jumps != self._jumps:
             self._jumps = self._estimator.time_jumps

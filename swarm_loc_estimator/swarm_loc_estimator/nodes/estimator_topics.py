@@ -179,7 +179,7 @@ class EstimatorInputs:
         # Of each topic, the newest sequence numbers of its publishers, and these when a number was left out
         self._newest: list[list[int]] = [[] for _ in topics]
         self._publishers: list[set[tuple[int, ...]]] = [set() for _ in topics]
-        self._looked_ns = 0
+        self.looked_ns = 0  # Newest time that the estimator knows; reading many messages takes a while
         self._quota = max(_MIN_PER_TOPIC, _MAX_PER_TAKE // len(topics))
         self._subscriptions = [self._subscribe(k, ReliabilityPolicy.RELIABLE) for k in range(len(topics))]
 
@@ -204,8 +204,8 @@ class EstimatorInputs:
         taken.sort(key=lambda one: one[0])
         now_ns = time_ns()
         # time must not seem to go back to where it was looked at before
-        begin_ns = now_ns if self._node.get_clock().ros_time_is_active else self._looked_ns
-        self._looked_ns = now_ns
+        begin_ns = now_ns if self._node.get_clock().ros_time_is_active else self.looked_ns
+        self.looked_ns = now_ns
         return [
             SerializedMessage(handle, data, min(max(at_ns, begin_ns), now_ns))
             for at_ns, handle, data in taken

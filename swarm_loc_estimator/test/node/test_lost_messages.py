@@ -36,7 +36,7 @@ class Inputs:
         """A publisher, and its node, as of another process."""
         stranger = self._ros.stranger()
         publisher = stranger.create_publisher(Odometry, TOPIC, QoSProfile(depth=4 * DEPTH))
-        self._ros.until(lambda: publisher.get_subscription_count())
+        self._ros.until(publisher.get_subscription_count)
         return stranger, publisher
 
     def send(self, publisher: Publisher, count: int) -> None:
