@@ -119,7 +119,8 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._reported_s = time.monotonic()
         self._lost = 0
         self._static_transforms = StaticTransforms(self, self._swarm, self.params)
-        self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop)
+        horizon_s = self.params.settings.horizon_s
+        self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop, horizon_s)
         frame = self.params.map_frame
         self._commands = PoseCommands(self, self._swarm, self._estimator, frame, by_topics=not shared)
         self._start_ticks()
@@ -265,7 +266,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         foreign = self._static_transforms.foreign
         lost, self._lost = drops.get("overload", 0) - self._lost, drops.get("overload", 0)
         if lost:
-            text = f"overload: {lost} messages were lost in full queues"
+            text = f"overload: {lost} messages were lost in queues"
             causes.append(Report("overload", text, Level.WARN))
         causes += [Report("transforms", text, Level.WARN) for text in foreign]
         self.health.warn_of(

@@ -169,13 +169,17 @@ class EstimatorInputs:
 
     Messages wait in the middleware, which keeps the newest of each topic, and not in the executor, whose
     queue is unbounded; no executor may handle the subscriptions. Lost messages are detected by the
-    publishers' sequence numbers. The index of a topic is its handle.
+    publishers' sequence numbers, and those are dropped unread that have waited here for longer than the
+    horizon, after which nothing is fused. The index of a topic is its handle.
     """
 
-    def __init__(self, node: Node, topics: Sequence[InputTopic], drop: Callable[[str, int], None]) -> None:
+    def __init__(
+        self, node: Node, topics: Sequence[InputTopic], drop: Callable[[str, int], None], horizon_s: float
+    ) -> None:
         self._node = node
         self._topics = topics
         self._drop = drop
+        self._horizon_ns = round(horizon_s * 1e9)
         # Of each topic, the newest sequence numbers of its publishers, and these when a number was left out
         self._newest: list[list[int]] = [[] for _ in topics]
         self._publishers: list[set[tuple[int, ...]]] = [set() for _ in topics]
@@ -189,22 +193,24 @@ class EstimatorInputs:
         `time_ns` returns the node's time. It is called after the messages are taken, since an earlier time
         could be before their stamps. In simulated time, all arrive at that time.
         """
-        taken = []
+        taken, clock = [], self._node.get_clock()
+        is_simulated = clock.ros_time_is_active  # where the middleware's times are of another clock
+        oldest_ns = 0 if is_simulated else clock.now().nanoseconds - self._horizon_ns
         for handle, subscription in enumerate(self._subscriptions):
             take, message_class = subscription.handle.take_message, subscription.msg_type
-            numbers = []
-            for _ in range(self._quota):
-                message = take(message_class, True)
-                if message is None:
-                    break
+            numbers, before = [], len(taken)
+            while len(taken) < before + self._quota and (message := take(message_class, True)) is not None:
                 data, info = message
                 numbers.append(info["publication_sequence_number"])
-                taken.append((info["received_timestamp"], handle, data))
+                if info["received_timestamp"] >= oldest_ns:
+                    taken.append((info["received_timestamp"], handle, data))
             self._count_gaps(handle, numbers)
+            if waited := len(numbers) - (len(taken) - before):
+                self._drop("overload", waited)
         taken.sort(key=lambda one: one[0])
         now_ns = time_ns()
         # time must not seem to go back to where it was looked at before
-        begin_ns = now_ns if self._node.get_clock().ros_time_is_active else self.looked_ns
+        begin_ns = now_ns if is_simulated else self.looked_ns
         self.looked_ns = now_ns
         return [
             SerializedMessage(handle, data, min(max(at_ns, begin_ns), now_ns))

@@ -26,11 +26,14 @@ TOPIC = "alpha/odom"
 class Inputs:
     """The inputs of a node of their own, which is in no executor, and what they count as dropped."""
 
-    def __init__(self, ros: Ros, node: Node, swarm_file: Path) -> None:
+    def __init__(self, ros: Ros, node: Node, swarm_file: Path, horizon_s: float = 60.0) -> None:
         self._ros, self.node = ros, node
         self.drops: Counter[str] = Counter()
         topics = [one for one in live_topics(load_swarm(swarm_file), shared=False) if one.name == TOPIC]
-        self._inputs = EstimatorInputs(node, topics, lambda why, n: self.drops.update({why: n}))
+        self._inputs = EstimatorInputs(node, topics, self._note, horizon_s)
+
+    def _note(self, why: str, count: int) -> None:
+        self.drops[why] += count
 
     def publisher(self) -> tuple[Node, Publisher]:
         """A publisher, and its node, as of another process."""
@@ -100,3 +103,18 @@ def test_what_a_full_queue_loses_is_counted_beside_other_publishers_too(
         inputs.send(each, 5)
     assert inputs.take_all() == 5 + 5 * len(others)
     assert inputs.drops.total() <= 70
+
+
+def test_what_has_waited_for_longer_than_the_horizon_is_dropped_unread_and_counted(
+    ros: Ros, swarm_file: Path
+) -> None:
+    node = rclpy.create_node("inputs")
+    inputs = Inputs(ros, node, swarm_file, horizon_s=2.0)
+    _, publisher = inputs.publisher()
+    inputs.send(publisher, 300)
+    last_s = time.monotonic()
+    ros.until(lambda: time.monotonic() > last_s + 2.1)
+    inputs.send(publisher, 1)
+    assert inputs.take_all() == 1
+    assert inputs.drops == {"overload": 300}
+    node.destroy_node()
