@@ -1,4 +1,4 @@
-"""Robustness: drivers of all protocols under corrupted bytes, and odometry with wrong stamps.
+"""Robustness: drivers of all protocols under corrupted bytes, odometry with wrong stamps, too much load.
 
 `protocols` runs drivers in simulated time, with robots whose bytes are lost, doubled, swapped, flipped or
 inserted (.01 to 10 %), shuffled, flooded or replaced for some seconds. A thread is dead when it ends or never
@@ -7,16 +7,18 @@ answers makes sense.
 
 `stamps` runs five simulated e-pucks with stamps that jitter by 5 to 90 % of the period, or are early, late or
 repeated now and then.
+
+`load` runs fifty robots at three times the load that fits, over DDS and in real time, see `load.py`.
 """
 
 from __future__ import annotations
 
 import argparse
 
-from bench.robustness import protocols, stamps
+from bench.robustness import load, protocols, stamps
 from bench.shared.common import ProgressLine, table, write_figures
 
-_PARTS = ("stamps", "protocols")
+_PARTS = ("stamps", "protocols", "load")
 
 
 def main() -> None:
@@ -24,6 +26,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--streams", type=int, default=10_000, help="corrupted streams of each protocol")
     parser.add_argument("--seeds", type=int, default=5, help="runs with wrong stamps of each kind")
+    parser.add_argument("--minutes", type=float, default=10.0, help="at three times the load that fits")
+    parser.add_argument("--image-rate", type=float, default=0.0, help="load instead of three times that [Hz]")
     parser.add_argument("--parts", nargs="+", choices=_PARTS, default=[*_PARTS])
     arguments = parser.parse_args()
     figures: dict[str, float] = {}
@@ -31,6 +35,8 @@ def main() -> None:
         figures |= stamps.measure(arguments.seeds, ProgressLine("stamps"))
     if "protocols" in arguments.parts:
         figures |= protocols.measure(arguments.streams, ProgressLine("protocols"))
+    if "load" in arguments.parts:
+        figures |= load.measure(arguments.minutes, ProgressLine("load"), arguments.image_rate)
     print()
     print(table(("figure", "value"), list(figures.items())))
     print(write_figures("robustness", figures))

@@ -193,12 +193,14 @@ class EstimatorInputs:
         `time_ns` returns the node's time. It is called after the messages are taken, since an earlier time
         could be before their stamps. In simulated time, all arrive at that time.
         """
-        taken, clock = [], self._node.get_clock()
+        taken: list[tuple[int, int, bytes]] = []
+        clock = self._node.get_clock()
         is_simulated = clock.ros_time_is_active  # where the middleware's times are of another clock
         oldest_ns = 0 if is_simulated else clock.now().nanoseconds - self._horizon_ns
         for handle, subscription in enumerate(self._subscriptions):
             take, message_class = subscription.handle.take_message, subscription.msg_type
-            numbers, before = [], len(taken)
+            before = len(taken)
+            numbers: list[int | None] = []
             while len(taken) < before + self._quota and (message := take(message_class, True)) is not None:
                 data, info = message
                 numbers.append(info["publication_sequence_number"])
