@@ -9,16 +9,18 @@ answers makes sense.
 repeated now and then.
 
 `load` runs fifty robots at three times the load that fits, over DDS and in real time, see `load.py`.
+
+`time` lets clocks jump, stops processes for a while and loops a bag, see `clocks.py`.
 """
 
 from __future__ import annotations
 
 import argparse
 
-from bench.robustness import load, protocols, stamps
+from bench.robustness import clocks, load, protocols, stamps
 from bench.shared.common import ProgressLine, table, write_figures
 
-_PARTS = ("stamps", "protocols", "load")
+_PARTS = ("stamps", "protocols", "load", "time")
 
 
 def main() -> None:
@@ -28,6 +30,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5, help="runs with wrong stamps of each kind")
     parser.add_argument("--minutes", type=float, default=10.0, help="at three times the load that fits")
     parser.add_argument("--image-rate", type=float, default=0.0, help="load instead of three times that [Hz]")
+    parser.add_argument("--loops", type=int, default=20, help="of a bag")
     parser.add_argument("--parts", nargs="+", choices=_PARTS, default=[*_PARTS])
     arguments = parser.parse_args()
     figures: dict[str, float] = {}
@@ -37,6 +40,8 @@ def main() -> None:
         figures |= protocols.measure(arguments.streams, ProgressLine("protocols"))
     if "load" in arguments.parts:
         figures |= load.measure(arguments.minutes, ProgressLine("load"), arguments.image_rate)
+    if "time" in arguments.parts:
+        figures |= clocks.measure(arguments.loops, ProgressLine("time"))
     print()
     print(table(("figure", "value"), list(figures.items())))
     print(write_figures("robustness", figures))
