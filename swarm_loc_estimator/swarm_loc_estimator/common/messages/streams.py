@@ -410,11 +410,10 @@ def _pack(
         source, place = (data, begin[k]) if begin[k] < data.size else (unlike, begin[k] - data.size)
         padded = begin[k] < data.size and (begin[k] - offset[k]) % 8 == ENCAPSULATION
         for first in range(row, row + count[k]):
-            for i in range(_DETECTION_SIZE):
-                if i == DETECTION_GAP and padded and first == row:
-                    place += 4
-                packed[first, i] = source[place]
-                place += 1
+            packed[first, :DETECTION_GAP] = source[place : place + DETECTION_GAP]
+            place += 4 if padded and first == row else 0
+            packed[first, DETECTION_GAP:] = source[place + DETECTION_GAP : place + _DETECTION_SIZE]
+            place += _DETECTION_SIZE
         row += count[k]
 
 
