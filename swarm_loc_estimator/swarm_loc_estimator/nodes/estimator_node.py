@@ -15,6 +15,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,7 @@ _ORDINARY_DROPS = frozenset(
 """Drops that are ordinary and not logged: late, duplicate or outlying data and infrared out of range.
 Drops under overload have a warning of their own."""
 
+_READ_BYTES = 8_000_000  # Read and thinned out at once: what is read takes more memory than what is left
 INACTIVE = "Nothing was changed: the estimator is not active."  # Answer of the services while it is not
 
 CreateEstimator = Callable[[Swarm, Settings], Estimator]
@@ -196,7 +198,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
     def _receive(self, time_ns: Callable[[], int]) -> None:
         """Pass the messages received to the estimator, thinned out under overload."""
         batch = MessageBatch.of(self._inputs.take(time_ns))
-        for messages in self._ingest.read(batch):
+        for messages in chain.from_iterable(map(self._ingest.read, batch.parts(_READ_BYTES))):
             thinned = self._thinning.thin(messages, self._shedding.share)
             self._cost.note_sightings(thinned.measurements, thinned.shed)
             self._estimator.receive(thinned.messages)

@@ -33,7 +33,8 @@ from swarm_loc_estimator.common.messages.streams import SerializedMessage
 from swarm_loc_estimator.common.node import message_class
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
-from swarm_loc_estimator.sensors.inputs import InputTopic
+from swarm_loc_estimator.sensors.inputs import SENSORS, InputTopic
+from swarm_loc_estimator.sensors.sensor import InputKind
 from swarm_loc_estimator.swarm.swarm import StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.sightings import encode_sightings, newest_sightings
@@ -145,8 +146,10 @@ class PoseCommands:
         return now_ns
 
 
-DEPTH = 1000  # Queue length of a topic, which is emptied at each tick: enough for the horizon
-_SHARED_DEPTH = 500  # The same for a topic with the readings of many robots, whose messages are large
+_RATE_HZ, _FAST_HZ = 100, 500
+"""Highest rate of a topic of which all messages within the horizon wait, and that of odometry and turn rates,
+which are small unless they are of many robots; images are large: their queues take most of the memory."""
+_LEAST_DEPTH, _MOST_DEPTH = 100, 1000
 _MAX_PER_TAKE = 5000  # Limit of messages per tick over all topics
 _MIN_PER_TOPIC = 100
 """Least limit per topic: the messages of the usual horizon. With less, an estimator that is late
@@ -154,14 +157,18 @@ would get ever older data, which cost more to fuse, and never catch up."""
 
 _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
 """Drop reason of messages that are missing in a publisher's sequence."""
-_MAX_SEQUENCES = (
-    100  # Of a topic with several publishers; of fewer, a rare message would seem to follow a loss
-)
+_MAX_SEQUENCES = 100  # Of a topic with several publishers; of fewer, a rare one would seem to follow a loss
 _TF_STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _MAX_FRAME_LENGTH = 64  # Longer names of foreign frames are cut
 _RELIABLE = QoSProfile(depth=10)
 _SIGHTINGS_PERIOD_NS = 180_000_000  # Publishing period of swarm/sightings, which are only for display
 _TF = QoSProfile(depth=100)  # what tf2's own broadcaster offers
+
+
+def queue_depth(kind: InputKind, horizon_s: float) -> int:
+    """Length of the queue of a topic, which is emptied at each tick: what can be used after a long one."""
+    is_small = SENSORS[kind.rows].unit is None and not kind.stands_for
+    return min(max(_LEAST_DEPTH, round((_FAST_HZ if is_small else _RATE_HZ) * horizon_s)), _MOST_DEPTH)
 
 
 class EstimatorInputs:
@@ -246,7 +253,7 @@ class EstimatorInputs:
             message_class(topic.kind.message_type),
             topic.name,
             lambda _: None,
-            QoSProfile(depth=_SHARED_DEPTH if topic.kind.stands_for else DEPTH, reliability=reliability),
+            QoSProfile(depth=queue_depth(topic.kind, 1e-9 * self._horizon_ns), reliability=reliability),
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=partial(self._follow, handle)),
         )

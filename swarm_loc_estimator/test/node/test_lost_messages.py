@@ -7,20 +7,24 @@ from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 import rclpy
 from nav_msgs.msg import Odometry
-from node_world import Ros, odometry_bytes
+from node_world import Ros, detection_bytes, odometry_bytes
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
-from swarm_loc_estimator.nodes.estimator_topics import DEPTH, EstimatorInputs
+from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
+from swarm_loc_estimator.nodes.estimator_topics import EstimatorInputs
 from swarm_loc_estimator.sensors.inputs import live_topics
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_msgs.msg import MarkerDetectionArray
 
 TOPIC = "alpha/odom"
+DEPTH, IMAGES = 1000, 200  # Most that wait of odometry and of images, with a horizon of two seconds
 
 
 class Inputs:
@@ -117,4 +121,29 @@ def test_what_has_waited_for_longer_than_the_horizon_is_dropped_unread_and_count
     inputs.send(publisher, 1)
     assert inputs.take_all() == 1
     assert inputs.drops == {"overload": 300}
+    node.destroy_node()
+
+
+def test_of_images_only_those_wait_that_come_within_the_horizon(ros: Ros, swarm_file: Path) -> None:
+    node = rclpy.create_node("inputs")
+    topics = [
+        one for one in live_topics(load_swarm(swarm_file), shared=False) if one.kind.name == "detections"
+    ]
+    drops: Counter[str] = Counter()
+    inputs = EstimatorInputs(node, topics[:1], lambda why, count: drops.update({why: count}), 2.0)
+    publisher = ros.stranger().create_publisher(MarkerDetectionArray, topics[0].name, QoSProfile(depth=DEPTH))
+    ros.until(publisher.get_subscription_count)
+    sent = [
+        detection_bytes("alpha", stamp_ns, np.zeros(0, DETECTION_DTYPE)) for stamp_ns in range(IMAGES + 51)
+    ]
+    publisher.publish(sent[0])
+    ros.until(lambda: len(inputs.take(time.time_ns)) == 1)
+    for data in sent[1:]:
+        publisher.publish(data)
+    ros.until(lambda: publisher.wait_for_all_acked(Duration()))
+    taken: list[bytes] = []
+    while more := inputs.take(time.time_ns):
+        taken += [one.data for one in more]
+    assert taken == sent[-IMAGES:]
+    assert drops == {"overload": 50}
     node.destroy_node()

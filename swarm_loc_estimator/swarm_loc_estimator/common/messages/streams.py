@@ -9,6 +9,7 @@ Many serialized messages at once: one buffer, and columns with the place of each
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -83,6 +84,13 @@ class MessageBatch(NamedTuple):
     def chosen(self, k: slice | NDArray[np.intp] | NDArray[np.bool_]) -> MessageBatch:
         """Some of them, in the same buffer."""
         return MessageBatch(self.data, self.topic[k], self.log_ns[k], self.offset[k], self.length[k])
+
+    def parts(self, size: int) -> Iterator[MessageBatch]:
+        """Successive messages of about so many bytes each, in the same buffer."""
+        ends = np.searchsorted(np.cumsum(self.length), np.arange(size, self.length.sum(), size)).tolist()
+        for begin, end in itertools.pairwise([0, *ends, self.size]):
+            if begin < end:
+                yield self.chosen(slice(begin, end))
 
     def in_order_of_time(self) -> MessageBatch:
         """Sorted by time, equal ones as they lie."""
