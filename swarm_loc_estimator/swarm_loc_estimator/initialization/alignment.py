@@ -20,6 +20,7 @@ from swarm_loc_estimator.common.numerics import (
     carry,
     cholesky3,
     composed,
+    factor_numbers,
     moved_by_twist,
     solve3,
     wrap,
@@ -428,6 +429,9 @@ def _drifted(constraints: ConstraintArray, track_noise: FloatArray) -> Constrain
         for i in range(3):
             for j in range(3):
                 drift[i, j] = track_noise[i, j] - constraint.track_noise[i, j]
+        if not _is_noise(drift):  # late odometry has replaced a larger noise that was assumed without it
+            assign_matrix(constraint.track_noise, track_noise)
+            continue
         xx, xy, yy = _spread_around(drift, constraint.local_x, constraint.local_y)
         if drift[2, 2] > _ARC:
             constraint.turn_variance += drift[2, 2]
@@ -435,6 +439,18 @@ def _drifted(constraints: ConstraintArray, track_noise: FloatArray) -> Constrain
         constraint.local_xy += xy
         constraint.local_yy += yy
     return out
+
+
+@cached_njit
+def _is_noise(drift: FloatArray) -> bool:
+    """Whether a matrix (3, 3) is positive semidefinite, but for rounding."""
+    work, rounding = drift.copy(), 1e-12
+    for i in range(3):
+        rounding += 1e-9 * abs(drift[i, i])
+    for i in range(3):
+        work[i, i] += rounding
+    first, _, second, _, _, third = factor_numbers(work)
+    return math.isfinite(first + second + third)
 
 
 @cached_njit
