@@ -36,10 +36,7 @@ CONSTRAINT_DTYPE = np.dtype(
         ("marker_id", np.int64),
         ("other", np.int64),  # the robot on the other side, or NOBODY
         ("landmark", np.int64),  # the landmark on the other side, or -1
-        (
-            "column",
-            np.int64,
-        ),  # first filter column of the other side's error, -1: it has none; once `refreshed`
+        ("column", np.int64),  # first of the other side's error in the filter, or -1; once `refreshed`
         ("local_x", np.float64),  # point in the track's frame [m]
         ("local_y", np.float64),
         ("local_xx", np.float64),  # its covariance
