@@ -135,6 +135,7 @@ class ReplyParser:
 
 
 _TRIES = 5  # Tries of a request
+_JITTER_NS = 50_000_000  # Allowed jitter of half the time between request and reply [ns]
 _SLACK_S, _ROUNDING_STEPS = 0.1, 2  # Uncertainty of the time between two readings, and of counters
 _NS = 1_000_000_000
 
@@ -203,16 +204,22 @@ class SerialSession(TalkSession):
             yield from self._resync()
 
     def _read(self, speeds: tuple[int, int]) -> Talk[bool]:
-        """Read counters and proximity; the stamp is the middle between request and reply."""
+        """Read counters and proximity; the stamp is the middle between request and reply.
+
+        A reply that is far later than the one before is not used: this process was stopped meanwhile.
+        """
         asked_ns = self._now_ns
         body = yield from self._ask(readings_request(*speeds, is_new=speeds != self._sent))
         if body is None:
             return False
-        self._way_ns = max(0, self._now_ns - asked_ns) // 2
+        way_ns = max(0, self._now_ns - asked_ns) // 2
+        is_late = way_ns > (most_ns := 2 * self._way_ns + _JITTER_NS)
+        self._way_ns = min(way_ns, most_ns)
         left, right, proximity = decode_readings(body)
         stamp_ns, sensors = asked_ns + self._way_ns, np.array(proximity, dtype=np.int64)
         reading = Reading(stamp_ns, self._way_ns, left, right, sensors)
-        self.found.append(reading)
+        if not is_late:
+            self.found.append(reading)
         self._may_have_moved |= any(self._sent) or any(speeds)
         if self._sense is None or self._can_follow(self._sense, reading):
             self._sense, self._sense_s, self._may_have_moved = reading, self._steady_s, False
