@@ -175,7 +175,7 @@ def test_a_robot_that_moves_unheard_while_its_driver_restarts_is_found_by_its_sc
     position, heading = error_of(mapper, 0, robot)
     assert position < 0.03
     assert heading < math.radians(2.0)
-    assert np.abs((mapper.graph.poses[: len(before)] - before)[:, :2]).max() < 0.04
+    assert np.abs((mapper.graph.poses[: len(before)] - before)[:, :2]).max() < 0.03
 
 
 def test_a_robot_whose_scan_fits_two_places_leaves_the_map_as_it_is() -> None:
@@ -226,7 +226,7 @@ def test_a_place_that_later_stops_contradict_is_taken_back(monkeypatch: pytest.M
     position, heading = error_of(mapper, 0, robot)
     assert position < 0.03
     assert heading < math.radians(2.0)
-    assert np.abs((mapper.graph.poses[: len(before)] - before)[:, :2]).max() < 0.04
+    assert np.abs((mapper.graph.poses[: len(before)] - before)[:, :2]).max() < 0.03
     assert len(mapper.begin_ns) < mapper.graph.count  # the stops at the wrong place count no more
 
 
