@@ -273,7 +273,7 @@ class Visit:
     turn_begin: float  # Turn by odometry at which the node begins [rad]
 
 
-class Sighting(NamedTuple):
+class LightBetween(NamedTuple):
     """A bearing of a light between two stops."""
 
     seer: Visit  # Of the robot that sees it
@@ -311,7 +311,7 @@ class LightBook:
         """Mark all stops of a robot until this time as recorded."""
         self._until_ns[robot] = stamp_ns
 
-    def settle(self, graph: PoseGraph) -> list[Sighting]:
+    def settle(self, graph: PoseGraph) -> list[LightBetween]:
         """Add bearings with known stops to the graph, one per pair of stops; returns those of all stops."""
         found: dict[tuple[Visit, Visit], list[tuple[float, float]]] = defaultdict(list)
         for _ in range(len(self._pending)):
@@ -328,7 +328,7 @@ class LightBook:
         for (seer, seen), sighted in found.items():
             is_known = LOST not in (seer.node, seen.node)
             ratio = graph.states[seer.node, 3] if is_known else 1.0 - graph.slip[seer.robot]
-            sightings.append(Sighting(seer, seen, *_median(ratio, *np.array(sighted).T)))
+            sightings.append(LightBetween(seer, seen, *_median(ratio, *np.array(sighted).T)))
             if is_known:
                 _add_bearing(graph, sightings[-1])
         return sightings
@@ -353,7 +353,7 @@ def _median(ratio: float, turn: FloatArray, bearing: FloatArray) -> tuple[float,
     return float(turn[middle]), float(bearing[middle] + float(np.median(off[passes])) - off[middle])
 
 
-def _add_bearing(graph: PoseGraph, sighting: Sighting) -> None:
+def _add_bearing(graph: PoseGraph, sighting: LightBetween) -> None:
     """Add a bearing to the graph, unless the robots are too close."""
     seer, seen = sighting.seer.node, sighting.seen.node
     away = math.dist(graph.states[seer, :2], graph.states[seen, :2])

@@ -20,8 +20,8 @@ from swarm_loc_estimator.mapping.exploration import Goal, goal_by_odometry, next
 from swarm_loc_estimator.mapping.grid import OccupancyMap, VisitationMap, draw_map
 from swarm_loc_estimator.mapping.localization import (
     LOST,
+    LightBetween,
     LightBook,
-    Sighting,
     Visit,
     align,
     align_all,
@@ -360,7 +360,7 @@ class CooperativeMapper:
                 self._note_light(sighting.seer, sighting.seen, sighting, is_seen=True)
                 self._note_light(sighting.seen, sighting.seer, sighting, is_seen=False)
 
-    def _note_light(self, lost: Visit, other: Visit, sighting: Sighting, *, is_seen: bool) -> None:
+    def _note_light(self, lost: Visit, other: Visit, sighting: LightBetween, *, is_seen: bool) -> None:
         """Note a light that a robot that is searched sees of a located one, or the other way around."""
         track, other_track = self._tracks.get(lost.robot), self._tracks.get(other.robot)
         tested = other_track is not None and other_track.search is not None

@@ -60,14 +60,10 @@ class Search:
     pause_s: float  # How long it was not heard
     poses: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 3)))  # (h, k, 3)
     fits: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # (h, k) share of beams that fit
-    known: FloatArray = field(
-        default_factory=lambda: np.zeros((0, 0))
-    )  # (h, k) of which the map says anything
+    known: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # (h, k) of which the map tells
     lit: FloatArray = field(default_factory=lambda: np.zeros(0))  # (h,) number of lights that fit
     stops: list[ScanStop] = field(default_factory=list)  # (k,)
-    since: FloatArray = field(
-        default_factory=lambda: np.zeros(3)
-    )  # (3,) motion since arrival at the last one
+    since: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,) motion since the last arrival
     left: FloatArray | None = None  # (3,) odometry then
     path: float = 0.0  # Length of the drives since the restart [m]
     lights: list[Light] = field(default_factory=list)  # That are not in `lit` yet
@@ -83,7 +79,7 @@ class Search:
 
         Returns whether its scan is a whole one; of others only the motion is used.
         """
-        away = math.inf if not self.stops else self._move(stop, ratio)
+        away = self._move(stop, ratio)
         self.left = stop.arrival if stop.reach else stop.departure
         turned = 0.0 if stop.reach else ratio * float(stop.turn[-1])
         is_whole = stop.reach > 0.0 or stop.turned > 2.0 * math.pi
@@ -95,12 +91,8 @@ class Search:
             else:
                 predicted = compose(self.poses[:, -1], self.since)
                 if away < _NEW_PLACE:  # the same place: its newest scan counts
-                    self.poses, self.fits, self.known = (
-                        self.poses[:, :-1],
-                        self.fits[:, :-1],
-                        self.known[:, :-1],
-                    )
-                    self.stops.pop()
+                    self.poses, self.fits = self.poses[:, :-1], self.fits[:, :-1]
+                    self.known, self.stops = self.known[:, :-1], self.stops[:-1]
                 self._append(view, predicted)
             self.stops.append(stop)
             self.since = np.zeros(3)
@@ -153,9 +145,7 @@ class Search:
     def _begin(self, view: _View, occupancy: OccupancyMap) -> None:
         """Try all places that the robot may have reached unheard."""
         step = max(1, round(_STEP / occupancy.cell))
-        places = (
-            occupancy.corner + (np.argwhere(occupancy.free[::step, ::step]) * step + 0.5) * occupancy.cell
-        )
+        places = view.places(step * np.argwhere(occupancy.free[::step, ::step]).astype(float) + 0.5)
         shift, turn = _SHIFT + RATES * (self.pause_s + self.path / RATES[0])
         places = places[np.hypot(*(places - self.near[:2]).T) < shift]
         headings = np.arange(0.0, 2.0 * math.pi, _TURN_STEP)
@@ -163,9 +153,8 @@ class Search:
         scores = _score_places(view.score, view.walls, view.cells(places), headings)
         # the best ones, each apart from all better ones
         poses = np.column_stack([np.repeat(places, len(headings), axis=0), np.tile(headings, len(places))])
-        order = np.argsort(-scores.ravel(), kind="stable")
+        poses = poses[np.argsort(-scores.ravel(), kind="stable")]
         chosen: list[FloatArray] = []
-        poses = poses[order]
         while len(poses) and len(chosen) < _HYPOTHESES:
             chosen.append(poses[0])
             poses = poses[_apart(poses[0], poses)]
@@ -293,11 +282,8 @@ def _align(score: FloatArray, walls: FloatArray, poses: FloatArray, step: float)
         for a in range(-_FINE_STEPS, _FINE_STEPS + 1):
             for b in range(-_FINE_STEPS, _FINE_STEPS + 1):
                 for c in range(-_FINE_STEPS, _FINE_STEPS + 1):
-                    x, y, heading = (
-                        poses[h, 0] + a * step,
-                        poses[h, 1] + b * step,
-                        poses[h, 2] + c * _FINE_TURN,
-                    )
+                    x, y = poses[h, 0] + a * step, poses[h, 1] + b * step
+                    heading = poses[h, 2] + c * _FINE_TURN
                     value = _mean_score(score, walls, x, y, heading)
                     if value > best:
                         best = value
