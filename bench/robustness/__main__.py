@@ -1,4 +1,4 @@
-"""Robustness: drivers of all protocols under corrupted bytes, and odometry with wrong stamps.
+"""Robustness: corrupted bytes, wrong stamps, full disks, signals at any time, too much load, clocks.
 
 `protocols` runs drivers in simulated time, with robots whose bytes are lost, doubled, swapped, flipped or
 inserted (.01 to 10 %), shuffled, flooded or replaced for some seconds. A thread is dead when it ends or never
@@ -7,16 +7,23 @@ answers makes sense.
 
 `stamps` runs five simulated e-pucks with stamps that jitter by 5 to 90 % of the period, or are early, late or
 repeated now and then.
+
+`files` runs each command that writes files where the disk fills up, is full or is read-only, and where links,
+folders and files are in the way; `kills` interrupts and kills commands at random instants. Both count faults.
+
+`load` runs fifty robots at three times the load that fits, over DDS and in real time, see `load.py`.
+
+`time` lets clocks jump, stops processes for a while and loops a bag, see `clocks.py`.
 """
 
 from __future__ import annotations
 
 import argparse
 
-from bench.robustness import protocols, stamps
+from bench.robustness import clocks, files, kills, load, protocols, stamps
 from bench.shared.common import ProgressLine, table, write_figures
 
-_PARTS = ("stamps", "protocols")
+_PARTS = ("stamps", "protocols", "files", "kills", "load", "time")
 
 
 def main() -> None:
@@ -24,6 +31,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--streams", type=int, default=10_000, help="corrupted streams of each protocol")
     parser.add_argument("--seeds", type=int, default=5, help="runs with wrong stamps of each kind")
+    parser.add_argument("--cuts", type=int, default=20, help="full disks of each command")
+    parser.add_argument("--kills", type=int, default=10, help="signals of each kind to each command")
+    parser.add_argument("--minutes", type=float, default=10.0, help="at three times the load that fits")
+    parser.add_argument("--image-rate", type=float, default=0.0, help="load instead of three times that [Hz]")
+    parser.add_argument("--loops", type=int, default=20, help="of a bag")
     parser.add_argument("--parts", nargs="+", choices=_PARTS, default=[*_PARTS])
     arguments = parser.parse_args()
     figures: dict[str, float] = {}
@@ -31,6 +43,14 @@ def main() -> None:
         figures |= stamps.measure(arguments.seeds, ProgressLine("stamps"))
     if "protocols" in arguments.parts:
         figures |= protocols.measure(arguments.streams, ProgressLine("protocols"))
+    if "files" in arguments.parts:
+        figures |= files.measure(arguments.cuts, ProgressLine("files"))
+    if "kills" in arguments.parts:
+        figures |= kills.measure(arguments.kills, ProgressLine("kills"))
+    if "load" in arguments.parts:
+        figures |= load.measure(arguments.minutes, ProgressLine("load"), arguments.image_rate)
+    if "time" in arguments.parts:
+        figures |= clocks.measure(arguments.loops, ProgressLine("time"))
     print()
     print(table(("figure", "value"), list(figures.items())))
     print(write_figures("robustness", figures))

@@ -188,7 +188,12 @@ def describe(rng: np.random.Generator, start: FloatArray, places: FloatArray) ->
 
 
 def observe_neighbours(
-    rng: np.random.Generator, swarm: Swarm, truth: Trajectories, exposures: Exposures, shape: Shape
+    rng: np.random.Generator,
+    swarm: Swarm,
+    truth: Trajectories,
+    exposures: Exposures,
+    shape: Shape,
+    view: View = VIEW,
 ) -> tuple[Records, Records]:
     """What the images show: frames of FRAME_DTYPE in order of arrival, and their sightings."""
     robot, stamp_ns = exposures
@@ -196,11 +201,10 @@ def observe_neighbours(
     landmarks = np.array([[mark.x, mark.y, mark.yaw] for mark in swarm.landmarks], dtype=float)
     ids = np.array([robot.faces[0].id for robot in swarm.robots] + [mark.id for mark in swarm.landmarks])
     if shape.wanders:
-        candidates = _passing(robot, stamp_ns, truth, landmarks[:, :2])
+        candidates = _passing(robot, stamp_ns, truth, landmarks[:, :2], view)
     else:
-        candidates = _candidates(shape.homes(count), landmarks[:, :2], VIEW.farthest + 4.0 * HOME_RADIUS)[
-            robot
-        ]
+        reach = view.farthest + 4.0 * HOME_RADIUS
+        candidates = _candidates(shape.homes(count), landmarks[:, :2], reach)[robot]
     if shape.one_sees:
         candidates[(candidates >= count) & (robot > 0)[:, None]] = -1
     frame, slot = np.nonzero(candidates >= 0)
@@ -209,7 +213,7 @@ def observe_neighbours(
     moving = target < count
     target_pose[moving] = truth.at(target[moving], stamp_ns[frame[moving]])
     exact = se2.between(truth.at(robot, stamp_ns)[frame], target_pose)
-    seen = VIEW.sees(exact)
+    seen = view.sees(exact)
     sigma = np.array([SENSOR.forward_sigma, SENSOR.left_sigma, SENSOR.heading_sigma])
     value = exact[seen] + sigma * rng.standard_normal((int(seen.sum()), 3))
     value[:, 2] = se2.wrap_angle(value[:, 2])
@@ -220,11 +224,15 @@ def observe_neighbours(
 
 
 def _passing(
-    robot: NDArray[np.int64], stamp_ns: NDArray[np.int64], truth: Trajectories, landmarks: FloatArray
+    robot: NDArray[np.int64],
+    stamp_ns: NDArray[np.int64],
+    truth: Trajectories,
+    landmarks: FloatArray,
+    view: View,
 ) -> NDArray[np.int64]:
     """Targets that may come into view in each image (E, C), as `_candidates`."""
     part = (stamp_ns - truth.stamp_ns[0]) // _NEAR_FOR_NS
-    reach = VIEW.farthest + ROAMING_SPEED[1] * _NEAR_FOR_NS * 1e-9
+    reach = view.farthest + ROAMING_SPEED[1] * _NEAR_FOR_NS * 1e-9
     tables = {}
     for which in np.unique(part).tolist():
         middle_ns = int(truth.stamp_ns[0]) + which * _NEAR_FOR_NS + _NEAR_FOR_NS // 2

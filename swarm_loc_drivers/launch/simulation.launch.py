@@ -7,8 +7,8 @@ from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction
 from launch_ros.actions import Node
 
-from swarm_loc_drivers.sim.link_host import link_folder
 from swarm_loc_drivers.sim.simulation import ROBOT_TYPES, SimulationOptions, graph_of, simulated_swarm
+from swarm_loc_estimator.common.files import temporary_folder
 from swarm_loc_estimator.common.launch import argument_texts, node_action, options_from
 
 
@@ -40,6 +40,6 @@ def start_nodes(context: LaunchContext) -> list[Node]:
     options = options_from(SimulationOptions, argument_texts(context, SimulationOptions))
     swarm = simulated_swarm(options)
     stack = ExitStack()
-    links = stack.enter_context(link_folder())
+    links = str(stack.enter_context(temporary_folder("swarm_loc-")))
     atexit.register(stack.close)  # when the last process has ended
     return [node_action(spec) for spec in graph_of(options, swarm, links)]

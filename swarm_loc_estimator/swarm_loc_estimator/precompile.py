@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ProcessPoolExecutor, wait
+from concurrent.futures import wait
 from dataclasses import replace
 from functools import partial
-from multiprocessing import get_context
 from typing import Literal
 
 import numpy as np
@@ -19,6 +18,7 @@ from swarm_loc_estimator.common.messages.detections import (
 )
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
+from swarm_loc_estimator.common.processes import process_beside, uninterrupted
 from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS
 from swarm_loc_estimator.filter.sources import is_kidnapped
 from swarm_loc_estimator.filter.state import SwarmState
@@ -66,8 +66,9 @@ def precompile(size: Size, infrared: bool) -> None:
     """
     compiled = partial(precompile, size, infrared)
     if not is_precompiled(compiled):
-        with ProcessPoolExecutor(1, get_context("spawn")) as beside:
-            updates = beside.submit(_compile_updates)
+        with process_beside() as beside:
+            with uninterrupted():
+                updates = beside.submit(_compile_updates)
             _run(Settings(), infrared=False, fused=False)
             if infrared:
                 precompile_infrared()

@@ -16,6 +16,7 @@ Droplets share, such as their model and their noise, is set once for all of them
 from __future__ import annotations
 
 from array import array
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,7 @@ from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
 from swarm_loc_drivers.common.ros_messages import stamp_message
 from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners
 from swarm_loc_drivers.droplet.exchange import Brightness
-from swarm_loc_drivers.droplet.parameters import DropletFleetParameters, DropletParameters
+from swarm_loc_drivers.droplet.parameters import DropletFleetParameters, DropletParameters, DropletTraits
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop, run_node, spin
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -120,7 +121,7 @@ class DropletFleetNode(ConfiguredNode[DropletFleetParameters]):
         self._drivers: list[DropletDriverNode] = []
         for turn in range(part, len(names), parts):
             own = {
-                **parameters.traits,
+                **{one.name: getattr(parameters, one.name) for one in fields(DropletTraits)},
                 "address": str(Path(parameters.link_folder) / names[turn]),
                 "turns": len(names),
                 "turn": turn,

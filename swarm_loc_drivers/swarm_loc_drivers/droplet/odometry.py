@@ -41,10 +41,6 @@ class _Move:
     def end_ns(self) -> int:
         return self.begin_ns + round(self.steps * self.gait.step_s * _NS)
 
-    def steps_left(self, stamp_ns: int) -> float:
-        """Number of remaining steps."""
-        return min(max(0.0, (self.end_ns - stamp_ns) / (_NS * self.gait.step_s)), self.steps)
-
 
 class CommandedMotion:
     """Integrates commands to a pose, with the noise of the motion."""
@@ -78,7 +74,8 @@ class CommandedMotion:
         self._advance(stamp_ns)
         self._settle()
         if move is not None:
-            rest = self._way(move.gait, move.steps_left(stamp_ns))
+            left = min(max(0.0, (move.end_ns - stamp_ns) / (_NS * move.gait.step_s)), move.steps)
+            rest = self._way(move.gait, left)
             self._covariance = self._covariance + doubt * np.outer(rest, rest)
         self._move = None
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 from swarm_loc_drivers.droplet.exchange import PollingSettings
 from swarm_loc_drivers.droplet.hardware import DROPLET_MODELS, ELEMENTS, FULL_POWER
 from swarm_loc_drivers.droplet.odometry import MotionNoise
 from swarm_loc_drivers.droplet.session import SessionSettings
 from swarm_loc_drivers.droplet.tdma import MIN_TURN_S, TdmaSettings
-from swarm_loc_estimator.common.parameters import ParameterError, Value, choice, flag, number, text, texts
+from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text, texts
 
 _ID = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})")
 _RELAYED = re.compile(r"([A-Za-z]\w*)=(.*)")
@@ -133,11 +133,6 @@ class DropletFleetParameters(DropletTraits):
     link_folder: str = text("", "where each robot's serial port lies under its name", required=True)
     part: int = number(0, "1", 0, 999, "of the table's parts, each in a process of its own, this one")
     parts: int = number(1, "1", 1, 1000, "how many parts there are")
-
-    @property
-    def traits(self) -> dict[str, Value]:
-        """Parameters for the driver of every robot."""
-        return {one.name: getattr(self, one.name) for one in fields(DropletTraits)}
 
 
 def _id(parameter: str, value: str) -> int:

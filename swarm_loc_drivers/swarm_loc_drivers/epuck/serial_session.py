@@ -94,11 +94,6 @@ def _request(left: int, right: int, letters: str, size: int) -> Request:
     return Request(queries, _SPEEDS.pack(left, right), size)
 
 
-def camera_setting(width: int, height: int, zoom: int) -> bytes:
-    """The line that sets the camera to RGB565; the robot answers `ASCII_CAMERA_SET`, even when it refuses."""
-    return f"J,{RGB565_MODE},{width},{height},{zoom}\r".encode()
-
-
 def decode_readings(body: bytes) -> Readings:
     """Decode a reply to `readings_request`."""
     left, right, *proximity = _READINGS.unpack(body)
@@ -140,6 +135,7 @@ class ReplyParser:
 
 
 _TRIES = 5  # Tries of a request
+_JITTER_NS = 50_000_000  # Allowed jitter of half the time between request and reply [ns]
 _SLACK_S, _ROUNDING_STEPS = 0.1, 2  # Uncertainty of the time between two readings, and of counters
 _NS = 1_000_000_000
 
@@ -208,16 +204,22 @@ class SerialSession(TalkSession):
             yield from self._resync()
 
     def _read(self, speeds: tuple[int, int]) -> Talk[bool]:
-        """Read counters and proximity; the stamp is the middle between request and reply."""
+        """Read counters and proximity; the stamp is the middle between request and reply.
+
+        A reply that is far later than the one before is not used: this process was stopped meanwhile.
+        """
         asked_ns = self._now_ns
         body = yield from self._ask(readings_request(*speeds, is_new=speeds != self._sent))
         if body is None:
             return False
-        self._way_ns = max(0, self._now_ns - asked_ns) // 2
+        way_ns = max(0, self._now_ns - asked_ns) // 2
+        is_late = way_ns > (most_ns := 2 * self._way_ns + _JITTER_NS)
+        self._way_ns = min(way_ns, most_ns)
         left, right, proximity = decode_readings(body)
         stamp_ns, sensors = asked_ns + self._way_ns, np.array(proximity, dtype=np.int64)
         reading = Reading(stamp_ns, self._way_ns, left, right, sensors)
-        self.found.append(reading)
+        if not is_late:
+            self.found.append(reading)
         self._may_have_moved |= any(self._sent) or any(speeds)
         if self._sense is None or self._can_follow(self._sense, reading):
             self._sense, self._sense_s, self._may_have_moved = reading, self._steady_s, False
@@ -277,8 +279,8 @@ class SerialSession(TalkSession):
 
     def _set_camera(self, camera: CameraSettings) -> Talk[None]:
         """Set the size of images, and check that the robot has accepted it."""
-        setting = camera_setting(camera.width, camera.height, camera.zoom)
-        yield from self._answer(setting, ASCII_CAMERA_SET)
+        setting = f"J,{RGB565_MODE},{camera.width},{camera.height},{camera.zoom}\r".encode()
+        yield from self._answer(setting, ASCII_CAMERA_SET)  # the answer even when it refuses
         answer = yield from self._answer(ASCII_CAMERA_QUERY, ASCII_CAMERA_REPLY)
         wanted = (RGB565_MODE, camera.width, camera.height, camera.zoom)
         taken = tuple(int(number) for number in answer.groups()[:4])

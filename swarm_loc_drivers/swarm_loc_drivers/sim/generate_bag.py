@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
@@ -33,7 +32,7 @@ from swarm_loc_drivers.sim.scenarios.bags import (
 from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, simulate_droplets
 from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight, simulate_eight_images
 from swarm_loc_drivers.sim.worlds import WORLDS
-from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
+from swarm_loc_estimator.common.command_line import bag_to_write, command_parser, exit_with_message, number_in
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -133,7 +132,7 @@ def _swarm(
 ) -> argparse.ArgumentParser:
     """Add a sub-command with the options of all swarms, which have at most `most` robots."""
     parser = swarms.add_parser(name, help=text, description=text)
-    parser.add_argument("bag", type=Path, help="bag folder to create")
+    parser.add_argument("bag", type=bag_to_write, help="bag folder to create")
     parser.add_argument("--seed", type=_ANY_SEED, default=1, help="the same seed gives the same bag")
     parser.add_argument(
         "--duration", type=number_in(2.0, 3600.0, "s"), default=seconds, help="simulated time [s]"

@@ -1,7 +1,6 @@
-"""Pseudo-terminals and TCP ports at which emulated firmware answers, and a temporary folder for their names.
+"""Pseudo-terminals and TCP ports at which emulated firmware answers.
 
-Everything happens in the thread that calls `poll`, so a world that steps its bodies there needs no locks. The
-folder is removed even after a kill.
+Everything happens in the thread that calls `poll`, so a world that steps its bodies there needs no locks.
 """
 
 from __future__ import annotations
@@ -11,57 +10,12 @@ import fcntl
 import os
 import pty
 import selectors
-import shutil
 import socket
-import tempfile
 import tty
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Protocol
 
 from typing_extensions import Self
-
-_PREFIX = "swarm_loc-"
-
-
-@contextmanager
-def link_folder() -> Iterator[str]:
-    """Create a folder and remove it at the end; also remove those that killed processes have left."""
-    for folder in Path(tempfile.gettempdir()).glob(f"{_PREFIX}*"):
-        if (lock := _lock(folder)) is not None:
-            _remove(folder, lock)
-    while (lock := _lock(folder := Path(tempfile.mkdtemp(prefix=_PREFIX)))) is None:
-        pass  # another process that cleans up has locked it
-    try:
-        yield str(folder)
-    finally:
-        _remove(folder, lock)
-
-
-def _lock(folder: Path) -> int | None:
-    """Lock a folder until this process ends; the handle of the lock.
-
-    None if another process holds the lock, or if this user has no such folder.
-    """
-    try:
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    except OSError:
-        return None
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if folder.stat().st_uid == os.getuid():
-            return handle
-    except OSError:
-        pass
-    os.close(handle)
-    return None
-
-
-def _remove(folder: Path, lock: int) -> None:
-    shutil.rmtree(folder, ignore_errors=True)
-    os.close(lock)
-
 
 _CHUNK = 4096
 _MAX_CLIENTS = 9

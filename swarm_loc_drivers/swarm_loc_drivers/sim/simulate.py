@@ -15,7 +15,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from swarm_loc_drivers.sim.link_host import link_folder
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
 from swarm_loc_drivers.sim.simulation import (
     ROBOT_TYPES,
@@ -25,6 +24,7 @@ from swarm_loc_drivers.sim.simulation import (
     simulated_swarm,
 )
 from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
+from swarm_loc_estimator.common.files import temporary_folder
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.launch import print_line, run_graph
 from swarm_loc_estimator.common.parameters import number_specs
@@ -77,8 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if detects and not is_precompiled(precompile):  # once here instead of in every detector
         print_line("compiling the marker detector for this machine: about half a minute")
         precompile()
-    with link_folder() as links:
-        return run_graph(graph_of(options, swarm, links))
+    with temporary_folder("swarm_loc-") as links:
+        return run_graph(graph_of(options, swarm, str(links)))
 
 
 if __name__ == "__main__":

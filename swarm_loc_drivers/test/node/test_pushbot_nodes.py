@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-from geometry_msgs.msg import PoseStamped, Twist, Vector3
-from nav_msgs.msg import Odometry
-from node_world import Program, Ros, stamp_ns
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped, Twist, Vector3
+from nav_msgs.msg import OccupancyGrid, Odometry
+from node_world import Program, Ros, stamp_ns, values_of
 from rclpy.parameter import Parameter
 from rclpy.qos import qos_profile_sensor_data
 from test_world_node import free_ports
@@ -26,6 +26,7 @@ from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import FOCAL_PX
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldParameters
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
+from swarm_loc_estimator.common.launch import NodeSpec
 from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS
 from swarm_loc_estimator.common.node import message_class
 from swarm_loc_msgs.msg import LaserDistance, LightBearingArray, SwarmPose, SwarmPoses
@@ -274,6 +275,63 @@ def test_a_simulated_swarm_maps_its_hall_and_is_tracked(ros: Ros, tmp_path: Path
     assert abs(known[:, 0].mean() - 1.6) < 3.0 * known[:, 1].mean()
     truth = min(truths, key=lambda one: abs(stamp_ns(one) - pose_ns)).pose.position  # it may be driving
     assert math.hypot(pose.x - truth.x, pose.y - truth.y) < 0.1
+
+
+@pytest.mark.timeout(600)  # two minutes of the simulation, however slow the machine
+def test_a_robot_whose_driver_is_killed_while_it_maps_is_lost_until_its_scans_tell_where_it_is(
+    ros: Ros, tmp_path: Path
+) -> None:
+    swarm = tmp_path / "swarm.yaml"
+    swarm.write_text(SIMULATED, encoding="utf-8")
+    options = SimulationOptions(str(swarm), seed=5, rate=2.0)
+    truths: list[PoseStamped] = ros.listen(PoseStamped, "a/ground_truth")
+    fixes: list[PoseWithCovarianceStamped] = ros.listen(PoseWithCovarianceStamped, "a/fix")
+    goals: list[PoseStamped] = ros.listen(PoseStamped, "a/goal")
+    maps: list[OccupancyGrid] = ros.listen(OccupancyGrid, "map")
+    diagnostics: list[DiagnosticArray] = ros.listen(DiagnosticArray, "/diagnostics")
+
+    def counted(name: str) -> int:
+        """A counter of the mapper."""
+        found = [one for array in diagnostics for one in array.status if one.name == "mapper"]
+        return int(values_of(found[-1])[name]) if found else 0
+
+    def has_driven(since: int) -> bool:
+        """Whether the robot has left the place where it was when there were so many true poses."""
+        there = truths[since - 1].pose.position
+        return way_from(there.x, there.y, truths[-1]) > 0.1
+
+    with ExitStack() as running:
+
+        def start(spec: NodeSpec) -> Program:
+            log = tmp_path / f"{spec.name}.log"
+            return running.enter_context(
+                Program(spec.executable, log, {}, spec.ros_arguments()[1:], spec.package)
+            )
+
+        specs = graph_of(options, simulated_swarm(options), str(tmp_path))
+        programs = {spec.executable: (spec, start(spec)) for spec in specs}
+        ros.until(lambda: len(goals) > 1, patience_s=240.0)
+        since = len(truths)
+        ros.until(lambda: has_driven(since))
+        spec, driver = programs["pushbot_driver_node"]
+        driver.end(signal.SIGKILL)
+        known = len(fixes)
+        start(spec)
+        ros.until(lambda: counted("odometry_restarts"), patience_s=60.0)
+        stops, cells = counted("stops"), maps[-1].data
+        # one scan never tells where it is, and more of them may not in so small a map
+        for scans in (1, 2, 3):
+            ros.until(lambda: counted("scans_not_located") >= scans or len(fixes) > known, patience_s=240.0)  # noqa: B023
+            if len(fixes) > known:
+                break
+            assert counted("stops") == stops
+            assert maps[-1].data == cells
+        assert counted("scans_not_located") > 0
+        ros.until(lambda: stamp_ns(truths[-1]) >= stamp_ns(fixes[-1]))
+    for fix in fixes[known:]:
+        truth = min(truths, key=lambda one: abs(stamp_ns(one) - stamp_ns(fix)))
+        place = fix.pose.pose.position
+        assert way_from(place.x, place.y, truth) < 0.1
 
 
 def test_a_laser_is_calibrated_by_a_drive_at_a_wall(ros: Ros, tmp_path: Path, swarm_file: Path) -> None:

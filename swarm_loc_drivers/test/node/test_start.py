@@ -42,7 +42,7 @@ def _executables() -> list[tuple[str, str]]:
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 @pytest.mark.parametrize(("package", "name"), _executables())
-def test_a_signal_during_the_imports_ends_an_executable_quietly(
+def test_a_signal_during_the_imports_ends_an_executable_with_a_sentence(
     tmp_path: Path, package: str, name: str, number: signal.Signals
 ) -> None:
     (tmp_path / "sitecustomize.py").write_text(HELD, encoding="utf-8")
@@ -58,4 +58,5 @@ def test_a_signal_during_the_imports_ends_an_executable_quietly(
         assert process.stdout.read(7) == b"imports"
         process.send_signal(number)
         output, errors = process.communicate(timeout=60)
-    assert (process.returncode, output, errors) == (128 + number, b"", b"")
+    said = f"Stopped by {number.name}.\n".encode()
+    assert (process.returncode, output, errors) == (128 + number, b"", said)

@@ -61,15 +61,26 @@ def test_walls_come_from_a_file(tmp_path: Path, name: str) -> None:
     assert plan.starts.tolist() == [[1.0, 1.0]]
 
 
-@pytest.mark.parametrize("ending", ["png", "pgm"])
-def test_walls_come_from_a_map(tmp_path: Path, ending: str) -> None:
+@pytest.mark.parametrize(
+    ("ending", "text"),
+    [
+        ("png", MAP),
+        ("pgm", MAP),
+        ("png", "\n".join(MAP.splitlines()[:4])),
+        ("png", MAP + "mode: scale\n"),
+        ("png", MAP + "mode: raw\n"),
+    ],
+)
+def test_walls_come_from_a_map(tmp_path: Path, ending: str, text: str) -> None:
     """A room of 40 x 20 pixels with a block in it; its first row is the uppermost."""
     pixels = np.full((20, 40), 254, np.uint8)
     pixels[[0, -1], :], pixels[:, [0, -1]] = 0, 0
     pixels[4:8, 30:34] = 0
     pixels[10, 10] = 205
+    if "raw" in text:  # percent
+        pixels = np.where(pixels == 0, 100, 0).astype(np.uint8)
     cv2.imwrite(str(tmp_path / f"room.{ending}"), pixels)
-    plan = floor_plan(written(tmp_path, MAP.replace("png", ending)))
+    plan = floor_plan(written(tmp_path, text.replace("png", ending)))
     assert len(plan.walls) == 8
     x, y = -1.013, -0.5
     assert free_way(plan, x + 0.5, y + 0.3, 0.0) == pytest.approx(1.95 - 0.5)
@@ -100,12 +111,12 @@ def test_the_hall_ends_where_a_map_ends(tmp_path: Path) -> None:
         (f"free: {[[0, k, 1, k + 1] for k in range(201)]}", "free has 201 rectangles but may have 200"),
         ("[1, 2]", "must be a mapping"),
         ("free: [", "is not YAML"),
-        ("image: room.png", "lacks resolution"),
+        ("image: room.png", "lacks origin"),
         (MAP.replace("0.05", "0"), "resolution is 0 but must lie in"),
         (MAP.replace("0.0]", "1.0e-5]"), "origin is .* but must be x, y and a yaw of 0"),
-        (MAP + "mode: raw", "mode must be trinary or scale"),
+        (MAP + "mode: shaded", "mode is 'shaded' but must be one of trinary, scale, raw"),
         (MAP, "room.png cannot be read"),
-        (MAP.replace("room.png", "plan.yaml"), "image is 'plan.yaml' but is no image that can be decoded"),
+        (MAP.replace("room.png", "plan.yaml"), "The image '.*plan.yaml' of a map cannot be decoded"),
     ],
 )
 def test_a_file_that_cannot_be_used_is_named_in_one_sentence(

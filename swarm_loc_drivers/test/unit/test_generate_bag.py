@@ -77,8 +77,9 @@ def test_the_same_arguments_give_the_same_bytes(bag: Path, tmp_path: Path) -> No
 
 
 def test_an_existing_bag_is_not_overwritten(bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["eight", str(bag)]) == 1
-    assert str(bag) in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["eight", str(bag)])
+    assert f"{bag} exists already" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

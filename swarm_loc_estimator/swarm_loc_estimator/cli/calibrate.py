@@ -25,7 +25,7 @@ from swarm_loc_estimator.common.command_line import (
     exit_with_message,
     number_in,
     swarm_beside,
-    yaml_to_write,
+    yaml_and_picture,
 )
 from swarm_loc_estimator.offline.calibration.fit import EVALUATIONS, Options, calibrate
 from swarm_loc_estimator.offline.calibration.plots import draw, text_of
@@ -67,7 +67,7 @@ def _parser() -> argparse.ArgumentParser:
     add_bag(parser, " with <robot>/ground_truth, with --truth or --self")
     add_remap(parser)
     add_truth(parser)
-    parser.add_argument("--out", type=yaml_to_write, required=True, help="swarm description to write")
+    parser.add_argument("--out", type=yaml_and_picture, required=True, help="swarm description to write")
     parser.add_argument("--self", dest="alone", action="store_true", help="use no ground truth")
     parser.add_argument("--plain", action="store_true", help="fit only noise, calibrate nothing")
     parser.add_argument(

@@ -22,7 +22,7 @@ from swarm_loc_estimator.common.command_line import (
     command_parser,
     exit_with_message,
     swarm_beside,
-    yaml_to_write,
+    yaml_and_picture,
 )
 from swarm_loc_estimator.offline.calibration.infrared.board import calibrate_from, with_board
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
@@ -69,13 +69,13 @@ def _parser() -> argparse.ArgumentParser:
     add_remap(parser)
     parser.add_argument(
         "--out",
-        type=yaml_to_write,
+        type=yaml_and_picture,
         default="out/calibrated_ir.yaml",
         help="swarm description to write (default out/calibrated_ir.yaml)",
     )
     parser.add_argument(
         "--board",
-        type=yaml_to_write,
+        type=yaml_and_picture,
         help="find what the board itself is, by ground truth, and write it to this file",
     )
     parser.add_argument("--without-truth", action="store_true", help="do as if there were no ground truth")

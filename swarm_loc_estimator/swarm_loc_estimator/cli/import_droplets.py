@@ -13,7 +13,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarm_loc_estimator.common.command_line import ProgressLine, command_parser, exit_with_message, number_in
+from swarm_loc_estimator.common.command_line import (
+    ProgressLine,
+    bag_to_write,
+    command_parser,
+    exit_with_message,
+    number_in,
+)
 from swarm_loc_estimator.offline.datasets.droplets import (
     METRES_PER_PIXEL,
     ImportSettings,
@@ -27,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     parser = command_parser(__doc__)
     parser.add_argument("recording", type=Path, help="text file, one exchange a line")
-    parser.add_argument("bag", type=Path, help="bag folder to create")
+    parser.add_argument("bag", type=bag_to_write, help="bag folder to create")
     parser.add_argument(
         "--platform", default="droplet_2016", help="board of the robots (default droplet_2016)"
     )

@@ -12,7 +12,12 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from swarm_loc_estimator.common.command_line import ProgressLine, command_parser, exit_with_message
+from swarm_loc_estimator.common.command_line import (
+    ProgressLine,
+    bag_to_write,
+    command_parser,
+    exit_with_message,
+)
 from swarm_loc_estimator.offline.datasets.mrclam import Delay, convert, read_dataset
 
 if TYPE_CHECKING:
@@ -24,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns its exit status."""
     parser = command_parser(__doc__)
     parser.add_argument("folder", type=Path, help="folder with Robot*_Odometry.dat and the other files")
-    parser.add_argument("bag", type=Path, help="bag folder to create")
+    parser.add_argument("bag", type=bag_to_write, help="bag folder to create")
     parser.add_argument(
         "--delay-ms",
         nargs=3,

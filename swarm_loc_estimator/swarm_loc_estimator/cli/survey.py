@@ -25,7 +25,7 @@ from swarm_loc_estimator.common.command_line import (
     described,
     exit_with_message,
     is_live,
-    yaml_to_write,
+    yaml_and_picture,
 )
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.doctor.evidence import Evidence
@@ -85,7 +85,7 @@ def _heard(evidence: Evidence) -> Recording:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(__doc__)
     add_live_or_bag(parser, f"how long to listen to a live graph (default: {_LIVE_S:g} s, or until Ctrl-C)")
-    parser.add_argument("--out", type=yaml_to_write, required=True, help="swarm description to write")
+    parser.add_argument("--out", type=yaml_and_picture, required=True, help="swarm description to write")
     parser.add_argument(
         "--all", action="store_true", help="survey landmarks, anchors and cameras that are described, too"
     )

@@ -31,7 +31,6 @@ Arguments = ParamSpec("Arguments")
 Parameters = TypeVar("Parameters")
 Number = TypeVar("Number", int, float)
 
-_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _INTERRUPTED = 130  # Exit status of a program that SIGINT has ended, as shells count
 _REDRAW_S = 0.1
 _WIDTH = 30
@@ -45,8 +44,9 @@ _FOR_BAGS = ("lz4", "mcap", "rosbags", "zstandard")
 class Program:
     """An entry point that imports a module only when it is called, and then runs its function.
 
-    A signal during the import ends the process with status 128 + n and without a traceback, a missing package
-    of others with one sentence and status 1.
+    SIGINT, and SIGTERM during the import, end it at once with status 128 + n and without a traceback: else
+    an exception might be swallowed where a compiler has called back. Some programs set other handlers. A
+    missing package of others is one sentence and status 1.
     """
 
     module: str  # Full name of the module
@@ -55,18 +55,26 @@ class Program:
 
     def __call__(self) -> int:
         """Run the program; returns its exit status."""
-        handlers = {number: signal.signal(number, lambda n, _: os._exit(128 + n)) for number in _SIGNALS}
+        signal.signal(signal.SIGINT, _leave)
+        before = signal.signal(signal.SIGTERM, _leave)
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # see `launch.start`
         try:
             main: Callable[[], int] = getattr(import_module(self.module), self.function)
-            for number, handler in handlers.items():
-                signal.signal(number, handler)
-            return main()
+            signal.signal(signal.SIGTERM, before)
+            status = main()
         except ModuleNotFoundError as error:
             missing = (error.name or "").partition(".")[0]
             if missing == self.module.partition(".")[0]:
                 raise
             print(f"{Path(sys.argv[0]).name} {_needs(missing)}.", file=sys.stderr)
             return 1
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # all is done, and Python's end gives up handlers
+        return status
+
+
+def _leave(number: int, _frame: object) -> None:
+    os.write(2, f"Stopped by {signal.Signals(number).name}.\n".encode())
+    os._exit(128 + number)
 
 
 def _needs(missing: str) -> str:
@@ -132,20 +140,32 @@ def folder_to_write(*patterns: str) -> Callable[[str], Path]:
     return read
 
 
-def file_to_write(*suffixes: str) -> Callable[[str], Path]:
-    """A type for argparse: a file with one of these suffixes that can be written. Nothing is created yet."""
+def bag_to_write(text: str) -> Path:
+    """A type for argparse: a bag that does not exist, in a folder that can be written."""
+    path = Path(text)
+    if os.path.lexists(path):
+        raise argparse.ArgumentTypeError(f"{path} exists already")
+    return folder_to_write()(str(path.parent)) / path.name
+
+
+def file_to_write(*suffixes: str, picture: str = "") -> Callable[[str], Path]:
+    """A type for argparse: a file with one of these suffixes that can be written. Nothing is created yet.
+
+    A `picture` of the same name and this suffix can be written, too.
+    """
 
     def read(text: str) -> Path:
         path = Path(text)
         if path.suffix not in suffixes:
             raise argparse.ArgumentTypeError(f"'{text}' must end in {' or '.join(suffixes)}")
-        folder_to_write(path.name)(str(path.parent))
+        folder_to_write(path.name, path.with_suffix(picture or path.suffix).name)(str(path.parent))
         return path
 
     return read
 
 
 yaml_to_write = file_to_write(".yaml", ".yml")
+yaml_and_picture = file_to_write(".yaml", ".yml", picture=".png")
 
 
 def add_bag(parser: argparse.ArgumentParser, content: str = "") -> None:

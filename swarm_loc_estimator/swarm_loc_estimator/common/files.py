@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import secrets
 import stat
+import subprocess
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from fnmatch import fnmatch
 from pathlib import Path
 
@@ -15,6 +16,8 @@ from swarm_loc_estimator.common.parameters import UserError
 
 _ROOM_BYTES = 4_000_000
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+_REMOVES = ("/bin/sh", "-c", 'read _; rm -rf -- "$0"')
+"""Removes a folder when its standard input ends, as it does with the process at the other end."""
 
 
 class FileError(UserError):
@@ -32,21 +35,41 @@ def naming(path: Path) -> Iterator[None]:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Path of a new file beside `path`, whose folder is created, to replace it at the end without an error.
+    """Path of a new file on the disk of `path`, whose folder is created, to replace it without an error.
+
+    It has no name until it is whole, so that a kill leaves nothing, but on file systems without such files.
 
     Raises:
         FileError: The file cannot be written, or is a link or no regular file.
     """
     part = path.with_name(f".{secrets.token_hex(8)}.part")  # nobody can put a link there before
-    try:
-        with naming(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
-            check_file(path)
+    with naming(path), ExitStack() as stack:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        check_file(path)
+        stack.callback(part.unlink, missing_ok=True)
+        try:
+            handle = os.open(path.parent, os.O_TMPFILE | os.O_RDWR, 0o666)
+        except OSError:
             yield part
-            part.replace(path)
-    finally:
-        with suppress(OSError):
-            part.unlink()
+        else:
+            stack.callback(os.close, handle)
+            nameless = Path(f"/proc/self/fd/{handle}")
+            yield nameless
+            os.link(nameless, part, src_dir_fd=handle)  # else Python links to the link
+        part.replace(path)
+
+
+@contextmanager
+def temporary_folder(prefix: str = ".", parent: Path | None = None) -> Iterator[Path]:
+    """A new folder of this user, in `parent` or where such are, removed however this process ends."""
+    folder = (parent or Path(tempfile.gettempdir())).absolute() / f"{prefix}{secrets.token_hex(8)}.part"
+    null, pipe = subprocess.DEVNULL, subprocess.PIPE
+    with subprocess.Popen(
+        [*_REMOVES, str(folder)], stdin=pipe, stdout=null, stderr=null, start_new_session=True
+    ):
+        with naming(folder):
+            folder.mkdir(mode=0o700)
+        yield folder
 
 
 def write_whole(path: Path, text: str) -> None:

@@ -14,12 +14,10 @@ import inspect
 import os
 import pickle
 import re
-import shutil
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import cache, partial
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
@@ -32,7 +30,7 @@ from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
 from numba.core.dispatcher import Dispatcher
 
-from swarm_loc_estimator.common.files import FileError, is_private, replacing
+from swarm_loc_estimator.common.files import FileError, is_private, replacing, temporary_folder
 
 Function = TypeVar("Function", bound=Callable[..., object])
 
@@ -361,8 +359,9 @@ def _private_folder(folder: Path) -> Path:
     _say_unsafe(folder)
     root = _HOME
     if folder.parent == root:
-        root = Path(tempfile.mkdtemp(prefix="swarm_loc_estimator_"))
-        atexit.register(shutil.rmtree, root, ignore_errors=True)
+        until_end = ExitStack()
+        root = until_end.enter_context(temporary_folder("swarm_loc_estimator_"))
+        atexit.register(until_end.close)
     os.environ[_ROOTS[0]] = str(root)  # numba reads its settings again when its own variables change
     return _folder()
 

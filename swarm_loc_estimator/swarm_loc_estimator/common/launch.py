@@ -29,13 +29,17 @@ AWAITED_SIGNALS = STOP_SIGNALS | {signal.SIGCHLD}
 _ARGUMENTS = {"parameter_file": "params_file"}
 _TIED_TO_PARENT = """
 import ctypes, os, signal, sys
-signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT, signal.SIGTERM, signal.SIGCHLD})
+signal.pthread_sigmask(signal.SIG_SETMASK, {signal.SIGINT})
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # shells start background jobs with it ignored
 PR_SET_PDEATHSIG = 1
 ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
-os.execv(sys.argv[1], sys.argv[1:])
+if os.getppid() == int(sys.argv[1]):
+    os.execv(sys.argv[2], sys.argv[2:])
 """
-"""Runs in a process before its program; between fork and exec only C code would be safe."""
+"""Runs in a process before its program; between fork and exec only C code would be safe.
+
+The program gets SIGINT when it asks for it, as `Program` does: while Python starts, that is a traceback.
+"""
 
 
 class GraphError(UserError):
@@ -236,7 +240,7 @@ def start(command: Sequence[str], output: IO[bytes] | None = None) -> subprocess
     Its standard output and error go to `output`; None: to those of this process.
     """
     return subprocess.Popen(
-        [sys.executable, "-S", "-c", _TIED_TO_PARENT, *command],
+        [sys.executable, "-S", "-c", _TIED_TO_PARENT, str(os.getpid()), *command],
         stdout=output,
         stderr=output,
         start_new_session=True,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import time
 from collections.abc import Callable
 from contextlib import suppress
@@ -53,6 +54,7 @@ class Listener(Node):
         executor.add_node(self)
         begin_s = time.monotonic()
         looked_s = begin_s - _LOOK_S
+        signal.signal(signal.SIGINT, signal.default_int_handler)
         with suppress(KeyboardInterrupt):
             while (now_s := time.monotonic()) < begin_s + seconds:
                 if now_s - looked_s >= _LOOK_S:

@@ -20,6 +20,7 @@ from swarm_loc_estimator.common.numerics import (
     carry,
     cholesky3,
     composed,
+    factor_numbers,
     moved_by_twist,
     solve3,
     wrap,
@@ -35,10 +36,7 @@ CONSTRAINT_DTYPE = np.dtype(
         ("marker_id", np.int64),
         ("other", np.int64),  # the robot on the other side, or NOBODY
         ("landmark", np.int64),  # the landmark on the other side, or -1
-        (
-            "column",
-            np.int64,
-        ),  # first filter column of the other side's error, -1: it has none; once `refreshed`
+        ("column", np.int64),  # first of the other side's error in the filter, or -1; once `refreshed`
         ("local_x", np.float64),  # point in the track's frame [m]
         ("local_y", np.float64),
         ("local_xx", np.float64),  # its covariance
@@ -428,6 +426,9 @@ def _drifted(constraints: ConstraintArray, track_noise: FloatArray) -> Constrain
         for i in range(3):
             for j in range(3):
                 drift[i, j] = track_noise[i, j] - constraint.track_noise[i, j]
+        if not _is_noise(drift):  # late odometry has replaced a larger noise that was assumed without it
+            assign_matrix(constraint.track_noise, track_noise)
+            continue
         xx, xy, yy = _spread_around(drift, constraint.local_x, constraint.local_y)
         if drift[2, 2] > _ARC:
             constraint.turn_variance += drift[2, 2]
@@ -435,6 +436,18 @@ def _drifted(constraints: ConstraintArray, track_noise: FloatArray) -> Constrain
         constraint.local_xy += xy
         constraint.local_yy += yy
     return out
+
+
+@cached_njit
+def _is_noise(drift: FloatArray) -> bool:
+    """Whether a matrix (3, 3) is positive semidefinite, but for rounding."""
+    work, rounding = drift.copy(), 1e-12
+    for i in range(3):
+        rounding += 1e-9 * abs(drift[i, i])
+    for i in range(3):
+        work[i, i] += rounding
+    first, _, second, _, _, third = factor_numbers(work)
+    return math.isfinite(first + second + third)
 
 
 @cached_njit

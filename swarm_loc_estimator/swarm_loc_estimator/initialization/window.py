@@ -161,6 +161,7 @@ class Problem:
         self._column = np.where(self._other >= 0, 3 * self._other, -1)
         self._column[by_mark] = [state.landmark_column(mark) for mark in marks[by_mark].tolist()]
         self._drift = noise - window.noise
+        self._drift[np.linalg.eigvalsh(self._drift)[:, 0] < -1e-12] = 0.0  # late odometry has replaced noise
         self._link = links(window)
         self.centre = window.track.mean(axis=0)
         self._shared = {

@@ -6,6 +6,7 @@ import math
 from collections import defaultdict, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -257,15 +258,28 @@ _LIGHT_OFFSET = 0.03  # Effective offset of a robot's lights from its centre, av
 _LEAST_SIGMA = math.radians(1.0)
 
 
+LOST = -1  #: In place of a stop in the graph
+
+
 @dataclass(frozen=True)
 class Visit:
     """A robot's stay at a stop."""
 
-    node: int  # Number of its stop in the graph
+    robot: int  # Its number
+    node: int  # Number of its stop in the graph; `LOST`: it is in none
     begin_ns: int  # First reading
     end_ns: int  # Last reading
     stop: ScanStop  # Its readings
     turn_begin: float  # Turn by odometry at which the node begins [rad]
+
+
+class LightBetween(NamedTuple):
+    """A bearing of a light between two stops."""
+
+    seer: Visit  # Of the robot that sees it
+    seen: Visit  # Of the other one
+    turn: float  # Turn by odometry of the robot that sees it, since its node begins [rad]
+    bearing: float  # In the frame of that robot [rad]
 
 
 class LightBook:
@@ -284,9 +298,9 @@ class LightBook:
             self.dropped += len(self._pending) == _MAX_PENDING
             self._pending.append((robot, target, stamp_ns, bearing))
 
-    def note_visit(self, robot: int, visit: Visit) -> None:
+    def note_visit(self, visit: Visit) -> None:
         """Record a stop that a robot has left."""
-        self._visits.setdefault(robot, deque(maxlen=_MAX_VISITS)).append(visit)
+        self._visits.setdefault(visit.robot, deque(maxlen=_MAX_VISITS)).append(visit)
 
     def forget_node(self, node: int) -> None:
         """Remove a node's visits, as when its number is reused for another stop."""
@@ -297,9 +311,9 @@ class LightBook:
         """Mark all stops of a robot until this time as recorded."""
         self._until_ns[robot] = stamp_ns
 
-    def settle(self, graph: PoseGraph) -> None:
-        """Add the bearings with known stops to the graph, one per pair of stops."""
-        found: dict[tuple[int, int], list[tuple[float, float]]] = defaultdict(list)
+    def settle(self, graph: PoseGraph) -> list[LightBetween]:
+        """Add bearings with known stops to the graph, one per pair of stops; returns those of all stops."""
+        found: dict[tuple[Visit, Visit], list[tuple[float, float]]] = defaultdict(list)
         for _ in range(len(self._pending)):
             one = self._pending.popleft()
             robot, target, stamp_ns, bearing = one
@@ -309,9 +323,15 @@ class LightBook:
             seer, seen = self._visit(robot, stamp_ns), self._visit(target, stamp_ns)
             if seer is not None and seen is not None:
                 turn = seer.stop.turn_at(stamp_ns) - seer.turn_begin
-                found[seer.node, seen.node].append((turn, bearing))
-        for (seer_node, seen_node), sighted in found.items():
-            _add_bearing(graph, seer_node, seen_node, *np.array(sighted).T)
+                found[seer, seen].append((turn, bearing))
+        sightings = []
+        for (seer, seen), sighted in found.items():
+            is_known = LOST not in (seer.node, seen.node)
+            ratio = graph.states[seer.node, 3] if is_known else 1.0 - graph.slip[seer.robot]
+            sightings.append(LightBetween(seer, seen, *_median(ratio, *np.array(sighted).T)))
+            if is_known:
+                _add_bearing(graph, sightings[-1])
+        return sightings
 
     def _visit(self, robot: int, stamp_ns: int) -> Visit | None:
         """The stop of a robot at a time; None if it was driving."""
@@ -321,18 +341,22 @@ class LightBook:
         return None
 
 
-def _add_bearing(graph: PoseGraph, seer: int, seen: int, turn: FloatArray, bearing: FloatArray) -> None:
-    """Add the median of bearings (n,) of a light at turns (n,) by odometry as one bearing.
+def _median(ratio: float, turn: FloatArray, bearing: FloatArray) -> tuple[float, float]:
+    """The turn by odometry, and median at this turn, of bearings (n,) of a light at turns (n,) by odometry.
 
     Where wheels slip, a robot that turns by more than a full turn sees the light again after more than a full
     turn by odometry. So the bearing belongs to the turn of one sighting, not to any turn with its direction.
     """
-    ratio = graph.states[seer, 3]
     off = wrap_angle(ratio * (turn - turn[0]) + bearing - bearing[0])
     middle = int(np.argsort(off, kind="stable")[len(off) // 2])
     passes = np.abs(turn - turn[middle]) < math.pi
-    at = bearing[middle] + float(np.median(off[passes])) - off[middle]
+    return float(turn[middle]), float(bearing[middle] + float(np.median(off[passes])) - off[middle])
+
+
+def _add_bearing(graph: PoseGraph, sighting: LightBetween) -> None:
+    """Add a bearing to the graph, unless the robots are too close."""
+    seer, seen = sighting.seer.node, sighting.seen.node
     away = math.dist(graph.states[seer, :2], graph.states[seen, :2])
     if away > 2.0 * _LIGHT_OFFSET:
         sigma = math.hypot(_LEAST_SIGMA, _LIGHT_OFFSET / away)
-        graph.constraints.add_bearing(seer, seen, float(turn[middle]), at, sigma)
+        graph.constraints.add_bearing(seer, seen, sighting.turn, sighting.bearing, sigma)

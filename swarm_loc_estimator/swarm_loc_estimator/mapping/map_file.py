@@ -31,7 +31,9 @@ _MAX_YAW = 1e-6  # Of a map [rad], as rounding leaves it: less than a millimetre
 _HEADER_BYTES = 1 << 18
 _COMMENTS = 1000
 _SEPARATOR = rb"(?:\s|#[^\r\n]*[\r\n])+"
-_PNM = re.compile(rb"P(?:[14]|[2356]" + _SEPARATOR + rb"\d+)" + 2 * (_SEPARATOR + rb"\d+") + rb"\s")
+_SIZE = 2 * (_SEPARATOR + rb"(\d{1,9})")
+_PNM = re.compile(rb"P(?:[14]" + _SIZE + rb"|[2356]" + _SIZE + _SEPARATOR + rb"\d+)\s")
+_PLAIN_BYTES = 16  # Maximum number of characters of a number in a plain PNM, with the space around it
 _FORMATS = ("PPM", "PNG", "BMP")  # Other decoders of Pillow start programs, or have seen less care
 _PLACE = NumberSpec("m", -1e6, 1e6, False, "of the lower left corner")
 
@@ -42,12 +44,10 @@ class MapFileError(UserError):
 
 def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
     """Write PATH.yaml and PATH.pgm; returns both, raises FileError if they cannot be written."""
-    from PIL import Image  # noqa: PLC0415 - an estimator without a map starts without it
-
     image_path, yaml_path = path.with_suffix(".pgm"), path.with_suffix(".yaml")
     pixels = np.full(occupancy.log_odds.shape, _UNKNOWN, dtype=np.uint8)
     pixels[occupancy.free], pixels[occupancy.occupied] = _FREE, _OCCUPIED
-    image = Image.fromarray(np.ascontiguousarray(pixels.T[::-1]))  # the first row is the uppermost
+    image = pixels.T[::-1]  # the first row is the uppermost
     about = {
         "image": image_path.name,
         "mode": "trinary",
@@ -58,7 +58,8 @@ def save_map(occupancy: OccupancyMap, path: Path) -> tuple[Path, Path]:
         "free_thresh": _FREE_THRESHOLD,
     }
     with replacing(image_path) as part:
-        image.save(part, "PPM")
+        head = f"P5\n{image.shape[1]} {image.shape[0]}\n255\n".encode()
+        part.write_bytes(head + image.tobytes())  # Pillow does not see where a disk ends
     write_tree(about, yaml_path)
     return yaml_path, image_path
 
@@ -72,7 +73,8 @@ def load_map(path: Path, cell: float | None = None) -> OccupancyMap:
         UserError: It cannot be read, or is not such a map.
     """
     checks = TreeChecks(path, MapFileError)
-    about = checks.mapping(read_tree(path), WHOLE_FILE, required=("image", "origin", *_NUMBERS))
+    given = checks.mapping(read_tree(path), WHOLE_FILE, required=("image", "origin", "resolution"))
+    about = {"occupied_thresh": _OCCUPIED_THRESHOLD, "free_thresh": _FREE_THRESHOLD, **given}
     numbers = {name: checks.number(about[name], name, spec) or 0.0 for name, spec in _NUMBERS.items()}
     places = checks.items(about["origin"], "origin")
     origin = [checks.number(value, "origin", _PLACE) or 0.0 for value in places]
@@ -134,9 +136,17 @@ def _check_header(data: bytes) -> None:
     head = data[:_HEADER_BYTES]
     is_short = head.startswith(b"BM") or b"IDAT" in head
     if head.startswith(b"P"):  # digits have comments between them, too
-        is_short = bool(_PNM.match(head)) and (head[1:2] > b"3" or data.count(b"#") <= _COMMENTS)
+        match = _PNM.match(head)
+        is_short = match is not None and (head[1:2] > b"3" or _is_dense(data, match))
     if not is_short:
-        raise ValueError("it is no PGM, PNG or BMP with a header of a usual length")
+        raise ValueError("it is no PGM, PNG or BMP with a header and spaces of a usual length")
+
+
+def _is_dense(data: bytes, head: re.Match[bytes]) -> bool:
+    """Whether a plain PNM has few comments, and no more space between its numbers than they need."""
+    width, height = (int(number) for number in head.groups() if number is not None)
+    most = _HEADER_BYTES + _PLAIN_BYTES * width * height * (3 if data[1:2] == b"3" else 1)
+    return len(data) <= most and data.count(b"#") <= _COMMENTS
 
 
 def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
@@ -145,7 +155,7 @@ def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
     Raises:
         UserError: It cannot be read, is too large, or is no PGM, PPM, PBM, PNG or BMP.
     """
-    from PIL import Image  # noqa: PLC0415 - as above
+    from PIL import Image  # noqa: PLC0415 - an estimator without a map starts without it
 
     data = read_file(path, _MAX_BYTES)
     try:

@@ -14,11 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import between, compose, wrap_angle
 from swarm_loc_estimator.mapping.exploration import Goal, goal_by_odometry, next_stop
 from swarm_loc_estimator.mapping.grid import OccupancyMap, VisitationMap, draw_map
 from swarm_loc_estimator.mapping.localization import (
+    LOST,
+    LightBetween,
     LightBook,
     Visit,
     align,
@@ -28,7 +30,7 @@ from swarm_loc_estimator.mapping.localization import (
     find_slip,
 )
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
-from swarm_loc_estimator.mapping.relocation import RATES, Search, agreement
+from swarm_loc_estimator.mapping.relocation import RATES, Light, Search
 from swarm_loc_estimator.mapping.scans import (
     MIN_TURN,
     UNSEEN,
@@ -68,7 +70,7 @@ class Track:
     located: Located | None = None  # Where its newest scan says that it was
     home: FloatArray | None = None  # (2,) old stop to which it returns to reduce its position uncertainty [m]
     last_ns: int = 0  # Its newest reading
-    search: Search | None = None  # Since its odometry restarted, until it is found and later stops agree
+    search: Search | None = None  # Since its odometry restarted, until no doubt is left
 
 
 START_TURN = 4.5 * math.pi
@@ -89,8 +91,6 @@ _LOST_SIGMA, _CHECK_EVERY = 0.15, 4
 """Maximum position standard deviation [m]; above it a robot returns to an old stop nearby (home)."""
 _FOUND_SIGMA, _UNKNOWN_HEADING = np.array([0.10, 0.10, math.radians(5.0)]), 1.8
 """Standard deviations of a place found after a restart [m, m, rad], and of a heading that nothing tells."""
-_CONFIRMED, _MIN_AGREEMENT = 4, 0.7
-"""Number of stops that must agree with that place, and share of their walls that must fit those of others."""
 _HOME_AGE, _HOME_RADIUS, _AT_HOME = 10, 4.0, 0.5
 """Minimum age in stops and maximum distance [m] of that stop, and the distance at which it is reached [m]."""
 
@@ -172,10 +172,13 @@ class CooperativeMapper:
     def _restart_track(self, robot: int, track: Track, stamp_ns: int) -> None:
         """Lose a robot, whose odometry has jumped, as by a restart of its driver."""
         self.counters["odometry_restarts"] += 1
-        pose, lost, pause_s = self.pose(robot), track.search, (stamp_ns - track.last_ns) * 1e-9
-        if pose is None and lost is not None:
-            pose, pause_s = lost.near, pause_s + lost.pause_s + track.path / RATES[0]
-        self._lose(track, Search(track.prior if pose is None else pose, pause_s))
+        pause_s, lost = (stamp_ns - track.last_ns) * 1e-9, track.search
+        if lost is None:
+            pose = self.pose(robot)
+            self._lose(track, Search(track.prior if pose is None else pose, pause_s))
+        else:
+            self._withdraw(robot, lost)
+            self._lose(track, lost.again(pause_s + track.path / RATES[0]))
         track.last = None
 
     def _lose(self, track: Track, search: Search) -> None:
@@ -184,47 +187,66 @@ class CooperativeMapper:
         track.is_known = track.passes = False
 
     def _is_found(self, robot: int, track: Track, stop: ScanStop) -> bool:
-        """Whether the one place is found that fits the scans of a lost robot; it becomes its prior."""
+        """Whether the one place is found that explains the scans of a lost robot; it becomes its prior."""
         search, known = track.search, self.graph.known_slips
         if search is None:
             return True
         ratio = math.nan if stop.reach or robot in known else turn_ratio(stop.turn, stop.inverse, stop.sigma)
-        search.add(stop, 1.0 - self.graph.slip[robot] if math.isnan(ratio) else ratio)
-        if not stop.reach and stop.turned < 2.0 * math.pi:
-            return False
-        if not self.graph.count and all(one.search is not None for one in self._tracks.values()):
+        ratio = 1.0 - self.graph.slip[robot] if math.isnan(ratio) else ratio
+        others = self._map_of_others()
+        is_whole = search.add(stop, ratio, others)
+        track.path = 0.0
+        if is_whole and not self.graph.count and all(one.search is not None for one in self._tracks.values()):
             track.prior_sigma = np.array([*track.prior_sigma[:2], _UNKNOWN_HEADING])
             track.search = None  # it begins the map
             return True
-        found = search.place(self.occupancy())
-        if found is None:
+        search.found = search.verdict() if is_whole else -1
+        if search.found < 0:
             return False
-        track.prior, track.prior_sigma = found, _FOUND_SIGMA
+        track.prior, track.prior_sigma = search.poses[search.found, -1], _FOUND_SIGMA
         search.first = self.graph.count
         return True
 
+    def _under_test(self, robot: int, search: Search) -> IntArray:
+        """Stops of a robot at the place where it was found."""
+        mine = np.flatnonzero(self.graph.robot[: self.graph.count] == robot)
+        return mine[mine >= search.first] if search.first >= 0 else mine[:0]
+
+    def _map_of_others(self) -> OccupancyMap:
+        """The map without robots that are under test."""
+        tested = [self._under_test(robot, one.search) for robot, one in self._tracks.items() if one.search]
+        without = frozenset(np.concatenate(tested).tolist()) if tested else frozenset()
+        graph, limit = self.graph, self.settings.max_cells
+        return (
+            draw_map(graph.scans, graph.count, limit, self.background, without)
+            if without
+            else self.occupancy()
+        )
+
     def _check_place(self, robot: int, track: Track, stop: ScanStop, *, fits: bool = True) -> None:
         """Take back the place where a robot was found, and all scans since, if its newest one contradicts."""
-        search, graph = track.search, self.graph
+        search = track.search
         if search is None or track.node is None:
             return
-        since = np.flatnonzero(graph.robot[: graph.count] == robot)
-        since = since[since >= search.first]
-        limit = self.settings.max_cells
-        others = draw_map(graph.scans, graph.count, limit, self.background, frozenset(since.tolist()))
-        share = agreement(others, stop, graph.states[track.node if search.is_entered else search.first])
-        search.is_entered = True
-        if fits and not share < _MIN_AGREEMENT:
-            search.checks += not math.isnan(share)
-            track.search = search if search.checks < _CONFIRMED else None
+        if stop not in search.stops:
+            search.add(stop, self.graph.states[track.node, 3], self._map_of_others())
+        if fits and not search.is_contradicted:
+            track.search = None if search.is_over else search
             return
         self.counters["places_taken_back"] += 1
-        for one in since.tolist():
-            graph.drop_stop(one)
+        self._withdraw(robot, search)
+        self._lose(track, search.again())
+
+    def _withdraw(self, robot: int, search: Search) -> None:
+        """Take all out of the graph that a robot has added since it was found."""
+        tested = self._under_test(robot, search).tolist()
+        for one in tested:
+            self.graph.drop_stop(one)
             self._lights.forget_node(one)
-            self.begin_ns.pop(one)
-        graph.solve(4)
-        self._lose(track, Search(search.near, search.pause_s))
+            self.begin_ns.pop(one, None)
+        if tested:
+            self.graph.solve(4)
+            self._map = None
 
     def add_lights(self, robot: int, sightings: LightSightings) -> None:
         """Process sightings (m,) of other robots by one robot."""
@@ -332,9 +354,26 @@ class CooperativeMapper:
         """Record a finished stop, for light bearings by and of this robot."""
         if track.node is not None:
             begin_ns, end_ns = int(stop.stamp_ns[stop.begin]), int(stop.stamp_ns[-1])
-            self._lights.note_visit(robot, Visit(track.node, begin_ns, end_ns, stop, stop.begin_turn))
+            self._lights.note_visit(Visit(robot, track.node, begin_ns, end_ns, stop, stop.begin_turn))
             self._lights.note_time(robot, end_ns)
-            self._lights.settle(self.graph)
+            for sighting in self._lights.settle(self.graph):
+                self._note_light(sighting.seer, sighting.seen, sighting, is_seen=True)
+                self._note_light(sighting.seen, sighting.seer, sighting, is_seen=False)
+
+    def _note_light(self, lost: Visit, other: Visit, sighting: LightBetween, *, is_seen: bool) -> None:
+        """Note a light that a robot that is searched sees of a located one, or the other way around."""
+        track, other_track = self._tracks.get(lost.robot), self._tracks.get(other.robot)
+        tested = other_track is not None and other_track.search is not None
+        if track is None or track.search is None or tested or other.node == LOST:
+            return
+        graph = self.graph
+        there = graph.states[other.node, :3].copy()
+        turn = sighting.turn
+        if is_seen:
+            turn = (1.0 - graph.slip[lost.robot]) * (turn + lost.turn_begin)
+        else:
+            there[2] += graph.states[other.node, 3] * turn
+        track.search.lights.append(Light(lost.stop, there, is_seen, turn, sighting.bearing))
 
     def _update_scan(self, track: Track) -> None:
         """Set all readings of the newest stop as its scan."""
@@ -347,6 +386,8 @@ class CooperativeMapper:
         """Add the first `count` readings of a stop as a node (several for a first scan) and align it."""
         if track.node is None and not self._is_found(robot, track, stop):
             self.counters["scans_not_located"] += 1
+            begin_ns, end_ns = int(stop.stamp_ns[0]), int(stop.stamp_ns[-1])
+            self._lights.note_visit(Visit(robot, LOST, begin_ns, end_ns, stop, 0.0))
             return
         self.counters["scans"] += 1
         self._map = None

@@ -1,155 +1,322 @@
-"""Where a robot is whose odometry has restarted: the one place in the map that fits all it has seen since.
+"""Where a robot is whose odometry has restarted: the one place in the map that explains what it sees.
 
-Robots turn and drive on while nobody hears them, so nothing before the restart tells their pose.
+Robots turn and drive on while nobody hears them, so nothing before the restart tells their pose. All places
+that they may have reached are hypotheses: each is moved by odometry, aligned with the map at each stop, and
+scored by what the robot sees. One that explains clearly less than the best one is ruled out.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.se2 import between, compose, transform_points
+from swarm_loc_estimator.common.se2 import between, compose, wrap_angle
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.scans import ScanStop
 
-# The constants are checked by `make bench-pushbot`, part restart: both halls, 20 instants each.
-_WALL_SIGMA, _UNKNOWN = 0.08, 0.3
-"""Standard deviation of points from walls [m], and the score of a point where the map is unknown."""
-_FARTHEST, _POINTS = 2.0, 120  # Maximum distance of points that are used [m], and their number
-_STEP, _TURN_STEP = 0.1, math.radians(3.0)  # Of the places that are tried [m], [rad]
-_MIN_SCORE, _MAX_OTHER = 0.8, 0.9  # Minimum score, and maximum score of another place relative to it
-_PLACES, _NEW_PLACE = 3, 0.1  # Number of newest stops that are matched together, and their least distance [m]
+# The constants are checked by `make bench-pushbot`, part restart: three halls, 20 instants each.
+_WALL_SIGMA, _UNKNOWN = 0.06, 0.7
+"""Standard deviation of points from walls [m], and how well a beam fits where the map is unknown."""
+_FARTHEST, _BEAMS = 1.9, 120  # Distance up to which beams are compared [m], and their number per stop
+_NEW_PLACE = 0.2  # Minimum distance of stops whose scans count separately [m]
 _SHIFT, RATES = np.array([0.5, math.radians(15.0)]), np.array([0.3, 3.0])
 """How far a robot is moved by hands [m, rad], and how fast it moves by itself [m/s, rad/s]."""
-_AT_WALL, _MIN_KNOWN = 0.15, 40
-"""Distance of points on walls [m]; minimum number of points where the map is known."""
-_SHARES = np.linspace(1.0, 0.1, 19)  # Shares of the way to a wall, before which no other one may be
-_APART = np.array([0.4, math.radians(20.0)])
-"""Distance [m] and turn [rad] from which a place is another one."""
+_APART = np.array([0.15, math.radians(8.0)])
+"""Distance [m] or turn [rad] from which a place is another one."""
+_STEP, _TURN_STEP = 0.1, math.radians(3.0)  # Of the places that are tried first [m], [rad]
+_FINE, _FINE_TURN, _FINE_STEPS = 0.03, math.radians(1.5), 3
+"""Of the places around these, and of those after each drive [m, rad], and their number to each side."""
+_HYPOTHESES = 100  # Maximum number of places
+_RULED_OUT = 0.5  # By how many scans a place explains less than another one if it is ruled out by it
+_FITS, _CONTRADICTS = 0.85, 0.7
+"""Share of the known beams that must fit a place where a robot is found, and to keep it there."""
+_MIN_KNOWN = 0.4  # Minimum share of beams of which the map says something
+_PLACES, _CONFIRMED = 2, 6
+"""Number of places from which a robot looks before it is found, and in known parts before its test ends."""
+_LIGHT_SIGMA = math.radians(3.0)  # Standard deviation of bearings of lights from stops [rad]
+
+
+class Light(NamedTuple):
+    """The light of a located robot that a lost one sees, or the other way around."""
+
+    stop: ScanStop  # Of the lost robot
+    there: FloatArray  # (3,) the other robot, with its heading when it sees the light
+    is_seen: bool  # Whether the lost robot sees the light
+    turn: float  # Turn of the lost robot since its arrival at the stop, if it sees the light [rad]
+    bearing: float  # Of the light, in the frame of the robot that sees it [rad]
 
 
 @dataclass
 class Search:
-    """What a robot has seen since its odometry restarted, in the frame of its first stop since then."""
+    """The places (h,) where a robot may be, at each of the stops (k,) since its odometry restarted."""
 
     near: FloatArray  # (3,) its pose in map before
     pause_s: float  # How long it was not heard
-    parts: list[FloatArray] = field(default_factory=list)  # Points (n, 2) on walls, of its newest places [m]
-    arrival: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,) at its newest stop
-    departure: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,) from its newest stop
-    left: FloatArray | None = None  # (3,) by odometry then
-    first: int = -1  # Its first stop in the graph since it was found
-    is_entered: bool = False  # Whether its scan there is in the graph
-    checks: int = 0  # Number of stops since then that agree with those of others
+    poses: FloatArray = field(default_factory=lambda: np.zeros((0, 0, 3)))  # (h, k, 3)
+    fits: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # (h, k) share of beams that fit
+    known: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))  # (h, k) of which the map tells
+    lit: FloatArray = field(default_factory=lambda: np.zeros(0))  # (h,) number of lights that fit
+    stops: list[ScanStop] = field(default_factory=list)  # (k,)
+    since: FloatArray = field(default_factory=lambda: np.zeros(3))  # (3,) motion since the last arrival
+    left: FloatArray | None = None  # (3,) odometry then
+    path: float = 0.0  # Length of the drives since the restart [m]
+    lights: list[Light] = field(default_factory=list)  # That are not in `lit` yet
+    found: int = -1  # The hypothesis that is taken for true
+    first: int = -1  # Its first stop in the graph
 
-    def add(self, stop: ScanStop, ratio: float) -> None:
-        """Add the readings of a stop; true turns are `ratio` times those by odometry."""
-        if self.left is not None:
-            x, y, turn = between(self.left, stop.arrival)
-            length, course = math.hypot(x, y), ratio * math.atan2(y, x)
-            motion = [length * math.cos(course), length * math.sin(course), ratio * turn]
-            self.arrival = compose(self.departure, motion)
-            self.parts = self.parts[1 - _PLACES :] if length > _NEW_PLACE else self.parts[:-1]
+    def again(self, more_s: float = 0.0) -> Search:
+        """A search that begins now; the robot has not been heard for more time."""
+        return Search(self.near, self.pause_s + self.path / RATES[0] + more_s)
+
+    def add(self, stop: ScanStop, ratio: float, occupancy: OccupancyMap) -> bool:
+        """Compare a stop with a map of others; true turns are `ratio` times those by odometry.
+
+        Returns whether its scan is a whole one; of others only the motion is used.
+        """
+        away = self._move(stop, ratio)
         self.left = stop.arrival if stop.reach else stop.departure
         turned = 0.0 if stop.reach else ratio * float(stop.turn[-1])
-        self.departure = self.arrival + np.array([0.0, 0.0, turned])
-        self.parts.append(transform_points(self.arrival, _wall_points(stop, ratio)))
+        is_whole = stop.reach > 0.0 or stop.turned > 2.0 * math.pi
+        if is_whole and occupancy.occupied.any():
+            view = _View(occupancy, stop, ratio)
+            if not len(self.poses):
+                self.stops = []
+                self._begin(view, occupancy)
+            else:
+                predicted = compose(self.poses[:, -1], self.since)
+                if away < _NEW_PLACE:  # the same place: its newest scan counts
+                    self.poses, self.fits = self.poses[:, :-1], self.fits[:, :-1]
+                    self.known, self.stops = self.known[:, :-1], self.stops[:-1]
+                self._append(view, predicted)
+            self.stops.append(stop)
+            self.since = np.zeros(3)
+            self._thin()
+        self.since = compose(self.since, [0.0, 0.0, turned])
+        return is_whole
 
-    def place(self, occupancy: OccupancyMap) -> FloatArray | None:
-        """The pose (3,) of its newest stop, if all points fit one place in a map that it may have reached."""
-        points = np.concatenate(self.parts)
-        points = points[:: max(1, len(points) // _POINTS)]
-        if len(points) < _POINTS // 4 or not occupancy.occupied.any():
-            return None
-        # score of a point in each cell, with a margin as wide as points reach [cells]
-        cell = occupancy.cell
-        walls = cell * distance_transform_edt(~occupancy.occupied)
-        score = np.exp(-0.5 * (walls / _WALL_SIGMA) ** 2)
-        score = np.where(occupancy.free, score, np.maximum(score, _UNKNOWN))
-        margin = math.ceil(np.hypot(*points.T).max() / cell) + 1
-        score = np.pad(score, margin, constant_values=_UNKNOWN)
-        # the best place that it may have reached unheard, and the best other one
-        step = max(1, round(_STEP / cell))
-        cells = np.argwhere(occupancy.free[::step, ::step]) * step + margin
-        begin = np.array([*((self.near[:2] - occupancy.corner) / cell + margin - 0.5), self.near[2]])
-        limits = _SHIFT + RATES * self.pause_s, _APART
-        scaled = np.array(limits) / [cell, 1.0]
-        found, other = np.full((2, 4), np.nan)
-        for one in (found, other):
-            one[:] = _best_place(score, points / cell, cells, np.array([begin, found[:3]]), scaled)
-        if found[3] < _MIN_SCORE or other[3] > _MAX_OTHER * found[3]:
-            return None
-        where = (found[:2] - margin + 0.5) * cell + occupancy.corner
-        return compose(np.array([*where, found[2]]), self.arrival)
+    def verdict(self) -> int:
+        """The hypothesis that explains all and has no rival; -1: none."""
+        if not len(self.poses) or self.fits.shape[1] < _PLACES:
+            return -1
+        total = self._totals()
+        best = int(total.argmax())
+        nowhere = _UNKNOWN * self.fits.shape[1]  # it is where the map is unknown
+        rival = total[_apart(self.poses[best, -1], self.poses[:, -1])].max(initial=nowhere)
+        known, fits = self.known[best, -_PLACES:].sum(), self.fits[best, -_PLACES:].sum()
+        is_seen = known > _MIN_KNOWN * _PLACES and fits > _FITS * known
+        return best if is_seen and total[best] - rival > _RULED_OUT else -1
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether the place that was found does not explain what the robot sees, or another does better."""
+        total = self._totals()
+        return bool(self._contradicts()[self.found]) or bool(total.max() - total[self.found] > _RULED_OUT)
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the place that was found has been confirmed, and all others are ruled out."""
+        return len(self.poses) == 1 and (self.known[0] > _MIN_KNOWN).sum() >= _CONFIRMED
+
+    def _contradicts(self) -> BoolArray:
+        """Whether the newest scans do not fit each hypothesis (h,)."""
+        known, fits = self.known[:, -_PLACES:].sum(axis=1), self.fits[:, -_PLACES:].sum(axis=1)
+        return np.asarray((known > _MIN_KNOWN * _PLACES) & (fits < _CONTRADICTS * known))
+
+    def _totals(self) -> FloatArray:
+        """How many scans and lights each hypothesis (h,) explains."""
+        totals: FloatArray = (self.fits + _UNKNOWN * (1.0 - self.known)).sum(axis=1) + self.lit
+        return totals
+
+    def _move(self, stop: ScanStop, ratio: float) -> float:
+        """Add the drive to a stop; its distance from the last one [m]."""
+        x, y, turn = between(stop.arrival if self.left is None else self.left, stop.arrival)
+        length, course = math.hypot(x, y), ratio * math.atan2(y, x)
+        motion = [length * math.cos(course), length * math.sin(course), ratio * turn]
+        self.since = compose(self.since, motion)
+        self.path += length
+        return math.hypot(self.since[0], self.since[1])
+
+    def _begin(self, view: _View, occupancy: OccupancyMap) -> None:
+        """Try all places that the robot may have reached unheard."""
+        step = max(1, round(_STEP / occupancy.cell))
+        places = view.places(step * np.argwhere(occupancy.free[::step, ::step]).astype(float) + 0.5)
+        shift, turn = _SHIFT + RATES * (self.pause_s + self.path / RATES[0])
+        places = places[np.hypot(*(places - self.near[:2]).T) < shift]
+        headings = np.arange(0.0, 2.0 * math.pi, _TURN_STEP)
+        headings = headings[np.abs(wrap_angle(headings - self.near[2])) < turn]
+        scores = _score_places(view.score, view.walls, view.cells(places), headings)
+        # the best ones, each apart from all better ones
+        poses = np.column_stack([np.repeat(places, len(headings), axis=0), np.tile(headings, len(places))])
+        poses = poses[np.argsort(-scores.ravel(), kind="stable")]
+        chosen: list[FloatArray] = []
+        while len(poses) and len(chosen) < _HYPOTHESES:
+            chosen.append(poses[0])
+            poses = poses[_apart(poses[0], poses)]
+        self.poses, self.fits, self.known = np.zeros((len(chosen), 0, 3)), *np.zeros((2, len(chosen), 0))
+        self.lit = np.zeros(len(chosen))
+        self._append(view, np.array(chosen).reshape(-1, 3))
+
+    def _append(self, view: _View, predicted: FloatArray) -> None:
+        """Align hypotheses (h, 3) with the map, and note how well they fit."""
+        cells = np.column_stack([view.cells(predicted[:, :2]), predicted[:, 2]])
+        aligned = _align(view.score, view.walls, cells, _FINE / view.cell)
+        poses = np.column_stack([view.places(aligned[:, :2]), aligned[:, 2]])
+        fits, known = _compare(view.score, view.occupied, view.ends, view.hits, aligned)
+        self.poses = np.concatenate([self.poses, poses[:, None]], axis=1)
+        self.fits = np.column_stack([self.fits, fits])
+        self.known = np.column_stack([self.known, known])
+
+    def _thin(self) -> None:
+        """Compare lights; drop hypotheses that are wrong, ruled out twice, or where better ones are."""
+        for light in (one for one in self.lights if one.stop in self.stops):
+            self.lit += _light_fits(light, self.poses[:, self.stops.index(light.stop)])
+        self.lights = []
+        total, wrong = self._totals(), self._contradicts()
+        keep: list[int] = []
+        for one in np.argsort(-total, kind="stable").tolist():
+            others = self.poses[keep, -1]
+            is_good = not wrong[one] and _apart(self.poses[one, -1], others).all()
+            if one == self.found or (is_good and total.max() - total[one] < 2.0 * _RULED_OUT):
+                keep.append(one)
+        self.found = keep.index(self.found) if self.found in keep else -1
+        self.poses, self.fits = self.poses[keep], self.fits[keep]
+        self.known, self.lit = self.known[keep], self.lit[keep]
 
 
-def agreement(occupancy: OccupancyMap, stop: ScanStop, state: FloatArray) -> float:
-    """Share of the walls seen from a stop with a state (4,) in the graph that fit a map; NaN if unknown.
+class _View:
+    """What a robot sees from a stop, and a map as scores, in cells.
 
-    A wall does not fit if it is not one of the map, or if one of the map is before it.
+    Attributes:
+        score: (nx, ny) how well a point of a wall fits in each cell.
+        ends: (n, 2) ends of beams, in the frame of the robot on arrival [cells].
+        hits: (n,) whether they are on walls.
+        walls: (m, 2) those that are.
     """
-    points = _wall_points(stop, state[3])
-    way = np.hypot(*points.T)
-    walls = distance_transform_edt(~occupancy.occupied) * occupancy.cell < _AT_WALL
-    known = fits = np.zeros(len(points), dtype=bool)
-    for share in _SHARES:
-        cells = occupancy.index(transform_points(state[:3], share * points))
-        inside = ((cells >= 0) & (cells < walls.shape)).all(axis=1)
-        i, j = np.where(inside[:, None], cells, 0).T
-        if share == 1.0:
-            known, fits = inside & (occupancy.log_odds[i, j] != 0.0), walls[i, j]
-        else:
-            fits &= ~(inside & occupancy.occupied[i, j] & ((1.0 - share) * way > 2.0 * _AT_WALL))
-    return float(fits[known].mean()) if known.sum() >= _MIN_KNOWN else math.nan
+
+    def __init__(self, occupancy: OccupancyMap, stop: ScanStop, ratio: float) -> None:
+        self._occupancy, self.cell = occupancy, occupancy.cell
+        self.occupied: BoolArray = occupancy.occupied
+        away = self.cell * distance_transform_edt(~self.occupied)
+        score = np.exp(-0.5 * (away / _WALL_SIGMA) ** 2)
+        self.score: FloatArray = np.where(occupancy.free, score, np.where(score > _UNKNOWN, score, np.nan))
+        angle = stop.bearing + ratio * stop.turn
+        every = max(1, len(angle) // _BEAMS)
+        angle, length = angle[::every], 1.0 / np.maximum(stop.inverse[::every], 1.0 / _FARTHEST)
+        self.hits: BoolArray = length < _FARTHEST
+        self.ends: FloatArray = np.stack([np.cos(angle), np.sin(angle)], -1) * length[:, None] / self.cell
+        self.walls: FloatArray = self.ends[self.hits]
+
+    def cells(self, places: FloatArray) -> FloatArray:
+        """Places (n, 2) [m] in cells."""
+        cells: FloatArray = (places - self._occupancy.corner) / self.cell
+        return cells
+
+    def places(self, cells: FloatArray) -> FloatArray:
+        """Places (n, 2) in cells in metres."""
+        places: FloatArray = self._occupancy.corner + cells * self.cell
+        return places
 
 
-def _wall_points(stop: ScanStop, ratio: float) -> FloatArray:
-    """Points (n, 2) on walls that a stop sees, in the frame of the robot on arrival [m]."""
-    seen = stop.inverse > 1.0 / _FARTHEST
-    angle = (stop.bearing + ratio * stop.turn)[seen]
-    return np.stack([np.cos(angle), np.sin(angle)], -1) / stop.inverse[seen, None]
+def _apart(pose: FloatArray, others: FloatArray) -> BoolArray:
+    """Whether others (n, 3) are another place than a pose (3,)."""
+    off = others - pose
+    return np.asarray(
+        (np.hypot(off[:, 0], off[:, 1]) > _APART[0]) | (np.abs(wrap_angle(off[:, 2])) > _APART[1])
+    )
+
+
+def _light_fits(light: Light, poses: FloatArray) -> FloatArray:
+    """How well a light fits poses (h, 3) of the lost robot on arrival at its stop, from 0 to 1."""
+    seer, seen = (poses, light.there) if light.is_seen else (light.there, poses)
+    x, y, _ = np.moveaxis(seen - seer, -1, 0)
+    heading = seer[..., 2] + (light.turn if light.is_seen else 0.0)
+    sigma = np.hypot(_LIGHT_SIGMA, _APART[0] / 2.0 / np.maximum(np.hypot(x, y), 1e-3))
+    off = wrap_angle(np.arctan2(y, x) - heading - light.bearing)
+    fits: FloatArray = np.exp(-0.5 * (off / sigma) ** 2)
+    return fits
 
 
 @cached_njit
-def _best_place(
-    field: FloatArray,
-    points: FloatArray,
-    cells: IntArray,
-    poses: FloatArray,
-    limits: FloatArray,
-) -> tuple[float, float, float, float]:
-    """The cell (i, j), heading and score at which points (n, 2) [cells] fit a field best.
+def _at(score: FloatArray, x: float, y: float) -> float:
+    """The score at a place [cells]; NaN where the map is unknown."""
+    i, j = math.floor(x), math.floor(y)
+    return float(score[i, j]) if 0 <= i < score.shape[0] and 0 <= j < score.shape[1] else math.nan
 
-    Only places as near to the first pose as the first of the limits [cells, rad] are tried, without those as
-    near to the second pose as the second ones.
+
+@cached_njit
+def _mean_score(score: FloatArray, walls: FloatArray, x: float, y: float, heading: float) -> float:
+    """How well points (n, 2) of walls fit, seen from a pose [cells, rad]."""
+    cos, sin, total = math.cos(heading), math.sin(heading), 0.0
+    for k in range(len(walls)):
+        value = _at(
+            score, x + cos * walls[k, 0] - sin * walls[k, 1], y + sin * walls[k, 0] + cos * walls[k, 1]
+        )
+        total += _UNKNOWN if math.isnan(value) else value
+    return total / max(1, len(walls))
+
+
+@cached_njit
+def _score_places(
+    score: FloatArray, walls: FloatArray, places: FloatArray, headings: FloatArray
+) -> FloatArray:
+    """How well points of walls fit (m, p) at places (m, 2) [cells] and headings (p,)."""
+    scores = np.zeros((len(places), len(headings)))
+    for m in range(len(places)):
+        for p in range(len(headings)):
+            scores[m, p] = _mean_score(score, walls, places[m, 0], places[m, 1], headings[p])
+    return scores
+
+
+@cached_njit
+def _align(score: FloatArray, walls: FloatArray, poses: FloatArray, step: float) -> FloatArray:
+    """The poses (h, 3) [cells, rad] near others (h, 3) at which points of walls fit best."""
+    aligned: FloatArray = poses.copy()
+    for h in range(len(poses)):
+        best = -1.0
+        for a in range(-_FINE_STEPS, _FINE_STEPS + 1):
+            for b in range(-_FINE_STEPS, _FINE_STEPS + 1):
+                for c in range(-_FINE_STEPS, _FINE_STEPS + 1):
+                    x, y = poses[h, 0] + a * step, poses[h, 1] + b * step
+                    heading = poses[h, 2] + c * _FINE_TURN
+                    value = _mean_score(score, walls, x, y, heading)
+                    if value > best:
+                        best = value
+                        aligned[h] = x, y, heading
+    return aligned
+
+
+@cached_njit
+def _compare(
+    score: FloatArray, occupied: BoolArray, ends: FloatArray, hits: BoolArray, poses: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Share of beams that fit (h,), and of those of which the map says anything (h,), from poses (h, 3).
+
+    A beam does not fit if the map has no wall where it ends at one, or a wall before that.
     """
-    count = len(points)
-    best = (0.0, 0.0, 0.0, 0.0)
-    offsets = np.zeros((count, 2), dtype=np.int64)
-    for k in range(round(2.0 * math.pi / _TURN_STEP)):
-        heading = k * _TURN_STEP
-        turned = np.abs((heading - poses[:, 2] + math.pi) % (2.0 * math.pi) - math.pi)
-        if turned[0] > limits[0, 1]:
-            continue
-        cos, sin = math.cos(heading), math.sin(heading)
-        for n in range(count):
-            offsets[n, 0] = round(cos * points[n, 0] - sin * points[n, 1])
-            offsets[n, 1] = round(sin * points[n, 0] + cos * points[n, 1])
-        for i, j in cells:
-            if math.hypot(i - poses[0, 0], j - poses[0, 1]) > limits[0, 0]:
-                continue
-            if turned[1] < limits[1, 1] and math.hypot(i - poses[1, 0], j - poses[1, 1]) < limits[1, 0]:
-                continue
-            total, least = 0.0, best[3] * count
-            for n in range(count):
-                total += field[i + offsets[n, 0], j + offsets[n, 1]]
-                if total + (count - 1 - n) < least:  # the rest cannot make up for it
+    fits, known = np.zeros(len(poses)), np.zeros(len(poses))
+    for h in range(len(poses)):
+        cos, sin = math.cos(poses[h, 2]), math.sin(poses[h, 2])
+        for k in range(len(ends)):
+            dx, dy = cos * ends[k, 0] - sin * ends[k, 1], sin * ends[k, 0] + cos * ends[k, 1]
+            length = math.hypot(dx, dy)
+            value, room = _at(score, poses[h, 0] + dx, poses[h, 1] + dy), length
+            if hits[k]:
+                room *= 0.85
+            elif not math.isnan(value):
+                value = 1.0
+            for step in range(1, int(room)):
+                i = math.floor(poses[h, 0] + dx * step / length)
+                j = math.floor(poses[h, 1] + dy * step / length)
+                if 0 <= i < occupied.shape[0] and 0 <= j < occupied.shape[1] and occupied[i, j]:
+                    value = 0.0
                     break
-            if total > least:
-                best = (float(i), float(j), heading, total / count)
-    return best
+            if not math.isnan(value):
+                known[h] += 1.0 / len(ends)
+                fits[h] += value / len(ends)
+    return fits, known

@@ -15,6 +15,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,7 @@ _ORDINARY_DROPS = frozenset(
 """Drops that are ordinary and not logged: late, duplicate or outlying data and infrared out of range.
 Drops under overload have a warning of their own."""
 
+_READ_BYTES = 8_000_000  # Read and thinned out at once: what is read takes more memory than what is left
 INACTIVE = "Nothing was changed: the estimator is not active."  # Answer of the services while it is not
 
 CreateEstimator = Callable[[Swarm, Settings], Estimator]
@@ -119,7 +121,8 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._reported_s = time.monotonic()
         self._lost = 0
         self._static_transforms = StaticTransforms(self, self._swarm, self.params)
-        self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop)
+        horizon_s = self.params.settings.horizon_s
+        self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop, horizon_s)
         frame = self.params.map_frame
         self._commands = PoseCommands(self, self._swarm, self._estimator, frame, by_topics=not shared)
         self._start_ticks()
@@ -158,7 +161,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             return
         self._shedding.begin_tick(begin_s, self._pace.waited_s(self._time_ns()))
         self._receive(partial(newest_time_ns, self))
-        now_ns = self._time_ns()
+        self._inputs.looked_ns = now_ns = self._time_ns()
         self._estimate, fusing_s = self._estimate_at(now_ns, begin_s)
         if self._estimator.time_jumps != self._jumps:
             self._jumps = self._estimator.time_jumps
@@ -195,7 +198,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
     def _receive(self, time_ns: Callable[[], int]) -> None:
         """Pass the messages received to the estimator, thinned out under overload."""
         batch = MessageBatch.of(self._inputs.take(time_ns))
-        for messages in self._ingest.read(batch):
+        for messages in chain.from_iterable(map(self._ingest.read, batch.parts(_READ_BYTES))):
             thinned = self._thinning.thin(messages, self._shedding.share)
             self._cost.note_sightings(thinned.measurements, thinned.shed)
             self._estimator.receive(thinned.messages)
@@ -265,7 +268,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         foreign = self._static_transforms.foreign
         lost, self._lost = drops.get("overload", 0) - self._lost, drops.get("overload", 0)
         if lost:
-            text = f"overload: {lost} messages were lost in full queues"
+            text = f"overload: {lost} messages were lost in queues"
             causes.append(Report("overload", text, Level.WARN))
         causes += [Report("transforms", text, Level.WARN) for text in foreign]
         self.health.warn_of(

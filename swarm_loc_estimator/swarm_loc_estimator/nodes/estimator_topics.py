@@ -33,7 +33,8 @@ from swarm_loc_estimator.common.messages.streams import SerializedMessage
 from swarm_loc_estimator.common.node import message_class
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
-from swarm_loc_estimator.sensors.inputs import InputTopic
+from swarm_loc_estimator.sensors.inputs import SENSORS, InputTopic
+from swarm_loc_estimator.sensors.sensor import InputKind
 from swarm_loc_estimator.swarm.swarm import StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.sightings import encode_sightings, newest_sightings
@@ -145,8 +146,10 @@ class PoseCommands:
         return now_ns
 
 
-DEPTH = 1000  # Queue length of a topic, which is emptied at each tick: enough for the horizon
-_SHARED_DEPTH = 500  # The same for a topic with the readings of many robots, whose messages are large
+_RATE_HZ, _FAST_HZ = 100, 500
+"""Highest rate of a topic of which all messages within the horizon wait, and that of odometry and turn rates,
+which are small unless they are of many robots; images are large: their queues take most of the memory."""
+_LEAST_DEPTH, _MOST_DEPTH = 100, 1000
 _MAX_PER_TAKE = 5000  # Limit of messages per tick over all topics
 _MIN_PER_TOPIC = 100
 """Least limit per topic: the messages of the usual horizon. With less, an estimator that is late
@@ -154,6 +157,7 @@ would get ever older data, which cost more to fuse, and never catch up."""
 
 _LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
 """Drop reason of messages that are missing in a publisher's sequence."""
+_MAX_SEQUENCES = 100  # Of a topic with several publishers; of fewer, a rare one would seem to follow a loss
 _TF_STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _MAX_FRAME_LENGTH = 64  # Longer names of foreign frames are cut
 _RELIABLE = QoSProfile(depth=10)
@@ -161,20 +165,32 @@ _SIGHTINGS_PERIOD_NS = 180_000_000  # Publishing period of swarm/sightings, whic
 _TF = QoSProfile(depth=100)  # what tf2's own broadcaster offers
 
 
+def queue_depth(kind: InputKind, horizon_s: float) -> int:
+    """Length of the queue of a topic, which is emptied at each tick: what can be used after a long one."""
+    is_small = SENSORS[kind.rows].unit is None and not kind.stands_for
+    return min(max(_LEAST_DEPTH, round((_FAST_HZ if is_small else _RATE_HZ) * horizon_s)), _MOST_DEPTH)
+
+
 class EstimatorInputs:
     """Takes all inputs as raw bytes: building message objects would cost more than estimating.
 
     Messages wait in the middleware, which keeps the newest of each topic, and not in the executor, whose
     queue is unbounded; no executor may handle the subscriptions. Lost messages are detected by the
-    publishers' sequence numbers. The index of a topic is its handle.
+    publishers' sequence numbers, and those are dropped unread that have waited here for longer than the
+    horizon, after which nothing is fused. The index of a topic is its handle.
     """
 
-    def __init__(self, node: Node, topics: Sequence[InputTopic], drop: Callable[[str, int], None]) -> None:
+    def __init__(
+        self, node: Node, topics: Sequence[InputTopic], drop: Callable[[str, int], None], horizon_s: float
+    ) -> None:
         self._node = node
         self._topics = topics
         self._drop = drop
-        self._newest: list[int | None] = [None] * len(topics)
-        self._looked_ns = 0
+        self._horizon_ns = round(horizon_s * 1e9)
+        # Of each topic, the newest sequence numbers of its publishers, and these when a number was left out
+        self._newest: list[list[int]] = [[] for _ in topics]
+        self._publishers: list[set[tuple[int, ...]]] = [set() for _ in topics]
+        self.looked_ns = 0  # Newest time that the estimator knows; reading many messages takes a while
         self._quota = max(_MIN_PER_TOPIC, _MAX_PER_TAKE // len(topics))
         self._subscriptions = [self._subscribe(k, ReliabilityPolicy.RELIABLE) for k in range(len(topics))]
 
@@ -184,33 +200,52 @@ class EstimatorInputs:
         `time_ns` returns the node's time. It is called after the messages are taken, since an earlier time
         could be before their stamps. In simulated time, all arrive at that time.
         """
-        taken = []
+        taken: list[tuple[int, int, bytes]] = []
+        clock = self._node.get_clock()
+        is_simulated = clock.ros_time_is_active  # where the middleware's times are of another clock
+        oldest_ns = 0 if is_simulated else clock.now().nanoseconds - self._horizon_ns
         for handle, subscription in enumerate(self._subscriptions):
             take, message_class = subscription.handle.take_message, subscription.msg_type
-            for _ in range(self._quota):
-                message = take(message_class, True)
-                if message is None:
-                    break
+            before = len(taken)
+            numbers: list[int | None] = []
+            while len(taken) < before + self._quota and (message := take(message_class, True)) is not None:
                 data, info = message
-                self._count_gap(handle, info["publication_sequence_number"])
-                taken.append((info["received_timestamp"], handle, data))
+                numbers.append(info["publication_sequence_number"])
+                if info["received_timestamp"] >= oldest_ns:
+                    taken.append((info["received_timestamp"], handle, data))
+            self._count_gaps(handle, numbers)
+            if waited := len(numbers) - (len(taken) - before):
+                self._drop("overload", waited)
         taken.sort(key=lambda one: one[0])
         now_ns = time_ns()
         # time must not seem to go back to where it was looked at before
-        begin_ns = now_ns if self._node.get_clock().ros_time_is_active else self._looked_ns
-        self._looked_ns = now_ns
+        begin_ns = now_ns if is_simulated else self.looked_ns
+        self.looked_ns = now_ns
         return [
             SerializedMessage(handle, data, min(max(at_ns, begin_ns), now_ns))
             for at_ns, handle, data in taken
         ]
 
-    def _count_gap(self, handle: int, number: int | None) -> None:
-        """Count what is missing between the newest message and this one, if one publisher numbers them."""
-        before, self._newest[handle] = self._newest[handle], number
-        if before is None or number is None or number <= before + 1:
+    def _count_gaps(self, handle: int, numbers: Sequence[int | None]) -> None:
+        """Count what is missing in the sequences of a topic's publishers, which messages do not name.
+
+        A number that continues no sequence is the first of a new publisher, or follows the nearest one.
+        """
+        newest, gaps = self._newest[handle], []
+        for number in filter(None, numbers):
+            if number - 1 in newest:
+                newest.remove(number - 1)
+            else:
+                gaps.append(number - 1 - max((one for one in newest if one < number), default=number - 1))
+            newest.append(number)
+        if not gaps:
             return
-        if len(self._node.get_publishers_info_by_topic(self._topics[handle].name)) == 1:
-            self._drop(_LOST[self._subscriptions[handle].qos_profile.reliability], number - before - 1)
+        known, infos = self._publishers[handle], self._node.get_publishers_info_by_topic
+        now = {tuple(one.endpoint_gid) for one in infos(self._topics[handle].name)}
+        self._publishers[handle] = now
+        del newest[: -1 if len(now | known) == 1 else -_MAX_SEQUENCES]
+        if lost := sum(sorted(gaps)[: max(0, len(gaps) - len(now - known))]):
+            self._drop(_LOST[self._subscriptions[handle].qos_profile.reliability], lost)
 
     def _subscribe(self, handle: int, reliability: ReliabilityPolicy) -> Subscription:
         topic = self._topics[handle]
@@ -218,7 +253,7 @@ class EstimatorInputs:
             message_class(topic.kind.message_type),
             topic.name,
             lambda _: None,
-            QoSProfile(depth=_SHARED_DEPTH if topic.kind.stands_for else DEPTH, reliability=reliability),
+            QoSProfile(depth=queue_depth(topic.kind, 1e-9 * self._horizon_ns), reliability=reliability),
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=partial(self._follow, handle)),
         )

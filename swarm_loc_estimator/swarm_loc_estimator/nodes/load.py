@@ -184,9 +184,7 @@ class Shedding:
         if wall_s - self._begin_s >= _WINDOW_S:
             self._adapt(wall_s - self._begin_s, waited_s)
             self._begin_window(wall_s)
-        self._handled_s += (
-            wall_s - self._ticked_s
-        )  # this tick handles what was received since the previous one
+        self._handled_s += wall_s - self._ticked_s  # it handles what was received since the previous one
         self._ticked_s = wall_s
 
     def _adapt(self, elapsed_s: float, waited_s: float) -> None:

@@ -13,7 +13,7 @@ from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, START_TURN, CooperativeMapper
 from swarm_loc_estimator.mapping.matching import Lattice, search_offsets
 from swarm_loc_estimator.mapping.relocation import Search
-from swarm_loc_estimator.mapping.scans import Readings
+from swarm_loc_estimator.mapping.scans import Readings, ScanStop
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
 _ROOM = (1.7, 1.1)  # Distances of the walls from the centre of the room, east and west, north and south [m]
@@ -42,9 +42,10 @@ def precompile() -> None:
     # what is called where a robot comes to an old stop again
     search_offsets(mapper.graph.scans, np.array([1]), np.array([0]), Lattice(0.06, 0.06, 0.03, 0.03))
     # what is called where odometry has restarted
-    search = Search(pose, 1.0)
-    search.parts.append(mapper.graph.poses[:, :2].repeat(10, axis=0))
-    search.place(mapper.occupancy())
+    view = ScanStop(pose)
+    view.turn = np.linspace(0.0, 7.0, 9)
+    view.inverse = np.ones(9)
+    Search(pose, 1.0).add(view, 1.0, mapper.occupancy())
     yaw_of(0.0, 0.0, 0.0, 1.0)  # what reads odometry
     note_precompiled(precompile)
 

@@ -153,17 +153,10 @@ class OdometryTracks:
         by_wheels, by_gyro = self.arrays.gyro_check[robot, : self.arrays.filled[robot], [WHEELS, GYRO]]
         return float(by_gyro @ by_wheels / (by_wheels @ by_wheels or math.nan))
 
-    def had_fault(self, now_ns: int) -> BoolArray:
-        """Whether the odometry of each robot (N,) has jumped or was reset within the last seconds."""
-        return self._had_faults(now_ns, 0)
-
-    def has_conflicting_sources(self, now_ns: int) -> BoolArray:
-        """Whether the odometry of each robot (N,) has done so repeatedly within the last seconds."""
-        return self._had_faults(now_ns, 1)
-
-    def _had_faults(self, now_ns: int, before_last: int) -> BoolArray:
+    def had_faults(self, now_ns: int, count: int) -> BoolArray:
+        """Whether the odometry of each robot (N,) has jumped or was reset recently, 1 or 2 times."""
         arrays, robots = self.arrays, np.arange(self._robots)
-        fault_ns = arrays.jump_ns[robots, np.maximum(arrays.filled - 1, 0), before_last]
+        fault_ns = arrays.jump_ns[robots, np.maximum(arrays.filled - 1, 0), count - 1]
         recent: BoolArray = (arrays.filled > 0) & (now_ns - fault_ns < _JUMPING_NS)
         return recent
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Iterator, Mapping
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.files import replacing
+from swarm_loc_estimator.common.files import check_file, naming, replacing, temporary_folder
 from swarm_loc_estimator.common.messages.cdr import (
     MARKERS,
     OCCUPANCY_GRID,
@@ -142,10 +141,11 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
     Raises:
         UserError: It cannot be written.
     """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=".mcap_") as folder:
-        bag = Path(folder) / "run"
-        with BagWriter(bag, compress=True) as writer:
+    with naming(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        check_file(path)
+    with temporary_folder(parent=path.parent) as folder:
+        with BagWriter(folder / "run", compress=True) as writer:
             _add_estimates(result, writer)
             _add_tracks("ground_truth", result.truth, writer)
             _add_tracks("goal", result.goals, writer)
@@ -153,8 +153,8 @@ def write_mcap(result: ReplayResult, path: Path) -> None:
                 writer.add_topic("map", OCCUPANCY_GRID, is_latched=True)
             for one in result.maps:
                 writer.write("map", one.log_ns, one.data)
-        with replacing(path) as part:
-            (bag / "run.mcap").replace(part)
+        with naming(path):
+            (folder / "run/run.mcap").replace(path)
 
 
 def _add_tracks(topic: str, tracks: Mapping[str, Trajectory], writer: BagWriter) -> None:

@@ -11,12 +11,14 @@ import weakref
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.files import naming
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.filter.measurements import LossReason
@@ -38,7 +40,8 @@ class Spool:
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile(prefix="replay_")  # noqa: SIM115 # for as long as this lives
-        weakref.finalize(self, self._file.close)
+        weakref.finalize(self, self._file.raw.close)  # what is not written is not needed
+        self._place = Path(tempfile.gettempdir())
         self._end = 0
         self._blocks: dict[Hashable, list[tuple[int, int]]] = {}
 
@@ -47,7 +50,8 @@ class Spool:
         data = np.ascontiguousarray(rows).tobytes()
         blocks = self._blocks.setdefault(key, [])
         blocks.append((self._end, len(data)))
-        self._file.write(data)
+        with naming(self._place):
+            self._file.write(data)
         self._end += len(data)
 
     def array(self, key: Hashable, dtype: npt.DTypeLike, *shape: int) -> npt.NDArray[Any]:
@@ -57,11 +61,12 @@ class Spool:
         begin = -(-self._end // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
         if not size:
             return np.zeros((0, *shape), dtype=dtype)
-        self._file.seek(begin)
-        self._end = begin
-        for offset, length in blocks:
-            self._copy(offset, length)
-        self._file.flush()
+        with naming(self._place):  # already this `seek` writes what is buffered
+            self._file.seek(begin)
+            self._end = begin
+            for offset, length in blocks:
+                self._copy(offset, length)
+            self._file.flush()
         mapped = mmap.mmap(self._file.fileno(), size, access=mmap.ACCESS_READ, offset=begin)
         return np.frombuffer(mapped, dtype=dtype).reshape(-1, *shape)
 

@@ -86,7 +86,10 @@ class ParameterTable(NamedTuple):
         drives = np.array([not robot.stands for robot in robots], dtype=bool)
         first_camera = sum(not isinstance(mark, FixedCamera) for mark in landmarks)
         first_anchor = first_camera - sum(isinstance(mark, Anchor) for mark in landmarks)
-        reopened = np.array([_reopened(mark) for mark in landmarks]).reshape(-1, 3, 3)
+        reopened = [
+            _error(mark, _CONTRADICTED_CAMERA_SIGMA) if isinstance(mark, FixedCamera) else _survey(mark)
+            for mark in landmarks
+        ]
         column, survey_column = np.full(sigma.shape, -1), np.full(len(landmarks), -1)
         table = cls(
             column,
@@ -94,7 +97,7 @@ class ParameterTable(NamedTuple):
             times,
             survey_column,
             surveys,
-            reopened,
+            np.array(reopened).reshape(-1, 3, 3),
             drives,
             first_anchor,
             first_camera,
@@ -149,11 +152,6 @@ def _survey(mark: Surveyed) -> FloatArray:
     third = mark.range_bias_sigma if isinstance(mark, Anchor) else mark.yaw_sigma
     given = mark.position_sigma, third
     return _error(mark, given if mark.is_estimated else _CONTRADICTED_SURVEY_SIGMA)
-
-
-def _reopened(mark: Surveyed) -> FloatArray:
-    """Covariance (3, 3) that is added to this error after a contradiction."""
-    return _error(mark, _CONTRADICTED_CAMERA_SIGMA) if isinstance(mark, FixedCamera) else _survey(mark)
 
 
 def _error(mark: Surveyed, sigma: tuple[float, float]) -> FloatArray:

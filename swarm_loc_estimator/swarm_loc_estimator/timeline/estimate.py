@@ -307,8 +307,8 @@ def contradictions(
     robots, belief, maps = len(swarm.robots), state.arrays(), swarm.map is not None
     names += [f"{'lidar' if maps and one.lidar.is_used else 'fixes'} of {one.name}" for one in swarm.robots]
     names += [f"marker of {one.name}" for one in swarm.robots]
-    conflicting = tracks.has_conflicting_sources(now_ns)
-    reset = tracks.had_fault(now_ns) & ~conflicting
+    conflicting = tracks.had_faults(now_ns, 2)
+    reset = tracks.had_faults(now_ns, 1) & ~conflicting
     denied = [is_tracked and is_contradicted(belief, robot) for robot, is_tracked in enumerate(state.tracked)]
     # Turns of gyroscopes may still turn out uncertain, which would explain what was found since then.
     is_new = state.contradicted_ns > now_ns - tracks.unsettled_ns

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -122,3 +122,46 @@ def test_an_overloaded_estimator_sheds_sightings_evenly_and_says_so(ros: Ros, sw
         for robot in message.robots:
             assert robot.status == SwarmPose.STATUS_TRACKED
             assert (robot.x, robot.y, robot.theta) == pytest.approx(TRUE_POSES[robot.name], abs=0.02)
+
+
+class BusyEstimator(Estimator):
+    """Once, a message comes while it reads others for longer than its clock may seem to jump back."""
+
+    def __init__(self, *arguments: Any) -> None:
+        super().__init__(*arguments)
+        self.send: Callable[[], None] | None = None
+        self.received = 0
+
+    def convert(self, batch: Batch) -> Batch:
+        """Read slowly, once."""
+        self.received += batch["odometry"].robot.size
+        if self.send is not None and self.received:
+            self.send()
+            self.send, end_s = None, time.monotonic() + 5.0 * self.settings.jump_back_s
+            while time.monotonic() < end_s:
+                pass
+        return super().convert(batch)
+
+
+def test_what_comes_while_much_is_read_is_no_jump_of_the_clock(ros: Ros, swarm_file: Any) -> None:
+    made: list[BusyEstimator] = []
+
+    def create(*arguments: Any) -> BusyEstimator:
+        made.append(BusyEstimator(*arguments))
+        return made[-1]
+
+    ros.add(
+        EstimatorNode(create, parameter_overrides=overrides(swarm_file=str(swarm_file), jump_back_s=0.02))
+    )
+    (busy,) = made
+    publisher = ros.stranger().create_publisher(Odometry, "alpha/odom", 100)
+    ros.until(publisher.get_subscription_count)
+
+    def send() -> None:
+        publisher.publish(odometry_bytes("alpha", time.time_ns()))
+        assert publisher.wait_for_all_acked()
+
+    busy.send = send
+    send()
+    ros.until(lambda: busy.received == 2)
+    assert busy.time_jumps == 0

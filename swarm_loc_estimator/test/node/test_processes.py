@@ -18,6 +18,12 @@ import pytest
 from swarm_loc_estimator.common import launch as processes
 from swarm_loc_estimator.common.launch import NodeSpec
 
+TAKES_SIGINT = """#!{0}
+import os, signal
+signal.pthread_sigmask(signal.SIG_UNBLOCK, {{signal.SIGINT}})
+os.execlp("sh", "sh", "-c", {1!r})
+"""
+"""As the executables of this project do, when they have begun."""
 PROGRAMS = {
     "forever": "trap 'echo asked; exit 0' INT\necho up\nwhile :; do sleep 0.2 & wait; done\n",
     "deaf": "trap '' INT\necho up > {fifo}\nexec sleep 60\n",
@@ -44,7 +50,8 @@ def _fake_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     marker.touch()
     os.mkfifo(tmp_path / "fifo")
     for name, lines in PROGRAMS.items():
-        (programs / name).write_text("#!/bin/sh\n" + lines.format(fifo=tmp_path / "fifo"), encoding="utf-8")
+        text = TAKES_SIGINT.format(sys.executable, lines.format(fifo=tmp_path / "fifo"))
+        (programs / name).write_text(text, encoding="utf-8")
         (programs / name).chmod(0o755)
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
 

@@ -163,7 +163,7 @@ def test_a_flood_is_dropped_and_counted_memory_stays_and_a_signal_ends_the_node(
         program.wait_for("ready")
         flood = subprocess.Popen(command)
         try:
-            ros.until(lambda: "lost in full queues" in newest_status(heard, "estimator").message)
+            ros.until(lambda: "were lost in queues" in newest_status(heard, "estimator").message)
             assert "dropped: overload" in values_of(newest_status(heard, "estimator"))
             before, begin_s = resident_bytes(program.process.pid), time.monotonic()
             ros.until(lambda: time.monotonic() > begin_s + FLOOD_S)

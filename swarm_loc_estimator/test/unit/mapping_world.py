@@ -89,6 +89,10 @@ class RoomRobot:
         """Let a time pass without readings [s]."""
         self._stamp_ns += round(1e9 * duration_s)
 
+    def catch_up(self, other: RoomRobot) -> None:
+        """Let time pass without readings until that of another robot, or that one's until ours."""
+        self._stamp_ns = other._stamp_ns = max(self._stamp_ns, other._stamp_ns)
+
     def drive(self, length: float) -> Readings:
         """Drive ahead [m]."""
         count = max(1, round(length / (_SPEED * PERIOD_NS * 1e-9)))

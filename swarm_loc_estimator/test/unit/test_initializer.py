@@ -245,6 +245,18 @@ def test_the_fix_is_the_truth_also_among_wrong_constraints(seed: int, count: int
     assert nees(error_of(found.transform, transform), found.covariance) < 45.0
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_odometry_that_comes_late_after_a_dropout_was_assumed_leaves_a_covariance(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    transform, swerve = any_pose(rng), rng.uniform(0.2, 0.8, 3)
+    constraints = constraints_of(rng, transform, rng.uniform(-1.0, 1.0, (12, 2)))
+    constraints["track_noise"][6:] = np.outer(swerve, swerve) + 1e-3 * np.eye(3)
+    found = alignment.align(constraints, 1e-3 * np.eye(3))
+    assert found is not None
+    assert np.linalg.eigvalsh(found.covariance)[0] > 0.0
+    assert nees(error_of(found.transform, transform), found.covariance) < 45.0
+
+
 def error_of(transform: FloatArray, truth: FloatArray) -> FloatArray:
     """The right-invariant error (3,), to first order."""
     error: FloatArray = pose_of(planar(truth) @ np.linalg.inv(planar(transform)))

@@ -215,9 +215,22 @@ def test_usual_comments_of_an_image_are_ignored(tmp_path: Path, head: bytes) -> 
 
 
 @pytest.mark.parametrize(
-    "kind", ["P5", "P2", "P1", "P4", "in a number", "between numbers", "before pixels", "PNG"]
+    "kind",
+    [
+        "P5",
+        "P2",
+        "P1",
+        "P4",
+        "P3 spaces",
+        "P2 spaces",
+        "one comment",
+        "in a number",
+        "between numbers",
+        "before pixels",
+        "PNG",
+    ],
 )
-def test_endless_comments_are_refused_and_not_read(
+def test_endless_comments_and_spaces_are_refused_and_not_read(
     tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Image, "open", pytest.fail)
@@ -227,6 +240,9 @@ def test_endless_comments_are_refused_and_not_read(
     png = io.BytesIO()
     Image.new("L", (160, 110)).save(png, "PNG")
     texts = {
+        "P3 spaces": b"P3 160 110 255\n" + b" " * 2_000_000,
+        "P2 spaces": b"P2 160 110 255\n" + b"0\n" + b"\n" * 2_000_000,
+        "one comment": b"P2 160 110 255\n" + b"0 #" + b"x" * 2_000_000 + b"\n",
         "in a number": b"P5 16" + long + b"0 110 255\n",
         "between numbers": b"P5 160 " + many + b"110 255\n",
         "before pixels": b"P5 160 110 255" + long,
@@ -238,8 +254,18 @@ def test_endless_comments_are_refused_and_not_read(
         texts.get(kind, kind.encode() + b"\n" + (b"" if within else long) + numbers + b"\n" + within)
         + bytes(160 * 110)
     )
-    with pytest.raises(UserError, match="with a header of a usual length"):
+    with pytest.raises(UserError, match="with a header and spaces of a usual length"):
         load_map(path, CELL)
+
+
+@pytest.mark.parametrize("space", [b" ", b"\r\n", b"\t\t\t\t# row\n"])
+def test_plain_images_are_read(tmp_path: Path, space: bytes) -> None:
+    path, image = save_map(hall(), tmp_path / "hall")
+    expected = load_map(path, CELL)
+    pixels = np.frombuffer(image.read_bytes()[-160 * 110 :], np.uint8).reshape(110, 160)
+    rows = [b"    ".join(b"%3d" % value for value in row) for row in pixels.tolist()]
+    image.write_bytes(b"P2\n160 110\n255\n" + space.join(rows) + b"\n")
+    assert np.array_equal(load_map(path, CELL).log_odds, expected.log_odds)
 
 
 @pytest.mark.parametrize("yaw", ["1e-9", "-1.0e-7", "0", "-0.0"])

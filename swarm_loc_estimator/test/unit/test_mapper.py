@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from mapping_world import ROOM, RoomRobot, distance_in_room
 
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
 from swarm_loc_estimator.mapping.relocation import Search
@@ -129,7 +130,7 @@ def test_odometry_that_begins_anew_is_no_drive() -> None:
     explore(mapper, mapper.join(np.array(START), KNOWN), robot, 2)
     robot.odometry = np.array([40.0, -7.0, 2.0])
     robot.pose[:2] += [0.04, -0.03]  # somebody has pushed it a little, too
-    explore(mapper, 0, robot, 2)
+    seek(mapper, robot)
     assert mapper.counters["odometry_restarts"] == 1
     position, heading = error_of(mapper, 0, robot)
     assert position < 0.03
@@ -174,7 +175,7 @@ def test_a_robot_that_moves_unheard_while_its_driver_restarts_is_found_by_its_sc
     position, heading = error_of(mapper, 0, robot)
     assert position < 0.03
     assert heading < math.radians(2.0)
-    assert np.abs((mapper.graph.poses[: len(before)] - before)[:, :2]).max() < 0.04
+    assert np.abs((mapper.graph.poses[: len(before)] - before)[:, :2]).max() < 0.03
 
 
 def test_a_robot_whose_scan_fits_two_places_leaves_the_map_as_it_is() -> None:
@@ -194,28 +195,102 @@ def test_a_robot_whose_scan_fits_two_places_leaves_the_map_as_it_is() -> None:
     assert np.array_equal(mapper.occupancy().log_odds, walls)
 
 
-def test_a_place_that_later_stops_contradict_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
+def at_a_wrong_place(patch: pytest.MonkeyPatch) -> tuple[CooperativeMapper, RoomRobot, FloatArray]:
+    """A robot that is found, but not where it is; the poses of the stops before its restart, too."""
     mapper, robot = CooperativeMapper(), RoomRobot(START, 0.02, np.random.default_rng(23))
     explore(mapper, mapper.join(np.array(START), KNOWN), robot, 3)
     before = mapper.graph.poses.copy()
     restart(robot, 2.1, 0.0)
-    wrong = [np.array([0.8, 1.9, 2.0])]
-    with monkeypatch.context() as patch:
-        find = Search.place
-        patch.setattr(Search, "place", lambda *given: wrong.pop() if wrong else find(*given))
+
+    def wrong(search: Search) -> int:
+        """The hypothesis that is furthest from the truth."""
+        return int(np.hypot(*(search.poses[:, -1, :2] - robot.pose[:2]).T).argmax())
+
+    with patch.context() as inside:
+        inside.setattr(Search, "verdict", wrong)
         seek(mapper, robot)
-        for _ in range(3):
-            goal = mapper.goal(0)
-            if goal is None:
-                seek(mapper, robot)
-            else:
-                feed(mapper, 0, [*robot.go_to(goal.odometry), robot.turn(SCAN_TURN)])
-    assert mapper.counters["places_taken_back"] == 1
+    assert error_of(mapper, 0, robot)[0] > 0.3
+    assert mapper.graph.count > len(before)
+    return mapper, robot, before
+
+
+def test_a_place_that_later_stops_contradict_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    mapper, robot, before = at_a_wrong_place(monkeypatch)
+    for _ in range(4):
+        goal = mapper.goal(0)
+        if goal is None:
+            seek(mapper, robot)
+        else:
+            feed(mapper, 0, [*robot.go_to(goal.odometry), robot.turn(SCAN_TURN)])
+    assert mapper.counters["places_taken_back"] > 0
     position, heading = error_of(mapper, 0, robot)
     assert position < 0.03
     assert heading < math.radians(2.0)
-    assert np.abs((mapper.graph.poses[: len(before)] - before)[:, :2]).max() < 0.04
+    assert np.abs((mapper.graph.poses[: len(before)] - before)[:, :2]).max() < 0.03
     assert len(mapper.begin_ns) < mapper.graph.count  # the stops at the wrong place count no more
+
+
+def test_a_place_is_taken_back_where_a_robot_restarts_before_it_is_confirmed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    mapper, robot, before = at_a_wrong_place(monkeypatch)
+    restart(robot, 0.7, 0.0)
+    feed(mapper, 0, [robot.turn(0.1)])
+    assert mapper.pose(0) is None
+    assert len(mapper.begin_ns) == len(before)
+    assert not mapper.graph.scans.beams.counts[len(before) : mapper.graph.count].any()
+    seek(mapper, robot)
+    assert error_of(mapper, 0, robot)[0] < 0.03
+
+
+def lights_of(
+    readings: Readings, heading: float, place: FloatArray, target: int, there: FloatArray
+) -> LightSightings:
+    """What a robot without slip that turns at a place (2,), at last to a heading, sees of one at another."""
+    turned = wrap_angle(readings.odometry[:, 2] - readings.odometry[-1, 2])
+    x, y = there - place
+    bearing = wrap_angle(math.atan2(y, x) - heading - turned)
+    seen = np.abs(bearing) < 0.5
+    count = int(seen.sum())
+    return LightSightings(
+        readings.stamp_ns[seen], np.full(count, target), bearing[seen], np.full(count, 0.02)
+    )
+
+
+@pytest.mark.parametrize("sees", [True, False])
+def test_lights_tell_at_which_of_two_places_that_look_alike_a_robot_is(sees: bool) -> None:
+    """In a room without a niche, of two robots one is lost, which sees the other one or is seen by it."""
+    mapper, starts = CooperativeMapper(), [(*MIDDLE, 0.3), (0.8, 0.8, 1.0)]
+    lost, other = robots = [
+        RoomRobot(one, 0.0, np.random.default_rng(22 + k)) for k, one in enumerate(starts)
+    ]
+    for number, robot in enumerate(robots):
+        robot.has_niche = False
+        mapper.join(np.array(starts[number]), KNOWN)
+        explore(mapper, number, robot, 1)
+    restart(lost, 2.0, 0.0)
+    feed(mapper, 0, look_around(lost))
+    assert mapper.pose(0) is None
+    for _ in range(2):
+        while distance_in_room(*lost.pose, has_niche=False) < 0.6:
+            feed(mapper, 0, [lost.turn(1.0)])
+        feed(mapper, 0, [lost.drive(0.4)])
+        other.catch_up(lost)
+        scans = [lost.turn(SCAN_TURN), other.turn(SCAN_TURN)]
+        for number, scan in enumerate(scans):
+            if (number == 0) == sees:
+                to = robots[1 - number].pose[:2]
+                seen = lights_of(scan, float(robots[number].pose[2]), robots[number].pose[:2], 1 - number, to)
+                mapper.add_lights(number, seen)
+            mapper.add_readings(number, scan)
+        feed(mapper, 0, [lost.rest(1.2)])
+        goal = mapper.goal(1)
+        assert goal is not None
+        feed(mapper, 1, other.go_to(goal.odometry))
+    feed(mapper, 0, [lost.drive(0.1), lost.turn(SCAN_TURN), lost.rest(1.2)])
+    position, heading = error_of(mapper, 0, lost)
+    assert position < 0.03
+    assert heading < math.radians(2.0)
 
 
 @pytest.mark.parametrize(

@@ -342,7 +342,7 @@ class Rims:
 
     def _least(self, darkest: FloatArray) -> FloatArray:
         """Least steps of edges by the logarithm of brightness on their darker side."""
-        return np.maximum(self.min_contrast, _NOISES * self.image.log_noise(darkest))
+        return np.maximum(self.min_contrast, _NOISES * self.image.noise * np.exp(-darkest))
 
 
 def likely(rims: Rims, centres: FloatArray, radius: float) -> FloatArray:

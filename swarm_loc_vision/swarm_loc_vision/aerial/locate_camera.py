@@ -17,8 +17,8 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
-import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -32,18 +32,19 @@ from swarm_loc_estimator.common.command_line import (
     parameters_of,
 )
 from swarm_loc_estimator.common.parameters import UserError, number_specs
-from swarm_loc_estimator.common.yaml_tree import tree_text
+from swarm_loc_estimator.common.yaml_tree import read_file, tree_text
 from swarm_loc_estimator.swarm.swarm import FixedCamera
 from swarm_loc_vision.aerial.control_points import ControlPointError
 from swarm_loc_vision.aerial.ground_camera import POSE_SIZE, GroundCamera
 from swarm_loc_vision.aerial.ground_control import located
 from swarm_loc_vision.aerial.ground_file import load_ground
 from swarm_loc_vision.aerial.parameters import AerialSettings
-from swarm_loc_vision.common.images import Gray
+from swarm_loc_vision.common.images import Gray, ImageError, Size, decoded_image
 
 _FROM_OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 """Columns: forward, left and up of a camera in its optical frame."""
 _GRID = (9, 7)
+_MAX_BYTES = 200_000_000
 _BESIDE_PX, _STEP = 20.0, 1e-5
 
 
@@ -112,7 +113,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if ground.markers and not options.pictures:
         raise LocateError(f"{options.control_points} has floor markers, so pictures of them must be given.")
     settings = parameters_of(AerialSettings, options.set)
-    size = (ground.camera.height, ground.camera.width)
+    size = (ground.camera.width, ground.camera.height)
     pictures = [_picture(path, size) for path in options.pictures]
     try:
         fit = located(ground, ground.camera, pictures, settings)
@@ -125,23 +126,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _picture(path: Path, size: tuple[int, int]) -> Gray:
-    """A picture (height, width) of a size."""
-    gray = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if gray is None:
-        raise LocateError(f"{path} is no picture.")
-    if gray.shape != size:
-        raise LocateError(
-            f"{path} has {gray.shape[1]} x {gray.shape[0]} pixels but the camera {size[1]} x {size[0]}."
-        )
-    return gray.astype("uint8", copy=False)
+def _picture(path: Path, size: Size) -> Gray:
+    """A picture (height, width) of a width and height, a PNG or JPEG."""
+    message = SimpleNamespace(format="", data=read_file(path, _MAX_BYTES))
+    try:
+        return decoded_image(message, size)
+    except ImageError as error:
+        raise LocateError(f"{path} cannot be used: {error}") from error
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(__doc__)
     parser.add_argument("name", help="the camera's name in the swarm description")
     parser.add_argument("control_points", type=Path, help="file of control points")
-    parser.add_argument("pictures", type=Path, nargs="*", help="pictures of the camera with floor markers")
+    parser.add_argument("pictures", type=Path, nargs="*", help="PNG or JPEG with floor markers")
     height = number_in(0.0, 10.0, "m")
     parser.add_argument("--height", type=height, default=0.0, help="of the robots' lying markers [m]")
     add_set(parser, "parameter of aerial_camera_node about control points")

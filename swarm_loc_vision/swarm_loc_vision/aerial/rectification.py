@@ -125,10 +125,6 @@ class Brightness:
     log: Plain  # (rows, columns) their logarithm, in which uneven light and shadows change edges little
     noise: float  # Standard deviation of the noise of the raw image [counts]
 
-    def log_noise(self, log: FloatArray) -> FloatArray:
-        """Standard deviation of values of the logarithm."""
-        return np.asarray(self.noise * np.exp(-log))
-
 
 def logarithm(plain: Plain | FloatArray) -> FloatArray:
     """The logarithm of counts, with an offset."""

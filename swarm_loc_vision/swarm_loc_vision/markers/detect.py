@@ -26,11 +26,13 @@ from swarm_loc_estimator.common.command_line import (
     ProgressLine,
     add_bag,
     add_set,
+    bag_to_write,
     command_parser,
     exit_with_message,
     parameters_of,
     swarm_beside,
 )
+from swarm_loc_estimator.common.files import naming
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS, CdrError, decode
 from swarm_loc_estimator.common.parameters import Value
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -68,8 +70,10 @@ class ImageBag:
         # of two transports of one camera, the uncompressed images are read
         self._images: dict[str, tuple[str, Transport]] = {}
         for transport in reversed(TRANSPORTS.values()):
-            for space in _spaces(topics, f"image_raw{transport.suffix}", transport.message_type):
-                self._images[space] = (f"{space}image_raw{transport.suffix}", transport)
+            ending = f"image_raw{transport.suffix}"
+            for name, message_type, _ in topics:
+                if message_type == transport.message_type and f"/{name}".endswith(f"/{ending}"):
+                    self._images[name.removesuffix(ending)] = (name, transport)
         if not self._images:
             names = " nor ".join(f"image_raw{transport.suffix}" for transport in TRANSPORTS.values())
             raise BagError(f"'{bag}' holds no images: there is neither {names}.")
@@ -78,12 +82,13 @@ class ImageBag:
             for space, (_, transport) in sorted(self._images.items())
         }
 
-    def detect(self, folder: Path, progress: Progress) -> int:
+    def detect(self, folder: Path, progress: Progress, swarm: Path | None) -> int:
         """Write a bag with detections in place of images.
 
         Args:
             folder: The new bag; must not exist.
             progress: Called with the share done and a word for the activity.
+            swarm: The description to copy to it, None for none.
 
         Returns:
             Number of messages.
@@ -97,6 +102,9 @@ class ImageBag:
         written = {f"{space}detections" for space in self._images}
         replaced = {f"{space}image_raw{t.suffix}" for space in self._images for t in TRANSPORTS.values()}
         with BagReader(self._bag) as reader, BagWriter(folder) as writer:
+            if swarm is not None:
+                with naming(folder):
+                    shutil.copyfile(swarm, writer.folder / "swarm.yaml")
             kept = [topic for topic in reader.topics if topic.name not in written | replaced]
             for topic in (*kept, *(BagTopic(name, DETECTIONS) for name in sorted(written))):
                 writer.add_topic(topic.name, topic.type)
@@ -114,15 +122,6 @@ class ImageBag:
                 count += 1
             self.losses = reader.losses
         return count
-
-
-def _spaces(topics: Sequence[BagTopic], name: str, message_type: str) -> list[str]:
-    """The namespaces, with slash, of topics of a name and type."""
-    return [
-        topic.name.removesuffix(name)
-        for topic in topics
-        if topic.type == message_type and f"/{topic.name}".endswith(f"/{name}")
-    ]
 
 
 def _detected(camera: CameraDetector, kind: str, data: bytes) -> bytes | None:
@@ -156,19 +155,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     recorded = swarm_beside(options.bag)
     swarm_file = options.swarm or (recorded if recorded.exists() else None)
-    described = "" if swarm_file is None else str(swarm_file)
-    given: dict[str, Value] = {
-        "autostart": True,
-        "image_transport": "raw",
-        "robot": "",
-        "swarm_file": described,
-    }
+    given: dict[str, Value] = {"autostart": True, "image_transport": "raw", "robot": ""}
+    given["swarm_file"] = "" if swarm_file is None else str(swarm_file)
     parameters = parameters_of(DetectorParameters, options.set, given)
     images = ImageBag(options.bag, camera_maker(parameters))
     with ProgressLine() as progress:
-        count = images.detect(options.output, progress)
-    if swarm_file is not None:
-        shutil.copyfile(swarm_file, options.output / "swarm.yaml")
+        count = images.detect(options.output, progress, swarm_file)
     for loss in images.losses:
         print(loss)
     for name, camera in images.cameras.items():
@@ -201,7 +193,7 @@ def _summary(name: str, camera: CameraDetector) -> str:
 def _parser() -> argparse.ArgumentParser:
     parser = command_parser(__doc__)
     add_bag(parser)
-    parser.add_argument("--output", type=Path, required=True, metavar="FOLDER", help="the new bag")
+    parser.add_argument("--output", type=bag_to_write, required=True, metavar="FOLDER", help="the new bag")
     add_set(parser, "parameter of marker_detector_node")
     return parser
 

@@ -72,7 +72,7 @@ def test_the_mean_of_many_pictures_is_better_than_one(
     rng, points = np.random.default_rng(5), tmp_path / "points.yaml"
     truth = over_floor(OVERHEAD, rng, tilt=0.3, height=1.5)
     save(Ground(markers=FLOOR, family=FAMILY), OVERHEAD, points)
-    still, pictures = photograph(truth), [str(tmp_path / f"{k}.bmp") for k in range(6)]
+    still, pictures = photograph(truth), [str(tmp_path / f"{k}.png") for k in range(6)]
     errors: dict[int, list[FloatArray]] = {1: [], 6: []}
     for _ in range(4):
         for path in pictures:
@@ -111,8 +111,10 @@ def test_pictures_without_markers_are_one_sentence(
 @pytest.mark.parametrize(
     ("added", "arguments", "said"),
     [
-        ("", ["picture.txt"], "picture.txt is no picture."),
-        ("", ["small.png"], "small.png has 8 x 6 pixels but the camera"),
+        ("", ["picture.txt"], "picture.txt cannot be used: the image's format is"),
+        ("", ["none.png"], "none.png cannot be read: No such file or directory."),
+        ("", ["bomb.png"], "bomb.png cannot be used: the image has 30000 x 30000 pixels, but must have"),
+        ("", ["small.png"], "small.png cannot be used: the image has 8 x 6 pixels, but must have"),
         ("markers: {7: {x: 0.0, y: 0.0, size: 0.1}}\n", [], "pictures of them must be given."),
         ("", ["--set", "control=1"], "'control' is no parameter"),
         ("", ["--height", "2"], "A camera 2 m above the floor does not see markers lying at 2 m."),
@@ -126,6 +128,8 @@ def test_what_the_command_cannot_use_is_one_sentence(
     path.write_text(path.read_text(encoding="utf-8").replace("markers: {}\n", "") + added, encoding="utf-8")
     (tmp_path / "picture.txt").write_text("no picture", encoding="utf-8")
     cv2.imwrite(str(tmp_path / "small.png"), np.zeros((6, 8), np.uint8))
+    png = (tmp_path / "small.png").read_bytes()
+    (tmp_path / "bomb.png").write_bytes(png[:16] + 2 * (30_000).to_bytes(4, "big") + png[24:])
     paths = [str(tmp_path / one) if "." in one else one for one in arguments]
     assert main(["ceiling1", str(path), *paths]) != 0
     assert said in capsys.readouterr().err

@@ -11,21 +11,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.parameters import NumberSpec, UserError
-from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, read_file, read_tree
+from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, read_tree
+from swarm_loc_estimator.mapping.map_file import load_map
 
 Rectangle = tuple[float, float, float, float]  # Left, lower, right and upper edge [m]
 _SUFFIXES = (".yaml", ".yml", ".json")
 _KEYS = ("about", "free", "solid", "polygons", "columns", "segments", "starts")
-_RESOLUTION = NumberSpec("m", 0.001, 10.0, False, "side of a pixel")
-_THRESHOLD = NumberSpec("1", 0.0, 1.0, False, "darker pixels are occupied")
-_MAX_IMAGE_BYTES = 50_000_000
 _MAX_WALLS, _MAX_RECTANGLES = 2000, 200  # Each step of a world compares every corner with every wall
 
 
@@ -93,7 +90,7 @@ def floor_plan(plan: str) -> FloorPlan:
         )
     tree = read_tree(path)
     is_map = isinstance(tree, dict) and "image" in tree
-    return _plan_of_map(path, tree) if is_map else _plan_of(plan, tree, TreeChecks(path, FloorPlanError))
+    return _plan_of_map(path) if is_map else _plan_of(plan, tree, TreeChecks(path, FloorPlanError))
 
 
 def _plan_of(name: str, tree: Tree, checks: TreeChecks) -> FloorPlan:
@@ -131,33 +128,15 @@ def _plan_of(name: str, tree: Tree, checks: TreeChecks) -> FloorPlan:
     return _checked(FloorPlan(name, np.vstack(walls), starts), checks)
 
 
-def _plan_of_map(path: Path, about: dict[str, Tree]) -> FloorPlan:
+def _plan_of_map(path: Path) -> FloorPlan:
     """The walls around the occupied cells of a map; where its image ends is a wall, too.
 
     Raises:
         UserError: The map cannot be used.
     """
-    checks = TreeChecks(path, FloorPlanError)
-    checks.mapping(about, WHOLE_FILE, required=("image", "resolution", "origin"))
-    cell = checks.number(about["resolution"], "resolution", _RESOLUTION) or 0.0
-    threshold = checks.number(about.get("occupied_thresh", 0.65), "occupied_thresh", _THRESHOLD) or 0.0
-    origin = checks.list_of_numbers(about["origin"], "origin")
-    if len(origin) != 3 or abs(origin[2]) > 1e-6:
-        raise checks.error("origin", list(origin), "must be x, y and a yaw of 0")
-    if about.get("mode", "trinary") == "raw" or about.get("negate", 0) not in (0, 1):
-        raise checks.said("mode must be trinary or scale, and negate 0 or 1")
-    data = read_file(path.parent / str(about["image"]), _MAX_IMAGE_BYTES)
-    try:
-        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
-    except cv2.error:  # an empty file, or one with too many pixels
-        pixels = None
-    if pixels is None:
-        raise checks.error("image", about["image"], "is no image that can be decoded")
-    darkness = (pixels if about.get("negate", 0) else 255 - pixels) / 255.0
-    occupied = (darkness > threshold)[::-1].T
-    corner = np.array(origin[:2])
-    walls = cell * _boundaries(occupied) + np.tile(corner, 2)
-    return _checked(FloorPlan(str(path), walls, np.zeros((0, 2))), checks)
+    grid = load_map(path)
+    walls = grid.cell * _boundaries(grid.occupied) + np.tile(grid.corner, 2)
+    return _checked(FloorPlan(str(path), walls, np.zeros((0, 2))), TreeChecks(path, FloorPlanError))
 
 
 def _checked(plan: FloorPlan, checks: TreeChecks) -> FloorPlan:

@@ -84,11 +84,6 @@ def spot_brightness(distance: float) -> float:
     return min(_SPOT_BRIGHTNESS / distance**2, _MAX_BRIGHTNESS)
 
 
-def led_brightness(distance: float) -> float:
-    """Brightness of an LED over its surroundings."""
-    return min(_LED_BRIGHTNESS / distance**2, _MAX_BRIGHTNESS)
-
-
 def camera_place(pose: FloatArray) -> tuple[float, float]:
     """Where the camera of a robot at `pose` (3,) is in the plane [m]."""
     return pose[0] + CAMERA_X_M * math.cos(pose[2]), pose[1] + CAMERA_X_M * math.sin(pose[2])
@@ -182,7 +177,8 @@ class HallSight:
             end = led_pixel(after[robot], after[other], front=front)
             place = led_place(after[other], front=front)
             if begin and end and is_visible(self._walls, x, y, *place):
-                spots.append(Spot(begin[:2], end[:2], led_brightness(end[2]), blinking))
+                brightness = min(_LED_BRIGHTNESS / end[2] ** 2, _MAX_BRIGHTNESS)
+                spots.append(Spot(begin[:2], end[:2], brightness, blinking))
         return spots
 
     def _edges(self, before: FloatArray, after: FloatArray) -> FloatArray:

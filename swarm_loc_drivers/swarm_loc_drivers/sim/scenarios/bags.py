@@ -228,9 +228,7 @@ def _write_run(
 
 def write_swarm_bag(streams: Sequence[Stream], swarm: Swarm, folder: Path, comment: str) -> int:
     """Write topics in order of arrival, and `swarm.yaml`; arguments and errors as for `write_bag`."""
-    count = write_streams(folder, streams)
-    save_swarm(swarm, folder / "swarm.yaml", comment)
-    return count
+    return write_streams(folder, streams, add=lambda part: save_swarm(swarm, part / "swarm.yaml", comment))
 
 
 def odometry_stream(run: LivedRun, robot: int) -> Stream:

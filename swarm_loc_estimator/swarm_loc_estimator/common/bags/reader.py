@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import itertools
 import shutil
-import tempfile
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any
@@ -24,6 +24,7 @@ from typing_extensions import Self
 from swarm_loc_estimator.common.bags.bag_file import BagError, BagTopic, RawMessage, ReadErrors
 from swarm_loc_estimator.common.bags.mcap_file import McapFile
 from swarm_loc_estimator.common.bags.sqlite_file import SqliteFile
+from swarm_loc_estimator.common.files import temporary_folder
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage, merge_streams
 from swarm_loc_estimator.common.yaml_tree import YamlTreeError, read_tree
@@ -140,7 +141,7 @@ class BagReader:
         self.offered_qos: dict[str, list[Qos]] = {}
         self._files: list[BagFile] = []
         self._own_losses = ReadErrors(path.name)
-        self._unpacked: tempfile.TemporaryDirectory[str] | None = None
+        self._unpacked = ExitStack()
         paths = self._find()
         try:
             self._open(paths)
@@ -217,8 +218,7 @@ class BagReader:
         """Close all files, and remove what was unpacked; may be called twice."""
         for file in self._files:
             file.close()
-        if self._unpacked:
-            self._unpacked.cleanup()
+        self._unpacked.close()
 
     def __enter__(self) -> Self:
         return self
@@ -244,8 +244,8 @@ class BagReader:
         """Open a file; a compressed one is unpacked into a temporary folder first."""
         if path.suffix in _STORAGES:
             return _STORAGES[path.suffix](path)
-        self._unpacked = self._unpacked or tempfile.TemporaryDirectory(prefix="unpacked_bag_")
-        plain = unpack_file(path, Path(self._unpacked.name), self._own_losses)
+        folder = self._unpacked.enter_context(temporary_folder("unpacked_bag_"))
+        plain = unpack_file(path, folder, self._own_losses)
         try:
             return _STORAGES[plain.suffix](plain)
         except BagError as error:

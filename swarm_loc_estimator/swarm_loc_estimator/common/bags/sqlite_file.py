@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import tempfile
 from collections.abc import Iterator, Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from urllib.parse import quote
 
 from swarm_loc_estimator.common.bags.bag_file import MAX_LOG_NS, BagError, BagTopic, ReadErrors
+from swarm_loc_estimator.common.files import temporary_folder
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 
 _BATCH = 500
@@ -37,7 +38,7 @@ class SqliteFile:
     def __init__(self, path: Path) -> None:
         """Open it; raises BagError if it is no bag, or nothing of it can be read."""
         self._path = path
-        self._rescue: tempfile.TemporaryDirectory[str] | None = None
+        self._rescue = ExitStack()
         self._done = 0
         self.losses = ReadErrors(path.name)
         self.message_count = 0
@@ -66,8 +67,7 @@ class SqliteFile:
     def close(self) -> None:
         """Close the file and forget what was rescued of it; may be called twice."""
         self._connection.close()
-        if self._rescue:
-            self._rescue.cleanup()
+        self._rescue.close()
 
     def batches(self, number_of: Mapping[BagTopic, int]) -> Iterator[MessageBatch]:
         """The messages of some topics in order of log time, equal ones in order of recording."""
@@ -119,8 +119,7 @@ class SqliteFile:
 
     def _open_rescued(self, error: sqlite3.Error) -> None:
         """Copy what can be read to a new file and open that."""
-        self._rescue = tempfile.TemporaryDirectory(prefix="rescued_bag_")
-        folder = Path(self._rescue.name)
+        folder = self._rescue.enter_context(temporary_folder("rescued_bag_"))
         self._leave_half_page(folder)
         rescued = sqlite3.connect(folder / "rescued.db3", isolation_level=None)
         try:

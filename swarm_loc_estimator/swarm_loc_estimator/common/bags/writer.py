@@ -6,8 +6,9 @@ Equal input gives equal bytes, so that a bag can be compared and kept in version
 
 from __future__ import annotations
 
-import shutil
+import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from functools import lru_cache
 from pathlib import Path
 from types import TracebackType
@@ -24,7 +25,7 @@ from typing_extensions import Self
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.bag_file import BagError
-from swarm_loc_estimator.common.files import naming
+from swarm_loc_estimator.common.files import naming, temporary_folder
 from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS, MESSAGE_PACKAGE, message_folder
 
 if TYPE_CHECKING:
@@ -114,9 +115,10 @@ class _Rosbag2Writer(Writer):
 
 
 class BagWriter:
-    """A new bag; use it as a context manager, an error inside leaves no bag behind.
+    """A new bag; use it as a context manager, after whose end without an error it is there.
 
-    Its folder must not exist. With `compress`, chunks are compressed with zstd.
+    Its folder must not exist. With `compress`, chunks are compressed with zstd. Other files of it are written
+    to `folder` before the end.
 
     Raises:
         BagError: The folder is there already, or cannot be created.
@@ -126,13 +128,19 @@ class BagWriter:
     def __init__(self, path: Path, *, compress: bool = False) -> None:
         self._path = path
         self._connections: dict[str, Connection] = {}
-        try:
-            self._writer = _Rosbag2Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
-            if compress:
-                self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-            self._writer.open()
-        except (WriterError, OSError) as error:
-            raise BagError(f"The bag '{path}' cannot be created: {error}") from error
+        if os.path.lexists(path):
+            raise BagError(f"The bag '{path}' cannot be created: it exists already.")
+        with ExitStack() as stack:
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                self.folder = stack.enter_context(temporary_folder(parent=path.parent)) / path.name
+                self._writer = _Rosbag2Writer(self.folder, version=9, storage_plugin=StoragePlugin.MCAP)
+                if compress:
+                    self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+                self._writer.open()
+            except (WriterError, OSError) as error:
+                raise BagError(f"The bag '{path}' cannot be created: {error}") from error
+            self._stack = stack.pop_all()
 
     def add_topic(self, name: str, message_type: str, *, is_latched: bool = False) -> None:
         """Announce a topic, such as robot1/odom of nav_msgs/msg/Odometry.
@@ -159,14 +167,12 @@ class BagWriter:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        is_whole = False
-        try:
-            with naming(self._path):
-                (self._writer.close if kind is None else self._writer.abort)()
-            is_whole = kind is None
-        finally:
-            if not is_whole:
-                shutil.rmtree(self._path, ignore_errors=True)
+        with self._stack, naming(self._path):
+            if kind is None:
+                self._writer.close()
+                self.folder.rename(self._path)
+            else:
+                self._writer.abort()
 
 
 class Stream(NamedTuple):
@@ -182,11 +188,15 @@ _REPORT_EVERY = 5000
 
 
 def write_streams(
-    folder: Path, streams: Sequence[Stream], progress: Callable[[float], None] = lambda _: None
+    folder: Path,
+    streams: Sequence[Stream],
+    progress: Callable[[float], None] = lambda _: None,
+    add: Callable[[Path], object] = lambda _: None,
 ) -> int:
     """Write messages as a new, compressed bag in order of log time, equal times in the order of the streams.
 
-    `progress` is called now and then with the share done. Returns the number of messages.
+    `progress` is called now and then with the share done, `add` with the folder for other files. Returns the
+    number of messages.
 
     Raises:
         BagError: The folder is there already, or cannot be created.
@@ -197,6 +207,8 @@ def write_streams(
     order = np.argsort(log_ns, kind="stable")
     columns = (column[order].tolist() for column in (log_ns, owner, place))
     with BagWriter(folder, compress=True) as bag:
+        with naming(folder):
+            add(bag.folder)
         for stream in streams:
             bag.add_topic(stream.topic, stream.type)
         for done, (at_ns, which, one) in enumerate(zip(*columns, strict=True)):

@@ -9,6 +9,7 @@ Many serialized messages at once: one buffer, and columns with the place of each
 
 from __future__ import annotations
 
+import itertools
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -83,6 +84,13 @@ class MessageBatch(NamedTuple):
     def chosen(self, k: slice | NDArray[np.intp] | NDArray[np.bool_]) -> MessageBatch:
         """Some of them, in the same buffer."""
         return MessageBatch(self.data, self.topic[k], self.log_ns[k], self.offset[k], self.length[k])
+
+    def parts(self, size: int) -> Iterator[MessageBatch]:
+        """Successive messages of about so many bytes each, in the same buffer."""
+        ends = np.searchsorted(np.cumsum(self.length), np.arange(size, self.length.sum(), size)).tolist()
+        for begin, end in itertools.pairwise([0, *ends, self.size]):
+            if begin < end:
+                yield self.chosen(slice(begin, end))
 
     def in_order_of_time(self) -> MessageBatch:
         """Sorted by time, equal ones as they lie."""
@@ -410,11 +418,10 @@ def _pack(
         source, place = (data, begin[k]) if begin[k] < data.size else (unlike, begin[k] - data.size)
         padded = begin[k] < data.size and (begin[k] - offset[k]) % 8 == ENCAPSULATION
         for first in range(row, row + count[k]):
-            for i in range(_DETECTION_SIZE):
-                if i == DETECTION_GAP and padded and first == row:
-                    place += 4
-                packed[first, i] = source[place]
-                place += 1
+            packed[first, :DETECTION_GAP] = source[place : place + DETECTION_GAP]
+            place += 4 if padded and first == row else 0
+            packed[first, DETECTION_GAP:] = source[place + DETECTION_GAP : place + _DETECTION_SIZE]
+            place += _DETECTION_SIZE
         row += count[k]
 
 

@@ -433,14 +433,14 @@ def import_recording(
         {robot: fiducials.pose(robot, seen, settings.metres_per_pixel) for robot, seen in where.items()}
         for where in truth.poses
     ]
-    _write_bag(folder, swarm, sized, places)
     known = sum(
         one.receiver in where and one.transmitter in where
         for one, where in zip(sized, truth.poses, strict=True)
     )
     counts = sorted((what.replace("_", " "), count) for what, count in (dropped + truth.remarks).items())
     remarks = tuple(f"{count} {what}." for what, count in counts if count)
-    save_swarm(swarm, folder / "swarm.yaml", "\n".join([f"Imported from {path.name}.", *remarks]))
+    comment = "\n".join([f"Imported from {path.name}.", *remarks])
+    _write_bag(folder, swarm, comment, sized, places)
     return DropletImport(len(sized), known, fiducials, remarks)
 
 
@@ -472,11 +472,16 @@ def _describe(
 
 
 def _write_bag(
-    folder: Path, swarm: Swarm, exchanges: Sequence[Exchange], places: Sequence[Mapping[int, Pose2]]
+    folder: Path,
+    swarm: Swarm,
+    comment: str,
+    exchanges: Sequence[Exchange],
+    places: Sequence[Mapping[int, Pose2]],
 ) -> None:
-    """Write all messages; exchanges with equal stamps are spaced by a microsecond."""
+    """Write all messages and `swarm.yaml`; exchanges with equal stamps are spaced by a microsecond."""
     covariance = np.diag(np.square(FIX_SIGMA))
     with BagWriter(folder, compress=True) as bag:
+        save_swarm(swarm, bag.folder / "swarm.yaml", comment)
         for robot in swarm.robots:
             for kind in (_BRIGHTNESS, _FIXES):
                 bag.add_topic(f"{robot.name}/{kind.topic}", kind.message_type)

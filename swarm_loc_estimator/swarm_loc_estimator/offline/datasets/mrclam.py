@@ -277,12 +277,14 @@ def convert(
         streams += [_odometry(robot), _detections(robot, delay, rng)]
         if robot.truth is not None:
             streams.append(_truth(robot.subject, robot.truth, begin_ns, end_ns))
-    count = write_streams(
-        folder, streams, lambda share: progress(_SERIALIZING + (1.0 - _SERIALIZING) * share, "writing")
-    )
     pairs = zip(dataset.robots, robots, strict=True)
     remarks = [*dataset.remarks, *(remark for whole, used in pairs for remark in _start_remarks(whole, used))]
-    save_swarm(describe(dataset, robots), folder / "swarm.yaml", "\n".join(remarks))
+    count = write_streams(
+        folder,
+        streams,
+        lambda share: progress(_SERIALIZING + (1.0 - _SERIALIZING) * share, "writing"),
+        lambda part: save_swarm(describe(dataset, robots), part / "swarm.yaml", "\n".join(remarks)),
+    )
     progress(1.0, "done")
     return MrclamImport(count, tuple(remarks))
 

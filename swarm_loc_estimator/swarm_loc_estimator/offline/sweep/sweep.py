@@ -16,10 +16,11 @@ import os
 import time
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
+from io import FileIO
 from pathlib import Path
 from socket import create_connection
 from typing import Any, Literal, NamedTuple, get_args
@@ -27,6 +28,7 @@ from urllib.parse import urlsplit
 
 import joblib
 import numpy as np
+from joblib._parallel_backends import LokyBackend
 
 from swarm_loc_estimator.common.bags.reader import is_storage
 from swarm_loc_estimator.common.files import check_file, naming
@@ -39,6 +41,7 @@ from swarm_loc_estimator.common.parameters import (
     Value,
     parameter_specs,
 )
+from swarm_loc_estimator.common.processes import end_with, uninterrupted
 from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, read_tree
 from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.offline.metrics import pool
@@ -266,17 +269,27 @@ def run_sweep(sweep: Sweep, path: Path, backend: Backend, progress: Progress) ->
     path.parent.mkdir(parents=True, exist_ok=True)
     check_file(path)
     began = time.monotonic()
-    with path.open("a", encoding="utf-8") as file:
+    with path.open("ab", buffering=0) as file:
         if file.tell() and not path.read_bytes().endswith(b"\n"):
-            file.write("\n")  # ends the line in which the last run was killed
+            file.write(b"\n")  # ends the line in which the last run was killed
         progress(0.0, f"0 of {len(jobs)} replays")
         for done, line in enumerate(_outcomes(jobs, sweep.workers, backend), 1):
             with naming(path):
-                file.write(json.dumps(line) + "\n")
-                file.flush()
+                _append(file, f"{json.dumps(line)}\n".encode())
             left_s = (time.monotonic() - began) / done * (len(jobs) - done)
             progress(done / len(jobs), f"{done} of {len(jobs)} replays, {left_s:.0f} s left")
     return _read(path)
+
+
+def _append(file: FileIO, data: bytes) -> None:
+    """Append all of the data or, where there is no room, nothing."""
+    begin = file.tell()
+    try:
+        while data:
+            data = data[file.write(data) :]
+    except OSError:
+        file.truncate(begin)
+        raise
 
 
 def _outcomes(jobs: Mapping[str, Job], count: int, backend: Backend) -> Iterator[Line]:
@@ -287,7 +300,9 @@ def _outcomes(jobs: Mapping[str, Job], count: int, backend: Backend) -> Iterator
         with workers(count, backend):
             as_done = "generator" if _IN_ORDER else "generator_unordered"
             calls = (joblib.delayed(outcome)(job) for job in jobs.values())
-            yield from joblib.Parallel(return_as=as_done, batch_size=1)(calls)
+            with uninterrupted():
+                lines = joblib.Parallel(return_as=as_done, batch_size=1)(calls)
+            yield from lines
     except BrokenProcessPool as error:
         reason = "A worker was killed, perhaps for its memory: give fewer workers; the next run goes on here."
         raise UserError(reason) from error
@@ -372,15 +387,22 @@ def workers(count: int, backend: Backend) -> Iterator[None]:
     Raises:
         BackendError: A package is missing, or the cluster is not reached.
     """
-    start = {"loky": _loky, "ray": _ray, "dask": _dask}[backend.name]
-    with start(count, backend.address) as options, joblib.parallel_config(n_jobs=count, **options):
+    start = {"ray": _ray, "dask": _dask}.get(backend.name)
+    local = nullcontext({"backend": _Loky(inner_max_num_threads=1)})
+    with (
+        start(count, backend.address) if start else local as options,
+        joblib.parallel_config(n_jobs=count, **options),
+    ):
         yield
 
 
-@contextmanager
-def _loky(_count: int, _address: str | None) -> Iterator[dict[str, Any]]:
-    """Processes of one thread each."""
-    yield {"backend": "loky", "inner_max_num_threads": 1}
+class _Loky(LokyBackend):
+    """Workers that end with this process; older versions of joblib have no argument for that."""
+
+    def configure(self, **options: Any) -> int:
+        """Start the workers; their number."""
+        started: int = super().configure(**options, initializer=end_with, initargs=(os.getpid(),))
+        return started
 
 
 @contextmanager

@@ -332,11 +332,6 @@ class BoardRecording:
     data: BoardReadings  # All exchanges with ground truth; robots by place in `robots`
     clear: BoolArray  # (k,) True where no other robot is known to occlude the line of sight
 
-    @property
-    def to_fit(self) -> BoardReadings:
-        """The exchanges to which a board is fitted."""
-        return self.data.select(self.clear & (self.data.poses[:, 0] < MAX_RANGE))
-
 
 def read_board(recording: Recording, swarm: Swarm) -> BoardRecording:
     """The exchanges with ground truth of the first kind of board of a swarm.
@@ -368,7 +363,8 @@ def calibrate_from(
     progress(0.0, "exchanges")
     board = read_board(recording, swarm)
     progress(0.1, "fitting, and validating on blocks of time")
-    return board, calibrate_board(board.platform, board.to_fit, len(board.robots))
+    to_fit = board.data.select(board.clear & (board.data.poses[:, 0] < MAX_RANGE))
+    return board, calibrate_board(board.platform, to_fit, len(board.robots))
 
 
 def with_board(swarm: Swarm, board: BoardRecording, done: BoardCalibration, path: Path) -> Swarm:
