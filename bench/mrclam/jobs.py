@@ -20,7 +20,8 @@ from bench.mrclam.sets import (
     without_sightings,
 )
 from bench.shared.common import OUT
-from swarm_loc_estimator.offline.calibration.fit import Options, calibrate
+from swarm_loc_estimator.offline.calibration.fit import calibrate
+from swarm_loc_estimator.offline.calibration.models import Options
 from swarm_loc_estimator.offline.calibration.recording import Recording, rerun
 from swarm_loc_estimator.offline.metrics import Errors, pool
 from swarm_loc_estimator.offline.replay import replay

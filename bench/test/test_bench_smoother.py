@@ -12,7 +12,7 @@ from calibration_world import World, record, robot
 from bench.mrclam.jobs import Job, smoothed
 from swarm_loc_estimator.filter.measurements import Measurements
 from swarm_loc_estimator.filter.models import POLAR
-from swarm_loc_estimator.offline.calibration.fit import with_noise
+from swarm_loc_estimator.offline.calibration.models import with_noise
 from swarm_loc_estimator.offline.calibration.recording import rerun, started_at_truth
 from swarm_loc_estimator.offline.metrics import pool, summarise
 from swarm_loc_estimator.swarm.swarm import Robot

@@ -27,7 +27,8 @@ from swarm_loc_estimator.common.command_line import (
     swarm_beside,
     yaml_and_picture,
 )
-from swarm_loc_estimator.offline.calibration.fit import EVALUATIONS, Options, calibrate
+from swarm_loc_estimator.offline.calibration.fit import calibrate
+from swarm_loc_estimator.offline.calibration.models import EVALUATIONS, Options
 from swarm_loc_estimator.offline.calibration.plots import draw, text_of
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
 from swarm_loc_estimator.offline.export import read_truth

@@ -16,7 +16,7 @@ from swarm_loc_estimator.common.jit import cached_njit
 _AT_ONCE = 50  # Residuals whose variances are computed together
 
 
-class NormalEquations:
+class ChainEquations:
     """J^T J x = -J^T r.
 
     Args:
@@ -37,7 +37,9 @@ class NormalEquations:
             np.ascontiguousarray(jacobian),
             np.ascontiguousarray(columns, dtype=np.int64),
             np.ascontiguousarray(residual),
-            (self._band, self._border, self._corner),
+            self._band,
+            self._border,
+            self._corner,
             self.gradient,
         )
 
@@ -45,7 +47,7 @@ class NormalEquations:
         """Diagonal (n,) of the matrix."""
         return np.concatenate([self._band[0], np.diag(self._corner)])
 
-    def factored(self, damping: float) -> Factor:
+    def factored(self, damping: float) -> ChainFactor:
         """The factor, with the diagonal enlarged by a share.
 
         Raises:
@@ -55,10 +57,10 @@ class NormalEquations:
         for diagonal in (band[0], np.einsum("ii->i", corner)):
             # what has no information stays as it is
             diagonal[:] = np.where(diagonal > 0.0, diagonal * (1.0 + damping), 1.0)
-        return Factor(band, self._border, corner)
+        return ChainFactor(band, self._border, corner)
 
 
-class Factor:
+class ChainFactor:
     """Solves normal equations, see there."""
 
     def __init__(self, band: FloatArray, border: FloatArray, corner: FloatArray) -> None:
@@ -103,11 +105,12 @@ def _add(
     jacobian: FloatArray,
     columns: IntArray,
     residual: FloatArray,
-    parts: tuple[FloatArray, FloatArray, FloatArray],
+    band: FloatArray,
+    border: FloatArray,
+    corner: FloatArray,
     gradient: FloatArray,
 ) -> None:
     """Add J^T J and -J^T r of all residuals."""
-    band, border, corner = parts
     size = band.shape[1]
     for k in range(jacobian.shape[0]):
         for a in range(jacobian.shape[2]):

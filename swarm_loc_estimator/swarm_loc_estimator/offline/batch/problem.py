@@ -81,7 +81,7 @@ class Derivatives(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Problem:
+class BatchProblem:
     """What is to be solved."""
 
     # The description with a landmark for each marker that belongs to nobody, at the origin where its place is
@@ -112,7 +112,7 @@ def problem_of(
     swarm: Swarm,
     parameters: tuple[Parameter, ...] = (),
     truth: Mapping[str, Trajectory] | None = None,
-) -> Problem:
+) -> BatchProblem:
     """Set up the problem of a recording; landmarks in the description, and poses of `truth`, are known."""
     # knots, and sightings by robots whose tracks are known then
     described, rare = _with_landmarks(recording, swarm)
@@ -133,7 +133,7 @@ def problem_of(
         since = at.covariance - knots.sample.covariance[sides[side][moves]]
         slip[side, moves] = since * np.sign(np.trace(since, axis1=1, axis2=2))[:, None, None]
     known = {mark.id for mark in swarm.landmarks}
-    problem = Problem(
+    problem = BatchProblem(
         described,
         np.array([mark.id in known for mark in described.landmarks], dtype=bool),
         knots,
@@ -162,7 +162,7 @@ _STEP = 0.01  # Step of a difference, in standard deviations of the prior
 
 
 def _differentiate(
-    problem: Problem, recording: Recording, seen: DetectionRows, kept: BoolArray, index: int
+    problem: BatchProblem, recording: Recording, seen: DetectionRows, kept: BoolArray, index: int
 ) -> None:
     """Write the derivatives by one parameter."""
     parameter, by = problem.parameters[index], problem.by_parameter

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,8 +18,8 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.filter.models import predict
-from swarm_loc_estimator.offline.batch.normal import Factor, NormalEquations
-from swarm_loc_estimator.offline.batch.problem import Problem, innovation
+from swarm_loc_estimator.offline.batch.normal import ChainEquations, ChainFactor
+from swarm_loc_estimator.offline.batch.problem import BatchProblem, innovation
 from swarm_loc_estimator.offline.batch.start import Start
 
 # The steps are checked by test_survey.py and make bench-commissioning, also with wrong scales of wheels.
@@ -44,7 +45,7 @@ Progress = Callable[[float, str], None]
 class Solution:
     """Estimates with the covariance of their right-invariant errors."""
 
-    problem: Problem  # What was solved
+    problem: BatchProblem  # What was solved
     knot: FloatArray  # (k, 3) transforms of the tracks at the knots; NaN: not connected
     landmark: FloatArray  # (L, 3) poses; NaN: not connected
     parameter: FloatArray  # (N, p) changes of parameters of the description
@@ -54,7 +55,7 @@ class Solution:
     weight: FloatArray  # (m,) of the sightings, from 0 for wrong ones to 1
     used: BoolArray  # (m,) whether both sides of the sighting are connected with the origin
     variance_ratio: float  # Mean squared residual of sightings by the described noise; 1 is ideal
-    factor: Factor  # Of the normal equations
+    factor: ChainFactor  # Of the normal equations
     column: IntArray  # (k,) first of the three unknowns of each knot; -1: not connected
     # Whitened residuals (u, 3) of used sightings, their Jacobians (u, 3, c) and unknowns (u, c), -1: none
     sightings: tuple[FloatArray, FloatArray, IntArray]
@@ -110,27 +111,29 @@ class Solution:
         )
 
 
+class ParameterPrior(NamedTuple):
+    """Prior of the changes of parameters."""
+
+    mean: FloatArray  # (N, p)
+    sigma: FloatArray  # (N, p) standard deviations
+
+
 class Solver:
     """Solves one problem; what is not connected at the start is left out.
 
     Args:
         problem: To be solved.
         start: Where to begin.
-        prior: (N, p) mean of the changes of parameters, and their standard deviations; by default none, and
-            those of the parameters.
+        prior: Of the changes of parameters; by default about none, with the sigmas of the parameters.
     """
 
-    def __init__(
-        self, problem: Problem, start: Start, prior: tuple[FloatArray, FloatArray] | None = None
-    ) -> None:
+    def __init__(self, problem: BatchProblem, start: Start, prior: ParameterPrior | None = None) -> None:
         self._problem, knots = problem, problem.knots
         robots, landmarks = len(problem.swarm.robots), len(problem.swarm.landmarks)
         self._is_near, self._landmark = start.knot is not None, start.landmark.copy()
         self._knot = start.transform[knots.robot] if start.knot is None else start.knot.copy()
         wide = np.tile(np.array([one.sigma for one in problem.parameters]), (robots, 1))
-        self._mean: FloatArray
-        self._prior: FloatArray
-        self._mean, self._prior = (np.zeros_like(wide), wide) if prior is None else prior
+        self._mean, self._prior = prior or ParameterPrior(np.zeros_like(wide), wide)
         self._parameter = self._mean.copy()
         is_placed = np.isfinite(self._knot[:, 0])
         self._mark = problem.sightings.landmark
@@ -216,9 +219,9 @@ class Solver:
             pose[rows] = se2.compose(se2.exp(twist), pose[rows])
         self._parameter = self._parameter + step[self._parameter_column]
 
-    def _normal(self, scale: float) -> tuple[NormalEquations, float]:
+    def _normal(self, scale: float) -> tuple[ChainEquations, float]:
         """Normal equations and robust cost, linearized at the estimates."""
-        normal = NormalEquations(self._band, self._width(), self._size - self._band)
+        normal = ChainEquations(self._band, self._width(), self._size - self._band)
         cost = self._add_priors(normal) + (0.0 if self._is_rigid else self._add_odometry(normal))
         residual, jacobian, columns = self._sightings()
         square = np.sum(residual**2, axis=1)
@@ -238,7 +241,7 @@ class Solver:
         )
         return int(np.abs(np.diff(pairs, axis=0)).max(initial=0)) + 2
 
-    def _add_odometry(self, normal: NormalEquations) -> float:
+    def _add_odometry(self, normal: ChainEquations) -> float:
         """Steps between consecutive knots: r = log(T_b T_a^-1) - Ad(T_a) D p."""
         a, b, root, response = self._pairs
         drift = se2.log(se2.compose(self._knot[b], se2.inverse(self._knot[a])))
@@ -260,7 +263,7 @@ class Solver:
         normal.add(jacobian, columns, residual)
         return float(np.sum(residual**2))
 
-    def _add_priors(self, normal: NormalEquations) -> float:
+    def _add_priors(self, normal: ChainEquations) -> float:
         """Priors of parameters, described landmarks, starts and the origin."""
         scaled = (self._parameter - self._mean) / self._prior
         normal.add(np.eye(scaled.shape[1]) / self._prior[:, :, None], self._parameter_column, scaled)
@@ -274,7 +277,7 @@ class Solver:
             cost += float(np.sum((root @ residual) ** 2))
         return cost
 
-    def _add_truth(self, normal: NormalEquations) -> float:
+    def _add_truth(self, normal: ChainEquations) -> float:
         """Poses by ground truth, with noise in the frame of the robot."""
         rows = np.flatnonzero(self._knot_column[self._problem.true.knot] >= 0)
         knot, track, true = (column[rows] for column in self._problem.true)
@@ -373,7 +376,7 @@ class Solver:
         whole[:, :, 6:] += (apart / growth)[:, :, None] * change_of
         return -np.einsum("kij,kj->ki", root, apart), root @ whole, columns
 
-    def _solution(self, factor: Factor) -> Solution:
+    def _solution(self, factor: ChainFactor) -> Solution:
         sightings = self._sightings()
         residual = sightings[0]
         good = self._weight > 0.5
@@ -411,7 +414,7 @@ def _numbered(wanted: BoolArray, first: int) -> tuple[IntArray, int]:
     return columns, first + 3 * int(wanted.sum())
 
 
-def _steps(problem: Problem, is_placed: BoolArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
+def _steps(problem: BatchProblem, is_placed: BoolArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
     """Pairs of consecutive knots (p,), whitening of their steps, and Jacobians by parameters."""
     knots = problem.knots
     same = (knots.robot[1:] == knots.robot[:-1]) & is_placed[1:]

@@ -14,7 +14,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.offline.batch.problem import Problem
+from swarm_loc_estimator.offline.batch.problem import BatchProblem
 
 _AGREES_M = 0.15
 """Landmarks closer than this, or than a tenth of the distance between them, agree on an alignment."""
@@ -29,7 +29,7 @@ class Start:
     knot: FloatArray | None = None  # (k, 3) transforms of tracks at knots, where paths are known
 
 
-def started_at(problem: Problem, paths: Mapping[str, Trajectory]) -> Start:
+def started_at(problem: BatchProblem, paths: Mapping[str, Trajectory]) -> Start:
     """Begin where robots are by paths in `map`; others as by `start_of`."""
     start, knots = start_of(problem), problem.knots
     knot = start.transform[knots.robot]
@@ -44,7 +44,7 @@ def started_at(problem: Problem, paths: Mapping[str, Trajectory]) -> Start:
     return replace(start, knot=knot)
 
 
-def start_of(problem: Problem) -> Start:
+def start_of(problem: BatchProblem) -> Start:
     """Join the maps of all robots that share landmarks or see each other.
 
     Begins with described landmarks and starts, else with the robot that has seen most landmarks, whose first
@@ -73,13 +73,13 @@ def start_of(problem: Problem) -> Start:
         _place(problem, start, maps, robot, transform)
 
 
-def _at_first(problem: Problem, robot: int, pose: FloatArray) -> FloatArray:
+def _at_first(problem: BatchProblem, robot: int, pose: FloatArray) -> FloatArray:
     """The transform of a robot's track with a pose (3,) at its first knot."""
     first = int(np.flatnonzero(problem.knots.robot == robot)[0])
     return se2.compose(pose, se2.inverse(problem.knots.sample.pose[first]))
 
 
-def _map_of(problem: Problem, robot: int) -> FloatArray:
+def _map_of(problem: BatchProblem, robot: int) -> FloatArray:
     """Poses (L, 3) of the landmarks that a robot has seen, in the frame of its track; NaN: not seen."""
     sightings, places = problem.sightings, np.full((len(problem.swarm.landmarks), 3), np.nan)
     rows = np.flatnonzero((sightings.observer == robot) & (sightings.landmark >= 0))
@@ -92,7 +92,7 @@ def _map_of(problem: Problem, robot: int) -> FloatArray:
     return places
 
 
-def _seen_at(problem: Problem, rows: IntArray, observer: FloatArray) -> FloatArray:
+def _seen_at(problem: BatchProblem, rows: IntArray, observer: FloatArray) -> FloatArray:
     """Poses (k, 3) of the markers of sightings by robots at poses (k, 3); heading NaN: not seen."""
     some, is_polar = select(problem.sightings, rows), problem.is_polar[rows]
     value = some.value.copy()
@@ -109,7 +109,9 @@ def _median_angle(angles: FloatArray) -> float:
     return float(some[np.argmin(np.abs(se2.wrap_angle(some[:, None] - angles)).sum(axis=1))])
 
 
-def _place(problem: Problem, start: Start, maps: list[FloatArray], robot: int, transform: FloatArray) -> None:
+def _place(
+    problem: BatchProblem, start: Start, maps: list[FloatArray], robot: int, transform: FloatArray
+) -> None:
     """Place a robot's track, and the landmarks that nobody has placed before."""
     start.transform[robot] = transform
     new = np.isnan(start.landmark[:, 0]) & np.isfinite(maps[robot][:, 0]) & ~problem.is_known
@@ -117,7 +119,7 @@ def _place(problem: Problem, start: Start, maps: list[FloatArray], robot: int, t
 
 
 def _alignment(
-    problem: Problem, start: Start, maps: list[FloatArray], robot: int
+    problem: BatchProblem, start: Start, maps: list[FloatArray], robot: int
 ) -> tuple[FloatArray, float]:
     """The transform of a robot's track on which most landmarks and robots agree, and how many do so."""
     own = maps[robot]
@@ -146,7 +148,7 @@ def _alignment(
     return best, most
 
 
-def _by_robots(problem: Problem, start: Start, robot: int) -> list[FloatArray]:
+def _by_robots(problem: BatchProblem, start: Start, robot: int) -> list[FloatArray]:
     """Transforms of a robot's track by sightings with heading, between it and placed robots."""
     sightings = problem.sightings
     placed = np.isfinite(start.transform[:, 0])

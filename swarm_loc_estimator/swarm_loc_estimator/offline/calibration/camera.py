@@ -11,7 +11,7 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.filter.measurements import Measurements, select
 from swarm_loc_estimator.filter.models import POLAR, predict
-from swarm_loc_estimator.offline.batch.problem import Problem, innovation
+from swarm_loc_estimator.offline.batch.problem import BatchProblem, innovation
 from swarm_loc_estimator.offline.calibration.motion import DENSE_GAP_NS
 from swarm_loc_estimator.swarm.swarm import Robot
 
@@ -39,7 +39,9 @@ class CameraFit:
         return self.sightings.size >= MIN_SIGHTINGS
 
 
-def camera_fits(before: Problem, after: Problem, paths: Mapping[str, Trajectory]) -> list[CameraFit]:
+def camera_fits(
+    before: BatchProblem, after: BatchProblem, paths: Mapping[str, Trajectory]
+) -> list[CameraFit]:
     """The errors of each robot with a camera, by the paths of the robots in `map`."""
     _, old, new = np.intersect1d(before.source, after.source, return_indices=True)
     described, calibrated = errors_of(before, paths)[old], errors_of(after, paths)[new]
@@ -53,7 +55,7 @@ def camera_fits(before: Problem, after: Problem, paths: Mapping[str, Trajectory]
     return fits
 
 
-def errors_of(problem: Problem, paths: Mapping[str, Trajectory]) -> FloatArray:
+def errors_of(problem: BatchProblem, paths: Mapping[str, Trajectory]) -> FloatArray:
     """Measured minus true (m, 3) of all sightings; NaN where a pose is not known."""
     sightings = problem.sightings
     marks = [(mark.x, mark.y, mark.yaw or 0.0) for mark in problem.swarm.landmarks]

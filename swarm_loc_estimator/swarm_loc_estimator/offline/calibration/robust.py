@@ -1,43 +1,17 @@
-"""Robust least squares with Gaussian priors, and the common prior of robots of one type."""
+"""Robust regression with a prior, and the common prior of robots of one type."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from scipy.optimize import least_squares
 
 from swarm_loc_estimator.common.arrays import FloatArray
 
-_BEND = 3.0  # Residuals beyond this many sigmas have linear cost
 TO_SIGMA = 1.4826  # Standard deviation per median absolute deviation, for normal errors
 
 
 def spread(residuals: FloatArray) -> float:
     """Robust standard deviation of residuals about zero; NaN without any."""
     return float(TO_SIGMA * np.median(np.abs(residuals))) if residuals.size else float("nan")
-
-
-def softened(residuals: FloatArray) -> FloatArray:
-    """Residuals in sigmas whose squares grow linearly from `_BEND` sigmas on (pseudo-Huber)."""
-    bent: FloatArray = np.sqrt(2.0 * (np.sqrt(1.0 + (residuals / _BEND) ** 2) - 1.0)) * _BEND
-    return np.copysign(bent, residuals)
-
-
-def fit_with_prior(
-    residuals: Callable[[FloatArray], FloatArray], mean: FloatArray, sigma: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Robust least squares of residuals (m,) in sigmas about a normal prior of the parameters (p,).
-
-    The search begins at the mean of the prior. Returns the parameters and their standard deviations (p,).
-    """
-
-    def cost(scaled: FloatArray) -> FloatArray:
-        return np.concatenate([softened(residuals(mean + sigma * scaled)), scaled])
-
-    found = least_squares(cost, np.zeros(mean.size), method="lm", diff_step=1e-4, max_nfev=50 * mean.size)
-    covariance = np.linalg.inv(found.jac.T @ found.jac)
-    return mean + sigma * found.x, sigma * np.sqrt(np.diag(covariance))
 
 
 def population(values: FloatArray, sigma: FloatArray, wide: FloatArray) -> tuple[FloatArray, FloatArray]:

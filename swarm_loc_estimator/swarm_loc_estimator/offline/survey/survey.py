@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.offline.batch.parameters import SURVEY, all_changed
-from swarm_loc_estimator.offline.batch.problem import MIN_SIGHTINGS, Problem, problem_of
+from swarm_loc_estimator.offline.batch.problem import MIN_SIGHTINGS, BatchProblem, problem_of
 from swarm_loc_estimator.offline.batch.solver import Solution, Solver
 from swarm_loc_estimator.offline.batch.start import start_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
@@ -369,7 +369,7 @@ class Surveyed:
     """What was found."""
 
     swarm: Swarm  # The description with all connected landmarks and corrected parameters
-    problem: Problem  # What was solved
+    problem: BatchProblem  # What was solved
     solution: Solution  # How
     path: FloatArray  # (k, 3) poses in map of the robots at the knots; NaN: not connected
     text: str  # Table of the landmarks, corrected parameters, and what is badly determined
@@ -404,7 +404,7 @@ def survey(
     return Surveyed(found, problem, solution, path, _text(problem, solution, swarm, found, placed))
 
 
-def _landmarks(problem: Problem, solution: Solution) -> list[Landmark]:
+def _landmarks(problem: BatchProblem, solution: Solution) -> list[Landmark]:
     """All landmarks that are connected, with standard deviations for those that were estimated."""
     factor = max(1.0, solution.variance_ratio)
     found = []
@@ -433,7 +433,7 @@ def _calibrated(swarm: Swarm, solution: Solution) -> Swarm:
     return all_changed(swarm, SURVEY, np.where(is_clear, solution.parameter, 0.0))
 
 
-def _text(problem: Problem, solution: Solution, before: Swarm, found: Swarm, placed: Placed) -> str:
+def _text(problem: BatchProblem, solution: Solution, before: Swarm, found: Swarm, placed: Placed) -> str:
     places = {mark.id: mark for mark in found.landmarks}
     lines = ["landmark        x [m]     y [m]  yaw [deg]  sigma [mm]  sightings  contradicting"]
     for index, mark in enumerate(problem.swarm.landmarks):
@@ -469,7 +469,7 @@ def _corrections(before: Swarm, found: Swarm) -> list[str]:
     return lines
 
 
-def _frame(problem: Problem) -> list[str]:
+def _frame(problem: BatchProblem) -> list[str]:
     """What gives the frame."""
     if problem.is_known.any():
         return [f"The frame is that of the {int(problem.is_known.sum())} described landmarks."]
@@ -478,7 +478,7 @@ def _frame(problem: Problem) -> list[str]:
     return ["The origin is the first pose of one robot, since no landmark and no start is described."]
 
 
-def _remarks(problem: Problem, solution: Solution) -> list[str]:
+def _remarks(problem: BatchProblem, solution: Solution) -> list[str]:
     """What is badly determined, a sentence each with a remedy."""
     sightings, remarks = problem.sightings, []
     # markers that were seen rarely

@@ -1,0 +1,386 @@
+"""Fit cameras, motion and a first noise to a recording, by batches of which ground truth may be a part."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+
+import numpy as np
+
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.offline.batch.parameters import all_changed, calibrated_parameters, values_of
+from swarm_loc_estimator.offline.batch.problem import BatchProblem, problem_of
+from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver
+from swarm_loc_estimator.offline.batch.start import started_at
+from swarm_loc_estimator.offline.calibration.camera import CameraFit, camera_fits
+from swarm_loc_estimator.offline.calibration.motion import (
+    DENSE_GAP_NS,
+    WINDOW_S,
+    Drive,
+    Lateness,
+    biased,
+    explained,
+    fit_lateness,
+    fit_response,
+    steps_of,
+    true_motion,
+    windows,
+)
+from swarm_loc_estimator.offline.calibration.recording import (
+    CalibrationError,
+    Recording,
+    rerun,
+    started_at_truth,
+)
+from swarm_loc_estimator.offline.calibration.robust import population, spread
+from swarm_loc_estimator.offline.calibration.scatter import with_scatter
+from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
+from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel, SensorModel
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+
+EVALUATIONS = 80  # Runs of the estimator to fit the noise
+
+_OF_SENSOR = frozenset({"range_sigma_per_m", "bearing_sigma", "forward_sigma", "left_sigma", "heading_sigma"})
+"""Noise in which robots differ."""
+
+_MIN_WINDOWS = 50
+_ROUNDS, _ROUNDS_ALONE = 2, 5  # Of the batch, with and without ground truth
+_SIGHTED = {
+    True: ("range_sigma_per_m", "bearing_sigma"),
+    False: ("forward_sigma", "left_sigma", "heading_sigma"),
+}
+"""Noise of ranges and bearings, and of poses."""
+_GOOD = 0.5  # Least weight of a sighting that counts
+_MOVED_M = 0.02
+_BIAS_ROUNDS = 3  # Of scale factors of motion, and turn biases
+_SAMPLES = 60  # Windows of each robot, and sightings, whose variances by the batch are computed
+_CORRELATION = 2.7  # Initial ratio of the white noise that represents correlated errors to their scatter
+RUN_TICK_S = 0.5  # Of poses by the estimator that a fit uses
+_FLOORS = {"wheel_noise": 0.0, "distance_drift": 1e-5, "range_sigma": 1e-3}
+"""Not fitted, since they duplicate fitted terms; they keep the covariance of a slow robot positive."""
+_LATERAL_SLIP = 1.0 / 60.0
+"""Standard deviation of the motion across the path after a second, in wheel separations.
+
+Not fitted: robots slip sideways when they touch something, which few recordings show. Without it a robot that
+turns on the spot and sees few markers is soon too sure of its place.
+"""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Choices of a calibration."""
+
+    plain: bool = False  # Whether only noise is fitted
+    # Whether a table of scale factors may be fitted, else one of speed and one of turn rate
+    response: bool = True
+    evaluations: int = EVALUATIONS  # Limit of runs of the estimator to fit the noise
+    alone: bool = False  # Whether the recording is fitted to itself, without ground truth
+
+
+@dataclass(frozen=True)
+class DriveFit:
+    """Calibrated motion of a type of robot."""
+
+    members: tuple[int, ...]  # Indices of its robots
+    drives: Mapping[int, Drive]  # Motion of the robots whose paths are known, by index
+    late: Lateness  # Delay and lag
+    response: MotionResponse | None  # Scale factors; None if only noise is fitted
+    before: FloatArray  # (m, 2) errors of path [m] and turn [rad] of 5 s windows as reported
+    after: FloatArray  # (m, 2) the same errors, calibrated
+    doubt: FloatArray = field(default_factory=lambda: np.zeros(2))  # (2,) variances of the path itself there
+
+
+@dataclass(frozen=True)
+class FittedModels:
+    """Calibrated models, without noise."""
+
+    swarm: Swarm  # Calibrated
+    cameras: tuple[CameraFit, ...]  # Of all robots, ordered by type
+    motion: tuple[DriveFit, ...]  # One per type
+    remarks: tuple[str, ...]  # Parameters that could not be fitted, one sentence each
+    noise: dict[str, float]  # First noise by name, from the scatter of sightings and of motion
+    paths: Mapping[str, Trajectory]  # By which motion and noise were fitted
+
+
+def with_noise(swarm: Swarm, values: dict[str, float]) -> Swarm:
+    """The swarm with noise parameters by name.
+
+    Noise of sightings keeps its ratios between the robots, and their geometric mean becomes the value.
+    """
+    odometry, sensor = (
+        {field.name: values[field.name] for field in fields(model) if field.name in values}
+        for model in (OdometryModel, SensorModel)
+    )
+    mean = {
+        name: math.exp(np.mean([math.log(getattr(robot.sensor, name)) for robot in swarm.robots]))
+        for name in _OF_SENSOR & sensor.keys()
+        if all(getattr(robot.sensor, name) > 0.0 for robot in swarm.robots)
+    }
+    robots = []
+    for robot in swarm.robots:
+        own = {name: sensor[name] * getattr(robot.sensor, name) / value for name, value in mean.items()}
+        seen = replace(robot.sensor, **(sensor | {k: float(f"{v:.3g}") for k, v in own.items()}))
+        robots.append(replace(robot, odometry=replace(robot.odometry, **odometry), sensor=seen))
+    return replace(swarm, robots=tuple(robots))
+
+
+def fixed_noise(swarm: Swarm) -> dict[str, float]:
+    """Noise parameters that are not fitted, by name."""
+    separation = max(robot.odometry.wheel_separation for robot in swarm.robots)
+    return {**_FLOORS, "lateral_drift": float(f"{(_LATERAL_SLIP * separation) ** 2:.3g}")}
+
+
+def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> FittedModels:
+    """Fit cameras, motion and first noise; with `plain` compute only the errors.
+
+    Each round solves the recording as a batch, in which ground truth is one more measurement, and fits motion
+    and noise to its paths. Without ground truth the noise follows from the batch's own residuals, so there
+    are more rounds.
+
+    Raises:
+        CalibrationError: Too little is known about the poses of robots.
+    """
+    begin, truth = problem_of(recording, swarm), recording.truth
+    if options.plain:
+        return _fitted(recording, begin, begin, truth, options)
+    current = started_at_truth(swarm, recording) if truth else swarm
+    online = rerun(recording, current, RUN_TICK_S)
+    known = {robot.name: online.track(index) for index, robot in enumerate(swarm.robots)} | dict(truth)
+    polar = bool(begin.is_polar.any())
+    parameters = calibrated_parameters(polar=polar, poses=not begin.is_polar.all())
+    mean, wide = values_of(swarm, parameters), np.array([one.sigma for one in parameters])
+    sigma = np.tile(wide, (len(mean), 1))
+    # motion is fitted again in each round: a table of speeds takes its place
+    is_fixed = np.array([not one.moves for one in parameters])
+    rounds = _ROUNDS if truth else _ROUNDS_ALONE
+    for number in range(rounds):
+        progress(0.2 * number / rounds, f"models, round {number + 1} of {rounds}")
+        # the batch, with parameters about those of the type
+        about = np.where(is_fixed, np.nan_to_num(mean - values_of(current, parameters)), 0.0)
+        prior = ParameterPrior(about, np.where(is_fixed, sigma, wide)) if number else None
+        problem = problem_of(recording, current, parameters, truth)
+        solution = Solver(problem, started_at(problem, known), prior).solve(unwatched)
+        found = all_changed(current, parameters, np.round(solution.parameter, 5))
+        mean, sigma = _of_types(swarm, found, solution)
+        # motion and noise by its paths
+        known = solution.paths() | {name: one for name, one in truth.items() if _is_dense(one)}
+        paths = {name: one for name, one in known.items() if not truth or name in truth}
+        models = _fitted(recording, begin, problem_of(recording, found), paths, options, solution)
+        current = with_noise(models.swarm, {**fixed_noise(swarm), **models.noise})
+    starts = [
+        replace(one, start=old.start) for one, old in zip(models.swarm.robots, swarm.robots, strict=True)
+    ]
+    return replace(models, swarm=replace(models.swarm, robots=tuple(starts)))
+
+
+def _of_types(described: Swarm, found: Swarm, solution: Solution) -> tuple[FloatArray, FloatArray]:
+    """Mean (N, p) and standard deviation (N, p) of parameters by type, as priors of the next round."""
+    parameters = solution.problem.parameters
+    mean, old = (
+        np.array([[one.of(robot) for one in parameters] for robot in swarm.robots])
+        for swarm in (found, described)
+    )
+    sigma = np.tile(np.array([one.sigma for one in parameters]), (len(mean), 1))
+    for name in dict.fromkeys(robot.type for robot in found.robots):
+        rows = np.flatnonzero([robot.type == name and robot.camera is not None for robot in found.robots])
+        if rows.size == 1:
+            mean[rows] = old[rows]
+        elif rows.size:
+            typical, apart = population(mean[rows], solution.parameter_sigma[rows], sigma[0])
+            mean[rows] = typical
+            sigma[rows] = apart
+    return mean, sigma
+
+
+def _is_dense(path: Trajectory) -> bool:
+    """Whether most of a path is known without gaps."""
+    return path.stamp_ns.size > 1 and float(np.median(np.diff(path.stamp_ns))) <= DENSE_GAP_NS
+
+
+def _fitted(
+    recording: Recording,
+    begin: BatchProblem,
+    found: BatchProblem,
+    paths: Mapping[str, Trajectory],
+    options: Options,
+    solution: Solution | None = None,
+) -> FittedModels:
+    """Motion and noise by the paths of the robots, type by type, and the errors of their sightings."""
+    robots, cameras = list(found.swarm.robots), camera_fits(begin, found, paths)
+    motion: list[DriveFit] = []
+    remarks: list[str] = []
+    for name in dict.fromkeys(robot.type for robot in robots):
+        members = [index for index, robot in enumerate(robots) if robot.type == name]
+        fits = [fit for fit in cameras if fit.robot.type == name]
+        drive = _fit_drive(recording, found.swarm, paths, members, options)
+        remarks += _remarks(found.swarm, members, fits, drive)
+        if drive is not None:
+            motion.append(drive if solution is None else replace(drive, doubt=_doubt(solution, members)))
+        if options.plain:
+            continue
+        sensed = {robot.name: robot for robot in with_scatter(fits)}
+        for index in members:
+            seen = sensed.get(robots[index].name, robots[index])
+            robots[index] = seen if drive is None else _with_motion(seen, index, drive)
+    if not motion and not any(fit.is_enough for fit in cameras):
+        raise CalibrationError(
+            f"recording '{recording.name}' holds too little ground truth together with odometry or sightings;"
+            " at least a minute of a moving robot that sees markers is needed."
+        )
+    swarm = replace(found.swarm, robots=tuple(robots))
+    models = FittedModels(swarm, tuple(cameras), tuple(motion), tuple(remarks), {}, paths)
+    noise = _first_noise(models, plain=options.plain)
+    return replace(models, noise=noise if solution is None else _with_leverage(noise, solution))
+
+
+def _with_leverage(noise: dict[str, float], solution: Solution) -> dict[str, float]:
+    """Noise of sightings, whose errors by a path that follows them are too small by its own variance."""
+    used, residual = np.flatnonzero(solution.used), solution.sightings[0]
+    is_good = solution.weight[used] > _GOOD
+    is_polar, rng = solution.problem.is_polar[used], np.random.default_rng(0)
+    larger = dict(noise)
+    for polar, names in _SIGHTED.items():
+        rows = np.flatnonzero(is_good & (is_polar == polar))
+        if not rows.size or names[0] not in noise:
+            continue
+        some = rng.choice(rows, min(_SAMPLES * len(solution.problem.swarm.robots), rows.size), replace=False)
+        own = np.median(solution.leverages(some), axis=0)
+        for component, name in enumerate(names):
+            scatter = (_CORRELATION * max(spread(residual[rows, component]), 1e-3)) ** 2
+            larger[name] = noise[name] * math.sqrt(1.0 + float(own[component]) / scatter)
+    return larger
+
+
+def _fit_drive(
+    recording: Recording,
+    swarm: Swarm,
+    paths: Mapping[str, Trajectory],
+    members: Sequence[int],
+    options: Options,
+) -> DriveFit | None:
+    """Fit the motion of a type; None without a robot whose path is known."""
+    drives: dict[int, Drive] = {}
+    for index in members:
+        track, path = recording.track(index), paths.get(swarm.robots[index].name)
+        if path is None or track.stamp_ns.size < 2:
+            continue
+        begin_ns, end_ns = int(track.stamp_ns[0]), int(track.stamp_ns[-1])
+        drive = Drive(steps_of(track, swarm.robots[index].odometry), true_motion(path, begin_ns, end_ns))
+        if windows(drive.motion, WINDOW_S)[0].size >= _MIN_WINDOWS:
+            drives[index] = drive
+    if not drives:
+        return None
+    own, prompt = [*drives.values()], Lateness(0.0, 0.0)
+    before = explained(own, prompt, None)
+    if options.plain:
+        return DriveFit(tuple(members), drives, prompt, None, before, before)
+    late = fit_lateness(own)
+    for _ in range(_BIAS_ROUNDS):
+        response = fit_response(own, late, table=options.response)
+        own = [biased(drive, late, response) for drive in own]
+    drives = dict(zip(drives, own, strict=True))
+    return DriveFit(tuple(members), drives, late, response, before, explained(own, late, response))
+
+
+def _doubt(solution: Solution, members: Sequence[int]) -> FloatArray:
+    """Mean variances (2,) of path and turn over a window in which a robot moves, by the batch itself."""
+    knots, rng = solution.problem.knots, np.random.default_rng(0)
+    first, last = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
+    for index in members:
+        own = np.flatnonzero((knots.robot == index) & (solution.column >= 0))
+        end = np.searchsorted(knots.stamp_ns[own], knots.stamp_ns[own] + round(1e9 * WINDOW_S))
+        begin = np.flatnonzero(end < own.size)
+        track = knots.sample.pose[own]
+        moved = se2.between(track[begin], track[end[begin]])
+        begin = begin[np.hypot(moved[:, 0], moved[:, 1]) > _MOVED_M]
+        some = rng.choice(begin, min(_SAMPLES, begin.size), replace=False)
+        first.append(own[some])
+        last.append(own[end[some]])
+    variances = solution.moved_variances(np.concatenate(first), np.concatenate(last))
+    return np.asarray(variances[:, [0, 2]].mean(axis=0)) if len(variances) else np.zeros(2)
+
+
+def _with_motion(robot: Robot, index: int, drive: DriveFit) -> Robot:
+    """The robot with the delay, lag and scale factors of its type."""
+    late, response = drive.late, drive.response
+    numbers = {
+        "delay_s": round(late.delay_s, 4),
+        "lag_s": round(late.lag_s, 4),
+        "distance_scale": 1.0,
+        "turn_scale": 1.0,
+    }
+    if index in drive.drives:
+        bias = drive.drives[index].steps.turn_bias
+        numbers["turn_bias"] = round(float(bias[np.argmax(np.abs(bias))]), 5)
+    if response is not None and len(response.speeds) == len(response.turn_rates) == 1:
+        numbers["distance_scale"] = response.speed_share[0][0]
+        numbers["turn_scale"] = response.turn_share[0][0]
+        response = None
+    return replace(robot, odometry=replace(robot.odometry, **numbers), response=response)
+
+
+def _first_noise(models: FittedModels, *, plain: bool) -> dict[str, float]:
+    """Initial noise parameters, from the scatter of sightings and the errors of motion windows."""
+    polar = np.concatenate([fit.polar for fit in models.cameras] or [np.zeros(0, dtype=bool)])
+    errors = [fit.before if plain else fit.after for fit in models.cameras]
+    error = np.concatenate(errors or [np.zeros((0, 3))])
+    begin: dict[str, float] = {}
+    if polar.any():
+        metres = np.concatenate([fit.sightings.value[:, 0] for fit in models.cameras])[polar]
+        begin["range_sigma_per_m"] = _CORRELATION * spread(error[polar, 0] / np.maximum(metres, 0.1))
+        begin["bearing_sigma"] = _CORRELATION * spread(error[polar, 1])
+    if (~polar).any():
+        names = ("forward_sigma", "left_sigma", "heading_sigma")
+        begin |= {n: _CORRELATION * max(1e-4, spread(error[~polar, k])) for k, n in enumerate(names)}
+    if models.motion:
+        begin |= _first_motion_noise(models.motion, plain=plain)
+    else:
+        model = OdometryModel()
+        begin |= {"distance_noise": model.wheel_noise, "turn_noise": 0.01, "turn_drift": 1e-4}
+    return begin
+
+
+def _first_motion_noise(motion: Sequence[DriveFit], *, plain: bool) -> dict[str, float]:
+    """Initial noise of motion: each parameter explains a part of the mean squared errors of windows."""
+    path = turn = seconds = path2 = turn2 = 0.0
+    for fit in motion:
+        for drive in fit.drives.values():
+            first, last = windows(drive.motion, WINDOW_S)
+            path += float(np.sum(np.abs(drive.motion.path[last] - drive.motion.path[first])))
+            turn += float(np.sum(np.abs(drive.motion.turn[last] - drive.motion.turn[first])))
+            seconds += WINDOW_S * first.size
+        # errors by a path that follows the odometry are too small by its own variance
+        path2 += float(np.sum(fit.after[:, 0] ** 2 + fit.doubt[0]))
+        turn2 += float(np.sum(fit.after[:, 1] ** 2 + fit.doubt[1]))
+    path, turn, path2, turn2 = max(path, 1e-3), max(turn, 1e-3), max(path2, 1e-7), max(turn2, 1e-7)
+    begin = {} if plain else {"turn_bias_sigma": np.sqrt(0.1 * turn2 / (seconds * WINDOW_S))}
+    return begin | {
+        "distance_noise": 0.5 * path2 / path,
+        "distance_turn_noise": 0.5 * path2 / turn,
+        "lateral_noise": 0.05 * path2 / path,
+        "turn_drift": 0.3 * turn2 / seconds,
+        "turn_noise": 0.3 * turn2 / turn,
+        "turn_change_noise": 0.2 * turn2 / turn,
+    }
+
+
+def _remarks(
+    swarm: Swarm, members: Sequence[int], fits: Sequence[CameraFit], drive: DriveFit | None
+) -> list[str]:
+    """One sentence for everything that could not be fitted."""
+    poor = [fit.robot.name for fit in fits if not fit.is_enough]
+    remarks = [
+        f"{name} has too few sightings with ground truth: it gets the mean of its type." for name in poor
+    ]
+    if not any(fit.is_enough for fit in fits) and any(
+        swarm.robots[index].camera is not None for index in members
+    ):
+        names = ", ".join(swarm.robots[index].name for index in members)
+        remarks.append(f"no camera of {names} could be calibrated: too few sightings with ground truth.")
+    if drive is None:
+        names = ", ".join(swarm.robots[index].name for index in members)
+        remarks.append(f"the motion of {names} could not be calibrated: none has dense ground truth.")
+    return remarks
