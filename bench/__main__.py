@@ -18,6 +18,7 @@ BENCHMARKS = {
     "large_swarms": "bench.graph.large_swarms",
     "live": "bench.graph.live",
     "mrclam": "bench.mrclam",
+    "selfcal": "bench.selfcal",
     "pushbot": "bench.pushbot",
     "pushbot_bag": "bench.pushbot.bag",
     "reading": "bench.peers.reading",

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.infrared.brightness import expected_brightness as expected_brightness
     from swarm_loc_estimator.mapping.exploration import Goal as Goal
     from swarm_loc_estimator.mapping.grid import OccupancyMap as OccupancyMap
+    from swarm_loc_estimator.mapping.map_file import load_map as load_map
     from swarm_loc_estimator.mapping.mapper import SCAN_TURN as SCAN_TURN
     from swarm_loc_estimator.mapping.mapper import START_TURN as START_TURN
     from swarm_loc_estimator.mapping.mapper import CooperativeMapper as CooperativeMapper
@@ -71,6 +72,7 @@ _MODULES = {
     "swarm_loc_estimator.infrared.brightness": ("expected_brightness",),
     "swarm_loc_estimator.mapping.exploration": ("Goal",),
     "swarm_loc_estimator.mapping.grid": ("OccupancyMap",),
+    "swarm_loc_estimator.mapping.map_file": ("load_map",),
     "swarm_loc_estimator.mapping.mapper": ("SCAN_TURN", "START_TURN", "CooperativeMapper"),
     "swarm_loc_estimator.mapping.mapper_feed": ("fix_covariance",),
     "swarm_loc_estimator.mapping.messages": ("ScanMessage", "decode_laser"),

@@ -34,8 +34,8 @@ _FINE, _FINE_TURN, _FINE_STEPS = 0.03, math.radians(1.5), 3
 """Of the places around these, and of those after each drive [m, rad], and their number to each side."""
 _HYPOTHESES = 100  # Maximum number of places
 _RULED_OUT = 0.5  # By how many scans a place explains less than another one if it is ruled out by it
-_FITS, _CONTRADICTS = 0.85, 0.7
-"""Share of the known beams that must fit a place where a robot is found, and to keep it there."""
+_FITS, _CONTRADICTS = 0.88, 0.7
+"""Share of the known beams that must fit the places where a robot is found, at all stops, and to keep it."""
 _MIN_KNOWN = 0.4  # Minimum share of beams of which the map says something
 _PLACES, _CONFIRMED = 2, 6
 """Number of places from which a robot looks before it is found, and in known parts before its test ends."""
@@ -108,8 +108,8 @@ class Search:
         best = int(total.argmax())
         nowhere = _UNKNOWN * self.fits.shape[1]  # it is where the map is unknown
         rival = total[_apart(self.poses[best, -1], self.poses[:, -1])].max(initial=nowhere)
-        known, fits = self.known[best, -_PLACES:].sum(), self.fits[best, -_PLACES:].sum()
-        is_seen = known > _MIN_KNOWN * _PLACES and fits > _FITS * known
+        known, fits = self.known[best].sum(), self.fits[best].sum()
+        is_seen = self.known[best, -_PLACES:].mean() > _MIN_KNOWN and fits > _FITS * known
         return best if is_seen and total[best] - rival > _RULED_OUT else -1
 
     @property

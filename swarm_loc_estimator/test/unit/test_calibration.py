@@ -15,7 +15,7 @@ from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.calibrate import main
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
-from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.offline.calibration.fit import (
     NEES_AIM,
     TICK_S,
@@ -324,3 +324,17 @@ def test_the_score_counts_error_consistency_and_poses_not_given() -> None:
     assert replace(fair, nees=2.0 * NEES_AIM).cost > fair.cost
     assert replace(fair, given=0.99).cost > fair.cost
     assert Score(np.nan, np.nan, np.nan, 0.0).cost > 10.0
+
+
+@pytest.mark.parametrize("seed", [7, 8])
+def test_without_ground_truth_the_models_are_found_by_landmarks_alone(seed: int) -> None:
+    recording, swarm = record(World((robot(1, TRUE), robot(2, TRUE)), seed))
+    alone = fit_models(replace(recording, truth={}), swarm, Options(alone=True), quiet)
+    for found in alone.swarm.robots:
+        assert found.sensor.range_curve == pytest.approx(0.5, abs=0.06)
+        assert found.sensor.bearing_scale == pytest.approx(0.97, abs=0.02)
+    errors = []
+    for name, path in alone.paths.items():
+        true, known = interpolate(recording.truth[name], path.stamp_ns, DEFAULT_GAP_NS)
+        errors.append(np.hypot(*(path.pose[known] - true[known])[:, :2].T))
+    assert np.sqrt(np.mean(np.square(np.concatenate(errors)))) < 0.03

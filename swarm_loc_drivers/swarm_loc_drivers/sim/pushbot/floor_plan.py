@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator import load_map
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, read_tree
-from swarm_loc_estimator.mapping.map_file import load_map
 
 Rectangle = tuple[float, float, float, float]  # Left, lower, right and upper edge [m]
 _SUFFIXES = (".yaml", ".yml", ".json")
