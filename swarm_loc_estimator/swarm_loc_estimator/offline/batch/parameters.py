@@ -47,16 +47,18 @@ _MOTION = (
     Parameter("odometry", "turn_bias", 0.02),
     Parameter("odometry", "distance_scale", 0.1),
     Parameter("odometry", "turn_scale", 0.1),
-    Parameter("odometry", "delay_s", 0.15),
-    Parameter("odometry", "course_offset", 0.05),
-    Parameter("odometry", "axle_offset", 0.05),
+    Parameter("odometry", "delay_s", 0.3),
     Parameter("imu", "turn_bias", 0.01),
     Parameter("imu", "turn_scale", 0.05),
+)
+_BODY = (
+    Parameter("odometry", "course_offset", 0.05),
+    Parameter("odometry", "axle_offset", 0.05),
 )
 _MOUNT = (
     Parameter("camera", "x", 0.03),
     Parameter("camera", "y", 0.02),
-    Parameter("sensor", "time_offset_s", 0.05),
+    Parameter("sensor", "time_offset_s", 0.03),
 )
 _POLAR = (
     Parameter("sensor", "range_log_scale", 0.1),
@@ -74,9 +76,13 @@ _POSES = (
 )
 
 
-def calibrated_parameters(*, polar: bool, poses: bool) -> tuple[Parameter, ...]:
-    """What a calibration estimates of robots that see ranges and bearings, or poses, of markers."""
-    return (*_MOTION, *_MOUNT, *(_POLAR if polar else ()), *(_POSES if poses else ()))
+def calibrated_parameters(*, polar: bool, poses: bool, truth: bool) -> tuple[Parameter, ...]:
+    """What a calibration estimates of robots that see ranges and bearings, or poses, of markers.
+
+    Where base_link is on a robot only ground truth tells; without it, it is where odometry has it.
+    """
+    seen = (*(_POLAR if polar else ()), *(_POSES if poses else ()))
+    return (*_MOTION, *(_BODY if truth else ()), *_MOUNT, *seen)
 
 
 def values_of(swarm: Swarm, parameters: Sequence[Parameter]) -> FloatArray:

@@ -150,7 +150,7 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
     online = rerun(recording, current, RUN_TICK_S)
     known = {robot.name: online.track(index) for index, robot in enumerate(swarm.robots)} | dict(truth)
     polar = bool(begin.is_polar.any())
-    parameters = calibrated_parameters(polar=polar, poses=not begin.is_polar.all())
+    parameters = calibrated_parameters(polar=polar, poses=not begin.is_polar.all(), truth=bool(truth))
     mean, wide = values_of(swarm, parameters), np.array([one.sigma for one in parameters])
     sigma = np.tile(wide, (len(mean), 1))
     # motion is fitted again in each round: a table of speeds takes its place
