@@ -8,11 +8,12 @@ the border by its Schur complement.
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, cho_solve_banded, cholesky_banded
+from scipy.linalg import LinAlgError, cho_factor, cho_solve, cho_solve_banded, cholesky_banded
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 
+_LEAST_DAMPING = 1e-14
 _AT_ONCE = 50  # Residuals whose variances are computed together
 
 
@@ -48,16 +49,16 @@ class ChainEquations:
         return np.concatenate([self._band[0], np.diag(self._corner)])
 
     def factored(self, damping: float) -> ChainFactor:
-        """The factor, with the diagonal enlarged by a share.
-
-        Raises:
-            LinAlgError: The matrix is not positive definite.
-        """
-        band, corner = self._band.copy(), self._corner.copy()
-        for diagonal in (band[0], np.einsum("ii->i", corner)):
-            # what has no information stays as it is
-            diagonal[:] = np.where(diagonal > 0.0, diagonal * (1.0 + damping), 1.0)
-        return ChainFactor(band, self._border, corner)
+        """The factor, with the diagonal enlarged by a share, or by as much as makes the matrix regular."""
+        while True:
+            band, corner = self._band.copy(), self._corner.copy()
+            for diagonal in (band[0], np.einsum("ii->i", corner)):
+                # what has no information stays as it is
+                diagonal[:] = np.where(diagonal > 0.0, diagonal * (1.0 + damping), 1.0)
+            try:
+                return ChainFactor(band, self._border, corner)
+            except LinAlgError:
+                damping = max(100.0 * damping, _LEAST_DAMPING)
 
 
 class ChainFactor:

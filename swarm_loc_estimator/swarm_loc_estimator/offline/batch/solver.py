@@ -36,7 +36,7 @@ _DAMPING = (1e-14, 1e-2)
 _LEAST_VARIANCE = 1e-10
 """Added to the variances of a step, so that the covariance of a standing robot is regular [m^2, rad^2]."""
 
-_PATH_NS = 50_000_000
+_PATH_NS = 50_000_000  # Time between two poses of a path
 
 Progress = Callable[[float, str], None]
 
@@ -89,12 +89,6 @@ class Solution:
                 known = np.isfinite(poses[:, 0])
                 found[robot.name] = Trajectory(stamps[known], poses[known])
         return found
-
-    def covariances(self, knots: IntArray) -> FloatArray:
-        """Covariances (c, 3, 3) of x, y, yaw of the poses at connected knots (c,)."""
-        poses = se2.compose(self.knot[knots], self.problem.knots.sample.pose[knots])
-        errors = [self.factor.covariance(self.column[one] + np.arange(3)) for one in knots.tolist()]
-        return se2.pose_covariance(poses, np.array(errors).reshape(-1, 3, 3))
 
     def leverages(self, rows: IntArray) -> FloatArray:
         """Variances (c, 3) of predictions of used sightings (c,), in units of their noise."""
@@ -153,7 +147,7 @@ class Solver:
         self._parameter_column = next_column + np.arange(self._prior.size).reshape(robots, -1)
         self._size = next_column + self._prior.size
         self._weight, self._is_rigid = np.ones(self._rows.size), True
-        self._robots, self._landmarks = robots, landmarks
+        self._landmarks = landmarks
         self._origin: FloatArray | None = None
 
     def solve(self, progress: Progress) -> Solution:

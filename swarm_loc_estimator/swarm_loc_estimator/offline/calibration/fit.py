@@ -22,6 +22,10 @@ from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_estimator.filter.measurements import select
+from swarm_loc_estimator.offline.batch.problem import problem_of
+from swarm_loc_estimator.offline.batch.solver import Solver
+from swarm_loc_estimator.offline.batch.start import started_at
+from swarm_loc_estimator.offline.calibration.camera import errors_of
 from swarm_loc_estimator.offline.calibration.models import (
     RUN_TICK_S,
     FittedModels,
@@ -36,6 +40,7 @@ from swarm_loc_estimator.offline.calibration.recording import (
     rerun,
     started_at_truth,
 )
+from swarm_loc_estimator.offline.calibration.robust import spread
 from swarm_loc_estimator.offline.metrics import nees
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.result import ReplayResult
@@ -56,6 +61,8 @@ _LOSS = 5.0  # A hundredth of the poses missing costs as much as 5 % more error
 _FORGETTING = 0.005
 """Weight of the prior that parameters stay near their initial values, per squared factor of e."""
 _FIRST_STEP, _LAST_STEP = 0.7, 0.07  # Trust radii of the search, in logarithms of the noise
+_BETTER = 0.97  # Scatter of held-out sightings that is asked of a fit without ground truth, per described one
+_UNCHECKED = "The recording is too short to check the fit: half of it is too little to fit anything."
 _WORST = 1e3  # Cost where nothing was estimated
 _BAD = 0.3  # Costs are capped this far above the initial one: when robots get lost, a score means nothing
 
@@ -182,9 +189,9 @@ class Calibration:
 def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Progress) -> Calibration:
     """Fit cameras, motion and noise to a recording with ground truth of at least one robot, or to itself.
 
-    Without ground truth the paths of the batch take its place; where half of them is not better predicted
-    with what the other half tells, the description stays as it is. `swarm` is the description to begin with.
-    `progress` is called now and then with the share done and what is being done.
+    Without ground truth the paths of the batch take its place; where sightings of one half do not scatter
+    less with what the other half tells, the description stays as it is. `swarm` is the description to begin
+    with. `progress` is called now and then with the share done and what is being done.
 
     Raises:
         CalibrationError: There is no or too little ground truth, or the clock of the recording jumps.
@@ -218,7 +225,8 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
     scores = [
         score([rerun(recording, started_at_truth(s, recording), RUN_TICK_S)]) for s in (swarm, calibrated)
     ]
-    warning = "" if options.plain else _warning(folds, swarm, noise)
+    check = _warning_alone if options.alone else _warning
+    warning = "" if options.plain else check(folds, swarm, noise)
     kept = swarm if options.alone and warning else calibrated
     return Calibration(kept, whole, noise, scores[0], scores[1], warning)
 
@@ -226,7 +234,7 @@ def calibrate(recording: Recording, swarm: Swarm, options: Options, progress: Pr
 def _warning(folds: Sequence[Fold], swarm: Swarm, noise: dict[str, float]) -> str:
     """A sentence if a half is not better with the models of the other half than with the description."""
     if not all(fold.is_held_out for fold in folds):
-        return "The recording is too short to check the fit: half of it is too little to fit anything."
+        return _UNCHECKED
     for fold in folds:
         described = started_at_truth(swarm, fold.recording)
         fitted_m, *described_m = (
@@ -240,6 +248,34 @@ def _warning(folds: Sequence[Fold], swarm: Swarm, noise: dict[str, float]) -> st
                 f" {1e3 * min(described_m):.1f} mm."
             )
     return ""
+
+
+def _warning_alone(folds: Sequence[Fold], swarm: Swarm, noise: dict[str, float]) -> str:
+    """A sentence if sightings of a half scatter as much with the models of the other half as described.
+
+    Paths do not tell: those of the new description are as far off as it is.
+    """
+    if not all(fold.is_held_out for fold in folds):
+        return _UNCHECKED
+    for fold in folds:
+        fitted, described = (_scatter(fold, with_noise(one, noise)) for one in (fold.swarm, swarm))
+        ratio = float(np.exp(np.mean(np.log(fitted / described))))
+        if ratio > _BETTER:
+            return (
+                "The description is kept, since it was as good: fitted to one half, sightings of the other"
+                f" half scatter {ratio:.2f} times as much as with it, and {_BETTER} is asked."
+            )
+    return ""
+
+
+def _scatter(fold: Fold, swarm: Swarm) -> FloatArray:
+    """Scatter of the first two components of sightings about a batch of a part, by kind of sightings."""
+    problem = problem_of(fold.recording, swarm)
+    solution = Solver(problem, started_at(problem, fold.recording.truth)).solve(unwatched)
+    error = errors_of(problem, solution.paths())
+    known = np.isfinite(error[:, 0])
+    kinds = [rows for rows in (known & problem.is_polar, known & ~problem.is_polar) if rows.any()]
+    return np.array([spread(error[rows, component]) for rows in kinds for component in range(2)])
 
 
 def _folds(recording: Recording, swarm: Swarm, whole: FittedModels, options: Options) -> list[Fold]:

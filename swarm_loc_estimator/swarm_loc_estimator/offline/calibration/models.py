@@ -15,7 +15,7 @@ from swarm_loc_estimator.offline.batch.parameters import all_changed, calibrated
 from swarm_loc_estimator.offline.batch.problem import BatchProblem, problem_of
 from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver
 from swarm_loc_estimator.offline.batch.start import started_at
-from swarm_loc_estimator.offline.calibration.camera import CameraFit, camera_fits
+from swarm_loc_estimator.offline.calibration.camera import MIN_SIGHTINGS, CameraFit, camera_fits
 from swarm_loc_estimator.offline.calibration.motion import (
     DENSE_GAP_NS,
     WINDOW_S,
@@ -43,16 +43,13 @@ from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 EVALUATIONS = 80  # Runs of the estimator to fit the noise
 
-_OF_SENSOR = frozenset({"range_sigma_per_m", "bearing_sigma", "forward_sigma", "left_sigma", "heading_sigma"})
-"""Noise in which robots differ."""
-
 _MIN_WINDOWS = 50
 _ROUNDS, _ROUNDS_ALONE = 2, 5  # Of the batch, with and without ground truth
 _SIGHTED = {
     True: ("range_sigma_per_m", "bearing_sigma"),
     False: ("forward_sigma", "left_sigma", "heading_sigma"),
 }
-"""Noise of ranges and bearings, and of poses."""
+"""Noise of ranges and bearings, and of poses, in which robots differ."""
 _GOOD = 0.5  # Least weight of a sighting that counts
 _MOVED_M = 0.02
 _BIAS_ROUNDS = 3  # Of scale factors of motion, and turn biases
@@ -95,7 +92,7 @@ class DriveFit:
 
 @dataclass(frozen=True)
 class FittedModels:
-    """Calibrated models, without noise."""
+    """Calibrated models, and the noise to begin with."""
 
     swarm: Swarm  # Calibrated
     cameras: tuple[CameraFit, ...]  # Of all robots, ordered by type
@@ -116,7 +113,8 @@ def with_noise(swarm: Swarm, values: dict[str, float]) -> Swarm:
     )
     mean = {
         name: math.exp(np.mean([math.log(getattr(robot.sensor, name)) for robot in swarm.robots]))
-        for name in _OF_SENSOR & sensor.keys()
+        for names in _SIGHTED.values()
+        for name in sensor.keys() & set(names)
         if all(getattr(robot.sensor, name) > 0.0 for robot in swarm.robots)
     }
     robots = []
@@ -146,6 +144,11 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
     begin, truth = problem_of(recording, swarm), recording.truth
     if options.plain:
         return _fitted(recording, begin, begin, truth, options)
+    if not truth and begin.sightings.size < MIN_SIGHTINGS:
+        raise CalibrationError(
+            f"recording '{recording.name}' holds {begin.sightings.size} sightings by robots that drive;"
+            f" without ground truth {MIN_SIGHTINGS} are needed, of described landmarks or of other robots."
+        )
     current = started_at_truth(swarm, recording) if truth else swarm
     online = rerun(recording, current, RUN_TICK_S)
     known = {robot.name: online.track(index) for index, robot in enumerate(swarm.robots)} | dict(truth)
@@ -179,10 +182,7 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
 def _of_types(described: Swarm, found: Swarm, solution: Solution) -> tuple[FloatArray, FloatArray]:
     """Mean (N, p) and standard deviation (N, p) of parameters by type, as priors of the next round."""
     parameters = solution.problem.parameters
-    mean, old = (
-        np.array([[one.of(robot) for one in parameters] for robot in swarm.robots])
-        for swarm in (found, described)
-    )
+    mean, old = values_of(found, parameters), values_of(described, parameters)
     sigma = np.tile(np.array([one.sigma for one in parameters]), (len(mean), 1))
     for name in dict.fromkeys(robot.type for robot in found.robots):
         rows = np.flatnonzero([robot.type == name and robot.camera is not None for robot in found.robots])
@@ -190,8 +190,7 @@ def _of_types(described: Swarm, found: Swarm, solution: Solution) -> tuple[Float
             mean[rows] = old[rows]
         elif rows.size:
             typical, apart = population(mean[rows], solution.parameter_sigma[rows], sigma[0])
-            mean[rows] = typical
-            sigma[rows] = apart
+            mean[rows], sigma[rows] = typical, apart
     return mean, sigma
 
 
@@ -333,8 +332,9 @@ def _first_noise(models: FittedModels, *, plain: bool) -> dict[str, float]:
         begin["range_sigma_per_m"] = _CORRELATION * spread(error[polar, 0] / np.maximum(metres, 0.1))
         begin["bearing_sigma"] = _CORRELATION * spread(error[polar, 1])
     if (~polar).any():
-        names = ("forward_sigma", "left_sigma", "heading_sigma")
-        begin |= {n: _CORRELATION * max(1e-4, spread(error[~polar, k])) for k, n in enumerate(names)}
+        begin |= {
+            n: _CORRELATION * max(1e-4, spread(error[~polar, k])) for k, n in enumerate(_SIGHTED[False])
+        }
     if models.motion:
         begin |= _first_motion_noise(models.motion, plain=plain)
     else:
@@ -373,14 +373,14 @@ def _remarks(
     """One sentence for everything that could not be fitted."""
     poor = [fit.robot.name for fit in fits if not fit.is_enough]
     remarks = [
-        f"{name} has too few sightings with ground truth: it gets the mean of its type." for name in poor
+        f"{name} has too few sightings whose truth is known: it gets the mean of its type." for name in poor
     ]
     if not any(fit.is_enough for fit in fits) and any(
         swarm.robots[index].camera is not None for index in members
     ):
         names = ", ".join(swarm.robots[index].name for index in members)
-        remarks.append(f"no camera of {names} could be calibrated: too few sightings with ground truth.")
+        remarks.append(f"no camera of {names} could be calibrated: too few sightings whose truth is known.")
     if drive is None:
         names = ", ".join(swarm.robots[index].name for index in members)
-        remarks.append(f"the motion of {names} could not be calibrated: none has dense ground truth.")
+        remarks.append(f"the motion of {names} could not be calibrated: no path of theirs is known.")
     return remarks
