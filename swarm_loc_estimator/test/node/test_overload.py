@@ -90,7 +90,8 @@ def test_an_overloaded_estimator_sheds_sightings_evenly_and_says_so(ros: Ros, sw
         made.append(SlowEstimator(*arguments))
         return made[-1]
 
-    parameters = overrides(swarm_file=str(swarm_file), tick_period_s=0.2, fusion_load=0.5)
+    # No tick takes as long as this horizon, so that no message is too old to be read
+    parameters = overrides(swarm_file=str(swarm_file), tick_period_s=0.2, fusion_load=0.5, horizon_s=5.0)
     ros.add(EstimatorNode(create, parameter_overrides=parameters))
     (slow,) = made
     poses: list[SwarmPoses] = ros.listen(SwarmPoses, "swarm/poses")
@@ -105,7 +106,7 @@ def test_an_overloaded_estimator_sheds_sightings_evenly_and_says_so(ros: Ros, sw
         level, sentence, values = newest(heard)
         assert level == DiagnosticStatus.WARN
         assert "overload: dropped " in sentence
-        assert sentence.endswith("uniformly over robots")
+        assert "uniformly over robots" in sentence
         assert int(values["dropped: shed_detections"]) > 0
 
         slow.taken[:] = 0
