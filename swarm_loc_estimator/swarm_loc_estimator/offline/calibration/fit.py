@@ -285,11 +285,13 @@ def _folds(recording: Recording, swarm: Swarm, whole: FittedModels, options: Opt
     first_ns, last_ns = recording.range_ns
     middle_ns = (first_ns + last_ns) // 2
     halves = [recording.between(first_ns, middle_ns), recording.between(middle_ns, last_ns + 1)]
+    # robots begin the second half where nobody has described
+    later = replace(swarm, robots=tuple(replace(one, start=None) for one in swarm.robots))
     folds = []
-    for half, fitted in ((halves[0], halves[1]), (halves[1], halves[0])):
+    for half, fitted, begin in ((halves[0], halves[1], later), (halves[1], halves[0], swarm)):
         run = replace(half, truth=whole.paths) if options.alone else half
         try:
-            models = fit_models(fitted, swarm, options, unwatched)
+            models = fit_models(fitted, begin, options, unwatched)
         except CalibrationError:
             models = whole
         folds.append(Fold(run, started_at_truth(models.swarm, run), models is not whole))
