@@ -339,3 +339,19 @@ def test_without_ground_truth_the_models_are_found_by_landmarks_alone(seed: int)
         true, known = interpolate(recording.truth[name], path.stamp_ns, DEFAULT_GAP_NS)
         errors.append(np.hypot(*(path.pose[known] - true[known])[:, :2].T))
     assert np.sqrt(np.mean(np.square(np.concatenate(errors)))) < 0.03
+
+
+def test_a_wrong_description_with_a_start_is_mended_by_the_recording_alone() -> None:
+    skewed = replace(
+        HONEST,
+        odometry=OdometryModel(distance_scale=0.95, turn_scale=1.05),
+        camera=CameraMount(yaw=-np.radians(5.0)),
+    )
+    recording, swarm = record(World((robot(1, skewed),), 11, 80.0, posed=True))
+    (wrong,) = started_at_truth(swarm, recording).robots
+    stiff = replace(wrong, odometry=OdometryModel(wheel_noise=2e-5))
+    begin = replace(swarm, robots=(stiff,))
+    done = calibrate(replace(recording, truth={}), begin, Options(response=False, alone=True), quiet)
+    assert not done.warning  # the half that begins where nobody has described is fitted, too
+    before, after = (score([rerun(recording, one, TICK_S)]).position_rmse for one in (begin, done.swarm))
+    assert after < 0.3 * before
