@@ -47,7 +47,7 @@ _MOTION = (
     Parameter("odometry", "turn_bias", 0.02),
     Parameter("odometry", "distance_scale", 0.1),
     Parameter("odometry", "turn_scale", 0.1),
-    Parameter("odometry", "delay_s", 0.3),
+    Parameter("odometry", "delay_s", 0.1),
     Parameter("imu", "turn_bias", 0.01),
     Parameter("imu", "turn_scale", 0.05),
 )

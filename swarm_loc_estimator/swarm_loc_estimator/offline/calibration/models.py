@@ -156,8 +156,9 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
     parameters = calibrated_parameters(polar=polar, poses=not begin.is_polar.all(), truth=bool(truth))
     mean, wide = values_of(swarm, parameters), np.array([one.sigma for one in parameters])
     sigma = np.tile(wide, (len(mean), 1))
-    # motion is fitted again in each round: a table of speeds takes its place
-    is_fixed = np.array([not one.moves for one in parameters])
+    # motion but for its delay is fitted again in each round: a table of speeds takes its place
+    is_delay = np.array([one.name == "delay_s" for one in parameters])
+    is_fixed = np.array([not one.moves for one in parameters]) | is_delay
     rounds = _ROUNDS if truth else _ROUNDS_ALONE
     for number in range(rounds):
         progress(0.2 * number / rounds, f"models, round {number + 1} of {rounds}")
@@ -167,7 +168,9 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
         problem = problem_of(recording, current, parameters, truth)
         solution = Solver(problem, started_at(problem, known), prior).solve(unwatched)
         found = all_changed(current, parameters, np.round(solution.parameter, 5))
-        mean, sigma = _of_types(swarm, found, solution)
+        typical, apart = _of_types(swarm, found, solution)
+        # feedback by which a robot keeps its course looks like a delay of its wheels: no recording is sure of one
+        mean, sigma = np.where(is_delay, mean, typical), np.where(is_delay, sigma, apart)
         # motion and noise by its paths
         known = solution.paths() | {name: one for name, one in truth.items() if _is_dense(one)}
         paths = {name: one for name, one in known.items() if not truth or name in truth}
@@ -276,7 +279,8 @@ def _fit_drive(
     before = explained(own, prompt, None)
     if options.plain:
         return DriveFit(tuple(members), drives, prompt, None, before, before)
-    late = fit_lateness(own)
+    # paths of the batch are as late as it has taken the wheels to be
+    late = fit_lateness(own, 1.0) if options.alone else fit_lateness(own)
     for _ in range(_BIAS_ROUNDS):
         response = fit_response(own, late, table=options.response)
         own = [biased(drive, late, response) for drive in own]

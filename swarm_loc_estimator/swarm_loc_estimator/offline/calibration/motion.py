@@ -149,8 +149,11 @@ def gathered(values: FloatArray, drive: Drive, late: Lateness) -> FloatArray:
     return lagged
 
 
-def fit_lateness(drives: Sequence[Drive]) -> Lateness:
-    """Delay and lag that explain turns in short windows best, with scale factors for driving and in place."""
+def fit_lateness(drives: Sequence[Drive], least_share: float = _CLEARLY) -> Lateness:
+    """Delay and lag that explain turns in short windows best, with scale factors for driving and in place.
+
+    They are zero unless they reduce the errors to `least_share`.
+    """
 
     def cost(late: FloatArray) -> float:
         delay_s, lag_s = late
@@ -175,7 +178,7 @@ def fit_lateness(drives: Sequence[Drive]) -> Lateness:
         method="Nelder-Mead",
         options={"initial_simplex": simplex, "xatol": 3e-3, "fatol": 0.0, "maxfev": 60},
     )
-    if found.fun > _CLEARLY * cost(np.zeros(2)):
+    if found.fun > least_share * cost(np.zeros(2)):
         return Lateness(0.0, 0.0)
     return Lateness(float(found.x[0]), float(found.x[1]) if found.x[1] > 2e-3 else 0.0)
 
