@@ -1,8 +1,8 @@
 """Calibration without ground truth: fitted to the first half of a recording, replayed on the second.
 
-Real robots (MRCLAM sets, imported without calibration) by `set<k>.imported` and `set<k>.self`. Simulated bags,
-by their error per that with their own description: which is kept or bettered (`<bag>.self`), and that is made
-wrong first (`<bag>.wrong` as it is, `<bag>.mended`). When images were taken, only a truth could tell.
+Real robots (MRCLAM sets, imported without calibration) by `set<k>.imported` and `set<k>.self`. Simulated bags
+by their error as a share of that with their own description: calibrated from it (`<bag>.self`), with a wrong
+one (`<bag>.wrong`), and calibrated from the wrong one (`<bag>.mended`).
 """
 
 from __future__ import annotations

@@ -169,7 +169,7 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
         solution = Solver(problem, started_at(problem, known), prior).solve(unwatched)
         found = all_changed(current, parameters, np.round(solution.parameter, 5))
         typical, apart = _of_types(swarm, found, solution)
-        # feedback by which a robot keeps its course looks like a delay of its wheels: no recording is sure of one
+        # a robot that corrects its course by feedback seems to follow its wheels late: no recording is sure
         mean, sigma = np.where(is_delay, mean, typical), np.where(is_delay, sigma, apart)
         # motion and noise by its paths
         known = solution.paths() | {name: one for name, one in truth.items() if _is_dense(one)}
