@@ -7,7 +7,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from wrong_setups import BAGS, BOTH, ROBOT, WRONG, Change, good, shifted, with_gyroscope, with_topics
+from wrong_setups import (
+    BAGS,
+    BOTH,
+    ROBOT,
+    SEEN,
+    WRONG,
+    Change,
+    farther,
+    good,
+    shifted,
+    with_gyroscope,
+    with_topics,
+)
 
 from swarm_loc_estimator.cli import doctor as command
 from swarm_loc_estimator.common.bags.reader import BagReader
@@ -57,6 +69,15 @@ def test_a_described_offset_makes_a_clock_good() -> None:
 def test_a_good_gyroscope_is_not_accused() -> None:
     findings = examine(with_gyroscope(1.0)(good()))
     assert not [one for one in findings if one.about.endswith("gyroscope")]
+
+
+def test_a_camera_is_not_accused_by_one_half_of_a_recording() -> None:
+    heard, changed = good(), farther(1.8)(good())
+    half = len(heard.topics[SEEN].messages) // 2
+    messages = [*changed.topics[SEEN].messages[:half], *heard.topics[SEEN].messages[half:]]
+    mixed = with_topics(heard, epuck2__detections=replace(heard.topics[SEEN], messages=messages))
+    assert not [one for one in examine(mixed) if "times as far" in one.problem]
+    assert [one for one in examine(changed) if "times as far" in one.problem]
 
 
 def test_the_command_prints_findings(capsys: pytest.CaptureFixture[str]) -> None:
