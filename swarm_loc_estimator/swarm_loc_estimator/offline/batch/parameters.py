@@ -41,6 +41,7 @@ SURVEY = (
     Parameter("imu", "turn_scale", 0.05),
     Parameter("camera", "yaw", 0.05),
     Parameter("sensor", "distance_scale", 0.02),
+    Parameter("sensor", "range_offset", 0.1),
 )
 """What a survey corrects."""
 _MOTION = (

@@ -180,10 +180,11 @@ def _differentiate(
     # how the change differs farther along the ray: of the range, or of forward and left
     far = seen._replace(detection=seen.detection.copy())
     far.detection["position"] *= 1.0 + _STEP
-    farther = select(_sighted(far, other), kept).value - select(_sighted(far, problem.swarm), kept).value
-    ray = before.value[:, :2] * np.where(problem.is_polar[:, None], [1.0, 0.0], 1.0)
-    along = np.sum((farther - change)[:, :2] * ray, axis=1) / np.maximum(np.sum(ray**2, axis=1), 1e-6)
-    by.growth[:, index] = along / (_STEP * step)
+    now = select(_sighted(far, problem.swarm), kept).value
+    farther = select(_sighted(far, other), kept).value - now
+    ray = (now - before.value)[:, :2] * np.where(problem.is_polar[:, None], [1.0, 0.0], 1.0)
+    along = np.sum((farther - change)[:, :2] * ray, axis=1) / np.maximum(np.sum(ray**2, axis=1), 1e-10)
+    by.growth[:, index] = along / step
     # another mount or exposure is that of an observer, or a target, that is elsewhere on its track
     later = _on_tracks(problem.odometry, before, after.stamp_ns)
     later[0] = se2.compose(later[0], se2.compose(after.sensor, se2.inverse(before.sensor)))

@@ -128,7 +128,7 @@ class Solver:
         self._knot = start.transform[knots.robot] if start.knot is None else start.knot.copy()
         wide = np.tile(np.array([one.sigma for one in problem.parameters]), (robots, 1))
         self._mean, self._prior = prior or ParameterPrior(np.zeros_like(wide), wide)
-        self._parameter = self._mean.copy()
+        self._parameter = (self._mean if start.parameter is None else start.parameter).copy()
         is_placed = np.isfinite(self._knot[:, 0])
         self._mark = problem.sightings.landmark
         targets = np.where(self._mark >= 0, np.isfinite(self._landmark[self._mark, 0]), True)

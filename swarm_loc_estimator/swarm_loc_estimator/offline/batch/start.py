@@ -27,6 +27,7 @@ class Start:
     transform: FloatArray  # (N, 3) from the common frame to the track of each robot; NaN: not connected
     landmark: FloatArray  # (L, 3) poses; NaN: not connected
     knot: FloatArray | None = None  # (k, 3) transforms of tracks at knots, where paths are known
+    parameter: FloatArray | None = None  # (N, p) changes of parameters; None: the mean of their prior
 
 
 def started_at(problem: BatchProblem, paths: Mapping[str, Trajectory]) -> Start:

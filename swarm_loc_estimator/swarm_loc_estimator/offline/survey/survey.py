@@ -26,8 +26,8 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.offline.batch.parameters import SURVEY, all_changed
 from swarm_loc_estimator.offline.batch.problem import MIN_SIGHTINGS, BatchProblem, problem_of
-from swarm_loc_estimator.offline.batch.solver import Solution, Solver
-from swarm_loc_estimator.offline.batch.start import start_of
+from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver
+from swarm_loc_estimator.offline.batch.start import Start, start_of
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.report.plots import INK, SOFT, colour_of, label_map, save, style
@@ -361,6 +361,9 @@ _VAGUE_M, _VAGUE = 0.01, 3.0
 """A landmark is named if its sigma exceeds this [m] and this multiple of the median sigma."""
 _WORSE = 1.5
 """One that was seen from one side is named if its sigma exceeds this multiple of the median sigma."""
+_SCALE = [(one.section, one.name) for one in SURVEY].index(("sensor", "distance_scale"))
+_POLAR_SIGMA = 0.1  # Standard deviation of scales of cameras that measure ranges and bearings
+_LINEAR = 0.04  # Changes of scales from which derivatives are computed again
 _SIGNIFICANT = 3.0  # Parameters are written if they exceed this many of their standard deviations
 
 
@@ -394,7 +397,7 @@ def survey(
         raise CalibrationError(
             f"'{recording.name}' has no marker that belongs to nobody and was seen {MIN_SIGHTINGS} times."
         )
-    solution = Solver(problem, start_of(problem)).solve(progress)
+    problem, solution = _solved(recording, swarm, problem, progress)
     found = replace(_calibrated(swarm, solution), landmarks=tuple(_landmarks(problem, solution)))
     frame = max(1.0, solution.variance_ratio) * solution.frame_covariance
     paths = Paths(solution.at, frame)
@@ -402,6 +405,27 @@ def survey(
     found = replace(found, cameras=placed.cameras, anchors=placed.anchors)
     path = se2.compose(solution.knot, problem.knots.sample.pose)
     return Surveyed(found, problem, solution, path, _text(problem, solution, swarm, found, placed))
+
+
+def _solved(
+    recording: Recording, swarm: Swarm, problem: BatchProblem, progress: Progress
+) -> tuple[BatchProblem, Solution]:
+    """The solution, and the problem with derivatives at its cameras if these differ much from the description."""
+    # scales of cameras that measure ranges and bearings are known less
+    sigma = np.tile([one.sigma for one in SURVEY], (len(swarm.robots), 1))
+    polar = np.unique(problem.sightings.observer[problem.is_polar])
+    sigma[polar, _SCALE] = _POLAR_SIGMA
+    prior = ParameterPrior(np.zeros_like(sigma), sigma)
+    solution = Solver(problem, start_of(problem), prior).solve(progress)
+    if np.abs(solution.parameter[:, _SCALE]).max() < _LINEAR:
+        return problem, solution
+    # again
+    change = np.where([one.moves for one in SURVEY], 0.0, solution.parameter)
+    problem = problem_of(recording, all_changed(swarm, SURVEY, change), SURVEY)
+    nowhere = np.full((len(swarm.robots), 3), np.nan)
+    start = Start(nowhere, solution.landmark, solution.knot, solution.parameter - change)
+    solution = Solver(problem, start, prior._replace(mean=-change)).solve(progress)
+    return problem, replace(solution, parameter=solution.parameter + change)
 
 
 def _landmarks(problem: BatchProblem, solution: Solution) -> list[Landmark]:
