@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import error_covariance
-from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Robot, Surveyed
+from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, Robot, Surveyed
 
 TURN_BIAS = 0  # Bias of the turn rate while moving, or of the gyroscope [rad/s]; it changes slowly
 DISTANCE_SCALE = 1  # Relative error of the distance driven
@@ -55,6 +55,7 @@ class ParameterTable(NamedTuple):
     # (L,) first of the three filter columns of each landmark; -1: not estimated
     survey_column: NDArray[np.int64]
     survey: FloatArray  # (L, 3, 3) prior covariance of its error
+    shared: FloatArray  # (L, 3) its displacement by one standard deviation of what all landmarks share
     reopened: FloatArray  # (L, 3, 3) covariance that is added after a contradiction
     drives: BoolArray  # (N,) whether the robot has odometry
     first_anchor: int  # Index of the first anchor among what was surveyed
@@ -97,6 +98,7 @@ class ParameterTable(NamedTuple):
             times,
             survey_column,
             surveys,
+            np.array([_shared(mark) for mark in landmarks]).reshape(-1, 3),
             np.array(reopened).reshape(-1, 3, 3),
             drives,
             first_anchor,
@@ -151,7 +153,13 @@ def _survey(mark: Surveyed) -> FloatArray:
     """Prior covariance (3, 3) of the error of what was surveyed."""
     third = mark.range_bias_sigma if isinstance(mark, Anchor) else mark.yaw_sigma
     given = mark.position_sigma, third
-    return _error(mark, given if mark.is_estimated else _CONTRADICTED_SURVEY_SIGMA)
+    own = _error(mark, given if mark.is_estimated else _CONTRADICTED_SURVEY_SIGMA)
+    return own + np.outer(_shared(mark), _shared(mark))
+
+
+def _shared(mark: Surveyed) -> FloatArray:
+    """Error (3,) by one standard deviation of what all landmarks share."""
+    return np.array([mark.shared_x, mark.shared_y, 0.0]) if isinstance(mark, Landmark) else np.zeros(3)
 
 
 def _error(mark: Surveyed, sigma: tuple[float, float]) -> FloatArray:

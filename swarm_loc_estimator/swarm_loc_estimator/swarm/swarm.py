@@ -141,6 +141,11 @@ class Landmark:
     )
     #: Standard deviation of yaw [rad]
     yaw_sigma: float = number(0.0, "rad", 0.0, 10.0, "standard deviation of yaw; 0: exact, else estimated")
+    #: Displacement by one standard deviation of an error that all landmarks share, such as of the scale [m]
+    shared_x: float = number(
+        0.0, "m", -100.0, 100.0, "displacement by one sigma of an error that all landmarks share"
+    )
+    shared_y: float = number(0.0, "m", -100.0, 100.0, "the same of y")
 
     @property
     def is_estimated(self) -> bool:

@@ -70,6 +70,11 @@ class ChainFactor:
         self._by_border = self._in_band(border.T)
         self._corner = cho_factor(corner - border @ self._by_border, lower=True) if len(corner) else None
 
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self._size + len(self._border)
+
     def _in_band(self, right: FloatArray) -> FloatArray:
         return cho_solve_banded((self._band, True), right) if right.size else np.zeros_like(right)
 
@@ -86,7 +91,7 @@ class ChainFactor:
         found, rows = np.zeros(jacobian.shape[:2]), jacobian.shape[1]
         for begin in range(0, len(found), _AT_ONCE):
             part = slice(begin, begin + _AT_ONCE)
-            right = np.zeros((self._size + len(self._border), found[part].size))
+            right = np.zeros((self.size, found[part].size))
             for place, (by, unknowns) in enumerate(zip(jacobian[part], columns[part], strict=True)):
                 known = unknowns >= 0
                 np.add.at(right[:, place * rows : (place + 1) * rows], unknowns[known], by[:, known].T)
@@ -95,7 +100,7 @@ class ChainFactor:
 
     def covariance(self, unknowns: IntArray) -> FloatArray:
         """Covariance (c, c) of unknowns (c,)."""
-        right = np.zeros((self._size + len(self._border), unknowns.size))
+        right = np.zeros((self.size, unknowns.size))
         right[unknowns, np.arange(unknowns.size)] = 1.0
         found = self.solve(right)[unknowns]
         return np.asarray(0.5 * (found + found.T))

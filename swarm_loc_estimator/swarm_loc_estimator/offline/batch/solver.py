@@ -57,6 +57,8 @@ class Solution:
     variance_ratio: float  # Mean squared residual of sightings by the described noise; 1 is ideal
     factor: ChainFactor  # Of the normal equations
     column: IntArray  # (k,) first of the three unknowns of each knot; -1: not connected
+    landmark_column: IntArray  # (L,) the same of each landmark; -1: exact, too
+    parameter_column: IntArray  # (N, p) unknown of each parameter
     # Whitened residuals (u, 3) of used sightings, their Jacobians (u, 3, c) and unknowns (u, c), -1: none
     sightings: tuple[FloatArray, FloatArray, IntArray]
 
@@ -398,6 +400,8 @@ class Solver:
             ratio,
             factor,
             self._knot_column,
+            self._landmark_column,
+            self._parameter_column,
             sightings,
         )
 

@@ -15,6 +15,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -363,6 +364,9 @@ _WORSE = 1.5
 """One that was seen from one side is named if its sigma exceeds this multiple of the median sigma."""
 _SCALE = [(one.section, one.name) for one in SURVEY].index(("sensor", "distance_scale"))
 _POLAR_SIGMA = 0.1  # Standard deviation of scales of cameras that measure ranges and bearings
+_LOOSE = (("odometry", "distance_scale"), ("sensor", "distance_scale"), ("sensor", "range_offset"))
+"""Parameters whose errors the filter can estimate."""
+_LEAST_LOOSE = 1e-3  # Smaller standard deviations of them are left out
 _LINEAR = 0.04  # Changes of scales from which derivatives are computed again
 _SIGNIFICANT = 3.0  # Parameters are written if they exceed this many of their standard deviations
 
@@ -398,7 +402,9 @@ def survey(
             f"'{recording.name}' has no marker that belongs to nobody and was seen {MIN_SIGHTINGS} times."
         )
     problem, solution = _solved(recording, swarm, problem, progress)
-    found = replace(_calibrated(swarm, solution), landmarks=tuple(_landmarks(problem, solution)))
+    shared = _shared(solution)
+    marks = tuple(_landmarks(problem, solution, shared.place))
+    found = replace(_calibrated(swarm, solution, shared.parameter), landmarks=marks)
     frame = max(1.0, solution.variance_ratio) * solution.frame_covariance
     paths = Paths(solution.at, frame)
     placed = place_fixed(recording, found, paths, cameras=cameras)
@@ -410,7 +416,7 @@ def survey(
 def _solved(
     recording: Recording, swarm: Swarm, problem: BatchProblem, progress: Progress
 ) -> tuple[BatchProblem, Solution]:
-    """The solution, and the problem with derivatives at its cameras if these differ much from the description."""
+    """The solution, and the problem: with derivatives at other cameras, if these differ much as described."""
     # scales of cameras that measure ranges and bearings are known less
     sigma = np.tile([one.sigma for one in SURVEY], (len(swarm.robots), 1))
     polar = np.unique(problem.sightings.observer[problem.is_polar])
@@ -428,33 +434,77 @@ def _solved(
     return problem, replace(solution, parameter=solution.parameter + change)
 
 
-def _landmarks(problem: BatchProblem, solution: Solution) -> list[Landmark]:
+class _Shared(NamedTuple):
+    """What one standard deviation of the error of the map's scale changes."""
+
+    place: FloatArray  # (L, 2) places of landmarks [m]
+    parameter: FloatArray  # (N, p) parameters of robots
+
+
+def _shared(solution: Solution) -> _Shared:
+    """The error of the scale of all landmarks that were estimated, and of what is correlated with it."""
+    # the scale as a function of the unknowns
+    column, place = solution.landmark_column, solution.landmark[:, :2]
+    free = np.flatnonzero(column >= 0)
+    away = place[free] - place[free].mean(axis=0) if free.size else place[free]
+    if not (away**2).sum() > 0.0:
+        return _Shared(np.zeros(place.shape), np.zeros(solution.parameter.shape))
+    away /= (away**2).sum()
+    moved = np.zeros((free.size, 2, 3))  # of errors (3,) to places
+    moved[:, :, :2], moved[:, 0, 2], moved[:, 1, 2] = np.eye(2), -place[free, 1], place[free, 0]
+    unknowns = column[free][:, None] + np.arange(3)
+    scale = np.zeros(solution.factor.size)
+    scale[unknowns] = np.einsum("ki,kij->kj", away, moved)
+    # what all unknowns are expected to be when it is off by its standard deviation
+    change = solution.factor.solve(scale)
+    change *= math.sqrt(max(1.0, solution.variance_ratio) / float(scale @ change))
+    found = np.zeros(place.shape)
+    found[free] = np.einsum("kij,kj->ki", moved, change[unknowns])
+    return _Shared(found, change[solution.parameter_column])
+
+
+def _landmarks(problem: BatchProblem, solution: Solution, shared: FloatArray) -> list[Landmark]:
     """All landmarks that are connected, with standard deviations for those that were estimated."""
     factor = max(1.0, solution.variance_ratio)
     found = []
-    for mark, pose, covariance, is_known in zip(
+    for mark, pose, covariance, is_known, common in zip(
         problem.swarm.landmarks,
         solution.landmark.tolist(),
         factor * solution.landmark_covariance,
         problem.is_known,
+        shared,
         strict=True,
     ):
         if is_known and not mark.is_estimated:
             found.append(mark)
         elif np.isfinite(pose).all():
             x, y, yaw = pose
-            position_sigma = math.sqrt(0.5 * float(covariance[0, 0] + covariance[1, 1]))
-            yaw_sigma = 0.0 if mark.yaw is None else math.sqrt(float(covariance[2, 2]))
-            place = {"x": x, "y": y, "yaw": None if mark.yaw is None else yaw}
-            found.append(replace(mark, **place, position_sigma=position_sigma, yaw_sigma=yaw_sigma))
+            own = float(covariance[0, 0] + covariance[1, 1] - common @ common)
+            sigma = {"position_sigma": math.sqrt(max(0.5 * own, _LEAST_SIGMA**2))}
+            sigma["yaw_sigma"] = 0.0 if mark.yaw is None else math.sqrt(float(covariance[2, 2]))
+            sigma["shared_x"], sigma["shared_y"] = common.tolist()
+            found.append(replace(mark, x=x, y=y, yaw=None if mark.yaw is None else yaw, **sigma))
     return found
 
 
-def _calibrated(swarm: Swarm, solution: Solution) -> Swarm:
-    """The swarm with those parameters corrected that differ significantly; turn biases are not constant."""
+def _calibrated(swarm: Swarm, solution: Solution, shared: FloatArray) -> Swarm:
+    """The swarm with those parameters corrected that differ significantly; turn biases are not constant.
+
+    Those that share the error of the map's scale are left to the filter. It takes them as independent, so
+    they are less certain, lest all together they tell the scale of the map better than the survey does.
+    """
     is_clear = np.abs(solution.parameter) > _SIGNIFICANT * solution.parameter_sigma
     is_clear &= np.array([one.name != "turn_bias" for one in SURVEY])
-    return all_changed(swarm, SURVEY, np.where(is_clear, solution.parameter, 0.0))
+    found = all_changed(swarm, SURVEY, np.where(is_clear, solution.parameter, 0.0))
+    sigma, robots = math.sqrt(len(_LOOSE) * len(found.robots)) * np.abs(shared), []
+    for index, robot in enumerate(found.robots):
+        models = {section: getattr(robot, section) for section, _ in _LOOSE}
+        for column, (section, name, _) in enumerate(SURVEY):
+            key, wanted = f"{name}_sigma", min(float(sigma[index, column]), 1.0)
+            if (section, name) in _LOOSE and wanted > max(_LEAST_LOOSE, getattr(models[section], key)):
+                models[section] = replace(models[section], **{key: wanted})
+        robots.append(replace(robot, **models))
+    return replace(found, robots=tuple(robots))
 
 
 def _text(problem: BatchProblem, solution: Solution, before: Swarm, found: Swarm, placed: Placed) -> str:
@@ -466,7 +516,7 @@ def _text(problem: BatchProblem, solution: Solution, before: Swarm, found: Swarm
             continue
         one, wrong = places[mark.id], float(np.mean(_is_wrong(solution)[rows]))
         yaw = "-" if one.yaw is None else f"{math.degrees(one.yaw):.1f}"
-        sigma = 1e3 * one.position_sigma
+        sigma = 1e3 * math.sqrt(one.position_sigma**2 + 0.5 * (one.shared_x**2 + one.shared_y**2))
         lines.append(
             f"{one.id:8d} {one.x:12.3f} {one.y:9.3f} {yaw:>10} {sigma:11.1f} {rows.sum():10d} {wrong:13.0%}"
         )
