@@ -17,6 +17,7 @@ from swarm_loc_estimator.cli import survey as command
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.measurements import select
+from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.offline.batch.parameters import SURVEY
 from swarm_loc_estimator.offline.batch.problem import problem_of
 from swarm_loc_estimator.offline.batch.solver import Solver
@@ -28,8 +29,9 @@ from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
 from swarm_loc_estimator.sensors.ranges import RangeRows
 from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import ImuModel
-from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, StartSigma, Swarm, UwbDevice
+from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, Robot, StartSigma, Swarm, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 PLAN = Plan(robots=3, duration_s=25.0, arena=0.8, landmarks=8, start_known=(False,))
@@ -122,6 +124,45 @@ def test_cameras_and_odometry_are_corrected() -> None:
     done = survey(recording_of(world), replace(world.swarm, robots=exact, landmarks=known))
     assert "Corrected for robot_" in done.text
     assert rms(errors(done.swarm, world.swarm)) < 0.03
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("known", [0, 1])
+def test_the_map_of_cameras_with_another_range_curve_is_right_within_its_covariance(
+    seed: int, known: int
+) -> None:
+    """Cameras whose ranges r are .87 r + .27 m, and wheels that are all off by 2 %."""
+    plan = replace(PLAN, duration_s=60.0, arena=2.0, landmarks=12, content=1, reach=5.0, speed=0.2)
+    world = simulate(plan, seed)
+    recording = recording_of(world)
+    seen = recording.detections._replace(detection=recording.detections.detection.copy())
+    distance = np.linalg.norm(seen.detection["position"], axis=1)
+    seen.detection["position"] *= ((distance - 0.27) / 0.87 / distance)[:, None]
+    driven = recording.odometry._replace(pose=recording.odometry.pose * [1.02, 1.02, 1.0])
+    known_ones = replace(located_start(world), landmarks=world.swarm.landmarks[:known])
+    far = select(seen, distance > 0.37)
+    done = survey(replace(recording, detections=far, odometry=driven), known_ones)
+    # errors of the scale and of all places, with the covariance that is written
+    marks, truth = done.swarm.landmarks[known:], places_of(world.swarm)
+    place = np.array([truth[mark.id][:2] for mark in marks])
+    error = np.array([(mark.x, mark.y) for mark in marks]) - place
+    shared = np.array([(mark.shared_x, mark.shared_y) for mark in marks]).ravel()
+    own = np.repeat([mark.position_sigma for mark in marks], 2)
+    covariance = np.diag(own**2) + np.outer(shared, shared)
+    away = (place - place.mean(axis=0)).ravel()
+    sigma = np.sqrt(away @ covariance @ away)
+    assert abs(away @ error.ravel()) < 3.0 * sigma
+    assert sigma / (away @ away) < (0.02, 0.006)[known]
+    assert error.ravel() @ np.linalg.solve(covariance, error.ravel()) < 4.0 * len(marks)
+
+
+def test_landmarks_share_an_error_in_the_filter() -> None:
+    marks = [Landmark(k, float(k), 0.0, position_sigma=0.1, shared_x=x) for k, x in ((1, 0.2), (2, -0.3))]
+    marks.append(Landmark(3, 2.0, 0.0, position_sigma=0.1))
+    state = SwarmState(ParameterTable.of([Robot("a")], marks))
+    columns = [state.landmark_column(k) for k in range(3)]
+    of_x = state.filter.block(np.array(columns))
+    assert of_x == pytest.approx(np.outer([0.2, -0.3, 0.0], [0.2, -0.3, 0.0]) + 0.01 * np.eye(3))
 
 
 def test_wrong_ids_change_little() -> None:
@@ -231,7 +272,8 @@ def test_turns_of_gyroscopes_replace_those_of_wheels() -> None:
     error = done.solution.parameter[:, 2] - 0.04
     assert (np.abs(error) < 3.0 * done.solution.parameter_sigma[:, 2]).all()
     assert [one.imu.turn_scale for one in done.swarm.robots] == pytest.approx([1.04] * 3, abs=0.03)
-    assert [one.odometry for one in done.swarm.robots] == [one.odometry for one in world.swarm.robots]
+    by_gyroscopes = [replace(one.odometry, distance_scale_sigma=0.0) for one in done.swarm.robots]
+    assert by_gyroscopes == [one.odometry for one in world.swarm.robots]
     by_wheels = survey(replace(turned, turn_rates=NO_TURN_RATES), replace(world.swarm, landmarks=()))
     assert rms(errors(by_wheels.swarm, world.swarm)) > 0.1
 
