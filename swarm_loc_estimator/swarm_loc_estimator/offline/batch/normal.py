@@ -73,7 +73,7 @@ class ChainFactor:
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return self._size + len(self._border)
+        return int(self._size + len(self._border))
 
     def _in_band(self, right: FloatArray) -> FloatArray:
         return cho_solve_banded((self._band, True), right) if right.size else np.zeros_like(right)

@@ -367,6 +367,7 @@ _POLAR_SIGMA = 0.1  # Standard deviation of scales of cameras that measure range
 _LOOSE = (("odometry", "distance_scale"), ("sensor", "distance_scale"), ("sensor", "range_offset"))
 """Parameters whose errors the filter can estimate."""
 _LEAST_LOOSE = 1e-3  # Smaller standard deviations of them are left out
+_KNOWN_SCALE = 0.01  # Standard deviation of the map's scale up to which they stay as they are described
 _LINEAR = 0.04  # Changes of scales from which derivatives are computed again
 _SIGNIFICANT = 3.0  # Parameters are written if they exceed this many of their standard deviations
 
@@ -404,7 +405,7 @@ def survey(
     problem, solution = _solved(recording, swarm, problem, progress)
     shared = _shared(solution)
     marks = tuple(_landmarks(problem, solution, shared.place))
-    found = replace(_calibrated(swarm, solution, shared.parameter), landmarks=marks)
+    found = replace(_calibrated(swarm, solution, shared), landmarks=marks)
     frame = max(1.0, solution.variance_ratio) * solution.frame_covariance
     paths = Paths(solution.at, frame)
     placed = place_fixed(recording, found, paths, cameras=cameras)
@@ -423,7 +424,7 @@ def _solved(
     sigma[polar, _SCALE] = _POLAR_SIGMA
     prior = ParameterPrior(np.zeros_like(sigma), sigma)
     solution = Solver(problem, start_of(problem), prior).solve(progress)
-    if np.abs(solution.parameter[:, _SCALE]).max() < _LINEAR:
+    if np.abs(solution.parameter[polar, _SCALE]).max(initial=0.0) < _LINEAR:
         return problem, solution
     # again
     change = np.where([one.moves for one in SURVEY], 0.0, solution.parameter)
@@ -437,6 +438,7 @@ def _solved(
 class _Shared(NamedTuple):
     """What one standard deviation of the error of the map's scale changes."""
 
+    scale: float  # The scale
     place: FloatArray  # (L, 2) places of landmarks [m]
     parameter: FloatArray  # (N, p) parameters of robots
 
@@ -448,7 +450,7 @@ def _shared(solution: Solution) -> _Shared:
     free = np.flatnonzero(column >= 0)
     away = place[free] - place[free].mean(axis=0) if free.size else place[free]
     if not (away**2).sum() > 0.0:
-        return _Shared(np.zeros(place.shape), np.zeros(solution.parameter.shape))
+        return _Shared(0.0, np.zeros(place.shape), np.zeros(solution.parameter.shape))
     away /= (away**2).sum()
     moved = np.zeros((free.size, 2, 3))  # of errors (3,) to places
     moved[:, :, :2], moved[:, 0, 2], moved[:, 1, 2] = np.eye(2), -place[free, 1], place[free, 0]
@@ -460,7 +462,7 @@ def _shared(solution: Solution) -> _Shared:
     change *= math.sqrt(max(1.0, solution.variance_ratio) / float(scale @ change))
     found = np.zeros(place.shape)
     found[free] = np.einsum("kij,kj->ki", moved, change[unknowns])
-    return _Shared(found, change[solution.parameter_column])
+    return _Shared(float(scale @ change), found, change[solution.parameter_column])
 
 
 def _landmarks(problem: BatchProblem, solution: Solution, shared: FloatArray) -> list[Landmark]:
@@ -480,14 +482,15 @@ def _landmarks(problem: BatchProblem, solution: Solution, shared: FloatArray) ->
         elif np.isfinite(pose).all():
             x, y, yaw = pose
             own = float(covariance[0, 0] + covariance[1, 1] - common @ common)
-            sigma = {"position_sigma": math.sqrt(max(0.5 * own, _LEAST_SIGMA**2))}
-            sigma["yaw_sigma"] = 0.0 if mark.yaw is None else math.sqrt(float(covariance[2, 2]))
-            sigma["shared_x"], sigma["shared_y"] = common.tolist()
-            found.append(replace(mark, x=x, y=y, yaw=None if mark.yaw is None else yaw, **sigma))
+            position_sigma = math.sqrt(max(0.5 * own, _LEAST_SIGMA**2))
+            yaw_sigma = 0.0 if mark.yaw is None else math.sqrt(float(covariance[2, 2]))
+            place = {"x": x, "y": y, "yaw": None if mark.yaw is None else yaw}
+            place |= {"shared_x": float(common[0]), "shared_y": float(common[1])}
+            found.append(replace(mark, **place, position_sigma=position_sigma, yaw_sigma=yaw_sigma))
     return found
 
 
-def _calibrated(swarm: Swarm, solution: Solution, shared: FloatArray) -> Swarm:
+def _calibrated(swarm: Swarm, solution: Solution, shared: _Shared) -> Swarm:
     """The swarm with those parameters corrected that differ significantly; turn biases are not constant.
 
     Those that share the error of the map's scale are left to the filter. It takes them as independent, so
@@ -496,7 +499,9 @@ def _calibrated(swarm: Swarm, solution: Solution, shared: FloatArray) -> Swarm:
     is_clear = np.abs(solution.parameter) > _SIGNIFICANT * solution.parameter_sigma
     is_clear &= np.array([one.name != "turn_bias" for one in SURVEY])
     found = all_changed(swarm, SURVEY, np.where(is_clear, solution.parameter, 0.0))
-    sigma, robots = math.sqrt(len(_LOOSE) * len(found.robots)) * np.abs(shared), []
+    if shared.scale < _KNOWN_SCALE:
+        return found
+    sigma, robots = math.sqrt(len(_LOOSE) * len(found.robots)) * np.abs(shared.parameter), []
     for index, robot in enumerate(found.robots):
         models = {section: getattr(robot, section) for section, _ in _LOOSE}
         for column, (section, name, _) in enumerate(SURVEY):
