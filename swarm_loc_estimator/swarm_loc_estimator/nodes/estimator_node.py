@@ -13,6 +13,7 @@ Services: `~/reset`, `~/set_robot_pose`, and those of a managed node. Parameters
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import chain
@@ -114,6 +115,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._pace = FusionPace(self.params.fusion_load, self.params.settings.horizon_s)
         self._shedding = Shedding(self.params.fusion_load, self.params.settings.horizon_s)
         self._thinning = self._create_thinning()
+        self._measurements: Counter[str] = Counter()  # Read so far, by sensor
         self._cost = TickCost()
         sole = ["swarm/poses", *(["/clock"] if self.get_clock().ros_time_is_active else [])]
         self._diagnostics = Diagnostics(self._swarm, self._ingest, self.params, self, sole)
@@ -200,8 +202,15 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         batch = MessageBatch.of(self._inputs.take(time_ns))
         for messages in chain.from_iterable(map(self._ingest.read, batch.parts(_READ_BYTES))):
             thinned = self._thinning.thin(messages, self._shedding.share)
-            self._cost.note_sightings(thinned.measurements, thinned.shed)
+            self._measurements.update(thinned.measurements)
+            self._cost.note_sightings(sum(thinned.measurements.values()), thinned.shed)
             self._estimator.receive(thinned.messages)
+        # how many measurements were in messages that were not read is not known: as many as usually
+        for sensor, count in self._measurements.items():
+            unread = self._inputs.unread.pop(sensor, 0)
+            missed = round(unread * count / max(self._inputs.taken[sensor], 1))
+            self._cost.note_sightings(missed, missed)
+            self._estimator.drop(f"shed_{sensor}", missed)
 
     def _follow_frame(self) -> None:
         """Publish in the frame that the poses are in: `map_frame`, or that of the origin of a local frame."""

@@ -5,6 +5,7 @@ Users set poses of robots by the service `set_robot_pose` and the topics `<robot
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import NamedTuple
@@ -146,17 +147,15 @@ class PoseCommands:
         return now_ns
 
 
-_RATE_HZ, _FAST_HZ = 100, 500
-"""Highest rate of a topic of which all messages within the horizon wait, and that of odometry and turn rates,
-which are small unless they are of many robots; images are large: their queues take most of the memory."""
-_LEAST_DEPTH, _MOST_DEPTH = 100, 1000
+_RATE_HZ, _FAST_HZ, _IMAGE_HZ = 100, 500, 30
+"""Highest rate of a topic of which all messages within the horizon wait, that of odometry and turn rates,
+which are small unless they are of many robots, and that of images: their queues take most of the memory."""
+_LEAST_DEPTH, _MOST_DEPTH = 50, 1000
 _MAX_PER_TAKE = 5000  # Limit of messages per tick over all topics
 _MIN_PER_TOPIC = 100
 """Least limit per topic: the messages of the usual horizon. With less, an estimator that is late
 would get ever older data, which cost more to fuse, and never catch up."""
 
-_LOST = {ReliabilityPolicy.RELIABLE: "overload", ReliabilityPolicy.BEST_EFFORT: "lost"}
-"""Drop reason of messages that are missing in a publisher's sequence."""
 _MAX_SEQUENCES = 100  # Of a topic with several publishers; of fewer, a rare one would seem to follow a loss
 _TF_STATIC = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _MAX_FRAME_LENGTH = 64  # Longer names of foreign frames are cut
@@ -168,7 +167,8 @@ _TF = QoSProfile(depth=100)  # what tf2's own broadcaster offers
 def queue_depth(kind: InputKind, horizon_s: float) -> int:
     """Length of the queue of a topic, which is emptied at each tick: what can be used after a long one."""
     is_small = SENSORS[kind.rows].unit is None and not kind.stands_for
-    return min(max(_LEAST_DEPTH, round((_FAST_HZ if is_small else _RATE_HZ) * horizon_s)), _MOST_DEPTH)
+    rate_hz = _FAST_HZ if is_small else _IMAGE_HZ if kind.of_cameras else _RATE_HZ
+    return min(max(_LEAST_DEPTH, round(rate_hz * horizon_s)), _MOST_DEPTH)
 
 
 class EstimatorInputs:
@@ -177,7 +177,9 @@ class EstimatorInputs:
     Messages wait in the middleware, which keeps the newest of each topic, and not in the executor, whose
     queue is unbounded; no executor may handle the subscriptions. Lost messages are detected by the
     publishers' sequence numbers, and those are dropped unread that have waited here for longer than the
-    horizon, after which nothing is fused. The index of a topic is its handle.
+    horizon, after which nothing is fused. A topic whose queue was full is heard best effort from then on: to
+    send again what came too late adds to the load, and Fast DDS 2.14 keeps each message for good that is sent
+    again and older than a full queue. The index of a topic is its handle.
     """
 
     def __init__(
@@ -190,6 +192,10 @@ class EstimatorInputs:
         # Of each topic, the newest sequence numbers of its publishers, and these when a number was left out
         self._newest: list[list[int]] = [[] for _ in topics]
         self._publishers: list[set[tuple[int, ...]]] = [set() for _ in topics]
+        self._why_lost = ["overload" for _ in topics]  # Drop reason of messages missing in a sequence
+        # Messages by sensor that were lost or dropped here under overload, and those that were taken
+        self.unread: Counter[str] = Counter()
+        self.taken: Counter[str] = Counter()
         self.looked_ns = 0  # Newest time that the estimator knows; reading many messages takes a while
         self._quota = max(_MIN_PER_TOPIC, _MAX_PER_TAKE // len(topics))
         self._subscriptions = [self._subscribe(k, ReliabilityPolicy.RELIABLE) for k in range(len(topics))]
@@ -213,9 +219,15 @@ class EstimatorInputs:
                 numbers.append(info["publication_sequence_number"])
                 if info["received_timestamp"] >= oldest_ns:
                     taken.append((info["received_timestamp"], handle, data))
-            self._count_gaps(handle, numbers)
-            if waited := len(numbers) - (len(taken) - before):
-                self._drop("overload", waited)
+            waited = len(numbers) - (len(taken) - before)
+            lost, sensor = self._count_gaps(handle, numbers), self._topics[handle].kind.rows
+            self.taken[sensor] += len(numbers) - waited
+            for why, count in (("overload", waited), (self._why_lost[handle], lost)):
+                if count:
+                    self._drop(why, count)
+                    self.unread[sensor] += count if why == "overload" else 0
+            if lost and len(numbers) >= min(self._quota, subscription.qos_profile.depth):
+                self._hear_best_effort(handle, "cannot be read fast enough")
         taken.sort(key=lambda one: one[0])
         now_ns = time_ns()
         # time must not seem to go back to where it was looked at before
@@ -226,8 +238,8 @@ class EstimatorInputs:
             for at_ns, handle, data in taken
         ]
 
-    def _count_gaps(self, handle: int, numbers: Sequence[int | None]) -> None:
-        """Count what is missing in the sequences of a topic's publishers, which messages do not name.
+    def _count_gaps(self, handle: int, numbers: Sequence[int | None]) -> int:
+        """Number of messages missing in the sequences of a topic's publishers, which messages do not name.
 
         A number that continues no sequence is the first of a new publisher, or follows the nearest one.
         """
@@ -239,13 +251,12 @@ class EstimatorInputs:
                 gaps.append(number - 1 - max((one for one in newest if one < number), default=number - 1))
             newest.append(number)
         if not gaps:
-            return
+            return 0
         known, infos = self._publishers[handle], self._node.get_publishers_info_by_topic
         now = {tuple(one.endpoint_gid) for one in infos(self._topics[handle].name)}
         self._publishers[handle] = now
         del newest[: -1 if len(now | known) == 1 else -_MAX_SEQUENCES]
-        if lost := sum(sorted(gaps)[: max(0, len(gaps) - len(now - known))]):
-            self._drop(_LOST[self._subscriptions[handle].qos_profile.reliability], lost)
+        return sum(sorted(gaps)[: max(0, len(gaps) - len(now - known))])
 
     def _subscribe(self, handle: int, reliability: ReliabilityPolicy) -> Subscription:
         topic = self._topics[handle]
@@ -259,15 +270,19 @@ class EstimatorInputs:
         )
 
     def _follow(self, handle: int, _event: object) -> None:
+        """Hear a publisher that sends nothing again."""
+        self._why_lost[handle] = "lost"
+        self._hear_best_effort(handle, "is published best effort")
+
+    def _hear_best_effort(self, handle: int, why: str) -> None:
         """Subscribe again as best effort, which matches all publishers but has no retransmissions."""
         before = self._subscriptions[handle]
         if before.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             return
         self._subscriptions[handle] = self._subscribe(handle, ReliabilityPolicy.BEST_EFFORT)
         self._node.destroy_subscription(before)
-        self._node.get_logger().info(
-            f"{self._topics[handle].name} is published best effort: lost messages are not sent again"
-        )
+        name = self._topics[handle].name
+        self._node.get_logger().info(f"{name} {why}: lost messages are not sent again")
 
 
 def newest_time_ns(node: Node) -> int:

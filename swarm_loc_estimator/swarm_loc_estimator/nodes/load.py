@@ -14,7 +14,7 @@ number. So whole periods are used or dropped: period k by the same rule.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -41,7 +41,8 @@ class Thinned(NamedTuple):
     """Result of thinning."""
 
     messages: Batch  # The remaining readings; `dropped` includes the readings dropped here
-    measurements: int  # Number of measurements before: detections, fixes, infrared exchanges, aerial images
+    # Number of measurements before by sensor: detections, fixes, infrared exchanges, aerial images
+    measurements: Mapping[str, int]
     shed: int  # Number of dropped measurements
 
 
@@ -80,7 +81,8 @@ class Thinning:
                 rows[sensor.name] = select(messages[sensor.name], mine[one.of_row])
                 shed[f"shed_{sensor.name}"] = int(np.sum(~mine))
         left = replace(messages, rows=rows, dropped={**messages.dropped, **shed})
-        return Thinned(left, used.size, sum(shed.values()))
+        measurements = {sensor.name: one.robot.size for sensor, one in zip(self._sensors, units, strict=True)}
+        return Thinned(left, measurements, sum(shed.values()))
 
     def _in_periods(self, stamp_ns: IntArray, share: float) -> NDArray[np.bool_]:
         """Select measurements (u,) by the periods of their stamps (u,) [ns]."""

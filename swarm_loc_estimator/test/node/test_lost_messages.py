@@ -15,7 +15,7 @@ from node_world import Ros, detection_bytes, odometry_bytes
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSProfile
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.nodes.estimator_topics import EstimatorInputs
@@ -24,7 +24,7 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
 TOPIC = "alpha/odom"
-DEPTH, IMAGES = 1000, 200  # Most that wait of odometry and of images, with a horizon of two seconds
+DEPTH, IMAGES = 1000, 60  # Most that wait of odometry and of images, with a horizon of two seconds
 
 
 class Inputs:
@@ -146,4 +146,14 @@ def test_of_images_only_those_wait_that_come_within_the_horizon(ros: Ros, swarm_
         taken += [one.data for one in more]
     assert taken == sent[-IMAGES:]
     assert drops == {"overload": 50}
+    assert inputs.unread == {"detections": 50}
+    assert inputs.taken == {"detections": 1 + IMAGES}
+
+    # what is sent again for a queue that is too short would come too late, and never be freed
+    def reliability() -> list[ReliabilityPolicy]:
+        infos = node.get_subscriptions_info_by_topic(topics[0].name)
+        return [one.qos_profile.reliability for one in infos]
+
+    ros.until(lambda: reliability() == [ReliabilityPolicy.BEST_EFFORT])
+    ros.until(lambda: publisher.publish(sent[0]) or len(inputs.take(time.time_ns)) > 0)
     node.destroy_node()

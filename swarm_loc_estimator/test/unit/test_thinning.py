@@ -82,8 +82,8 @@ def test_the_same_backlog_leaves_the_same_behind(backlogs: list[tuple[int, float
         first, second = (each.thin(images(k, range(robots)), share) for each in (one, other))
         assert first.shed == second.shed
         assert first.messages["detections"].robot.tolist() == second.messages["detections"].robot.tolist()
-        assert first.measurements == robots * SEEN
-        assert first.measurements - first.shed == first.messages["detections"].robot.size
+        assert sum(first.measurements.values()) == first.measurements["detections"] == robots * SEEN
+        assert robots * SEEN - first.shed == first.messages["detections"].robot.size
         assert first.messages.dropped.get("shed_detections", 0) == first.shed
 
 
