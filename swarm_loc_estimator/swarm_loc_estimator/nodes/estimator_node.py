@@ -199,8 +199,8 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
 
     def _receive(self, time_ns: Callable[[], int]) -> None:
         """Pass the messages received to the estimator, thinned out under overload."""
-        batch = MessageBatch.of(self._inputs.take(time_ns))
-        for messages in chain.from_iterable(map(self._ingest.read, batch.parts(_READ_BYTES))):
+        batches = MessageBatch.parts_of(self._inputs.take(time_ns), _READ_BYTES)
+        for messages in chain.from_iterable(map(self._ingest.read, batches)):
             thinned = self._thinning.thin(messages, self._shedding.share)
             self._measurements.update(thinned.measurements)
             self._cost.note_sightings(sum(thinned.measurements.values()), thinned.shed)

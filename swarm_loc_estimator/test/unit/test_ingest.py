@@ -250,12 +250,12 @@ def test_messages_are_parted_where_time_goes_back() -> None:
 @pytest.mark.parametrize("size", [1, 5, 6, 7, 100])
 def test_parts_have_all_messages_in_order_and_at_most_one_above_the_size_asked(size: int) -> None:
     sent = [SerializedMessage(k, bytes(length), k) for k, length in enumerate([3, 0, 9, 2, 2, 1])]
-    parts = list(MessageBatch.of(sent).parts(size))
+    parts = list(MessageBatch.parts_of([*sent], size))
     assert [one for part in parts for one in part.messages()] == [
         (k, log_ns, data) for k, data, log_ns in sent
     ]
     assert all(part.length[1:].sum() <= size for part in parts)
-    assert not list(MessageBatch.of([]).parts(size))
+    assert not list(MessageBatch.parts_of([], size))
 
 
 def test_a_quaternion_of_zeros_has_no_yaw() -> None:

@@ -65,6 +65,14 @@ class MessageBatch(NamedTuple):
             length,
         )
 
+    @classmethod
+    def parts_of(cls, messages: list[SerializedMessage], size: int) -> Iterator[MessageBatch]:
+        """Batches of successive messages of about so many bytes each; the list is emptied meanwhile."""
+        ends = (np.cumsum([len(data) for _, data, _ in messages]) // size).tolist()
+        messages.reverse()
+        for _, part in itertools.groupby(ends):
+            yield cls.of([messages.pop() for _ in part])
+
     @property
     def size(self) -> int:
         """Number of messages."""
@@ -84,13 +92,6 @@ class MessageBatch(NamedTuple):
     def chosen(self, k: slice | NDArray[np.intp] | NDArray[np.bool_]) -> MessageBatch:
         """Some of them, in the same buffer."""
         return MessageBatch(self.data, self.topic[k], self.log_ns[k], self.offset[k], self.length[k])
-
-    def parts(self, size: int) -> Iterator[MessageBatch]:
-        """Successive messages of about so many bytes each, in the same buffer."""
-        ends = np.searchsorted(np.cumsum(self.length), np.arange(size, self.length.sum(), size)).tolist()
-        for begin, end in itertools.pairwise([0, *ends, self.size]):
-            if begin < end:
-                yield self.chosen(slice(begin, end))
 
     def in_order_of_time(self) -> MessageBatch:
         """Sorted by time, equal ones as they lie."""
