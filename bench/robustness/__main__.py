@@ -19,6 +19,7 @@ folders and files are in the way; `kills` interrupts and kills commands at rando
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 
 from bench.robustness import clocks, files, kills, load, protocols, stamps
 from bench.shared.common import ProgressLine, table, write_figures
@@ -39,21 +40,24 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=_PARTS, default=[*_PARTS])
     arguments = parser.parse_args()
     figures: dict[str, float] = {}
-    if "stamps" in arguments.parts:
-        figures |= stamps.measure(arguments.seeds, ProgressLine("stamps"))
-    if "protocols" in arguments.parts:
-        figures |= protocols.measure(arguments.streams, ProgressLine("protocols"))
-    if "files" in arguments.parts:
-        figures |= files.measure(arguments.cuts, ProgressLine("files"))
-    if "kills" in arguments.parts:
-        figures |= kills.measure(arguments.kills, ProgressLine("kills"))
-    if "load" in arguments.parts:
-        figures |= load.measure(arguments.minutes, ProgressLine("load"), arguments.image_rate)
-    if "time" in arguments.parts:
-        figures |= clocks.measure(arguments.loops, ProgressLine("time"))
-    print()
-    print(table(("figure", "value"), list(figures.items())))
-    print(write_figures("robustness", figures))
+
+    def note(of_part: dict[str, float]) -> None:
+        """Print and store figures at once: a part may take an hour."""
+        figures.update(of_part)
+        print("\n" + table(("figure", "value"), list(of_part.items())), flush=True)
+        print(write_figures("robustness", figures), flush=True)
+
+    measures: dict[str, Callable[[ProgressLine], dict[str, float]]] = {
+        "stamps": lambda say: stamps.measure(arguments.seeds, say),
+        "protocols": lambda say: protocols.measure(arguments.streams, say, note),
+        "files": lambda say: files.measure(arguments.cuts, say),
+        "kills": lambda say: kills.measure(arguments.kills, say),
+        "load": lambda say: load.measure(arguments.minutes, say, arguments.image_rate),
+        "time": lambda say: clocks.measure(arguments.loops, say),
+    }
+    for part in _PARTS:
+        if part in arguments.parts:
+            note(measures[part](ProgressLine(part)))
 
 
 if __name__ == "__main__":

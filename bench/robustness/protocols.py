@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import traceback
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from itertools import repeat
+from multiprocessing import get_context
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +20,7 @@ _CONNECT_S, _NONSENSE_S, _RECOVER_S, _STEADY_S, _STOP_S = 4.0, 4.0, 8.0, 0.5, 8.
 _PARTIAL_S = 1.5
 _SHARES = (1e-4, 0.1)  # Shares of corrupted bytes, evenly by magnitude
 _VELOCITY = (0.02, 0.0, 0.5)
+_CHUNK = 20  # Streams that a process runs at once
 
 
 class Outcome(NamedTuple):
@@ -88,20 +94,26 @@ class Stream:
         self._phase, self._since_s = phase, self._run.now_s
 
 
-def measure(streams: int, say: ProgressLine) -> dict[str, float]:
-    """Figures of so many streams of each protocol; prints each new traceback."""
+def _outcome(protocol: str, seed: int) -> Outcome:
+    return Stream(protocol, seed).run()
+
+
+def measure(streams: int, say: ProgressLine, note: Callable[[dict[str, float]], None]) -> dict[str, float]:
+    """Figures of so many streams of each protocol; notes those of each, and prints each new traceback."""
     figures: dict[str, float] = {}
     found: list[Outcome] = []
-    for protocol in PROTOCOLS:
-        ones = []
-        for seed in range(streams):
-            ones.append(Stream(protocol, seed).run())
-            if seed % 100 == 0:
-                say(f"{protocol} {seed} of {streams}")
-        figures |= _figures(f"protocols.{protocol}", ones)
-        found += ones
-    for text in sorted({one.traceback for one in found} - {""}):
-        print(text)
+    with ProcessPoolExecutor(os.cpu_count(), get_context("spawn")) as pool:
+        for protocol in PROTOCOLS:
+            ones = []
+            for one in pool.map(_outcome, repeat(protocol, streams), range(streams), chunksize=_CHUNK):
+                ones.append(one)
+                say(f"{protocol} {len(ones) // _CHUNK * _CHUNK} of {streams}")
+            of_protocol = _figures(f"protocols.{protocol}", ones)
+            for text in sorted({one.traceback for one in ones} - {one.traceback for one in found} - {""}):
+                print(text)
+            note(of_protocol)
+            figures |= of_protocol
+            found += ones
     return _figures("protocols", found) | figures
 
 

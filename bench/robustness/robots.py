@@ -6,6 +6,7 @@ The clock moves while a driver waits for bytes, pauses or sleeps, and everything
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -45,12 +46,12 @@ class Body:
     def __init__(self) -> None:
         self.now_ns = 100 * _NS
         self.rates = (0.0, 0.0)
-        self._steps = np.array([700.0, 900.0])
+        self._steps = [700.0, 900.0]
 
     def advance(self, seconds: float) -> None:
         """Let time pass."""
         self.now_ns += round(seconds * _NS)
-        self._steps += seconds * np.array(self.rates)
+        self._steps = [steps + seconds * rate for steps, rate in zip(self._steps, self.rates, strict=True)]
 
     def set_wheel_speeds(self, left: float, right: float) -> None:
         """See `EpuckBody`."""
@@ -66,8 +67,7 @@ class Body:
 
     def wheel_steps(self) -> tuple[int, int]:
         """See `EpuckBody`."""
-        left, right = np.floor(self._steps).astype(int).tolist()
-        return left, right
+        return math.floor(self._steps[0]), math.floor(self._steps[1])
 
     wheel_ticks = wheel_steps
 
@@ -151,8 +151,8 @@ class Run:
         if isinstance(self.firmware, PushbotFirmware):
             for _ in range(max(1, round(1e3 * step_s))):
                 self.firmware.millisecond()
-            end_us = self.body.now_ns // 1000
-            times = np.linspace(end_us - 1e6 * step_s, end_us, round(1e3 * _EVENTS * step_s)).astype(np.int64)
+            end_us, count = self.body.now_ns // 1000, round(1e3 * _EVENTS * step_s)
+            times = end_us + np.arange(1 - count, 1) * 1000 // _EVENTS
             words = (times * 2_654_435_761 & 0x7FFF).astype(np.uint16)
             self.firmware.see(words, times)
 
