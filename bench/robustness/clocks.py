@@ -7,11 +7,8 @@ measurement after it, until all robots are TRACKED in one message; that of a loo
 
 from __future__ import annotations
 
-import os
-import signal
 import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
 
@@ -19,11 +16,12 @@ import numpy as np
 
 from bench.graph.listener import Say
 from bench.graph.soak import BAG
+from bench.robustness import pauses
 from bench.robustness.load import BREAK_NS, Run, started
+from bench.robustness.pauses import PAUSES_S, misleading_share, stopped
 from bench.robustness.source import SourceSettings
 from bench.shared.common import OUT
 from swarm_loc_estimator.common.launch import GraphOptions, graph_nodes
-from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_estimator.offline.live_run import (
     ESTIMATOR,
     PLAYER,
@@ -33,13 +31,11 @@ from swarm_loc_estimator.offline.live_run import (
     read_poses,
     resident_mb,
 )
-from swarm_loc_estimator.offline.metrics import is_misleading
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 
 _ROBOTS, _IMAGE_HZ = 5, 10.0
 JUMPS_S = (10.0, 3600.0, -1.0, -3600.0)
-PAUSES_S = (1.0, 5.0, 30.0)
 _BETWEEN_S, _PATIENCE_S = 5.0, 60.0
 _SECOND = 1_000_000_000
 _LOOP_RATE = 5.0
@@ -59,18 +55,9 @@ def _recovery_s(run: Run, since_ns: int) -> float:
     return time.monotonic() - begin_s
 
 
-@contextmanager
-def _stopped(pid: int) -> Iterator[None]:
-    os.kill(pid, signal.SIGSTOP)
-    try:
-        yield
-    finally:
-        os.kill(pid, signal.SIGCONT)
-
-
 def _pause(run: Run, pid: int, seconds: float) -> float:
     """Stop a process for a while; the time of recovery."""
-    with _stopped(pid):
+    with stopped(pid):
         time.sleep(seconds)
     return _recovery_s(run, time.time_ns())
 
@@ -168,13 +155,10 @@ def measure_loops(loops: int, say: Say) -> dict[str, float]:
         back = np.flatnonzero(is_tracked[begin:end].all(axis=1))
         back_ns = stamp_ns[begin + back[0]] if back.size else content.end_ns
         recoveries_s.append(1e-9 * float(back_ns - content.begin_ns))
-    truth = [interpolate(content.truth[robot.name], stamp_ns, DEFAULT_GAP_NS)[0] for robot in swarm.robots]
-    error = result.poses - np.stack(truth, axis=1)
-    known = is_tracked & np.isfinite(error).all(axis=2)
     return {
         "time.loops": float(loops),
         "time.loops.recovery_s": max(recoveries_s),
-        "time.loops.misleading_share": float(is_misleading(error[known], result.covariances[known]).mean()),
+        "time.loops.misleading_share": misleading_share(result, content.truth, content.begin_ns),
         "time.loops.memory_growth": max(memory_mb[1:]) / memory_mb[1] - 1.0,
     }
 
@@ -183,6 +167,7 @@ def measure(loops: int, say: Say) -> dict[str, float]:
     """All figures of clocks, pauses and loops."""
     figures = measure_breaks(ON_CLOCK, say, is_clock=True)
     figures |= measure_breaks(ON_WALL, say, is_clock=False)
+    figures |= pauses.measure(say)
     figures |= measure_loops(loops, say)
     shares = [value for name, value in figures.items() if name.endswith("misleading_share")]
     recoveries = [value for name, value in figures.items() if name.endswith("recovery_s")]
