@@ -56,10 +56,12 @@ def _recovery_s(run: Run, since_ns: int) -> float:
 
 
 def _pause(run: Run, pid: int, seconds: float) -> float:
-    """Stop a process for a while; the time of recovery."""
+    """Stop a process for a while; the time of recovery, from the first measurement after it."""
     with stopped(pid):
         time.sleep(seconds)
-    return _recovery_s(run, time.time_ns())
+    since_ns = time.time_ns()
+    run.graph.wait_for(lambda: run.heard.measured_ns > since_ns, "measure", _PATIENCE_S)
+    return _recovery_s(run, since_ns)
 
 
 Break = Callable[[Run], float]

@@ -15,12 +15,15 @@ from pathlib import Path
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from nav_msgs.msg import Odometry
+from rclpy.qos import qos_profile_sensor_data
 
 from bench.robustness.source import Circles, Sent, Source, SourceSettings, running
 from bench.shared.common import OUT, ProgressLine
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray
 from swarm_loc_estimator.common.launch import GraphOptions, graph_nodes
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.nodes.load import SHED_REASONS
 from swarm_loc_estimator.offline.live_run import (
     ESTIMATOR,
@@ -61,6 +64,7 @@ class Heard:
     tracked_ns: int = 0  # Newest instant at which all robots are TRACKED, since the stamps have jumped
     shift_ns: int = 0  # By which the source's stamps have been shifted
     next_shift_ns: int = 0  # The same, once the stamps have jumped
+    measured_ns: int = 0  # Stamp of the newest odometry of the last robot
     values: dict[str, str] = field(default_factory=dict)  # Of the estimator's newest status
     statuses: int = 0  # Of robots, since robots have been TRACKED
     silent: int = 0  # Of these, the ones that are OK although a robot is not TRACKED, and was not before
@@ -81,6 +85,10 @@ class Heard:
         self.tracked = tracked
         if tracked.all():
             self.tracked_ns = poses.stamp_ns
+
+    def note_odometry(self, message: Odometry) -> None:
+        """Keep its stamp."""
+        self.measured_ns = nanoseconds(message.header.stamp)
 
     def note_values(self, message: DiagnosticArray) -> None:
         """Keep what the estimator's statuses say."""
@@ -151,6 +159,8 @@ def started(settings: SourceSettings, name: str) -> Iterator[Run]:
             heard = Heard(circles)
             graph.recorder.create_subscription(SwarmPoses, "swarm/poses", heard.take, 1000, raw=True)
             graph.recorder.create_subscription(DiagnosticArray, "/diagnostics", heard.note_values, 100)
+            last = f"{circles.swarm.robots[-1].name}/odom"
+            graph.recorder.create_subscription(Odometry, last, heard.note_odometry, qos_profile_sensor_data)
             graph.wait_for(source.has_begun, "hear the source", START_PATIENCE_S)
             yield Run(graph, source, heard)
 

@@ -1,8 +1,8 @@
 """Nodes of whole simulated graphs that are stopped by SIGSTOP for a while: drivers, and the mapper.
 
 PushBots explore a corridor that the mapper maps; e-pucks drive an eight, with drivers that talk to them over
-TCP as over WiFi. "Recovery" is the time from SIGCONT until all robots are TRACKED in one message that is
-stamped later.
+TCP as over WiFi. "Recovery" is the time until all robots are TRACKED in one message, from the first
+measurement after SIGCONT that locates the robot; "measured" is the time from SIGCONT until that comes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from geometry_msgs.msg import PoseStamped
+from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 
 from bench.graph.listener import Say
 from bench.graph.soak import BAG
@@ -34,6 +34,7 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 from swarm_loc_estimator.watch.server import free_port
+from swarm_loc_msgs.msg import MarkerDetectionArray
 
 PAUSES_S = (1.0, 5.0, 30.0)
 _BETWEEN_S, _PATIENCE_S = 8.0, 60.0
@@ -44,6 +45,11 @@ STOPPED: Mapping[str, Mapping[str, str]] = {
     "epucks_wifi": {"driver": "epuck1/epuck_driver"},
 }
 """Simulation -> what is stopped, with the full name of its node."""
+_MEASURED = {
+    "pushbots": ("pushbot1/fix", PoseWithCovarianceStamped),
+    "epucks_wifi": ("epuck1/detections", MarkerDetectionArray),
+}
+"""Simulation -> topic of the measurements that locate the robot whose driver is stopped."""
 
 
 @contextmanager
@@ -138,6 +144,9 @@ def measure(say: Say) -> dict[str, float]:
     figures: dict[str, float] = {}
     for kind, stops in STOPPED.items():
         with _simulated(kind) as (graph, swarm, truth):
+            measured: list[bytes] = []
+            topic, message_type = _MEASURED[kind]
+            graph.recorder.create_subscription(message_type, topic, measured.append, 1000, raw=True)
             _all_tracked(graph, 0, START_PATIENCE_S)
             _go(graph, _BETWEEN_S)
             begin_ns = graph.recorder.poses()[-1].stamp_ns
@@ -146,8 +155,11 @@ def measure(say: Say) -> dict[str, float]:
                     say(f"{kind} {what} {pause_s:g} s")
                     with stopped(graph.process(node).pid):
                         _go(graph, pause_s)
-                    recovery_s = _all_tracked(graph, graph.recorder.poses()[-1].stamp_ns, _PATIENCE_S)
-                    figures[f"time.{kind}.{what}_stopped_{pause_s:g}_s.recovery_s"] = recovery_s
+                    name = f"time.{kind}.{what}_stopped_{pause_s:g}_s"
+                    figures[f"{name}.measured_s"] = _measured_s(graph, measured)
+                    figures[f"{name}.recovery_s"] = _all_tracked(
+                        graph, graph.recorder.poses()[-1].stamp_ns, _PATIENCE_S
+                    )
                     _go(graph, _BETWEEN_S)
             paths = {
                 name: Trajectory(np.array([at for at, _ in one]), np.array([pose for _, pose in one]))
@@ -156,3 +168,11 @@ def measure(say: Say) -> dict[str, float]:
             result = graph.recorder.result(kind, swarm, paths)
         figures[f"time.{kind}.misleading_share"] = misleading_share(result, paths, begin_ns)
     return figures
+
+
+def _measured_s(graph: LiveGraph, measured: list[bytes]) -> float:
+    """Wait until a measurement comes; how long that takes [s]."""
+    begin_s = time.monotonic()
+    measured.clear()
+    graph.wait_for(lambda: bool(measured), "measure", START_PATIENCE_S)
+    return time.monotonic() - begin_s
