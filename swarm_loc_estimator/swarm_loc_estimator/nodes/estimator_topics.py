@@ -193,9 +193,8 @@ class EstimatorInputs:
         self._newest: list[list[int]] = [[] for _ in topics]
         self._publishers: list[set[tuple[int, ...]]] = [set() for _ in topics]
         self._why_lost = ["overload" for _ in topics]  # Drop reason of messages missing in a sequence
-        # Messages by sensor that were lost or dropped here under overload, and those that were taken
-        self.unread: Counter[str] = Counter()
-        self.taken: Counter[str] = Counter()
+        # Messages by sensor that were lost or dropped here under overload, and that were taken
+        self.unread, self.taken = Counter[str](), Counter[str]()
         self.looked_ns = 0  # Newest time that the estimator knows; reading many messages takes a while
         self._quota = max(_MIN_PER_TOPIC, _MAX_PER_TAKE // len(topics))
         self._subscriptions = [self._subscribe(k, ReliabilityPolicy.RELIABLE) for k in range(len(topics))]
@@ -219,15 +218,14 @@ class EstimatorInputs:
                 numbers.append(info["publication_sequence_number"])
                 if info["received_timestamp"] >= oldest_ns:
                     taken.append((info["received_timestamp"], handle, data))
-            waited = len(numbers) - (len(taken) - before)
-            lost, sensor = self._count_gaps(handle, numbers), self._topics[handle].kind.rows
+            waited, sensor = len(numbers) - (len(taken) - before), self._topics[handle].kind.rows
+            lost = self._count_gaps(handle, numbers)
             self.taken[sensor] += len(numbers) - waited
             for why, count in (("overload", waited), (self._why_lost[handle], lost)):
-                if count:
-                    self._drop(why, count)
-                    self.unread[sensor] += count if why == "overload" else 0
+                self._drop(why, count)
+                self.unread[sensor] += count if why == "overload" else 0
             if lost and len(numbers) >= min(self._quota, subscription.qos_profile.depth):
-                self._hear_best_effort(handle, "cannot be read fast enough")
+                self._hear_best_effort(handle, "cannot be read fast enough", "overload")
         taken.sort(key=lambda one: one[0])
         now_ns = time_ns()
         # time must not seem to go back to where it was looked at before
@@ -260,29 +258,26 @@ class EstimatorInputs:
 
     def _subscribe(self, handle: int, reliability: ReliabilityPolicy) -> Subscription:
         topic = self._topics[handle]
+        follow = partial(self._hear_best_effort, handle, "is published best effort", "lost")
         return self._node.create_subscription(
             message_class(topic.kind.message_type),
             topic.name,
             lambda _: None,
             QoSProfile(depth=queue_depth(topic.kind, 1e-9 * self._horizon_ns), reliability=reliability),
             raw=True,
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=partial(self._follow, handle)),
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=follow),
         )
 
-    def _follow(self, handle: int, _event: object) -> None:
-        """Hear a publisher that sends nothing again."""
-        self._why_lost[handle] = "lost"
-        self._hear_best_effort(handle, "is published best effort")
-
-    def _hear_best_effort(self, handle: int, why: str) -> None:
+    def _hear_best_effort(self, handle: int, trouble: str, why_lost: str, _event: object = None) -> None:
         """Subscribe again as best effort, which matches all publishers but has no retransmissions."""
         before = self._subscriptions[handle]
         if before.qos_profile.reliability is ReliabilityPolicy.BEST_EFFORT:
             return
         self._subscriptions[handle] = self._subscribe(handle, ReliabilityPolicy.BEST_EFFORT)
         self._node.destroy_subscription(before)
-        name = self._topics[handle].name
-        self._node.get_logger().info(f"{name} {why}: lost messages are not sent again")
+        self._why_lost[handle] = why_lost
+        text = f"{self._topics[handle].name} {trouble}: lost messages are not sent again"
+        self._node.get_logger().info(text)
 
 
 def newest_time_ns(node: Node) -> int:

@@ -37,7 +37,7 @@ class Inputs:
         self._inputs = EstimatorInputs(node, topics, self._note, horizon_s)
 
     def _note(self, why: str, count: int) -> None:
-        self.drops[why] += count
+        self.drops += Counter({why: count})
 
     def publisher(self) -> tuple[Node, Publisher]:
         """A publisher, and its node, as of another process."""
@@ -130,7 +130,7 @@ def test_of_images_only_those_wait_that_come_within_the_horizon(ros: Ros, swarm_
         one for one in live_topics(load_swarm(swarm_file), shared=False) if one.kind.name == "detections"
     ]
     drops: Counter[str] = Counter()
-    inputs = EstimatorInputs(node, topics[:1], lambda why, count: drops.update({why: count}), 2.0)
+    inputs = EstimatorInputs(node, topics[:1], lambda why, count: drops.update([why] * count), 2.0)
     publisher = ros.stranger().create_publisher(MarkerDetectionArray, topics[0].name, QoSProfile(depth=DEPTH))
     ros.until(publisher.get_subscription_count)
     sent = [
