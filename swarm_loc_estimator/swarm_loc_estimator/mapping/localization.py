@@ -173,7 +173,7 @@ _STEP, _TURN_STEP = 0.06, math.radians(1.5)
 _MIN_SCORE, _MAX_OTHER = 0.35, 0.9  # Minimum score, and maximum score of another place relative to it
 _MIN_FIT, _MAX_SIGMA, _MAX_SIGMAS = 0.5, 0.03, 4.0
 """Minimum share of matched beams, maximum sigma of the position [m], and maximum shift in sigmas."""
-_TIE_SIGMA = np.array([0.03, 0.03, 0.012])
+_TIE_ROOT = np.diag([1.0 / 0.03, 1.0 / 0.03, 1.0 / 0.012])
 _LOOP_TARGETS, _MIN_LOOP_OVERLAP = 9, 0.2
 _LOOP_GATE = 0.05  # Maximum distance of a matched beam from its line [m]
 _SWEEP_HOPS = 6
@@ -216,7 +216,7 @@ def close_loop(graph: PoseGraph, stop: int) -> bool:
 def tie(graph: PoseGraph, stop: int, pose: FloatArray, against: list[int]) -> None:
     """Add a tie of a stop at a pose (3,) to the first of `against`, and solve the whole graph."""
     relative = between(graph.states[against[0], :3], pose)
-    graph.constraints.add_tie(against[0], stop, relative, _TIE_SIGMA)
+    graph.constraints.add_tie(against[0], stop, relative, _TIE_ROOT)
     graph.solve(4)
     for one in dict.fromkeys([stop, *against]):
         graph.targets[one] = graph.neighbours(one, _LOOP_TARGETS, _MIN_LOOP_OVERLAP)

@@ -40,6 +40,7 @@ from swarm_loc_estimator.mapping.scans import (
     ScanStop,
     turn_ratio,
 )
+from swarm_loc_estimator.mapping.sweep_map import SweepMap
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
 
@@ -111,6 +112,7 @@ class CooperativeMapper:
         self.settings = settings or MapperSettings()
         self.graph = PoseGraph(self.settings)
         self.visits = VisitationMap()
+        self.sweeps = SweepMap(self.graph)
         self.counters = {"scans": 0, "scans_refused": 0, "loops_closed": 0, "odometry_restarts": 0}
         self.counters |= {"scans_not_located": 0, "places_taken_back": 0}
         self._tracks: dict[int, Track] = {}
@@ -164,8 +166,8 @@ class CooperativeMapper:
             if math.hypot(x, y) < _SWEEP_STEP and abs(turn) < _SWEEP_TURN:
                 return
         self.graph.known_slips.add(robot)  # no turn by odometry is in a sweep
-        self._enter(robot, track, sweep, len(sweep.turn))
-        track.is_known, track.left, track.path = False, sweep.arrival, 0.0
+        self._enter_sweep(robot, track, sweep)
+        track.left, track.path = sweep.arrival, 0.0
         if track.node is not None:
             track.located = Located(track.last_ns, self.graph.poses[track.node].copy())
 
@@ -417,6 +419,29 @@ class CooperativeMapper:
         if close_loop(self.graph, node):
             self.counters["loops_closed"] += 1
         self._check_place(robot, track, stop)
+
+    def _enter_sweep(self, robot: int, track: Track, sweep: ScanStop) -> None:
+        """Add a sweep of a lidar as a node, and match it."""
+        graph, begin = self.graph, track.node
+        if begin is None and not self._is_found(robot, track, sweep):
+            self.counters["scans_not_located"] += 1
+            return
+        self.counters["scans"] += 1
+        self._map = None
+        pose = track.prior if begin is None else self._driven(track, sweep.arrival)
+        node = track.node = graph.add_stop(robot, pose, sweep.sigma, sweep.reach)
+        self.begin_ns[node] = int(sweep.stamp_ns[0])
+        if begin is None:
+            graph.constraints.add_prior(node, track.prior, track.prior_sigma)
+            self.sweeps.begin(node, sweep)
+        else:
+            motion = between(track.left, sweep.arrival)
+            sigma = self._motion_sigma(track.path, abs(float(motion[2])))
+            sigma[0] += _SWEEP_DISTANCE_NOISE * track.path
+            if not self.sweeps.add(begin, node, sweep, motion, sigma):
+                self.counters["scans_refused"] += 1
+        self.counters["loops_closed"] = len(self.sweeps.loops)
+        self._check_place(robot, track, sweep)
 
     def _replace(self, node: int, pose: FloatArray, motion_sigma: FloatArray, stop: ScanStop) -> int:
         """Replace a robot's newest stop by its next one, since the graph is full; returns its number."""

@@ -49,7 +49,7 @@ class Ties(NamedTuple):
     begin: IntArray  # (m,) reference stop
     end: IntArray  # (m,) stop whose pose in the frame of `begin` is given
     pose: FloatArray  # (m, 3)
-    sigma: FloatArray  # (m, 3) [m, m, rad]
+    root: FloatArray  # (m, 3, 3) square root of its information
 
 
 class Bearings(NamedTuple):
@@ -105,7 +105,8 @@ def ties(states: FloatArray, given: Ties) -> Linearised:
     residual = np.stack([ahead, left, end[:, 2] - begin[:, 2]], -1) - given.pose
     residual[:, 2] = wrap_angle(residual[:, 2])
     index = np.hstack([_unknowns(given.begin, 3), _unknowns(given.end, 3)])
-    return Linearised(index, jacobian, residual, given.sigma**-2.0)
+    residual = np.einsum("mab,mb->ma", given.root, residual)
+    return Linearised(index, given.root @ jacobian, residual, np.ones_like(residual))
 
 
 def bearings(states: FloatArray, given: Bearings) -> Linearised:
@@ -249,9 +250,13 @@ class ConstraintLists:
         """Add odometry from stop to stop, see `constraints.Departures`."""
         self._departures.append((begin, end, np.concatenate([[turn], motion, sigma])))
 
-    def add_tie(self, begin: int, end: int, pose: FloatArray, sigma: FloatArray) -> None:
-        """Add a relative pose, see `constraints.Ties`."""
-        self._ties.append((begin, end, np.concatenate([pose, sigma])))
+    def add_tie(self, begin: int, end: int, pose: FloatArray, root: FloatArray) -> None:
+        """Add a relative pose, see `Ties`."""
+        self._ties.append((begin, end, np.concatenate([pose, root.ravel()])))
+
+    def remove_tie(self, begin: int, end: int) -> None:
+        """Remove the ties of two stops."""
+        self._ties[:] = [one for one in self._ties if one[:2] != (begin, end)]
 
     def add_bearing(self, begin: int, end: int, turn: float, bearing: float, sigma: float) -> None:
         """Add the bearing of a robot's light at another stop, see `constraints.Bearings`."""
@@ -267,6 +272,14 @@ class ConstraintLists:
         for rows in (self._priors, self._departures, self._ties, self._bearings):
             rows[:] = [one for one in rows if stop not in one[:2]]
 
+    def worst_tie(self, states: FloatArray) -> float:
+        """The greatest squared residual of a tie at states (k, 4), in variances."""
+        if not self._ties:
+            return 0.0
+        begin, end, v = _arrays(self._ties)
+        residual = ties(states, Ties(begin, end, v[:, :3], v[:, 3:].reshape(-1, 3, 3))).residual
+        return float(np.square(residual).sum(axis=1).max())
+
     def departures(self) -> Iterator[_Row]:
         """Stop of departure, of arrival, and turn, motion and sigmas, see `constraints.Departures`."""
         yield from self._departures
@@ -281,7 +294,7 @@ class ConstraintLists:
             yield odometry(states, Departures(begin, end, v[:, 0], v[:, 1:4], v[:, 4:]))
         if self._ties:
             begin, end, v = _arrays(self._ties)
-            yield ties(states, Ties(begin, end, v[:, :3], v[:, 3:]))
+            yield ties(states, Ties(begin, end, v[:, :3], v[:, 3:].reshape(-1, 3, 3)))
         if self._bearings:
             begin, end, v = _arrays(self._bearings)
             yield bearings(states, Bearings(begin, end, *v.T))
@@ -497,7 +510,8 @@ class PoseGraph:
             if self._apply(step):
                 break
         for stop in np.flatnonzero(moves):
-            if abs(self.states[stop, 3] - self._fitted_ratio[stop]) > _REFIT_RATIO:
+            changed = abs(self.states[stop, 3] - self._fitted_ratio[stop]) > _REFIT_RATIO
+            if changed and self._beams.counts[stop]:
                 self.fit(int(stop))
 
     def equations(self, free: BoolArray, gate: float = MATCH_GATE, stride: int = 2) -> NormalEquations:
