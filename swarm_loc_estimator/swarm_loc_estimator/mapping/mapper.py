@@ -81,6 +81,7 @@ _SWEEP_STEP, _SWEEP_TURN = 0.3, math.radians(20.0)
 """Motion by odometry after which the next sweep of a lidar is used: path [m], turn [rad]."""
 _SWEEP_DISTANCE_NOISE = 0.2
 """Error of paths between sweeps, per path: slip is the same in all, so they must not count as many."""
+_UNKNOWN_MOTION = np.array([2.0, 2.0, 1.0])  # Deviations of a motion of which odometry says nothing [m, rad]
 _START_PARTS = (0.25 * math.pi, *(0.5 * math.pi * k for k in range(1, 9)))
 """Turns at which a first scan is split into parts, each a stop [rad]."""
 # The constants of the mapper are checked by `make bench-pushbot`: corridor, office and ring, 20 seeds each.
@@ -157,7 +158,13 @@ class CooperativeMapper:
         """Process a sweep of a robot's lidar, newer than all before, if the robot has moved since."""
         track, place = self._tracks[robot], sweep.arrival[None]
         step = Readings(sweep.stamp_ns[:1], place, np.full(1, UNSEEN), math.nan)
-        if any(run.jumps for run in track.motion.runs(step)):
+        jumps = any(run.jumps for run in track.motion.runs(step))
+        found = self.sweeps.place(track.node, sweep) if jumps and track.node is not None else None
+        if found is not None and track.node is not None:
+            self.counters["odometry_restarts"] += 1
+            back = between(found, self.graph.states[track.node, :3])
+            track.left, track.last = compose(sweep.arrival, back), sweep.arrival
+        elif jumps:
             self._restart_track(robot, track, int(sweep.stamp_ns[0]))
         self._drive(track, place)
         track.last_ns = int(sweep.stamp_ns[0])
@@ -166,7 +173,7 @@ class CooperativeMapper:
             if math.hypot(x, y) < _SWEEP_STEP and abs(turn) < _SWEEP_TURN:
                 return
         self.graph.known_slips.add(robot)  # no turn by odometry is in a sweep
-        self._enter_sweep(robot, track, sweep)
+        self._enter_sweep(robot, track, sweep, jumps=jumps)
         track.left, track.path = sweep.arrival, 0.0
         if track.node is not None:
             track.located = Located(track.last_ns, self.graph.poses[track.node].copy())
@@ -420,8 +427,8 @@ class CooperativeMapper:
             self.counters["loops_closed"] += 1
         self._check_place(robot, track, stop)
 
-    def _enter_sweep(self, robot: int, track: Track, sweep: ScanStop) -> None:
-        """Add a sweep of a lidar as a node, and match it."""
+    def _enter_sweep(self, robot: int, track: Track, sweep: ScanStop, *, jumps: bool) -> None:
+        """Add a sweep of a lidar as a node, and match it; `jumps`: its odometry says nothing."""
         graph, begin = self.graph, track.node
         if begin is None and not self._is_found(robot, track, sweep):
             self.counters["scans_not_located"] += 1
@@ -438,6 +445,7 @@ class CooperativeMapper:
             motion = between(track.left, sweep.arrival)
             sigma = self._motion_sigma(track.path, abs(float(motion[2])))
             sigma[0] += _SWEEP_DISTANCE_NOISE * track.path
+            sigma = _UNKNOWN_MOTION if jumps else sigma
             if not self.sweeps.add(begin, node, sweep, motion, sigma):
                 self.counters["scans_refused"] += 1
         self.counters["loops_closed"] = len(self.sweeps.loops)

@@ -32,6 +32,8 @@ _TURN, _TURN_SHARE, _MAX_TURN = math.radians(15.0), 0.5, math.radians(50.0)
 """Search for its heading: turn [rad], share of the turn by odometry, and greatest [rad]."""
 _PREDICTED, _PREDICTED_PER_M, _PREDICTED_TURN = 0.10, 0.25, math.radians(5.0)
 """Standard deviations of the prediction [m], per path, and of its heading [rad]."""
+_ANYWHERE = Window(2.5, math.pi, math.inf, math.inf)  # Search for a sweep that does not fit the prediction
+_GOOD, _BETTER = 0.5, 0.15  # Score from which it is not searched elsewhere, or is elsewhere if so much better
 _MIN_SCORE = 0.30  # Least score of a sweep among the newest ones
 _CONTRADICTS = 16.0  # Squared difference of match and odometry, in variances, from which they contradict
 _MEMORY, _MAX_SQUARE = 0.05, 400.0  # Weight of a new difference in the noise of odometry, and its maximum
@@ -246,13 +248,8 @@ class SweepMap:
 
     def _match_newest(self, chain: Chain, node: int, sweep: Sweep, motion: FloatArray) -> Match | None:
         """Match a sweep with the newest ones of its robot; None: too little is seen."""
-        recent = [
-            one
-            for one, path in zip(chain.nodes[-_RECENT:], chain.path[-_RECENT:], strict=True)
-            if path > chain.path[-1] - _RECENT_PATH
-        ]
-        others = self.points_at(recent)
-        if len(sweep.points) < _MIN_POINTS or len(others) < _MIN_POINTS:
+        newest = self._newest(chain)
+        if len(sweep.points) < _MIN_POINTS or newest is None:
             return None
         path, turn = math.hypot(motion[0], motion[1]), abs(float(motion[2]))
         window = Window(
@@ -261,7 +258,34 @@ class SweepMap:
             _PREDICTED + _PREDICTED_PER_M * path,
             _PREDICTED_TURN + 0.1 * turn,
         )
-        return match(field_of(others), sweep.points, self._graph.states[node, :3], window)
+        pose = self._graph.states[node, :3]
+        found = match(newest, sweep.points, pose, window)
+        if found.score < _GOOD:
+            anywhere = match(newest, sweep.points, self._graph.states[chain.nodes[-1], :3], _ANYWHERE, _RIVAL)
+            if not anywhere.rival and anywhere.score > max(_GOOD, found.score + _BETTER):
+                return anywhere
+        return found
+
+    def _newest(self, chain: Chain) -> Field | None:
+        """The field of the newest sweeps of a robot; None: too little was seen."""
+        recent = [
+            one
+            for one, path in zip(chain.nodes[-_RECENT:], chain.path[-_RECENT:], strict=True)
+            if path > chain.path[-1] - _RECENT_PATH
+        ]
+        others = self.points_at(recent)
+        return field_of(others) if len(others) >= _MIN_POINTS else None
+
+    def place(self, node: int, stop: ScanStop) -> FloatArray | None:
+        """The only pose (3,) near a robot's newest sweep that explains the next one; None: none does.
+
+        It is for robots of whose motion nothing is known.
+        """
+        sweep, newest = sweep_of(stop), self._newest(self._chains[int(self._graph.robot[node])])
+        if newest is None or len(sweep.points) < _MIN_POINTS:
+            return None
+        found = match(newest, sweep.points, self._graph.states[node, :3], _ANYWHERE, _RIVAL)
+        return found.pose if found.score > _GOOD and not found.rival else None
 
     def _fuse(
         self, chain: Chain, begin: int, node: int, found: Match, motion: FloatArray, sigma: FloatArray
