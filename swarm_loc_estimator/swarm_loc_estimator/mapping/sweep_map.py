@@ -44,7 +44,7 @@ _QUERY, _QUERY_PATH = 6, 3.5  # Newest sweeps that are matched as one body: numb
 _DRIFT, _DRIFT_PER_M, _MAX_DRIFT = 0.3, 0.04, 4.0
 """Search for loops: offset [m], per way through the graph, and greatest."""
 _SPIN, _SPIN_PER_M, _MAX_SPIN = math.radians(4.0), math.radians(0.4), math.radians(30.0)
-_LOOP_SCORE, _RIVAL, _LOOP_RIDGE = 0.5, 0.88, 0.12
+_LOOP_SCORE, _RIVAL, _LOOP_RIDGE = 0.5, 0.88, 0.16
 """Least score of a loop, share of it that no other place reaches, and its greatest deviation [m]."""
 _SHORT = 12.0  # Way up to which one tie is believed [m]
 _AGREE, _AGREE_PER_M, _AGREE_TURN = 0.15, 0.04, math.radians(2.5)
@@ -59,6 +59,7 @@ class Sweep(NamedTuple):
     """A sweep in the graph, in the frame of its robot."""
 
     points: FloatArray  # (n, 2) thinned, on walls [m]
+    middle: FloatArray  # (2,) of them [m]
     ends: NDArray[np.float32]  # (m, 2) of all beams [m]
     hits: BoolArray  # (m,) whether they met something
 
@@ -148,13 +149,14 @@ class SweepMap:
         old = self._old(chain, node)
         if not len(old):
             return
-        away = graph.distances(node)[old]
+        query = self._query(chain, node)
+        views = self._middles(old) - transform_points(graph.states[node, :3], np.median(query, axis=0))
+        away = np.hypot(views[:, 0], views[:, 1])
         ways = self._ways(node)[old]
         drift = np.minimum(_DRIFT + _DRIFT_PER_M * ways, _MAX_DRIFT)
         near = np.flatnonzero(away < _NEAR + drift)
         if not len(near):
             return
-        query = self._query(chain, node)
         nearest = near[np.argmin(away[near] - drift[near])]
         one = self._match_old(node, query, int(old[nearest]), float(ways[nearest]))
         if one is None:
@@ -169,6 +171,16 @@ class SweepMap:
         """All sweeps but the newest ones of a robot."""
         newest = set(chain.nodes[-_OLD:])
         return np.array([one for one in self.sweeps if one not in newest and one != node], dtype=np.int64)
+
+    def _middles(self, nodes: IntArray) -> FloatArray:
+        """Middles (n, 2) of what was seen in sweeps, in map [m]."""
+        x, y, heading = self._graph.states[nodes, :3].T
+        middle = np.array([self.sweeps[one].middle for one in nodes.tolist()])
+        cos, sin = np.cos(heading), np.sin(heading)
+        places: FloatArray = np.stack(
+            [x + cos * middle[:, 0] - sin * middle[:, 1], y + sin * middle[:, 0] + cos * middle[:, 1]], -1
+        )
+        return places
 
     def _query(self, chain: Chain, node: int) -> FloatArray:
         """Points (n, 2) of the newest sweeps of a robot, in its frame at the newest one [m]."""
@@ -344,7 +356,9 @@ def sweep_of(stop: ScanStop) -> Sweep:
     distance = 1.0 / np.where(hits, stop.inverse, 1.0 / stop.reach)
     angle = stop.bearing + stop.turn
     ends = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * distance[:, None]
-    return Sweep(thin(ends[hits & (distance < _FAR)], _APART), ends.astype(np.float32), hits)
+    points = thin(ends[hits & (distance < _FAR)], _APART)
+    middle = np.median(points, axis=0) if len(points) else np.zeros(2)
+    return Sweep(points, middle, ends.astype(np.float32), hits)
 
 
 def root_of(covariance: FloatArray) -> FloatArray:
