@@ -18,7 +18,9 @@ from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 
 _CELL, _LEVELS = 0.05, 5  # Side of a cell [m], and number of sizes of blocks: 1 to 16 cells
-_SPREAD, _SPREAD_CELLS = 0.08, 5  # Standard deviation of points of a wall [m], and up to where they count
+_SPREAD, _SPREAD_CELLS = 0.08, 4  # Standard deviation of points of a wall [m], and up to where they count
+_PARTS = 4  # Parts of a cell along each side in which points are drawn alike
+_SEARCH_POINTS, _SHAPE_POINTS = 160, 80  # Number of points in searches and in covariances
 _INDEPENDENT = 30.0  # Points that count as independent, since neighbours share their errors
 _MAX_PENALTY = 4.0  # Loss of a pose that the prediction excludes, in log likelihood
 _SHAPE_CELLS, _SHAPE_TURNS, _SHAPE_TURN = 8, 5, 0.008
@@ -70,6 +72,20 @@ def thin(points: FloatArray, apart: float) -> FloatArray:
     return thinned
 
 
+@cached_njit
+def gather(points: FloatArray, first: IntArray, counts: IntArray, poses: FloatArray) -> FloatArray:
+    """Points (m, 2) at poses (n, 3): of each the `counts` ones of all (p, 2) from `first` on."""
+    moved = np.zeros((counts.sum(), 2))
+    at = 0
+    for k in range(len(poses)):
+        cos, sin = math.cos(poses[k, 2]), math.sin(poses[k, 2])
+        for i in range(first[k], first[k] + counts[k]):
+            moved[at, 0] = poses[k, 0] + cos * points[i, 0] - sin * points[i, 1]
+            moved[at, 1] = poses[k, 1] + sin * points[i, 0] + cos * points[i, 1]
+            at += 1
+    return moved
+
+
 def field_of(points: FloatArray) -> Field:
     """The field of points (n, 2), at least one [m]."""
     pad = (_SPREAD_CELLS + 1 + (1 << (_LEVELS - 1))) * _CELL  # blocks may begin before the first cell
@@ -84,14 +100,27 @@ def _draw(cells: FloatArray, nx: int, ny: int) -> NDArray[np.uint8]:
     """The levels of a field of points (n, 2) [cells]."""
     levels = np.zeros((_LEVELS, nx, ny), dtype=np.uint8)
     first = levels[0]
+    # each part of a cell has its own pattern, and is drawn once
+    width = 2 * _SPREAD_CELLS + 1
+    patterns = np.zeros((_PARTS * _PARTS, width, width), dtype=np.uint8)
     scale = -0.5 * (_CELL / _SPREAD) ** 2
+    for part in range(_PARTS * _PARTS):
+        u, v = (part // _PARTS + 0.5) / _PARTS, (part % _PARTS + 0.5) / _PARTS
+        for a in range(width):
+            for b in range(width):
+                square = (a - _SPREAD_CELLS + 0.5 - u) ** 2 + (b - _SPREAD_CELLS + 0.5 - v) ** 2
+                patterns[part, a, b] = np.uint8(255.0 * math.exp(scale * square))
+    drawn = np.zeros((nx, ny), dtype=np.uint16)
     for k in range(len(cells)):
         i, j = math.floor(cells[k, 0]), math.floor(cells[k, 1])
-        for a in range(i - _SPREAD_CELLS, i + _SPREAD_CELLS + 1):
-            for b in range(j - _SPREAD_CELLS, j + _SPREAD_CELLS + 1):
-                square = (a + 0.5 - cells[k, 0]) ** 2 + (b + 0.5 - cells[k, 1]) ** 2
-                value = np.uint8(255.0 * math.exp(scale * square))
-                first[a, b] = max(first[a, b], value)
+        part = int((cells[k, 0] - i) * _PARTS) * _PARTS + int((cells[k, 1] - j) * _PARTS)
+        if drawn[i, j] >> part & 1:
+            continue
+        drawn[i, j] |= 1 << part
+        for a in range(width):
+            row = first[i - _SPREAD_CELLS + a]
+            for b in range(width):
+                row[j - _SPREAD_CELLS + b] = max(row[j - _SPREAD_CELLS + b], patterns[part, a, b])
     for level in range(1, _LEVELS):
         step = 1 << (level - 1)
         below, here = levels[level - 1], levels[level]
@@ -124,14 +153,14 @@ def match(field: Field, points: FloatArray, pose: FloatArray, window: Window, ri
     turns = math.ceil(window.turn / step)
     sigmas = np.array([window.sigma / _CELL, window.turn_sigma])
     nothing = np.full(3, np.nan)
-    rotated = _rotated(cells, centre, turns, step)
+    rotated = _rotated(cells[:: -(-len(cells) // _SEARCH_POINTS)], centre, turns, step)
     best, place = _search(field.levels, rotated, reach, turns, step, sigmas, 0.0, nothing)
     other = 0.0
     if rival:
         other, _ = _search(field.levels, rotated, reach, turns, step, sigmas, rival * best, place)
         other = other if other > rival * best else 0.0
     found, score = _climb(field.levels[0], cells, centre + place)
-    covariance = _shape(field.levels[0], cells, found)
+    covariance = _shape(field.levels[0], cells[:: -(-len(cells) // _SHAPE_POINTS)], found)
     found[:2] = found[:2] * _CELL + field.corner
     return Match(found, covariance, score, other)
 
