@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.se2 import transform_points
 from swarm_loc_estimator.mapping.matching import Scans
 from swarm_loc_estimator.mapping.scans import BINS, LINE, POINT, UNKNOWN, Lines
 
 _FREE_STEP, _HIT_STEP = 0.25, 0.9  # Change of the log odds of a cell by one ray
 _POINT_HIT = 0.25  # Share of `_HIT_STEP` for a reflection without a fitted line
+_UNMET = 0.25  # Share of `_FREE_STEP` for a beam of a lidar that met nothing
 _SHARP_M = 0.03  # Standard deviation of a wall above which the increase of the log odds is reduced
 
 
@@ -53,22 +58,47 @@ def draw_stop(
         angle = pose[2] + (m + 0.5) * 2.0 * math.pi / BINS
         cos, sin = math.cos(angle) / cell, math.sin(angle) / cell
         x, y = (pose[0] - corner[0]) / cell, (pose[1] - corner[1]) / cell
-        _draw_free(log_odds, x, y, cos, sin, end, 0.7 * cell)
+        _draw_free(log_odds, x, y, cos, sin, end, 0.7 * cell, _FREE_STEP)
         i, j = math.floor(x + distance * cos), math.floor(y + distance * sin)
         if hit > 0.0 and 0 <= i < log_odds.shape[0] and 0 <= j < log_odds.shape[1]:
             log_odds[i, j] += hit
 
 
+class DrawnSweep(NamedTuple):
+    """Beams (n,) of a sweep of a lidar, in the frame of its robot."""
+
+    ends: NDArray[np.float32]  # (n, 2) [m]
+    sigma: NDArray[np.float32]  # (n,) standard deviation of the distance [m]; infinite: nothing was met
+
+
+@cached_njit
+def draw_sweep(log_odds: FloatArray, corner: FloatArray, cell: float, pose: FloatArray, sweep: DrawnSweep) -> None:
+    """Add the evidence of a sweep to a grid, see `draw_stop`."""
+    x, y = (pose[0] - corner[0]) / cell, (pose[1] - corner[1]) / cell
+    for k in range(len(sweep.sigma)):
+        sigma = float(sweep.sigma[k])
+        distance = math.hypot(sweep.ends[k, 0], sweep.ends[k, 1])
+        angle = pose[2] + math.atan2(sweep.ends[k, 1], sweep.ends[k, 0])
+        cos, sin = math.cos(angle) / cell, math.sin(angle) / cell
+        if math.isinf(sigma):  # glass reflects nothing, too
+            _draw_free(log_odds, x, y, cos, sin, distance, 0.7 * cell, _UNMET * _FREE_STEP)
+            continue
+        _draw_free(log_odds, x, y, cos, sin, distance - 0.03 - 1.5 * sigma, 0.7 * cell, _FREE_STEP)
+        i, j = math.floor(x + distance * cos), math.floor(y + distance * sin)
+        if 0 <= i < log_odds.shape[0] and 0 <= j < log_odds.shape[1]:
+            log_odds[i, j] += _HIT_STEP / (1.0 + (sigma / _SHARP_M) ** 2)
+
+
 @cached_njit
 def _draw_free(
-    log_odds: FloatArray, x: float, y: float, cos: float, sin: float, end: float, step: float
+    log_odds: FloatArray, x: float, y: float, cos: float, sin: float, end: float, step: float, change: float
 ) -> None:
     """Decrease each cell along a ray from (x, y) [cells] once; the direction is in cells per metre."""
     last_i, last_j = -1, -1
     for k in range(int(end / step) + 1 if end > 0.0 else 0):
         i, j = math.floor(x + k * step * cos), math.floor(y + k * step * sin)
         if (i != last_i or j != last_j) and 0 <= i < log_odds.shape[0] and 0 <= j < log_odds.shape[1]:
-            log_odds[i, j] -= _FREE_STEP
+            log_odds[i, j] -= change
         last_i, last_j = i, j
 
 
@@ -116,6 +146,7 @@ def draw_map(
     max_cells: int,
     background: OccupancyMap | None = None,
     without: Collection[int] = (),
+    sweeps: Mapping[int, DrawnSweep] = MappingProxyType({}),
 ) -> OccupancyMap:
     """Draw the map of the first stops; its size follows from their positions.
 
@@ -125,19 +156,30 @@ def draw_map(
         max_cells: Maximum number of cells; a larger map is cropped around its centre.
         background: A map with the same cell size, drawn below the stops.
         without: Stops that are not drawn.
+        sweeps: Stops that are sweeps of lidars.
     """
-    reach = scans.beams.reach[:count].max(initial=0.0) + 0.1
-    places = scans.states[:count, :2]
-    points = [places - reach, places + reach]
+    shown = [one for one in range(count) if one not in without]
+    points = [scans.states[:count, :2]]
+    for stop in shown:
+        if stop in sweeps:
+            met = np.isfinite(sweeps[stop].sigma)
+            points.append(transform_points(scans.states[stop, :3], sweeps[stop].ends[met]))
+        else:
+            reach = scans.beams.reach[stop] + 0.1
+            points.append(scans.states[stop, :2] + np.array([[-reach], [reach]]))
     if background is not None:
         points.append(background.corner + CELL * np.array([(0, 0), background.log_odds.shape]))
     corner, shape = grid_around(np.concatenate(points), CELL, max_cells)
     log_odds = np.zeros(shape)
     if background is not None:
         _lay_below(log_odds, corner, background)
-    for stop in (one for one in range(count) if one not in without):
-        draw_stop(log_odds, corner, CELL, scans.states[stop, :3], stop, scans.lines, scans.beams.free[stop])
-    return OccupancyMap(corner, CELL, np.clip(log_odds, -LOG_ODDS_CAP, LOG_ODDS_CAP))
+    for stop in shown:
+        pose = scans.states[stop, :3]
+        if stop in sweeps:
+            draw_sweep(log_odds, corner, CELL, pose, sweeps[stop])
+        else:
+            draw_stop(log_odds, corner, CELL, pose, stop, scans.lines, scans.beams.free[stop])
+    return OccupancyMap(corner, CELL, np.clip(log_odds, -LOG_ODDS_CAP, LOG_ODDS_CAP, out=log_odds))
 
 
 def _lay_below(log_odds: FloatArray, corner: FloatArray, background: OccupancyMap) -> None:

@@ -108,10 +108,11 @@ def _match_parts(graph: PoseGraph, parts: Sequence[int], oldest: int) -> None:
 
 def align_all(graph: PoseGraph) -> None:
     """Align all scans with all their beams: the final solution."""
-    for stop in range(graph.count):
+    scanned = np.flatnonzero(graph.scans.beams.counts[: graph.count]).tolist()
+    for stop in scanned:
         graph.targets[stop] = graph.neighbours(stop, _FINAL_TARGETS, _MIN_FINAL_OVERLAP)
     graph.solve(5, stride=1)
-    for stop in range(graph.count):
+    for stop in scanned:
         graph.fit(stop)
 
 

@@ -227,7 +227,7 @@ class CooperativeMapper:
         without = frozenset(np.concatenate(tested).tolist()) if tested else frozenset()
         graph, limit = self.graph, self.settings.max_cells
         return (
-            draw_map(graph.scans, graph.count, limit, self.background, without)
+            draw_map(graph.scans, graph.count, limit, self.background, without, self.sweeps.drawn)
             if without
             else self.occupancy()
         )
@@ -251,6 +251,7 @@ class CooperativeMapper:
         tested = self._under_test(robot, search).tolist()
         for one in tested:
             self.graph.drop_stop(one)
+            self.sweeps.drop(one)
             self._lights.forget_node(one)
             self.begin_ns.pop(one, None)
         if tested:
@@ -299,7 +300,8 @@ class CooperativeMapper:
         """The map from the current poses of the stops."""
         if self._map is None:
             limit = self.settings.max_cells
-            self._map = draw_map(self.graph.scans, self.graph.count, limit, self.background)
+            graph, sweeps = self.graph, self.sweeps.drawn
+            self._map = draw_map(graph.scans, graph.count, limit, self.background, (), sweeps)
         return self._map
 
     def finish(self) -> None:

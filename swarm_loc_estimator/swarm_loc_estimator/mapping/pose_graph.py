@@ -470,7 +470,7 @@ class PoseGraph:
 
     def neighbours(self, stop: int, limit: int, least: float) -> list[int]:
         """The nearest stops in range whose lines overlap at least the share `least` of a stop's beams."""
-        away = self.distances(stop)
+        away = np.where(self._beams.counts[: self.count] > 0, self.distances(stop), np.inf)
         found: list[int] = []
         for other in np.argsort(away, kind="stable"):
             if away[other] > 0.88 * self._beams.reach[stop] or len(found) == limit:

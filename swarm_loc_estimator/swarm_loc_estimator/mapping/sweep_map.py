@@ -29,8 +29,9 @@ from swarm_loc_estimator.mapping.correlation import (
     score_at,
     thin,
 )
+from swarm_loc_estimator.mapping.grid import DrawnSweep
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
-from swarm_loc_estimator.mapping.scans import ScanStop
+from swarm_loc_estimator.mapping.scans import MAX_BEAMS, ScanStop
 
 # The constants were chosen on freiburg-101 and acapulco; `make bench-lidar` runs two others, too.
 _APART, _FAR, _MIN_POINTS = 0.08, 25.0, 20
@@ -138,10 +139,10 @@ class _Ways:
         self._edges[self._used] = begin, end, length + 1e-3
         self._used += 1
 
-    def cut(self, begin: int, end: int) -> None:
-        """Remove the edges of two stops."""
+    def cut(self, *stops: int) -> None:
+        """Remove all edges of one stop, or those of two."""
         edges = self._edges[: self._used]
-        edges[(edges[:, 0] == begin) & (edges[:, 1] == end), 2] = np.inf
+        edges[np.isin(edges[:, :2], stops).sum(axis=1) == len(stops), 2] = np.inf
 
     def lengths(self, node: int, count: int, limit: float = np.inf) -> FloatArray:
         """Lengths (count,) of the shortest ways from a stop, up to a limit [m]."""
@@ -164,6 +165,7 @@ class SweepMap:
         graph: The pose graph; modified.
 
     Attributes:
+        drawn: Node -> its beams.
         loops: Ties with old sweeps that are believed.
         contradicted: Nodes to which odometry and scans say different motions.
         refused: Nodes of which the sweeps fit nothing.
@@ -171,6 +173,7 @@ class SweepMap:
     """
 
     def __init__(self, graph: PoseGraph) -> None:
+        self.drawn: dict[int, DrawnSweep] = {}
         self.loops: list[LoopTie] = []
         self.contradicted: list[int] = []
         self.refused: list[int] = []
@@ -184,7 +187,7 @@ class SweepMap:
         """Note the first sweep of a robot, or the first after it was lost."""
         chain = self._chains[int(self._graph.robot[node])]
         chain.nodes, chain.path, chain.pending = [node], [0.0], []
-        self._points.set(node, points_of(stop))
+        self._note(node, stop)
 
     def add(self, begin: int, node: int, stop: ScanStop, motion: FloatArray, sigma: FloatArray) -> bool:
         """Match the newest sweep, at its pose by odometry; returns whether it fits.
@@ -197,7 +200,7 @@ class SweepMap:
             sigma: (3,) standard deviations of it as described: along [m], across [m], heading [rad].
         """
         chain = self._chains[int(self._graph.robot[node])]
-        points = points_of(stop)
+        points = self._note(node, stop)
         path = math.hypot(motion[0], motion[1])
         found = self._match_newest(chain, node, points, motion)
         odometry = sigma * chain.noise[[0, 0, 1]]
@@ -209,7 +212,6 @@ class SweepMap:
             odometry = np.maximum(odometry, [0.1 + 0.3 * path, 0.1 + 0.3 * path, _PREDICTED_TURN])
         self._graph.constraints.add_departure(begin, node, 0.0, motion, odometry)
         self._ways.add(begin, node, path if fits else 3.0 * path + _UNTIED_M)
-        self._points.set(node, points)
         chain.nodes.append(node)
         chain.path.append(chain.path[-1] + path)
         if fits:
@@ -221,11 +223,28 @@ class SweepMap:
 
         It is for robots of whose motion nothing is known.
         """
-        points, newest = points_of(stop), self._newest(self._chains[int(self._graph.robot[node])])
+        newest = self._newest(self._chains[int(self._graph.robot[node])])
+        points = _points_of(beams_of(stop))
         if newest is None or len(points) < _MIN_POINTS:
             return None
         found = match(newest, points, self._graph.states[node, :3], _ANYWHERE, _RIVAL)
         return found.pose if found.score > _GOOD and not found.rival else None
+
+    def drop(self, node: int) -> None:
+        """Take back a sweep."""
+        self.drawn.pop(node, None)
+        self._points.counts[node] = 0
+        self._ways.cut(node)
+        self.loops = [one for one in self.loops if node not in one[:2]]
+        for chain in self._chains.values():
+            chain.pending = [one for one in chain.pending if node not in one[:2]]
+
+    def _note(self, node: int, stop: ScanStop) -> FloatArray:
+        """Keep a sweep; returns its points (n, 2)."""
+        beams = self.drawn[node] = beams_of(stop)
+        points = _points_of(beams)
+        self._points.set(node, points)
+        return points
 
     def finish(self) -> None:
         """Solve all."""
@@ -413,12 +432,21 @@ def _square(tie: LoopTie, states: FloatArray) -> float:
     return float(np.square(tie.root @ off).sum())
 
 
-def points_of(stop: ScanStop) -> FloatArray:
-    """Points (n, 2) on walls of a sweep, in the frame of its robot, thinned [m]."""
-    distance = 1.0 / np.maximum(stop.inverse, 1.0 / (2.0 * _FAR))
+def beams_of(stop: ScanStop) -> DrawnSweep:
+    """The beams of a sweep, in the frame of its robot."""
+    every = slice(None, None, -(-len(stop.turn) // MAX_BEAMS) or 1)
+    met = stop.inverse > 0.0
+    distance = 1.0 / np.where(met, stop.inverse, 1.0 / stop.reach)
     angle = stop.bearing + stop.turn
     ends = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * distance[:, None]
-    points: FloatArray = thin(ends[distance < _FAR], _APART)
+    sigma = np.where(met, distance**2 * stop.sigma / np.sqrt(stop.weight), np.inf)
+    return DrawnSweep(ends[every].astype(np.float32), sigma[every].astype(np.float32))
+
+
+def _points_of(beams: DrawnSweep) -> FloatArray:
+    """Points (n, 2) on walls that beams met, thinned [m]."""
+    near = np.isfinite(beams.sigma) & (np.hypot(beams.ends[:, 0], beams.ends[:, 1]) < _FAR)
+    points: FloatArray = thin(beams.ends[near].astype(float), _APART)
     return points
 
 

@@ -141,6 +141,7 @@ def _wall_points(walls: FloatArray) -> FloatArray:
 
 
 _WIDTH_IN = 9.0
+_PIXELS = 1500  # Cells of a picture along a side from which some are left out
 
 
 def draw_map(
@@ -153,8 +154,9 @@ def draw_map(
     figure = Figure(figsize=(_WIDTH_IN, max(2.0, _WIDTH_IN * height / width)), dpi=150, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.add_subplot()
+    every = max(1, max(occupancy.log_odds.shape) // _PIXELS)
     extent = (low[0], high[0], low[1], high[1])
-    axes.imshow(occupancy.log_odds.T, origin="lower", extent=extent, cmap="gray_r", vmin=-5.0, vmax=5.0)
+    axes.imshow(occupancy.log_odds[::every, ::every].T, origin="lower", extent=extent, cmap="gray_r", vmin=-5.0, vmax=5.0)
     segments = [wall.reshape(2, 2) for wall in walls]
     axes.add_collection(LineCollection(segments, colors="C0", linewidths=1.0, alpha=0.7))
     axes.plot(stops[:, 0], stops[:, 1], ".", color="C3", markersize=3.0)
