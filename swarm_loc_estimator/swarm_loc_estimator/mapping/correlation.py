@@ -21,13 +21,14 @@ _CELL, _LEVELS = 0.05, 5  # Side of a cell [m], and number of sizes of blocks: 1
 _SPREAD, _SPREAD_CELLS = 0.08, 4  # Standard deviation of points of a wall [m], and up to where they count
 _PARTS = 4  # Parts of a cell along each side in which points are drawn alike
 _SEARCH_POINTS, _SHAPE_POINTS = 160, 80  # Number of points in searches and in covariances
-_INDEPENDENT = 30.0  # Points that count as independent, since neighbours share their errors
-_MAX_PENALTY = 4.0  # Loss of a pose that the prediction excludes, in log likelihood
-_SHAPE_CELLS, _SHAPE_TURNS, _SHAPE_TURN = 8, 5, 0.008
+_INDEPENDENT = 90.0  # Points that count as independent, since neighbours share their errors
+_MAX_PENALTY, _DISTINCT = 4.0, 30.0
+"""Loss of a pose that the prediction excludes, in log likelihood, and what that is of a score."""
+_SHAPE_CELLS, _SHAPE_TURNS, _SHAPE_TURN = 8, 5, 0.005
 """Lattice for covariances: cells and turns to each side, and step of the turns [rad]."""
 _RIDGE = 0.16  # Standard deviation on the lattice from which a direction is unknown [m]
 _UNKNOWN = 3.0  # Standard deviation of such a direction [m]
-_LEAST_VARIANCE = np.array([0.015, 0.015, 0.003]) ** 2  # [m, m, rad]
+_LEAST_VARIANCE = np.array([0.01, 0.01, 0.002]) ** 2  # [m, m, rad]
 _STEPS = 8  # Number of Gauss-Newton steps to a place between cells
 _APART_TURN = math.radians(12.0)  # Turn from which a pose is another place
 _APART = 0.5  # Distance from which it is one [m]
@@ -210,7 +211,7 @@ def _penalty(i: int, j: int, width: int, turn: float, sigmas: FloatArray) -> flo
     x = max(0, i, -(i + width - 1))
     y = max(0, j, -(j + width - 1))
     loss = 0.5 * ((x * x + y * y) / sigmas[0] ** 2 + (turn / sigmas[1]) ** 2)
-    return min(loss, _MAX_PENALTY) / _INDEPENDENT
+    return min(loss, _MAX_PENALTY) / _DISTINCT
 
 
 @cached_njit

@@ -81,6 +81,8 @@ _SWEEP_STEP, _SWEEP_TURN = 0.3, math.radians(20.0)
 """Motion by odometry after which the next sweep of a lidar is used: path [m], turn [rad]."""
 _SWEEP_DISTANCE_NOISE = 0.2
 """Error of paths between sweeps, per path: slip is the same in all, so they must not count as many."""
+_LOCATED_SIGMA = np.array([0.05, 0.05, 0.02])
+"""Standard deviations of a sweep that is located in the map without becoming part of it [m, m, rad]."""
 _UNKNOWN_MOTION = np.array([2.0, 2.0, 1.0])  # Deviations of a motion of which odometry says nothing [m, rad]
 _START_PARTS = (0.25 * math.pi, *(0.5 * math.pi * k for k in range(1, 9)))
 """Turns at which a first scan is split into parts, each a stop [rad]."""
@@ -116,6 +118,7 @@ class CooperativeMapper:
         self.sweeps = SweepMap(self.graph)
         self.counters = {"scans": 0, "scans_refused": 0, "loops_closed": 0, "odometry_restarts": 0}
         self.counters |= {"scans_not_located": 0, "places_taken_back": 0}
+        self.counters |= {"loops_taken_back": 0, "odometry_contradicted": 0}
         self._tracks: dict[int, Track] = {}
         self._lights = LightBook()
         self.background: OccupancyMap | None = None
@@ -437,21 +440,37 @@ class CooperativeMapper:
             return
         self.counters["scans"] += 1
         self._map = None
-        pose = track.prior if begin is None else self._driven(track, sweep.arrival)
+        pose, motion = track.prior, between(track.left, sweep.arrival)
+        if begin is not None:
+            pose = self._driven(track, sweep.arrival)
+            pose[2] -= graph.slip[robot] * motion[2]
+        if begin is not None and track.passes:
+            self.sweeps.drop(begin)
+            pose = self.sweeps.locate(sweep, pose, motion)
+            graph.reuse_stop(begin, pose, sweep.sigma, sweep.reach)
+            graph.constraints.add_prior(begin, pose, _LOCATED_SIGMA)
+            return
         node = track.node = graph.add_stop(robot, pose, sweep.sigma, sweep.reach)
+        track.passes = graph.count > self.settings.max_stops
         self.begin_ns[node] = int(sweep.stamp_ns[0])
         if begin is None:
             graph.constraints.add_prior(node, track.prior, track.prior_sigma)
             self.sweeps.begin(node, sweep)
         else:
-            motion = between(track.left, sweep.arrival)
             sigma = self._motion_sigma(track.path, abs(float(motion[2])))
             sigma[0] += _SWEEP_DISTANCE_NOISE * track.path
             sigma = _UNKNOWN_MOTION if jumps else sigma
             if not self.sweeps.add(begin, node, sweep, motion, sigma):
                 self.counters["scans_refused"] += 1
-        self.counters["loops_closed"] = len(self.sweeps.loops)
+        self._count_loops()
         self._check_place(robot, track, sweep)
+
+    def _count_loops(self) -> None:
+        """Count what has become of matches of sweeps."""
+        sweeps = self.sweeps
+        self.counters["loops_closed"] = len(sweeps.loops)
+        self.counters["loops_taken_back"] = sweeps.taken_back
+        self.counters["odometry_contradicted"] = len(sweeps.contradicted)
 
     def _replace(self, node: int, pose: FloatArray, motion_sigma: FloatArray, stop: ScanStop) -> int:
         """Replace a robot's newest stop by its next one, since the graph is full; returns its number."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import defaultdict
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -67,8 +66,10 @@ _TOGETHER, _SPAN, _MAX_GAP = 3, 1.0, 8.0
 _SOLVE, _SOLVE_SHARE = 9.0, 0.03
 """Squared residual of a tie, in variances, and share of the stops with new ties, from which all is solved."""
 _TORN = 25.0  # Squared residual of a tie, in variances, from which it contradicts
-_DOUBT_EVERY, _DOUBT_SHARE, _DOUBT_APART = 4, 0.6, 2.0
-"""Sweeps that are checked, share of the best score that they must have, and distance of places [m]."""
+_DOUBT_EVERY, _DOUBT_NEAR, _DOUBT_SHARE, _DOUBT_APART = 4, 1.0, 0.6, 2.0
+"""Sweeps that are checked, how near others are that see the same [m], share of the best score that they must
+have, and distance of places [m]."""
+_DOUBT_WINDOW = Window(1.0, math.radians(10.0), math.inf, math.inf)
 _UNTIED_M = 1.0  # Way that counts for a sweep that fits nothing [m], and three times its path
 
 
@@ -246,10 +247,40 @@ class SweepMap:
         self._points.set(node, points)
         return points
 
-    def finish(self) -> None:
-        """Solve all."""
-        if self._chains:
-            self._graph.solve(8)
+    def locate(self, stop: ScanStop, pose: FloatArray, motion: FloatArray) -> FloatArray:
+        """The pose (3,) of a sweep in the map, which stays as it is, near one by odometry after a motion (3,)."""
+        points = _points_of(beams_of(stop))
+        nodes = np.flatnonzero(self._points.counts[: self._graph.count])
+        if len(points) < _MIN_POINTS or not len(nodes):
+            return pose
+        off = self._middles(nodes) - transform_points(pose, np.median(points, axis=0))
+        nearest = int(nodes[np.argmin(np.hypot(off[:, 0], off[:, 1]))])
+        field = self._around(nearest, self._points.counts[: self._graph.count] > 0)
+        found = match(field, points, pose, _window(motion))
+        return found.pose if found.score >= _MIN_SCORE else pose
+
+    def doubts(self) -> FloatArray:
+        """Places (n, 2) in map where sweeps fit nothing, or fit others elsewhere better [m]."""
+        graph, count = self._graph, self._graph.count
+        nodes = np.flatnonzero(self._points.counts[:count] >= _MIN_POINTS)
+        places = [graph.states[one, :2] for one in self.refused if self._points.counts[one]]
+        middles = self._middles(nodes)
+        for node, middle in zip(nodes[::_DOUBT_EVERY].tolist(), middles[::_DOUBT_EVERY], strict=True):
+            is_other = self._points.counts[:count] >= _MIN_POINTS
+            is_other[max(0, node - _OLD) : node + _OLD] = False
+            away = np.where(is_other[nodes], np.hypot(*(middles - middle).T), np.inf)
+            if away.min(initial=np.inf) > _DOUBT_NEAR:
+                continue
+            pose, points = graph.states[node, :3].copy(), self._points.at(np.array([node]), np.zeros((1, 3)))
+            field = self._around(int(nodes[np.argmin(away)]), is_other)
+            here = score_at(field, points, pose)
+            if here < _GOOD and here < _DOUBT_SHARE * match(field, points, pose, _DOUBT_WINDOW).score:
+                places.append(pose[:2])
+        kept: list[FloatArray] = []
+        for place in places:
+            if all(math.dist(place, one) > _DOUBT_APART for one in kept):
+                kept.append(place)
+        return np.array(kept).reshape(-1, 2)
 
     def _points_at(self, nodes: list[int]) -> FloatArray:
         """Points (n, 2) of sweeps in map [m]."""
@@ -265,14 +296,7 @@ class SweepMap:
         newest = self._newest(chain)
         if len(points) < _MIN_POINTS or newest is None:
             return None
-        path, turn = math.hypot(motion[0], motion[1]), abs(float(motion[2]))
-        window = Window(
-            min(_REACH + _REACH_PER_M * path, _MAX_REACH),
-            min(_TURN + _TURN_SHARE * turn, _MAX_TURN),
-            _PREDICTED + _PREDICTED_PER_M * path,
-            _PREDICTED_TURN + 0.1 * turn,
-        )
-        found = match(newest, points, self._graph.states[node, :3], window)
+        found = match(newest, points, self._graph.states[node, :3], _window(motion))
         if found.score < _GOOD:
             anywhere = match(newest, points, self._graph.states[chain.nodes[-1], :3], _ANYWHERE, _RIVAL)
             if not anywhere.rival and anywhere.score > max(_GOOD, found.score + _BETTER):
@@ -304,7 +328,6 @@ class SweepMap:
         # the pose by both
         best = moved - given @ np.linalg.solve(given + covariance, off)
         graph.states[node, :3] = compose(before, best)
-        graph.states[node, 2] = before[2] + wrap_angle(best[2])
         graph.constraints.add_tie(begin, node, tied, root_of(covariance))
         return odometry
 
@@ -423,6 +446,17 @@ class SweepMap:
             self._graph.constraints.remove_tie(one.begin, one.end)
             self._ways.cut(one.begin, one.end)
             self.loops.remove(one)
+
+
+def _window(motion: FloatArray) -> Window:
+    """What is searched after a motion (3,) by odometry."""
+    path, turn = math.hypot(motion[0], motion[1]), abs(float(motion[2]))
+    return Window(
+        min(_REACH + _REACH_PER_M * path, _MAX_REACH),
+        min(_TURN + _TURN_SHARE * turn, _MAX_TURN),
+        _PREDICTED + _PREDICTED_PER_M * path,
+        _PREDICTED_TURN + 0.1 * turn,
+    )
 
 
 def _square(tie: LoopTie, states: FloatArray) -> float:
