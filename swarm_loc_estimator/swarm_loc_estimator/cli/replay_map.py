@@ -5,7 +5,8 @@
 
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The map goes
 to OUT/map.yaml and OUT/map.pgm, a picture of it to OUT/map.png, the robots' stops to OUT/stops.csv. The same
-bag gives the same files, byte for byte. --walls draws a floor plan below the map (x0,y0,x1,y1 [m] per line)
+bag gives the same files, byte for byte. Loops, refused scans, odometry that scans contradict, and places where
+the map is in doubt are printed. --walls draws a floor plan below the map (x0,y0,x1,y1 [m] per line)
 and prints the errors of the map's walls; with ground truth in the bag, the errors of the stops, too.
 """
 
@@ -14,7 +15,7 @@ from __future__ import annotations
 import argparse
 import csv
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +39,9 @@ from swarm_loc_estimator.mapping.messages import led_frequencies
 from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.offline.map_replay import draw_map, map_figures, replay_map, truth_of
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
+
+
+_CONTRADICTED = 0.02  # Share of contradicted stops from which odometry is named
 
 
 class WallsError(UserError):
@@ -73,9 +77,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     write_stops(mapper, name_of, options.out / "stops.csv")
     for reason, count in (feed.all_drops + feed.dropped_beams).items():
         print(f"dropped: {count} {reason}")
+    for sentence in findings(mapper, name_of):
+        print(sentence)
     print(figures or "nothing to compare with: no ground truth in the bag, no --walls")
     print(f"{mapper.graph.count} stops; map: {path}, {image}; picture: {picture}")
     return 0
+
+
+def findings(mapper: CooperativeMapper, name_of: Mapping[int, str]) -> Iterator[str]:
+    """Sentences on loops, refused scans, contradicted odometry, and places where the map is in doubt."""
+    counts, graph = mapper.counters, mapper.graph
+    loops = f"loops: {counts['loops_closed']} closed, {counts['loops_taken_back']} taken back"
+    yield f"{loops}; scans refused: {counts['scans_refused']} of {counts['scans']}"
+    contradicted = np.array(mapper.sweeps.contradicted, dtype=int)
+    for number, name in name_of.items():
+        mine = contradicted[graph.robot[contradicted] == number]
+        count = int((graph.robot[: graph.count] == number).sum())
+        if len(mine) > _CONTRADICTED * count:
+            x, y = graph.states[mine[0], :2]
+            what = f"scans contradict its odometry at {len(mine)} of {count} stops"
+            yield f"{name}: {what}, first at x {x:.1f} m, y {y:.1f} m"
+    for x, y in mapper.sweeps.doubts():
+        yield f"the map is in doubt near x {x:.1f} m, y {y:.1f} m: scans do not agree there"
 
 
 def read_walls(path: Path) -> FloatArray:
@@ -96,13 +119,13 @@ def read_walls(path: Path) -> FloatArray:
 
 
 def write_stops(mapper: CooperativeMapper, name_of: Mapping[int, str], path: Path) -> None:
-    """Write the stops of the robots: robot, x, y, theta on arrival."""
+    """Write the stops of the robots: robot, time, x, y, theta on arrival."""
     robots = mapper.graph.robot[: mapper.graph.count].tolist()
     with replacing(path) as part, part.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow(["robot", "x_m", "y_m", "theta_rad"])
-        for robot, pose in zip(robots, mapper.graph.poses.tolist(), strict=True):
-            writer.writerow([name_of[robot], *pose])
+        writer.writerow(["robot", "stamp_ns", "x_m", "y_m", "theta_rad"])
+        for stop, (robot, pose) in enumerate(zip(robots, mapper.graph.poses.tolist(), strict=True)):
+            writer.writerow([name_of[robot], mapper.begin_ns.get(stop, ""), *pose])
 
 
 def _parser() -> argparse.ArgumentParser:

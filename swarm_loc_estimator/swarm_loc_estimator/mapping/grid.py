@@ -72,7 +72,9 @@ class DrawnSweep(NamedTuple):
 
 
 @cached_njit
-def draw_sweep(log_odds: FloatArray, corner: FloatArray, cell: float, pose: FloatArray, sweep: DrawnSweep) -> None:
+def draw_sweep(
+    log_odds: FloatArray, corner: FloatArray, cell: float, pose: FloatArray, sweep: DrawnSweep
+) -> None:
     """Add the evidence of a sweep to a grid, see `draw_stop`."""
     x, y = (pose[0] - corner[0]) / cell, (pose[1] - corner[1]) / cell
     for k in range(len(sweep.sigma)):

@@ -434,7 +434,7 @@ class CooperativeMapper:
 
     def _enter_sweep(self, robot: int, track: Track, sweep: ScanStop, *, jumps: bool) -> None:
         """Add a sweep of a lidar as a node, and match it; `jumps`: its odometry says nothing."""
-        graph, begin = self.graph, track.node
+        graph, begin, loops = self.graph, track.node, len(self.sweeps.loops)
         if begin is None and not self._is_found(robot, track, sweep):
             self.counters["scans_not_located"] += 1
             return
@@ -462,15 +462,10 @@ class CooperativeMapper:
             sigma = _UNKNOWN_MOTION if jumps else sigma
             if not self.sweeps.add(begin, node, sweep, motion, sigma):
                 self.counters["scans_refused"] += 1
-        self._count_loops()
+        self.counters["loops_closed"] += len(self.sweeps.loops) - loops
+        self.counters["loops_taken_back"] = self.sweeps.taken_back
+        self.counters["odometry_contradicted"] = len(self.sweeps.contradicted)
         self._check_place(robot, track, sweep)
-
-    def _count_loops(self) -> None:
-        """Count what has become of matches of sweeps."""
-        sweeps = self.sweeps
-        self.counters["loops_closed"] = len(sweeps.loops)
-        self.counters["loops_taken_back"] = sweeps.taken_back
-        self.counters["odometry_contradicted"] = len(sweeps.contradicted)
 
     def _replace(self, node: int, pose: FloatArray, motion_sigma: FloatArray, stop: ScanStop) -> int:
         """Replace a robot's newest stop by its next one, since the graph is full; returns its number."""

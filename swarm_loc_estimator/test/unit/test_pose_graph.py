@@ -24,7 +24,7 @@ def kinds(rng: np.random.Generator) -> dict[str, Callable[[FloatArray, FloatArra
     motion, turn = rng.normal(0.0, 0.6, (3, 3)), rng.normal(0.0, 2.0, 3)
     sigma, robot = rng.uniform(0.01, 0.2, (3, 3)), np.array([0, 0, 1, 1])
     departures = pose_graph.Departures(FIRST, SECOND, turn, motion, sigma)
-    ties = pose_graph.Ties(FIRST, SECOND, motion, sigma)
+    ties = pose_graph.Ties(FIRST, SECOND, motion, rng.normal(0.0, 20.0, (3, 3, 3)))
     bearings = pose_graph.Bearings(FIRST, SECOND, turn, motion[:, 2], sigma[:, 0])
     return {
         "odometry": lambda s, _: pose_graph.odometry(s, departures),

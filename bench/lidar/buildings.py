@@ -1,0 +1,121 @@
+"""Maps of real buildings by raw wheel odometry and scans, against the path that gmapping found.
+
+    python -m bench.lidar.buildings freiburg-101 acapulco
+
+That path is no independent truth, but its maps are consistent. Each building is mapped in a process of its own,
+so that its memory can be told.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import resource
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+from bench.lidar.radish import BUILDINGS, NAME, reference, write_bag
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.bags.reader import BagReader
+from swarm_loc_estimator.common.se2 import between, rigid_fit, transform_points
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+
+_BEGIN_S = 160.0  # Of freiburg-079, of which the odometry contradicts the scans, the begin is measured, too
+_WRONG_M, _WRONG_TURN = (
+    1.0,
+    math.radians(15.0),
+)  # Difference of a tie from the reference from which it is wrong
+_SAME_S = 0.01
+_WARM = 10  # Scans before the first that count for the cost, while code is loaded
+
+
+def figures(buildings: Sequence[str] = BUILDINGS) -> dict[str, dict[str, float]]:
+    """Building -> path_rms_m, wrong_loops, cpu_ms_per_scan, last_over_first, memory_mb and others."""
+    found = {}
+    for building in buildings:
+        command = [sys.executable, "-m", "bench.lidar.buildings", "--one", building]
+        lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout  # noqa: S603
+        found[building.replace("-", "")] = json.loads(lines)
+    return found
+
+
+def mapped(building: str, until_s: float = math.inf) -> tuple[CooperativeMapper, FloatArray]:
+    """Map a building; returns the mapper and the CPU time of each scan (n,) [s]."""
+    with TemporaryDirectory() as folder:
+        bag = Path(folder, "bag")
+        write_bag(building, bag, until_s)
+        mapper = CooperativeMapper()
+        feed = MapperFeed(load_swarm(bag / "swarm.yaml").robots, mapper, {})
+        kinds = {f"{NAME}/{kind.topic}": kind for kind in (MapperInput.ODOMETRY, MapperInput.SCAN)}
+        cpu, begin = [], time.process_time()
+        with BagReader(bag) as reader:
+            for topic, _, _, data in reader.messages(kinds):
+                feed.add(0, kinds[topic], data)
+                if kinds[topic] is MapperInput.SCAN:
+                    now = time.process_time()
+                    cpu.append(now - begin)
+                    begin = now
+    mapper.finish()
+    return mapper, np.array(cpu)
+
+
+def path_rms(mapper: CooperativeMapper, building: str) -> float:
+    """RMS distance of the stops from the reference after a rigid fit [m]."""
+    at, known = _at_stops(mapper, reference(building))
+    path, truth = mapper.graph.poses[known, :2], reference(building)[at[known], 1:3]
+    off = transform_points(rigid_fit(path, truth), path) - truth
+    return float(np.sqrt(np.square(off).sum(axis=1).mean()))
+
+
+def wrong_loops(mapper: CooperativeMapper, building: str) -> int:
+    """Number of ties of loops that the reference contradicts."""
+    path = reference(building)
+    at, _ = _at_stops(mapper, path)
+    count = 0
+    for tie in mapper.sweeps.loops:
+        x, y, turn = between(between(path[at[tie.begin], 1:], path[at[tie.end], 1:]), tie.pose)
+        count += math.hypot(x, y) > _WRONG_M or abs(turn) > _WRONG_TURN
+    return count
+
+
+def _at_stops(mapper: CooperativeMapper, path: FloatArray) -> tuple[IntArray, BoolArray]:
+    """Rows (k,) of a path at the stops, and whether there are such rows."""
+    stamp_s = np.array([mapper.begin_ns[stop] for stop in range(mapper.graph.count)]) * 1e-9
+    after = np.clip(np.searchsorted(path[:, 0], stamp_s), 1, len(path) - 1)
+    at = np.where(stamp_s - path[after - 1, 0] < path[after, 0] - stamp_s, after - 1, after)
+    return at, np.abs(path[at, 0] - stamp_s) < _SAME_S
+
+
+def _figures_of(building: str) -> dict[str, float]:
+    mapper, cpu = mapped(building)
+    tenth = len(cpu) // 10
+    found = {
+        "path_rms_m": path_rms(mapper, building),
+        "wrong_loops": float(wrong_loops(mapper, building)),
+        "loops": float(mapper.counters["loops_closed"]),
+        "doubts": float(len(mapper.sweeps.doubts())),
+        "contradicted": float(mapper.counters["odometry_contradicted"]),
+        "cpu_ms_per_scan": 1e3 * float(cpu[_WARM:].mean()),
+        "last_over_first": float(cpu[-tenth:].mean() / cpu[_WARM : _WARM + tenth].mean()),
+        "map_cells": float(mapper.occupancy().log_odds.size),
+        "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+    }
+    if building == "freiburg-079":
+        found["begin_rms_m"] = path_rms(mapped(building, _BEGIN_S)[0], building)
+    return found
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--one"]:
+        print(json.dumps(_figures_of(sys.argv[2])))
+    else:
+        for name, row in figures(sys.argv[1:] or BUILDINGS).items():
+            print(name, {key: round(value, 3) for key, value in row.items()})
