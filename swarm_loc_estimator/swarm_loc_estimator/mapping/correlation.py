@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 
-_CELL, _LEVELS = 0.05, 5  # Side of a cell [m], and number of sizes of blocks: 1 to 16 cells
+_CELL, _LEVELS = 0.05, 6  # Side of a cell [m], and number of sizes of blocks: 1 to 32 cells
 _SPREAD, _SPREAD_CELLS = 0.08, 4  # Standard deviation of points of a wall [m], and up to where they count
 _PARTS = 4  # Parts of a cell along each side in which points are drawn alike
 _SEARCH_POINTS, _SHAPE_POINTS = 160, 80  # Number of points in searches and in covariances
@@ -93,14 +93,21 @@ def field_of(points: FloatArray) -> Field:
     corner = np.floor((points.min(axis=0) - pad) / _CELL) * _CELL
     high = points.max(axis=0) + (_SPREAD_CELLS + 2) * _CELL
     nx, ny = np.ceil((high - corner) / _CELL).astype(int)
-    return Field(corner, _draw((points - corner) / _CELL, int(nx), int(ny)))
+    levels = np.empty((_LEVELS, int(nx), int(ny)), dtype=np.uint8)
+    levels[0] = _draw((points - corner) / _CELL, int(nx), int(ny))
+    for level in range(1, _LEVELS):
+        step, below, here = 1 << (level - 1), levels[level - 1], levels[level]
+        here[:] = below
+        np.maximum(below[:-step], below[step:], out=here[:-step])
+        wide = here.copy()
+        np.maximum(wide[:, :-step], wide[:, step:], out=here[:, :-step])
+    return Field(corner, levels)
 
 
 @cached_njit
 def _draw(cells: FloatArray, nx: int, ny: int) -> NDArray[np.uint8]:
-    """The levels of a field of points (n, 2) [cells]."""
-    levels = np.zeros((_LEVELS, nx, ny), dtype=np.uint8)
-    first = levels[0]
+    """The finest level of a field of points (n, 2) [cells]."""
+    first = np.zeros((nx, ny), dtype=np.uint8)
     # each part of a cell has its own pattern, and is drawn once
     width = 2 * _SPREAD_CELLS + 1
     patterns = np.zeros((_PARTS * _PARTS, width, width), dtype=np.uint8)
@@ -122,18 +129,7 @@ def _draw(cells: FloatArray, nx: int, ny: int) -> NDArray[np.uint8]:
             row = first[i - _SPREAD_CELLS + a]
             for b in range(width):
                 row[j - _SPREAD_CELLS + b] = max(row[j - _SPREAD_CELLS + b], patterns[part, a, b])
-    for level in range(1, _LEVELS):
-        step = 1 << (level - 1)
-        below, here = levels[level - 1], levels[level]
-        for i in range(nx):
-            other = min(i + step, nx - 1)
-            for j in range(ny - step):
-                here[i, j] = max(
-                    max(below[i, j], below[i, j + step]), max(below[other, j], below[other, j + step])
-                )
-            for j in range(max(0, ny - step), ny):
-                here[i, j] = max(below[i, j], below[other, j])
-    return levels
+    return first
 
 
 def match(field: Field, points: FloatArray, pose: FloatArray, window: Window, rival: float = 0.0) -> Match:

@@ -33,7 +33,7 @@ from swarm_loc_estimator.mapping.pose_graph import PoseGraph
 from swarm_loc_estimator.mapping.scans import MAX_BEAMS, ScanStop
 
 # The constants were chosen on freiburg-101 and acapulco; `make bench-lidar` runs two others, too.
-_APART, _FAR, _MIN_POINTS = 0.08, 25.0, 20
+_APART, _FAR, _MIN_POINTS = 0.08, 18.0, 20
 """Distance of points of a sweep [m], up to which distance they are matched [m], and their least number."""
 _RECENT, _RECENT_PATH = 15, 10.0  # Newest sweeps that the next one is matched with: number, path [m]
 _REACH, _REACH_PER_M, _MAX_REACH = 0.35, 1.2, 2.0
