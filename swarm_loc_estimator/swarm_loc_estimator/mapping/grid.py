@@ -155,7 +155,7 @@ def draw_map(
     Args:
         scans: All stops.
         count: Number of stops to draw.
-        max_cells: Maximum number of cells; a larger map is cropped around its centre.
+        max_cells: Maximum number of cells; a larger map has larger cells. With a background it is cropped.
         background: A map with the same cell size, drawn below the stops.
         without: Stops that are not drawn.
         sweeps: Stops that are sweeps of lidars.
@@ -171,17 +171,20 @@ def draw_map(
             points.append(scans.states[stop, :2] + np.array([[-reach], [reach]]))
     if background is not None:
         points.append(background.corner + CELL * np.array([(0, 0), background.log_odds.shape]))
-    corner, shape = grid_around(np.concatenate(points), CELL, max_cells)
+    cell, places = CELL, np.concatenate(points)
+    while background is None and np.ptp(places / cell, axis=0).prod() > max_cells:
+        cell *= 2.0
+    corner, shape = grid_around(places, cell, max_cells)
     log_odds = np.zeros(shape)
     if background is not None:
         _lay_below(log_odds, corner, background)
     for stop in shown:
         pose = scans.states[stop, :3]
         if stop in sweeps:
-            draw_sweep(log_odds, corner, CELL, pose, sweeps[stop])
+            draw_sweep(log_odds, corner, cell, pose, sweeps[stop])
         else:
-            draw_stop(log_odds, corner, CELL, pose, stop, scans.lines, scans.beams.free[stop])
-    return OccupancyMap(corner, CELL, np.clip(log_odds, -LOG_ODDS_CAP, LOG_ODDS_CAP, out=log_odds))
+            draw_stop(log_odds, corner, cell, pose, stop, scans.lines, scans.beams.free[stop])
+    return OccupancyMap(corner, cell, np.clip(log_odds, -LOG_ODDS_CAP, LOG_ODDS_CAP, out=log_odds))
 
 
 def _lay_below(log_odds: FloatArray, corner: FloatArray, background: OccupancyMap) -> None:
@@ -233,7 +236,7 @@ class VisitationMap:
         """Counts (nx, ny) on the cells of an occupancy map."""
         counts = np.zeros(occupancy.log_odds.shape, dtype=np.int64)
         if self._visits:
-            cells = np.array(list(self._visits)) - np.round(occupancy.corner / CELL).astype(int)
+            cells = occupancy.index((np.array(list(self._visits)) + 0.5) * CELL)
             inside = ((cells >= 0) & (cells < counts.shape)).all(axis=1)
-            counts[tuple(cells[inside].T)] = np.array(list(self._visits.values()))[inside]
+            np.add.at(counts, tuple(cells[inside].T), np.array(list(self._visits.values()))[inside])
         return counts

@@ -48,6 +48,7 @@ _MIN_SCORE = 0.30  # Least score of a sweep among the newest ones
 _CONTRADICTS = 16.0  # Squared difference of match and odometry, in variances, from which they contradict
 _MEMORY, _MAX_SQUARE = 0.05, 400.0  # Weight of a new difference in the noise of odometry, and its maximum
 _KNOWN = 0.3  # Greatest deviation of a match from which that noise is learned [m]
+_LOOK_EVERY = 0.5  # Path after which old sweeps are looked for again [m]
 _OLD = 20  # Sweeps of the same robot in between from which one is old
 _NEAR, _REFERENCE, _REFERENCE_WAY = 3.0, 20, 5.0
 """Distance of old sweeps that are matched [m], their number, and greatest way between them [m]."""
@@ -90,6 +91,7 @@ class Chain:
     nodes: list[int] = field(default_factory=list)
     path: list[float] = field(default_factory=list)  # Driven until each [m]
     noise: FloatArray = field(default_factory=lambda: np.ones(2))  # Of paths and turns, over the described
+    looked: float = 0.0  # Driven until old ones were looked for [m]
     pending: list[LoopTie] = field(default_factory=list)  # That are not believed yet
 
     def newest(self, count: int, path: float) -> list[int]:
@@ -215,7 +217,8 @@ class SweepMap:
         self._ways.add(begin, node, path if fits else 3.0 * path + _UNTIED_M)
         chain.nodes.append(node)
         chain.path.append(chain.path[-1] + path)
-        if fits:
+        if fits and chain.path[-1] - chain.looked > _LOOK_EVERY:
+            chain.looked = chain.path[-1]
             self._close_loops(chain, node)
         return fits
 
