@@ -2,8 +2,8 @@
 
     python -m bench.lidar.buildings freiburg-101 acapulco
 
-That path is no independent truth, but its maps are consistent. Each building is mapped in a process of its own,
-so that its memory can be told.
+That path is no independent truth, but its maps are consistent. Each building is mapped in a process of its
+own, whose memory is measured.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def figures(buildings: Sequence[str] = BUILDINGS) -> dict[str, dict[str, float]]
     found = {}
     for building in buildings:
         command = [sys.executable, "-m", "bench.lidar.buildings", "--one", building]
-        lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout  # noqa: S603
+        lines = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         found[building.replace("-", "")] = json.loads(lines)
     return found
 

@@ -5,8 +5,8 @@
 
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The map goes
 to OUT/map.yaml and OUT/map.pgm, a picture of it to OUT/map.png, the robots' stops to OUT/stops.csv. The same
-bag gives the same files, byte for byte. Loops, refused scans, odometry that scans contradict, and places where
-the map is in doubt are printed. --walls draws a floor plan below the map (x0,y0,x1,y1 [m] per line)
+bag gives the same files, byte for byte. Loops, refused scans, odometry that scans contradict, and places
+where the map is in doubt are printed. --walls draws a floor plan below the map (x0,y0,x1,y1 [m] per line)
 and prints the errors of the map's walls; with ground truth in the bag, the errors of the stops, too.
 """
 
@@ -39,7 +39,6 @@ from swarm_loc_estimator.mapping.messages import led_frequencies
 from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.offline.map_replay import draw_map, map_figures, replay_map, truth_of
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-
 
 _CONTRADICTED = 0.02  # Share of contradicted stops from which odometry is named
 

@@ -34,7 +34,7 @@ _APART_TURN = math.radians(12.0)  # Turn from which a pose is another place
 _APART = 0.5  # Distance from which it is one [m]
 
 
-class Field(NamedTuple):
+class PointField(NamedTuple):
     """How well points fit places."""
 
     corner: FloatArray  # (2,) of the first cell [m]
@@ -42,7 +42,7 @@ class Field(NamedTuple):
     levels: NDArray[np.uint8]
 
 
-class Window(NamedTuple):
+class PoseWindow(NamedTuple):
     """Poses that are searched, around a predicted one."""
 
     reach: float  # Greatest offset along x and y [m]
@@ -51,7 +51,7 @@ class Window(NamedTuple):
     turn_sigma: float  # and of its heading [rad]
 
 
-class Match(NamedTuple):
+class BestPose(NamedTuple):
     """The best pose in a window."""
 
     pose: FloatArray  # (3,)
@@ -87,7 +87,7 @@ def gather(points: FloatArray, first: IntArray, counts: IntArray, poses: FloatAr
     return moved
 
 
-def field_of(points: FloatArray) -> Field:
+def field_of(points: FloatArray) -> PointField:
     """The field of points (n, 2), at least one [m]."""
     pad = (_SPREAD_CELLS + 1 + (1 << (_LEVELS - 1))) * _CELL  # blocks may begin before the first cell
     corner = np.floor((points.min(axis=0) - pad) / _CELL) * _CELL
@@ -101,7 +101,7 @@ def field_of(points: FloatArray) -> Field:
         np.maximum(below[:-step], below[step:], out=here[:-step])
         wide = here.copy()
         np.maximum(wide[:, :-step], wide[:, step:], out=here[:, :-step])
-    return Field(corner, levels)
+    return PointField(corner, levels)
 
 
 @cached_njit
@@ -132,7 +132,9 @@ def _draw(cells: FloatArray, nx: int, ny: int) -> NDArray[np.uint8]:
     return first
 
 
-def match(field: Field, points: FloatArray, pose: FloatArray, window: Window, rival: float = 0.0) -> Match:
+def match(
+    field: PointField, points: FloatArray, pose: FloatArray, window: PoseWindow, rival: float = 0.0
+) -> BestPose:
     """Find where points (n, 2) in the frame of a robot fit best around a predicted pose (3,).
 
     Args:
@@ -159,11 +161,11 @@ def match(field: Field, points: FloatArray, pose: FloatArray, window: Window, ri
     found, score = _climb(field.levels[0], cells, centre + place)
     covariance = _shape(field.levels[0], cells[:: -(-len(cells) // _SHAPE_POINTS)], found)
     found[:2] = found[:2] * _CELL + field.corner
-    return Match(found, covariance, score, other)
+    return BestPose(found, covariance, score, other)
 
 
 @cached_njit
-def score_at(field: Field, points: FloatArray, pose: FloatArray) -> float:
+def score_at(field: PointField, points: FloatArray, pose: FloatArray) -> float:
     """Mean value of the field, 0 to 1, at points (n, 2) in the frame of a robot at a pose (3,)."""
     cos, sin, total = math.cos(pose[2]), math.sin(pose[2]), 0.0
     first = field.levels[0]
@@ -207,7 +209,7 @@ def _penalty(i: int, j: int, width: int, turn: float, sigmas: FloatArray) -> flo
     x = max(0, i, -(i + width - 1))
     y = max(0, j, -(j + width - 1))
     loss = 0.5 * ((x * x + y * y) / sigmas[0] ** 2 + (turn / sigmas[1]) ** 2)
-    return min(loss, _MAX_PENALTY) / _DISTINCT
+    return float(min(loss, _MAX_PENALTY) / _DISTINCT)
 
 
 @cached_njit
@@ -368,5 +370,5 @@ def precompile() -> None:
     """Compile what matching needs."""
     points: FloatArray = thin(np.array([[1.0, 0.0], [1.0, 0.5]]), 0.1)
     field = field_of(points)
-    match(field, points, np.zeros(3), Window(0.1, 0.1, 1.0, 1.0), 0.5)
+    match(field, points, np.zeros(3), PoseWindow(0.1, 0.1, 1.0, 1.0), 0.5)
     score_at(field, points, np.zeros(3))

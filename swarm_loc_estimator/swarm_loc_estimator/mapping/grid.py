@@ -20,6 +20,7 @@ from swarm_loc_estimator.mapping.scans import BINS, LINE, POINT, UNKNOWN, Lines
 
 _FREE_STEP, _HIT_STEP = 0.25, 0.9  # Change of the log odds of a cell by one ray
 _POINT_HIT = 0.25  # Share of `_HIT_STEP` for a reflection without a fitted line
+_FREE_RANGE_SHARE = 0.76  # Share of the range of a laser pointer that counts as free without a reflection
 _UNMET = 0.25  # Share of `_FREE_STEP` for a beam of a lidar that met nothing
 _SHARP_M = 0.03  # Standard deviation of a wall above which the increase of the log odds is reduced
 
@@ -172,7 +173,7 @@ def draw_map(
     if background is not None:
         points.append(background.corner + CELL * np.array([(0, 0), background.log_odds.shape]))
     cell, places = CELL, np.concatenate(points)
-    while background is None and np.ptp(places / cell, axis=0).prod() > max_cells:
+    while background is None and count and np.ptp(places / cell, axis=0).prod() > max_cells:
         cell *= 2.0
     corner, shape = grid_around(places, cell, max_cells)
     log_odds = np.zeros(shape)
@@ -183,7 +184,9 @@ def draw_map(
         if stop in sweeps:
             draw_sweep(log_odds, corner, cell, pose, sweeps[stop])
         else:
-            draw_stop(log_odds, corner, cell, pose, stop, scans.lines, scans.beams.free[stop])
+            draw_stop(
+                log_odds, corner, cell, pose, stop, scans.lines, _FREE_RANGE_SHARE * scans.beams.reach[stop]
+            )
     return OccupancyMap(corner, cell, np.clip(log_odds, -LOG_ODDS_CAP, LOG_ODDS_CAP, out=log_odds))
 
 

@@ -177,8 +177,6 @@ _MIN_FIT, _MAX_SIGMA, _MAX_SIGMAS = 0.5, 0.03, 4.0
 _TIE_ROOT = np.diag([1.0 / 0.03, 1.0 / 0.03, 1.0 / 0.012])
 _LOOP_TARGETS, _MIN_LOOP_OVERLAP = 9, 0.2
 _LOOP_GATE = 0.05  # Maximum distance of a matched beam from its line [m]
-_SWEEP_HOPS = 6
-"""Matches in a row that connect two sweeps, which are closer together than stops of laser pointers."""
 
 
 def close_loop(graph: PoseGraph, stop: int) -> bool:
@@ -240,8 +238,7 @@ def refine(graph: PoseGraph, stop: int, against: list[int]) -> bool:
 def _unconnected(graph: PoseGraph, stop: int) -> list[int]:
     """Old stops nearby, nearest first, that are connected with this stop only over many others."""
     connected = {stop, *graph.targets.get(stop, ())}
-    for _ in range(_SWEEP_HOPS if graph.is_sweep(stop) else 1):
-        connected = connected.union(*(graph.targets.get(one, ()) for one in connected))
+    connected = connected.union(*(graph.targets.get(one, ()) for one in connected))
     away, robot = graph.distances(stop), graph.robot
     return [
         int(one)

@@ -40,8 +40,8 @@ from swarm_loc_estimator.mapping.scans import (
     ScanStop,
     turn_ratio,
 )
-from swarm_loc_estimator.mapping.sweep_map import SweepMap
 from swarm_loc_estimator.mapping.settings import MapperSettings
+from swarm_loc_estimator.mapping.sweep_map import SweepMap
 
 
 class Located(NamedTuple):
@@ -126,7 +126,10 @@ class CooperativeMapper:
         self._map: OccupancyMap | None = None
 
     def join(self, pose: FloatArray, sigma: FloatArray) -> int:
-        """Add a robot with a start pose (3,) in map and standard deviations (3,); returns its number."""
+        """Add a robot with a start pose (3,) in map and standard deviations (3,); returns its number.
+
+        Where these are infinite, a robot with a lidar is located by its scans in the map of others.
+        """
         robot = self.graph.add_robot()
         self._tracks[robot] = Track(np.asarray(pose, dtype=float), np.asarray(sigma, dtype=float))
         return robot
@@ -178,7 +181,7 @@ class CooperativeMapper:
         self.graph.known_slips.add(robot)  # no turn by odometry is in a sweep
         self._enter_sweep(robot, track, sweep, jumps=jumps)
         track.left, track.path = sweep.arrival, 0.0
-        if track.node is not None:
+        if track.node is not None and not self.sweeps.floats(robot):
             track.located = Located(track.last_ns, self.graph.poses[track.node].copy())
 
     def _restart_track(self, robot: int, track: Track, stamp_ns: int) -> None:
@@ -266,9 +269,9 @@ class CooperativeMapper:
         self._lights.add(robot, sightings)
 
     def pose(self, robot: int) -> FloatArray | None:
-        """The pose (3,) of a robot in map at its newest reading; None before its first scan."""
+        """The pose (3,) of a robot in map at its newest reading; None before it is located."""
         track = self._tracks[robot]
-        if track.node is None or track.last is None:
+        if track.node is None or track.last is None or self.sweeps.floats(robot):
             return None
         if track.is_known and track.stop is not None:
             x, y, theta, ratio = self.graph.states[track.node]
@@ -304,7 +307,8 @@ class CooperativeMapper:
         if self._map is None:
             limit = self.settings.max_cells
             graph, sweeps = self.graph, self.sweeps.drawn
-            self._map = draw_map(graph.scans, graph.count, limit, self.background, (), sweeps)
+            floating = np.flatnonzero(self.sweeps.floating()).tolist()
+            self._map = draw_map(graph.scans, graph.count, limit, self.background, floating, sweeps)
         return self._map
 
     def finish(self) -> None:
@@ -412,14 +416,12 @@ class CooperativeMapper:
             return
         motion = between(track.left, stop.arrival)
         sigma = self._motion_sigma(track.path, abs(float(motion[2])))
-        if stop.reach:
-            sigma[0] += _SWEEP_DISTANCE_NOISE * track.path
         pose = self._driven(track, stop.arrival)
         begin = track.node
         if track.passes:
             node = self._replace(track.node, pose, sigma, stop)
         else:
-            node = self.graph.add_stop(robot, pose, stop.sigma, stop.reach)
+            node = self.graph.add_stop(robot, pose, stop.sigma)
             self.graph.constraints.add_departure(begin, node, self.graph.turned[begin], motion, sigma)
         self.begin_ns[node] = int(stop.stamp_ns[0])
         self.graph.set_scan(node, stop.scan(0, count))
@@ -447,15 +449,15 @@ class CooperativeMapper:
         if begin is not None and track.passes:
             self.sweeps.drop(begin)
             pose = self.sweeps.locate(sweep, pose, motion)
-            graph.reuse_stop(begin, pose, sweep.sigma, sweep.reach)
+            graph.reuse_stop(begin, pose, sweep.sigma)
             graph.constraints.add_prior(begin, pose, _LOCATED_SIGMA)
             return
-        node = track.node = graph.add_stop(robot, pose, sweep.sigma, sweep.reach)
+        node = track.node = graph.add_stop(robot, pose, sweep.sigma)
         track.passes = graph.count > self.settings.max_stops
         self.begin_ns[node] = int(sweep.stamp_ns[0])
         if begin is None:
-            graph.constraints.add_prior(node, track.prior, track.prior_sigma)
-            self.sweeps.begin(node, sweep)
+            graph.constraints.add_prior(node, track.prior, np.minimum(track.prior_sigma, 1.0))
+            self.sweeps.begin(node, sweep, floats=not np.isfinite(track.prior_sigma).all())
         else:
             sigma = self._motion_sigma(track.path, abs(float(motion[2])))
             sigma[0] += _SWEEP_DISTANCE_NOISE * track.path
@@ -471,7 +473,7 @@ class CooperativeMapper:
         """Replace a robot's newest stop by its next one, since the graph is full; returns its number."""
         known = np.sqrt(np.maximum(np.diag(self.graph.covariance(node)), 0.0))
         self._lights.forget_node(node)
-        self.graph.reuse_stop(node, pose, stop.sigma, stop.reach)
+        self.graph.reuse_stop(node, pose, stop.sigma)
         drive = np.array([*np.full(2, motion_sigma[:2].max()), motion_sigma[2]])
         self.graph.constraints.add_prior(node, pose, np.hypot(known, drive))
         return node
@@ -501,7 +503,7 @@ class CooperativeMapper:
         nodes: list[int] = []
         pose = track.prior
         for first, last in pairwise(bounds):
-            node = self.graph.add_stop(robot, pose, stop.sigma, stop.reach)
+            node = self.graph.add_stop(robot, pose, stop.sigma)
             self.graph.set_scan(node, stop.scan(first, last))
             if nodes:
                 turned = self.graph.turned[nodes[-1]]

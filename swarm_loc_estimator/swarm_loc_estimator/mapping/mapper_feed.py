@@ -241,11 +241,11 @@ class MapperFeed:
     def __init__(
         self, robots: Sequence[Robot], mapper: CooperativeMapper, frequencies: Mapping[str, float]
     ) -> None:
-        unknown = [robot.name for robot in robots if robot.start is None]
+        unknown = [robot.name for robot in robots if robot.start is None and not robot.lidar.is_used]
         if len(unknown) > (len(robots) == 1):
             raise MapperInputError(
                 f"robot '{unknown[-1]}' has no start in the swarm description: where several robots map, all"
-                " must have one."
+                " without a lidar must have one."
             )
         self.drops: Counter[str] = Counter()
         self.received: Counter[tuple[int, MapperInput]] = Counter()
@@ -311,7 +311,9 @@ class MapperFeed:
             start, sigma = described.start, described.start_sigma
             since: FloatArray = between(self._begin[robot], odometry)
             pose: FloatArray = since if start is None else compose(np.array(start), since)
-            known = ORIGIN_SIGMA if start is None else np.array([sigma.x, sigma.y, sigma.theta])
+            known = np.array([sigma.x, sigma.y, sigma.theta])
+            if start is None:  # the first one begins the map, and is looked for in no other
+                known = np.full(3, np.inf) if self._number else ORIGIN_SIGMA
             self._number[robot] = self._mapper.join(pose, np.maximum(known, ORIGIN_SIGMA))
         return self._number[robot]
 

@@ -57,7 +57,7 @@ def beam_residual(
     """
     states, lines = scans.states, scans.lines
     measured = scans.beams.inverse[k, i]
-    angle = states[k, 2] + scans.beams.bearing[k, i] + states[k, 3] * scans.beams.turn[k, i]
+    angle = states[k, 2] + states[k, 3] * scans.beams.turn[k, i]
     ux, uy = math.cos(angle), math.sin(angle)
     dx, dy = states[k, 0] - states[j, 0], states[k, 1] - states[j, 1]
     cos, sin = math.cos(states[j, 2]), math.sin(states[j, 2])
@@ -78,8 +78,7 @@ def beam_residual(
         return UNUSABLE, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     per_metre = predicted / distance
     line_sigma = math.sqrt(lines.variance[j, m]) * lines.distance[j, m] / size  # of its distance [m]
-    noise = sigma**2 / scans.beams.weight[k, i]
-    variance = noise + (per_metre * line_sigma) ** 2 + (per_metre * _ROUGHNESS) ** 2
+    variance = sigma**2 + (per_metre * line_sigma) ** 2 + (per_metre * _ROUGHNESS) ** 2
     residual = measured - predicted
     if residual * residual > _GATE_VARIANCES * variance + (gate * per_metre) ** 2:
         return OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -142,7 +141,7 @@ def _jacobian(
 ) -> None:
     """Write the derivative (7,) of the inverse distance predicted on a line at a distance, with a normal."""
     states, turn = scans.states, scans.beams.turn[k, i]
-    angle = states[k, 2] + scans.beams.bearing[k, i] + states[k, 3] * turn
+    angle = states[k, 2] + states[k, 3] * turn
     ux, uy = math.cos(angle), math.sin(angle)
     dx, dy = states[k, 0] - states[j, 0], states[k, 1] - states[j, 1]
     per_metre = (nx * ux + ny * uy) / (distance * distance)

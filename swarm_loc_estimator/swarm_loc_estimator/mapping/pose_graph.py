@@ -7,7 +7,7 @@ per robot follows the unknowns of all stops. Residuals are estimates minus measu
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -254,6 +254,10 @@ class ConstraintLists:
         """Add a relative pose, see `Ties`."""
         self._ties.append((begin, end, np.concatenate([pose, root.ravel()])))
 
+    def remove_priors(self, stops: Collection[int]) -> None:
+        """Remove the priors of stops."""
+        self._priors[:] = [one for one in self._priors if one[0] not in stops]
+
     def remove_tie(self, begin: int, end: int) -> None:
         """Remove the ties of two stops."""
         self._ties[:] = [one for one in self._ties if one[:2] != (begin, end)]
@@ -312,7 +316,6 @@ _MATCH_WEIGHT, _START_WEIGHT = 0.3, 1.5
 _SMALL_STEP = (1e-3, 1e-3, 5e-4)
 MATCH_GATE = 0.03  # Maximum distance of a matched beam from its line in the final solution [m]
 _OVERLAP_STRIDE = 6  # Every sixth beam decides on the overlap of stops
-_FREE_RANGE_SHARE = 0.76  # Share of the range of a laser pointer that counts as free without a reflection
 _MIN_SEEN_BINS = 15  # Directions with a usable line, one degree each, from which a stop sees walls
 
 
@@ -366,24 +369,19 @@ class PoseGraph:
         """(count,) whether walls that scans can be matched with were seen from each stop."""
         return np.asarray(self._lines.usable[: self.count].sum(axis=1) >= _MIN_SEEN_BINS)
 
-    def is_sweep(self, stop: int) -> bool:
-        """Whether a stop is a sweep of a lidar."""
-        return bool(self._beams.free[stop] == self._beams.reach[stop])
-
     def add_robot(self) -> int:
         """Add a robot; returns its number."""
         self.slip = np.append(self.slip, self.settings.usual_slip)
         self._factored = -1
         return len(self.slip) - 1
 
-    def add_stop(self, robot: int, pose: FloatArray, sigma: float, reach: float = 0.0) -> int:
+    def add_stop(self, robot: int, pose: FloatArray, sigma: float) -> int:
         """Add a stop; returns its number.
 
         Args:
             robot: Number of the robot.
             pose: (3,) in map.
             sigma: Standard deviation of its inverse distances [1/m].
-            reach: Range of its lidar [m]; 0: it has a laser pointer.
         """
         if self.count == len(self.states):
             self._grow()
@@ -391,21 +389,14 @@ class PoseGraph:
         self.count += 1
         self.states[k] = (*pose[:3], 1.0 - self.slip[robot])
         self.robot[k], self.place[k] = robot, k
-        self._set_laser(k, sigma, reach)
+        self._beams.sigma[k], self._beams.reach[k] = sigma, self.settings.max_range
         return k
 
-    def _set_laser(self, stop: int, sigma: float, reach: float) -> None:
-        """Note the laser of a stop, see `add_stop`."""
-        pointer = self.settings.max_range
-        self._beams.sigma[stop] = sigma
-        self._beams.reach[stop] = reach or pointer
-        self._beams.free[stop] = reach or _FREE_RANGE_SHARE * pointer
-
-    def reuse_stop(self, stop: int, pose: FloatArray, sigma: float, reach: float = 0.0) -> None:
+    def reuse_stop(self, stop: int, pose: FloatArray, sigma: float) -> None:
         """Replace a stop by a new one of the same robot under the same number; see `add_stop`."""
         self._disconnect(stop)
         self.states[stop] = (*pose[:3], 1.0 - self.slip[self.robot[stop]])
-        self._set_laser(stop, sigma, reach)
+        self._beams.sigma[stop] = sigma
 
     def drop_stop(self, stop: int) -> None:
         """Take back all that a stop tells; its number and its place stay."""
@@ -426,9 +417,9 @@ class PoseGraph:
         self._factored = -1
 
     def set_scan(self, stop: int, scan: Scan) -> None:
-        """Set the beams of a stop; the next drive begins at the first beam of a lidar, else the last."""
+        """Set the beams of a stop; the next drive begins at the last one."""
         set_beams(self._beams, stop, scan)
-        self.turned[stop] = 0.0 if self.is_sweep(stop) else scan.turn[-1]
+        self.turned[stop] = scan.turn[-1]
         self._turned_all[stop] = np.abs(scan.turn).max()
         self.fit(stop)
 

@@ -53,39 +53,32 @@ class Beams(NamedTuple):
 
     turn: FloatArray  # (k, MAX_BEAMS) turn by odometry since arrival at the stop [rad]
     inverse: FloatArray  # (k, MAX_BEAMS) inverse distance [1/m], 0: no reflection
-    bearing: FloatArray  # (k, MAX_BEAMS) direction in the frame of the robot [rad]; 0 of a laser pointer
-    weight: FloatArray  # (k, MAX_BEAMS) variance sigma^2 over that of this beam; 1 of a laser pointer
     counts: IntArray  # (k,) number of beams
-    sigma: FloatArray  # (k,) standard deviation of an inverse distance [1/m]; of a lidar at its range
+    sigma: FloatArray  # (k,) standard deviation of an inverse distance [1/m]
     reach: FloatArray  # (k,) range of the laser [m]
-    free: FloatArray  # (k,) distance that is free in a direction without reflection [m]
 
 
 def no_beams(capacity: int) -> Beams:
     """Memory for the beams of `capacity` stops."""
     shape = (capacity, MAX_BEAMS)
-    turn, inverse, bearing = np.zeros((3, *shape))
-    sigma, reach, free = np.ones((3, capacity))
-    return Beams(
-        turn, inverse, bearing, np.ones(shape), np.zeros(capacity, dtype=np.int64), sigma, reach, free
-    )
+    counts = np.zeros(capacity, dtype=np.int64)
+    return Beams(np.zeros(shape), np.zeros(shape), counts, np.ones(capacity), np.ones(capacity))
 
 
 class Scan(NamedTuple):
-    """What was measured at one place, beams (n,); the fields are the first ones of `Beams`."""
+    """What was measured at one place, beams (n,)."""
 
-    turn: FloatArray
+    turn: FloatArray  # As in `Beams`
     inverse: FloatArray
-    bearing: FloatArray | float = 0.0
-    weight: FloatArray | float = 1.0
+    bearing: FloatArray | float = 0.0  # Direction in the frame of the robot [rad]; 0 of a laser pointer
+    weight: FloatArray | float = 1.0  # Variance sigma^2 over that of this beam; 1 of a laser pointer
 
 
 def set_beams(beams: Beams, stop: int, scan: Scan) -> None:
     """Set the beams of a stop."""
     every = -(-len(scan.turn) // MAX_BEAMS) or 1
     count = len(scan.turn[::every])
-    for memory, values in zip(beams, scan, strict=False):
-        memory[stop, :count] = values[::every] if isinstance(values, np.ndarray) else values
+    beams.turn[stop, :count], beams.inverse[stop, :count] = scan.turn[::every], scan.inverse[::every]
     beams.counts[stop] = count
 
 
@@ -93,8 +86,8 @@ BINS = 360
 UNKNOWN, FREE, POINT, LINE = 0, 1, 2, 3
 """Kinds of a direction: unknown; no reflection; reflection without a line; line."""
 
-_SEEN, _CC, _CS, _SS, _YC, _YS, _YY, _C, _S, _Y, _ALL, _W = range(12)
-"""Sums over the beams of a direction, all but the two counts weighted; y is the inverse distance."""
+_SEEN, _CC, _CS, _SS, _YC, _YS, _YY, _C, _S, _Y, _ALL = range(11)
+"""Sums over the beams of a direction; y is the inverse distance."""
 # The constants below are checked by `make bench-pushbot`: corridor, office and ring, 20 seeds each.
 _WINDOWS = (40, 28, 20, 14, 9, 6)  # Widths in degrees of the windows that may be a line, longest first
 _MIN_BEAMS, _MIN_SEEN_SHARE = 5, 0.85  # Minimum number of reflections in a window, and their share of beams
@@ -138,7 +131,7 @@ def fit_lines(stop: int, ratio: float, max_range: float, beams: Beams, lines: Li
         lines: Of all stops; those of this one are written.
     """
     sums, turns = _sums_per_bin(stop, ratio, beams)
-    total = np.zeros((3 * BINS + 1, 12))  # three periods, since windows cross the seam
+    total = np.zeros((3 * BINS + 1, 11))  # three periods, since windows cross the seam
     for m in range(3 * BINS):
         total[m + 1] = total[m] + sums[m % BINS]
     sigma = beams.sigma[stop]
@@ -154,33 +147,32 @@ def fit_lines(stop: int, ratio: float, max_range: float, beams: Beams, lines: Li
             lines.kind[stop, m] = FREE
         elif seen > 0:
             lines.kind[stop, m] = POINT
-            lines.distance[stop, m] = 1.0 / math.sqrt(sums[m, _YY] / sums[m, _W])
+            lines.distance[stop, m] = 1.0 / math.sqrt(sums[m, _YY] / seen)
 
 
 @cached_njit
 def _sums_per_bin(stop: int, ratio: float, beams: Beams) -> tuple[FloatArray, FloatArray]:
-    """Sums (BINS, 12), and sums of turns by odometry (BINS,)."""
-    sums, turns = np.zeros((BINS, 12)), np.zeros(BINS)
+    """Sums (BINS, 11), and sums of turns by odometry (BINS,)."""
+    sums, turns = np.zeros((BINS, 11)), np.zeros(BINS)
     for i in range(beams.counts[stop]):
-        angle = beams.bearing[stop, i] + ratio * beams.turn[stop, i]
+        angle = ratio * beams.turn[stop, i]
         m = math.floor(angle * BINS / (2.0 * math.pi)) % BINS
         y = beams.inverse[stop, i]
         sums[m, _ALL] += 1.0
         turns[m] += beams.turn[stop, i]
         if y > 0.0:
-            c, s, w = math.cos(angle), math.sin(angle), beams.weight[stop, i]
+            c, s = math.cos(angle), math.sin(angle)
             row = sums[m]
             row[_SEEN] += 1.0
-            row[_W] += w
-            row[_CC] += w * c * c
-            row[_CS] += w * c * s
-            row[_SS] += w * s * s
-            row[_YC] += w * y * c
-            row[_YS] += w * y * s
-            row[_YY] += w * y * y
-            row[_C] += w * c
-            row[_S] += w * s
-            row[_Y] += w * y
+            row[_CC] += c * c
+            row[_CS] += c * s
+            row[_SS] += s * s
+            row[_YC] += y * c
+            row[_YS] += y * s
+            row[_YY] += y * y
+            row[_C] += c
+            row[_S] += s
+            row[_Y] += y
     return sums, turns
 
 
@@ -226,7 +218,7 @@ def _fit_window(
     if n < _MIN_BEAMS or n < _MIN_SEEN_SHARE * d[_ALL]:
         return none
     det = d[_CC] * d[_SS] - d[_CS] * d[_CS]
-    if det < 1e-9 * (d[_W] / n) ** 2:
+    if det < 1e-9:
         return none
     a = (d[_SS] * d[_YC] - d[_CS] * d[_YS]) / det
     b = (d[_CC] * d[_YS] - d[_CS] * d[_YC]) / det
@@ -236,7 +228,7 @@ def _fit_window(
     width = high - low
     for part in range(3):
         first, last = low + part * width // 3, low + (part + 1) * width // 3
-        count = total[last, _W] - total[first, _W]
+        count = total[last, _SEEN] - total[first, _SEEN]
         if count > 0.0:
             off = total[last, _Y] - total[first, _Y]
             off -= a * (total[last, _C] - total[first, _C]) + b * (total[last, _S] - total[first, _S])

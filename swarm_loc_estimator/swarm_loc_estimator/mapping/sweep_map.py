@@ -1,4 +1,4 @@
-"""Sweeps of lidars in the pose graph: each is matched with the newest ones, and with old ones at the same place.
+"""Sweeps of lidars in the pose graph: each is matched with the newest ones and with old ones near.
 
 A match is a tie of the graph with the covariance of its score. Ties with old sweeps are loops: they are
 believed if several places in a row say the same, and taken back if the graph contradicts them.
@@ -9,19 +9,18 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import between, compose, inverse, transform_points, wrap_angle
 from swarm_loc_estimator.mapping.correlation import (
-    Field,
-    Match,
-    Window,
+    BestPose,
+    PointField,
+    PoseWindow,
     field_of,
     gather,
     match,
@@ -42,7 +41,9 @@ _TURN, _TURN_SHARE, _MAX_TURN = math.radians(15.0), 0.5, math.radians(50.0)
 """Search for its heading: turn [rad], share of the turn by odometry, and greatest [rad]."""
 _PREDICTED, _PREDICTED_PER_M, _PREDICTED_TURN = 0.10, 0.25, math.radians(5.0)
 """Standard deviations of the prediction [m], per path, and of its heading [rad]."""
-_ANYWHERE = Window(2.5, math.pi, math.inf, math.inf)  # Search for a sweep that does not fit the prediction
+_ANYWHERE = PoseWindow(
+    2.5, math.pi, math.inf, math.inf
+)  # Search for a sweep that does not fit the prediction
 _GOOD, _BETTER = 0.5, 0.15  # Score from which it is not searched elsewhere, or is elsewhere if so much better
 _MIN_SCORE = 0.30  # Least score of a sweep among the newest ones
 _CONTRADICTS = 16.0  # Squared difference of match and odometry, in variances, from which they contradict
@@ -64,13 +65,15 @@ _AGREE, _AGREE_PER_M, _AGREE_TURN = 0.15, 0.04, math.radians(2.5)
 """By how much ties of loops may differ [m], per way between them, and in heading [rad]."""
 _TOGETHER, _SPAN, _MAX_GAP = 3, 1.0, 8.0
 """Ties of a loop that must agree: number, least way between the first and the last, and greatest [m]."""
+_EVERYWHERE_EVERY, _EVERYWHERE_SCORE = 2.0, 0.6
+"""Path after which a robot of which nobody knows the begin is looked for again [m], and its least score."""
 _SOLVE, _SOLVE_SHARE = 9.0, 0.03
 """Squared residual of a tie, in variances, and share of the stops with new ties, from which all is solved."""
 _TORN = 25.0  # Squared residual of a tie, in variances, from which it contradicts
 _DOUBT_EVERY, _DOUBT_NEAR, _DOUBT_SHARE, _DOUBT_APART = 4, 1.0, 0.6, 2.0
 """Sweeps that are checked, how near others are that see the same [m], share of the best score that they must
 have, and distance of places [m]."""
-_DOUBT_WINDOW = Window(1.0, math.radians(10.0), math.inf, math.inf)
+_DOUBT_WINDOW = PoseWindow(1.0, math.radians(10.0), math.inf, math.inf)
 _UNTIED_M = 1.0  # Way that counts for a sweep that fits nothing [m], and three times its path
 
 
@@ -91,7 +94,9 @@ class Chain:
     nodes: list[int] = field(default_factory=list)
     path: list[float] = field(default_factory=list)  # Driven until each [m]
     noise: FloatArray = field(default_factory=lambda: np.ones(2))  # Of paths and turns, over the described
+    searched: float = 0.0  # Driven until it was looked for everywhere [m]
     looked: float = 0.0  # Driven until old ones were looked for [m]
+    floats: bool = False  # Whether nobody knows where its robot began
     pending: list[LoopTie] = field(default_factory=list)  # That are not believed yet
 
     def newest(self, count: int, path: float) -> list[int]:
@@ -128,7 +133,7 @@ class _Points:
         return moved
 
 
-class _Ways:
+class _GraphWays:
     """Ways through the graph: edges of which the length says how much two stops may be off."""
 
     def __init__(self) -> None:
@@ -157,7 +162,7 @@ class _Ways:
         return lengths
 
 
-def _doubled(array: NDArray[np.generic]) -> NDArray[np.generic]:
+def _doubled(array: Any) -> Any:
     return np.concatenate([array, np.zeros_like(array)])
 
 
@@ -183,17 +188,18 @@ class SweepMap:
         self.taken_back = 0
         self._graph = graph
         self._chains: defaultdict[int, Chain] = defaultdict(Chain)
-        self._points, self._ways = _Points(), _Ways()
+        self._points, self._ways = _Points(), _GraphWays()
         self._unsolved = 0
 
-    def begin(self, node: int, stop: ScanStop) -> None:
-        """Note the first sweep of a robot, or the first after it was lost."""
+    def begin(self, node: int, stop: ScanStop, *, floats: bool = False) -> None:
+        """Note the first sweep of a robot, or the first since it was lost; `floats`: its pose says nothing."""
         chain = self._chains[int(self._graph.robot[node])]
+        chain.floats = floats
         chain.nodes, chain.path, chain.pending = [node], [0.0], []
         self._note(node, stop)
 
     def add(self, begin: int, node: int, stop: ScanStop, motion: FloatArray, sigma: FloatArray) -> bool:
-        """Match the newest sweep, at its pose by odometry; returns whether it fits.
+        """BestPose the newest sweep, at its pose by odometry; returns whether it fits.
 
         Args:
             begin: The robot's sweep before.
@@ -251,7 +257,7 @@ class SweepMap:
         return points
 
     def locate(self, stop: ScanStop, pose: FloatArray, motion: FloatArray) -> FloatArray:
-        """The pose (3,) of a sweep in the map, which stays as it is, near one by odometry after a motion (3,)."""
+        """The pose (3,) of a sweep in the map, near one by odometry after a motion (3,)."""
         points = _points_of(beams_of(stop))
         nodes = np.flatnonzero(self._points.counts[: self._graph.count])
         if len(points) < _MIN_POINTS or not len(nodes):
@@ -289,13 +295,15 @@ class SweepMap:
         """Points (n, 2) of sweeps in map [m]."""
         return self._points.at(np.array(nodes, dtype=np.int64), self._graph.states[nodes, :3])
 
-    def _newest(self, chain: Chain) -> Field | None:
+    def _newest(self, chain: Chain) -> PointField | None:
         """The field of the newest sweeps of a robot; None: too little was seen."""
         others = self._points_at(chain.newest(_RECENT, _RECENT_PATH))
         return field_of(others) if len(others) >= _MIN_POINTS else None
 
-    def _match_newest(self, chain: Chain, node: int, points: FloatArray, motion: FloatArray) -> Match | None:
-        """Match points (n, 2) of a sweep with the newest ones of its robot; None: too little is seen."""
+    def _match_newest(
+        self, chain: Chain, node: int, points: FloatArray, motion: FloatArray
+    ) -> BestPose | None:
+        """BestPose points (n, 2) of a sweep with the newest ones of its robot; None: too little is seen."""
         newest = self._newest(chain)
         if len(points) < _MIN_POINTS or newest is None:
             return None
@@ -307,7 +315,7 @@ class SweepMap:
         return found
 
     def _fuse(
-        self, chain: Chain, begin: int, node: int, found: Match, motion: FloatArray, sigma: FloatArray
+        self, chain: Chain, begin: int, node: int, found: BestPose, motion: FloatArray, sigma: FloatArray
     ) -> FloatArray:
         """Tie a sweep to the one before, and move it; returns the deviations (3,) of odometry."""
         graph = self._graph
@@ -335,9 +343,14 @@ class SweepMap:
         return odometry
 
     def _close_loops(self, chain: Chain, node: int) -> None:
-        """Match the newest sweeps of a robot with old ones near, and tie what is believed."""
+        """BestPose the newest sweeps of a robot with old ones near, and tie what is believed."""
         graph, count = self._graph, self._graph.count
+        if chain.floats:
+            self._look_everywhere(chain, node)
         is_old = self._points.counts[:count] >= _MIN_POINTS
+        is_old &= self.floating() == chain.floats
+        if chain.floats:
+            is_old &= graph.robot[:count] == graph.robot[node]
         is_old[chain.nodes[-_OLD:]] = False
         old = np.flatnonzero(is_old)
         if not len(old):
@@ -364,6 +377,56 @@ class SweepMap:
             chain.pending.append(one)
             self._test_together(chain)
 
+    def floats(self, robot: int) -> bool:
+        """Whether nobody knows yet where a robot began."""
+        return robot in self._chains and self._chains[robot].floats
+
+    def floating(self) -> BoolArray:
+        """(count,) whether stops are of robots of which nobody knows where they began."""
+        robots = [robot for robot, chain in self._chains.items() if chain.floats]
+        floating: BoolArray = np.isin(self._graph.robot[: self._graph.count], robots)
+        return floating
+
+    def _look_everywhere(self, chain: Chain, node: int) -> None:
+        """Look for the newest sweeps of a robot that floats in the whole map, and join it there."""
+        graph, count = self._graph, self._graph.count
+        others = np.flatnonzero((self._points.counts[:count] >= _MIN_POINTS) & ~self.floating())
+        if chain.path[-1] < _QUERY_PATH or chain.path[-1] - chain.searched < _EVERYWHERE_EVERY:
+            return
+        chain.searched = chain.path[-1]
+        known = self._points_at(others.tolist())
+        if len(known) < _MIN_POINTS:
+            return
+        query = self._points_at(chain.newest(_QUERY, _QUERY_PATH))
+        query = transform_points(
+            inverse(graph.states[node, :3]), query[:: max(1, len(query) // _QUERY_POINTS)]
+        )
+        low, high = known.min(axis=0), known.max(axis=0)
+        window = PoseWindow(0.5 * float((high - low).max()), math.pi, math.inf, math.inf)
+        found = match(field_of(known), query, np.array([*(0.5 * (low + high)), 0.0]), window, _RIVAL)
+        if found.score < _EVERYWHERE_SCORE or found.rival:
+            return
+        old = int(others[np.argmin(np.hypot(*(graph.states[others, :2] - found.pose[:2]).T))])
+        there = graph.states[old, :3]
+        root = root_of(_turned(found.covariance, -there[2]))
+        chain.pending.append(LoopTie(old, node, between(there, found.pose), root, math.inf))
+        where = dict(zip(chain.nodes, chain.path, strict=True))
+        now = where[node]
+        newest = chain.pending[-1]
+        agree = [one for one in chain.pending if self._agree(one, newest, now - where[one.end])]
+        if len(agree) >= _TOGETHER:
+            self._join(chain, found.pose, node, agree)
+
+    def _join(self, chain: Chain, pose: FloatArray, node: int, agree: list[LoopTie]) -> None:
+        """Move all sweeps of a robot so that one has a pose (3,) in map, and tie it there."""
+        graph = self._graph
+        shift = compose(pose, inverse(graph.states[node, :3]))
+        mine = np.flatnonzero(graph.robot[: graph.count] == graph.robot[node])
+        graph.states[mine, :3] = compose(shift, graph.states[mine, :3])
+        graph.constraints.remove_priors(set(mine.tolist()))
+        chain.floats, chain.pending = False, []
+        self._believe(agree)
+
     def _middles(self, nodes: IntArray) -> FloatArray:
         """Middles (n, 2) of what was seen in sweeps, in map [m]."""
         x, y, heading = self._graph.states[nodes, :3].T
@@ -374,12 +437,12 @@ class SweepMap:
     def _match_old(
         self, node: int, query: FloatArray, old: int, way: float, is_old: BoolArray
     ) -> LoopTie | None:
-        """Match points (n, 2) seen from a sweep with those of old sweeps around one; None: not unique."""
+        """BestPose points (n, 2) seen from a sweep with those of old sweeps around one; None: not unique."""
         found = match(
             self._around(old, is_old),
             query,
             self._graph.states[node, :3],
-            Window(
+            PoseWindow(
                 min(_DRIFT + _DRIFT_PER_M * way, _MAX_DRIFT),
                 min(_SPIN + _SPIN_PER_M * way, _MAX_SPIN),
                 math.inf,
@@ -394,7 +457,7 @@ class SweepMap:
         root = root_of(_turned(found.covariance, -there[2]))
         return LoopTie(old, node, between(there, found.pose), root, way)
 
-    def _around(self, old: int, is_old: BoolArray) -> Field:
+    def _around(self, old: int, is_old: BoolArray) -> PointField:
         """The field of old sweeps around one of them."""
         ways = self._ways.lengths(old, self._graph.count, _REFERENCE_WAY)
         ways[~is_old] = np.inf
@@ -451,10 +514,10 @@ class SweepMap:
             self.loops.remove(one)
 
 
-def _window(motion: FloatArray) -> Window:
+def _window(motion: FloatArray) -> PoseWindow:
     """What is searched after a motion (3,) by odometry."""
     path, turn = math.hypot(motion[0], motion[1]), abs(float(motion[2]))
-    return Window(
+    return PoseWindow(
         min(_REACH + _REACH_PER_M * path, _MAX_REACH),
         min(_TURN + _TURN_SHARE * turn, _MAX_TURN),
         _PREDICTED + _PREDICTED_PER_M * path,

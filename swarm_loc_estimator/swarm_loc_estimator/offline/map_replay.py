@@ -156,7 +156,8 @@ def draw_map(
     axes = figure.add_subplot()
     every = max(1, max(occupancy.log_odds.shape) // _PIXELS)
     extent = (low[0], high[0], low[1], high[1])
-    axes.imshow(occupancy.log_odds[::every, ::every].T, origin="lower", extent=extent, cmap="gray_r", vmin=-5.0, vmax=5.0)
+    shown = occupancy.log_odds[::every, ::every].T
+    axes.imshow(shown, origin="lower", extent=extent, cmap="gray_r", vmin=-5.0, vmax=5.0)
     segments = [wall.reshape(2, 2) for wall in walls]
     axes.add_collection(LineCollection(segments, colors="C0", linewidths=1.0, alpha=0.7))
     axes.plot(stops[:, 0], stops[:, 1], ".", color="C3", markersize=3.0)
