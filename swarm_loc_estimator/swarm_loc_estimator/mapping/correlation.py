@@ -26,7 +26,7 @@ _MAX_PENALTY, _DISTINCT = 4.0, 30.0
 """Loss of a pose that the prediction excludes, in log likelihood, and what that is of a score."""
 _SHAPE_CELLS, _SHAPE_TURNS, _SHAPE_TURN = 8, 5, 0.005
 """Lattice for covariances: cells and turns to each side, and step of the turns [rad]."""
-_RIDGE = 0.16  # Standard deviation on the lattice from which a direction is unknown [m]
+_RIDGE = 0.1  # Standard deviation on the lattice from which a direction is unknown [m]
 _UNKNOWN = 3.0  # Standard deviation of such a direction [m]
 _LEAST_VARIANCE = np.array([0.01, 0.01, 0.002]) ** 2  # [m, m, rad]
 _STEPS = 8  # Number of Gauss-Newton steps to a place between cells
@@ -152,16 +152,21 @@ def match(
     turns = math.ceil(window.turn / step)
     sigmas = np.array([window.sigma / _CELL, window.turn_sigma])
     nothing = np.full(3, np.nan)
-    rotated = _rotated(cells[:: -(-len(cells) // _SEARCH_POINTS)], centre, turns, step)
+    rotated = _rotated(_some(cells, _SEARCH_POINTS), centre, turns, step)
     best, place = _search(field.levels, rotated, reach, turns, step, sigmas, 0.0, nothing)
     other = 0.0
     if rival:
         other, _ = _search(field.levels, rotated, reach, turns, step, sigmas, rival * best, place)
         other = other if other > rival * best else 0.0
     found, score = _climb(field.levels[0], cells, centre + place)
-    covariance = _shape(field.levels[0], cells[:: -(-len(cells) // _SHAPE_POINTS)], found)
+    covariance = _shape(field.levels[0], _some(cells, _SHAPE_POINTS), found)
     found[:2] = found[:2] * _CELL + field.corner
     return BestPose(found, covariance, score, other)
+
+
+def _some(points: FloatArray, most: int) -> FloatArray:
+    """At most so many of points (n, 2), evenly."""
+    return np.ascontiguousarray(points[:: -(-len(points) // most)])
 
 
 @cached_njit
@@ -364,11 +369,3 @@ def _shape(first: NDArray[np.uint8], cells: FloatArray, pose: FloatArray) -> Flo
             direction = np.array([math.cos(angle), math.sin(angle), 0.0])
             covariance += _UNKNOWN**2 * np.outer(direction, direction)
     return covariance
-
-
-def precompile() -> None:
-    """Compile what matching needs."""
-    points: FloatArray = thin(np.array([[1.0, 0.0], [1.0, 0.5]]), 0.1)
-    field = field_of(points)
-    match(field, points, np.zeros(3), PoseWindow(0.1, 0.1, 1.0, 1.0), 0.5)
-    score_at(field, points, np.zeros(3))

@@ -44,7 +44,8 @@ _PREDICTED, _PREDICTED_PER_M, _PREDICTED_TURN = 0.10, 0.25, math.radians(5.0)
 _ANYWHERE = PoseWindow(
     2.5, math.pi, math.inf, math.inf
 )  # Search for a sweep that does not fit the prediction
-_GOOD, _BETTER = 0.5, 0.15  # Score from which it is not searched elsewhere, or is elsewhere if so much better
+_GOOD, _LESS, _BETTER = 0.5, 0.8, 0.15
+"""Score, and share of the usual one, below which it is searched elsewhere, and is there if so much better."""
 _MIN_SCORE = 0.30  # Least score of a sweep among the newest ones
 _CONTRADICTS = 16.0  # Squared difference of match and odometry, in variances, from which they contradict
 _MEMORY, _MAX_SQUARE = 0.05, 400.0  # Weight of a new difference in the noise of odometry, and its maximum
@@ -65,8 +66,9 @@ _AGREE, _AGREE_PER_M, _AGREE_TURN = 0.15, 0.04, math.radians(2.5)
 """By how much ties of loops may differ [m], per way between them, and in heading [rad]."""
 _TOGETHER, _SPAN, _MAX_GAP = 3, 1.0, 8.0
 """Ties of a loop that must agree: number, least way between the first and the last, and greatest [m]."""
-_EVERYWHERE_EVERY, _EVERYWHERE_SCORE = 2.0, 0.6
-"""Path after which a robot of which nobody knows the begin is looked for again [m], and its least score."""
+_EVERYWHERE_EVERY, _EVERYWHERE_PATH, _EVERYWHERE_SCORE = 2.0, 12.0, 0.6
+"""Path after which a robot of which nobody knows the begin is looked for again [m], its newest path of which the
+sweeps are compared [m], and its least score."""
 _SOLVE, _SOLVE_SHARE = 9.0, 0.03
 """Squared residual of a tie, in variances, and share of the stops with new ties, from which all is solved."""
 _TORN = 25.0  # Squared residual of a tie, in variances, from which it contradicts
@@ -95,6 +97,7 @@ class Chain:
     path: list[float] = field(default_factory=list)  # Driven until each [m]
     noise: FloatArray = field(default_factory=lambda: np.ones(2))  # Of paths and turns, over the described
     searched: float = 0.0  # Driven until it was looked for everywhere [m]
+    score: float = 0.0  # Usual one of its sweeps
     looked: float = 0.0  # Driven until old ones were looked for [m]
     floats: bool = False  # Whether nobody knows where its robot began
     pending: list[LoopTie] = field(default_factory=list)  # That are not believed yet
@@ -215,6 +218,8 @@ class SweepMap:
         odometry = sigma * chain.noise[[0, 0, 1]]
         fits = found is not None and found.score >= _MIN_SCORE
         if found is not None and fits:
+            usual = chain.score or found.score
+            chain.score = usual + _MEMORY * (found.score - usual)
             odometry = self._fuse(chain, begin, node, found, motion, sigma)
         elif len(points) >= _MIN_POINTS:
             self.refused.append(node)
@@ -293,7 +298,7 @@ class SweepMap:
 
     def _points_at(self, nodes: list[int]) -> FloatArray:
         """Points (n, 2) of sweeps in map [m]."""
-        return self._points.at(np.array(nodes, dtype=np.int64), self._graph.states[nodes, :3])
+        return self._points.at(np.array(nodes, dtype=np.int64), self._graph.poses[nodes])
 
     def _newest(self, chain: Chain) -> PointField | None:
         """The field of the newest sweeps of a robot; None: too little was seen."""
@@ -308,7 +313,7 @@ class SweepMap:
         if len(points) < _MIN_POINTS or newest is None:
             return None
         found = match(newest, points, self._graph.states[node, :3], _window(motion))
-        if found.score < _GOOD:
+        if found.score < max(_GOOD, _LESS * chain.score):
             anywhere = match(newest, points, self._graph.states[chain.nodes[-1], :3], _ANYWHERE, _RIVAL)
             if not anywhere.rival and anywhere.score > max(_GOOD, found.score + _BETTER):
                 return anywhere
@@ -397,7 +402,7 @@ class SweepMap:
         known = self._points_at(others.tolist())
         if len(known) < _MIN_POINTS:
             return
-        query = self._points_at(chain.newest(_QUERY, _QUERY_PATH))
+        query = self._points_at(chain.newest(len(chain.nodes), _EVERYWHERE_PATH))
         query = transform_points(
             inverse(graph.states[node, :3]), query[:: max(1, len(query) // _QUERY_POINTS)]
         )

@@ -13,7 +13,7 @@ from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, START_TURN, CooperativeMapper
 from swarm_loc_estimator.mapping.matching import Lattice, search_offsets
 from swarm_loc_estimator.mapping.relocation import Search
-from swarm_loc_estimator.mapping.scans import Readings, ScanStop
+from swarm_loc_estimator.mapping.scans import Readings, Scan, ScanStop
 from swarm_loc_estimator.mapping.settings import MapperSettings
 
 _ROOM = (1.7, 1.1)  # Distances of the walls from the centre of the room, east and west, north and south [m]
@@ -46,6 +46,16 @@ def precompile() -> None:
     view.turn = np.linspace(0.0, 7.0, 9)
     view.inverse = np.ones(9)
     Search(pose, 1.0).add(view, 1.0, mapper.occupancy())
+    # what is called where robots have lidars
+    mapper, around = CooperativeMapper(MapperSettings()), np.linspace(-3.0, 3.0, 200)
+    robot = mapper.join(np.zeros(3), np.array([0.01, 0.01, 0.01]))
+    for ahead_m in (0.0, 0.4):
+        pose = np.array([ahead_m, 0.0, 0.0])
+        inverse = _inverse_distances(np.column_stack([np.tile(pose[:2], (len(around), 1)), around]))
+        scan = Scan(np.zeros(len(around)), inverse, around)
+        mapper.add_sweep(robot, ScanStop.of_sweep(round(1e10 * ahead_m), pose, scan, _SIGMA, 12.0))
+    mapper.sweeps.doubts()
+    mapper.occupancy()
     yaw_of(0.0, 0.0, 0.0, 1.0)  # what reads odometry
     note_precompiled(precompile)
 

@@ -1,0 +1,203 @@
+"""Maps by lidars: correlative matches, loops, odometry that says nothing, and robots with unknown starts."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.se2 import between, compose
+from swarm_loc_estimator.mapping.correlation import PoseWindow, field_of, match, score_at
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.scans import Scan, ScanStop
+from swarm_loc_estimator.mapping.settings import MapperSettings
+
+REACH, NOISE, STEP_NS = 8.0, 0.01, 1_000_000_000
+SIGMA = NOISE / REACH**2
+UNKNOWN = np.full(3, np.inf)
+_OUTER, _INNER = (0.0, 0.0, 16.0, 11.0), (3.0, 3.0, 12.0, 8.6)
+
+
+def _box(x0: float, y0: float, x1: float, y1: float) -> list[tuple[float, float, float, float]]:
+    return [(x0, y0, x1, y0), (x1, y0, x1, y1), (x1, y1, x0, y1), (x0, y1, x0, y0)]
+
+
+RING = np.array(
+    [
+        *_box(*_OUTER),
+        *_box(*_INNER),
+        *_box(5.0, 0.0, 5.6, 0.7),
+        *_box(15.2, 4.0, 16.0, 5.5),
+        *_box(9.0, 10.2, 10.5, 11.0),
+        *_box(0.0, 6.0, 0.5, 6.4),
+        *_box(7.5, 2.4, 8.5, 3.0),
+    ]
+)
+"""Walls (S, 4) of a corridor around a block, with pillars."""
+
+
+def ranges(walls: FloatArray, pose: FloatArray, angle: FloatArray) -> FloatArray:
+    """Distances (n,) of walls in directions (n,) from a pose (3,); infinite beyond the range [m]."""
+    heading = pose[2] + angle
+    ray = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
+    begin, way = walls[:, :2] - pose[:2], walls[:, 2:] - walls[:, :2]
+    cross = ray[:, None, 0] * way[:, 1] - ray[:, None, 1] * way[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        far = (begin[:, 0] * way[:, 1] - begin[:, 1] * way[:, 0]) / cross
+        along = (begin[:, 0] * ray[:, None, 1] - begin[:, 1] * ray[:, None, 0]) / cross
+    found = np.where((far > 0.0) & (along >= 0.0) & (along <= 1.0), far, np.inf).min(axis=1)
+    return np.where(found < REACH, found, np.inf)
+
+
+def sweep(rng: np.random.Generator, pose: FloatArray, odometry: FloatArray, stamp_ns: int) -> ScanStop:
+    """A sweep of 180 beams over 270 degrees."""
+    angle = np.linspace(-0.75 * math.pi, 0.75 * math.pi, 180)
+    far = ranges(RING, pose, angle) + NOISE * rng.standard_normal(len(angle))
+    nothing = np.zeros(len(angle))
+    return ScanStop.of_sweep(stamp_ns, odometry, Scan(nothing, 1.0 / far, angle), SIGMA, REACH)
+
+
+def laps(count: float) -> FloatArray:
+    """Poses (n, 3) every half metre of a drive around the ring."""
+    corners = np.array([(1.5, 1.5), (14.0, 1.5), (14.0, 9.8), (1.5, 9.8)])
+    poses = []
+    for k in range(round(4 * count)):
+        here, there = corners[k % 4], corners[(k + 1) % 4]
+        heading = math.atan2(*(there - here)[::-1])
+        shares = np.arange(0.0, 1.0, 0.5 / math.dist(here, there))
+        poses += [[*(here + share * (there - here)), heading] for share in shares]
+    return np.array(poses)
+
+
+def drive(
+    mapper: CooperativeMapper,
+    robot: int,
+    path: FloatArray,
+    rng: np.random.Generator,
+    jump: int = -1,
+    stops: slice = slice(None),
+) -> FloatArray:
+    """Drive along poses (n, 3) by wheels that are 3 % off; returns these poses relative to the first."""
+    pose, odometry = np.zeros(3), []
+    for k, true in enumerate(path):
+        if k:
+            step = between(path[k - 1], true) * [1.03, 1.0, 0.97] + rng.normal(0.0, [0.01, 0.01, 0.015])
+            step[2] += 1.3 * (k == jump)
+            pose = compose(pose, step)
+        odometry.append(pose)
+    for k in range(len(path))[stops]:
+        mapper.add_sweep(robot, sweep(np.random.default_rng(k), path[k], odometry[k], k * STEP_NS))
+    return between(path[0], path)
+
+
+def off(mapper: CooperativeMapper, robot: int, truth: FloatArray) -> FloatArray:
+    """Distances (n,) of the stops of a robot from true poses (n, 3)."""
+    mine = mapper.graph.robot[: mapper.graph.count] == robot
+    return np.hypot(*(mapper.graph.poses[mine, :2] - truth[:, :2]).T)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_search_finds_what_trying_all_poses_finds(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    field = field_of(rng.uniform(-3.0, 3.0, (60, 2)))
+    points, pose = rng.uniform(-2.5, 2.5, (40, 2)), rng.uniform(-0.5, 0.5, 3)
+    found = match(field, points, pose, PoseWindow(0.4, 0.2, math.inf, math.inf))
+    offsets = np.stack(np.meshgrid(*[np.arange(-0.4, 0.41, 0.05)] * 2, np.arange(-0.2, 0.21, 0.02)), -1)
+    best = max(score_at(field, points, pose + one) for one in offsets.reshape(-1, 3))
+    assert found.score > 0.9 * best  # turns are tried in other steps
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_match_is_right_within_its_covariance_and_knows_nothing_along_a_corridor(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    room, corridor = (
+        np.array(_box(-2.0, -1.5, 3.0, 2.0)),
+        np.array([(-9.0, -1.0, 9.0, -1.0), (9.0, 1.0, -9.0, 1.0)]),
+    )
+    angle = np.linspace(-math.pi, math.pi, 240)
+    for walls, is_open in ((room, False), (corridor, True)):
+        true = np.array([*rng.uniform(-0.3, 0.3, 2), rng.uniform(-0.1, 0.1)])
+        parts = []
+        for pose in (np.zeros(3), true):
+            far = ranges(walls, pose, angle) + NOISE * rng.standard_normal(len(angle))
+            parts.append((np.stack([np.cos(angle), np.sin(angle)], -1) * far[:, None])[np.isfinite(far)])
+        found = match(field_of(parts[0]), parts[1], np.zeros(3), PoseWindow(0.6, 0.3, math.inf, math.inf))
+        error = found.pose - true
+        assert error @ np.linalg.solve(found.covariance, error) < 16.0
+        assert abs(error[1]) < 0.03
+        assert (math.sqrt(found.covariance[0, 0]) > 1.0) == is_open
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_loops_are_closed(seed: int) -> None:
+    rng, mapper = np.random.default_rng(seed), CooperativeMapper()
+    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
+    truth = drive(mapper, robot, laps(1.5), rng)
+    mapper.finish()
+    assert mapper.counters["loops_closed"] >= 10
+    assert off(mapper, robot, truth).max() < 0.25  # nothing tells how long a plain wall is but the wheels
+    for tie in mapper.sweeps.loops:
+        assert np.abs(between(truth[tie.begin], truth[tie.end]) - tie.pose)[:2].max() < 0.2
+    assert not len(mapper.sweeps.doubts())
+
+
+def test_a_map_that_is_torn_is_in_doubt_there() -> None:
+    mapper = CooperativeMapper()
+    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
+    drive(mapper, robot, laps(2.0), np.random.default_rng(1))
+    mapper.finish()
+    half = mapper.graph.count // 2
+    mapper.graph.states[half : mapper.graph.count, :2] += 0.6
+    assert len(mapper.sweeps.doubts()) >= 3
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_odometry_that_jumps_is_contradicted(seed: int) -> None:
+    rng, mapper = np.random.default_rng(seed), CooperativeMapper()
+    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
+    truth = drive(mapper, robot, laps(0.5), rng, jump=6)
+    assert mapper.sweeps.contradicted
+    assert off(mapper, robot, truth).max() < 0.3
+
+
+def test_a_robot_with_an_unknown_start_is_located_in_the_map_of_another_one() -> None:
+    rng, mapper = np.random.default_rng(2), CooperativeMapper()
+    first = mapper.join(np.zeros(3), np.full(3, 1e-3))
+    truth = drive(mapper, first, laps(1.25), rng)
+    second = mapper.join(np.zeros(3), UNKNOWN)
+    path = laps(2.0)[40:90]
+    drive(mapper, second, path, np.random.default_rng(5), stops=slice(3))
+    assert mapper.located(second) is None
+    assert mapper.pose(second) is None
+    cells = int(mapper.occupancy().occupied.sum())
+    drive(mapper, second, path, np.random.default_rng(5), stops=slice(3, None))
+    located = mapper.located(second)
+    assert located is not None
+    assert located.pose[:2] == pytest.approx(between(laps(1.0)[0], path[-1])[:2], abs=0.25)
+    assert off(mapper, first, truth).max() < 0.25
+    assert cells > 500
+
+
+def test_a_full_graph_locates_robots_without_growing() -> None:
+    rng, mapper = np.random.default_rng(3), CooperativeMapper(MapperSettings(max_stops=90))
+    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
+    path = laps(2.0)
+    truth = drive(mapper, robot, path, rng)
+    assert mapper.graph.count == 91
+    located = mapper.located(robot)
+    assert located is not None
+    assert located.pose[:2] == pytest.approx(truth[-1, :2], abs=0.15)
+
+
+def test_a_large_map_has_larger_cells() -> None:
+    mapper = CooperativeMapper(MapperSettings(max_cells=60_000))
+    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
+    drive(mapper, robot, laps(1.0), np.random.default_rng(4))
+    occupancy = mapper.occupancy()
+    assert occupancy.log_odds.size <= 60_000
+    assert occupancy.cell == pytest.approx(0.08)
+    x, y = occupancy.centres(occupancy.occupied).T
+    assert np.ptp(x) > 15.5
+    assert np.ptp(y) > 10.5
