@@ -67,8 +67,8 @@ _AGREE, _AGREE_PER_M, _AGREE_TURN = 0.15, 0.04, math.radians(2.5)
 _TOGETHER, _SPAN, _MAX_GAP = 3, 1.0, 8.0
 """Ties of a loop that must agree: number, least way between the first and the last, and greatest [m]."""
 _EVERYWHERE_EVERY, _EVERYWHERE_PATH, _EVERYWHERE_SCORE = 2.0, 12.0, 0.6
-"""Path after which a robot of which nobody knows the begin is looked for again [m], its newest path of which the
-sweeps are compared [m], and its least score."""
+"""Path after which a robot with an unknown start is looked for again [m], its newest path of which sweeps are
+compared [m], and its least score."""
 _SOLVE, _SOLVE_SHARE = 9.0, 0.03
 """Squared residual of a tie, in variances, and share of the stops with new ties, from which all is solved."""
 _TORN = 25.0  # Squared residual of a tie, in variances, from which it contradicts
@@ -195,7 +195,7 @@ class SweepMap:
         self._unsolved = 0
 
     def begin(self, node: int, stop: ScanStop, *, floats: bool = False) -> None:
-        """Note the first sweep of a robot, or the first since it was lost; `floats`: its pose says nothing."""
+        """Note the first sweep of a robot, or the first since it was lost; `floats`: its start is unknown."""
         chain = self._chains[int(self._graph.robot[node])]
         chain.floats = floats
         chain.nodes, chain.path, chain.pending = [node], [0.0], []
