@@ -31,7 +31,7 @@ from swarm_loc_estimator.mapping.grid import DrawnSweep
 from swarm_loc_estimator.mapping.pose_graph import PoseGraph
 from swarm_loc_estimator.mapping.scans import MAX_BEAMS, ScanStop
 
-# The constants were chosen on freiburg-101 and acapulco; `make bench-lidar` runs two others, too.
+# The constants were chosen on freiburg-101, acapulco and intel, `_LOOK_EVERY` by the cost in freiburg-079.
 _APART, _FAR, _MIN_POINTS = 0.08, 18.0, 20
 """Distance of points of a sweep [m], up to which distance they are matched [m], and their least number."""
 _RECENT, _RECENT_PATH = 15, 10.0  # Newest sweeps that the next one is matched with: number, path [m]
