@@ -268,6 +268,35 @@ def predict(
     return value, jacobian
 
 
+def predict_any(
+    measurements: Measurements, observer_pose: FloatArray, target_pose: FloatArray, camera: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Predicted values (m, 3) of any models, and Jacobians (m, 3, 3) by observer, target and camera.
+
+    Arguments are those of `predict`. Components that were not measured are zero, as are their rows.
+    """
+    value, jacobian = predict(measurements, observer_pose, target_pose, camera)
+    sides = -jacobian[:, :, :3], jacobian[:, :, :3].copy()
+    for k in np.flatnonzero(~is_compiled(measurements.model)).tolist():
+        one = measurements.row(k)
+        found = MODELS[int(one.model)].predicted(one, observer_pose[k], target_pose[k])
+        value[k], jacobian[k], count = 0.0, 0.0, found.value.size
+        value[k, :count] = found.value
+        for side, by_pose in zip(sides, (found.observer_jacobian, found.target_jacobian), strict=True):
+            side[k] = 0.0
+            side[k, :count] = by_pose
+    return value, *sides, jacobian[:, :, 3:]
+
+
+def angles(models: np.typing.NDArray[np.int64]) -> BoolArray:
+    """Which components (m, 3) of measurements of models (m,) are angles."""
+    found = np.zeros((models.size, 3), dtype=bool)
+    for number in np.unique(models).tolist():
+        is_angle = MODELS[number].is_angle
+        found[models == number, : len(is_angle)] = is_angle
+    return found
+
+
 @cached_njit
 def _predict_all(
     measurements: Measurements,

@@ -106,6 +106,33 @@ class ChainFactor:
         return np.asarray(0.5 * (found + found.T))
 
 
+    def inverse_band(self) -> FloatArray:
+        """The inverse (width + 1, n) within the band: row d has its elements [j + d, j].
+
+        By the recursion of Takahashi, from the last column to the first.
+        """
+        inverse = np.zeros_like(self._band)
+        _invert_in_band(np.ascontiguousarray(self._band), inverse)
+        if self._corner is not None:
+            back = cho_solve(self._corner, self._by_border.T)
+            for d in range(min(len(inverse), self._size)):
+                inverse[d, : self._size - d] += np.sum(self._by_border[d:].T * back[:, : self._size - d], axis=0)
+        return inverse
+
+
+@cached_njit
+def _invert_in_band(factor: FloatArray, inverse: FloatArray) -> None:
+    """Write the inverse (w + 1, n) of L L^T within the band of the factor L (w + 1, n)."""
+    width, size = factor.shape[0] - 1, factor.shape[1]
+    for j in range(size - 1, -1, -1):
+        last = min(width, size - 1 - j)
+        for d in range(last, -1, -1):
+            total = 1.0 / factor[0, j] if d == 0 else 0.0
+            for e in range(1, last + 1):  # the element [j + d, j + e]
+                total -= factor[e, j] * inverse[abs(d - e), j + min(d, e)]
+            inverse[d, j] = total / factor[0, j]
+
+
 @cached_njit
 def _add(
     jacobian: FloatArray,

@@ -19,23 +19,23 @@ import numpy as np
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory
-from swarm_loc_estimator.filter.measurements import Measurements, select
-from swarm_loc_estimator.filter.models import POLAR, is_compiled
+from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, Measurements, concatenate, select
+from swarm_loc_estimator.filter.models import MODELS, POLAR, angles, is_compiled
 from swarm_loc_estimator.odometry.track_arrays import OdometrySample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.offline.batch.parameters import Parameter, all_changed
 from swarm_loc_estimator.offline.calibration.recording import Recording
-from swarm_loc_estimator.sensors.camera import (
-    CONTENT_POSE,
-    CONTENT_POSE_TWO,
-    DetectionRows,
-    SightingConverter,
-)
+from swarm_loc_estimator.sensors.camera import CONTENT_POSE, CONTENT_POSE_TWO
+from swarm_loc_estimator.sensors.fix import NO_FIXES
+from swarm_loc_estimator.sensors.inputs import Batch, InputConverter
+from swarm_loc_estimator.sensors.ranges import NO_RANGES
 from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
+from swarm_loc_estimator.timeline.settings import Settings
 
 STEP_NS = 100_000_000  # Shortest time between two instants at which the transform of a track is estimated
 MAX_KNOTS = 12_000
 """Maximum number of these instants, of all robots; those of long recordings are farther apart."""
+_MOMENT_NS = 1_000_000  # Time over which a speed is measured
 _WITH_POSE = (CONTENT_POSE, CONTENT_POSE_TWO)
 MIN_SIGHTINGS = 5  # Minimum number of sightings of a marker that is to be a landmark
 
@@ -87,13 +87,13 @@ class BatchProblem:
     # The description with a landmark for each marker that belongs to nobody, at the origin where its place is
     # not known
     swarm: Swarm
-    is_known: BoolArray  # (L,) whether the place of a landmark is described
+    is_known: BoolArray  # (S,) whether a place of `Swarm.surveyed` is described
     knots: Knots  # Instants at which transforms are estimated
     true: TruePoses  # By ground truth
-    # (m,) measurements of cameras; markers of landmarks are in the landmark's own frame
+    # (m,) measurements; markers of landmarks are in the landmark's own frame
     sightings: Measurements
-    source: IntArray  # (m,) their indices among all sightings by robots
-    sides: IntArray  # (m, 2) knots of observer and target; -1: a landmark
+    source: IntArray  # (m,) their indices among all
+    sides: IntArray  # (m, 2) knots of observer and target; -1: no robot
     tracks: FloatArray  # (2, m, 3) poses of observer and target on their tracks
     slip: FloatArray  # (2, m, 3, 3) covariance of their slip since the knot, in the frame of the track
     odometry: OdometryTracks  # The tracks
@@ -112,30 +112,46 @@ def problem_of(
     swarm: Swarm,
     parameters: tuple[Parameter, ...] = (),
     truth: Mapping[str, Trajectory] | None = None,
+    *,
+    is_described: bool = False,
 ) -> BatchProblem:
-    """Set up the problem of a recording; landmarks in the description, and poses of `truth`, are known."""
-    # knots, and sightings by robots whose tracks are known then
-    described, rare = _with_landmarks(recording, swarm)
-    seen = select(recording.detections, ~np.isin(recording.detections.detection["id"], list(rare)))
-    tracks, sightings = _tracks(recording, swarm), _sighted(seen, described)
-    knots = _knots(tracks, recording)
+    """Set up the problem of a recording; landmarks in the description, and poses of `truth`, are known.
+
+    Measurements are sightings by cameras of robots, of markers that belong to nobody, too. Where all
+    `is_described`, they are those of all sensors, and such markers are not used.
+    """
+    # knots, and measurements by robots whose tracks are known then
+    described, rare, seen = swarm, dict[int, int](), recording
+    if not is_described:
+        described, rare = _with_landmarks(recording, swarm)
+        rows = recording.detections
+        wanted = ~np.isin(rows.detection["id"], list(rare)) & (rows.robot < len(swarm.robots))
+        seen = replace(recording, detections=select(rows, wanted), fixes=NO_FIXES, ranges=NO_RANGES)
+    tracks, sightings = _tracks(recording, swarm), _measured(seen, described)
+    knots = _knots(tracks, recording, swarm, sightings if is_described else NO_MEASUREMENTS)
     robots = np.stack([sightings.observer, sightings.target])
     sides = np.stack([knots.nearest(one, sightings.stamp_ns) for one in robots])
     started = np.array([tracks.has_started(np.maximum(one, 0), sightings.stamp_ns) for one in robots])
     near = np.abs(sightings.stamp_ns - knots.stamp_ns[sides]) <= 2 * knots.step_ns
     kept: BoolArray = np.asarray(((robots < 0) | (started & (sides >= 0) & near)).all(axis=0))
+    if not is_described:
+        kept &= is_compiled(sightings.model)  # not directions alone
     sightings, sides = select(sightings, kept), sides[:, kept]
-    # where these robots are on their tracks, and the slip since the knot
+    # where these robots are on their tracks, and the slip since the knot, with the motion by errors of stamps
     poses, slip = _on_tracks(tracks, sightings, sightings.stamp_ns), np.zeros((2, sightings.size, 3, 3))
+    later = _on_tracks(tracks, sightings, sightings.stamp_ns + _MOMENT_NS)
+    rate = se2.log(se2.compose(later, se2.inverse(poses))) / (1e-9 * _MOMENT_NS)
     for side, robot in enumerate((sightings.observer, sightings.target)):
         moves = sides[side] >= 0
         at = tracks.at(robot[moves], sightings.stamp_ns[moves])
         since = at.covariance - knots.sample.covariance[sides[side][moves]]
         slip[side, moves] = since * np.sign(np.trace(since, axis1=1, axis2=2))[:, None, None]
+        slip[side] += np.einsum("k,ki,kj->kij", sightings.stamp_variance, rate[side], rate[side])
     known = {mark.id for mark in swarm.landmarks}
+    places = described.surveyed
     problem = BatchProblem(
         described,
-        np.array([mark.id in known for mark in described.landmarks], dtype=bool),
+        np.array([not isinstance(one, Landmark) or one.id in known for one in places], dtype=bool),
         knots,
         _true(truth or {}, swarm, knots, tracks),
         sightings,
@@ -162,7 +178,7 @@ _STEP = 0.01  # Step of a difference, in standard deviations of the prior
 
 
 def _differentiate(
-    problem: BatchProblem, recording: Recording, seen: DetectionRows, kept: BoolArray, index: int
+    problem: BatchProblem, recording: Recording, seen: Recording, kept: BoolArray, index: int
 ) -> None:
     """Write the derivatives by one parameter."""
     parameter, by = problem.parameters[index], problem.by_parameter
@@ -173,15 +189,16 @@ def _differentiate(
         moved = _tracks(recording, other).at(problem.knots.robot, problem.knots.stamp_ns).pose
         by.knots[:, :, index] = se2.log(se2.compose(moved, se2.inverse(sample))) / step
         return
-    before, after = problem.sightings, select(_sighted(seen, other), kept)
+    before, after = problem.sightings, select(_measured(seen, other), kept)
     change = after.value - before.value
     change[:, 2] = se2.wrap_angle(change[:, 2])
     by.value[:, :, index] = change / step
     # how the change differs farther along the ray: of the range, or of forward and left
-    far = seen._replace(detection=seen.detection.copy())
-    far.detection["position"] *= 1.0 + _STEP
-    now = select(_sighted(far, problem.swarm), kept).value
-    farther = select(_sighted(far, other), kept).value - now
+    detection = seen.detections.detection.copy()
+    detection["position"] *= 1.0 + _STEP
+    far = replace(seen, detections=seen.detections._replace(detection=detection))
+    now = select(_measured(far, problem.swarm), kept).value
+    farther = select(_measured(far, other), kept).value - now
     ray = (now - before.value)[:, :2] * np.where(problem.is_polar[:, None], [1.0, 0.0], 1.0)
     along = np.sum((farther - change)[:, :2] * ray, axis=1) / np.maximum(np.sum(ray**2, axis=1), 1e-10)
     by.growth[:, index] = along / step
@@ -199,12 +216,14 @@ def _tracks(recording: Recording, swarm: Swarm) -> OdometryTracks:
     return tracks
 
 
-def _sighted(seen: DetectionRows, swarm: Swarm) -> Measurements:
-    """Sightings (m,) by robots; markers of landmarks are in the landmark's own frame."""
+def _measured(recording: Recording, swarm: Swarm) -> Measurements:
+    """Measurements (m,) of a recording; markers of landmarks are in the landmark's own frame."""
     at_origin = [replace(one, x=0.0, y=0.0, yaw=None if one.yaw is None else 0.0) for one in swarm.landmarks]
-    sightings = SightingConverter(replace(swarm, landmarks=tuple(at_origin))).convert(seen)
-    # not directions alone, and not what fixed cameras see
-    return select(sightings, is_compiled(sightings.model) & (sightings.observer >= 0))
+    parts = {"detections": recording.detections, "fixes": recording.fixes, "ranges": recording.ranges}
+    inputs = Batch.of(*recording.range_ns, **parts)
+    found = InputConverter(replace(swarm, landmarks=tuple(at_origin)), Settings()).convert(inputs).rows
+    every = concatenate([NO_MEASUREMENTS, *found.values()])
+    return select(every, np.array([MODELS[one].predict is not None for one in every.model.tolist()], dtype=bool))
 
 
 def _true(truth: Mapping[str, Trajectory], swarm: Swarm, knots: Knots, tracks: OdometryTracks) -> TruePoses:
@@ -242,15 +261,20 @@ def _with_landmarks(recording: Recording, swarm: Swarm) -> tuple[Swarm, dict[int
         for marker_id in unknown
         if marker_id not in rare
     ]
-    return replace(swarm, landmarks=(*swarm.landmarks, *new)), rare
+    return replace(swarm, landmarks=(*swarm.landmarks, *new), anchors=(), cameras=()), rare
 
 
-def _knots(tracks: OdometryTracks, recording: Recording) -> Knots:
+def _knots(tracks: OdometryTracks, recording: Recording, swarm: Swarm, measured: Measurements) -> Knots:
+    """Instants of all robots with odometry, and of robots that need none and were measured."""
     rows, robots, stamps = recording.odometry, [], []
     spans = {}
     for robot in np.unique(rows.robot).tolist():
         own = rows.stamp_ns[rows.robot == robot]
         spans[robot] = (int(own.min()), int(own.max()))
+    for robot in np.flatnonzero([one.stands for one in swarm.robots]).tolist():
+        own = measured.stamp_ns[(measured.observer == robot) | (measured.target == robot)]
+        if robot not in spans and own.size:
+            spans[robot] = (int(own.min()), int(own.max()))
     whole_ns = sum(end - begin for begin, end in spans.values())
     step_ns = max(STEP_NS, whole_ns // MAX_KNOTS)
     for robot, (begin_ns, end_ns) in spans.items():
@@ -263,11 +287,9 @@ def _knots(tracks: OdometryTracks, recording: Recording) -> Knots:
     return Knots(robot, stamp_ns, tracks.at(robot, stamp_ns), step_ns)
 
 
-def innovation(
-    measured: FloatArray, predicted: FloatArray, is_polar: BoolArray, has_heading: BoolArray
-) -> FloatArray:
-    """Measured minus predicted (k, 3), angles wrapped, zero for a heading that was not measured."""
+def innovation(some: Measurements, measured: FloatArray, predicted: FloatArray) -> FloatArray:
+    """Measured values (m, 3) minus predicted ones, angles wrapped, zero for a heading without measurement."""
     found = measured - predicted
-    found[:, 2] = np.where(has_heading, se2.wrap_angle(found[:, 2]), 0.0)
-    found[is_polar, 1] = se2.wrap_angle(found[is_polar, 1])
+    found = np.where(angles(some.model), se2.wrap_angle(found), found)
+    found[is_compiled(some.model) & ~some.has_heading.astype(bool), 2] = 0.0
     return found

@@ -17,10 +17,11 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.filter.models import predict
+from swarm_loc_estimator.filter.models import predict_any
 from swarm_loc_estimator.offline.batch.normal import ChainEquations, ChainFactor
 from swarm_loc_estimator.offline.batch.problem import BatchProblem, innovation
 from swarm_loc_estimator.offline.batch.start import Start
+from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera
 
 # The steps are checked by test_survey.py and make bench-commissioning, also with wrong scales of wheels.
 _SCALES = (50.0, 20.0, 10.0, 5.0)
@@ -47,10 +48,11 @@ class Solution:
 
     problem: BatchProblem  # What was solved
     knot: FloatArray  # (k, 3) transforms of the tracks at the knots; NaN: not connected
-    landmark: FloatArray  # (L, 3) poses; NaN: not connected
+    # (S, 3) poses of landmarks, shifts and biases of anchors, corrections of cameras; NaN: not connected
+    landmark: FloatArray
     parameter: FloatArray  # (N, p) changes of parameters of the description
     parameter_sigma: FloatArray  # (N, p) their standard deviations
-    landmark_covariance: FloatArray  # (L, 3, 3) of x, y, yaw
+    landmark_covariance: FloatArray  # (S, 3, 3) of x, y, yaw
     frame_covariance: FloatArray  # (3, 3) of a knot in the middle: what is common to all is as uncertain
     weight: FloatArray  # (m,) of the sightings, from 0 for wrong ones to 1
     used: BoolArray  # (m,) whether both sides of the sighting are connected with the origin
@@ -125,21 +127,23 @@ class Solver:
 
     def __init__(self, problem: BatchProblem, start: Start, prior: ParameterPrior | None = None) -> None:
         self._problem, knots = problem, problem.knots
-        robots, landmarks = len(problem.swarm.robots), len(problem.swarm.landmarks)
+        robots, places = len(problem.swarm.robots), problem.swarm.surveyed
         self._is_near, self._landmark = start.knot is not None, start.landmark.copy()
         self._knot = start.transform[knots.robot] if start.knot is None else start.knot.copy()
         wide = np.tile(np.array([one.sigma for one in problem.parameters]), (robots, 1))
         self._mean, self._prior = prior or ParameterPrior(np.zeros_like(wide), wide)
         self._parameter = (self._mean if start.parameter is None else start.parameter).copy()
         is_placed = np.isfinite(self._knot[:, 0])
-        self._mark = problem.sightings.landmark
-        targets = np.where(self._mark >= 0, np.isfinite(self._landmark[self._mark, 0]), True)
+        mark = problem.sightings.landmark
+        # index -1, nobody, is that of a row after the last
+        targets = np.append(np.isfinite(self._landmark[:, 0]), True)[mark]
         for side in range(2):
-            targets &= (problem.sides[:, side] < 0) | is_placed[problem.sides[:, side]]
+            targets &= np.append(is_placed, True)[problem.sides[:, side]]
         self.used: BoolArray = np.asarray(targets)
         self._rows = np.flatnonzero(self.used)
         # exactly described landmarks have no columns
-        is_exact = np.array([not mark.is_estimated for mark in problem.swarm.landmarks], dtype=bool)
+        is_exact = np.array([not mark.is_estimated for mark in places], dtype=bool)
+        self._is_shift = np.array([isinstance(mark, Anchor) for mark in places], dtype=bool)
         free = np.isfinite(self._landmark[:, 0]) & ~(problem.is_known & is_exact)
         self._pairs = _steps(problem, is_placed)
         in_time = np.lexsort((knots.robot, knots.stamp_ns))
@@ -149,7 +153,7 @@ class Solver:
         self._parameter_column = next_column + np.arange(self._prior.size).reshape(robots, -1)
         self._size = next_column + self._prior.size
         self._weight, self._is_rigid = np.ones(self._rows.size), True
-        self._landmarks = landmarks
+        self._landmarks = len(places)
         self._origin: FloatArray | None = None
 
     def solve(self, progress: Progress) -> Solution:
@@ -212,7 +216,9 @@ class Solver:
         for pose, column in ((self._knot, self._knot_column), (self._landmark, self._landmark_column)):
             rows = np.flatnonzero(column >= 0)
             twist = step[column[rows][:, None] + np.arange(3)]
-            pose[rows] = se2.compose(se2.exp(twist), pose[rows])
+            moved = se2.compose(se2.exp(twist), pose[rows])
+            is_shift = self._is_shift[rows] if column is self._landmark_column else np.zeros(rows.size, bool)
+            pose[rows] = np.where(is_shift[:, None], pose[rows] + twist, moved)
         self._parameter = self._parameter + step[self._parameter_column]
 
     def _normal(self, scale: float) -> tuple[ChainEquations, float]:
@@ -286,20 +292,24 @@ class Solver:
     def _anchors(self) -> list[tuple[int, FloatArray, FloatArray, FloatArray]]:
         """Columns, poses, described poses and standard deviations of what is described."""
         problem, found = self._problem, []
-        for index, mark in enumerate(problem.swarm.landmarks):
-            column = int(self._landmark_column[index])
+        for index, mark in enumerate(problem.swarm.surveyed):
+            column, pose = int(self._landmark_column[index]), self._landmark[index]
             if column < 0:
                 continue
+            if isinstance(mark, Anchor):
+                sigma = np.array([mark.position_sigma, mark.position_sigma, mark.range_bias_sigma])
+                found.append((column, pose, np.zeros(3), np.maximum(sigma, _ORIGIN_SIGMA)))
+                continue
             described = np.array([mark.x, mark.y, mark.yaw or 0.0])
+            pose = se2.compose(pose, described) if isinstance(mark, FixedCamera) else pose
             if problem.is_known[index]:
                 sigma = np.array([mark.position_sigma, mark.position_sigma, mark.yaw_sigma])
                 if mark.yaw is None:
                     sigma[2] = _YAW_SIGMA
-                found.append((column, self._landmark[index], described, np.maximum(sigma, _ORIGIN_SIGMA)))
+                found.append((column, pose, described, np.maximum(sigma, _ORIGIN_SIGMA)))
             elif mark.yaw is None:
-                pose = self._landmark[index]
                 found.append((column, pose, pose * [1.0, 1.0, 0.0], np.array([1e3, 1e3, _YAW_SIGMA])))
-        has_frame = bool(problem.is_known.any())
+        has_frame = bool(problem.is_known.any()) or bool(np.any(problem.sightings.observer < 0))
         for index, robot in enumerate(problem.swarm.robots):
             own = np.flatnonzero((problem.knots.robot == index) & (self._knot_column >= 0))
             if not own.size or robot.start is None:
@@ -326,26 +336,26 @@ class Solver:
     def _sightings(self) -> tuple[FloatArray, FloatArray, IntArray]:
         """Whitened residuals (u, 3), Jacobians (u, 3, 8) and columns (u, 8) of the used sightings."""
         problem, rows = self._problem, self._rows
-        some, (observer, target) = select(problem.sightings, rows), problem.sides[rows].T
-        mark, robot = self._mark[rows], problem.sightings.observer[rows]
-        change, by = self._parameter[robot], problem.by_parameter
+        some, sides = select(problem.sightings, rows), problem.sides[rows].T
+        robot, change, by = some.observer, self._parameter[some.observer], problem.by_parameter
         moved = se2.exp(np.einsum("skij,kj->ski", by.tracks[:, rows], change))
         track = se2.compose(moved, problem.tracks[:, rows])
-        poses = [se2.compose(self._knot[observer], track[0])]
-        target_pose = se2.compose(self._knot[target], track[1])
-        poses.append(np.where((target >= 0)[:, None], target_pose, self._landmark[mark]))
+        places, poses = (some.mount, some.landmark), []
+        for knot, place, on_track in zip(sides, places, track, strict=True):
+            fixed = np.vstack([self._landmark, np.zeros(3)])[place]
+            poses.append(np.where((knot >= 0)[:, None], se2.compose(self._knot[knot], on_track), fixed))
         correction = np.einsum("kij,kj->ki", by.value[rows], change)
         some = some._replace(value=some.value + correction, second=some.second + correction)
-        value, jacobian = predict(some, poses[0], poses[1], np.zeros((rows.size, 3)))
-        by_pose = jacobian[:, :, :3]
+        value, *by_pose, _ = predict_any(some, *poses, np.zeros((rows.size, 3)))
         noise = some.covariance.copy()
-        for side, knot in enumerate((observer, target)):
-            carried = np.where((knot >= 0)[:, None, None], by_pose @ se2.adjoint(self._knot[knot]), 0.0)
+        by_track = []
+        for side, knot in enumerate(sides):
+            carried = np.where((knot >= 0)[:, None, None], by_pose[side] @ se2.adjoint(self._knot[knot]), 0.0)
             noise += carried @ problem.slip[side, rows] @ carried.transpose(0, 2, 1)
+            by_track.append(carried)
         root = np.linalg.inv(np.linalg.cholesky(noise))
-        is_polar, has_heading = problem.is_polar[rows], some.has_heading > 0
-        apart = innovation(some.value, value, is_polar, has_heading)
-        other = innovation(some.second, value, is_polar, has_heading)
+        is_polar = problem.is_polar[rows]
+        apart, other = innovation(some, some.value, value), innovation(some, some.second, value)
         square, mirrored = (
             np.sum(np.square(np.einsum("kij,kj->ki", root, one)), axis=1) for one in (apart, other)
         )
@@ -359,14 +369,14 @@ class Solver:
         growth += np.einsum("kij,kj->ki", change_of, change)
         apart /= growth
         by_change = -by.value[rows]
-        for side, (knot, sign) in enumerate(((observer, -1.0), (target, 1.0))):
-            carried = by_pose @ se2.adjoint(self._knot[knot]) @ by.tracks[side, rows]
-            by_change = by_change + np.where((knot >= 0)[:, None, None], sign * carried, 0.0)
-        whole = np.concatenate([-by_pose, by_pose, by_change], axis=2)
+        for side, carried in enumerate(by_track):
+            by_change = by_change + carried @ by.tracks[side, rows]
+        whole = np.concatenate([*by_pose, by_change], axis=2)
         columns = np.full((rows.size, 6 + self._prior.shape[1]), -1)
-        columns[:, :3] = self._knot_column[observer][:, None] + np.arange(3)
-        first = np.where(target >= 0, self._knot_column[target], self._landmark_column[mark])
-        columns[:, 3:6] = np.where(first[:, None] >= 0, first[:, None] + np.arange(3), -1)
+        for side, (knot, place) in enumerate(zip(sides, places, strict=True)):
+            first = np.where(knot >= 0, self._knot_column[knot], np.append(self._landmark_column, -1)[place])
+            own = slice(3 * side, 3 * side + 3)
+            columns[:, own] = np.where((first >= 0)[:, None], first[:, None] + np.arange(3), -1)
         columns[:, 6:] = self._parameter_column[robot]
         whole /= growth[:, :, None]
         whole[:, :, 6:] += (apart / growth)[:, :, None] * change_of
@@ -376,7 +386,7 @@ class Solver:
         sightings = self._sightings()
         residual = sightings[0]
         good = self._weight > 0.5
-        degrees = 2.0 + self._problem.sightings.has_heading[self._rows]
+        degrees = sightings[1].any(axis=2).sum(axis=1)
         ratio = float(np.sum(residual[good] ** 2) / max(1.0, np.sum(degrees[good])))
         covariance = np.zeros((self._landmarks, 3, 3))
         for index in np.flatnonzero(self._landmark_column >= 0).tolist():

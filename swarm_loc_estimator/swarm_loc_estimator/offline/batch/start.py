@@ -32,8 +32,14 @@ class Start:
 
 def started_at(problem: BatchProblem, paths: Mapping[str, Trajectory]) -> Start:
     """Begin where robots are by paths in `map`; others as by `start_of`."""
-    start, knots = start_of(problem), problem.knots
-    knot = start.transform[knots.robot]
+    start = start_of(problem)
+    return replace(start, knot=on_paths(problem, paths, start.transform))
+
+
+def on_paths(problem: BatchProblem, paths: Mapping[str, Trajectory], transform: FloatArray) -> FloatArray:
+    """Transforms (k, 3) of tracks at knots, by paths in `map`; those of robots (N, 3) without one."""
+    knots = problem.knots
+    knot = transform[knots.robot]
     for index, robot in enumerate(problem.swarm.robots):
         own, path = np.flatnonzero(knots.robot == index), paths.get(robot.name)
         if path is None or not path.stamp_ns.size:
@@ -42,7 +48,7 @@ def started_at(problem: BatchProblem, paths: Mapping[str, Trajectory]) -> Start:
         middle = path.stamp_ns[:-1] + np.diff(path.stamp_ns) // 2
         nearest = np.searchsorted(middle, knots.stamp_ns[own])
         knot[own] = se2.compose(path.pose, se2.inverse(track))[nearest]
-    return replace(start, knot=knot)
+    return knot
 
 
 def start_of(problem: BatchProblem) -> Start:

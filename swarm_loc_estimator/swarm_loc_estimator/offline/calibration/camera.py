@@ -69,4 +69,4 @@ def errors_of(problem: BatchProblem, paths: Mapping[str, Trajectory]) -> FloatAr
                 pose, known = interpolate(paths[robot.name], sightings.stamp_ns[rows], DENSE_GAP_NS)
                 sides[side, rows[known]] = pose[known]
     value, _ = predict(sightings, *sides)
-    return innovation(sightings.value, value, problem.is_polar, sightings.has_heading > 0)
+    return innovation(sightings, sightings.value, value)
