@@ -5,7 +5,7 @@ Models and noise are those of the description, as in the filter.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -15,13 +15,14 @@ import numpy as np
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.offline.batch.parameters import Parameter
 from swarm_loc_estimator.offline.batch.problem import problem_of
-from swarm_loc_estimator.offline.batch.solver import Solution, Solver
+from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver
 from swarm_loc_estimator.offline.batch.start import Start, on_paths
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.swarm.swarm import Landmark
+from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Status
 
 
@@ -46,7 +47,8 @@ def smooth_recording(
 ) -> ReplayResult:
     """Smooth a replay of a recording, see `smooth`."""
     swarm = online.swarm
-    problem = problem_of(recording, swarm, is_described=True)
+    parameters, sigma = described_sigmas(swarm)
+    problem = problem_of(recording, swarm, parameters, is_described=True)
     paths = {robot.name: online.track(index) for index, robot in enumerate(swarm.robots)}
     places = [
         (one.x, one.y, one.yaw or 0.0) if isinstance(one, Landmark) else (0.0, 0.0, 0.0)
@@ -54,7 +56,8 @@ def smooth_recording(
     ]
     nowhere = np.full((len(swarm.robots), 3), np.nan)
     start = Start(nowhere, np.array(places).reshape(-1, 3), on_paths(problem, paths, nowhere))
-    solution = Solver(problem, start).solve(progress)
+    prior = ParameterPrior(np.zeros_like(sigma), sigma)
+    solution = Solver(problem, start, prior).solve(progress)
     robots = len(swarm.robots)
     who, when = np.tile(np.arange(robots), online.stamp_ns.size), np.repeat(online.stamp_ns, robots)
     poses = solution.at(who, when)
@@ -68,6 +71,30 @@ def smooth_recording(
         status=np.where(known, Status.TRACKED, Status.WAITING).astype(np.uint8),
         heading_known=known,
     )
+
+
+_FIXED = 1e-6  # Standard deviation of a parameter that is exact
+
+
+def described_sigmas(swarm: Swarm) -> tuple[tuple[Parameter, ...], FloatArray]:
+    """Parameters of which a description states standard deviations, and these (N, p)."""
+    found, sigmas = [], []
+    for section, name, of in _UNSURE:
+        sigma = np.array([of(robot) for robot in swarm.robots])
+        if sigma.any():
+            found.append(Parameter(section, name, float(sigma.max())))
+            sigmas.append(np.maximum(sigma, _FIXED))
+    return tuple(found), np.array(sigmas).reshape(-1, len(swarm.robots)).T
+
+
+_UNSURE: tuple[tuple[str, str, Callable[[Robot], float]], ...] = (
+    ("odometry", "distance_scale", lambda one: one.odometry.distance_scale * one.odometry.distance_scale_sigma),
+    ("odometry", "turn_scale", lambda one: one.odometry.turn_scale_sigma if not one.imu.is_used else 0.0),
+    ("imu", "turn_scale", lambda one: one.imu.turn_scale_sigma if one.imu.is_used else 0.0),
+    ("sensor", "distance_scale", lambda one: one.sensor.distance_scale_sigma if one.camera else 0.0),
+    ("sensor", "range_offset", lambda one: one.sensor.range_offset_sigma if one.camera else 0.0),
+    ("camera", "yaw", lambda one: one.camera.yaw_sigma if one.camera and not one.camera.yaw_time_s else 0.0),
+)
 
 
 def covariances_at(
