@@ -29,6 +29,7 @@ from swarm_loc_estimator.sensors.camera import CONTENT_POSE, CONTENT_POSE_TWO
 from swarm_loc_estimator.sensors.fix import NO_FIXES
 from swarm_loc_estimator.sensors.inputs import Batch, InputConverter
 from swarm_loc_estimator.sensors.ranges import NO_RANGES
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, TURN_BIAS, ParameterTable
 from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -69,6 +70,14 @@ class TruePoses(NamedTuple):
     pose: FloatArray  # (t, 3) in `map`
 
 
+class Drift(NamedTuple):
+    """Errors of a robot that change slowly (Gauss-Markov): of its turn rate [rad/s], of its camera's yaw."""
+
+    sigma: FloatArray  # (N, 2) standard deviations
+    time_s: FloatArray  # (N, 2) time constants
+    turn: FloatArray  # (k, 3) right-invariant errors of tracks at knots by an error of the turn rate
+
+
 class Derivatives(NamedTuple):
     """Derivatives by the p parameters of the robot, or of the observer."""
 
@@ -100,6 +109,7 @@ class BatchProblem:
     rare: dict[int, int]  # Number of sightings by id, of markers that were seen too rarely
     parameters: tuple[Parameter, ...]  # Of robots, that are estimated
     by_parameter: Derivatives
+    drift: Drift | None = None  # None: there is none
 
     @property
     def is_polar(self) -> BoolArray:
@@ -169,9 +179,24 @@ def problem_of(
             np.zeros((2, sightings.size, 3, len(parameters))),
         ),
     )
+    if is_described:
+        problem = replace(problem, drift=_drift(swarm, knots))
     for index in range(len(parameters)):
         _differentiate(problem, recording, seen, kept, index)
     return problem
+
+
+_NO_DRIFT = 1e-6  # Standard deviation of what does not change
+
+
+def _drift(swarm: Swarm, knots: Knots) -> Drift | None:
+    table = ParameterTable.of(swarm.robots)
+    varies = (table.column >= 0) & np.isfinite(table.time_s)
+    if not varies.any():
+        return None
+    some = [TURN_BIAS, CAMERA_YAW]
+    sigma = np.where(varies, table.sigma, _NO_DRIFT)[:, some]
+    return Drift(sigma, np.where(varies, table.time_s, 1.0)[:, some], knots.sample.jacobian[:, :, TURN_BIAS])
 
 
 _STEP = 0.01  # Step of a difference, in standard deviations of the prior

@@ -19,7 +19,7 @@ from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.filter.models import predict_any
 from swarm_loc_estimator.offline.batch.normal import ChainEquations, ChainFactor
-from swarm_loc_estimator.offline.batch.problem import BatchProblem, innovation
+from swarm_loc_estimator.offline.batch.problem import BatchProblem, Drift, innovation
 from swarm_loc_estimator.offline.batch.start import Start
 from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera
 
@@ -148,7 +148,10 @@ class Solver:
         self._pairs = _steps(problem, is_placed)
         in_time = np.lexsort((knots.robot, knots.stamp_ns))
         self._knot_column = np.full(knots.robot.size, -1)
-        self._knot_column[in_time], self._band = _numbered(is_placed[in_time], 0)
+        drifts = 0 if problem.drift is None else 2
+        self._knot_column[in_time], self._band = _numbered(is_placed[in_time], 0, 3 + drifts)
+        self._drift = np.zeros((knots.robot.size, drifts))
+        self._drift_column = self._knot_column[:, None] + 3 + np.arange(drifts)
         self._landmark_column, next_column = _numbered(free, self._band)
         self._parameter_column = next_column + np.arange(self._prior.size).reshape(robots, -1)
         self._size = next_column + self._prior.size
@@ -189,7 +192,7 @@ class Solver:
         """
         damping, rises = _DAMPING[0], 0
         normal, least = self._normal(scale)
-        best = self._knot, self._landmark, self._parameter, normal
+        best = self._knot, self._landmark, self._parameter, self._drift, normal
         for _ in range(_ITERATIONS):
             self._apply(normal.factored(damping).solve(normal.gradient))
             normal, cost = self._normal(scale)
@@ -197,18 +200,18 @@ class Solver:
             has_converged = abs(least - cost) < enough
             if cost <= least:
                 least, rises = cost, 0
-                best = self._knot, self._landmark, self._parameter, normal
+                best = self._knot, self._landmark, self._parameter, self._drift, normal
                 damping = max(_DAMPING[0], 0.01 * damping)
             if has_converged:
                 break
             if cost > least and rises < _RISES:
                 rises += 1
             elif cost > least:
-                self._knot, self._landmark, self._parameter, normal = best
+                self._knot, self._landmark, self._parameter, self._drift, normal = best
                 damping, rises = 100.0 * damping, 0
                 if damping > _DAMPING[1]:
                     return
-        self._knot, self._landmark, self._parameter, _ = best
+        self._knot, self._landmark, self._parameter, self._drift, _ = best
 
     def _apply(self, step: FloatArray) -> None:
         """Move all estimates by a step (n,)."""
@@ -220,6 +223,8 @@ class Solver:
             is_shift = self._is_shift[rows] if column is self._landmark_column else np.zeros(rows.size, bool)
             pose[rows] = np.where(is_shift[:, None], pose[rows] + twist, moved)
         self._parameter = self._parameter + step[self._parameter_column]
+        placed = (self._knot_column >= 0)[:, None]
+        self._drift = self._drift + np.where(placed, step[self._drift_column], 0.0)
 
     def _normal(self, scale: float) -> tuple[ChainEquations, float]:
         """Normal equations and robust cost, linearized at the estimates."""
@@ -241,7 +246,7 @@ class Solver:
         pairs = np.concatenate(
             [self._knot_column[both], self._knot_column[np.array(self._pairs[:2])]], axis=1
         )
-        return int(np.abs(np.diff(pairs, axis=0)).max(initial=0)) + 2
+        return int(np.abs(np.diff(pairs, axis=0)).max(initial=0)) + 2 + self._drift.shape[1]
 
     def _add_odometry(self, normal: ChainEquations) -> float:
         """Steps between consecutive knots: r = log(T_b T_a^-1) - Ad(T_a) D p."""
@@ -262,8 +267,33 @@ class Solver:
             ],
             axis=1,
         )
-        normal.add(jacobian, columns, residual)
-        return float(np.sum(residual**2))
+        drift = self._problem.drift
+        if drift is None:
+            normal.add(jacobian, columns, residual)
+            return float(np.sum(residual**2))
+        by_rate = np.einsum("kij,kj->ki", root, drift.turn[b] - drift.turn[a])
+        residual -= by_rate * self._drift[a, :1]
+        jacobian = np.concatenate([jacobian, -by_rate[:, :, None]], axis=2)
+        normal.add(jacobian, np.column_stack([columns, self._drift_column[a, 0]]), residual)
+        return float(np.sum(residual**2)) + self._add_drift(normal, drift)
+
+    def _add_drift(self, normal: ChainEquations, drift: Drift) -> float:
+        """Gauss-Markov chains of drifts: r = x_b - exp(-t / T) x_a, and their first values."""
+        knots, (a, b) = self._problem.knots, self._pairs[:2]
+        robot, duration_s = knots.robot[a], 1e-9 * (knots.stamp_ns[b] - knots.stamp_ns[a])
+        kept = np.exp(-duration_s[:, None] / drift.time_s[robot])
+        root = 1.0 / (drift.sigma[robot] * np.sqrt(1.0 - kept**2))
+        first = np.setdiff1d(np.flatnonzero(self._knot_column >= 0), b)
+        sigma, cost = drift.sigma[knots.robot[first]], 0.0
+        for which in range(self._drift.shape[1]):
+            value, column = self._drift[:, which], self._drift_column[:, which]
+            change = (value[b] - kept[:, which] * value[a]) * root[:, which]
+            by_both = np.stack([-kept[:, which] * root[:, which], root[:, which]], axis=1)
+            normal.add(by_both[:, None], np.stack([column[a], column[b]], axis=1), change[:, None])
+            begin = value[first] / sigma[:, which]
+            normal.add(1.0 / sigma[:, which, None, None], column[first, None], begin[:, None])
+            cost += float(np.sum(change**2) + np.sum(begin**2))
+        return cost
 
     def _add_priors(self, normal: ChainEquations) -> float:
         """Priors of parameters, described landmarks, starts and the origin."""
@@ -346,7 +376,9 @@ class Solver:
             poses.append(np.where((knot >= 0)[:, None], se2.compose(self._knot[knot], on_track), fixed))
         correction = np.einsum("kij,kj->ki", by.value[rows], change)
         some = some._replace(value=some.value + correction, second=some.second + correction)
-        value, *by_pose, _ = predict_any(some, *poses, np.zeros((rows.size, 3)))
+        camera = np.zeros((rows.size, 3))
+        camera[:, 0] = np.where(sides[0] >= 0, self._drift[sides[0], 1], 0.0) if problem.drift else 0.0
+        value, *by_pose, by_camera = predict_any(some, *poses, camera)
         noise = some.covariance.copy()
         by_track = []
         for side, knot in enumerate(sides):
@@ -378,8 +410,12 @@ class Solver:
             own = slice(3 * side, 3 * side + 3)
             columns[:, own] = np.where((first >= 0)[:, None], first[:, None] + np.arange(3), -1)
         columns[:, 6:] = self._parameter_column[robot]
+        if problem.drift:
+            by_yaw = np.where((sides[0] >= 0)[:, None], by_camera[:, :, 0], 0.0)
+            whole = np.concatenate([whole, by_yaw[:, :, None]], axis=2)
+            columns = np.column_stack([columns, np.where(sides[0] >= 0, self._drift_column[sides[0], 1], -1)])
         whole /= growth[:, :, None]
-        whole[:, :, 6:] += (apart / growth)[:, :, None] * change_of
+        whole[:, :, 6 : 6 + change.shape[1]] += (apart / growth)[:, :, None] * change_of
         return -np.einsum("kij,kj->ki", root, apart), root @ whole, columns
 
     def _solution(self, factor: ChainFactor) -> Solution:
@@ -416,10 +452,10 @@ class Solver:
         )
 
 
-def _numbered(wanted: BoolArray, first: int) -> tuple[IntArray, int]:
-    """First columns (k,) of bodies of three columns, -1 where not wanted; and the next free column."""
-    columns = np.where(wanted, first + 3 * (np.cumsum(wanted) - 1), -1)
-    return columns, first + 3 * int(wanted.sum())
+def _numbered(wanted: BoolArray, first: int, size: int = 3) -> tuple[IntArray, int]:
+    """First columns (k,) of bodies of `size` columns, -1 where not wanted; and the next free column."""
+    columns = np.where(wanted, first + size * (np.cumsum(wanted) - 1), -1)
+    return columns, first + size * int(wanted.sum())
 
 
 def _steps(problem: BatchProblem, is_placed: BoolArray) -> tuple[IntArray, IntArray, FloatArray, FloatArray]:
