@@ -399,10 +399,10 @@ def without_repeats(measurements: Measurements) -> list[slice]:
 
 # Systematic; tuned on MRCLAM set 1, where 80 % of the variances of sightings repeat. Of ranges to twelve real
 # anchors (LIAS-CUHKSZ, libRSF) 30 to 60 % do while the range changes by 0.15 m, and 1/e of that at 0.3 m.
-_REPEATED = 0.5  # Share of the variance of a sighting that repeats at the same place
+REPEATED = 0.5  # Share of the variance of a sighting that repeats at the same place
 _LEAST_OWN = 1e-3  # Least share of a standard deviation that the place of a source does not have, too
-_LENGTH_M = 0.03  # Motion of one end, as the other sees it, after which its correlation is 1/e
-_RADIO_LENGTH_M = 0.3  # Change of a range after which its correlation is 1/e
+LENGTH_M = 0.03  # Motion of one end, as the other sees it, after which its correlation is 1/e
+RADIO_LENGTH_M = 0.3  # Change of a range after which its correlation is 1/e
 
 
 @cached_njit
@@ -569,8 +569,8 @@ def _weight(
     alone = is_fix(measurements, k) or measurements.systematic_share[k, 0] > 0.0
     if alone or not moved >= 0.0:
         return 0.0
-    left = math.exp(since - moved / (_LENGTH_M if has_kernel(measurements, k) else _RADIO_LENGTH_M))
-    return 2.0 * share * _REPEATED * left / max(1.0 - left, 1e-3)
+    left = math.exp(since - moved / (LENGTH_M if has_kernel(measurements, k) else RADIO_LENGTH_M))
+    return 2.0 * share * REPEATED * left / max(1.0 - left, 1e-3)
 
 
 @cached_njit

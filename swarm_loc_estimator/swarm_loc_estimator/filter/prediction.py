@@ -37,7 +37,7 @@ from swarm_loc_estimator.filter.state import BeliefArrays, covariance_within, ow
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, DRIVES, TURN_BIAS
 
-_GROWTH = 0.1  # g [1/s], tuned on MRCLAM sets 2, 3, 6 and 7; 0.5 hides errors
+GROWTH = 0.1  # g [1/s], tuned on MRCLAM sets 2, 3, 6 and 7; 0.5 hides errors
 
 
 class _Drift(NamedTuple):
@@ -113,7 +113,7 @@ def _growth(belief: BeliefArrays, robot: int, stamp_ns: int) -> float:
     """Mean of g t over a prediction to an instant."""
     begin_ns, last_ns = belief.predicted_to_ns[robot], belief.sources.measured_ns[robot]
     middle_s = (0.5 * (begin_ns - last_ns) + 0.5 * (stamp_ns - last_ns)) * 1e-9
-    growth: float = _GROWTH * max(0.0, middle_s)
+    growth: float = GROWTH * max(0.0, middle_s)
     return growth if belief.table.drives[robot] else 0.0
 
 

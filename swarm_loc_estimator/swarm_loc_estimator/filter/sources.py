@@ -44,7 +44,7 @@ from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SourceArray
 
 # Rate
 CORRELATION_NS = 100_000_000  # Errors of a link within this time are the same
-_LEAST_SHARE = 1e-3
+LEAST_SHARE = 1e-3
 # Health; tuned on the scenarios of bench/integrity
 EXCLUDED, _MAX_EVIDENCE = 10.0, 15.0  # Evidence from which a link is excluded, and its maximum
 _OUTLIER = 6.0
@@ -166,13 +166,13 @@ def share_of(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
         return 1.0
     since_ns = measurements.stamp_ns[k] - belief.sources.seen_ns[robot_of(measurements, k), place]
     if since_ns == 0:  # two markers of one picture are two measurements, two fixes are not
-        return _LEAST_SHARE if is_fix(measurements, k) else 1.0
+        return LEAST_SHARE if is_fix(measurements, k) else 1.0
     if since_ns < 0:
         return 1.0
     last = belief.sources.last_look[robot_of(measurements, k), place]
     if measurements.value[k, 0] == last[0] and not has_kernel(measurements, k):
-        return _LEAST_SHARE
-    share: float = max(min(1.0, since_ns / CORRELATION_NS), _LEAST_SHARE)
+        return LEAST_SHARE
+    share: float = max(min(1.0, since_ns / CORRELATION_NS), LEAST_SHARE)
     return share
 
 
@@ -239,7 +239,7 @@ def assess(
     if is_link:  # of one component; the other is the share of repeated values
         if distance <= limit:  # an outlier, which may be as large as any, tells of no drift
             drift[0] += _FORGETTING * share * (whitened[0] - drift[0])
-        drift[1] += _FORGETTING * ((1.0 if share == _LEAST_SHARE else 0.0) - drift[1])
+        drift[1] += _FORGETTING * ((1.0 if share == LEAST_SHARE else 0.0) - drift[1])
     else:
         for i in range(2):
             drift[i] += _FORGETTING * share * (whitened[i] - drift[i])

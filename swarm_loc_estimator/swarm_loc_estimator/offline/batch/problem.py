@@ -116,6 +116,22 @@ class BatchProblem:
         """Whether sightings (m,) are range and bearing."""
         return np.asarray(self.sightings.model == POLAR)
 
+    def poses(self, rows: IntArray, knot: FloatArray, place: FloatArray, track: FloatArray) -> list[FloatArray]:
+        """Poses (2, r, 3) of observers and targets of some measurements (r,), of nobody the origin.
+
+        Args:
+            rows: (r,) which.
+            knot: (k, 3) transforms of tracks at knots.
+            place: (S, 3) poses or corrections of what was surveyed.
+            track: (2, r, 3) poses on tracks.
+        """
+        fixed, found = np.vstack([place, np.zeros(3)]), []
+        bodies = self.sightings.mount[rows], self.sightings.landmark[rows]
+        for side, body, on_track in zip(self.sides[rows].T, bodies, track, strict=True):
+            moving = se2.compose(knot[side], on_track)
+            found.append(np.where((side >= 0)[:, None], moving, fixed[body]))  # -1, nobody, is the last row
+        return found
+
 
 def problem_of(
     recording: Recording,

@@ -15,6 +15,7 @@ import numpy as np
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.offline.batch.lasting import with_lasting_errors
 from swarm_loc_estimator.offline.batch.parameters import Parameter
 from swarm_loc_estimator.offline.batch.problem import problem_of
 from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver
@@ -56,6 +57,7 @@ def smooth_recording(
     ]
     nowhere = np.full((len(swarm.robots), 3), np.nan)
     start = Start(nowhere, np.array(places).reshape(-1, 3), on_paths(problem, paths, nowhere))
+    problem = with_lasting_errors(problem, start)
     prior = ParameterPrior(np.zeros_like(sigma), sigma)
     solution = Solver(problem, start, prior).solve(progress)
     robots = len(swarm.robots)

@@ -370,10 +370,7 @@ class Solver:
         robot, change, by = some.observer, self._parameter[some.observer], problem.by_parameter
         moved = se2.exp(np.einsum("skij,kj->ski", by.tracks[:, rows], change))
         track = se2.compose(moved, problem.tracks[:, rows])
-        places, poses = (some.mount, some.landmark), []
-        for knot, place, on_track in zip(sides, places, track, strict=True):
-            fixed = np.vstack([self._landmark, np.zeros(3)])[place]
-            poses.append(np.where((knot >= 0)[:, None], se2.compose(self._knot[knot], on_track), fixed))
+        poses = problem.poses(rows, self._knot, self._landmark, track)
         correction = np.einsum("kij,kj->ki", by.value[rows], change)
         some = some._replace(value=some.value + correction, second=some.second + correction)
         camera = np.zeros((rows.size, 3))
@@ -405,7 +402,7 @@ class Solver:
             by_change = by_change + carried @ by.tracks[side, rows]
         whole = np.concatenate([*by_pose, by_change], axis=2)
         columns = np.full((rows.size, 6 + self._prior.shape[1]), -1)
-        for side, (knot, place) in enumerate(zip(sides, places, strict=True)):
+        for side, (knot, place) in enumerate(zip(sides, (some.mount, some.landmark), strict=True)):
             first = np.where(knot >= 0, self._knot_column[knot], np.append(self._landmark_column, -1)[place])
             own = slice(3 * side, 3 * side + 3)
             columns[:, own] = np.where((first >= 0)[:, None], first[:, None] + np.arange(3), -1)
