@@ -38,7 +38,7 @@ _BLOCK, _SLOT = np.divmod(np.arange(PARAMETERS), DRIVES)
 
 _CONTRADICTED_SIGMA = (0.0, 0.05, 0.1, 0.03, 0.03, 0.0)
 """Standard deviations of parameters that are exact in the description, after a contradiction."""
-_CONTRADICTED_SURVEY_SIGMA = (0.02, 0.03)
+CONTRADICTED_SURVEY_SIGMA = (0.02, 0.03)
 """Standard deviations of a landmark's position [m] and yaw [rad] after a contradiction."""
 _CONTRADICTED_CAMERA_SIGMA = (0.1, 0.05)  # The same of a fixed camera, which may have been pushed
 
@@ -153,7 +153,7 @@ def _survey(mark: Surveyed) -> FloatArray:
     """Prior covariance (3, 3) of the error of what was surveyed."""
     third = mark.range_bias_sigma if isinstance(mark, Anchor) else mark.yaw_sigma
     given = mark.position_sigma, third
-    own = _error(mark, given if mark.is_estimated else _CONTRADICTED_SURVEY_SIGMA)
+    own = _error(mark, given if mark.is_estimated else CONTRADICTED_SURVEY_SIGMA)
     return own + np.outer(_shared(mark), _shared(mark))
 
 

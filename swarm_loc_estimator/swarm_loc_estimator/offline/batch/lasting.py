@@ -1,8 +1,8 @@
 """Errors that last, as noise of a batch: of sightings from one place, and of wheels while nothing measures.
 
-The batch takes errors as independent. So what the filter says of repeated errors, see `filter/sources.py`,
-`filter/correlated_noise.py` and `filter/prediction.py`, enlarges their noise here: n measurements whose errors
-have the correlations c are as good as their mean with the variance of one of these.
+The batch takes errors as independent. So what the filter knows of repeated errors, see `filter/sources.py`,
+`filter/correlated_noise.py` and `filter/prediction.py`, enlarges their noise here: n measurements by one link,
+of whose variance a share s repeats, have together the variance (1 - s) / n + s.
 """
 
 from __future__ import annotations
@@ -25,9 +25,7 @@ def with_lasting_errors(problem: BatchProblem, start: Start) -> BatchProblem:
     factor = _repeated(problem, start)
     sightings = problem.sightings
     covariance = sightings.covariance * factor[:, None, None]
-    return replace(
-        problem, sightings=sightings._replace(covariance=covariance), knots=_unmeasured(problem)
-    )
+    return replace(problem, sightings=sightings._replace(covariance=covariance), knots=_unmeasured(problem))
 
 
 def _repeated(problem: BatchProblem, start: Start) -> FloatArray:
@@ -49,7 +47,9 @@ def _repeated(problem: BatchProblem, start: Start) -> FloatArray:
     share = np.clip((some.stamp_ns[b] - some.stamp_ns[a]) / CORRELATION_NS, LEAST_SHARE, 1.0)
     share[~by_sight[b] & (some.value[a, 0] == some.value[b, 0])] = LEAST_SHARE
     moved = np.hypot(*(place[b] - place[a]).T) / np.where(by_sight[b], LENGTH_M, RADIO_LENGTH_M)
-    kept = np.where(same & ~is_fix & np.isfinite(moved), np.exp(-np.where(np.isfinite(moved), moved, 0.0)), 0.0)
+    kept = np.where(
+        same & ~is_fix & np.isfinite(moved), np.exp(-np.where(np.isfinite(moved), moved, 0.0)), 0.0
+    )
     own = np.append(1.0, np.where(same, share, 1.0))
     # sums of all that have the same error, before and after
     before, after = own.copy(), own.copy()
@@ -63,7 +63,7 @@ def _repeated(problem: BatchProblem, start: Start) -> FloatArray:
 
 
 def _unmeasured(problem: BatchProblem) -> Knots:
-    """Knots with the noise of wheels that grows with the time to what has measured the robot last, or next."""
+    """Knots with noise of wheels that grows with the time to the nearest measurement of the robot."""
     knots = problem.knots
     covariance = knots.sample.covariance.copy()
     for robot in np.unique(knots.robot).tolist():

@@ -105,7 +105,6 @@ class ChainFactor:
         found = self.solve(right)[unknowns]
         return np.asarray(0.5 * (found + found.T))
 
-
     def inverse_band(self) -> FloatArray:
         """The inverse (width + 1, n) within the band: row d has its elements [j + d, j].
 
@@ -116,7 +115,9 @@ class ChainFactor:
         if self._corner is not None:
             back = cho_solve(self._corner, self._by_border.T)
             for d in range(min(len(inverse), self._size)):
-                inverse[d, : self._size - d] += np.sum(self._by_border[d:].T * back[:, : self._size - d], axis=0)
+                inverse[d, : self._size - d] += np.sum(
+                    self._by_border[d:].T * back[:, : self._size - d], axis=0
+                )
         return inverse
 
 

@@ -116,7 +116,9 @@ class BatchProblem:
         """Whether sightings (m,) are range and bearing."""
         return np.asarray(self.sightings.model == POLAR)
 
-    def poses(self, rows: IntArray, knot: FloatArray, place: FloatArray, track: FloatArray) -> list[FloatArray]:
+    def poses(
+        self, rows: IntArray, knot: FloatArray, place: FloatArray, track: FloatArray
+    ) -> list[FloatArray]:
         """Poses (2, r, 3) of observers and targets of some measurements (r,), of nobody the origin.
 
         Args:
@@ -264,7 +266,9 @@ def _measured(recording: Recording, swarm: Swarm) -> Measurements:
     inputs = Batch.of(*recording.range_ns, **parts)
     found = InputConverter(replace(swarm, landmarks=tuple(at_origin)), Settings()).convert(inputs).rows
     every = concatenate([NO_MEASUREMENTS, *found.values()])
-    return select(every, np.array([MODELS[one].predict is not None for one in every.model.tolist()], dtype=bool))
+    return select(
+        every, np.array([MODELS[one].predict is not None for one in every.model.tolist()], dtype=bool)
+    )
 
 
 def _true(truth: Mapping[str, Trajectory], swarm: Swarm, knots: Knots, tracks: OdometryTracks) -> TruePoses:

@@ -5,7 +5,7 @@ Models and noise are those of the description, as in the filter.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -14,6 +14,7 @@ import numpy as np
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.offline.batch.lasting import with_lasting_errors
 from swarm_loc_estimator.offline.batch.parameters import Parameter
@@ -23,12 +24,33 @@ from swarm_loc_estimator.offline.batch.start import Start, on_paths
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
+from swarm_loc_estimator.sensors.inputs import input_topics
+from swarm_loc_estimator.swarm.calibration_states import (
+    CAMERA_OFFSET,
+    CAMERA_SCALE,
+    CAMERA_YAW,
+    CONTRADICTED_SURVEY_SIGMA,
+    DISTANCE_SCALE,
+    TURN_SCALE,
+    ParameterTable,
+)
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import Status
+
+MAX_STEP_S, MAX_SIZE = 3.0, 1_000_000
+"""Longest time between two knots, and largest number of knots times robots."""
+_FIXED = 1e-6  # Standard deviation of a parameter that is exact
+_CONTRADICTED = 0.5  # Weight below which the batch contradicts a measurement
+_CONTRADICTING = 0.15  # Share of the measurements of a robot or camera from which they contradict the others
+_LACKED = ("brightness", "scans", "aerial")
+_WITHOUT_FRAME = "it has no start, landmark or fix, so its poses are relative to a robot"
 
 
 class SmoothError(UserError):
     """A recording that cannot be smoothed."""
+
+    def __init__(self, recording: str, why: str) -> None:
+        super().__init__(f"'{recording}' cannot be smoothed: {why}.")
 
 
 def smooth(
@@ -38,7 +60,27 @@ def smooth(
     remap: Mapping[str, str] = MappingProxyType({}),
     progress: Progress = unwatched,
 ) -> ReplayResult:
-    """Smooth a replay of a bag."""
+    """Estimate all poses of a replay again, each from the whole bag, past and future.
+
+    Args:
+        bag: The bag of the replay: rosbag2 folder, .mcap or .db3 file.
+        online: Its result, where the batch begins; the smoothed poses are at its instants.
+        remap: As for `replay`.
+        progress: Called now and then with the share done and what is being done.
+
+    Returns:
+        The result with smoothed poses and their covariances. Robots are TRACKED while they have odometry and
+        were measured, also before they were located online.
+
+    Raises:
+        BagError: Nothing in the bag can be read, or a topic cannot be mapped.
+        SmoothError: Nothing ties the poses to `map`, the bag is too large, robots have infrared boards or
+            lidars or are seen from above, or measurements contradict each other.
+    """
+    topics = [one for one in input_topics(online.swarm) if one.kind.rows in _LACKED]
+    lacked = {one.kind.rows for one in topics if online.counters.get(f"messages on {one.name}")}
+    if lacked:
+        raise SmoothError(online.title, f"it has {listed(sorted(lacked))}, which the batch does not use")
     recording = read_recording(Path(bag), online.swarm, progress, remap)
     return smooth_recording(recording, online, progress)
 
@@ -46,25 +88,47 @@ def smooth(
 def smooth_recording(
     recording: Recording, online: ReplayResult, progress: Progress = unwatched
 ) -> ReplayResult:
-    """Smooth a replay of a recording, see `smooth`."""
-    swarm = online.swarm
-    parameters, sigma = described_sigmas(swarm)
+    """Estimate all poses of a run over a recording again, see `smooth`."""
+    # the problem, as described and opened by contradictions, begun at the online poses
+    if not recording.odometry.robot.size:
+        raise SmoothError(recording.name, "it has no odometry")
+    if online.is_local.any():
+        raise SmoothError(recording.name, _WITHOUT_FRAME)
+    swarm = _opened(online)
+    parameters, sigma = _unsure(swarm, online.self_calibrated or swarm)
     problem = problem_of(recording, swarm, parameters, is_described=True)
+    knots = problem.knots
+    if knots.step_ns > MAX_STEP_S * 1e9 or knots.robot.size * len(swarm.robots) > MAX_SIZE:
+        raise SmoothError(recording.name, "it is too large; cut it, or leave robots out")
     paths = {robot.name: online.track(index) for index, robot in enumerate(swarm.robots)}
-    places = [
-        (one.x, one.y, one.yaw or 0.0) if isinstance(one, Landmark) else (0.0, 0.0, 0.0)
-        for one in swarm.surveyed
-    ]
+    places = [(one.x, one.y, one.yaw or 0.0) for one in swarm.landmarks]
+    places += [(0.0, 0.0, 0.0)] * (len(swarm.surveyed) - len(places))
     nowhere = np.full((len(swarm.robots), 3), np.nan)
-    start = Start(nowhere, np.array(places).reshape(-1, 3), on_paths(problem, paths, nowhere))
+    knot = on_paths(problem, paths, nowhere)
+    if not np.isfinite(knot).any():
+        raise SmoothError(recording.name, "no robot was located online")
+    start = Start(nowhere, np.array(places).reshape(-1, 3), knot)
     problem = with_lasting_errors(problem, start)
-    prior = ParameterPrior(np.zeros_like(sigma), sigma)
-    solution = Solver(problem, start, prior).solve(progress)
-    robots = len(swarm.robots)
+    # the solution, unless it contradicts much of a source
+    solution = Solver(problem, start, ParameterPrior(np.zeros_like(sigma), sigma)).solve(progress)
+    sources = problem.sightings.received_from
+    for index, source in enumerate(swarm.sources):
+        own = solution.weight[(sources == index) & solution.used]
+        wrong = float(np.mean(own < _CONTRADICTED)) if own.size else 0.0
+        if wrong > _CONTRADICTING:
+            raise SmoothError(
+                recording.name, f"{wrong:.0%} of the measurements of {source.name} contradict the others"
+            )
+    return _result(online, solution)
+
+
+def _result(online: ReplayResult, solution: Solution) -> ReplayResult:
+    """The online result with the smoothed poses at its instants."""
+    robots = len(online.swarm.robots)
     who, when = np.tile(np.arange(robots), online.stamp_ns.size), np.repeat(online.stamp_ns, robots)
     poses = solution.at(who, when)
-    covariances = covariances_at(solution, who, when, poses).reshape(-1, robots, 3, 3)
-    poses = poses.reshape(-1, robots, 3)
+    covariances = covariances_at(solution, who, when, poses) + _of_fixes(solution, who, when)
+    poses, covariances = poses.reshape(-1, robots, 3), covariances.reshape(-1, robots, 3, 3)
     known: BoolArray = np.isfinite(poses[:, :, 0])
     return replace(
         online,
@@ -72,31 +136,67 @@ def smooth_recording(
         covariances=covariances,
         status=np.where(known, Status.TRACKED, Status.WAITING).astype(np.uint8),
         heading_known=known,
+        self_calibrated=None,
+        sightings=(),
+        losses=(),
     )
 
 
-_FIXED = 1e-6  # Standard deviation of a parameter that is exact
+def _opened(online: ReplayResult) -> Swarm:
+    """The description, with standard deviations of landmarks that a contradiction has opened."""
+    learned = online.self_calibrated or online.swarm
+    position_sigma, yaw_sigma = CONTRADICTED_SURVEY_SIGMA
+    marks = tuple(
+        replace(mark, position_sigma=position_sigma, yaw_sigma=yaw_sigma)
+        if now.is_estimated and not mark.is_estimated
+        else mark
+        for mark, now in zip(online.swarm.landmarks, learned.landmarks, strict=True)
+    )
+    return replace(online.swarm, landmarks=marks)
 
 
-def described_sigmas(swarm: Swarm) -> tuple[tuple[Parameter, ...], FloatArray]:
-    """Parameters of which a description states standard deviations, and these (N, p)."""
-    found, sigmas = [], []
-    for section, name, of in _UNSURE:
-        sigma = np.array([of(robot) for robot in swarm.robots])
-        if sigma.any():
+def _unsure(swarm: Swarm, learned: Swarm) -> tuple[tuple[Parameter, ...], FloatArray]:
+    """Constant parameters that were estimated online, and their standard deviations before (N, p)."""
+    table, found, sigmas = ParameterTable.of(swarm.robots), [], []
+    for section, name, which in _CONSTANT:
+        sigma = np.full(len(swarm.robots), _FIXED)
+        for index, (robot, now) in enumerate(zip(swarm.robots, learned.robots, strict=True)):
+            holder = getattr(now, section)
+            is_own = holder is not None and (name != "turn_scale" or holder is now.turn_sensor)
+            drifts = table.column[index, which] >= 0 and np.isfinite(table.time_s[index, which])
+            if is_own and not drifts and getattr(holder, f"{name}_sigma") > 0.0:
+                scale = (
+                    1.0 if which in {CAMERA_YAW, CAMERA_OFFSET} else getattr(getattr(robot, section), name)
+                )
+                sigma[index] = abs(scale) * table.sigma[index, which]
+        if np.any(sigma > _FIXED):
             found.append(Parameter(section, name, float(sigma.max())))
-            sigmas.append(np.maximum(sigma, _FIXED))
+            sigmas.append(sigma)
     return tuple(found), np.array(sigmas).reshape(-1, len(swarm.robots)).T
 
 
-_UNSURE: tuple[tuple[str, str, Callable[[Robot], float]], ...] = (
-    ("odometry", "distance_scale", lambda one: one.odometry.distance_scale * one.odometry.distance_scale_sigma),
-    ("odometry", "turn_scale", lambda one: one.odometry.turn_scale_sigma if not one.imu.is_used else 0.0),
-    ("imu", "turn_scale", lambda one: one.imu.turn_scale_sigma if one.imu.is_used else 0.0),
-    ("sensor", "distance_scale", lambda one: one.sensor.distance_scale_sigma if one.camera else 0.0),
-    ("sensor", "range_offset", lambda one: one.sensor.range_offset_sigma if one.camera else 0.0),
-    ("camera", "yaw", lambda one: one.camera.yaw_sigma if one.camera and not one.camera.yaw_time_s else 0.0),
+_CONSTANT = (
+    ("odometry", "distance_scale", DISTANCE_SCALE),
+    ("odometry", "turn_scale", TURN_SCALE),
+    ("imu", "turn_scale", TURN_SCALE),
+    ("sensor", "distance_scale", CAMERA_SCALE),
+    ("sensor", "range_offset", CAMERA_OFFSET),
+    ("camera", "yaw", CAMERA_YAW),
 )
+"""Section and name of a parameter, and which self-calibration state it is."""
+
+
+def _of_fixes(solution: Solution, robots: IntArray, stamps_ns: IntArray) -> FloatArray:
+    """Covariances (k, 3, 3) of errors that fixes of a robot share, of the next fix of robots at instants."""
+    some, found = solution.problem.sightings, np.zeros((robots.size, 3, 3))
+    lasting = (some.observer < 0) & (some.mount < 0) & (some.systematic_share[:, 0] > 0.0)
+    for robot in np.unique(some.target[lasting]).tolist():
+        own = np.flatnonzero(lasting & (some.target == robot) & solution.used)
+        own, rows = own[np.argsort(some.stamp_ns[own])], np.flatnonzero(robots == robot)
+        following = own[np.searchsorted(some.stamp_ns[own], stamps_ns[rows]).clip(max=own.size - 1)]
+        share = np.where(some.has_heading[following], some.systematic_share[following, 0], 0.0)
+        found[rows] = share[:, None, None] * some.covariance[following]
+    return found
 
 
 def covariances_at(
