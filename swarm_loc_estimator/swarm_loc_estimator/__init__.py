@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.mapping.scans import UNSEEN as UNSEEN
     from swarm_loc_estimator.mapping.scans import LightSightings as LightSightings
     from swarm_loc_estimator.mapping.scans import Readings as Readings
+    from swarm_loc_estimator.offline.batch.smooth import smooth as smooth
     from swarm_loc_estimator.offline.export import read_truth as read_truth
     from swarm_loc_estimator.offline.metrics import Errors as Errors
     from swarm_loc_estimator.offline.metrics import ErrorSummary as ErrorSummary
@@ -77,6 +78,7 @@ _MODULES = {
     "swarm_loc_estimator.mapping.mapper_feed": ("fix_covariance",),
     "swarm_loc_estimator.mapping.messages": ("ScanMessage", "decode_laser"),
     "swarm_loc_estimator.mapping.scans": ("UNSEEN", "LightSightings", "Readings"),
+    "swarm_loc_estimator.offline.batch.smooth": ("smooth",),
     "swarm_loc_estimator.offline.export": ("read_truth",),
     "swarm_loc_estimator.offline.metrics": ("Errors", "ErrorSummary"),
     "swarm_loc_estimator.offline.recorded_bag": ("Loss",),

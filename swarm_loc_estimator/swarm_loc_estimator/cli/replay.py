@@ -9,6 +9,8 @@ The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm
 --mcap writes poses, /tf, markers, and the bag's map and goals for RViz, Foxglove and other viewers.
 --truth reads ground truth from files in the format of TUM in place of that of the bag.
 --tum writes poses and ground truth of each robot in the format of TUM, for evo and other tools.
+--smooth estimates all poses again, each from the whole recording, and compares them in the report; writes
+smoothed.csv and, with --tum, <robot>.smoothed.tum.
 --learned writes the description with the self-calibrated parameters of cameras, odometry and landmarks; the
 parameters with a sigma in the description are estimated.
 """
@@ -19,6 +21,7 @@ import argparse
 import csv
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +42,7 @@ from swarm_loc_estimator.common.command_line import (
     yaml_to_write,
 )
 from swarm_loc_estimator.common.files import replacing
+from swarm_loc_estimator.offline.batch.smooth import smooth
 from swarm_loc_estimator.offline.export import read_truth, write_mcap, write_tum
 from swarm_loc_estimator.offline.replay import TICK_S, TICKS_S, replay
 from swarm_loc_estimator.offline.report.report import REPORT_FILES, write_report
@@ -74,6 +78,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             keep_sightings=True,
             progress=progress,
         )
+        if options.smooth:
+            smoothed = smooth(options.bag, result, remap=options.remap, progress=progress)
+            result = replace(result, smoothed=smoothed)
+            write_poses(smoothed, options.out / "smoothed.csv")
         progress(1.0, "writing the report")
         write_poses(result, options.out / "poses.csv")
         files = write_report(result, options.out)
@@ -118,8 +126,11 @@ def _parser() -> argparse.ArgumentParser:
     add_bag(parser)
     add_remap(parser)
     add_truth(parser)
-    folder = folder_to_write(*REPORT_FILES, "poses.csv")
+    folder = folder_to_write(*REPORT_FILES, "poses.csv", "smoothed.csv")
     parser.add_argument("--out", type=folder, default="out/replay", help="folder for the report")
+    parser.add_argument(
+        "--smooth", action="store_true", help="estimate all poses again, from the whole recording"
+    )
     parser.add_argument(
         "--learned", type=yaml_to_write, metavar="FILE", help="where to write what was learned"
     )

@@ -45,12 +45,14 @@ class TumError(UserError):
 def write_tum(result: ReplayResult, folder: Path) -> None:
     """Write the trajectories of a run, in `map`, to a folder; files of the same names are replaced.
 
-    `<robot>.tum` has the estimated poses, `<robot>.truth.tum` the ground truth at the same instants, as far
-    as it is known there. So evo, which pairs the nearest stamps, finds the errors of the report.
+    `<robot>.tum` has the estimated poses, `<robot>.smoothed.tum` the smoothed ones, if there are any, and
+    `<robot>.truth.tum` the ground truth at the same instants, as far as it is known there. So evo, which pairs the nearest stamps, finds the errors of the report.
     """
     for index, robot in enumerate(result.swarm.robots):
         pose = result.poses[:, index]
         _write(folder / f"{robot.name}.tum", result.stamp_ns, pose)
+        if result.smoothed is not None:
+            _write(folder / f"{robot.name}.smoothed.tum", result.stamp_ns, result.smoothed.poses[:, index])
         if robot.name in result.truth:
             truth, known = interpolate(result.truth[robot.name], result.stamp_ns, DEFAULT_GAP_NS)
             truth[~known] = np.nan

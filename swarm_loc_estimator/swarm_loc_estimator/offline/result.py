@@ -131,6 +131,8 @@ class ReplayResult:
     goals: Mapping[str, Trajectory] = field(default_factory=dict)
     #: (T,) True while poses are relative to a robot instead of in map, and have no errors; empty: never
     is_local: npt.NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    #: The same with poses smoothed by the whole recording; None: not asked for
+    smoothed: ReplayResult | None = None
     losses: tuple[LossReport, ...] = ()  #: Losses of robots, as known at the stamps; robot by robot
 
     @property

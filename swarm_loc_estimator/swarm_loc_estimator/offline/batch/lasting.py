@@ -1,8 +1,8 @@
 """Errors that last, as noise of a batch: of sightings from one place, and of wheels while nothing measures.
 
 The batch takes errors as independent. So what the filter knows of repeated errors, see `filter/sources.py`,
-`filter/correlated_noise.py` and `filter/prediction.py`, enlarges their noise here: n measurements by one link,
-of whose variance a share s repeats, have together the variance (1 - s) / n + s.
+`filter/correlated_noise.py` and `filter/prediction.py`, enlarges their noise here: n measurements by one
+link, of whose variance a share s repeats, have together the variance (1 - s) / n + s.
 """
 
 from __future__ import annotations
@@ -17,26 +17,25 @@ from swarm_loc_estimator.filter.models import POLAR, is_compiled, predict_any
 from swarm_loc_estimator.filter.prediction import GROWTH
 from swarm_loc_estimator.filter.sources import CORRELATION_NS, LEAST_SHARE
 from swarm_loc_estimator.offline.batch.problem import BatchProblem, Knots
-from swarm_loc_estimator.offline.batch.start import Start
 
 
-def with_lasting_errors(problem: BatchProblem, start: Start) -> BatchProblem:
-    """The problem with noise that holds errors that last; robots are about where they begin."""
-    factor = _repeated(problem, start)
+def with_lasting_errors(problem: BatchProblem, knot: FloatArray, place: FloatArray) -> BatchProblem:
+    """The problem with the noise of errors that last, about knots (k, 3) and places (S, 3)."""
+    factor = _repeated(problem, knot, place)
     sightings = problem.sightings
     covariance = sightings.covariance * factor[:, None, None]
     return replace(problem, sightings=sightings._replace(covariance=covariance), knots=_unmeasured(problem))
 
 
-def _repeated(problem: BatchProblem, start: Start) -> FloatArray:
+def _repeated(problem: BatchProblem, knot: FloatArray, place: FloatArray) -> FloatArray:
     """By how much more noise (m,) counts since measurements of a link share their errors."""
     some, rows = problem.sightings, np.arange(problem.sightings.size)
-    poses = problem.poses(rows, start.knot, start.landmark, problem.tracks)
-    predicted = predict_any(some, *poses, np.zeros((some.size, 3)))[0]
-    place, by_sight = predicted[:, :2].copy(), is_compiled(some.model)
+    poses = problem.poses(rows, knot, place, problem.tracks)
+    predicted, *_ = predict_any(some, poses[0], poses[1], np.zeros((some.size, 3)))
+    seen, by_sight = predicted[:, :2].copy(), is_compiled(some.model)
     polar = some.model == POLAR
     cos, sin = np.cos(predicted[polar, 1]), np.sin(predicted[polar, 1])
-    place[polar] = predicted[polar, :1] * np.column_stack([cos, sin])
+    seen[polar] = predicted[polar, :1] * np.column_stack([cos, sin])
     # measurements of one link after the other, and what each shares with the one before
     columns = (some.received_from, some.observer, some.target, some.landmark, some.mount, some.model)
     _, link = np.unique(np.stack([*columns, some.reading]), axis=1, return_inverse=True)
@@ -46,7 +45,7 @@ def _repeated(problem: BatchProblem, start: Start) -> FloatArray:
     is_fix = (some.observer[b] < 0) & (some.mount[b] < 0)
     share = np.clip((some.stamp_ns[b] - some.stamp_ns[a]) / CORRELATION_NS, LEAST_SHARE, 1.0)
     share[~by_sight[b] & (some.value[a, 0] == some.value[b, 0])] = LEAST_SHARE
-    moved = np.hypot(*(place[b] - place[a]).T) / np.where(by_sight[b], LENGTH_M, RADIO_LENGTH_M)
+    moved = np.hypot(*(seen[b] - seen[a]).T) / np.where(by_sight[b], LENGTH_M, RADIO_LENGTH_M)
     kept = np.where(
         same & ~is_fix & np.isfinite(moved), np.exp(-np.where(np.isfinite(moved), moved, 0.0)), 0.0
     )

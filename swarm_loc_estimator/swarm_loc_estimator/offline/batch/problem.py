@@ -262,10 +262,16 @@ def _tracks(recording: Recording, swarm: Swarm) -> OdometryTracks:
 def _measured(recording: Recording, swarm: Swarm) -> Measurements:
     """Measurements (m,) of a recording; markers of landmarks are in the landmark's own frame."""
     at_origin = [replace(one, x=0.0, y=0.0, yaw=None if one.yaw is None else 0.0) for one in swarm.landmarks]
-    parts = {"detections": recording.detections, "fixes": recording.fixes, "ranges": recording.ranges}
-    inputs = Batch.of(*recording.range_ns, **parts)
-    found = InputConverter(replace(swarm, landmarks=tuple(at_origin)), Settings()).convert(inputs).rows
-    every = concatenate([NO_MEASUREMENTS, *found.values()])
+    converter = InputConverter(replace(swarm, landmarks=tuple(at_origin)), Settings())
+    found = converter.convert(
+        Batch.of(
+            *recording.range_ns,
+            detections=recording.detections,
+            fixes=recording.fixes,
+            ranges=recording.ranges,
+        )
+    )
+    every: Measurements = concatenate([NO_MEASUREMENTS, *found.rows.values()])
     return select(
         every, np.array([MODELS[one].predict is not None for one in every.model.tolist()], dtype=bool)
     )

@@ -24,7 +24,7 @@ from swarm_loc_estimator.offline.batch.start import Start, on_paths
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.result import ReplayResult
-from swarm_loc_estimator.sensors.inputs import input_topics
+from swarm_loc_estimator.sensors.inputs import kinds
 from swarm_loc_estimator.swarm.calibration_states import (
     CAMERA_OFFSET,
     CAMERA_SCALE,
@@ -42,7 +42,7 @@ MAX_STEP_S, MAX_SIZE = 3.0, 1_000_000
 _FIXED = 1e-6  # Standard deviation of a parameter that is exact
 _CONTRADICTED = 0.5  # Weight below which the batch contradicts a measurement
 _CONTRADICTING = 0.15  # Share of the measurements of a robot or camera from which they contradict the others
-_LACKED = ("brightness", "scans", "aerial")
+_USED = {"odometry", "imu", "detections", "fixes", "ranges"}  # Sensors
 _WITHOUT_FRAME = "it has no start, landmark or fix, so its poses are relative to a robot"
 
 
@@ -77,10 +77,9 @@ def smooth(
         SmoothError: Nothing ties the poses to `map`, the bag is too large, robots have infrared boards or
             lidars or are seen from above, or measurements contradict each other.
     """
-    topics = [one for one in input_topics(online.swarm) if one.kind.rows in _LACKED]
-    lacked = {one.kind.rows for one in topics if online.counters.get(f"messages on {one.name}")}
-    if lacked:
-        raise SmoothError(online.title, f"it has {listed(sorted(lacked))}, which the batch does not use")
+    received = (kind for kind in kinds().values() if online.counters.get(f"messages on {kind.pattern}"))
+    if lacked := {kind.rows for kind in received} - _USED:
+        raise SmoothError(online.title, f"the batch does not use its {listed(sorted(lacked))}")
     recording = read_recording(Path(bag), online.swarm, progress, remap)
     return smooth_recording(recording, online, progress)
 
@@ -108,7 +107,7 @@ def smooth_recording(
     if not np.isfinite(knot).any():
         raise SmoothError(recording.name, "no robot was located online")
     start = Start(nowhere, np.array(places).reshape(-1, 3), knot)
-    problem = with_lasting_errors(problem, start)
+    problem = with_lasting_errors(problem, knot, start.landmark)
     # the solution, unless it contradicts much of a source
     solution = Solver(problem, start, ParameterPrior(np.zeros_like(sigma), sigma)).solve(progress)
     sources = problem.sightings.received_from

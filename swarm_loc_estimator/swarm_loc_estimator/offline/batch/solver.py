@@ -267,15 +267,15 @@ class Solver:
             ],
             axis=1,
         )
-        drift = self._problem.drift
-        if drift is None:
+        drifts = self._problem.drift
+        if drifts is None:
             normal.add(jacobian, columns, residual)
             return float(np.sum(residual**2))
-        by_rate = np.einsum("kij,kj->ki", root, drift.turn[b] - drift.turn[a])
+        by_rate = np.einsum("kij,kj->ki", root, drifts.turn[b] - drifts.turn[a])
         residual -= by_rate * self._drift[a, :1]
         jacobian = np.concatenate([jacobian, -by_rate[:, :, None]], axis=2)
         normal.add(jacobian, np.column_stack([columns, self._drift_column[a, 0]]), residual)
-        return float(np.sum(residual**2)) + self._add_drift(normal, drift)
+        return float(np.sum(residual**2)) + self._add_drift(normal, drifts)
 
     def _add_drift(self, normal: ChainEquations, drift: Drift) -> float:
         """Gauss-Markov chains of drifts: r = x_b - exp(-t / T) x_a, and their first values."""
@@ -375,7 +375,7 @@ class Solver:
         some = some._replace(value=some.value + correction, second=some.second + correction)
         camera = np.zeros((rows.size, 3))
         camera[:, 0] = np.where(sides[0] >= 0, self._drift[sides[0], 1], 0.0) if problem.drift else 0.0
-        value, *by_pose, by_camera = predict_any(some, *poses, camera)
+        value, *by_pose, by_camera = predict_any(some, poses[0], poses[1], camera)
         noise = some.covariance.copy()
         by_track = []
         for side, knot in enumerate(sides):

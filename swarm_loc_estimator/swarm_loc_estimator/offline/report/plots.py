@@ -410,6 +410,8 @@ def plot_errors(result: ReplayResult, path: Path) -> bool:
     for row, name in enumerate(shown):
         colour = colour_of(result.swarm.index_of[name])
         _draw_errors_of(axes[row, :3], result.errors[name], colour, int(result.stamp_ns[0]), limits)
+        if result.smoothed is not None:
+            _draw_smoothed(axes[row, :3], result.smoothed.errors[name], int(result.stamp_ns[0]), limits)
         _draw_nees(axes[row, 3], result.errors[name], colour, int(result.stamp_ns[0]))
         axes[row, 0].set_ylabel(name, color=colour, fontweight="bold")
     titles = (f"x error [{unit}]", f"y error [{unit}]", "heading error [deg]", "NEES")
@@ -418,6 +420,8 @@ def plot_errors(result: ReplayResult, path: Path) -> bool:
     for axis in axes[-1]:
         axis.set_xlabel("time [s]", color=SOFT, fontsize=9)
     note = "error (line) within the estimated 3-sigma band (shade); NEES with its 95 % bounds, ideal mean 3"
+    if result.smoothed is not None:
+        note += "; dark: smoothed"
     if len(shown) < len(names):
         note += f"; the {len(shown)} of {len(names)} robots with the largest errors"
     figure.suptitle(note, x=0.005, ha="left", fontsize=9, color=SOFT)
@@ -454,6 +458,18 @@ def _draw_errors_of(
         limit = scale * limits[column == 2]
         axis.set_ylim(-limit, limit)
         axis.locator_params(axis="y", nbins=5)
+
+
+def _draw_smoothed(
+    axes: npt.NDArray[np.object_], errors: Errors, begin_ns: int, limits: tuple[float, float]
+) -> None:
+    """Plot one robot's smoothed errors in x, y and heading over those of its online poses."""
+    rows = _thin(errors)
+    time_s, metre = seconds_since(begin_ns, errors.stamp_ns[rows]), length_unit(limits[0])[0]
+    for column, (axis, scale) in enumerate(zip(axes, (metre, metre, math.degrees(1.0)), strict=True)):
+        value = scale * errors.error[rows, column]
+        line = broken(errors.stamp_ns[rows], np.column_stack([time_s, value]))
+        axis.plot(*line.T, color=INK, linewidth=0.7)
 
 
 def _draw_nees(axis: Axes, errors: Errors, colour: str, begin_ns: int) -> None:

@@ -52,12 +52,15 @@ HEADER = (
 GROUPS = (("", 2), ("position", 5), ("heading", 5), ("", 1))
 """Headings over the columns, with the number of columns below each."""
 
-POOLED = "all"
+POOLED, SMOOTHED = "all", "all, smoothed"
 
 
 def summaries(result: ReplayResult) -> list[tuple[str, ErrorSummary]]:
-    """Name and errors of each robot with ground truth, and of all together."""
-    return [*result.summaries.items(), (POOLED, result.overall)] if result.errors else []
+    """Name and errors of each robot with ground truth, of all smoothed ones, and of all together."""
+    if not result.errors:
+        return []
+    later = [(SMOOTHED, result.smoothed.overall)] if result.smoothed is not None else []
+    return [*result.summaries.items(), *later, (POOLED, result.overall)]
 
 
 def cells(name: str, row: ErrorSummary) -> list[str]:
