@@ -20,6 +20,7 @@ from bench.mrclam.sets import (
     without_sightings,
 )
 from bench.shared.common import OUT
+from swarm_loc_estimator.offline.batch.smooth import SmoothError, smooth_recording
 from swarm_loc_estimator.offline.calibration.fit import calibrate
 from swarm_loc_estimator.offline.calibration.models import Options
 from swarm_loc_estimator.offline.calibration.recording import Recording, rerun
@@ -185,11 +186,9 @@ def sums_of(errors: Mapping[str, Errors]) -> Sums | None:
 
 def smoothed(job: Job, recording: Recording, swarm: Swarm) -> Done:
     """Errors of the smoother, or why it failed."""
-    from bench.mrclam.smoother import SmootherError, smooth  # noqa: PLC0415 # only benchmarks require gtsam
-
     try:
-        return Done(job, sums_of(smooth(recording, rerun(recording, swarm, TICK_S))))
-    except SmootherError as error:
+        return Done(job, sums_of(smooth_recording(recording, rerun(recording, swarm, TICK_S)).errors))
+    except SmoothError as error:
         return Done(job, None, str(error))
 
 

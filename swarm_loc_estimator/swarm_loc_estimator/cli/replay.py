@@ -78,6 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             keep_sightings=True,
             progress=progress,
         )
+        (options.out / "smoothed.csv").unlink(missing_ok=True)  # of an earlier run
         if options.smooth:
             smoothed = smooth(options.bag, result, remap=options.remap, progress=progress)
             result = replace(result, smoothed=smoothed)

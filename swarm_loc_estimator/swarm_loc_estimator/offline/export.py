@@ -46,7 +46,8 @@ def write_tum(result: ReplayResult, folder: Path) -> None:
     """Write the trajectories of a run, in `map`, to a folder; files of the same names are replaced.
 
     `<robot>.tum` has the estimated poses, `<robot>.smoothed.tum` the smoothed ones, if there are any, and
-    `<robot>.truth.tum` the ground truth at the same instants, as far as it is known there. So evo, which pairs the nearest stamps, finds the errors of the report.
+    `<robot>.truth.tum` the ground truth at the same instants, as far as it is known there. So evo, which
+    pairs the nearest stamps, finds the errors of the report.
     """
     for index, robot in enumerate(result.swarm.robots):
         pose = result.poses[:, index]

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Container, Iterable
 
-from core_messages import SECOND, Event, give
+import numpy as np
+from core_messages import SECOND, Event, give, joined
 from core_world import World
 
+from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.filter.measurements import Verdict
+from swarm_loc_estimator.offline.calibration.recording import Recording
+from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
+from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.timeline import HasBudget
 
@@ -46,3 +51,23 @@ def settled(estimator: Estimator) -> dict[str, int]:
     """How many measurements ended with which verdict."""
     counts = estimator._timeline.verdict_counts()
     return {verdict.name: int(counts[verdict]) for verdict in Verdict}
+
+
+def recording_of(world: World) -> Recording:
+    """The world's odometry and detections as a recording, with its truth."""
+    moved = [event for event in world.events if event.pose is not None]
+    seen = [event for event in world.events if event.detections.size]
+    stamps = np.array([event.stamp_ns for event in moved])
+    poses = np.array([event.pose for event in moved], dtype=float)
+    odometry = OdometryRows.without_twist(np.array([event.robot for event in moved]), stamps, poses, stamps)
+    count = [event.detections.size for event in seen]
+    at_ns = np.repeat([event.stamp_ns for event in seen], count)
+    robots = np.repeat([event.robot for event in seen], count)
+    detections = NO_DETECTIONS
+    if seen:
+        detections = DetectionRows(robots, at_ns, joined([e.detections for e in seen]), at_ns)
+    truth = {
+        robot.name: Trajectory(world.stamp_ns, world.truth[:, index])
+        for index, robot in enumerate(world.swarm.robots)
+    }
+    return Recording("world", odometry, detections, truth)

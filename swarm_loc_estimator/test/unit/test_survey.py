@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from core_messages import detection
 from core_messages import joined as joined_detections
+from core_run import recording_of
 from core_world import Plan, World, simulate
 from scipy.spatial.transform import Rotation
 
@@ -22,11 +23,11 @@ from swarm_loc_estimator.offline.batch.parameters import SURVEY
 from swarm_loc_estimator.offline.batch.problem import problem_of
 from swarm_loc_estimator.offline.batch.solver import Solver
 from swarm_loc_estimator.offline.batch.start import start_of
-from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
+from swarm_loc_estimator.offline.calibration.recording import CalibrationError
 from swarm_loc_estimator.offline.survey.survey import survey
 from swarm_loc_estimator.sensors.camera import FROM_OPTICAL, NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
-from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
+from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY
 from swarm_loc_estimator.sensors.ranges import RangeRows
 from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
@@ -36,19 +37,6 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 PLAN = Plan(robots=3, duration_s=25.0, arena=0.8, landmarks=8, start_known=(False,))
 BAGS = Path(__file__).parents[3] / "bags"
-
-
-def recording_of(world: World) -> Recording:
-    moved = [event for event in world.events if event.pose is not None]
-    seen = [event for event in world.events if event.detections.size]
-    stamps = np.array([event.stamp_ns for event in moved])
-    poses = np.array([event.pose for event in moved], dtype=float)
-    odometry = OdometryRows.without_twist(np.array([event.robot for event in moved]), stamps, poses, stamps)
-    count = [event.detections.size for event in seen]
-    at_ns = np.repeat([event.stamp_ns for event in seen], count)
-    robots = np.repeat([event.robot for event in seen], count)
-    detections = DetectionRows(robots, at_ns, joined_detections([e.detections for e in seen]), at_ns)
-    return Recording("world", odometry, detections, {})
 
 
 def unplaced(swarm: Swarm) -> Swarm:
