@@ -1,8 +1,9 @@
-"""Errors that last, as noise of a batch: of sightings from one place, and of wheels while nothing measures.
+"""Errors that last: of measurements by one link, and of wheels while nothing measures.
 
-The batch takes errors as independent. So what the filter knows of repeated errors, see `filter/sources.py`,
-`filter/correlated_noise.py` and `filter/prediction.py`, enlarges their noise here: n measurements by one
-link, of whose variance a share s repeats, have together the variance (1 - s) / n + s.
+The batch takes errors as independent. What the filter knows of repeated ones, see `filter/sources.py`,
+`filter/correlated_noise.py` and `filter/prediction.py`, enlarges their noise here. Where it does so for its
+poses, so does the batch; where only for covariances, the solution gets these from a problem with more noise:
+n measurements by one link, of whose variance a share s repeats, have together the variance (1 - s) / n + s.
 """
 
 from __future__ import annotations
@@ -11,54 +12,66 @@ from dataclasses import replace
 
 import numpy as np
 
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.filter.correlated_noise import LENGTH_M, RADIO_LENGTH_M, REPEATED
+from swarm_loc_estimator.filter.measurements import Measurements
 from swarm_loc_estimator.filter.models import POLAR, is_compiled, predict_any
 from swarm_loc_estimator.filter.prediction import GROWTH
 from swarm_loc_estimator.filter.sources import CORRELATION_NS, LEAST_SHARE
 from swarm_loc_estimator.offline.batch.problem import BatchProblem, Knots
 
 
+def counted_once(problem: BatchProblem) -> BatchProblem:
+    """The problem in which measurements of a link within their correlation time count as one."""
+    sightings = problem.sightings
+    order, same = _links(sightings)
+    share = np.empty(sightings.size)
+    share[order] = _shares(sightings, order, same)
+    covariance = sightings.covariance / share[:, None, None]
+    return replace(problem, sightings=sightings._replace(covariance=covariance))
+
+
 def with_lasting_errors(problem: BatchProblem, knot: FloatArray, place: FloatArray) -> BatchProblem:
     """The problem with the noise of errors that last, about knots (k, 3) and places (S, 3)."""
-    factor = _repeated(problem, knot, place)
-    sightings = problem.sightings
-    covariance = sightings.covariance * factor[:, None, None]
-    return replace(problem, sightings=sightings._replace(covariance=covariance), knots=_unmeasured(problem))
-
-
-def _repeated(problem: BatchProblem, knot: FloatArray, place: FloatArray) -> FloatArray:
-    """By how much more noise (m,) counts since measurements of a link share their errors."""
     some, rows = problem.sightings, np.arange(problem.sightings.size)
+    # how far each end of a link has moved, as the other sees it
     poses = problem.poses(rows, knot, place, problem.tracks)
     predicted, *_ = predict_any(some, poses[0], poses[1], np.zeros((some.size, 3)))
-    seen, by_sight = predicted[:, :2].copy(), is_compiled(some.model)
-    polar = some.model == POLAR
+    seen, polar = predicted[:, :2].copy(), some.model == POLAR
     cos, sin = np.cos(predicted[polar, 1]), np.sin(predicted[polar, 1])
     seen[polar] = predicted[polar, :1] * np.column_stack([cos, sin])
-    # measurements of one link after the other, and what each shares with the one before
+    order, same = _links(some)
+    a, b = order[:-1], order[1:]
+    moved = np.hypot(*(seen[b] - seen[a]).T) / np.where(is_compiled(some.model[b]), LENGTH_M, RADIO_LENGTH_M)
+    same &= ((some.observer[b] >= 0) | (some.mount[b] >= 0)) & np.isfinite(moved)  # no fixes
+    kept = np.where(same, np.exp(-np.where(same, moved, 0.0)), 0.0).tolist()
+    # sums of all that have the same error, before and after
+    own = _shares(some, order, same)
+    before, after = own.copy(), own.copy()
+    for k, left in enumerate(kept):
+        before[k + 1] += left * before[k]
+    for k in range(len(kept) - 1, -1, -1):
+        after[k] += kept[k] * after[k + 1]
+    factor = np.empty(some.size)
+    factor[order] = 1.0 + REPEATED * (before + after - own - 1.0).clip(min=0.0)
+    covariance = some.covariance * factor[:, None, None]
+    return replace(problem, sightings=some._replace(covariance=covariance), knots=_unmeasured(problem))
+
+
+def _links(some: Measurements) -> tuple[IntArray, BoolArray]:
+    """Order (m,) of measurements, link by link, and whether each (m - 1,) but the first continues a link."""
     columns = (some.received_from, some.observer, some.target, some.landmark, some.mount, some.model)
     _, link = np.unique(np.stack([*columns, some.reading]), axis=1, return_inverse=True)
     order = np.lexsort((some.stamp_ns, link.ravel()))
-    same = np.diff(link.ravel()[order]) == 0
+    return order, np.asarray(np.diff(link.ravel()[order]) == 0)
+
+
+def _shares(some: Measurements, order: IntArray, same: BoolArray) -> FloatArray:
+    """By how much measurements (m,) in their order count, see `share_of` of `filter/sources.py`."""
     a, b = order[:-1], order[1:]
-    is_fix = (some.observer[b] < 0) & (some.mount[b] < 0)
     share = np.clip((some.stamp_ns[b] - some.stamp_ns[a]) / CORRELATION_NS, LEAST_SHARE, 1.0)
-    share[~by_sight[b] & (some.value[a, 0] == some.value[b, 0])] = LEAST_SHARE
-    moved = np.hypot(*(seen[b] - seen[a]).T) / np.where(by_sight[b], LENGTH_M, RADIO_LENGTH_M)
-    kept = np.where(
-        same & ~is_fix & np.isfinite(moved), np.exp(-np.where(np.isfinite(moved), moved, 0.0)), 0.0
-    )
-    own = np.append(1.0, np.where(same, share, 1.0))
-    # sums of all that have the same error, before and after
-    before, after = own.copy(), own.copy()
-    for k, left in enumerate(kept.tolist()):
-        before[k + 1] += left * before[k]
-    for k, left in zip(range(kept.size - 1, -1, -1), kept[::-1].tolist(), strict=True):
-        after[k] += left * after[k + 1]
-    found = np.empty(some.size)
-    found[order] = (1.0 + REPEATED * (before + after - own - 1.0).clip(min=0.0)) / own
-    return found
+    share[~is_compiled(some.model[b]) & (some.value[a, 0] == some.value[b, 0])] = LEAST_SHARE
+    return np.concatenate([np.ones(min(1, order.size)), np.where(same, share, 1.0)])
 
 
 def _unmeasured(problem: BatchProblem) -> Knots:

@@ -16,7 +16,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.offline.batch.lasting import with_lasting_errors
+from swarm_loc_estimator.offline.batch.lasting import counted_once, with_lasting_errors
 from swarm_loc_estimator.offline.batch.parameters import Parameter
 from swarm_loc_estimator.offline.batch.problem import problem_of
 from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver
@@ -107,9 +107,10 @@ def smooth_recording(
     if not np.isfinite(knot).any():
         raise SmoothError(recording.name, "no robot was located online")
     start = Start(nowhere, np.array(places).reshape(-1, 3), knot)
-    problem = with_lasting_errors(problem, knot, start.landmark)
+    problem = counted_once(problem)
     # the solution, unless it contradicts much of a source
-    solution = Solver(problem, start, ParameterPrior(np.zeros_like(sigma), sigma)).solve(progress)
+    solver = Solver(problem, start, ParameterPrior(np.zeros_like(sigma), sigma))
+    solution = solver.solve(progress)
     sources = problem.sightings.received_from
     for index, source in enumerate(swarm.sources):
         own = solution.weight[(sources == index) & solution.used]
@@ -118,7 +119,8 @@ def smooth_recording(
             raise SmoothError(
                 recording.name, f"{wrong:.0%} of the measurements of {source.name} contradict the others"
             )
-    return _result(online, solution)
+    lasting = with_lasting_errors(problem, solution.knot, solution.landmark)
+    return _result(online, solver.with_noise_of(lasting))
 
 
 def _result(online: ReplayResult, solution: Solution) -> ReplayResult:

@@ -170,6 +170,12 @@ class Solver:
         normal, _ = self._normal(_SCALES[-1])
         return self._solution(normal.factored(0.0))
 
+    def with_noise_of(self, problem: BatchProblem) -> Solution:
+        """The same solution with the covariances of a problem with other noise."""
+        self._problem, self._pairs = problem, _steps(problem, self._knot_column >= 0)
+        normal, _ = self._normal(_SCALES[-1])
+        return self._solution(normal.factored(0.0))
+
     def _solve_rigid(self) -> None:
         """Solve with exact odometry: one transform of each robot's track, in the border."""
         columns, whole = (self._knot_column, self._landmark_column, self._parameter_column), self._size
