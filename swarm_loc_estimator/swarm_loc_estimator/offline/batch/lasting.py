@@ -22,13 +22,17 @@ from swarm_loc_estimator.offline.batch.problem import BatchProblem, Knots
 
 
 def counted_once(problem: BatchProblem) -> BatchProblem:
-    """The problem in which measurements of a link within their correlation time count as one."""
+    """The problem in which measurements of a link within their correlation time count as one.
+
+    Wheels are the less sure the longer nothing has measured their robot, lest the batch contradicts what does
+    so at last.
+    """
     sightings = problem.sightings
     order, same = _links(sightings)
     share = np.empty(sightings.size)
     share[order] = _shares(sightings, order, same)
     covariance = sightings.covariance / share[:, None, None]
-    return replace(problem, sightings=sightings._replace(covariance=covariance))
+    return replace(problem, sightings=sightings._replace(covariance=covariance), knots=_unmeasured(problem))
 
 
 def with_lasting_errors(problem: BatchProblem, knot: FloatArray, place: FloatArray) -> BatchProblem:
@@ -55,7 +59,7 @@ def with_lasting_errors(problem: BatchProblem, knot: FloatArray, place: FloatArr
     factor = np.empty(some.size)
     factor[order] = 1.0 + REPEATED * (before + after - own - 1.0).clip(min=0.0)
     covariance = some.covariance * factor[:, None, None]
-    return replace(problem, sightings=some._replace(covariance=covariance), knots=_unmeasured(problem))
+    return replace(problem, sightings=some._replace(covariance=covariance))
 
 
 def _links(some: Measurements) -> tuple[IntArray, BoolArray]:

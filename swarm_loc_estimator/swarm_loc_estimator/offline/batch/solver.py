@@ -171,8 +171,8 @@ class Solver:
         return self._solution(normal.factored(0.0))
 
     def with_noise_of(self, problem: BatchProblem) -> Solution:
-        """The same solution with the covariances of a problem with other noise."""
-        self._problem, self._pairs = problem, _steps(problem, self._knot_column >= 0)
+        """The same solution with the covariances of a problem with other noise of measurements."""
+        self._problem = problem
         normal, _ = self._normal(_SCALES[-1])
         return self._solution(normal.factored(0.0))
 
