@@ -8,7 +8,7 @@ MRCLAM_Dataset<k>. Robots and ground truth may be missing. Set 1 is fitted to if
 several sets, which are tests then; without TEST all sets of ../shared/data/mrclam are.
 
 Errors are those of online poses at 10 Hz, started at the true pose. For "plain" only the noise is fitted, for
-"calibrated" everything. The smoother is the offline optimum with the same models and noise. In `blind_robots`
+"calibrated" everything. The smoother is that of `replay --smooth`. In `blind_robots`
 only two robots see landmarks and all see robots; errors are those of the others, pooled over all pairs.
 """
 
