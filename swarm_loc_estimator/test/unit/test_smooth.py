@@ -247,9 +247,11 @@ def errors_of(result: ReplayResult, world: World) -> tuple[FloatArray, FloatArra
     return error, result.covariances[rows].reshape(-1, 3, 3)
 
 
-@pytest.mark.parametrize("sensor", list(ALL))
-def test_poses_are_better_than_online_ones_and_as_good_as_they_say(sensor: str) -> None:
-    """With unknown starts; of each sensor alone."""
+@pytest.mark.parametrize(
+    ("sensor", "least"), [*((one, 0.8) for one in ALL if one != "ranges"), ("ranges", 0.3)]
+)
+def test_poses_are_better_than_online_ones_and_as_good_as_they_say(sensor: str, least: float) -> None:
+    """With unknown starts; of each sensor alone. Half of the variance of ranges is taken as repeated."""
     online_squares, squares, normalized = [], [], []
     for seed in range(4):
         world = simulate(PLAN, seed)
@@ -263,7 +265,7 @@ def test_poses_are_better_than_online_ones_and_as_good_as_they_say(sensor: str) 
         squares += np.sum(both[1][0][known, :2] ** 2, axis=1).tolist()
         normalized += nees(*both[1]).tolist()
     assert np.mean(squares) < 0.8 * np.mean(online_squares)
-    assert 0.8 < np.mean(normalized) < 4.0
+    assert least < np.mean(normalized) < 4.0
 
 
 def run(recording: Recording, swarm: Swarm) -> ReplayResult:

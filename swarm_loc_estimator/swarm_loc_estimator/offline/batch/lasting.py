@@ -73,7 +73,10 @@ def _links(some: Measurements) -> tuple[IntArray, BoolArray]:
 def _shares(some: Measurements, order: IntArray, same: BoolArray) -> FloatArray:
     """By how much measurements (m,) in their order count, see `share_of` of `filter/sources.py`."""
     a, b = order[:-1], order[1:]
-    share = np.clip((some.stamp_ns[b] - some.stamp_ns[a]) / CORRELATION_NS, LEAST_SHARE, 1.0)
+    since_ns = some.stamp_ns[b] - some.stamp_ns[a]
+    is_fix = (some.observer[b] < 0) & (some.mount[b] < 0)
+    share = np.clip(since_ns / CORRELATION_NS, LEAST_SHARE, 1.0)
+    share[(since_ns == 0) & ~is_fix] = 1.0
     share[~is_compiled(some.model[b]) & (some.value[a, 0] == some.value[b, 0])] = LEAST_SHARE
     return np.concatenate([np.ones(min(1, order.size)), np.where(same, share, 1.0)])
 
