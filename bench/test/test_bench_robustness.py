@@ -81,7 +81,7 @@ class Stopped(Run):
         self.states.append(received[-1])
 
     def _watch(self) -> None:
-        self.track.append((self.body.now_ns, float(self.body._steps.mean())))
+        self.track.append((self.body.now_ns, float(np.mean(self.body._steps))))
         if self._left_s and not (self._begin_s and self.now_s >= self._begin_s):
             self.drive((0.02, 0.0, 0.0))
             if not self._begin_s and self.received > 30:
