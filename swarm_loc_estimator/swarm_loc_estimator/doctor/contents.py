@@ -162,7 +162,7 @@ def check_estimate(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(robot.name, problem, "Give it a start, or a sensor and something to see")
 
 
-_OUTER = {Contradicted.SUSPENDED, Contradicted.REPEATED, Contradicted.LATE}
+_OUTER = {Contradicted.SUSPENDED, Contradicted.REPEATED, Contradicted.LATE, Contradicted.BACKWARDS}
 """Faults of sources apart from their robots."""
 
 
@@ -235,6 +235,7 @@ _CONTRADICTED = MappingProxyType(
         Contradicted.DESCRIPTION: ("other than described", "Measure it again, or use survey or calibrate"),
         Contradicted.REPEATED: ("repeated", "Let its driver publish each range once"),
         Contradicted.LATE: ("late", "Set its delay_s as it says, then run doctor again"),
+        Contradicted.BACKWARDS: ("backwards in time", "Correct its driver; poses are right meanwhile"),
         Contradicted.SUSPENDED: ("at odds with the rest", "Correct it, then run doctor again"),
     }
 )

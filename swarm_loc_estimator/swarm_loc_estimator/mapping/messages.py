@@ -68,17 +68,13 @@ class ScanMessage(NamedTuple):
 
     stamp_ns: int  #: Time of the first beam
     angle_min: float  #: Direction of the first beam [rad]
-    angle_max: float  #: Direction of the last beam [rad]
+    angle_max: float  #: Direction of the last beam [rad], which many drivers get wrong: not used
     angle_increment: float  #: From a beam to the next one [rad]
     time_increment: float  #: From a beam to the next one [s]
     range_min: float  #: [m]
     range_max: float  #: [m]
     ranges: FloatArray  #: (b,) [m]
-
-    @property
-    def frame_id(self) -> str:
-        """Not read: the mount is that of the swarm description."""
-        return ""
+    frame_id: str = ""  #: Of the lidar
 
 
 class LightMessage(NamedTuple):
@@ -99,8 +95,9 @@ def decode_laser(data: bytes) -> LaserMessage:
 def decode_scan(data: bytes) -> ScanMessage:
     """Read a sensor_msgs/LaserScan; raises CdrError unless the bytes are a whole one."""
     message = decode(data, LASER_SCAN)
-    numbers = {name: float(getattr(message, name)) for name in ScanMessage._fields[1:-1]}
-    return ScanMessage(nanoseconds(message.header.stamp), **numbers, ranges=message.ranges.astype(float))
+    numbers = {name: float(getattr(message, name)) for name in ScanMessage._fields[1:-2]}
+    header, ranges = message.header, message.ranges.astype(float)
+    return ScanMessage(nanoseconds(header.stamp), **numbers, ranges=ranges, frame_id=header.frame_id)
 
 
 def decode_lights(data: bytes) -> list[LightMessage]:
@@ -131,14 +128,16 @@ def led_frequencies(entries: Collection[str], robots: Collection[str]) -> dict[s
     return found
 
 
-_MAX_SWEEP_S, _MAX_SWEEP_TURN = 2.0, 6.5
+_MAX_SWEEP_S, _MAX_SWEEP_TURN = 2.0, 7.0
 """Longest time [s] and greatest angle [rad] from the first to the last beam of a scan."""
+_AT_RANGE_MAX = 1e-3  # Share of range_max by which ranges of what met nothing may differ from it
 
 
 class LidarSweep(NamedTuple):
     """Beams (n,) of a scan that are used."""
 
     stamp_ns: int  # Time of the first beam of the scan
+    duration_ns: int  # From its first to its last beam; negative: the last one is measured first
     beam_ns: IntArray  # (n,) times of the beams
     angle: FloatArray  # (n,) directions in the frame of the lidar [rad]
     distance: FloatArray  # (n,) [m]; infinite: nothing up to `reach`
@@ -149,6 +148,10 @@ class LidarSweep(NamedTuple):
         """(n,) True for beams that met something."""
         return np.isfinite(self.distance)
 
+    def backwards(self) -> LidarSweep:
+        """The same beams in the other order of time."""
+        return self._replace(beam_ns=2 * self.stamp_ns + self.duration_ns - self.beam_ns)
+
     def ends(self, lidar: LidarModel, motion: FloatArray) -> FloatArray:
         """Ends (n, 2) of the beams, at `reach` where they met nothing.
 
@@ -157,14 +160,17 @@ class LidarSweep(NamedTuple):
             motion: (n, 3) pose of the robot at each beam, in the frame of the ends.
         """
         distance = np.minimum(self.distance, self.reach)
-        ray = distance[:, None] * np.stack([np.cos(self.angle), np.sin(self.angle)], axis=-1)
+        across = math.cos(lidar.roll)  # walls are vertical, and a lidar upside down sees them mirrored
+        ray = distance[:, None] * np.stack([np.cos(self.angle), across * np.sin(self.angle)], axis=-1)
         return transform_points(compose(motion, np.array([lidar.x, lidar.y, lidar.yaw])), ray)
 
 
 def read_sweep(
     scan: ScanMessage, lidar: LidarModel, drops: Counter[str], dropped_beams: Counter[str]
 ) -> LidarSweep | None:
-    """The valid beams of a scan, by REP 117: what met nothing is infinitely far.
+    """The valid beams of a scan; beam i points to angle_min + i * angle_increment, however many there are.
+
+    What met nothing is infinitely far, as in REP 117, or has range_max. NaN, 0 and -inf say nothing.
 
     Args:
         scan: The message.
@@ -177,27 +183,23 @@ def read_sweep(
     """
     # geometry: angles and times of the beams
     count, step = len(scan.ranges), scan.angle_increment
-    numbers = (scan.angle_min, scan.angle_max, step, scan.time_increment)
-    is_finite = all(map(math.isfinite, numbers))
-    duration_s = scan.time_increment * (count - 1) if is_finite else 0.0
-    if not is_finite or step == 0.0 or not 0.0 <= duration_s <= _MAX_SWEEP_S:
+    is_finite = all(map(math.isfinite, (scan.angle_min, step)))
+    if not is_finite or step == 0.0 or abs(step) * (count - 1) > _MAX_SWEEP_TURN:
         drops["scan_bad_geometry"] += 1
         return None
-    if abs((scan.angle_max - scan.angle_min) / step + 1.0 - count) > 1.5 or not count:
-        drops["scan_wrong_length"] += 1  # many drivers are one off
-        return None
-    if abs(step) * (count - 1) > _MAX_SWEEP_TURN:
-        drops["scan_bad_geometry"] += 1
+    duration_s = scan.time_increment * (count - 1) if count else 0.0
+    if not abs(duration_s) <= _MAX_SWEEP_S:
+        drops["scan_bad_times"] += 1
         return None
     # ranges that can be true
     far = scan.range_max if math.isfinite(scan.range_max) and scan.range_max > 0.0 else math.inf
-    reach = min(far, lidar.max_range)
+    nothing, reach = (1.0 - _AT_RANGE_MAX) * far, min(far, lidar.max_range)
     near = max(scan.range_min, lidar.min_range) if math.isfinite(scan.range_min) else 0.0
     # beams without such a range are counted and left out
     wrong = {
         "beam_not_a_number": np.isnan(scan.ranges),
         "beam_too_near": (scan.ranges < near) | (scan.ranges <= 0.0),
-        "beam_too_far": np.isfinite(scan.ranges) & (scan.ranges > far),
+        "beam_too_far": np.isfinite(scan.ranges) & (scan.ranges > (1.0 + _AT_RANGE_MAX) * far),
     }
     for reason, beams in wrong.items():
         dropped_beams[reason] += int(beams.sum())
@@ -208,6 +210,6 @@ def read_sweep(
     # the others, each with its own time
     begin_ns = scan.stamp_ns + round(1e9 * lidar.delay_s)
     beam_ns = begin_ns + np.round(used * (scan.time_increment * 1e9)).astype(np.int64)
-    distance = np.where(scan.ranges[used] > reach, math.inf, scan.ranges[used])
+    distance = np.where(scan.ranges[used] > min(nothing, reach), math.inf, scan.ranges[used])
     angle = scan.angle_min + used.astype(float) * step
-    return LidarSweep(begin_ns, beam_ns, angle, distance, reach)
+    return LidarSweep(begin_ns, round(1e9 * duration_s), beam_ns, angle, distance, reach)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import Level, Report, drop_values, level_of, listed
 from swarm_loc_estimator.filter.measurements import Measurements, Verdict
+from swarm_loc_estimator.filter.models import SCAN
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.inputs import Ingest, InputStatistics, InputTopic
@@ -34,8 +35,18 @@ _CAUSES = {
     "face_down": "are of lying markers that show the floor: is the pose of the camera right?",
     "not_flat": "are of markers that do not lie level at z of their face: are size and camera pose right?",
     "odometry_absurd": "are odometry that is absurdly large",
+    "scan_bad_geometry": "are scans without finite angles, or of more than a revolution",
+    "scan_bad_times": "are scans whose time_increment is not finite, or makes a sweep of more than 2 s",
+    "scan_without_beams": "are scans without any valid range",
 }
 """Why messages of a robot are dropped."""
+_UNUSED_SCANS = {
+    Verdict.OFF_MAP: "contradict the map at its pose: check lidar.yaw, lidar.roll, the map and the start",
+    Verdict.BLOCKED: "show too few walls of the map",
+    Verdict.NOT_LOCALIZED: "fit no place in the map, or several: it is not located",
+    Verdict.GATED: "were gated",
+}
+"""Why no scan of a robot is used."""
 _PATIENCE_S, _PATIENCE_PERIODS = 10.0, 5.0  # Timeout of an expected input [s], and in its mean periods
 
 
@@ -159,6 +170,7 @@ class Diagnostics:
             loss = losses[index] if index < len(losses) else None
             known = [loss.text(now_ns)] if loss is not None else []
             known += self._drop_troubles(index, drops_of[index]) if drops_of else []
+            known += _unused_scans(index, recent)
             if index in clocks_apart:
                 known.append(clocks_apart[index].problem)
             report = self._source_report(index, source, estimate, now_ns, elapsed_s, known)
@@ -335,6 +347,16 @@ def _used_per_source(recent: Recent, sources: int) -> tuple[list[int], list[floa
     total = np.bincount(observers, nis[mine], minlength=sources)
     mean = np.divide(total, count, out=np.full(sources, np.nan), where=count > 0)
     return count.tolist(), mean.tolist()
+
+
+def _unused_scans(robot: int, recent: Recent) -> list[str]:
+    """A sentence if none of the newest scans of a robot is used."""
+    measurements, verdicts, _ = recent
+    own = verdicts[(measurements.model == SCAN) & (measurements.target == robot)]
+    if not own.size or (own == Verdict.USED).any():
+        return []
+    most = Verdict(int(np.bincount(own).argmax()))
+    return [f"none of its last {own.size} scans is used: they {_UNUSED_SCANS[most]}"] if most else []
 
 
 def _figure(value: float | None) -> str:

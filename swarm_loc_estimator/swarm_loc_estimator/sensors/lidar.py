@@ -34,6 +34,8 @@ _NEW, _SLIP = 0.3, 0.05  # Share of a match's variance that the next one does no
 _BENT = 0.25  # Error of the heading, as a share of the turn in a sweep that was straightened without it
 _DOF = 4.0  # Errors have Student's distribution: wheels slip
 _GAP_NS = 1_000_000_000  # Scans farther apart are not compared
+_BACKWARDS, _SURE_ORDER = -2.0, 4.0
+"""Log odds that the header says the order of the beams wrongly, at first and from which on it is known."""
 _NEAR_S, _REFUTED = 0.06, 0.05  # A delay is refuted if it, and those so near, have less chance than this
 
 
@@ -42,7 +44,7 @@ class ScanRows(NamedTuple):
 
     robot: IntArray  #: (s,) index of the robot
     stamp_ns: IntArray  #: (s,) time of the first beam
-    scan: NDArray[Any]  #: (s,) of `ScanMessage`
+    scan: NDArray[Any]  #: (s,) of `ScanMessage`, and of `LidarSweep` after `ScanSensor.measure`
     arrival_ns: IntArray  #: (s,) arrival times
 
 
@@ -55,13 +57,12 @@ class SweepStore:
         swarm: Robots with their lidars.
 
     Attributes:
-        drops: Reason -> number of unusable scans.
+        drops: None; scans that cannot be used are counted by the sensor.
         sweeps: LidarSweep by robot and stamp of its first beam [ns].
     """
 
     def __init__(self, swarm: Swarm) -> None:
-        self._lidars = [robot.lidar for robot in swarm.robots]
-        self._beams: Counter[str] = Counter()
+        self._late_ns = np.array([round(-1e9 * min(0.0, one.lidar.delay_s)) for one in swarm.robots])
         self.drops: Counter[str] = Counter()
         self.sweeps: dict[tuple[int, int], LidarSweep] = {}
 
@@ -71,27 +72,19 @@ class SweepStore:
         return {}
 
     def take(self, rows: ScanRows) -> Change:
-        """Add scans."""
+        """Add sweeps."""
         nothing = np.zeros((len(rows.scan), 3))
-        added = about_robots(rows.robot, rows.stamp_ns, nothing, np.eye(3)[None], SCAN)
-        usable = np.ones(len(rows.scan), dtype=bool)
-        columns = rows.robot.tolist(), rows.stamp_ns.tolist(), rows.scan
-        for k, (robot, stamp_ns, scan) in enumerate(zip(*columns, strict=True)):
-            sweep = read_sweep(scan, self._lidars[robot], self.drops, self._beams)
-            if sweep is None:
-                usable[k] = False
-                continue
-            shift_ns = stamp_ns - scan.stamp_ns  # of the robot's clock
-            sweep = sweep._replace(stamp_ns=sweep.stamp_ns + shift_ns, beam_ns=sweep.beam_ns + shift_ns)
-            self.sweeps.setdefault((robot, stamp_ns), sweep)
-            late_ns = round(1e9 * max(0.0, -self._lidars[robot].delay_s))
-            added.stamp_ns[k], added.reading[k] = sweep.beam_ns[-1] + late_ns, stamp_ns
-        added.arrival_ns[:] = rows.arrival_ns
-        return Change(select(added, usable), NO_MEASUREMENTS)
+        ends_ns = [max(one.stamp_ns, one.stamp_ns + one.duration_ns) for one in rows.scan]
+        stamps_ns = np.array(ends_ns) + self._late_ns[rows.robot]
+        added = about_robots(rows.robot, stamps_ns, nothing, np.eye(3)[None], SCAN)
+        added.reading[:], added.arrival_ns[:] = rows.stamp_ns, rows.arrival_ns
+        for key in zip(rows.robot.tolist(), rows.stamp_ns.tolist(), rows.scan, strict=True):
+            self.sweeps.setdefault(key[:2], key[2])
+        return Change(added, NO_MEASUREMENTS)
 
     def forget_before(self, oldest_ns: int) -> None:
         """Discard sweeps that ended before an instant."""
-        for key in [key for key, sweep in self.sweeps.items() if sweep.beam_ns[-1] < oldest_ns]:
+        for key in [key for key, sweep in self.sweeps.items() if sweep.beam_ns.max() < oldest_ns]:
             del self.sweeps[key]
 
     def restart(self) -> None:
@@ -114,6 +107,20 @@ class ScanSensor(Sensor):
         scans[:] = messages.decoded
         return ScanRows(messages.robot, messages.stamp_ns, scans, messages.arrival_ns)
 
+    def measure(self, rows: ScanRows) -> ScanRows:
+        """Read the sweeps, and count scans that cannot be used."""
+        sweeps, columns = rows.scan.copy(), (rows.robot.tolist(), rows.stamp_ns.tolist(), rows.scan)
+        for k, (robot, stamp_ns, scan) in enumerate(zip(*columns, strict=True)):
+            reasons: Counter[str] = Counter()
+            sweep = sweeps[k] = read_sweep(scan, self.swarm.robots[robot].lidar, reasons, Counter())
+            for reason in reasons:
+                self.drops.add(reason, rows.robot[k : k + 1])
+            if sweep is not None:
+                shift_ns = stamp_ns - scan.stamp_ns  # of the robot's clock
+                times = {"stamp_ns": sweep.stamp_ns + shift_ns, "beam_ns": sweep.beam_ns + shift_ns}
+                sweeps[k] = sweep._replace(**times)
+        return select(rows._replace(scan=sweeps), np.array([one is not None for one in sweeps], dtype=bool))
+
     @classmethod
     def expected_of(cls, robot: Robot) -> bool:
         """Whether the description says that the robot has a lidar."""
@@ -121,7 +128,7 @@ class ScanSensor(Sensor):
 
 
 class DelayBelief(NamedTuple):
-    """What is known of the delay of a lidar, and its newest scan."""
+    """What is known of the times of a lidar's beams, and its newest scan."""
 
     lag_s: FloatArray  # (L,) how much older scans may be than described [s]
     chance: FloatArray  # (L,) of each
@@ -129,6 +136,12 @@ class DelayBelief(NamedTuple):
     seen: FloatArray  # (3,) pose of the robot in the middle of the sweep, in `map`
     covariance: FloatArray  # (3, 3) of this pose, by its own axes
     track: FloatArray  # (L, 3) this pose by odometry, at each lag
+    backwards: float = _BACKWARDS  # Log odds that beams are measured in the other order than described
+
+    @property
+    def is_backwards(self) -> bool:
+        """Whether beams are certainly measured in the other order than described."""
+        return self.backwards > _SURE_ORDER
 
     @property
     def mean_s(self) -> float:
@@ -184,7 +197,7 @@ def learned_delay(
             transition * (1.0 + squares / (bent * _DOF)) ** (-0.5 * (_DOF + 3.0)) / np.sqrt(bent)
         )
         chance /= chance.sum()
-    return DelayBelief(before.lag_s, chance, stamp_ns, seen, own, track)
+    return DelayBelief(before.lag_s, chance, stamp_ns, seen, own, track, before.backwards)
 
 
 def at_odometry(belief: DelayBelief, now: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -155,6 +155,7 @@ class LidarModel:
     x: float = number(0.0, "m", -10.0, 10.0, "forward of base_link")
     y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")
     yaw: float = number(0.0, "rad", -TURN, TURN, "turned to the left; 3.1416: its zero is backwards")
+    roll: float = number(0.0, "rad", -TURN, TURN, "turned about its zero before; 3.1416: upside down")
     delay_s: float = number(0.0, "s", -2.0, 2.0, "beams are measured this much after their stamps")
     min_range: float = number(0.0, "m", 0.0, 10.0, "nearer ranges are dropped, as those below range_min")
     max_range: float = number(

@@ -270,6 +270,7 @@ class Contradicted(Enum):
     SUSPENDED = "suspended source"
     REPEATED = "repeated values"
     LATE = "stamps of scans"
+    BACKWARDS = "order of beams"
 
 
 GYROSCOPE_OF = "gyroscope of "  # Before the name of its robot
@@ -337,6 +338,11 @@ def contradictions(
         ),
         *(_suspended(names[source]) for source in suspended.tolist()),
         *(_late(swarm.robots[robot], one) for robot, one in state.delays.items() if one.is_refuted),
+        *(
+            _of_robot(names[one], Contradicted.BACKWARDS)
+            for one in sorted(state.delays)
+            if state.delays[one].is_backwards
+        ),
         *(_description(names[source], source, state) for source in contradicted),
     ]
 
@@ -351,8 +357,14 @@ _TEXTS = {
     Contradicted.POSE: "the newest measurements contradict the pose of {0}",
     Contradicted.REPEATED: "the radio of {0} repeats its values: they count once; publish each range once,"
     " with its stamp",
+    Contradicted.BACKWARDS: "the lidar of {0} measures its beams in the other order than its time_increment"
+    " says: using them so; let its driver publish a negative one, or reverse the ranges",
 }
-_PART = {Contradicted.GYROSCOPE: GYROSCOPE_OF, Contradicted.REPEATED: "radio of "}
+_PART = {
+    Contradicted.GYROSCOPE: GYROSCOPE_OF,
+    Contradicted.REPEATED: "radio of ",
+    Contradicted.BACKWARDS: "lidar of ",
+}
 
 
 def _of_robot(name: str, kind: Contradicted) -> Contradiction:

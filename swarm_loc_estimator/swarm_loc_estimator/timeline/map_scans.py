@@ -61,6 +61,7 @@ _MIN_INFORMATION = 4.0  # Information below which a direction is not determined 
 UNDETERMINED_SIGMA = 2.0
 """Standard deviation where walls tell nothing [m, or rad times the mean range]; robots are lost before."""
 _THROUGH_M = 0.25  # A beam that ends farther than this beyond a wall has gone through it [m]
+_MAX_MISFIT = 9.0  # Of a beam, in variances
 _MIN_BEAMS, _MIN_FIT, _MAX_THROUGH = 20, 0.5, 0.1
 """Minimum number and share of beams that fit, and maximum share of beams that go through walls."""
 
@@ -94,6 +95,7 @@ class Match(NamedTuple):
     determined: int  # Number of directions that walls tell, of 3
     fitting: float  # Share of the comparable beams that fit walls
     through: float  # Share of those that go through walls
+    misfit: float  # Mean squared distance of the comparable beams from walls, in variances
 
 
 def wall_map(occupancy: OccupancyMap, path: Path) -> WallMap:
@@ -192,7 +194,7 @@ def match(
             break
     for i in range(3):
         result[i, i] += walls.variance * (_SHARED_TURN / (scale * scale) if i == 2 else _SHARED)
-    fitting, blocked, through = _classified(walls, ends, origin, variance, pose)
+    fitting, blocked, through, misfit = _classified(walls, ends, origin, variance, pose)
     tried = max(fitting + blocked + through, 1)
     shift = pose - predicted
     distance = np.dot(shift, np.linalg.solve(covariance + result, shift))
@@ -203,7 +205,7 @@ def match(
         outcome = BLOCKED
     elif distance > POSE_GATE:
         outcome = FAR
-    return Match(outcome, pose, result, determined, fitting / tried, through / tried)
+    return Match(outcome, pose, result, determined, fitting / tried, through / tried, misfit / tried)
 
 
 @cached_njit
@@ -298,24 +300,29 @@ def _inverted(
 @cached_njit
 def _classified(
     walls: WallMap, ends: FloatArray, origin: FloatArray, variance: FloatArray, pose: FloatArray
-) -> tuple[int, int, int]:
-    """Numbers of beams that fit walls, end where the map is free, and go through walls."""
+) -> tuple[int, int, int, float]:
+    """Numbers of beams that fit walls, end where the map is free, and go through walls.
+
+    And the sum of their squared distances from walls, in variances, `_MAX_MISFIT` at most.
+    """
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     from_x = pose[0] + cos * origin[0] - sin * origin[1]
     from_y = pose[1] + sin * origin[0] + cos * origin[1]
-    fitting, blocked, through = 0, 0, 0
+    fitting, blocked, through, misfit = 0, 0, 0, 0.0
     for k in range(len(ends)):
         x = pose[0] + cos * ends[k, 0] - sin * ends[k, 1]
         y = pose[1] + sin * ends[k, 0] + cos * ends[k, 1]
         i, j = _cell_of(walls, x, y)
         wall, near = (walls.nearest[i, j] if i >= 0 else -1), _near(walls, variance[k])
-        if wall >= 0 and _distance(walls.line[wall], x, y) <= near:
+        away = _distance(walls.line[wall], x, y) if wall >= 0 else math.inf
+        if away <= near:
             fitting += 1
+            misfit += min(away * away / (variance[k] + walls.variance), _MAX_MISFIT)
         elif _goes_through(walls, from_x, from_y, x, y, max(_THROUGH_M, near)):
             through += 1
         elif i >= 0 and walls.kind[i, j] == _FREE:
             blocked += 1
-    return fitting, blocked, through
+    return fitting, blocked, through, misfit + _MAX_MISFIT * (blocked + through)
 
 
 @cached_njit
@@ -347,6 +354,10 @@ _MAX_MISSED, _MAX_AT_START = 10.0, 3.0
 _ALL, _SURE_FIT = 3, 0.65
 """Number of directions and share of fitting beams with which a scan confirms a start: elsewhere, walls like
 those at home are seen now and then."""
+_ORDER_TURN, _ORDER_KNOWN = 0.03, 12.0
+"""Turn during a sweep that tells in which order its beams are measured [rad], and log odds that settle it."""
+_ORDER_WEIGHT, _ORDER_NEWS = 10.0, 4.0
+"""Log odds of this order by the misfit of a scan, whose beams err together, and the most by a scan."""
 Sweeps = Mapping[tuple[int, int], LidarSweep]  # Sweeps by robot and stamp of the first beam [ns]
 
 
@@ -403,6 +414,16 @@ class MapScans:
         back = between(now, track[best])
         _, doubt = at_odometry(delay._replace(seen=compose(pose, back), track=track), now)
         found = match(walls, *beams, pose, covariance + doubt)
+        if abs(delay.backwards) < _ORDER_KNOWN and self._turned(robot, sweep) > _ORDER_TURN:
+            beams, _, _ = self._beams(robot, stamp_ns, sweep.backwards(), delay.lag_s, best)
+            other = match(walls, *beams, pose, covariance + doubt)
+            news = min(max(_ORDER_WEIGHT * (found.misfit - other.misfit), -_ORDER_NEWS), _ORDER_NEWS)
+            delay = delay._replace(backwards=delay.backwards + news)
+            found = other if delay.backwards > 0.0 else found
+        elif delay.backwards > 0.0:
+            beams, _, _ = self._beams(robot, stamp_ns, sweep.backwards(), delay.lag_s, best)
+            found = match(walls, *beams, pose, covariance + doubt)
+        state.delays[robot] = delay
         confirmed = state.sources.confirmations[robot] >= CONFIRMED
         if found.outcome == FITS or (found.outcome == FAR and confirmed):
             delay = learned_delay(delay, stamp_ns, compose(found.pose, back), found.covariance, track)
@@ -424,6 +445,12 @@ class MapScans:
         fix.has_second[:], fix.second[:] = True, fix.value
         return fix, Verdict.OPEN, found.determined >= _ALL and found.fitting >= _SURE_FIT
 
+    def _turned(self, robot: int, sweep: LidarSweep) -> float:
+        """How far a robot turned during a sweep, by odometry [rad]."""
+        ends_ns = np.array([sweep.stamp_ns, sweep.stamp_ns + sweep.duration_ns])
+        first, last = self._tracks.at(np.array([robot, robot]), ends_ns).pose[:, 2]
+        return abs(float(last - first))
+
     def _beams(
         self, robot: int, stamp_ns: int, sweep: LidarSweep, lag_s: FloatArray, best: int
     ) -> tuple[tuple[FloatArray, FloatArray, FloatArray], FloatArray, FloatArray]:
@@ -432,7 +459,7 @@ class MapScans:
         And poses by odometry: then (3,), and in the middle of the sweep at each lag (L, 3).
         """
         lidar, seen, beams = self._lidars[robot], sweep.seen, sweep.beam_ns.size
-        lag_ns, middle_ns = np.round(1e9 * lag_s).astype(np.int64), int(sweep.beam_ns.mean())
+        lag_ns, middle_ns = np.round(1e9 * lag_s).astype(np.int64), sweep.stamp_ns + sweep.duration_ns // 2
         at_ns = np.concatenate([sweep.beam_ns - lag_ns[best], [stamp_ns], middle_ns - lag_ns])
         poses = self._tracks.at(np.full(at_ns.size, robot), at_ns).pose
         ends = sweep.ends(lidar, between(poses[beams], poses[:beams]))[seen]

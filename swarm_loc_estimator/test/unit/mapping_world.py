@@ -165,9 +165,9 @@ class LidarRobot:
 
 def scan_bytes(scan: ScanMessage) -> bytes:
     """A sensor_msgs/LaserScan."""
-    header = {"stamp": scan.stamp_ns, "frame_id": "a/base_scan"}
+    header = {"stamp": scan.stamp_ns, "frame_id": scan.frame_id or "a/base_scan"}
     fields = {**scan._asdict(), "header": header, "ranges": scan.ranges.astype(np.float32)}
-    del fields["stamp_ns"]
+    del fields["stamp_ns"], fields["frame_id"]
     return encode(fields, LASER_SCAN)
 
 

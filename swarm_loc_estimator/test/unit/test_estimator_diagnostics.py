@@ -9,6 +9,7 @@ from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, enco
 from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
+from swarm_loc_estimator.filter.models import SCAN
 from swarm_loc_estimator.nodes.estimator_diagnostics import Diagnostics, Recent, TickCost, load_report
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.inputs import Ingest
@@ -261,3 +262,19 @@ def test_ticks_that_take_all_the_time_name_what_helps(tick_s: float, warning: bo
     assert report.warning == warning
     assert ("fusion_period_s" in report.message) == warning
     assert report.values["tick mean [ms]"] == f"{1e3 * tick_s:.4g}"
+
+
+@pytest.mark.parametrize(
+    ("verdict", "said"), [(Verdict.OFF_MAP, "contradict the map"), (Verdict.BLOCKED, "show too few walls")]
+)
+def test_a_robot_whose_scans_are_all_unused_is_not_ok(verdict: Verdict, said: str) -> None:
+    world, scans = World(), Measurements.empty(3)
+    scans.model[:], scans.target[:] = SCAN, 0
+    found = {}
+    for used in (verdict, Verdict.USED):
+        verdicts = np.array([verdict, used, verdict], dtype=np.uint8)
+        recent = (scans, verdicts, np.full(3, np.nan))
+        found[used] = world.reports(9, estimate(9, Status.TRACKED, Status.TRACKED), recent, {})
+    assert f"none of its last 3 scans is used: they {said}" in found[verdict][0].message
+    assert found[verdict][0].warning
+    assert "scans" not in found[verdict][1].message + found[Verdict.USED][0].message

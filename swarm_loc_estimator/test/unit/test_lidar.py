@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from swarm_loc_estimator.common.se2 import between, compose, transform_points
 from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput, SweepPairer
-from swarm_loc_estimator.mapping.messages import ScanMessage, decode_scan
+from swarm_loc_estimator.mapping.messages import LidarSweep, ScanMessage, decode_scan, read_sweep
 from swarm_loc_estimator.mapping.scans import ScanStop
 from swarm_loc_estimator.swarm.error_models import LidarModel
 from swarm_loc_estimator.swarm.swarm import Robot, StartSigma, Swarm
@@ -56,6 +57,15 @@ def changed(ranges: list[float], **fields: Any) -> ScanMessage:
     return ScanMessage(5, 0.0, last, 0.1, 0.0, 0.2, 4.0, np.array(ranges))._replace(**fields)
 
 
+def swept(scan: ScanMessage) -> LidarSweep:
+    """The sweep of a scan that can be used."""
+    drops: Counter[str] = Counter()
+    sweep = read_sweep(scan, LidarModel(range_sigma=0.01), drops, Counter())
+    assert sweep is not None
+    assert not drops
+    return sweep
+
+
 def one_stop(pairer: SweepPairer, scan: ScanMessage) -> ScanStop:
     """The stop of a scan by a robot that stands."""
     pairer.add_odometry(0, np.zeros(3))
@@ -74,7 +84,8 @@ def test_a_scan_is_read_as_others_write_it() -> None:
     ranges = np.array([0.5, math.inf, 1.5, 2.0, 2.5], dtype=np.float32)
     message = types[LASER_SCAN](header=header, **numbers, ranges=ranges, intensities=ranges)
     found = decode_scan(bytes(typestore().serialize_cdr(message, LASER_SCAN)))
-    assert found[:-1] == (1_000_000_007, -1.0, 1.0, 0.5, 0.25, 0.125, 3.5)
+    assert found[:-2] == (1_000_000_007, -1.0, 1.0, 0.5, 0.25, 0.125, 3.5)
+    assert found.frame_id == "laser"
     assert found.ranges.tolist() == ranges.tolist()
 
 
@@ -105,12 +116,11 @@ def test_a_range_beyond_what_is_described_is_free_space(range_max: float) -> Non
     [
         ([1.0, 1.0], {"angle_increment": 0.0}, "scan_bad_geometry"),
         ([1.0, 1.0], {"angle_min": math.nan}, "scan_bad_geometry"),
-        ([1.0, 1.0], {"time_increment": math.inf}, "scan_bad_geometry"),
-        ([1.0, 1.0], {"time_increment": -0.1}, "scan_bad_geometry"),
-        ([1.0, 1.0], {"time_increment": 2.1}, "scan_bad_geometry"),
-        ([1.0] * 70, {}, "scan_bad_geometry"),
-        ([1.0] * 5, {"angle_max": 0.2}, "scan_wrong_length"),
-        ([], {"angle_max": 0.0}, "scan_wrong_length"),
+        ([1.0, 1.0], {"time_increment": math.inf}, "scan_bad_times"),
+        ([1.0, 1.0], {"time_increment": -2.1}, "scan_bad_times"),
+        ([1.0, 1.0], {"time_increment": 2.1}, "scan_bad_times"),
+        ([1.0] * 72, {}, "scan_bad_geometry"),
+        ([], {}, "scan_without_beams"),
         ([math.nan, 0.0], {}, "scan_without_beams"),
         ([1.0, 1.0], {"stamp_ns": -1}, "scan_too_old"),
     ],
@@ -123,6 +133,34 @@ def test_a_scan_that_cannot_be_used_is_dropped_with_a_reason(
     pairer.add_scan(changed(ranges, **fields))
     assert dict(pairer.drops) == {reason: 1}
     assert [one.inverse.size for one in pairer.ready()] == []  # there is no odometry yet
+
+
+@pytest.mark.parametrize("angle_max", [0.2, 9.0, -1.0, math.nan])
+def test_a_beam_is_where_its_number_says_however_many_there_are(angle_max: float) -> None:
+    for step in (0.1, -0.1):
+        sweep = swept(changed([1.0] * 5, angle_min=1.0, angle_max=angle_max, angle_increment=step))
+        assert sweep.angle == pytest.approx(1.0 + step * np.arange(5))
+
+
+def test_what_met_nothing_is_no_wall() -> None:
+    """Range_max, also rounded, 0, NaN and infinities; a wall just before range_max is one."""
+    nothing = [4.0, 4.0 - 1e-6, 4.0 + 1e-6, 0.0, math.nan, math.inf, -math.inf]
+    sweep = swept(changed([*nothing, 3.9]))
+    assert sweep.distance[sweep.seen] == pytest.approx([3.9])
+
+
+def test_times_of_beams_go_with_time_increment() -> None:
+    forwards, backwards = (swept(changed([1.0, math.nan, 1.0], time_increment=dt)) for dt in (0.5, -0.5))
+    assert (forwards.beam_ns - 5).tolist() == [0, 1_000_000_000]
+    assert (backwards.beam_ns - 5).tolist() == [0, -1_000_000_000]
+    assert (forwards.backwards().beam_ns - 5).tolist() == [1_000_000_000, 0]
+
+
+def test_a_lidar_upside_down_sees_mirrored() -> None:
+    scan = changed([1.0, 2.0, 3.0], angle_increment=0.5)
+    upright, mounted = LidarModel(yaw=0.3, x=0.1), LidarModel(yaw=0.3, x=0.1, roll=math.pi)
+    mirrored = swept(scan._replace(angle_increment=-0.5)).ends(upright, np.zeros((3, 3)))
+    assert swept(scan).ends(mounted, np.zeros((3, 3))) == pytest.approx(mirrored)
 
 
 def test_scans_without_odometry_do_not_wait_for_ever() -> None:

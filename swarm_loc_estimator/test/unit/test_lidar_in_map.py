@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +21,7 @@ from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.map_file import save_map
+from swarm_loc_estimator.mapping.messages import ScanMessage
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.sensors.inputs import Ingest, input_topics
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, StartSigma, Swarm
@@ -52,7 +55,12 @@ class Weaver(LidarRobot):
 
 
 def sent(
-    until_ns: int, seed: int, blocked: int = 0, kind: type[LidarRobot] = LidarRobot, late_ns: int = 0
+    until_ns: int,
+    seed: int,
+    blocked: int = 0,
+    kind: type[LidarRobot] = LidarRobot,
+    late_ns: int = 0,
+    change: Callable[[ScanMessage], ScanMessage] = lambda scan: scan,
 ) -> list[tuple[str, int, bytes]]:
     """Topic, arrival and bytes: odometry, and each sweep when it is over, with some beams at people."""
     robot, unknown = kind(np.random.default_rng(seed)), UNKNOWN_COVARIANCE
@@ -67,7 +75,7 @@ def sent(
         beams = np.arange(7 * k, 7 * k + blocked) % len(scan.ranges)
         scan.ranges[beams] = np.minimum(scan.ranges[beams], 0.5)
         scan = scan._replace(stamp_ns=at_ns + late_ns)
-        found.append(("a/scan", at_ns + late_ns + SWEEP_NS, scan_bytes(scan)))
+        found.append(("a/scan", at_ns + late_ns + SWEEP_NS, scan_bytes(change(scan))))
     return sorted(found, key=lambda one: one[1])
 
 
@@ -122,6 +130,68 @@ def test_scans_that_are_stamped_late_are_named_and_poses_are_right(
         assert said is not None
         assert float(said[1]) == pytest.approx(-late_s, abs=0.04)
     assert np.mean(squares) < 4.5
+
+
+class Spinner(Weaver):
+    """A robot that turns by up to 1.8 rad/s."""
+
+    def odometry(self, stamp_ns: NDArray[np.int64]) -> FloatArray:
+        """Poses (n, 3) by odometry at times (n,)."""
+        return super().odometry(stamp_ns) * [1.0, 1.0, 2.0]
+
+
+def backwards(scan: ScanMessage) -> ScanMessage:
+    """The same beams, listed in the other direction, without a word about their times."""
+    last = scan.angle_min + (len(scan.ranges) - 1) * scan.angle_increment
+    shape = {"angle_min": last, "angle_increment": -scan.angle_increment}
+    return scan._replace(ranges=scan.ranges[::-1], **shape)
+
+
+@pytest.mark.parametrize("kind", [Spinner, LidarRobot])
+@pytest.mark.parametrize("is_wrong", [True, False])
+def test_beams_that_are_measured_against_their_order_are_found_and_named(
+    room: Path, kind: type[LidarRobot], is_wrong: bool
+) -> None:
+    until_ns, squares = 5_000_000_000, []
+    for seed in range(4):
+        estimator = Estimator(swarm_at(room, LidarRobot.start + np.array([0.03, -0.02, 0.03])))
+        messages = sent(until_ns, seed, kind=kind, change=backwards if is_wrong else lambda scan: scan)
+        estimate = hand_in(estimator, messages)[-1]
+        error = wrapped(estimate.poses[0] - kind().pose(until_ns))
+        squares.append(float(nees(error[None], estimate.covariances)[0]))
+        assert estimate.status[0] == Status.TRACKED
+        named = [one.about for one in estimator.contradictions(until_ns)]
+        assert named == (["lidar of a"] if is_wrong else [])
+    assert np.mean(squares) < 4.5
+
+
+def test_headers_as_drivers_write_them_give_the_same_poses(room: Path) -> None:
+    """Ranges of what met nothing, ends of angles and numbers of beams differ between drivers."""
+    until_ns, start = 3_000_000_000, LidarRobot.start + np.array([0.03, 0.0, 0.0])
+
+    def nothing_met(value: float) -> Callable[[ScanMessage], ScanMessage]:
+        def change(scan: ScanMessage) -> ScanMessage:
+            far = scan.ranges > 1.5
+            return scan._replace(ranges=np.where(far, value, scan.ranges), range_max=1.5)
+
+        return change
+
+    poses = []
+    for value in (math.inf, 1.5, 0.0, math.nan, -math.inf):
+        estimator = Estimator(swarm_at(room, start))
+        poses.append(hand_in(estimator, sent(until_ns, seed=1, change=nothing_met(value)))[-1].poses)
+        assert estimator.used >= 14
+    assert all(one.tobytes() == poses[0].tobytes() for one in poses)
+    cropped = sent(until_ns, 1, change=lambda scan: scan._replace(ranges=scan.ranges[:300]))
+    estimator = Estimator(swarm_at(room, start))
+    assert hand_in(estimator, cropped)[-1].status[0] == Status.TRACKED
+    assert estimator.used >= 14
+
+
+def test_scans_that_cannot_be_used_are_counted_of_their_robot(room: Path) -> None:
+    estimator = Estimator(swarm_at(room, LidarRobot.start))
+    hand_in(estimator, sent(1_000_000_000, 1, change=lambda scan: scan._replace(angle_increment=0.0)))
+    assert dict(estimator.drops_of(0)) == {"scan_bad_geometry": 5} == dict(estimator.drops)
 
 
 def test_the_order_of_arrival_does_not_matter(room: Path) -> None:
