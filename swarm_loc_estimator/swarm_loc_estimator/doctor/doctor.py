@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -23,6 +24,7 @@ from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, Messag
 from swarm_loc_estimator.doctor.topics import DIAGNOSTICS, check_clocks, check_frames, check_topics
 from swarm_loc_estimator.offline.recorded_bag import Progress, renamed_topics, same_type
 from swarm_loc_estimator.sensors.inputs import input_topics, kinds
+from swarm_loc_estimator.sensors.mounts import TF_STATIC, Mounts
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 CHECKS = (
@@ -39,9 +41,32 @@ MAX_IMAGES = 20  # Maximum number of images of a topic that are kept; what is wr
 def examine(evidence: Evidence) -> list[Finding]:
     """All that is wrong, the most basic things first.
 
-    What the estimator contradicts often follows from the rest, so it is added only where nothing else is.
+    Mounts are those of static transforms where the description says none. What the estimator contradicts
+    often follows from the rest, so it is added only where nothing else is.
     """
-    return [one for check in CHECKS for one in check(evidence)] or [*check_estimate(evidence)]
+    mounts = _mounts(evidence)
+    evidence = replace(evidence, swarm=mounts.described())
+    found = [
+        Finding(
+            robot,
+            f"has {key} {described:.3g} in the description but {value:.3g} by tf_static",
+            "Correct the one that is wrong; without it in the description, the transform is taken",
+        )
+        for robot, key, described, value in mounts.differences()
+    ]
+    found += [one for check in CHECKS for one in check(evidence)]
+    return found or [*check_estimate(evidence)]
+
+
+def _mounts(evidence: Evidence) -> Mounts:
+    """Mounts of sensors by static transforms."""
+    mounts = Mounts(evidence.swarm)
+    for name, heard in evidence.topics.items():
+        is_static = name.endswith(TF_STATIC) and same_type(heard.type, TRANSFORMS)
+        is_usable = name in mounts.topics and evidence.usable(mounts.topics[name]) is not None
+        for message in heard.messages if is_static else heard.messages[:1] if is_usable else ():
+            mounts.add_message(name, message.data)
+    return mounts
 
 
 def lines_of(findings: Sequence[Finding]) -> list[str]:

@@ -41,6 +41,7 @@ from swarm_loc_estimator.nodes.estimator_topics import (
     NO_CLOCK,
     EstimateOutputs,
     EstimatorInputs,
+    MountListener,
     PoseCommands,
     StaticTransforms,
     newest_time_ns,
@@ -123,6 +124,8 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._reported_s = time.monotonic()
         self._lost = 0
         self._static_transforms = StaticTransforms(self, self._swarm, self.params)
+        per_robot = self.params.tf_per_robot
+        self._mounts = MountListener(self, self._swarm, self._ingest, tf_per_robot=per_robot)
         horizon_s = self.params.settings.horizon_s
         self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop, horizon_s)
         frame = self.params.map_frame
@@ -163,6 +166,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             return
         self._shedding.begin_tick(begin_s, self._pace.waited_s(self._time_ns()))
         self._receive(partial(newest_time_ns, self))
+        self._follow_mounts()
         self._inputs.looked_ns = now_ns = self._time_ns()
         self._estimate, fusing_s = self._estimate_at(now_ns, begin_s)
         if self._estimator.time_jumps != self._jumps:
@@ -211,6 +215,13 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             missed = round(unread * count / max(self._inputs.taken[sensor], 1))
             self._cost.note_sightings(missed, missed)
             self._estimator.drop(f"shed_{sensor}", missed)
+
+    def _follow_mounts(self) -> None:
+        """Restart with mounts of sensors that static transforms tell."""
+        news = self._mounts.news()
+        if news is not None and news[0] != self._estimator.swarm:
+            self._estimator.describe(news[0])
+            self.get_logger().info(" ".join(news[1]))
 
     def _follow_frame(self) -> None:
         """Publish in the frame that the poses are in: `map_frame`, or that of the origin of a local frame."""

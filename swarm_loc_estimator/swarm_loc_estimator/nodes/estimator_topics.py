@@ -34,7 +34,8 @@ from swarm_loc_estimator.common.messages.streams import SerializedMessage
 from swarm_loc_estimator.common.node import message_class
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
-from swarm_loc_estimator.sensors.inputs import SENSORS, InputTopic
+from swarm_loc_estimator.sensors.inputs import SENSORS, Ingest, InputTopic
+from swarm_loc_estimator.sensors.mounts import TF_STATIC, Mounts
 from swarm_loc_estimator.sensors.sensor import InputKind
 from swarm_loc_estimator.swarm.swarm import StartSigma, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
@@ -333,6 +334,41 @@ class StaticTransforms:
             child = transform.child_frame_id.lstrip("/")
             if child in owned:
                 self._parents[topic, child] = transform.header.frame_id.lstrip("/")[:_MAX_FRAME_LENGTH]
+
+
+class MountListener:
+    """Takes mounts from static transforms and the frames of sensors, where the description says none.
+
+    Args:
+        node: The node.
+        swarm: The swarm as described.
+        ingest: Knows the frames of messages.
+        tf_per_robot: Whether each robot has transforms of its own.
+    """
+
+    def __init__(self, node: Node, swarm: Swarm, ingest: Ingest, *, tf_per_robot: bool) -> None:
+        self._mounts, self._ingest = Mounts(swarm), ingest
+        self._waiting = [k for k, topic in enumerate(ingest.topics) if topic.name in self._mounts.topics]
+        self._is_changed = False
+        names = [f"{robot.name}/{TF_STATIC}" for robot in swarm.robots] if tf_per_robot else []
+        for topic in (f"/{TF_STATIC}", *names) if self._waiting else ():
+            listener = partial(self._on_transforms, topic)
+            node.create_subscription(TFMessage, topic, listener, _TF_STATIC)
+
+    def news(self) -> tuple[Swarm, list[str]] | None:
+        """The swarm with all mounts and a sentence for each, if there may be new ones since the last call."""
+        framed = [handle for handle in self._waiting if self._ingest.frame_id(handle)]
+        for handle in framed:
+            self._waiting.remove(handle)
+            self._mounts.add_frame(self._ingest.topics[handle], self._ingest.frame_id(handle))
+        if not (framed or self._is_changed):
+            return None
+        self._is_changed = False
+        return self._mounts.described(), self._mounts.remarks()
+
+    def _on_transforms(self, topic: str, message: TFMessage) -> None:
+        self._mounts.add_transforms(topic, message)
+        self._is_changed = True
 
 
 class _Transforms(NamedTuple):

@@ -22,6 +22,7 @@ from swarm_loc_estimator.common.messages.cdr import (
     POSE_STAMPED,
     POSE_WITH_COVARIANCE,
     TRANSFORM_STAMPED,
+    TRANSFORMS,
     CdrError,
     decode,
     nanoseconds,
@@ -41,6 +42,7 @@ from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.offline.result import RecordedMap, Spool
 from swarm_loc_estimator.sensors.inputs import Batch, Ingest, kinds
+from swarm_loc_estimator.sensors.mounts import TF_STATIC, Mounts
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 
@@ -240,6 +242,31 @@ def read_bag(
         unusable = () if any(one.received > one.malformed for one in ingest.statistics) else unusable
         tracks, shown = truth.tracks(), (maps.maps(), maps.goals())
         return BagSummary(range_ns, tracks, ingest.received(), remarks, unusable, *shown)
+
+
+def mounts_of_bag(bag: Path, swarm: Swarm, remap: Mapping[str, str] = MappingProxyType({})) -> Mounts:
+    """Mounts of sensors by the static transforms of a bag; `remap` as in `renamed_topics`.
+
+    Raises:
+        BagError: Nothing in the bag can be read, or a topic cannot be mapped.
+    """
+    mounts = Mounts(swarm)
+    known = [*Ingest(swarm).handle_of, *truth_topics(swarm), *MapReader(swarm).topics]
+    with BagReader(bag, renamed_topics(remap, swarm, known)) as reader:
+        types = {topic.name: topic.type for topic in reader.topics}
+        static = [name for name in types if name.endswith(TF_STATIC) and same_type(types[name], TRANSFORMS)]
+        waiting = {
+            name for name, topic in mounts.topics.items() if types.get(name) == topic.kind.message_type
+        }
+        for name, _, _, data in reader.messages(static):
+            mounts.add_message(name, data)
+        for name, _, _, data in reader.messages([*sorted(waiting)] if static else []):
+            if name in waiting:
+                waiting.remove(name)
+                mounts.add_message(name, data)
+            if not waiting:
+                break
+    return mounts
 
 
 def _from(batch: MessageBatch, first: int) -> MessageBatch:

@@ -23,7 +23,14 @@ from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.identification.memory import Identities
-from swarm_loc_estimator.offline.recorded_bag import NOTHING_LOST, Loss, Progress, read_bag, unwatched
+from swarm_loc_estimator.offline.recorded_bag import (
+    NOTHING_LOST,
+    Loss,
+    Progress,
+    mounts_of_bag,
+    read_bag,
+    unwatched,
+)
 from swarm_loc_estimator.offline.result import AerialImage, ReplayResult, Spool
 from swarm_loc_estimator.sensors.aerial import AerialRows
 from swarm_loc_estimator.sensors.inputs import MAX_PAUSE_NS, Batch
@@ -78,6 +85,8 @@ def replay(
     swarm = load_swarm(swarm_beside(bag)) if swarm is None else swarm
     periodic = PeriodicSchedule(_period_ns(tick_s))
     schedule = periodic if stamp_ns is None else ListedSchedule(_increasing(stamp_ns))
+    mounts = mounts_of_bag(bag, swarm, remap)
+    swarm = mounts.described()
     estimator = Estimator(swarm, settings)
     runner = Runner(estimator, schedule, keep_sightings=keep_sightings)
     summary = read_bag(bag, swarm, runner.take, progress, remap, loss)
@@ -86,7 +95,7 @@ def replay(
             "\n".join([f"'{bag}' holds no message that the estimator can use.", *summary.unusable])
         )
     runner.finish(summary.range_ns[1])
-    remarks = list(summary.remarks)
+    remarks = [*mounts.remarks(), *summary.remarks]
     if periodic.jumps:
         jumps = f"The log time jumps ahead by more than an hour, {periodic.jumps} x"
         remarks.append(f"{jumps}; no poses are given meanwhile.")

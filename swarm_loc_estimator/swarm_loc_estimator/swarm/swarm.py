@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -183,6 +183,8 @@ class Robot:
     clock: ClockModel = ClockModel()  #: Its clock
     ir: RobotIr | None = None  #: Infrared board; None if it has none
     uwb: UwbDevice | None = None  #: UWB radio; None if it has none
+    #: Numbers that its file says, such as "lidar.yaw"; others may come from transforms
+    said: frozenset[str] = field(default=frozenset(), compare=False, repr=False)
 
     @property
     def turn_sensor(self) -> OdometryModel | ImuModel:

@@ -122,6 +122,7 @@ START = {
     "theta": number_specs(CameraMount)["yaw"],
 }
 LANDMARK_DEFAULTS = {name: number_specs(Landmark)[name] for name in ("size", "position_sigma", "yaw_sigma")}
+MOUNT = ("x", "y", "z", "yaw", "pitch", "roll")  # Numbers that transforms tell where no description does
 RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
 MAX_ID, MAX_ADDRESS = 2**32 - 1, 2**64 - 1
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
@@ -247,6 +248,7 @@ class _Loader(TreeChecks):
             stands=models["odometry"] is None,
             ir=self._ir.board(sections["ir"], f"{key}.ir"),
             uwb=UwbDevice(**{**uwb, **self._address(uwb, f"{key}.uwb")}) if uwb else None,
+            said=frozenset(f"{name}.{key}" for name, values in sections.items() for key in values or ()),
             **{**models, "odometry": models["odometry"] or OdometryModel()},
         )
 
@@ -474,16 +476,26 @@ def _board(ir: RobotIr, folder: Path) -> Entries:
 
 def _layer(robot: Robot, folder: Path) -> Entries:
     """Everything about a robot that a type can say, as far as it differs from the defaults."""
-    layer: Entries = {section: _numbers(getattr(robot, section)) for section in MODELS if section != "camera"}
+    layer: Entries = {
+        section: _numbers(getattr(robot, section), _said_of(robot, section))
+        for section in MODELS
+        if section != "camera"
+    }
     response = {} if robot.response is None else asdict(robot.response)
     layer["response"] = {name: _listed(value) for name, value in response.items()}
-    layer["camera"] = None if robot.camera is None else _numbers(robot.camera)
+    layer["camera"] = None if robot.camera is None else _numbers(robot.camera, _said_of(robot, "camera"))
     if robot.stands:
         layer["odometry"] = None
     layer["ir"] = {} if robot.ir is None else _board(robot.ir, folder)
-    layer["uwb"] = {} if robot.uwb is None else _numbers(robot.uwb)
+    layer["uwb"] = {} if robot.uwb is None else _numbers(robot.uwb, _said_of(robot, "uwb"))
     layer["faces"] = {f.name: _numbers(f) | ({"lies": True} if f.lies else {}) for f in robot.faces}
     return layer
+
+
+def _said_of(robot: Robot, section: str) -> tuple[str, ...]:
+    """The numbers of a mount that the robot's file says, also those that are the defaults."""
+    said = (key.partition(".") for key in robot.said)
+    return tuple(key for name, _, key in said if name == section and key in MOUNT)
 
 
 def _listed(value: Any) -> Any:

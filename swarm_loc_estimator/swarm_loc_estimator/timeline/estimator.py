@@ -78,8 +78,13 @@ class Estimator:
         for name, value, expected in (("swarm", swarm, Swarm), ("settings", settings, Settings)):
             if not isinstance(value, expected):
                 raise TypeError(f"{name} must be a {expected.__name__}, not {value!r}")
-        self.swarm = swarm
         self.settings = settings.resolved_for(swarm)
+        self.time_jumps = 0
+        self._describe(swarm)
+
+    def _describe(self, swarm: Swarm) -> None:
+        """Begin with a description."""
+        self.swarm = swarm
         self._limits = TrackedLimits.of(swarm, self.settings)
         self._tracks = OdometryTracks(swarm.robots)
         self._converter = InputConverter(swarm, self.settings)
@@ -94,7 +99,6 @@ class Estimator:
         )
         self._horizon_ns = round(self.settings.horizon_s * 1e9)
         self._jump_back_ns = round(self.settings.jump_back_s * 1e9)
-        self.time_jumps = 0
         self._gathering: dict[str, Accumulator] = {}  # those that have data
         self._begin()
 
@@ -103,6 +107,12 @@ class Estimator:
         self._constant = ConstantOdometry(len(self.swarm.robots))
         self._odometry: list[OdometryRows] = []
         self._turn_rates: list[TurnRateRows] = []
+
+    def describe(self, swarm: Swarm) -> None:
+        """Restart with another description of the same robots; the total of `drops` is kept."""
+        drops = self.drops
+        self._describe(swarm)
+        self._converter.drops.total.update(drops)
 
     def reset(self) -> None:
         """Discard all data and restart at the configured starts; counters in `drops` are kept."""

@@ -7,13 +7,15 @@ from functools import partial
 from pathlib import Path
 
 import pytest
+from geometry_msgs.msg import TransformStamped
 from nav_msgs.msg import Odometry
 from node_world import SECOND, T0_NS, Ros, odometry_bytes, overrides, stamp_ns
-from rclpy.qos import qos_profile_sensor_data
+from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import LaserScan
 from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
 from swarm_loc_msgs.msg import SwarmPose, SwarmPoses
@@ -78,6 +80,39 @@ def test_scans_correct_a_start(ros: Ros, tmp_path: Path) -> None:
         now_ns, before = T0_NS + step * SECOND // 2, len(poses)
         odometry.publish(odometry_bytes("alpha", now_ns))
         scans.publish(scan_at(now_ns))
+        clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+        ros.until(partial(is_estimated, poses, before, now_ns))
+
+    (alpha,) = poses[-1].robots
+    assert alpha.status == SwarmPose.STATUS_TRACKED
+    assert (alpha.x, alpha.y, alpha.theta) == pytest.approx((0.0, 0.0, 0.0), abs=0.02)
+
+
+def test_a_mount_comes_from_static_transforms(ros: Ros, tmp_path: Path) -> None:
+    """The lidar looks to the left; who does not know it takes the robot to look to the right."""
+    path = tmp_path / "swarm.yaml"
+    path.write_text(SWARM_YAML, encoding="utf-8")
+    write_map(tmp_path)
+    ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True)))
+    clock = ros.tester.create_publisher(Clock, "/clock", 10)
+    odometry = ros.tester.create_publisher(Odometry, "alpha/odom", 100)
+    scans = ros.tester.create_publisher(LaserScan, "alpha/scan", qos_profile_sensor_data)
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    static = ros.tester.create_publisher(TFMessage, "/tf_static", latched)
+    turned = TransformStamped(header=Header(frame_id="alpha/base_link"), child_frame_id="alpha/base_scan")
+    turned.transform.rotation.z = turned.transform.rotation.w = math.sqrt(0.5)
+    static.publish(TFMessage(transforms=[turned]))
+    poses = ros.listen(SwarmPoses, "swarm/poses")
+    publishers = (clock, odometry, scans, static)
+    ros.until(lambda: all(one.get_subscription_count() for one in publishers))
+    ros.until(lambda: ros.tester.count_publishers("swarm/poses"))
+    quarter = BEAMS // 4
+    for step in range(10):
+        now_ns, before = T0_NS + step * SECOND // 2, len(poses)
+        odometry.publish(odometry_bytes("alpha", now_ns))
+        scan = scan_at(now_ns)
+        scan.ranges = [*scan.ranges[quarter:], *scan.ranges[:quarter]]
+        scans.publish(scan)
         clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
         ros.until(partial(is_estimated, poses, before, now_ns))
 
