@@ -115,6 +115,8 @@ class Verdict(IntEnum):
     AMBIGUOUS = 6  # an anonymous detection that matches several robots
     OFF_MAP = 7  # a scan that contradicts the map at the pose of its robot
     BLOCKED = 8  # a scan of which too few beams meet walls of the map
+    SEVERAL_PLACES = 9  # a scan of a robot that may be at several places in the map
+    NO_PLACE = 10  # a scan of a robot that is not located and fits no place in the map
 
 
 _DROPS = {
@@ -124,6 +126,8 @@ _DROPS = {
     "aerial_ambiguous": Verdict.AMBIGUOUS,
     "scan_off_map": Verdict.OFF_MAP,
     "scan_blocked": Verdict.BLOCKED,
+    "scan_ambiguous": Verdict.SEVERAL_PLACES,
+    "scan_nowhere": Verdict.NO_PLACE,
 }
 
 

@@ -285,6 +285,7 @@ class SwarmState:
         next_window_ns: (N,) earliest instant of the next attempt with them.
         images: Memory of aerial images; None before the first.
         delays: What is known of the delays of lidars, by robot, see `sensors/lidar.py`.
+        places: Where robots with lidars that are not located may be in the map, see `map_search.py`.
         origin: Robot whose pose was the origin when a local frame began, see `initializer.py`; IN_MAP: none.
         frame_moves: How often all poses have moved from a local frame to `map`.
         meetings: Robots that have met while nobody was located.
@@ -320,6 +321,7 @@ class SwarmState:
         self.next_window_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.images: IdentityMemory | None = None
         self.delays: dict[int, Any] = {}  # of `lidar.DelayBelief`
+        self.places: dict[int, Any] = {}  # of `map_search.Places`
         self.origin, self.frame_moves, self.meetings = IN_MAP, 0, Meetings()
         self.lost_why: IntArray = np.zeros(robots, dtype=np.int64)
         self.lost_ns: IntArray = np.full(robots, NEVER_NS)

@@ -43,7 +43,9 @@ _CAUSES = {
 _UNUSED_SCANS = {
     Verdict.OFF_MAP: "contradict the map at its pose: check lidar.yaw, lidar.roll, the map and the start",
     Verdict.BLOCKED: "show too few walls of the map",
-    Verdict.NOT_LOCALIZED: "fit no place in the map, or several: it is not located",
+    Verdict.NOT_LOCALIZED: "do not locate it before it has driven on",
+    Verdict.SEVERAL_PLACES: "fit several places in the map: drive it to where the map looks otherwise",
+    Verdict.NO_PLACE: "fit no place in the map: check lidar.yaw, lidar.roll and the map",
     Verdict.GATED: "were gated",
 }
 """Why no scan of a robot is used."""

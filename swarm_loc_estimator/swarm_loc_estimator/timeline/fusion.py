@@ -228,6 +228,13 @@ class Fusion:
     ) -> None:
         """Fuse the scan (1,) of a lidar."""
         self.starts.initialize_measured(state, one)
+        robot, stamp_ns = int(one.target[0]), int(one.stamp_ns[0])
+        if state.origin != IN_MAP or not state.tracked[robot]:
+            found, verdicts[:] = self._scans.place_of(state, one.row(0))
+            if found is not None:
+                self._set_pose(state, robot, stamp_ns, found.pose, found.covariance)
+            return
+        state.places.pop(robot, None)
         fix, verdicts[:], confirms = self._scans.fix_of(state, one.row(0))
         if fix is not None:
             known, before = state.sources.confirmations, state.sources.confirmations.copy()
@@ -428,12 +435,17 @@ class Fusion:
             if state.origin != IN_MAP and not state.tracked.any():
                 self._local.leave(state, stamp_ns)
             return
-        if not self._tracks.has_started(robot, stamp_ns):
-            return
+        if self._tracks.has_started(robot, stamp_ns):
+            self._set_pose(state, robot, stamp_ns, command.pose, command.covariance)
+
+    def _set_pose(
+        self, state: SwarmState, robot: int, stamp_ns: int, pose: FloatArray, covariance: FloatArray
+    ) -> None:
+        """Set a robot to a pose (3,) in `map` with covariance (3, 3)."""
         track = self._tracks.at(np.array([robot]), np.array([stamp_ns]))
-        transform = se2.compose(command.pose, se2.inverse(track.pose[0]))
+        transform = se2.compose(pose, se2.inverse(track.pose[0]))
         at = Preintegrated(stamp_ns, track.covariance[0], track.jacobian[0])
-        initial = InitialPose(transform, se2.error_covariance(command.pose, command.covariance))
+        initial = InitialPose(transform, se2.error_covariance(pose, covariance))
         if state.origin == IN_MAP:
             state.initialize(robot, initial, at, WELL_CONFIRMED)
         else:

@@ -1,0 +1,304 @@
+"""Where a robot with a lidar starts in a known map: the one place that explains its scans while it drives.
+
+The first scan is compared with the map at all free places and headings, coarse to fine: a level keeps those
+whose beams end near walls, as far as its steps allow. The best are matched, and each that fits is a
+hypothesis, moved by odometry and matched again at every new place. A hypothesis that explains clearly less
+than the best one is ruled out. The last one is believed if it has fit at several places, and if a search with
+the newest scan finds no other that explains all of them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import OrderedDict
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.numerics import wrap
+from swarm_loc_estimator.common.se2 import between, compose, inverse, wrap_angle
+from swarm_loc_estimator.timeline.map_matching import (
+    BLOCKED,
+    FREE,
+    OFF_MAP,
+    WALL,
+    Match,
+    WallMap,
+    match,
+)
+
+# The constants are checked by `make bench-lidar`: three halls and a real map, 50 random starts each.
+_BEAMS, _ANGLES = 60, 128  # Number of beams and of headings that are compared
+_STEP_M, _LEVELS, _KEPT = 0.4, 3, 3000
+"""Distance of the places that are tried first [m], number of levels, and of the best that each one keeps."""
+_WIDTH_M = 0.15  # Distance beyond the reach of a level at which a beam fits no wall [m]
+_TRIED, _HYPOTHESES = 200, 60  # Maximum numbers of places that are matched, and that are followed
+_SPREAD = np.diag(np.square([0.15, 0.15, 0.06]))  # Covariance (3, 3) of the places that are matched
+_APART_M, _APART = 0.25, math.radians(12.0)  # Places farther apart are different ones [m], [rad]
+_LOOK_M, _LOOK_TURN = 0.3, 0.5  # Drive [m] or turn [rad] after which a scan counts as another look
+_SLIP = (0.03, 0.02, 0.06)  # Error of such a drive [m], of its turn [rad], and their growth with both
+_RULED_OUT = 0.5  # By how many scans a hypothesis explains less than another that rules it out
+_LOOKS, _MEMORY = 3, 8  # Minimum number of looks, and maximum number that are compared
+_MIN_FIT = 0.7  # Share of the beams that must fit, on average
+_PAUSE_NS, _LONGEST_PAUSE_NS = 1_000_000_000, 16_000_000_000  # Between searches of a robot
+_CACHED = 16
+
+
+class SearchMap(NamedTuple):
+    """A map prepared for the search of places."""
+
+    walls: WallMap
+    away: NDArray[np.float32]  # (nx, ny) distance from the nearest wall [m]
+    places: FloatArray  # (p, 2) that are tried first [m]
+
+
+class Beams(NamedTuple):
+    """A sweep from the pose of the robot at one instant, see `match`."""
+
+    ends: FloatArray  # (n, 2)
+    origin: FloatArray  # (2,)
+    variance: FloatArray  # (n,)
+
+
+class Look(NamedTuple):
+    """A scan that counts."""
+
+    beams: Beams
+    track: FloatArray  # (3,) pose by odometry
+
+
+class Places(NamedTuple):
+    """The places (h,) where a robot may be, and its looks (k,)."""
+
+    transform: FloatArray  # (h, 3) from `map` to the track of its odometry
+    fits: FloatArray  # (h, k) share of the beams of each look that fit
+    looks: tuple[Look, ...]
+    searched_ns: int  # Stamp of the last search
+    pause_ns: int  # After it
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether several places explain what the robot has seen while it drove."""
+        return len(self.transform) > 1 and len(self.looks) >= _LOOKS
+
+
+class Found(NamedTuple):
+    """A place that was found."""
+
+    pose: FloatArray  # (3,) of the robot
+    covariance: FloatArray  # (3, 3)
+
+
+def search_map(walls: WallMap) -> SearchMap:
+    """Prepare a map."""
+    away = scipy.ndimage.distance_transform_edt(walls.kind != WALL) * walls.cell
+    step = max(1, round(_STEP_M / walls.cell))
+    nx, ny = (-(-size // step) for size in walls.kind.shape)
+    free = np.zeros((nx * step, ny * step), dtype=bool)
+    free[: walls.kind.shape[0], : walls.kind.shape[1]] = walls.kind == FREE
+    blocks = np.argwhere(free.reshape(nx, step, ny, step).any(axis=(1, 3)))
+    places: FloatArray = walls.corner + (blocks + 0.5) * step * walls.cell
+    return SearchMap(walls, away.astype(np.float32), places)
+
+
+class MapSearch:
+    """Searches places in a map; results are kept for steps that are computed again.
+
+    Args:
+        walls: The map.
+    """
+
+    def __init__(self, walls: WallMap) -> None:
+        self._map = search_map(walls)
+        self._cache: OrderedDict[bytes, FloatArray] = OrderedDict()
+
+    def add(
+        self, before: Places | None, stamp_ns: int, beams: Beams, track: FloatArray, walls: WallMap
+    ) -> tuple[Places, Found | None]:
+        """Follow the places of a robot by a scan.
+
+        Args:
+            before: What is known; None: nothing.
+            stamp_ns: Stamp of the scan.
+            beams: The scan.
+            track: (3,) pose by odometry.
+            walls: The map, with the error of its walls.
+
+        Returns:
+            What is known then, and the place where the robot is, once it is found.
+        """
+        if before is None or not len(before.transform):
+            paused_ns = 0 if before is None else before.pause_ns
+            if before is not None and stamp_ns < before.searched_ns + paused_ns:
+                return before, None
+            return self._begin(stamp_ns, paused_ns, Look(beams, track), walls), None
+        away, turn = _moved(before.looks[-1].track, track)
+        if away < _LOOK_M and turn < _LOOK_TURN:
+            return before, None
+        # match each place again, and rule out what explains less
+        covariance = np.diag(
+            [_SLIP[0] + _SLIP[2] * away, _SLIP[0] + _SLIP[2] * away, _SLIP[1] + _SLIP[2] * turn]
+        )
+        found = [match(walls, *beams, compose(one, track), covariance**2) for one in before.transform]
+        poses = np.array([one.pose for one in found])
+        fits = np.column_stack([before.fits, [_fit(one) for one in found]])
+        looks = (*before.looks, Look(beams, track))
+        if len(looks) > _MEMORY:  # the first look stays
+            looks, fits = (looks[0], *looks[2:]), np.delete(fits, 1, axis=1)
+        kept = _best(poses, fits)
+        after = before._replace(transform=compose(poses, inverse(track))[kept], fits=fits[kept], looks=looks)
+        if after.fits[0].mean() < _MIN_FIT and len(looks) >= _LOOKS:
+            return after._replace(transform=np.zeros((0, 3))), None
+        return self._confirmed(after, [found[k] for k in kept], walls)
+
+    def _begin(self, stamp_ns: int, paused_ns: int, look: Look, walls: WallMap) -> Places:
+        """Search the whole map."""
+        pause_ns = min(max(_PAUSE_NS, 2 * paused_ns), _LONGEST_PAUSE_NS)
+        tried = self._candidates(look.beams)
+        found = [match(walls, *look.beams, pose, _SPREAD) for pose in tried]
+        poses, fits = (
+            np.array([one.pose for one in found]).reshape(-1, 3),
+            np.array([_fit(one) for one in found]),
+        )
+        kept = _best(poses, fits[:, None])[:_HYPOTHESES]
+        kept = kept[fits[kept] > 0.0]
+        transform = compose(poses, inverse(look.track))[kept]
+        return Places(transform, fits[kept, None], (look,), stamp_ns, pause_ns)
+
+    def _confirmed(self, places: Places, found: list[Match], walls: WallMap) -> tuple[Places, Found | None]:
+        """Believe the last place if it has no rival anywhere."""
+        looks, best = places.looks, found[0]
+        is_sure = len(looks) >= _LOOKS and best.determined == 3 and best.outcome not in (OFF_MAP, BLOCKED)
+        if len(places.transform) > 1 or not is_sure:
+            return places, None
+        # others that explain the newest scan, at all looks
+        poses = self._candidates(looks[-1].beams)
+        poses = poses[_apart(best.pose, poses)]
+        total = float(places.fits[0].sum())
+        for pose in poses:
+            transform, fits = compose(pose, inverse(looks[-1].track)), []
+            for look in reversed(looks):
+                one = match(walls, *look.beams, compose(transform, look.track), _SPREAD)
+                transform = compose(one.pose, inverse(look.track))
+                fits.append(_fit(one))
+                if sum(fits) + len(looks) - len(fits) < total - _RULED_OUT:
+                    break
+            same = compose(places.transform[0], looks[0].track)
+            if len(fits) == len(looks) and _apart(same, compose(transform, looks[0].track)[None])[0]:
+                latest = match(walls, *looks[-1].beams, pose, _SPREAD).pose
+                rival = compose(latest, inverse(looks[-1].track))
+                both = np.array([places.transform[0], rival]), np.array([places.fits[0], fits[::-1]])
+                return places._replace(transform=both[0], fits=both[1]), None
+        return places, Found(best.pose, best.covariance)
+
+    def _candidates(self, beams: Beams) -> FloatArray:
+        """Poses (h, 3) from which the ends of beams are near walls, the best first, see the module."""
+        key = beams.ends.tobytes()
+        if key not in self._cache:
+            self._cache[key] = _candidates(self._map, beams.ends)
+            if len(self._cache) > _CACHED:
+                self._cache.popitem(last=False)
+        return self._cache[key]
+
+
+def _candidates(search: SearchMap, ends: FloatArray) -> FloatArray:
+    """Poses (h, 3) from which the ends (n, 2) of beams are near walls, coarse to fine."""
+    if not len(ends):
+        return np.zeros((0, 3))
+    points = ends[np.linspace(0, len(ends) - 1, _BEAMS).astype(np.int64)]
+    step, turn = _STEP_M, 2.0 * math.pi / _ANGLES
+    x, y, theta = (
+        column.ravel()
+        for column in (
+            np.repeat(search.places[:, 0], _ANGLES),
+            np.repeat(search.places[:, 1], _ANGLES),
+            np.tile(turn * np.arange(_ANGLES), len(search.places)),
+        )
+    )
+    poses = np.stack([x, y, theta], axis=-1)
+    for level in range(_LEVELS):
+        score = _scores(search, points, poses, 0.75 * step)
+        kept = _largest(score, _KEPT)
+        poses, score = poses[kept], score[kept]
+        if level == _LEVELS - 1:
+            break
+        quarter = 0.25 * step
+        offsets = [(a, b, c) for a in (-quarter, quarter) for b in (-quarter, quarter) for c in (-0.25, 0.25)]
+        offsets = np.array(offsets) * [1.0, 1.0, turn] if level else np.array(offsets)[::2] * [1.0, 1.0, 0.0]
+        poses = (poses[:, None] + offsets).reshape(-1, 3)
+        step *= 0.5
+    return poses[_separate(poses, score, _TRIED)]
+
+
+@cached_njit
+def _scores(search: SearchMap, points: FloatArray, poses: FloatArray, reach: float) -> FloatArray:
+    """How well (n,) points (b, 2) of poses (n, 3) end within a reach of walls; 0 where no place is free."""
+    walls, out = search.walls, np.zeros(len(poses))
+    x0, y0, scale = walls.corner[0], walls.corner[1], 1.0 / walls.cell
+    nx, ny = walls.kind.shape
+    for k in range(len(poses)):
+        cos, sin = math.cos(poses[k, 2]), math.sin(poses[k, 2])
+        x, y, total = (poses[k, 0] - x0) * scale, (poses[k, 1] - y0) * scale, 0.0
+        for b in range(len(points)):
+            i = math.floor(x + scale * (cos * points[b, 0] - sin * points[b, 1]))
+            j = math.floor(y + scale * (sin * points[b, 0] + cos * points[b, 1]))
+            if 0 <= i < nx and 0 <= j < ny:
+                total += max(0.0, 1.0 - max(0.0, search.away[i, j] - reach) / _WIDTH_M)
+        out[k] = total / len(points)
+    return out
+
+
+def _largest(score: FloatArray, count: int) -> IntArray:
+    """Indices of the largest scores, the largest first."""
+    order: IntArray = np.argsort(-score, kind="stable")[:count]
+    return order
+
+
+@cached_njit
+def _separate(poses: FloatArray, score: FloatArray, count: int) -> IntArray:
+    """Indices of up to `count` poses (n, 3), the best first, none near a better one."""
+    kept = np.zeros(min(count, len(poses)), dtype=np.int64)
+    size = 0
+    for k in range(len(poses)):
+        near = score[k] <= 0.0
+        for m in range(size):
+            if near:
+                break
+            dx, dy = poses[k, 0] - poses[kept[m], 0], poses[k, 1] - poses[kept[m], 1]
+            turn = wrap(poses[k, 2] - poses[kept[m], 2])
+            near = math.hypot(dx, dy) < _APART_M and abs(turn) < _APART
+        if not near:
+            kept[size] = k
+            size += 1
+            if size == len(kept):
+                break
+    return kept[:size]
+
+
+def _fit(found: Match) -> float:
+    """Share of the beams of a scan that fit; 0 where they go through walls."""
+    return 0.0 if found.outcome == OFF_MAP else found.fitting
+
+
+def _best(poses: FloatArray, fits: FloatArray) -> IntArray:
+    """Indices of places (h, 3) that explain hardly less than the best, the best first, each once."""
+    total = fits.sum(axis=1)
+    order = _largest(total, len(total))
+    order = order[_separate(poses[order], total[order] + 1e-9, len(order))]
+    return order[total[order] > total.max(initial=0.0) - _RULED_OUT]
+
+
+def _moved(before: FloatArray, now: FloatArray) -> tuple[float, float]:
+    """Distance [m] and absolute turn [rad] from a pose (3,) to another."""
+    x, y, turn = between(before, now)
+    return math.hypot(x, y), abs(float(wrap_angle(turn)))
+
+
+def _apart(pose: FloatArray, others: FloatArray) -> BoolArray:
+    """Which poses (n, 3) are other places than a pose (3,)."""
+    off = others - pose
+    return np.asarray((np.hypot(off[:, 0], off[:, 1]) > _APART_M) | (np.abs(wrap_angle(off[:, 2])) > _APART))
