@@ -7,6 +7,7 @@ search the map for its place, see `map_search.py`.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
 import numpy as np
@@ -16,7 +17,7 @@ from swarm_loc_estimator.common.se2 import between, compose
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.filter.models import CARTESIAN
 from swarm_loc_estimator.filter.sources import CONFIRMED, RELIEF
-from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.filter.state import SwarmState, robot_columns
 from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.mapping.messages import LidarSweep
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
@@ -30,6 +31,7 @@ from swarm_loc_estimator.timeline.settings import Settings
 
 _SYSTEMATIC_SHARE = 0.7
 """Share of a match's variance that the next scans have, too: what is wrong with the map at a place."""
+_ALIKE_M = 2.0  # Distance within which errors of a map are alike [m]
 _MAX_MISSED, _MAX_AT_START = 10.0, 3.0
 """Fault scores at which a robot is lost whose scans contradict the map, and before its start is confirmed."""
 _ALL, _SURE_FIT = 3, 0.65
@@ -37,7 +39,7 @@ _ALL, _SURE_FIT = 3, 0.65
 those at home are seen now and then."""
 _ORDER_TURN, _ORDER_KNOWN = 0.03, 12.0
 """Turn during a sweep that tells in which order its beams are measured [rad], and log odds that settle it."""
-_SEARCH_TURN = 0.05  # Turn during a sweep beyond which it begins no search before its order is known [rad]
+_SEARCH_TURN = 0.05  # Turn during a sweep beyond which it searches no place [rad]
 _ORDER_WEIGHT, _ORDER_NEWS = 10.0, 4.0
 """Log odds of this order by the misfit of a scan, whose beams err together, and the most by a scan."""
 Sweeps = Mapping[tuple[int, int], LidarSweep]  # Sweeps by robot and stamp of the first beam [ns]
@@ -91,13 +93,16 @@ class MapScans:
         if not self._tracks.has_started(robot, sweep.stamp_ns):
             return None, Verdict.NOT_LOCALIZED
         delay = state.delays.get(robot) or described_delay(self._lidars[robot].delay_s)
-        turns = self._turned(robot, sweep) > _SEARCH_TURN
-        if turns and abs(delay.backwards) < _ORDER_KNOWN and robot not in state.places:
-            return None, Verdict.NOT_LOCALIZED  # it may be bent
+        if self._turned(robot, sweep) > _SEARCH_TURN:
+            return None, Verdict.NOT_LOCALIZED  # its delay and the order of its beams may be wrong
         sweep = sweep.backwards() if delay.backwards > 0.0 else sweep
         beams, now, _ = self._beams(robot, stamp_ns, sweep, delay.lag_s, int(delay.chance.argmax()))
         places, found = self._search.add(
-            state.places.get(robot), stamp_ns, Beams(*beams), now, self._walls_of(self._walls, robot)
+            state.places.get(robot),
+            stamp_ns,
+            Beams.thinned(*beams),
+            now,
+            self._walls_of(self._walls, robot),
         )
         state.places[robot] = places
         if found is not None:
@@ -143,9 +148,11 @@ class MapScans:
         elif delay.backwards > 0.0:
             beams, _, _ = self._beams(robot, stamp_ns, sweep.backwards(), delay.lag_s, best)
             found = match(walls, *beams, pose, covariance + doubt)
-        state.delays[robot] = delay
+        state.delays[robot], driven = delay, 0.0
         confirmed = state.sources.confirmations[robot] >= CONFIRMED
         if found.outcome == FITS or (found.outcome == FAR and confirmed):
+            if delay.stamp_ns > 0:
+                driven = math.dist(delay.track[best, :2], track[best, :2])
             delay = learned_delay(delay, stamp_ns, compose(found.pose, back), found.covariance, track)
             state.delays[robot] = delay
         if found.outcome in (OFF_MAP, FAR):
@@ -158,6 +165,9 @@ class MapScans:
         if found.outcome == BLOCKED:
             return None, Verdict.BLOCKED, False
         state.sources.score[robot] = max(0.0, state.sources.score[robot] - 4.0 * RELIEF)
+        # walls err otherwise where it is now than where it was: the error that it shares with them fades
+        fading = 2.0 * _SYSTEMATIC_SHARE * walls.variance * min(1.0, driven / _ALIKE_M)
+        state.filter.add(robot_columns(np.array([robot]))[0], np.diag([fading, fading, 0.0]))
         pose, doubt = at_odometry(delay, now)
         fix = about_robots(robot, stamp_ns, pose[None], (found.covariance + doubt)[None], CARTESIAN)
         fix.systematic_share[:] = _SYSTEMATIC_SHARE

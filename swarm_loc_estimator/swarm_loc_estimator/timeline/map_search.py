@@ -33,6 +33,8 @@ from swarm_loc_estimator.timeline.map_matching import (
 
 # The constants are checked by `make bench-lidar`: three halls and a real map, 50 random starts each.
 _BEAMS, _ANGLES = 60, 128  # Number of beams and of headings that are compared
+_FIRST, _LEAST = 15, 0.4  # So many beams rule a pose out that fits them worse than this
+_MATCHED = 120  # Maximum number of beams that are matched
 _STEP_M, _LEVELS, _KEPT = 0.4, 3, 3000
 """Distance of the places that are tried first [m], number of levels, and of the best that each one keeps."""
 _WIDTH_M = 0.15  # Distance beyond the reach of a level at which a beam fits no wall [m]
@@ -44,6 +46,8 @@ _SLIP = (0.03, 0.02, 0.06)  # Error of such a drive [m], of its turn [rad], and 
 _RULED_OUT = 0.5  # By how many scans a hypothesis explains less than another that rules it out
 _LOOKS, _MEMORY = 3, 8  # Minimum number of looks, and maximum number that are compared
 _MIN_FIT = 0.7  # Share of the beams that must fit, on average
+_START = np.diag(np.square([0.1, 0.1, 0.05]))
+"""Covariance (3, 3) added to that of a place, since the next scans, which see the same walls, replace it."""
 _PAUSE_NS, _LONGEST_PAUSE_NS = 1_000_000_000, 16_000_000_000  # Between searches of a robot
 _CACHED = 16
 
@@ -62,6 +66,12 @@ class Beams(NamedTuple):
     ends: FloatArray  # (n, 2)
     origin: FloatArray  # (2,)
     variance: FloatArray  # (n,)
+
+    @classmethod
+    def thinned(cls, ends: FloatArray, origin: FloatArray, variance: FloatArray) -> Beams:
+        """Not more of them than are needed here."""
+        step = -(-len(ends) // _MATCHED)
+        return cls(np.ascontiguousarray(ends[::step]), origin, np.ascontiguousarray(variance[::step]))
 
 
 class Look(NamedTuple):
@@ -176,24 +186,26 @@ class MapSearch:
         if len(places.transform) > 1 or not is_sure:
             return places, None
         # others that explain the newest scan, at all looks
-        poses = self._candidates(looks[-1].beams)
-        poses = poses[_apart(best.pose, poses)]
-        total = float(places.fits[0].sum())
-        for pose in poses:
-            transform, fits = compose(pose, inverse(looks[-1].track)), []
-            for look in reversed(looks):
-                one = match(walls, *look.beams, compose(transform, look.track), _SPREAD)
-                transform = compose(one.pose, inverse(look.track))
-                fits.append(_fit(one))
-                if sum(fits) + len(looks) - len(fits) < total - _RULED_OUT:
+        least, now = float(places.fits[0].sum()) - _RULED_OUT, inverse(looks[-1].track)
+        transforms, fits = [places.transform[0]], [places.fits[0]]
+        for pose in self._candidates(looks[-1].beams):
+            then = latest = compose(pose, now)
+            own = np.ones(len(looks))
+            for k in range(len(looks) - 1, -1, -1):
+                one = match(walls, *looks[k].beams, compose(then, looks[k].track), _SPREAD)
+                then, own[k] = compose(one.pose, inverse(looks[k].track)), _fit(one)
+                latest = then if k == len(looks) - 1 else latest
+                if own.sum() < least:
                     break
-            same = compose(places.transform[0], looks[0].track)
-            if len(fits) == len(looks) and _apart(same, compose(transform, looks[0].track)[None])[0]:
-                latest = match(walls, *looks[-1].beams, pose, _SPREAD).pose
-                rival = compose(latest, inverse(looks[-1].track))
-                both = np.array([places.transform[0], rival]), np.array([places.fits[0], fits[::-1]])
-                return places._replace(transform=both[0], fits=both[1]), None
-        return places, Found(best.pose, best.covariance)
+            else:
+                transforms.append(latest)
+                fits.append(own)
+        poses, found_fits = compose(np.array(transforms), looks[-1].track), np.array(fits)
+        rivals = np.append(0, np.flatnonzero(_apart(best.pose, poses)))
+        kept = rivals[_best(poses[rivals], found_fits[rivals])]
+        if len(kept) > 1:
+            return places._replace(transform=np.array(transforms)[kept], fits=found_fits[kept]), None
+        return places, Found(best.pose, best.covariance + _START)
 
     def _candidates(self, beams: Beams) -> FloatArray:
         """Poses (h, 3) from which the ends of beams are near walls, the best first, see the module."""
@@ -209,7 +221,9 @@ def _candidates(search: SearchMap, ends: FloatArray) -> FloatArray:
     """Poses (h, 3) from which the ends (n, 2) of beams are near walls, coarse to fine."""
     if not len(ends):
         return np.zeros((0, 3))
-    points = ends[np.linspace(0, len(ends) - 1, _BEAMS).astype(np.int64)]
+    # in an order in which any first ones look all around
+    spread = np.linspace(0, len(ends) - 1, _BEAMS).astype(np.int64)
+    points = ends[spread[np.argsort((np.arange(_BEAMS) * 0.618034) % 1.0)]]
     step, turn = _STEP_M, 2.0 * math.pi / _ANGLES
     x, y, theta = (
         column.ravel()
@@ -248,14 +262,18 @@ def _scores(search: SearchMap, points: FloatArray, poses: FloatArray, reach: flo
             j = math.floor(y + scale * (sin * points[b, 0] + cos * points[b, 1]))
             if 0 <= i < nx and 0 <= j < ny:
                 total += max(0.0, 1.0 - max(0.0, search.away[i, j] - reach) / _WIDTH_M)
+            if b == _FIRST and total < _LEAST * _FIRST:
+                total = 0.0
+                break
         out[k] = total / len(points)
     return out
 
 
 def _largest(score: FloatArray, count: int) -> IntArray:
     """Indices of the largest scores, the largest first."""
-    order: IntArray = np.argsort(-score, kind="stable")[:count]
-    return order
+    some = np.flatnonzero(score >= np.partition(score, -count)[-count]) if len(score) > count else slice(None)
+    numbers: IntArray = np.arange(len(score))[some]
+    return numbers[np.argsort(-score[numbers], kind="stable")[:count]]
 
 
 @cached_njit
