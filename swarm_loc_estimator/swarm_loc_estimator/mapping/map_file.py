@@ -35,7 +35,7 @@ _SIZE = 2 * (_SEPARATOR + rb"(\d{1,9})")
 _PNM = re.compile(rb"P(?:[14]" + _SIZE + rb"|[2356]" + _SIZE + _SEPARATOR + rb"\d+)\s")
 _PLAIN_BYTES = 16  # Maximum number of characters of a number in a plain PNM, with the space around it
 _FORMATS = ("PPM", "PNG", "BMP")  # Other decoders of Pillow start programs, or have seen less care
-_PLACE = NumberSpec("m", -1e6, 1e6, False, "of the lower left corner")
+_PLACE = NumberSpec("m", -1e8, 1e8, False, "of the lower left corner")
 
 
 class MapFileError(UserError):

@@ -61,8 +61,8 @@ class Anchor:
     """Radio at a fixed place in `map`."""
 
     address: int  #: Number by which messages name it, unique among robots and anchors
-    x: float = number(0.0, "m", -1e6, 1e6, "in map")
-    y: float = number(0.0, "m", -1e6, 1e6, "in map")
+    x: float = number(0.0, "m", -1e8, 1e8, "in map")
+    y: float = number(0.0, "m", -1e8, 1e8, "in map")
     z: float = number(0.0, "m", -1e4, 1e4, "above the ground")
     position_sigma: float = number(
         0.0, "m", 0.0, 100.0, "standard deviation of x and y; 0: exact, else estimated with the poses"
@@ -128,8 +128,8 @@ class Landmark:
     """A static marker in `map`."""
 
     id: int  #: Marker id, unique in the swarm
-    x: float = number(0.0, "m", -1e6, 1e6, "in map")  #: [m]
-    y: float = number(0.0, "m", -1e6, 1e6, "in map")  #: [m]
+    x: float = number(0.0, "m", -1e8, 1e8, "in map")  #: [m]
+    y: float = number(0.0, "m", -1e8, 1e8, "in map")  #: [m]
     z: float = number(0.0, "m", -1e4, 1e4, "in map")  #: [m]
     #: Direction of the outward normal [rad]; None if the marker shows no heading
     yaw: float | None = number(None, "rad", -TURN, TURN, "direction out of its face; null: shows no heading")
@@ -203,8 +203,8 @@ class FixedCamera:
     """A camera with a fixed pose in `map`, such as at the ceiling; its angles are those of `CameraMount`."""
 
     name: str
-    x: float = number(0.0, "m", -1e6, 1e6, "in map")
-    y: float = number(0.0, "m", -1e6, 1e6, "in map")
+    x: float = number(0.0, "m", -1e8, 1e8, "in map")
+    y: float = number(0.0, "m", -1e8, 1e8, "in map")
     z: float = number(0.0, "m", -1e4, 1e4, "above the floor")
     yaw: float = number(0.0, "rad", -TURN, TURN, "turned to the left")
     pitch: float = number(math.pi / 2, "rad", -TURN, TURN, "turned down; by default straight down")
@@ -253,6 +253,7 @@ class Swarm:
     cameras: tuple[FixedCamera, ...] = ()
     anchors: tuple[Anchor, ...] = ()
     map: Path | None = None
+    origin: tuple[float, float] = (0.0, 0.0)  #: Of all places in the frame of `map` and its file [m]
 
     def __post_init__(self) -> None:
         names = Counter(one.name.lower() for one in self.sources)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -41,6 +42,14 @@ from swarm_loc_estimator.timeline.estimate import (
     last_loss,
 )
 from swarm_loc_estimator.timeline.fusion import Fusion
+from swarm_loc_estimator.timeline.local_origin import (
+    about,
+    described_origin,
+    first_place,
+    is_placed,
+    local_origin,
+    readings_about,
+)
 from swarm_loc_estimator.timeline.self_calibration import learned, learns
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.sightings import Recent
@@ -85,6 +94,9 @@ class Estimator:
     def _describe(self, swarm: Swarm) -> None:
         """Begin with a description."""
         self.swarm = swarm
+        # Poses are estimated about a local origin, which the first fix tells where no description does.
+        self._origin = described_origin(swarm) if is_placed(swarm) else None
+        swarm = self._local = swarm if self._origin is None else about(swarm, self._origin)
         self._limits = TrackedLimits.of(swarm, self.settings)
         self._tracks = OdometryTracks(swarm.robots)
         self._converter = InputConverter(swarm, self.settings)
@@ -140,6 +152,10 @@ class Estimator:
 
     def convert(self, batch: Batch) -> Batch:
         """Convert readings to measurements for `receive`; invalid ones are counted in `drops`."""
+        if self._origin is None and (place := first_place(batch.rows)) is not None:
+            self._origin = local_origin(place)
+        if self._origin is not None and self._origin.any():
+            batch = replace(batch, rows=readings_about(batch.rows, self._origin))
         return self._converter.convert(batch)
 
     def receive(self, inputs: Batch) -> None:
@@ -186,7 +202,11 @@ class Estimator:
             "" on success, else a reason of `drops`, such as "not_localized" before its first odometry.
         """
         self._use_odometry()
-        fix = about_robots(robot, stamp_ns, np.array([pose]), np.array([covariance]), CARTESIAN)
+        poses = np.array([pose], dtype=float)
+        if self._origin is None:
+            self._origin = local_origin(poses[:, :2])
+        poses[:, :2] -= self._origin
+        fix = about_robots(robot, stamp_ns, poses, np.array([covariance]), CARTESIAN)
         fault = REJECT_REASONS[reject_reasons(fix)[0]] or (
             "" if self._tracks.has_started(robot, stamp_ns) else "not_localized"
         )
@@ -273,7 +293,8 @@ class Estimator:
 
     def learned(self) -> Swarm:
         """Swarm with the estimated parameters of cameras, odometry and landmarks."""
-        return learned(self.swarm, self._timeline.state)
+        found = learned(self._local, self._timeline.state)
+        return found if self._origin is None else about(found, -self._origin)
 
     @property
     def origin(self) -> str:
@@ -378,4 +399,7 @@ class Estimator:
         self._constant.add(self._tracks.is_constant(), estimate)
         contradicted = self._constant.contradicted(now_ns) & (estimate.status == Status.TRACKED)
         estimate.status[contradicted] = Status.CONTRADICTED
+        if self._origin is not None and state.origin == IN_MAP:
+            estimate.poses[:, :2] += self._origin
+            estimate.map_to_odom[:, :2] += self._origin
         return estimate

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
@@ -39,7 +40,7 @@ _ALL, _SURE_FIT = 3, 0.65
 those at home are seen now and then."""
 _ORDER_TURN, _ORDER_KNOWN = 0.03, 12.0
 """Turn during a sweep that tells in which order its beams are measured [rad], and log odds that settle it."""
-_SEARCH_TURN = 0.05  # Turn during a sweep beyond which it searches no place [rad]
+_SEARCH_TURN = 0.1  # Turn during a sweep beyond which it searches no place [rad]
 _ORDER_WEIGHT, _ORDER_NEWS = 10.0, 4.0
 """Log odds of this order by the misfit of a scan, whose beams err together, and the most by a scan."""
 Sweeps = Mapping[tuple[int, int], LidarSweep]  # Sweeps by robot and stamp of the first beam [ns]
@@ -53,7 +54,8 @@ def walls_of(swarm: Swarm) -> WallMap | None:
     """
     if swarm.map is None:
         return None
-    walls = wall_map(load_map(swarm.map), swarm.map)
+    drawn = load_map(swarm.map)
+    walls = wall_map(replace(drawn, corner=drawn.corner - swarm.origin), swarm.map)
     match(walls, np.zeros((0, 2)), np.zeros(2), np.zeros(0), np.zeros(3), np.eye(3))
     return walls
 

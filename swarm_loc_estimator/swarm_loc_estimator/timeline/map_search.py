@@ -240,9 +240,10 @@ def _candidates(search: SearchMap, ends: FloatArray) -> FloatArray:
         poses, score = poses[kept], score[kept]
         if level == _LEVELS - 1:
             break
-        quarter = 0.25 * step
-        offsets = [(a, b, c) for a in (-quarter, quarter) for b in (-quarter, quarter) for c in (-0.25, 0.25)]
-        offsets = np.array(offsets) * [1.0, 1.0, turn] if level else np.array(offsets)[::2] * [1.0, 1.0, 0.0]
+        corners = [(a, b, c) for a in (-1.0, 1.0) for b in (-1.0, 1.0) for c in (-1.0, 1.0)]
+        offsets = np.array(corners) * [0.25 * step, 0.25 * step, 0.25 * turn]
+        if not level:  # headings are close enough for the first level
+            offsets = offsets[::2] * [1.0, 1.0, 0.0]
         poses = (poses[:, None] + offsets).reshape(-1, 3)
         step *= 0.5
     return poses[_separate(poses, score, _TRIED)]

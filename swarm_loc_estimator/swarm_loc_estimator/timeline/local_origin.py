@@ -1,0 +1,78 @@
+"""Coordinates about a local origin: far from that of `map`, as in UTM, numbers lose what covariances need."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.mapping.map_file import load_map
+from swarm_loc_estimator.swarm.swarm import Swarm
+
+_GRID_M = 1e4  # Local origins are multiples of it [m]; nearer to that of `map`, there is none
+_IN_MAP = ("fixes", "aerial")  # Sensors whose readings are in `map`
+
+
+def is_placed(swarm: Swarm) -> bool:
+    """Whether the description says any place in `map`."""
+    return bool(swarm.surveyed) or swarm.map is not None or any(one.start for one in swarm.robots)
+
+
+def local_origin(places: FloatArray) -> FloatArray:
+    """The local origin (2,) of places (n, 2) [m]."""
+    return np.round(np.median(places, axis=0) / _GRID_M) * _GRID_M + 0.0
+
+
+def described_origin(swarm: Swarm) -> FloatArray:
+    """The local origin (2,) of a swarm by what it says of places in `map` [m].
+
+    Raises:
+        UserError: Its map is needed for that and cannot be read.
+    """
+    places: list[Any] = [robot.start[:2] for robot in swarm.robots if robot.start is not None]
+    places += [(one.x, one.y) for one in swarm.surveyed]
+    if not places and swarm.map is not None:
+        places = [load_map(swarm.map).corner]
+    return local_origin(np.array(places)) if places else np.zeros(2)
+
+
+def about(swarm: Swarm, origin: FloatArray) -> Swarm:
+    """The swarm with all places about an origin (2,) [m]."""
+    x, y = origin.tolist()
+    if not (x or y):
+        return swarm
+    moved: dict[str, Any] = {
+        name: tuple(replace(one, x=one.x - x, y=one.y - y) for one in getattr(swarm, name))
+        for name in ("landmarks", "cameras", "anchors")
+    }
+    robots = [
+        robot
+        if robot.start is None
+        else replace(robot, start=(robot.start[0] - x, robot.start[1] - y, robot.start[2]))
+        for robot in swarm.robots
+    ]
+    there = swarm.origin[0] + x, swarm.origin[1] + y
+    return replace(swarm, robots=tuple(robots), origin=there, **moved)
+
+
+def readings_about(rows: Mapping[str, Any], origin: FloatArray) -> dict[str, Any]:
+    """Readings by sensor, with poses in `map` about an origin (2,)."""
+    found = dict(rows)
+    for name in _IN_MAP:
+        if name in rows:
+            found[name] = rows[name]._replace(pose=rows[name].pose - [*origin, 0.0])
+    return found
+
+
+def first_place(rows: Mapping[str, Any]) -> FloatArray | None:
+    """The first finite place (2,) in `map` of readings by sensor; None without one."""
+    for name in _IN_MAP:
+        places = rows[name].pose[:, :2] if name in rows else np.zeros((0, 2))
+        usable = np.isfinite(places).all(axis=1)
+        if usable.any():
+            first: FloatArray = places[usable][:1]
+            return first
+    return None

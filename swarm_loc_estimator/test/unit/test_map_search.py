@@ -1,0 +1,137 @@
+"""Starts in a known map: where a robot without a start is found, and what it says where it is not."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from core_geometry import wrapped
+from mapping_world import BEAMS, ROOM, LidarRobot, room_map, scan_bytes
+from test_lidar_in_map import CELL, ODOMETRY_NS, SWEEP_NS, hand_in, sent, swarm_at
+
+from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
+from swarm_loc_estimator.common.se2 import compose
+from swarm_loc_estimator.mapping.grid import OccupancyMap
+from swarm_loc_estimator.mapping.map_file import save_map
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.estimator import Estimator, Status
+
+SECOND = 1_000_000_000
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of the room, which a niche makes unlike itself when turned."""
+    return save_map(room_map(CELL), tmp_path_factory.mktemp("maps") / "room")[0]
+
+
+def without_start(room: Path) -> Swarm:
+    swarm = swarm_at(room, LidarRobot.start)
+    return replace(swarm, robots=(replace(swarm.robots[0], start=None),))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_robot_without_a_start_is_found_by_its_map_while_it_drives(room: Path, seed: int) -> None:
+    """Not by its first scan, and nowhere else."""
+    estimator, until_ns = Estimator(without_start(room)), 9 * SECOND
+    estimates = hand_in(estimator, sent(until_ns, seed, blocked=60))
+    tracked = [one for one in estimates if one.status[0] == Status.TRACKED]
+    assert estimates[-1].status[0] == Status.TRACKED
+    assert tracked[0].stamp_ns > SECOND
+    for one in tracked:
+        error = wrapped(one.poses[0] - LidarRobot().pose(one.stamp_ns))
+        assert np.hypot(error[0], error[1]) < 2.0 * CELL
+        assert abs(error[2]) < 0.1
+
+
+def test_a_robot_that_stands_is_not_believed_to_be_anywhere(room: Path) -> None:
+    class Standing(LidarRobot):
+        def odometry(self, stamp_ns: Any) -> Any:
+            return np.zeros((len(stamp_ns), 3))
+
+    estimator = Estimator(without_start(room))
+    estimates = hand_in(estimator, sent(4 * SECOND, 1, kind=Standing))
+    assert {int(one.status[0]) for one in estimates} == {Status.WAITING}
+    assert estimator.drops["not_localized"] == 20
+
+
+def test_a_robot_in_a_symmetric_room_says_that_it_may_be_at_several_places(tmp_path: Path) -> None:
+    """A rectangle looks the same from its other end."""
+    whole = room_map(CELL)
+    inside = np.zeros(whole.log_odds.shape, dtype=bool)
+    low, high = whole.index(np.array([ROOM[:2], ROOM[2:]]))
+    inside[low[0] : high[0] + 1, low[1] : high[1] + 1] = True
+    edge = inside.copy()
+    edge[low[0] + 1 : high[0], low[1] + 1 : high[1]] = False
+    odds = np.where(edge, 5.0, np.where(inside, -5.0, 0.0))
+    path, _ = save_map(OccupancyMap(whole.corner, CELL, odds), tmp_path / "rectangle")
+    size = (high - low) * CELL
+    estimator, robot, messages = Estimator(without_start(path)), LidarRobot(), []
+    for at_ns in range(0, 9 * SECOND, ODOMETRY_NS):
+        pose, unknown = robot.odometry(np.array([at_ns])), UNKNOWN_COVARIANCE
+        frames, stamps = ("a/odom", "a/base_link"), np.array([at_ns])
+        data = encode_odometry(*frames, stamps, pose, np.zeros((1, 3)), unknown, unknown)[0]
+        messages.append(("a/odom", at_ns, data))
+        if at_ns % SWEEP_NS == 0 and at_ns:
+            scan = robot.scan(at_ns - SWEEP_NS)
+            beams = np.arange(BEAMS)
+            mount = compose(
+                compose(robot.start, robot.odometry(at_ns - SWEEP_NS + SWEEP_NS // BEAMS * beams)),
+                [estimator.swarm.robots[0].lidar.x, estimator.swarm.robots[0].lidar.y, 0.5 * math.pi],
+            )
+            angle = mount[:, 2] + scan.angle_increment * beams
+            corner = whole.corner + (low + 0.5) * CELL
+            away = np.where(
+                np.stack([np.cos(angle), np.sin(angle)]) > 0.0, (corner + size)[:, None], corner[:, None]
+            )
+            with np.errstate(divide="ignore"):
+                ways = (away - mount[:, :2].T) / np.stack([np.cos(angle), np.sin(angle)])
+            scan = scan._replace(ranges=np.abs(ways).min(axis=0), range_max=9.0)
+            messages.append(("a/scan", at_ns, scan_bytes(scan)))
+    estimates = hand_in(estimator, messages)
+    assert {int(one.status[0]) for one in estimates} == {Status.WAITING}
+    assert estimator.drops["scan_ambiguous"] > 10
+
+
+def test_a_lost_robot_comes_back_by_the_map(room: Path) -> None:
+    """Its start is wrong by a metre, so it is lost, and found where it is."""
+    estimator, until_ns = Estimator(swarm_at(room, LidarRobot.start + np.array([0.0, 1.0, 0.0]))), 12 * SECOND
+    estimates = hand_in(estimator, sent(until_ns, 3))
+    error = wrapped(estimates[-1].poses[0] - LidarRobot().pose(until_ns))
+    assert estimates[-1].status[0] == Status.TRACKED
+    assert np.hypot(error[0], error[1]) < CELL
+    assert estimator.counters["lost: off map"] == 1
+    assert all(
+        np.hypot(*(one.poses[0, :2] - LidarRobot().pose(one.stamp_ns)[:2])) < 2.0 * CELL
+        for one in estimates
+        if one.status[0] == Status.TRACKED
+    )
+
+
+def test_scans_that_fit_nowhere_are_named(room: Path) -> None:
+    """A lidar that is mounted upside down, undescribed."""
+    swarm = without_start(room)
+    lidar = replace(swarm.robots[0].lidar, roll=math.pi)
+    estimator = Estimator(replace(swarm, robots=(replace(swarm.robots[0], lidar=lidar),)))
+    estimates = hand_in(estimator, sent(9 * SECOND, 2))
+    assert {int(one.status[0]) for one in estimates} == {Status.WAITING}
+    assert estimator.drops["scan_nowhere"] > 0
+
+
+def test_late_data_change_nothing_of_a_search(room: Path) -> None:
+    """Scans that arrive before their odometry are searched for again."""
+    until_ns, results = 6 * SECOND, []
+    for late_ns in (0, 300_000_000):
+        messages = [
+            (topic, at_ns + late_ns * (topic == "a/odom"), data) for topic, at_ns, data in sent(until_ns, 1)
+        ]
+        estimator = Estimator(without_start(room))
+        hand_in(estimator, sorted(messages, key=lambda one: one[1]))
+        results.append(estimator.tick(until_ns + 300_000_000))
+    assert results[0].status[0] == Status.TRACKED
+    assert results[1].status[0] == Status.TRACKED
+    assert results[1].poses[0] == pytest.approx(results[0].poses[0], abs=0.02)
