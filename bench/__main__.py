@@ -16,6 +16,7 @@ BENCHMARKS = {
     "inputs": "bench.inputs",
     "integrity": "bench.integrity",
     "large_swarms": "bench.graph.large_swarms",
+    "lidar": "bench.lidar",
     "live": "bench.graph.live",
     "mrclam": "bench.mrclam",
     "selfcal": "bench.selfcal",

@@ -135,13 +135,7 @@ def bodies(grid: OccupancyMap, far_m: float, seeds: range) -> Iterator[tuple[int
 def try_start(path: Path, body: GridBody) -> Start:
     """Drive a robot without a start until some time after it is found."""
     robot = Robot(NAME, lidar=replace(LIDAR, max_range=body.far_m), odometry=_ODOMETRY)
-    estimator, cpu_s, found_s, wrong, first = (
-        Estimator(Swarm((robot,), map=path)),
-        0.0,
-        math.inf,
-        False,
-        [0, 0],
-    )
+    estimator, cpu_s, found_s, wrong = Estimator(Swarm((robot,), map=path)), 0.0, math.inf, False
     odometry: list[tuple[int, FloatArray]] = []
     for step in range(round(_UNTIL_S / PERIOD_S) + 1):
         now_ns = round(step * PERIOD_S * 1e9)

@@ -27,7 +27,7 @@ from swarm_loc_estimator.sensors.lidar import at_odometry, described_delay, lear
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.map_matching import BLOCKED, FAR, FITS, OFF_MAP, WallMap, match, wall_map
-from swarm_loc_estimator.timeline.map_search import Beams, Found, MapSearch
+from swarm_loc_estimator.timeline.map_search import Beams, Found, MapSearch, Places
 from swarm_loc_estimator.timeline.settings import Settings
 
 _SYSTEMATIC_SHARE = 0.7
@@ -58,6 +58,15 @@ def walls_of(swarm: Swarm) -> WallMap | None:
     walls = wall_map(replace(drawn, corner=drawn.corner - swarm.origin), swarm.map)
     match(walls, np.zeros((0, 2)), np.zeros(2), np.zeros(0), np.zeros(3), np.eye(3))
     return walls
+
+
+def _why_nowhere(places: Places | None) -> Verdict:
+    """Why the scans of a robot do not locate it."""
+    if places is None:
+        return Verdict.NOT_LOCALIZED
+    if not len(places.transform):
+        return Verdict.NO_PLACE
+    return Verdict.SEVERAL_PLACES if places.is_ambiguous else Verdict.NOT_LOCALIZED
 
 
 class MapScans:
@@ -96,7 +105,7 @@ class MapScans:
             return None, Verdict.NOT_LOCALIZED
         delay = state.delays.get(robot) or described_delay(self._lidars[robot].delay_s)
         if self._turned(robot, sweep) > _SEARCH_TURN:
-            return None, Verdict.NOT_LOCALIZED  # its delay and the order of its beams may be wrong
+            return None, _why_nowhere(state.places.get(robot))  # its delay and order of beams may be wrong
         sweep = sweep.backwards() if delay.backwards > 0.0 else sweep
         beams, now, _ = self._beams(robot, stamp_ns, sweep, delay.lag_s, int(delay.chance.argmax()))
         places, found = self._search.add(
@@ -110,11 +119,7 @@ class MapScans:
         if found is not None:
             del state.places[robot]
             return found, Verdict.USED
-        several = places.is_ambiguous
-        nowhere = not len(places.transform)
-        return None, (
-            Verdict.SEVERAL_PLACES if several else Verdict.NO_PLACE if nowhere else Verdict.NOT_LOCALIZED
-        )
+        return None, _why_nowhere(places)
 
     def _walls_of(self, walls: WallMap, robot: int) -> WallMap:
         """The map with the error that the description of a robot says."""

@@ -1,0 +1,33 @@
+"""Robots with lidars in known maps: python -m bench lidar [--starts 50] [--parts cases ...]."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+
+from bench.lidar import cases, real, starts
+from bench.shared.common import ProgressLine, table, write_figures
+
+
+def main() -> None:
+    """Measure, print the table, write the figures."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--starts", type=int, default=50, help="number of random starts in each map")
+    parts: Mapping[str, Callable[[int], dict[str, float]]] = {
+        "cases": lambda _: cases.measure(),
+        "turtlebot4_map": lambda _: real.measure(),
+        "global_start": lambda count: starts.measure(
+            count, real.MAP if real.MAP.is_file() else None, ProgressLine("starts")
+        ),
+    }
+    parser.add_argument("--parts", nargs="+", choices=[*parts], default=[*parts], help="what to measure")
+    arguments = parser.parse_args()
+    figures: dict[str, float] = {}
+    for name in arguments.parts:
+        figures |= parts[name](arguments.starts)
+    print(table(["figure", "value"], [[key, value] for key, value in figures.items()]))
+    print(f"Written: {write_figures('lidar', figures)}")
+
+
+if __name__ == "__main__":
+    main()
