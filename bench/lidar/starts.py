@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -193,7 +193,7 @@ def measure(count: int, real: Path | None, say: ProgressLine) -> dict[str, float
 
 
 def _figures(name: str, starts: list[Start]) -> dict[str, float]:
-    figures = {
+    figures: dict[str, Any] = {
         "found": np.mean([one.is_found for one in starts]),
         "found_or_ambiguous": np.mean([one.is_found or one.is_ambiguous for one in starts]),
         "wrong": sum(one.is_wrong for one in starts),

@@ -321,7 +321,7 @@ class SwarmState:
         self.next_window_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
         self.images: IdentityMemory | None = None
         self.delays: dict[int, Any] = {}  # of `lidar.DelayBelief`
-        self.places: dict[int, Any] = {}  # of `map_search.Places`
+        self.places: dict[int, Any] = {}  # of `map_search.PossiblePlaces`
         self.origin, self.frame_moves, self.meetings = IN_MAP, 0, Meetings()
         self.lost_why: IntArray = np.zeros(robots, dtype=np.int64)
         self.lost_ns: IntArray = np.full(robots, NEVER_NS)

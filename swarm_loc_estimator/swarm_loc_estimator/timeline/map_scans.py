@@ -27,7 +27,7 @@ from swarm_loc_estimator.sensors.lidar import at_odometry, described_delay, lear
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import TrackedLimits, estimate_at
 from swarm_loc_estimator.timeline.map_matching import BLOCKED, FAR, FITS, OFF_MAP, WallMap, match, wall_map
-from swarm_loc_estimator.timeline.map_search import Beams, Found, MapSearch, Places
+from swarm_loc_estimator.timeline.map_search import FoundPlace, MapSearch, PossiblePlaces, SweptBeams
 from swarm_loc_estimator.timeline.settings import Settings
 
 _SYSTEMATIC_SHARE = 0.7
@@ -60,7 +60,7 @@ def walls_of(swarm: Swarm) -> WallMap | None:
     return walls
 
 
-def _why_nowhere(places: Places | None) -> Verdict:
+def _why_nowhere(places: PossiblePlaces | None) -> Verdict:
     """Why the scans of a robot do not locate it."""
     if places is None:
         return Verdict.NOT_LOCALIZED
@@ -90,7 +90,7 @@ class MapScans:
         self._walls = walls_of(swarm)
         self._search = None if self._walls is None else MapSearch(self._walls)
 
-    def place_of(self, state: SwarmState, one: Measurements) -> tuple[Found | None, Verdict]:
+    def place_of(self, state: SwarmState, one: Measurements) -> tuple[FoundPlace | None, Verdict]:
         """Search the place of a robot that is not located, by its scan; returns it once it is found.
 
         Args:
@@ -111,7 +111,7 @@ class MapScans:
         places, found = self._search.add(
             state.places.get(robot),
             stamp_ns,
-            Beams.thinned(*beams),
+            SweptBeams.thinned(*beams),
             now,
             self._walls_of(self._walls, robot),
         )

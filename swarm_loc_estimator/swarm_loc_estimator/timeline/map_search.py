@@ -40,7 +40,7 @@ _STEP_M, _LEVELS, _KEPT = 0.4, 3, 3000
 _WIDTH_M = 0.15  # Distance beyond the reach of a level at which a beam fits no wall [m]
 _TRIED, _HYPOTHESES = 200, 60  # Maximum numbers of places that are matched, and that are followed
 _SPREAD = np.diag(np.square([0.15, 0.15, 0.06]))  # Covariance (3, 3) of the places that are matched
-_APART_M, _APART = 0.25, math.radians(12.0)  # Places farther apart are different ones [m], [rad]
+_APART_M, _APART = 0.25, math.radians(12.0)  # PossiblePlaces farther apart are different ones [m], [rad]
 _LOOK_M, _LOOK_TURN = 0.3, 0.5  # Drive [m] or turn [rad] after which a scan counts as another look
 _SLIP = (0.03, 0.02, 0.06)  # Error of such a drive [m], of its turn [rad], and their growth with both
 _RULED_OUT = 0.5  # By how many scans a hypothesis explains less than another that rules it out
@@ -60,7 +60,7 @@ class SearchMap(NamedTuple):
     places: FloatArray  # (p, 2) that are tried first [m]
 
 
-class Beams(NamedTuple):
+class SweptBeams(NamedTuple):
     """A sweep from the pose of the robot at one instant, see `match`."""
 
     ends: FloatArray  # (n, 2)
@@ -68,7 +68,7 @@ class Beams(NamedTuple):
     variance: FloatArray  # (n,)
 
     @classmethod
-    def thinned(cls, ends: FloatArray, origin: FloatArray, variance: FloatArray) -> Beams:
+    def thinned(cls, ends: FloatArray, origin: FloatArray, variance: FloatArray) -> SweptBeams:
         """Not more of them than are needed here."""
         step = -(-len(ends) // _MATCHED)
         return cls(np.ascontiguousarray(ends[::step]), origin, np.ascontiguousarray(variance[::step]))
@@ -77,11 +77,11 @@ class Beams(NamedTuple):
 class Look(NamedTuple):
     """A scan that counts."""
 
-    beams: Beams
+    beams: SweptBeams
     track: FloatArray  # (3,) pose by odometry
 
 
-class Places(NamedTuple):
+class PossiblePlaces(NamedTuple):
     """The places (h,) where a robot may be, and its looks (k,)."""
 
     transform: FloatArray  # (h, 3) from `map` to the track of its odometry
@@ -96,7 +96,7 @@ class Places(NamedTuple):
         return len(self.transform) > 1 and len(self.looks) >= _LOOKS
 
 
-class Found(NamedTuple):
+class FoundPlace(NamedTuple):
     """A place that was found."""
 
     pose: FloatArray  # (3,) of the robot
@@ -127,8 +127,13 @@ class MapSearch:
         self._cache: OrderedDict[bytes, FloatArray] = OrderedDict()
 
     def add(
-        self, before: Places | None, stamp_ns: int, beams: Beams, track: FloatArray, walls: WallMap
-    ) -> tuple[Places, Found | None]:
+        self,
+        before: PossiblePlaces | None,
+        stamp_ns: int,
+        beams: SweptBeams,
+        track: FloatArray,
+        walls: WallMap,
+    ) -> tuple[PossiblePlaces, FoundPlace | None]:
         """Follow the places of a robot by a scan.
 
         Args:
@@ -165,7 +170,7 @@ class MapSearch:
             return after._replace(transform=np.zeros((0, 3))), None
         return self._confirmed(after, [found[k] for k in kept], walls)
 
-    def _begin(self, stamp_ns: int, paused_ns: int, look: Look, walls: WallMap) -> Places:
+    def _begin(self, stamp_ns: int, paused_ns: int, look: Look, walls: WallMap) -> PossiblePlaces:
         """Search the whole map."""
         pause_ns = min(max(_PAUSE_NS, 2 * paused_ns), _LONGEST_PAUSE_NS)
         tried = self._candidates(look.beams)
@@ -177,9 +182,11 @@ class MapSearch:
         kept = _best(poses, fits[:, None])[:_HYPOTHESES]
         kept = kept[fits[kept] > 0.0]
         transform = compose(poses, inverse(look.track))[kept]
-        return Places(transform, fits[kept, None], (look,), stamp_ns, pause_ns)
+        return PossiblePlaces(transform, fits[kept, None], (look,), stamp_ns, pause_ns)
 
-    def _confirmed(self, places: Places, found: list[Match], walls: WallMap) -> tuple[Places, Found | None]:
+    def _confirmed(
+        self, places: PossiblePlaces, found: list[Match], walls: WallMap
+    ) -> tuple[PossiblePlaces, FoundPlace | None]:
         """Believe the last place if it has no rival anywhere."""
         looks, best = places.looks, found[0]
         is_sure = len(looks) >= _LOOKS and best.determined == 3 and best.outcome not in (OFF_MAP, BLOCKED)
@@ -205,9 +212,9 @@ class MapSearch:
         kept = rivals[_best(poses[rivals], found_fits[rivals])]
         if len(kept) > 1:
             return places._replace(transform=np.array(transforms)[kept], fits=found_fits[kept]), None
-        return places, Found(best.pose, best.covariance + _START)
+        return places, FoundPlace(best.pose, best.covariance + _START)
 
-    def _candidates(self, beams: Beams) -> FloatArray:
+    def _candidates(self, beams: SweptBeams) -> FloatArray:
         """Poses (h, 3) from which the ends of beams are near walls, the best first, see the module."""
         key = beams.ends.tobytes()
         if key not in self._cache:
@@ -307,8 +314,9 @@ def _best(poses: FloatArray, fits: FloatArray) -> IntArray:
     """Indices of places (h, 3) that explain hardly less than the best, the best first, each once."""
     total = fits.sum(axis=1)
     order = _largest(total, len(total))
-    order = order[_separate(poses[order], total[order] + 1e-9, len(order))]
-    return order[total[order] > total.max(initial=0.0) - _RULED_OUT]
+    each: IntArray = order[_separate(poses[order], total[order] + 1e-9, len(order))]
+    kept: IntArray = each[total[each] > total.max(initial=0.0) - _RULED_OUT]
+    return kept
 
 
 def _moved(before: FloatArray, now: FloatArray) -> tuple[float, float]:
