@@ -70,7 +70,7 @@ class SweptBeams(NamedTuple):
     @classmethod
     def thinned(cls, ends: FloatArray, origin: FloatArray, variance: FloatArray) -> SweptBeams:
         """Not more of them than are needed here."""
-        step = -(-len(ends) // _MATCHED)
+        step = max(1, -(-len(ends) // _MATCHED))
         return cls(np.ascontiguousarray(ends[::step]), origin, np.ascontiguousarray(variance[::step]))
 
 

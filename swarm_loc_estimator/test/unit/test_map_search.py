@@ -122,6 +122,13 @@ def test_scans_that_fit_nowhere_are_named(room: Path) -> None:
     assert estimator.drops["scan_nowhere"] > 0
 
 
+def test_scans_that_meet_nothing_locate_nobody(room: Path) -> None:
+    estimator = Estimator(without_start(room))
+    nothing = sent(3 * SECOND, 2, change=lambda scan: scan._replace(ranges=np.full(BEAMS, math.inf)))
+    assert {int(one.status[0]) for one in hand_in(estimator, nothing)} == {Status.WAITING}
+    assert estimator.drops["scan_nowhere"] > 5
+
+
 def test_late_data_change_nothing_of_a_search(room: Path) -> None:
     """Scans that arrive before their odometry are searched for again."""
     until_ns, results = 6 * SECOND, []
