@@ -1,1 +1,1 @@
-"""Robots with lidars: in real buildings, in known maps, from starts anywhere, by headers as drivers write them."""
+"""Robots with lidars: real buildings, known maps, starts anywhere, headers as drivers write them."""
