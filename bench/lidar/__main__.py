@@ -1,11 +1,11 @@
-"""Robots with lidars in known maps: python -m bench lidar [--starts 50] [--parts cases ...]."""
+"""Robots with lidars: python -m bench lidar [--starts 50] [--parts cases ...]."""
 
 from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
 
-from bench.lidar import cases, real, starts
+from bench.lidar import buildings, cases, real, starts
 from bench.shared.common import ProgressLine, table, write_figures
 
 
@@ -15,6 +15,9 @@ def main() -> None:
     parser.add_argument("--starts", type=int, default=50, help="number of random starts in each map")
     parts: Mapping[str, Callable[[int], dict[str, float]]] = {
         "cases": lambda _: cases.measure(),
+        "buildings": lambda _: {
+            f"{name}.{key}": value for name, row in buildings.figures().items() for key, value in row.items()
+        },
         "turtlebot4_map": lambda _: real.measure(),
         "global_start": lambda count: starts.measure(
             count, real.MAP if real.MAP.is_file() else None, ProgressLine("starts")

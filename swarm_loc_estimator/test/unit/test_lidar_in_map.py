@@ -143,8 +143,7 @@ class Spinner(Weaver):
 def backwards(scan: ScanMessage) -> ScanMessage:
     """The same beams, listed in the other direction, without a word about their times."""
     last = scan.angle_min + (len(scan.ranges) - 1) * scan.angle_increment
-    shape = {"angle_min": last, "angle_increment": -scan.angle_increment}
-    return scan._replace(ranges=scan.ranges[::-1], **shape)
+    return scan._replace(ranges=scan.ranges[::-1], angle_min=last, angle_increment=-scan.angle_increment)
 
 
 @pytest.mark.parametrize("kind", [Spinner, LidarRobot])

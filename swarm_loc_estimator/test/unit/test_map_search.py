@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from core_geometry import wrapped
-from mapping_world import BEAMS, ROOM, LidarRobot, room_map, scan_bytes
-from test_lidar_in_map import CELL, ODOMETRY_NS, SWEEP_NS, hand_in, sent, swarm_at
+from mapping_world import BEAMS, ROOM, SWEEP_NS, LidarRobot, room_map, scan_bytes
+from test_lidar_in_map import CELL, ODOMETRY_NS, hand_in, sent, swarm_at
 
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.se2 import compose

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from swarm_loc_estimator import replay, smooth
 from swarm_loc_estimator.cli import replay as command
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.batch.lasting import with_lasting_errors
 from swarm_loc_estimator.offline.batch.normal import ChainEquations
 from swarm_loc_estimator.offline.batch.parameters import SURVEY
@@ -63,8 +65,8 @@ def with_fixes(world: World, seed: int) -> tuple[Recording, Swarm]:
     noisy = pose + FIX_SIGMA * rng.standard_normal(pose.shape)
     covariance = np.tile(np.diag(FIX_SIGMA**2), (len(noisy), 1, 1))
     order = np.argsort(stamps, kind="stable")
-    columns = (robots, stamps, noisy, covariance, stamps)
-    return replace(recording, fixes=FixRows(*(one[order] for one in columns))), world.swarm
+    fixes = select(FixRows(robots, stamps, noisy, covariance, stamps), order)
+    return replace(recording, fixes=fixes), world.swarm
 
 
 def with_ranges(world: World, seed: int) -> tuple[Recording, Swarm]:
@@ -85,13 +87,14 @@ def with_ranges(world: World, seed: int) -> tuple[Recording, Swarm]:
     rows = []
     for k in range(0, world.stamp_ns.size, 2):
         poses = world.truth[k]
-        places = [[*se2.transform_points(pose, np.array([[0.05, 0.0]]))[0].tolist(), 0.1] for pose in poses]
+        ahead = [se2.transform_points(pose, np.array([[0.05, 0.0]]))[0].tolist() for pose in poses]
+        places = [(x, y, 0.1) for x, y in ahead]
         for robot, own in enumerate(places):
             others = [(a.address, (a.x, a.y, a.z), a.range_bias) for a in anchors]
             others += [(1 + j, place, 0.0) for j, place in enumerate(places) if j != robot]
             for address, place, bias in others:
-                value = float(np.linalg.norm(np.subtract(place, own))) + bias
-                rows.append((robot, int(world.stamp_ns[k]), address, value))
+                length = float(np.linalg.norm(np.subtract(place, own))) + bias
+                rows.append((robot, int(world.stamp_ns[k]), address, length))
     robots, stamps, device, value = (np.array(column) for column in zip(*rows, strict=True))
     none = np.zeros(robots.size, dtype=np.uint64)
     value = value + RANGE_SIGMA * rng.standard_normal(value.size)
@@ -155,7 +158,8 @@ def everything(world: World, seed: int) -> tuple[Recording, Swarm]:
     robots = parts["ranges"][1].robots
     detections = [parts[name][0].detections for name in ("sightings", "fixed camera")]
     joint = DetectionRows(
-        *(np.concatenate([one[c] for one in detections]) for c in range(2)),
+        np.concatenate([one.robot for one in detections]),
+        np.concatenate([one.stamp_ns for one in detections]),
         joined([one.detection for one in detections]),
         np.concatenate([one.arrival_ns for one in detections]),
     )
@@ -211,7 +215,8 @@ def test_jacobians_are_those_of_finite_differences(off: float) -> None:
         solver._knot, solver._landmark, solver._parameter, solver._drift = state
         solver._apply(step)
         found = Collected(size)
-        found.add(*(solver._sightings()[k] for k in (1, 2, 0)))
+        residual, jacobian, columns = solver._sightings()
+        found.add(jacobian, columns, residual)
         solver._add_priors(found)
         if off == 0.0:  # else of second order, as the frame of a step's noise moves
             solver._add_odometry(found)
@@ -275,14 +280,19 @@ def run(recording: Recording, swarm: Swarm) -> ReplayResult:
     from swarm_loc_estimator.timeline.estimator import Estimator
 
     runner = Runner(Estimator(swarm), PeriodicSchedule(100_000_000))
-    rows = {"odometry": recording.odometry, "imu": recording.turn_rates, "detections": recording.detections}
-    rows |= {"fixes": recording.fixes, "ranges": recording.ranges}
-    rows = {name: one for name, one in rows.items() if one.robot.size}
-    sorted_rows = {
-        name: type(one)(*(c[np.argsort(one.arrival_ns, kind="stable")] for c in one))
-        for name, one in rows.items()
+    rows: dict[str, Any] = {
+        "odometry": recording.odometry,
+        "imu": recording.turn_rates,
+        "detections": recording.detections,
+        "fixes": recording.fixes,
+        "ranges": recording.ranges,
     }
-    runner.take(Batch.of(*recording.range_ns, **sorted_rows))
+    in_order = {
+        name: select(one, np.argsort(one.arrival_ns, kind="stable"))
+        for name, one in rows.items()
+        if one.robot.size
+    }
+    runner.take(Batch.of(*recording.range_ns, **in_order))
     runner.finish(recording.range_ns[1])
     return runner.result(recording.name, recording.range_ns, recording.truth, {})
 
@@ -389,11 +399,9 @@ def test_other_recordings_without_a_solution(monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(SmoothError, match="its poses are relative to a robot"):
         smooth_recording(recording, rerun(recording, lost, 0.1))
     online = rerun(recording, swarm, 0.1)
+    none = replace(recording, odometry=select(recording.odometry, np.zeros(0, dtype=np.int64)))
     with pytest.raises(SmoothError, match="it has no odometry"):
-        smooth_recording(
-            replace(recording, odometry=recording.odometry.__class__(*(c[:0] for c in recording.odometry))),
-            online,
-        )
+        smooth_recording(none, online)
     monkeypatch.setattr("swarm_loc_estimator.offline.batch.smooth.MAX_SIZE", 100)
     with pytest.raises(SmoothError, match="it is too large; cut it, or leave robots out"):
         smooth_recording(recording, online)

@@ -95,7 +95,8 @@ def drive(
 def off(mapper: CooperativeMapper, robot: int, truth: FloatArray) -> FloatArray:
     """Distances (n,) of the stops of a robot from true poses (n, 3)."""
     mine = mapper.graph.robot[: mapper.graph.count] == robot
-    return np.hypot(*(mapper.graph.poses[mine, :2] - truth[:, :2]).T)
+    away: FloatArray = mapper.graph.poses[mine, :2] - truth[:, :2]
+    return np.asarray(np.hypot(*away.T))
 
 
 @pytest.mark.parametrize("seed", range(5))
