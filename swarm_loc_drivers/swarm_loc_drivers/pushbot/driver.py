@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 from swarm_loc_drivers.common.link import Link, open_link
 from swarm_loc_drivers.common.odometry import DeadReckoning, OdometryState, WheelGeometry
@@ -23,6 +24,7 @@ _MAX_RATE = 2.0 * MAX_TICK_RATE  # Largest rate of a wheel, also while its contr
 _SLACK_S = 0.15  # Largest error of a stamp [s]
 _MAX_CORRECTION_S = 0.5
 """Stamps step back by at most so much when a smaller delay is found, or events arrive after ticks [s]."""
+_UNHEARD_S = 1.0  # A robot that was not heard for so long before its board was reset has moved [s]
 
 
 class PushbotOdometry:
@@ -34,19 +36,23 @@ class PushbotOdometry:
 
     def __init__(self, geometry: WheelGeometry, wheel_noise: float, counts: Counter[str]) -> None:
         self._metres_per_tick = geometry.metres_per_step
-        self._reckoning = DeadReckoning(geometry, wheel_noise)
+        self._begin = partial(DeadReckoning, geometry, wheel_noise)
+        self._reckoning = self._begin()
         self._counts = counts
         self._last: WheelTicks | None = None
+        self._heard_ns: int | None = None
         self._doubtful = False
 
     def restart(self) -> None:
-        """The board is reset and its ticks are zero; the robot has not moved in between."""
-        self._last = None
+        """The board is reset and its ticks are zero; the pose is, too, unless it is heard again soon."""
+        self._heard_ns, self._last = self._last.stamp_ns if self._last else self._heard_ns, None
 
     def update(self, ticks: WheelTicks) -> OdometryState | None:
         """Take a reading; the state, or None if the reading is not newer or is impossible."""
         last = self._last
         if last is None:
+            if self._heard_ns is not None and ticks.stamp_ns - self._heard_ns > 1e9 * _UNHEARD_S:
+                self._reckoning = self._begin()
             self._last = ticks
             return self._reckoning.state(ticks.stamp_ns, 0.0, 0.0, 0.0)
         if ticks.stamp_ns == last.stamp_ns:

@@ -126,6 +126,7 @@ _ATTEMPTS = 3
 _REPEAT_S = 0.4  # A constant velocity is repeated after so long; a decaying one holds for a second [s]
 _REPEAT_STOP_S = 0.1  # A stop is repeated after so long while the wheels turn [s]
 _STILL_S = 0.1  # The wheels stand when their ticks have not changed for so long [s]
+_STALE_STEPS = 100  # In so many steps after this driver was stopped, what waited in buffers still comes
 _STOP_S = 1.0  # The wheels must stand so long after a stop, and two periods of their ticks later [s]
 
 
@@ -196,14 +197,20 @@ class PushbotSession(TalkSession):
     def _stream(self, generation: FirmwareGeneration) -> Talk[None]:
         """Take measurements and send velocities until the session ends."""
         params = self._params
-        parser = EventParser(params.event_timestamps or "none", self._counts)
-        clock = EventClock(parser.span_us) if params.event_timestamps not in ("", "none") else None
         packets = EventPackets(params.packet_period, params.on_bit)
-        readings = TickClock(_tick_period_ms(params))
+        parser, clock, readings = self._begin_stream()
+        last_s, stale = self._steady_s, 0
         self._ticks_s = self._stood_s = self._steady_s
         while not (self.ending and self._stands()):
             yield
             received, self._received = self._received, b""
+            if self._steady_s > last_s + params.reply_timeout_s:  # this driver was stopped
+                parser, clock, readings = self._begin_stream()
+                stale = _STALE_STEPS
+            if stale:
+                received, stale = b"", stale - 1
+                self._ticks_s = self._turned_s = self._stood_s = self._steady_s
+            last_s = self._steady_s
             parsed = parser.feed(received)
             stamps_ns = self._take_events(parsed, clock, packets)
             for before, line in parsed.lines:
@@ -214,6 +221,13 @@ class PushbotSession(TalkSession):
                 raise SessionError("the robot has stopped sending wheel ticks")
             self._send_velocity(generation)
             self._check_stop()
+
+    def _begin_stream(self) -> tuple[EventParser, EventClock | None, TickClock]:
+        """What reads and times the bytes from now on."""
+        timestamps = self._params.event_timestamps or "none"
+        parser = EventParser(timestamps, self._counts)
+        clock = EventClock(parser.span_us) if timestamps != "none" else None
+        return parser, clock, TickClock(_tick_period_ms(self._params))
 
     def _take_events(self, parsed: Parsed, clock: EventClock | None, packets: EventPackets) -> list[int]:
         """Stamp and pack events; their stamps [ns], which time the lines between them."""

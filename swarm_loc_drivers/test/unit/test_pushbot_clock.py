@@ -151,6 +151,20 @@ def test_a_stamp_that_is_corrected_backwards_is_no_jump_of_time() -> None:
     assert counts == {"corrected_times": 1, "time_jumps": 1}
 
 
+@pytest.mark.parametrize(("pause_s", "x"), [(0.7, 0.03), (3.0, 0.01)])
+def test_a_robot_that_was_not_heard_for_long_before_a_reset_begins_anew(pause_s: float, x: float) -> None:
+    reckoning, _ = odometry()
+    for k, ticks in enumerate((0, 100, 200)):
+        reckoning.update(WheelTicks(10**9 + 100 * k * MS, ticks, ticks))
+    again_ns = 10**9 + 200 * MS + round(1e9 * pause_s)
+    reckoning.restart()
+    reckoning.restart()
+    reckoning.update(WheelTicks(again_ns, 0, 0))
+    state = reckoning.update(WheelTicks(again_ns + 100 * MS, 100, 100))
+    assert state is not None
+    assert state.pose == pytest.approx([x, 0.0, 0.0])
+
+
 def test_commands_keep_the_curve_at_the_limit() -> None:
     left, right = wheel_velocities(GEOMETRY, 1.0, 2.0)
     assert max(left, right) == 100

@@ -275,6 +275,33 @@ def test_a_long_stall_blocks_the_robot_and_the_driver_resets_it() -> None:
     assert wire.speed == 0.0
 
 
+@pytest.mark.parametrize("timestamps", ["16bit", "24bit", "delta"])
+@pytest.mark.parametrize("pause_s", [3.0, 30.0])
+def test_a_driver_that_is_stopped_for_a_while_misses_no_motion(pause_s: float, timestamps: str) -> None:
+    """Its robot turns on; the oldest bytes wait in the buffers meanwhile, and are no news afterwards."""
+    wire = streaming({"timestamps": timestamps}, FIRST_FIRMWARE)
+    wire.velocities = (-9, 9)
+    wire.run(0.5)
+    before, waiting = len(wire.states), b""
+    end_ns = wire.world.now_ns + round(1e9 * pause_s)
+    while wire.world.now_ns < end_ns:
+        wire.world.step()
+        waiting += wire.firmware.stream() if len(waiting) < 4096 else b""
+    wire.velocities = (0, 0)
+    stream = wire.firmware.stream
+    wire.firmware.stream = lambda: waiting + stream()  # type: ignore[method-assign]
+    wire.step()
+    wire.firmware.stream = stream  # type: ignore[method-assign]
+    wire.run(1.0)
+    assert not wire.errors
+    assert not wire.counts["ignored_stops"] + wire.counts["counter_restarts"]
+    assert wire.odometry_error()[1] < 0.01
+    stamps = np.array([one.stamp_ns for one in wire.states[before:]])
+    assert stamps[0] > end_ns
+    assert (np.diff(stamps) > 0).all()
+    assert wire.world.now_ns - stamps[-1] < 30_000_000
+
+
 def test_lines_that_are_no_ticks_are_counted() -> None:
     wire = streaming()
     wire.firmware.receive(b"!X\nx\n")
