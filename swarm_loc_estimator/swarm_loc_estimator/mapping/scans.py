@@ -306,6 +306,8 @@ _DRIVES, _STANDS, _ARRIVES, _JUMPS = 0, 1, 2, 3
 _MAX_SPEED, _MAX_STEP, _MAX_RATE, _MAX_TURN = 3.0, 0.05, 20.0, 0.3
 """Limits beyond which odometry counts as restarted: rate and offset of position, and of heading."""
 _PAUSE_S = 0.5  # Pause after which odometry near zero has restarted, since its driver has [s]
+_UNHEARD_S, _UNHEARD_TURN = 2.0, 0.05
+"""Pause [s] in which turns [rad] may be whole ones, of which slip is unknown; `stop_and_go` has it, too."""
 
 
 class ScanStop:
@@ -433,8 +435,9 @@ class MotionTracker:
         self._before_ns = 0
 
     def runs(self, readings: Readings) -> Iterator[Run]:
-        """Split readings (n,) at arrivals and departures."""
-        labels = _labels(readings.stamp_ns, readings.odometry, self._state, self._before_ns)
+        """Split readings (n,) at arrivals and departures, and after motion of which too little is known."""
+        unheard_s = math.inf if math.isnan(readings.sigma) else _UNHEARD_S  # a lidar measures turns itself
+        labels = _labels(readings.stamp_ns, readings.odometry, self._state, self._before_ns, unheard_s)
         self._before_ns = int(readings.stamp_ns[-1])
         changes = (labels[1:] >= _ARRIVES) | ((labels[1:] == _DRIVES) != (labels[:-1] == _DRIVES))
         bounds = [0, *(np.flatnonzero(changes) + 1).tolist(), len(labels)]
@@ -446,7 +449,9 @@ class MotionTracker:
 
 
 @cached_njit
-def _labels(stamp_ns: IntArray, odometry: FloatArray, state: FloatArray, before_ns: int) -> IntArray:
+def _labels(
+    stamp_ns: IntArray, odometry: FloatArray, state: FloatArray, before_ns: int, unheard_s: float
+) -> IntArray:
     """Label each reading as driving, stopped, arriving or jump; updates the state."""
     labels = np.zeros(len(stamp_ns), dtype=np.int64)
     for k in range(len(stamp_ns)):
@@ -456,6 +461,7 @@ def _labels(stamp_ns: IntArray, odometry: FloatArray, state: FloatArray, before_
         turn = abs((odometry[k, 2] - state[5] + math.pi) % (2.0 * math.pi) - math.pi)
         at_zero = math.hypot(x, y) < _MAX_STEP and abs(odometry[k, 2]) < _MAX_TURN
         restarts = at_zero and elapsed_s > _PAUSE_S and step + turn > 0.0
+        restarts |= elapsed_s > unheard_s and (step > _DEPARTED or turn > _UNHEARD_TURN)
         if restarts or step > _MAX_SPEED * elapsed_s + _MAX_STEP or turn > _MAX_RATE * elapsed_s + _MAX_TURN:
             labels[k] = _JUMPS
             state[0], state[1], state[4] = x, y, 1.0
