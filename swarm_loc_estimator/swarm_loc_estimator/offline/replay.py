@@ -85,11 +85,12 @@ def replay(
     swarm = load_swarm(swarm_beside(bag)) if swarm is None else swarm
     periodic = PeriodicSchedule(_period_ns(tick_s))
     schedule = periodic if stamp_ns is None else ListedSchedule(_increasing(stamp_ns))
-    mounts = mounts_of_bag(bag, swarm, remap)
-    swarm = mounts.described()
     estimator = Estimator(swarm, settings)
+    mounts = mounts_of_bag(bag, swarm, remap)
+    if mounts.remarks():
+        estimator.describe(mounts.described())
     runner = Runner(estimator, schedule, keep_sightings=keep_sightings)
-    summary = read_bag(bag, swarm, runner.take, progress, remap, loss)
+    summary = read_bag(bag, estimator.swarm, runner.take, progress, remap, loss)
     if summary.unusable:
         raise BagError(
             "\n".join([f"'{bag}' holds no message that the estimator can use.", *summary.unusable])

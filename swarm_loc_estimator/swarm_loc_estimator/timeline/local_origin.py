@@ -13,6 +13,7 @@ from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 _GRID_M = 1e4  # Local origins are multiples of it [m]; nearer to that of `map`, there is none
+_FARTHEST_M = 1e8  # Places farther away are absurd
 _IN_MAP = ("fixes", "aerial")  # Sensors whose readings are in `map`
 
 
@@ -68,10 +69,10 @@ def readings_about(rows: Mapping[str, Any], origin: FloatArray) -> dict[str, Any
 
 
 def first_place(rows: Mapping[str, Any]) -> FloatArray | None:
-    """The first finite place (2,) in `map` of readings by sensor; None without one."""
+    """The first usable place (1, 2) in `map` of readings by sensor; None without one."""
     for name in _IN_MAP:
         places = rows[name].pose[:, :2] if name in rows else np.zeros((0, 2))
-        usable = np.isfinite(places).all(axis=1)
+        usable = (np.abs(places) <= _FARTHEST_M).all(axis=1)  # false for NaN
         if usable.any():
             first: FloatArray = places[usable][:1]
             return first

@@ -199,7 +199,7 @@ def test_owners_of_marker_ids(tmp_path: Path) -> None:
             "defaults.landmark.yaw_sigma is -1 but must lie in [0, 10] rad.",
         ),
         ("size: 0.08", "size: 0.0", "landmarks.100.size is 0.0 but must lie in [0.001, 10] m."),
-        ("  101: {x: 0, y: 0", "  101: {x: 0", "landmarks.101 lacks y, a number in [-1e+06, 1e+06] m."),
+        ("  101: {x: 0, y: 0", "  101: {x: 0", "landmarks.101 lacks y, a number in [-1e+08, 1e+08] m."),
         (
             "y: -2.5, theta: 0.5",
             "y: -2.5",

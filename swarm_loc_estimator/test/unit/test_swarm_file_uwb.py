@@ -53,8 +53,8 @@ def test_a_description_is_read_and_written_back(tmp_path: Path) -> None:
         ("address: 7", "address: '0x0'", f"anchors[0].address is '0x0' but must be {ADDRESS}."),
         ("address: 7", "address: 1.5", f"anchors[0].address is 1.5 but must be {ADDRESS}."),
         ("address: 0x1F, ", "", f"robots.a.uwb lacks address, {ADDRESS}."),
-        ("y: 5.0, z: 2.5", "z: 2.5", "anchors[0] lacks y, a number in [-1e+06, 1e+06] m."),
-        ("x: 0.0", "x: .nan", "anchors[0].x is nan but must lie in [-1e+06, 1e+06] m."),
+        ("y: 5.0, z: 2.5", "z: 2.5", "anchors[0] lacks y, a number in [-1e+08, 1e+08] m."),
+        ("x: 0.0", "x: .nan", "anchors[0].x is nan but must lie in [-1e+08, 1e+08] m."),
         ("sigma: 0.05", "sigma: 0", "types.rover.uwb.range_sigma is 0 but must lie in (0, 10] m."),
         (
             "{x: 0.1",

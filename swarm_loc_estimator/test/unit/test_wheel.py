@@ -132,7 +132,7 @@ def test_a_bag_without_the_libraries_for_bags_ends_with_one_sentence() -> None:
     done = python("sys.exit(run(*sys.argv[1:]))", "replay", str(BAG), refused="rosbags mcap")
     assert done.returncode == 1
     assert done.stderr == (
-        "swarm-loc replay needs the Python package mcap, which is not installed:"
+        "swarm-loc replay needs the Python package rosbags, which is not installed:"
         " pip install lz4 mcap rosbags zstandard.\n"
     )
 
