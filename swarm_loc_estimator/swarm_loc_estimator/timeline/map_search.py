@@ -46,6 +46,8 @@ _SLIP = (0.03, 0.02, 0.06)  # Error of such a drive [m], of its turn [rad], and 
 _RULED_OUT = 0.5  # By how many scans a hypothesis explains less than another that rules it out
 _LOOKS, _MEMORY = 3, 8  # Minimum number of looks, and maximum number that are compared
 _MIN_FIT = 0.7  # Share of the beams that must fit, on average
+_DECLINE = 0.07
+"""How much worse later scans may fit than the first, by which a place was found: a wrong one fits that best."""
 _START = np.diag(np.square([0.1, 0.1, 0.05]))
 """Covariance (3, 3) added to that of a place, since the next scans, which see the same walls, replace it."""
 _PAUSE_NS, _LONGEST_PAUSE_NS = 1_000_000_000, 16_000_000_000  # Between searches of a robot
@@ -212,6 +214,8 @@ class MapSearch:
         kept = rivals[_best(poses[rivals], found_fits[rivals])]
         if len(kept) > 1:
             return places._replace(transform=np.array(transforms)[kept], fits=found_fits[kept]), None
+        if places.fits[0, 0] - places.fits[0, 1:].mean() > _DECLINE:  # the true place was not among all
+            return places._replace(transform=np.zeros((0, 3))), None
         return places, FoundPlace(best.pose, best.covariance + _START)
 
     def _candidates(self, beams: SweptBeams) -> FloatArray:
