@@ -47,7 +47,7 @@ _RULED_OUT = 0.5  # By how many scans a hypothesis explains less than another th
 _LOOKS, _MEMORY = 3, 8  # Minimum number of looks, and maximum number that are compared
 _MIN_FIT = 0.7  # Share of the beams that must fit, on average
 _DECLINE = 0.07
-"""How much worse later scans may fit than the first, by which a place was found: a wrong one fits that best."""
+"""How much worse later scans may fit than the first, by which a place was found: wrong places fit it best."""
 _START = np.diag(np.square([0.1, 0.1, 0.05]))
 """Covariance (3, 3) added to that of a place, since the next scans, which see the same walls, replace it."""
 _PAUSE_NS, _LONGEST_PAUSE_NS = 1_000_000_000, 16_000_000_000  # Between searches of a robot
