@@ -30,10 +30,8 @@ from swarm_loc_estimator.mapping.sweep_map import LoopTie
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 _BEGIN_S = 160.0  # Of freiburg-079, of which the odometry contradicts the scans, the begin is measured, too
-_WRONG_M, _WRONG_TURN = (
-    1.0,
-    math.radians(15.0),
-)  # Difference of a tie from the reference from which it is wrong
+_WRONG_M, _WRONG_TURN = 1.0, math.radians(15.0)
+"""Difference of a tie from the reference from which it is wrong."""
 _SAME_S = 0.01
 _WARM = 10  # Scans before the first that count for the cost, while code is loaded
 

@@ -41,9 +41,8 @@ _TURN, _TURN_SHARE, _MAX_TURN = math.radians(15.0), 0.5, math.radians(50.0)
 """Search for its heading: turn [rad], share of the turn by odometry, and greatest [rad]."""
 _PREDICTED, _PREDICTED_PER_M, _PREDICTED_TURN = 0.10, 0.25, math.radians(5.0)
 """Standard deviations of the prediction [m], per path, and of its heading [rad]."""
-_ANYWHERE = PoseWindow(
-    2.5, math.pi, math.inf, math.inf
-)  # Search for a sweep that does not fit the prediction
+_ANYWHERE = PoseWindow(2.5, math.pi, math.inf, math.inf)
+"""Search for a sweep that does not fit the prediction."""
 _GOOD, _LESS, _BETTER = 0.5, 0.8, 0.15
 """Score, and share of the usual one, below which it is searched elsewhere, and is there if so much better."""
 _MIN_SCORE = 0.30  # Least score of a sweep among the newest ones
@@ -202,7 +201,7 @@ class SweepMap:
         self._note(node, stop)
 
     def add(self, begin: int, node: int, stop: ScanStop, motion: FloatArray, sigma: FloatArray) -> bool:
-        """BestPose the newest sweep, at its pose by odometry; returns whether it fits.
+        """Match the newest sweep, at its pose by odometry; returns whether it fits.
 
         Args:
             begin: The robot's sweep before.
@@ -308,7 +307,7 @@ class SweepMap:
     def _match_newest(
         self, chain: Chain, node: int, points: FloatArray, motion: FloatArray
     ) -> BestPose | None:
-        """BestPose points (n, 2) of a sweep with the newest ones of its robot; None: too little is seen."""
+        """Match points (n, 2) of a sweep with the newest ones of its robot; None: too little is seen."""
         newest = self._newest(chain)
         if len(points) < _MIN_POINTS or newest is None:
             return None
@@ -348,7 +347,7 @@ class SweepMap:
         return odometry
 
     def _close_loops(self, chain: Chain, node: int) -> None:
-        """BestPose the newest sweeps of a robot with old ones near, and tie what is believed."""
+        """Match the newest sweeps of a robot with old ones near, and tie what is believed."""
         graph, count = self._graph, self._graph.count
         if chain.floats:
             self._look_everywhere(chain, node)
@@ -442,7 +441,7 @@ class SweepMap:
     def _match_old(
         self, node: int, query: FloatArray, old: int, way: float, is_old: BoolArray
     ) -> LoopTie | None:
-        """BestPose points (n, 2) seen from a sweep with those of old sweeps around one; None: not unique."""
+        """Match points (n, 2) seen from a sweep with those of old sweeps around one; None: not unique."""
         found = match(
             self._around(old, is_old),
             query,
