@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from geometry_msgs.msg import PoseStamped
-from node_world import drop_reasons, stamp_ns
+from node_world import stamp_ns
 
 from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
@@ -18,7 +18,11 @@ from swarm_loc_estimator.timeline.estimator import Status
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
 PATIENCE_S = 100.0
-PARAMETERS = "epuck_world: {ros__parameters: {width: 640, height: 480}}\n"
+# No data are too old, however long a busy machine stands still
+PARAMETERS = (
+    "epuck_world: {ros__parameters: {width: 640, height: 480}}\n"
+    "estimator: {ros__parameters: {horizon_s: 20.0}}\n"
+)
 
 
 @pytest.mark.timeout(300)  # the renderer may have to be compiled first
@@ -69,5 +73,5 @@ def test_robots_are_located_by_what_their_cameras_see(tmp_path: Path) -> None:
     assert np.median(errors) < 0.02
     assert sum(len(array.detections) for array in seen) > len(seen)
     log = (tmp_path / "nodes.log").read_text(encoding="utf-8")
-    assert not drop_reasons(log)
+    assert "dropped" not in log
     assert "simulated time continues without" not in log

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import math
 import os
-import re
 import signal
 import subprocess
 import time
@@ -57,8 +56,6 @@ landmarks:
 LANDMARKS = {100: (2.0, 0.0, math.pi), 101: (2.0, 1.0, math.pi)}
 TRUE_POSES = {"alpha": (0.0, 0.0, 0.0), "beta": (0.0, 1.0, 0.0)}
 UNKNOWN_ID = 999
-LATE = {"too_old", "imu_too_old", "odometry_too_old", "overload", "lost"}
-"""Reasons for which messages are dropped by a machine that stands still for a second."""
 SETTINGS = {"fusion_load": 1.0}  # Every tick fuses, however fast the test lets time pass
 
 _RELIABLE = QoSProfile(depth=100)
@@ -380,9 +377,3 @@ def with_patience(process: subprocess.Popen[bytes], seconds: float) -> None:
         process.wait(seconds)
     except subprocess.TimeoutExpired:
         return
-
-
-def drop_reasons(log: str) -> set[str]:
-    """Reasons of drops in a log of an estimator, but for those of a machine that was busy."""
-    lines = re.findall(r"dropped so far: (.*)", log)
-    return {reason for line in lines for reason in re.findall(r"\d+ (\w+)", line)} - LATE
