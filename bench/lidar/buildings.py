@@ -74,12 +74,12 @@ def path_rms(mapper: CooperativeMapper, building: str) -> float:
     return float(np.sqrt(np.square(off).sum(axis=1).mean()))
 
 
-def wrong_loops(mapper: CooperativeMapper, building: str) -> int:
-    """Number of ties of loops that the reference contradicts."""
+def wrong_loops(mapper: CooperativeMapper, building: str, offsets: Sequence[int] = (0,)) -> int:
+    """Number of ties of loops that the reference contradicts, from each stop at some offsets from theirs."""
     path = reference(building)
     at, _ = _at_stops(mapper, path)
     return sum(
-        all(_contradict(mapper, path[at, 1:], tie, off) for off in (-1, 0, 1)) for tie in mapper.sweeps.loops
+        all(_contradict(mapper, path[at, 1:], tie, off) for off in offsets) for tie in mapper.sweeps.loops
     )
 
 
@@ -110,6 +110,7 @@ def _figures_of(building: str) -> dict[str, float]:
     found = {
         "path_rms_m": path_rms(mapper, building),
         "wrong_loops": float(wrong_loops(mapper, building)),
+        "wrong_loops_also_from_next_stops": float(wrong_loops(mapper, building, (-1, 0, 1))),
         "loops": float(mapper.counters["loops_closed"]),
         "doubts": float(len(mapper.sweeps.doubts())),
         "contradicted": float(mapper.counters["odometry_contradicted"]),
