@@ -43,9 +43,9 @@ from swarm_loc_estimator.timeline.estimate import (
 )
 from swarm_loc_estimator.timeline.fusion import Fusion
 from swarm_loc_estimator.timeline.local_origin import (
+    OriginOfFixes,
     about,
     described_origin,
-    first_place,
     is_placed,
     local_origin,
     readings_about,
@@ -96,6 +96,7 @@ class Estimator:
         self.swarm = swarm
         # Poses are estimated about a local origin, which the first fix tells where no description does.
         self._origin = described_origin(swarm) if is_placed(swarm) else None
+        self._seen = OriginOfFixes() if self._origin is None else None
         swarm = self._local = swarm if self._origin is None else about(swarm, self._origin)
         self._limits = TrackedLimits.of(swarm, self.settings)
         self._tracks = OdometryTracks(swarm.robots)
@@ -152,8 +153,10 @@ class Estimator:
 
     def convert(self, batch: Batch) -> Batch:
         """Convert readings to measurements for `receive`; invalid ones are counted in `drops`."""
-        if self._origin is None and (place := first_place(batch.rows)) is not None:
-            self._origin = local_origin(place)
+        if self._seen is not None and (moved := self._seen.moved(batch.rows, self._origin)) is not None:
+            if self._origin is not None:  # it was that of a source whose fixes are far from all others
+                self.reset()
+            self._origin = moved
         if self._origin is not None and self._origin.any():
             batch = replace(batch, rows=readings_about(batch.rows, self._origin))
         return self._converter.convert(batch)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict, deque
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -14,6 +15,7 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 
 _GRID_M = 1e4  # Local origins are multiples of it [m]; nearer to that of `map`, there is none
 _FARTHEST_M = 1e8  # Places farther away are absurd
+_FAR_M, _IN_A_ROW = 5e5, 3  # Distance of fixes from the origin that are far [m], and how many in a row count
 _IN_MAP = ("fixes", "aerial")  # Sensors whose readings are in `map`
 
 
@@ -68,12 +70,39 @@ def readings_about(rows: Mapping[str, Any], origin: FloatArray) -> dict[str, Any
     return found
 
 
-def first_place(rows: Mapping[str, Any]) -> FloatArray | None:
-    """The first usable place (1, 2) in `map` of readings by sensor; None without one."""
-    for name in _IN_MAP:
-        places = rows[name].pose[:, :2] if name in rows else np.zeros((0, 2))
-        usable = (np.abs(places) <= _FARTHEST_M).all(axis=1)  # false for NaN
-        if usable.any():
-            first: FloatArray = places[usable][:1]
-            return first
-    return None
+class OriginOfFixes:
+    """The local origin where no description says one: the first fix tells it.
+
+    A source whose first fix is far from all others must not keep them out. So the origin moves where more
+    robots have their newest fixes than near it.
+    """
+
+    def __init__(self) -> None:
+        # By robot, its newest fixes in a row that are far, the last ones
+        self._far: defaultdict[int, deque[FloatArray]] = defaultdict(lambda: deque(maxlen=_IN_A_ROW))
+        self._near: set[int] = set()  # Robots with their newest fixes near the origin
+
+    def moved(self, rows: Mapping[str, Any], origin: FloatArray | None) -> FloatArray | None:
+        """Another local origin (2,) by readings by sensor; None: it stays."""
+        for name in _IN_MAP:
+            if name not in rows or not rows[name].pose.size:
+                continue
+            robots, places = getattr(rows[name], "robot", None), rows[name].pose[:, :2]
+            usable = np.flatnonzero((np.abs(places) <= _FARTHEST_M).all(axis=1))  # false for NaN
+            if origin is None and usable.size:
+                return local_origin(places[usable[:1]])
+            if origin is None or robots is None:
+                continue
+            is_far = (np.abs(places[usable] - origin) > _FAR_M).any(axis=1)
+            for robot in np.unique(robots[usable[~is_far]]).tolist():
+                self._near.add(robot)
+                self._far.pop(robot, None)
+            for row in usable[is_far].tolist():
+                self._far[int(robots[row])].append(places[row])
+        lost = [robot for robot, found in self._far.items() if len(found) == _IN_A_ROW]
+        if len(lost) <= len(self._near - set(lost)):
+            return None
+        found = np.array([self._far[robot][-1] for robot in lost])
+        self._far.clear()
+        self._near.clear()
+        return local_origin(found)

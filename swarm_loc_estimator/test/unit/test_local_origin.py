@@ -78,3 +78,23 @@ def test_a_description_moves_there_and_back() -> None:
     assert (local.landmarks[0].x, local.anchors[0].y) == (0.0, 0.0)
     assert about(local, -origin) == swarm
     assert not described_origin(Swarm((Robot("a", start=(4000.0, 0.0, 0.0)),))).any()
+
+
+@pytest.mark.parametrize("liar_x", [0.0, 9e6])
+@pytest.mark.parametrize("rate", [1, 50])
+def test_a_first_fix_far_from_all_others_keeps_none_out(liar_x: float, rate: int) -> None:
+    """A receiver without a signal, say: it sends first, and more often than others."""
+    estimator = Estimator(Swarm(tuple(Robot(name) for name in "abc")))
+    stamps = np.arange(60) * SECOND // 10
+    for at_ns in stamps.tolist():
+        robots = np.array([*[0] * rate, *([1, 2] if at_ns else [])])
+        poses = np.where(robots[:, None] == 0, [liar_x, 0.0, 0.0], [5e5, 5e6, 0.0])
+        many, at = np.tile(np.diag([1e-4, 1e-4, 1e-4]), (robots.size, 1, 1)), np.full(robots.size, at_ns)
+        at[:rate] -= np.arange(rate) * 1000
+        fixes = FixRows(robots, at, poses, many, at)
+        who, zeros = np.arange(3), np.zeros((3, 3))
+        odometry = OdometryRows(who, np.full(3, at_ns), zeros, zeros, np.full(3, at_ns))
+        estimator.receive(Batch.of(int(at_ns) - SECOND // 10, int(at_ns), odometry=odometry, fixes=fixes))
+        estimate = estimator.tick(int(at_ns))
+    assert (estimate.status[1:] == Status.TRACKED).all()
+    assert estimate.poses[1:] == pytest.approx(np.tile([5e5, 5e6, 0.0], (2, 1)), abs=1e-2)
