@@ -25,7 +25,7 @@ from bench.shared.common import ProgressLine
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.se2 import compose, wrap_angle
+from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.filter.measurements import Verdict
 from swarm_loc_estimator.filter.models import SCAN
 from swarm_loc_estimator.mapping.grid import OccupancyMap
@@ -103,14 +103,8 @@ class GridBody(LidarBody):
 
     def ranges(self, begin: int) -> FloatArray:
         """Ranges (BEAMS,) of the sweep that began at a step [m]."""
-        share = np.arange(BEAMS) / BEAMS * SWEEP_STEPS
-        poses = np.array([*self.trace[begin : begin + SWEEP_STEPS], self.pose])
-        poses[:, 2] = np.unwrap(poses[:, 2])
-        at = np.stack([np.interp(share, np.arange(len(poses)), column) for column in poses.T], axis=-1)
-        turns = 2.0 * math.pi / BEAMS * np.arange(BEAMS)
-        beam = np.stack([np.full(BEAMS, LIDAR.x), np.zeros(BEAMS), turns], axis=-1)
         grid = self.grid
-        true = _ranges(grid.occupied, np.asarray(grid.corner), grid.cell, compose(at, beam), self.far_m)
+        true = _ranges(grid.occupied, np.asarray(grid.corner), grid.cell, self.beams(begin), self.far_m)
         noise = LIDAR.range_sigma + LIDAR.range_sigma_per_m * np.minimum(true, self.far_m)
         found = true + noise * self.rng.standard_normal(BEAMS)
         return np.where(found > self.far_m, math.inf, np.maximum(found, NEAREST))

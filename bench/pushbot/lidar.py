@@ -107,16 +107,18 @@ class LidarBody:
                     best, target = score, place
         return target
 
-    def ranges(self, begin: int) -> FloatArray:
-        """Ranges (BEAMS,) of the sweep that began at a step, as the lidar reports them [m]."""
+    def beams(self, begin: int) -> FloatArray:
+        """Poses (BEAMS, 3) of the beams of the sweep that began at a step."""
         share = np.arange(BEAMS) / BEAMS * SWEEP_STEPS
         poses = np.array([*self.trace[begin : begin + SWEEP_STEPS], self.pose])
         poses[:, 2] = np.unwrap(poses[:, 2])
         at = np.stack([np.interp(share, np.arange(len(poses)), column) for column in poses.T], axis=-1)
-        beam = np.stack(
-            [np.full(BEAMS, LIDAR.x), np.zeros(BEAMS), 2.0 * math.pi / BEAMS * np.arange(BEAMS)], -1
-        )
-        true = _sweep_distances(self.plan.walls, compose(at, beam))
+        turns = 2.0 * math.pi / BEAMS * np.arange(BEAMS)
+        return compose(at, np.stack([np.full(BEAMS, LIDAR.x), np.zeros(BEAMS), turns], axis=-1))
+
+    def ranges(self, begin: int) -> FloatArray:
+        """Ranges (BEAMS,) of the sweep that began at a step, as the lidar reports them [m]."""
+        true = _sweep_distances(self.plan.walls, self.beams(begin))
         noise = LIDAR.range_sigma + LIDAR.range_sigma_per_m * np.minimum(true, FARTHEST)
         found = true + noise * self.rng.standard_normal(BEAMS)
         found = np.where((found > FARTHEST) | (true > FARTHEST), math.inf, found)

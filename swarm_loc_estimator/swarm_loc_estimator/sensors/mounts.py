@@ -75,7 +75,10 @@ class Mounts:
         }
 
     def add_transforms(self, topic: str, message: Any) -> None:
-        """Add a decoded tf2_msgs/TFMessage of `tf_static`, or of one below the namespace of a robot."""
+        """Add a decoded tf2_msgs/TFMessage of `tf_static`, or of one below the namespace of a robot.
+
+        The first transform to a frame counts: a later one must not restart the estimator.
+        """
         joints = self._joints.setdefault(topic.strip("/").removesuffix(TF_STATIC), {})
         for one in message.transforms:
             turn, place = one.transform.rotation, one.transform.translation
@@ -83,7 +86,7 @@ class Mounts:
             numbers = [*quaternion, place.x, place.y, place.z]
             if np.isfinite(numbers).all() and quaternion.any() and len(joints) < _MAX_FRAMES:
                 parent, child = (name.lstrip("/") for name in (one.header.frame_id, one.child_frame_id))
-                joints[child] = _Joint(parent, _rotation(quaternion), np.array(numbers[4:]))
+                joints.setdefault(child, _Joint(parent, _rotation(quaternion), np.array(numbers[4:])))
 
     def add_frame(self, topic: InputTopic, frame: str) -> None:
         """Add the frame of a sensor's messages."""

@@ -66,6 +66,13 @@ def test_a_lidar_is_where_a_chain_of_joints_leads(prefix: str, topic: str) -> No
     assert mounts.differences() == []
 
 
+def test_the_first_transform_to_a_frame_counts() -> None:
+    """Else whoever publishes others by turns restarts the estimator again and again."""
+    joints = [static(("base_link", "laser", (x, 0.0, 0.0), (0.0, 0.0, 0.0))) for x in (0.1, 0.2)]
+    mounts = mounts_of(Robot("a", lidar=LidarModel(range_sigma=0.01)), {"scan": "laser"}, *joints)
+    assert mounts.described().robots[0].lidar.x == 0.1
+
+
 def test_the_description_wins_number_by_number_and_differences_are_named() -> None:
     robot = Robot("a", lidar=LidarModel(range_sigma=0.01, x=0.2), said=frozenset({"lidar.yaw"}))
     message = static(("base_link", "laser", (0.1, 0.3, 0.0), (TURN, 0.0, 0.0)))
