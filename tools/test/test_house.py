@@ -26,7 +26,7 @@ PATH_LIMITS = {
     "detection": (22, 6),
     "odometry": (18, 8),
     "range": (23, 7),
-    "scan": (27, 12),
+    "scan": (26, 12),
     "brightness": (27, 21),
 }
 ORDER = (

@@ -43,6 +43,7 @@ from swarm_loc_estimator.timeline.estimate import (
 )
 from swarm_loc_estimator.timeline.fusion import Fusion
 from swarm_loc_estimator.timeline.local_origin import (
+    PLACING,
     OriginOfFixes,
     about,
     described_origin,
@@ -153,10 +154,11 @@ class Estimator:
 
     def convert(self, batch: Batch) -> Batch:
         """Convert readings to measurements for `receive`; invalid ones are counted in `drops`."""
-        if self._seen is not None and (moved := self._seen.moved(batch.rows, self._origin)) is not None:
-            if self._origin is not None:  # it was that of a source whose fixes are far from all others
-                self.reset()
-            self._origin = moved
+        if self._seen is not None and any(name in batch.rows for name in PLACING):
+            moved = self._seen.moved(batch.rows, self._origin)
+            if moved is not None and self._origin is not None:
+                self.reset()  # it was that of a source whose fixes are far from all others
+            self._origin = self._origin if moved is None else moved
         if self._origin is not None and self._origin.any():
             batch = replace(batch, rows=readings_about(batch.rows, self._origin))
         return self._converter.convert(batch)

@@ -78,6 +78,7 @@ from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.aerial_images import PictureFusion, as_fixes, relieve_seen
 from swarm_loc_estimator.timeline.map_scans import MapScans, Sweeps
+from swarm_loc_estimator.timeline.map_search import MapSearch
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.timeline import middle_of_period
 
@@ -120,6 +121,8 @@ class Fusion:
         self._local = LocalFrame(swarm, tracks, self._initializer, settings.origin_after_s)
         self._pictures = PictureFusion(swarm, settings, tracks)
         self._scans = MapScans(swarm, settings, tracks, sweeps)
+        walls = self._scans.walls
+        self._search = None if walls is None else MapSearch(walls, self._scans, swarm)
         robots, surveyed = len(swarm.robots), len(swarm.surveyed)
         self._sides = robots, 3 * robots + surveyed
         self._first_mount, self._first_direction = surveyed - len(swarm.cameras), 2 * robots + surveyed
@@ -229,8 +232,8 @@ class Fusion:
         """Fuse the scan (1,) of a lidar."""
         self.starts.initialize_measured(state, one)
         robot, stamp_ns = int(one.target[0]), int(one.stamp_ns[0])
-        if state.origin != IN_MAP or not state.tracked[robot]:
-            found, verdicts[:] = self._scans.place_of(state, one.row(0))
+        if self._search is not None and (state.origin != IN_MAP or not state.tracked[robot]):
+            found, verdicts[:] = self._search.place_of(state, one.row(0))
             if found is not None:
                 self._set_pose(state, robot, stamp_ns, found.pose, found.covariance)
             return

@@ -16,7 +16,7 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 _GRID_M = 1e4  # Local origins are multiples of it [m]; nearer to that of `map`, there is none
 _FARTHEST_M = 1e8  # Places farther away are absurd
 _FAR_M, _IN_A_ROW = 5e5, 3  # Distance of fixes from the origin that are far [m], and how many in a row count
-_IN_MAP = ("fixes", "aerial")  # Sensors whose readings are in `map`
+PLACING = ("fixes", "aerial")  # Sensors whose readings are in `map`
 
 
 def is_placed(swarm: Swarm) -> bool:
@@ -64,7 +64,7 @@ def about(swarm: Swarm, origin: FloatArray) -> Swarm:
 def readings_about(rows: Mapping[str, Any], origin: FloatArray) -> dict[str, Any]:
     """Readings by sensor, with poses in `map` about an origin (2,)."""
     found = dict(rows)
-    for name in _IN_MAP:
+    for name in PLACING:
         if name in rows:
             found[name] = rows[name]._replace(pose=rows[name].pose - [*origin, 0.0])
     return found
@@ -84,7 +84,7 @@ class OriginOfFixes:
 
     def moved(self, rows: Mapping[str, Any], origin: FloatArray | None) -> FloatArray | None:
         """Another local origin (2,) by readings by sensor; None: it stays."""
-        for name in _IN_MAP:
+        for name in PLACING:
             if name not in rows or not rows[name].pose.size:
                 continue
             robots, places = getattr(rows[name], "robot", None), rows[name].pose[:, :2]

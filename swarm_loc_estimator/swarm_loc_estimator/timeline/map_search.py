@@ -21,11 +21,16 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.numerics import wrap
 from swarm_loc_estimator.common.se2 import between, compose, inverse, wrap_angle
-from swarm_loc_estimator.timeline.map_matching import (
+from swarm_loc_estimator.filter.measurements import Measurements, Verdict
+from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.sensors.lidar import described_delay
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.timeline.map_scans import (
     BLOCKED,
     FREE,
     OFF_MAP,
     WALL,
+    MapScans,
     Match,
     WallMap,
     match,
@@ -50,6 +55,7 @@ _DECLINE = 0.07
 """How much worse later scans may fit than the first, by which a place was found: wrong places fit it best."""
 _START = np.diag(np.square([0.1, 0.1, 0.05]))
 """Covariance (3, 3) added to that of a place, since the next scans, which see the same walls, replace it."""
+_SEARCH_TURN = 0.1  # Turn during a sweep beyond which it searches no place [rad]
 _PAUSE_NS, _LONGEST_PAUSE_NS = 1_000_000_000, 16_000_000_000  # Between searches of a robot
 _CACHED = 16
 
@@ -122,11 +128,38 @@ class MapSearch:
 
     Args:
         walls: The map.
+        scans: What knows the beams of sweeps.
+        swarm: The robots.
     """
 
-    def __init__(self, walls: WallMap) -> None:
+    def __init__(self, walls: WallMap, scans: MapScans, swarm: Swarm) -> None:
+        self._walls, self._scans, self._robots = walls, scans, swarm.robots
         self._map = search_map(walls)
         self._cache: OrderedDict[bytes, FloatArray] = OrderedDict()
+
+    def place_of(self, state: SwarmState, one: Measurements) -> tuple[FoundPlace | None, Verdict]:
+        """Search the place of a robot that is not located, by its scan; returns it once it is found.
+
+        Args:
+            state: What is known of places is changed.
+            one: Row of the scan.
+        """
+        robot, stamp_ns, scans = int(one.target), int(one.stamp_ns), self._scans
+        sweep, described = scans.sweep_of(one), self._robots[robot]
+        if sweep is None or described.stands or not scans.tracks.has_started(robot, sweep.stamp_ns):
+            return None, Verdict.NOT_LOCALIZED
+        delay = state.delays.get(robot) or described_delay(described.lidar.delay_s)
+        if scans.turned(robot, sweep) > _SEARCH_TURN:
+            return None, _why_nowhere(state.places.get(robot))  # its delay and order of beams may be wrong
+        sweep = sweep.backwards() if delay.backwards > 0.0 else sweep
+        beams, now, _ = scans.beams(robot, stamp_ns, sweep, delay.lag_s, int(delay.chance.argmax()))
+        walls, thinned = scans.walls_of(self._walls, robot), SweptBeams.thinned(*beams)
+        places, found = self.add(state.places.get(robot), stamp_ns, thinned, now, walls)
+        if found is not None:
+            state.places.pop(robot, None)
+            return found, Verdict.USED
+        state.places[robot] = places
+        return None, _why_nowhere(places)
 
     def add(
         self,
@@ -226,6 +259,15 @@ class MapSearch:
             if len(self._cache) > _CACHED:
                 self._cache.popitem(last=False)
         return self._cache[key]
+
+
+def _why_nowhere(places: PossiblePlaces | None) -> Verdict:
+    """Why the scans of a robot do not locate it."""
+    if places is None:
+        return Verdict.NOT_LOCALIZED
+    if not len(places.transform):
+        return Verdict.NO_PLACE
+    return Verdict.SEVERAL_PLACES if places.is_ambiguous else Verdict.NOT_LOCALIZED
 
 
 def _candidates(search: SearchMap, ends: FloatArray) -> FloatArray:

@@ -15,7 +15,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import compose, inverse, transform_points, wrap_angle
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import MapFileError
-from swarm_loc_estimator.timeline.map_matching import (
+from swarm_loc_estimator.timeline.map_scans import (
     BLOCKED,
     FAR,
     FITS,
