@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from ruamel.yaml import YAML
 
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import typestore
@@ -31,7 +29,6 @@ from swarm_loc_estimator.timeline.sightings import (
 from swarm_loc_estimator.watch.markers import MarkersEncoder, ellipses
 
 SECOND = 1_000_000_000
-VIEWERS = Path(__file__).parents[2] / "viewers"
 
 
 def estimate_of(names: list[str], seed: int, stamp_ns: int = 5 * SECOND + 3) -> EstimateMessage:
@@ -190,14 +187,3 @@ def test_a_run_is_written_as_mcap(tmp_path: Path) -> None:
     transforms: Any = typestore().deserialize_cdr(first, "tf2_msgs/msg/TFMessage")
     (transform,) = transforms.transforms
     assert (transform.header.frame_id, transform.child_frame_id) == ("map", "a/base_link")
-
-
-def test_shipped_layouts_show_what_is_published() -> None:
-    rviz = YAML(typ="safe").load((VIEWERS / "swarm.rviz").read_text(encoding="utf-8"))[
-        "Visualization Manager"
-    ]
-    topics = {one["Topic"]["Value"] for one in rviz["Displays"] if "Topic" in one}
-    assert topics == {"swarm/markers", "map"}
-    assert rviz["Global Options"]["Fixed Frame"] == "map"
-    layout = json.loads((VIEWERS / "foxglove.json").read_text(encoding="utf-8"))
-    assert layout["configById"][layout["layout"]["first"]]["topics"]["/swarm/markers"]["visible"]

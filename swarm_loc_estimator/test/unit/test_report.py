@@ -112,6 +112,15 @@ def test_robots_that_wait_and_robots_without_truth(tmp_path: Path) -> None:
     write_report(result, tmp_path)
 
 
+@pytest.mark.parametrize("unknown", [slice(40, 90), slice(None)])
+def test_robots_whose_heading_is_unknown_for_a_while_or_always(tmp_path: Path, unknown: slice) -> None:
+    result = result_of(2)
+    result.heading_known[unknown] = False
+    files = write_report(result, tmp_path)
+    assert files.errors is not None
+    assert re.search(r"^r0 +200 +0\.3000 ", files.text.read_text(), re.MULTILINE)
+
+
 def test_page_is_whole_and_needs_nothing_else(report_of_two: Path) -> None:
     page = Page()
     html = (report_of_two / "report.html").read_text(encoding="utf-8")

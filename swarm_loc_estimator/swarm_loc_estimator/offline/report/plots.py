@@ -341,9 +341,18 @@ def _draw_errors(axis: Axes, title: str, of: Callable[[Errors], FloatArray], res
         colour, alpha = colour_of(result.swarm.index_of[name]), min(0.6, 6.0 / len(result.errors))
         axis.plot(*broken(errors.stamp_ns, line).T, color=colour, linewidth=0.7, alpha=alpha)
     every = pool(list(result.errors.values()))
-    axis.plot(*_rms(seconds_since(begin_ns, every.stamp_ns), of(every)), color=INK, linewidth=1.8)
+    off = of(every)
+    known = np.isfinite(off)  # a heading may be unknown
+    if known.any():
+        axis.plot(*_rms(seconds_since(begin_ns, every.stamp_ns[known]), off[known]), color=INK, linewidth=1.8)
     axis.set_title(f"{title}, bold: RMS", loc="left", fontsize=10, color=INK)
-    axis.set(xmargin=0.0, ylim=(0.0, max(1.3 * float(np.percentile(of(every), 99.0)), 1e-3)))
+    axis.set(xmargin=0.0, ylim=(0.0, max(1.3 * _most(off), 1e-3)))
+
+
+def _most(off: FloatArray) -> float:
+    """The 99th percentile of the errors that are known; 0 without any."""
+    known = off[np.isfinite(off)]
+    return float(np.percentile(known, 99.0)) if len(known) else 0.0
 
 
 def _rms(time_s: FloatArray, off: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -433,10 +442,7 @@ def _error_limits(errors: list[Errors]) -> tuple[float, float]:
     """Axis limits of position [m] and heading [rad] from the 99th percentiles of all robots."""
     position = np.concatenate([np.abs(one.error[:, :2]).max(axis=1) for one in errors])
     heading = np.concatenate([np.abs(one.error[:, 2]) for one in errors])
-    return (
-        1.6 * max(float(np.percentile(position, 99.0)), 1e-4),
-        1.6 * max(float(np.percentile(heading, 99.0)), 1e-5),
-    )
+    return 1.6 * max(_most(position), 1e-4), 1.6 * max(_most(heading), 1e-5)
 
 
 def _draw_errors_of(
