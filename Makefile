@@ -3,6 +3,7 @@
 # make bench-NAME [ARGS="..."]   prints a table, draws it under out/, writes out/bench/NAME.json
 # make test-lowest   unit tests with the oldest versions that requirements/workspace.txt allows
 # make lock      writes the versions and hashes of the wheels that the set-up installs
+# make compiled  compiles all inner loops into a wheel for other machines: out/wheels
 # make house     prints the figures of the layout, writes out/bench/house.json
 # make docs      builds the documentation site: out/docs/index.html
 # make setup | lint | types | unit | node | clean
@@ -14,7 +15,7 @@ MYPY := ./run -- mypy --num-workers 2
 PYTEST := ./run -- env PYTEST_DISABLE_PLUGIN_AUTOLOAD=1 pytest \
     -p xdist.plugin -p pytest_timeout -p _hypothesis_pytestplugin --numprocesses 2 --dist worksteal
 
-.PHONY: demo test lint types unit node test-lowest lock house docs setup clean
+.PHONY: demo test lint types unit node test-lowest lock compiled house docs setup clean
 
 demo: setup
 	@./run swarm_loc_estimator demo $(ARGS)
@@ -56,6 +57,9 @@ lock: setup
 	@$(LOCK) --universal --python-version 3.10 --override requirements/overrides.txt \
 	    --output-file requirements/workspace.lock requirements/ros.txt requirements/workspace.txt
 	@echo 'uv>=0.5,<1' | $(LOCK) --universal --python-version 3.10 --output-file requirements/uv.lock -
+
+compiled: setup
+	@./run -- python tools/compiled_wheel.py $(ARGS)
 
 house: setup
 	@./run -- python tools/house.py $(ARGS)

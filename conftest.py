@@ -31,26 +31,26 @@ settings.register_profile(
 settings.load_profile("workspace")
 
 
-_PRECOMPILED: list[Callable[[], None]] = [
+PRECOMPILED: list[Callable[[], None]] = [
     partial(precompile, "small", False),
     precompile_infrared,
     precompile_mapper,
     *(partial(precompile, size, infrared) for infrared in (False, True) for size in ("large", "sparse")),
 ]
-"""What tests run; two processes compile it side by side."""
+"""What tests and a wheel of compiled code need; two processes compile it side by side."""
 if find_spec("swarm_loc_vision"):  # colcon tests the estimator without it
     from swarm_loc_vision.markers.detector import precompile as precompile_detector
 
-    _PRECOMPILED.insert(2, precompile_detector)
+    PRECOMPILED.insert(2, precompile_detector)
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     """Compile before any test's time runs, once and not in every worker."""
-    if hasattr(session.config, "workerinput") or all(map(is_precompiled, _PRECOMPILED)):
+    if hasattr(session.config, "workerinput") or all(map(is_precompiled, PRECOMPILED)):
         return
     print("compiling all inner loops for this machine: about two minutes", flush=True)
     with ProcessPoolExecutor(2, get_context("spawn")) as processes:
-        for done in [processes.submit(one) for one in _PRECOMPILED]:
+        for done in [processes.submit(one) for one in PRECOMPILED]:
             done.result()
 
 

@@ -69,6 +69,7 @@ def ensure(*, extra: str | None) -> None:
     groups += tuple(name for name in EXTRAS if name == extra or f"group.{name}" in found)
     wanted = _wanted(groups)
     if found == wanted and VENV_PYTHON.exists():
+        _take_compiled()
         return
     reusable = VENV_PYTHON.exists() and all(found.get(key) == wanted[key] for key in ("venv", "ros"))
     STAMP.clear()
@@ -79,6 +80,20 @@ def ensure(*, extra: str | None) -> None:
     if ros is None:
         _patch_cmake_exports()
     STAMP.write(json.dumps(wanted, sort_keys=True))
+    _take_compiled()
+
+
+def _take_compiled() -> None:
+    """Install compiled code from the folder of wheels SWARM_LOC_COMPILED, if one fits this Python."""
+    folder = os.environ.get("SWARM_LOC_COMPILED")
+    if not folder:
+        return
+    # never from an index: nobody vouches there for what is executed here
+    command: list[str | Path] = [VENV / "bin" / "uv", "pip", "install", "--python", VENV_PYTHON, "--upgrade"]
+    command += ["--no-index", "--no-deps", "--find-links", folder, "swarm-loc-compiled"]
+    status, _ = run_logged(command, "compiled.log", lambda _: None)
+    if status:
+        say(f"  no wheel in SWARM_LOC_COMPILED={folder} fits: compiling here ({LOGS / 'compiled.log'})")
 
 
 def identity() -> str:

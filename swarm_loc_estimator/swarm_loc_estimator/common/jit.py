@@ -19,12 +19,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, suppress
 from functools import cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
+from llvmlite import binding
 from numba import core
 from numba.core.caching import NullCache
 from numba.core.compiler import CompileResult
@@ -47,9 +49,19 @@ _core.config.DISABLE_JIT = 0  # NUMBA_DISABLE_JIT has no effect: only compiled c
 if "NUMBA_OPT" not in os.environ:
     # numba's 3 compiles for a quarter longer, and the code is no faster: loops are short or branch
     _core.config.OPT = type(_core.config.OPT)(1)
+_CPUS = (
+    ("x86-64-v3", "", {"avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"}),
+    ("generic", "+v8.2a", {"neon", "crc", "lse"}),
+)
+"""Name and features of the CPUs that compiled code is for, and what the machine's CPU must have."""
+if not {"NUMBA_CPU_NAME", "NUMBA_CPU_FEATURES"} & set(os.environ):
+    # equal code and poses on all machines, no slower than for this CPU alone; older CPUs have their own code
+    for _name_of_cpu, _features, _needed in _CPUS:
+        if all(binding.get_host_cpu_features().get(one) for one in _needed):
+            _core.config.CPU_NAME, _core.config.CPU_FEATURES = _name_of_cpu, _features
 _registry: Any = core.registry
 _types = _core.types
-_OPTIONS = f"numba {numba.__version__}, Python {sys.version}"
+_OPTIONS = f"numba {numba.__version__}, {sys.implementation.cache_tag}"
 
 
 def cached_njit(function: Function) -> Function:
@@ -81,8 +93,9 @@ def reassociated_njit(function: Function) -> Function:
 
 
 def is_precompiled(precompile: Callable[[], None]) -> bool:
-    """Whether the cache has the compiled code of a function (or partial call) and of all that it calls."""
-    return _mark(precompile).exists()
+    """Whether there is compiled code of a function (or partial call) and of all that it calls."""
+    mark = _mark(precompile)
+    return mark.exists() or any((folder / mark.name).exists() for folder in _shipped())
 
 
 def note_precompiled(precompile: Callable[[], None]) -> None:
@@ -183,6 +196,8 @@ class _ContentCache(NullCache):
         # not refresh(): that also imports all that only compiling needs, which takes half a second
         _core.runtime.rtsys.initialize(target_context)
         file = self._file(sig, target_context.codegen())
+        if not file.exists():
+            file = next((found for folder in _shipped() if (found := folder / file.name).exists()), file)
         try:
             with file.open("rb") as opened:
                 data = opened.read()
@@ -340,6 +355,14 @@ def _digest(parts: list[str], codegen: Any) -> str:
     level = int(_core.config.OPT)
     text = "\n".join([_OPTIONS, f"boundscheck {checked} opt {level}", repr(codegen.magic_tuple()), *parts])
     return hashlib.sha256(text.encode()).hexdigest()[:32]
+
+
+@cache
+def _shipped() -> tuple[Path, ...]:
+    """The folder of the package `swarm_loc_compiled`, where it is installed."""
+    found = find_spec("swarm_loc_compiled")
+    folders = map(Path, (found and found.submodule_search_locations) or ())
+    return tuple(folder for folder in folders if is_private(folder.lstat(), folder.stat()))
 
 
 def _folder() -> Path:
