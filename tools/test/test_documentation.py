@@ -13,7 +13,13 @@ from bench.__main__ import BENCHMARKS
 from workspace.layout import PACKAGES, ROOT
 
 FOLDERS = (*PACKAGES, "bags", "bench", "docs", "tools")
-PAGES = sorted([*ROOT.glob("*.md"), *(page for folder in FOLDERS for page in (ROOT / folder).rglob("*.md"))])
+PAGES = sorted(
+    [
+        *ROOT.glob("*.md"),
+        ROOT / "llms.txt",
+        *(page for folder in FOLDERS for page in (ROOT / folder).rglob("*.md")),
+    ]
+)
 SUFFIXES = "cff|cfg|jpg|md|mcap|msg|png|py|rst|srv|toml|txt|xml|yaml|yml"
 MADE_BY_RUNNING = ("out/",)
 

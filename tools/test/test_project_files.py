@@ -7,11 +7,13 @@ import re
 import shlex
 import xml.etree.ElementTree as ET
 from configparser import ConfigParser
+from pathlib import Path
 from typing import Any
 
 import pytest
 from ruamel.yaml import YAML
 
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from workspace import host, install
 from workspace.layout import PACKAGES, REQUIREMENTS, ROOT
 
@@ -21,7 +23,7 @@ def read_yaml(name: str) -> Any:
 
 
 def make_targets() -> set[str]:
-    return set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    return set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
 
 
 def test_the_workflow_runs_what_continuous_integration_runs() -> None:
@@ -39,11 +41,34 @@ def test_the_jobs_of_the_workflow_name_what_there_is() -> None:
     lines = "\n".join(step["run"] for job in jobs.values() for step in job["steps"] if "run" in step)
     called = re.findall(r"^make (.+)$", lines, re.MULTILINE)
     targets = {word for line in called for word in line.split() if "=" not in word}
-    assert targets == {"unit", "node", "docs"}
+    assert targets == {"unit", "node", "docs", "test-lowest"}
     assert targets <= make_targets()
     assert [name for name in re.findall(r"requirements/\w+\.txt", lines) if not (ROOT / name).is_file()] == []
     versions = [tuple(map(int, one.split("."))) for one in jobs["python"]["strategy"]["matrix"]["python"]]
     assert versions == [host.LOWEST_PYTHON, host.HIGHEST_WHEEL_PYTHON]
+
+
+def test_a_release_is_made_of_what_there_is() -> None:
+    jobs = read_yaml(".github/workflows/release.yml")["jobs"]
+    lines = "\n".join(step["run"] for job in jobs.values() for step in job["steps"] if "run" in step)
+    assert {line.split()[0] for line in re.findall(r"^make (.+)$", lines, re.MULTILINE)} <= make_targets()
+    needed = {name for job in jobs.values() for name in [job.get("needs", [])] if isinstance(name, str)}
+    assert needed | set(jobs["publish"]["needs"]) <= set(jobs)
+    versions = [tuple(map(int, one.split("."))) for one in jobs["wheels"]["strategy"]["matrix"]["python"]]
+    assert (versions[0], versions[-1]) == (host.LOWEST_PYTHON, host.HIGHEST_WHEEL_PYTHON)
+
+
+def test_the_example_for_coding_assistants_is_a_description(tmp_path: Path) -> None:
+    (example,) = re.findall(r"```yaml\n(.*?)```", (ROOT / "llms.txt").read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "swarm.yaml").write_text(example, encoding="utf-8")
+    assert [robot.name for robot in load_swarm(tmp_path / "swarm.yaml").robots] == ["tb1", "tb2"]
+
+
+def test_dependencies_that_are_kept_up_to_date_are_there() -> None:
+    updates = read_yaml(".github/dependabot.yml")["updates"]
+    places = {one["package-ecosystem"]: ROOT / one["directory"].strip("/") for one in updates}
+    assert (places["pip"] / "workspace.lock").is_file()
+    assert (places["docker"] / "Dockerfile").is_file()
 
 
 def test_what_make_adds_to_the_set_up_has_requirements() -> None:

@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from llvmlite import binding
 
 USED = """
 from typing import NamedTuple
@@ -86,6 +87,28 @@ def test_code_is_found_again_in_another_folder_and_in_a_copy_of_the_cache(
     assert run(tmp_path / "another clone", cache)[1:] == ["3.0", "1"]
     copy = shutil.copytree(cache, tmp_path / "copy")
     assert run(tmp_path / "first", copy)[1:] == ["3.0", "1"]
+
+
+def test_code_that_a_package_ships_is_used_unless_others_can_write_it(tmp_path: Path, compiled: Path) -> None:
+    folder = tmp_path / "first"
+    shipped = shutil.copytree(compiled / "swarm_loc_estimator", folder / "swarm_loc_compiled")
+    assert run(folder, tmp_path / "cache") == ["True", "3.0", "1"]
+    assert not list((tmp_path / "cache" / "swarm_loc_estimator").glob("*.nbc"))
+    shipped.chmod(0o777)
+    assert run(folder, tmp_path / "another cache") == ["False", "3.0", "0"]
+
+
+def test_code_is_for_the_same_cpu_on_all_machines_that_have_its_features() -> None:
+    features = {name for name, has in binding.get_host_cpu_features().items() if has}
+    expected = "x86-64-v3" if {"avx2", "bmi2", "fma"} <= features else None
+    if expected is None:
+        pytest.skip("this CPU has less than x86-64-v3")
+    core = "jit._core.registry.cpu_target.target_context.codegen()"
+    script = f"from swarm_loc_estimator.common import jit; print({core}.magic_tuple()[1])"
+    for given, found in (({}, expected), ({"NUMBA_CPU_NAME": "generic"}, "generic")):
+        env, command = {**os.environ, **given}, [sys.executable, "-c", script]
+        done = subprocess.run(command, env=env, capture_output=True, text=True, check=True)
+        assert done.stdout.strip() == found
 
 
 def test_docstrings_comments_and_lines_do_not_matter(tmp_path: Path, cache: Path) -> None:
