@@ -49,6 +49,7 @@ _SIZES_PX = 16.0, 32.0  # Least and largest diameter of robots in the rectified 
 _ROUGH_PX = 14.0
 _MAX_SHARE = 0.25  # Largest robot that is searched for, over the shorter side of the image
 _SPARE, _SPARE_SHARE = 60, 4
+_ROUGH_MOST = 100  # Candidates of each size that is tried
 _LEAST_DISTANCE = 0.75  # Least distance of two robots, in diameters
 _MAX_SPREAD, _MAX_SPREAD_PX = 0.03, 0.2
 """Largest rms distance of a disc's rim from a circle: a share of the radius, plus pixels."""
@@ -128,18 +129,18 @@ class AerialDetector:
         if self._grid is None:
             settings = self._settings
             self._grid = rectification(self._ground, settings, self.diameter, _SIZES_PX)
-        found, dropped = self._discs(gray, self._grid, self.diameter, noise)
+        most = _SPARE_SHARE * self._settings.max_robots + _SPARE
+        found, dropped = self._discs(gray, self._grid, self.diameter, noise, most)
         return self._located(self._grid, found, dropped)
 
     def _discs(
-        self, gray: Gray, grid: Rectification, diameter: float, noise: float
+        self, gray: Gray, grid: Rectification, diameter: float, noise: float, most: int
     ) -> tuple[_Found, dict[str, int]]:
         """Discs of the polarity with the higher score, and numbers of dropped ones."""
         settings = self._settings
         wide = diameter / grid.metres_per_px
         image = brightness(grid.apply(gray), wide, noise)
         edges = Edges(image.log, grid.seen, settings.min_contrast)
-        most = _SPARE_SHARE * settings.max_robots + _SPARE
         kinds: list[tuple[_Found, dict[str, int]]] = []
         for polarity in self._polarities:
             centres = peaks(edges.votes(wide, polarity), wide, most)
@@ -222,7 +223,7 @@ class AerialDetector:
         diameters, scores = [np.zeros(0)], [np.zeros(0)]
         for diameter in ladder(1.2 * least, largest).tolist():
             grid = rectification(ground, settings, diameter, (_ROUGH_PX, _ROUGH_PX))
-            found, _ = self._discs(gray, grid, diameter, noise)
+            found, _ = self._discs(gray, grid, diameter, noise, _ROUGH_MOST)
             diameters.append(2.0 * found.circles.radius * grid.metres_per_px)
             scores.append(_quality(found.circles))
         return commonest(np.concatenate(diameters), np.concatenate(scores))
