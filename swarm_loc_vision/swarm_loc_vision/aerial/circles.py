@@ -353,8 +353,10 @@ def likely(rims: Rims, centres: FloatArray, radius: float) -> FloatArray:
 
 def _masked_median(values: FloatArray, mask: NDArray[np.bool_], otherwise: FloatArray) -> FloatArray:
     """(C,) medians over the masked entries of each row (C, R)."""
-    rows = zip(values, mask, otherwise, strict=True)
-    return np.array([np.median(row[own]) if own.any() else default for row, own, default in rows])
+    count = mask.sum(axis=1)
+    middle = np.stack([np.maximum(count - 1, 0) // 2, count // 2], axis=1)
+    ordered = np.sort(np.where(mask, values, np.inf), axis=1)
+    return np.where(count > 0, np.take_along_axis(ordered, middle, axis=1).mean(axis=1), otherwise)
 
 
 def _fit(
