@@ -71,7 +71,7 @@ def test_fewer_messages_than_the_statistics_tell_are_told(tmp_path: Path) -> Non
     assert losses == ["x.mcap: it holds 59 messages, but its statistics count 60."]
 
 
-def test_a_message_shorter_than_its_head_is_told(tmp_path: Path) -> None:
+def test_a_message_shorter_than_its_head_ends_a_file(tmp_path: Path) -> None:
     messages, path = some_messages(10), tmp_path / "x.mcap"
     write_mcap(path, messages, compression=CompressionType.NONE, use_chunking=False)
     data = path.read_bytes()
@@ -79,7 +79,8 @@ def test_a_message_shorter_than_its_head_is_told(tmp_path: Path) -> None:
     path.write_bytes(data[:place] + record_of(Opcode.MESSAGE, b"1234"))
     found, losses = read(path)
     assert found == expected(messages)
-    assert any("the message at byte" in loss for loss in losses)
+    (loss,) = losses
+    assert f"was cut off at byte {place} of {place + 13}: the 10 messages before that were kept" in loss
 
 
 ABSURD_NS = [2**63 - 1, 2**63, 2**64 - 1, MAX_LOG_NS + 1]
