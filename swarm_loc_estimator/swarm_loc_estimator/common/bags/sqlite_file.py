@@ -143,32 +143,41 @@ def _connect(path: Path) -> sqlite3.Connection:
     name = f"file:{quote(str(path.resolve()))}"
     for mode in ("?mode=ro", "?immutable=1"):
         connection = sqlite3.connect(name + mode, uri=True, isolation_level=None)
+        connection.text_factory = lambda data: data.decode(errors="replace")
         try:
             # a file shorter than its head says would otherwise be refused as a whole
             connection.execute("PRAGMA writable_schema=ON")
             views = connection.execute(_VIEWS).fetchone()
         except sqlite3.Error:
-            if mode == "?immutable=1":
-                break
             connection.close()
-        else:
-            connection.text_factory = lambda data: data.decode(errors="replace")
-            if not views:
-                return connection
-            connection.close()
-            raise BagError(f"{path} is no sqlite3 bag: its {views[0]} are computed, not stored.")
-    connection.close()
+            continue
+        if not views:
+            return connection
+        connection.close()
+        raise BagError(f"{path} is no sqlite3 bag: its {views[0]} are computed, not stored.")
     raise BagError(f"{path} is no sqlite3 bag.")
 
 
 def _copy_readable(source: sqlite3.Connection, target: sqlite3.Connection) -> None:
+    """Copy topics and messages; after damaged pages, up to an eighth as many as they had are lost as well."""
     target.execute("BEGIN")
     target.executemany("INSERT INTO topics VALUES (?, ?, ?, ?)", source.execute(_TOPICS).fetchall())
-    last = _last_id(source)
-    next_id: int | None = 0
-    while next_id is not None:
-        after, finished = _copy_stretch(source, target, next_id, last)
-        next_id = None if finished else _next_readable(source, after, last)
+    next_id, step, last = 0, 1, _last_id(source)
+    while next_id <= last:
+        query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id >= ? ORDER BY id"
+        try:
+            for row in source.execute(query, (next_id,)):
+                if not next_id <= row[0] <= last:
+                    break
+                next_id, step = row[0] + 1, 1
+                if isinstance(row[2], int) and isinstance(row[3], bytes):
+                    target.execute("INSERT INTO messages VALUES (?, ?, ?, ?)", row)
+            else:
+                break
+        except sqlite3.Error:
+            pass
+        next_id += step
+        step += 1 + step // 8
     target.execute("COMMIT")
 
 
@@ -179,51 +188,3 @@ def _last_id(source: sqlite3.Connection) -> int:
     except sqlite3.Error:
         return _MAX_ID
     return int(last) if isinstance(last, int) else 0
-
-
-def _copy_stretch(
-    source: sqlite3.Connection, target: sqlite3.Connection, first: int, last: int
-) -> tuple[int, bool]:
-    """Copy messages from an id on up to the end or a damaged page.
-
-    Returns:
-        The next id, and whether the end was reached.
-    """
-    next_id = first
-    query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id >= ? ORDER BY id"
-    try:
-        for row in source.execute(query, (first,)):
-            if not next_id <= row[0] <= last:
-                return next_id, False
-            next_id = row[0] + 1
-            if isinstance(row[2], int) and isinstance(row[3], bytes):
-                target.execute("INSERT INTO messages VALUES (?, ?, ?, ?)", row)
-    except sqlite3.Error:
-        return next_id, False
-    return next_id, True
-
-
-def _next_readable(source: sqlite3.Connection, after: int, last: int) -> int | None:
-    """The first readable id after a damaged page: seen from farther and farther away, then narrowed down."""
-    bad, good = 0, 1
-    while not _readable(source, after + good, last):
-        bad, good = good, 2 * good
-        if after + good > last:
-            return None
-    while good - bad > 1:
-        middle = (bad + good) // 2
-        if _readable(source, after + middle, last):
-            good = middle
-        else:
-            bad = middle
-    return after + good
-
-
-def _readable(source: sqlite3.Connection, message_id: int, last: int) -> bool:
-    """Whether the next message from an id on can be read."""
-    query = "SELECT id, data FROM messages WHERE id >= ? ORDER BY id LIMIT 1"
-    try:
-        row = source.execute(query, (message_id,)).fetchone()
-    except sqlite3.Error:
-        return False
-    return row is not None and message_id <= row[0] <= last
