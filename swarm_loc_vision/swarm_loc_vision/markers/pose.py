@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,7 +22,8 @@ from swarm_loc_estimator.common.jit import cached_njit
 _ROUNDS = 12
 _CONVERGED = 1e-6  # Threshold of the weighted squared step at convergence
 _NOWHERE = 1e12
-_NO_SQUARE = 1e-15  # Determinant of corners on one line
+# About 0.001 px: OpenCV finds no pose of 1 % of the squares that are exactly aligned with the image.
+_UNALIGNED = 1e-6 * np.array([[0.9, 0.1], [-0.3, 0.7], [0.2, -0.8], [-0.6, 0.4]])
 _LYING = 1e-6  # Length of a z axis along the direction up
 # Checked by the NEES of test_pose.py.
 _TRUST = 6.0
@@ -125,8 +127,7 @@ def _two_starts(
     """Two initial poses of each square by Infinitesimal Plane-based Pose Estimation.
 
     Collins and Bartoli, IJCV 2014: the perspective of a plane at its centre yields two rotations, mirrored
-    about the line of sight. OpenCV's `solvePnPGeneric` finds the same two, but none for 1 % of the squares
-    that are exactly aligned with the image.
+    about the line of sight.
 
     Args:
         points: (N, 4, 3) corners in the marker's frame, clockwise from the upper left [m].
@@ -136,46 +137,18 @@ def _two_starts(
     Returns:
         Rotations (N, 2, 3, 3) and positions (N, 2, 3) [m]; a position behind the camera means no pose.
     """
-    with np.errstate(divide="ignore", invalid="ignore"):
-        # the homography from the square with corners (-1, 1), (1, 1), (1, -1), (-1, -1)
-        first, second, third, fourth = directions.swapaxes(0, 1)
-        both, a, b = first - second + third - fourth, second - third, fourth - third
-        determinant = _cross(a, b)
-        g, h = _cross(both, b) / determinant, _cross(a, both) / determinant
-        right, down = second - first + g * second, fourth - first + h * fourth
-        # its value and its Jacobian at the centre, by x to the right and y up
-        middle = 1.0 + 0.5 * (g + h)
-        centre = (first + 0.5 * (right + down)) / middle
-        jacobian = 0.5 * np.stack([right - centre * g, centre * h - down], axis=2) / middle[:, None]
-        # a rotation that turns the z axis into the line of sight
-        axis = np.concatenate([centre, np.ones_like(g)], axis=1)
-        axis /= np.linalg.norm(axis, axis=1, keepdims=True)
-        out, ahead = axis[:, :2, None], axis[:, 2:, None]
-        upper = np.eye(2) - out * out.swapaxes(1, 2) / (1.0 + ahead)
-        sight = np.block([[upper, out], [-out.swapaxes(1, 2), ahead]])
-        # the upper left 2 x 2 of the rotation about it, scaled by the largest singular value
-        scaled = np.linalg.solve(upper + centre[:, :, None] * out.swapaxes(1, 2), jacobian)
-        square_sum, area = np.square(scaled).sum(axis=(1, 2)), np.linalg.det(scaled)
-        largest = np.sqrt(0.5 * (square_sum + np.sqrt(np.maximum(square_sum**2 - 4.0 * area**2, 0.0))))
-        turned = scaled / largest[:, None, None]
-        # its third row up to a sign, which makes the two solutions
-        last = np.sqrt(np.maximum(1.0 - np.square(turned).sum(axis=1), 0.0))
-        last[:, 1] *= np.where((turned[:, :, 0] * turned[:, :, 1]).sum(axis=1) > 0.0, -1.0, 1.0)
-        columns = np.stack([np.concatenate([turned, s * last[:, None]], axis=1) for s in (1.0, -1.0)], axis=1)
-        normal = np.cross(columns[..., 0], columns[..., 1])[..., None]
-        rotation = sight[:, None] @ np.concatenate([columns, normal], axis=3)
-    none = ~((np.abs(determinant[:, 0]) > _NO_SQUARE) & (largest > 0.0))
+    rotation = np.full((len(points), 2, 3, 3), np.nan)
+    for n, (corners, seen) in enumerate(zip(points, directions + _UNALIGNED, strict=True)):
+        turns = cv2.solvePnPGeneric(corners, seen, np.eye(3), None, flags=cv2.SOLVEPNP_IPPE_SQUARE)[1]
+        if len(turns) == 2:
+            rotation[n] = [cv2.Rodrigues(turn)[0] for turn in turns]
+    none = ~np.isfinite(rotation).all(axis=(1, 2, 3))
     rotation[none] = 0.0
     if up is not None:
         _set_upright(rotation, up)
     position = _places(points, directions, rotation)
     position[none] = -1.0
     return rotation, position
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """Cross products (N, 1) of vectors (N, 2)."""
-    return a[:, :1] * b[:, 1:] - a[:, 1:] * b[:, :1]
 
 
 def _set_upright(rotation: FloatArray, up: FloatArray) -> None:
