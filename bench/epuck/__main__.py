@@ -132,7 +132,7 @@ def _self_calibrating(robot: Robot) -> Robot:
 
 FILTERS: dict[str, tuple[Prepare, Settings]] = {
     "white": (as_described, Settings()),
-    "paper": (papers_own, Settings(state_period_s=PAPER_STATE_PERIOD_S, max_fault_score=1e9)),
+    "paper": (papers_own, Settings(max_fault_score=1e9)),
     "selfcal": (self_calibrating, Settings()),
 }
 
@@ -167,6 +167,10 @@ def simulate(case: Case, seed: int) -> SimulatedRun:
         )
     prepare = FILTERS[case.filter][0]
     run = replace(run, swarm=prepare(run.swarm))
+    if case.filter == "paper":  # images belong to the closest stored state
+        frames, period_ns = run.frames.copy(), round(PAPER_STATE_PERIOD_S * 1e9)
+        frames["stamp_ns"] = (frames["stamp_ns"] + period_ns // 2) // period_ns * period_ns
+        run = replace(run, frames=frames)
     if case.relative:
         return run
     return run.masked(np.isin(run.sightings["marker_id"], [mark.id for mark in run.swarm.landmarks]))

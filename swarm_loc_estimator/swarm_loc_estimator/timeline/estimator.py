@@ -104,10 +104,8 @@ class Estimator:
         self._converter = InputConverter(swarm, self.settings)
         self._sweeps = cast(SweepStore, self._converter.accumulators[ScanSensor.name])
         self._fusion = Fusion(swarm, self.settings, self._tracks, self._sweeps.sweeps)
-        grouped_s = self.settings.state_period_s + self.settings.fusion_period_s
-        self._lookback_ns = self._tracks.lookback_ns + round(
-            0.5e9 * grouped_s
-        )  # maximum shift of a measurement from its stamp
+        # a measurement is shifted from its stamp by half a period at most
+        self._lookback_ns = self._tracks.lookback_ns + round(0.5e9 * self.settings.fusion_period_s)
         self._timeline = Timeline(
             self.settings, self._fusion.step, self._fusion.new_state(), self._lookback_ns
         )

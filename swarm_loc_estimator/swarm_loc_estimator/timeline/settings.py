@@ -72,13 +72,6 @@ class Settings:
         1_000_000,
         "minimum number of robots for the sparse filter, which keeps only covariances of neighbours",
     )
-    state_period_s: float = number(
-        0.0,
-        "s",
-        0.0,
-        1.0,
-        "period of stored states; measurements use the closest one (e-puck paper V-B); 0: exact stamps",
-    )
     future_tolerance_s: float = number(
         0.1, "s", 0.0, 10.0, "maximum time of stamps ahead of the clock; data beyond it are dropped"
     )

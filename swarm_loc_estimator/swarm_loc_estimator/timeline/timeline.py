@@ -24,7 +24,6 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.filter.measurements import Command, Measurements, Verdict, concatenate, select
-from swarm_loc_estimator.filter.models import ANONYMOUS
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -309,7 +308,6 @@ class Timeline:
     def __init__(self, settings: Settings, step: Step, state: SwarmState, lookback_ns: int) -> None:
         self._step = step
         self._horizon_ns = round(settings.horizon_s * 1e9)
-        self._state_period_ns = round(settings.state_period_s * 1e9)
         self._fusion_period_ns = round(settings.fusion_period_s * 1e9)
         waits = self._fusion_period_ns and state.tracked.size >= settings.policy.delay_from
         self._fusion_delay_ns = round(settings.fusion_delay_s * 1e9) if waits else None
@@ -449,9 +447,8 @@ class Timeline:
             if given.stamp_ns < oldest_ns:
                 self.too_old += 1
                 continue
-            command = given._replace(stamp_ns=self._rounded(given.stamp_ns))
-            insort(self._commands, command, key=lambda one: (one.stamp_ns, one.robot))
-            self._redo_from(command.stamp_ns)
+            insort(self._commands, given, key=lambda one: (one.stamp_ns, one.robot))
+            self._redo_from(given.stamp_ns)
         self._new_commands = []
 
     def _remove(self, oldest_ns: int) -> None:
@@ -462,23 +459,10 @@ class Timeline:
             self._redo_from(first_ns)
 
     def _not_older(self, parts: list[Measurements], oldest_ns: int) -> Measurements:
-        """Select measurements (m,) whose stamps are not older than an instant.
-
-        With `state_period_s`, stamps are rounded to the closest stored state.
-        """
+        """Select measurements (m,) whose stamps are not older than an instant."""
         rows = concatenate(parts)
         fresh = rows.stamp_ns >= oldest_ns
-        if not fresh.all():
-            rows = select(rows, fresh)
-        if self._state_period_ns:  # detections of different aerial images must not be mixed
-            nearest_ns = self._rounded(rows.stamp_ns)
-            rows = rows._replace(stamp_ns=np.where(rows.model == ANONYMOUS, rows.stamp_ns, nearest_ns))
-        return rows
-
-    def _rounded(self, stamps_ns: Stamps) -> Stamps:
-        """Stamps rounded to the closest stored state."""
-        period_ns = self._state_period_ns
-        return (stamps_ns + period_ns // 2) // period_ns * period_ns if period_ns else stamps_ns
+        return rows if fresh.all() else select(rows, fresh)
 
     def _go_back(self, key: int) -> None:
         """Roll back to the last checkpoint before step `key`, unless `key` is ahead."""

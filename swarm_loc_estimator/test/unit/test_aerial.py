@@ -97,7 +97,6 @@ def test_robots_that_do_not_move_get_no_answer_and_its_reason() -> None:
     seed=st.integers(0, 10**6),
     start_known=st.sampled_from([(False,), (True, False), (True,)]),
     headings=st.booleans(),
-    state_period_s=st.sampled_from([0.0, 0.13]),
     late_s=st.sampled_from([0.3, 1.9]),
     carried=st.booleans(),
 )
@@ -105,21 +104,19 @@ def test_any_lateness_loss_and_repetition_gives_the_same(
     seed: int,
     start_known: Sequence[bool],
     headings: bool,
-    state_period_s: float,
     late_s: float,
     carried: bool,
 ) -> None:
     rng = np.random.default_rng(seed)
     plan = Plan(3, 7.0, 0.2, start_known=start_known, carried=(0,) if carried else ())
     world = seen_from_above(plan, View(detected=0.9, false=0.3, headings=headings), seed).world
-    chosen = Settings(state_period_s=state_period_s)
     events = [event for event in world.events if rng.uniform() < 0.9]
     orderly = [(event.stamp_ns, event) for event in events]
     late = [(event.stamp_ns + int(rng.uniform(0, late_s) * SECOND), event) for event in events]
     late += [late[k] for k in rng.integers(0, len(late), 5)]
     end = (T0 + 10 * SECOND, Event(0, T0 + 8 * SECOND, (0.0, 0.0, 0.0)))
     (a, estimates), (b, others) = (
-        run(world, [*one, end], period, chosen) for one, period in ((orderly, 0.25), (late, 0.11))
+        run(world, [*one, end], period) for one, period in ((orderly, 0.25), (late, 0.11))
     )
     one, other = estimates[-1], others[-1]
     np.testing.assert_array_equal(one.status, other.status)

@@ -10,7 +10,7 @@ import pytest
 from core_geometry import marker_frame, seen, wrapped
 from core_messages import POSE, POSE_TWO, POSITION, SECOND, T0, Event, detection, give_fix, joined
 from core_run import on_time, play, settled, ticks
-from core_world import MOUNT, ODOMETRY, Plan, World, simulate
+from core_world import MOUNT, Plan, World, simulate
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -57,7 +57,6 @@ USUAL: dict[str, Any] = {
     "start_known": (True,),
     "fusion_period_s": 0.2,
     "delay_s": None,
-    "state_period_s": 0.0,
     "outliers": 0.0,
     "lost_after": 2,
     "late_s": 1.0,
@@ -75,15 +74,11 @@ USUAL: dict[str, Any] = {
     start_known=st.sampled_from([(True,), (False,), (True, False), (True, True, False)]),
     fusion_period_s=st.sampled_from([0.0, 0.2, 0.5]),
     delay_s=st.sampled_from([None, 0.0, 0.3, 1.0]),
-    state_period_s=st.sampled_from([0.0, 0.0, 0.13]),
     outliers=st.sampled_from([0.0, 0.1, 0.6]),
     lost_after=st.sampled_from([2, 12]),
     late_s=st.sampled_from([0.3, 1.0, 1.9]),
     lasting=st.sampled_from([0.0, 1.0]),
     sparse=st.booleans(),
-)
-@example(  # a sighting within the horizon, the state closest to it beyond
-    **(USUAL | {"seed": 163, "fusion_period_s": 0.0, "state_period_s": 0.13, "late_s": 1.9})
 )
 @example(  # robots that start unknown, are gated and lost, in the sparse filter
     **(USUAL | {"seed": 7, "start_known": (True, False), "outliers": 0.1, "sparse": True})
@@ -104,7 +99,6 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
     start_known: Sequence[bool],
     fusion_period_s: float,
     delay_s: float | None,
-    state_period_s: float,
     outliers: float,
     lost_after: int,
     late_s: float,
@@ -118,7 +112,6 @@ def test_any_lateness_loss_repetition_and_ticking_gives_the_same(
         fusion_period_s=fusion_period_s,
         fusion_delay_s=delay_s or 0.0,
         sparse_from=2 if sparse else 250,
-        state_period_s=state_period_s,
         lost_after=lost_after,
         # so that a small swarm's measurements are fused together, too, and wait
         policy=Policy(large_from=1, batch_from=5)
@@ -266,20 +259,6 @@ def test_odometry_that_comes_at_the_edge_of_the_horizon_changes_what_lay_before_
     assert_same(outcome(world, delayed(events, lambda _: 0.0), at_ns), outcome(world, late, at_ns))
 
 
-@pytest.mark.parametrize("state_period_s", [0.4, 1.0])
-def test_how_late_a_sighting_is_is_told_by_its_own_stamp(state_period_s: float) -> None:
-    """Also where it counts at a stored state that lies beyond the horizon."""
-    world = small()
-    brief = [replace(robot, odometry=replace(ODOMETRY, timeout_s=0.05)) for robot in world.swarm.robots]
-    world = replace(world, swarm=replace(world.swarm, robots=tuple(brief)))
-    settings = replace(EXACT, state_period_s=state_period_s)
-    events, at_ns = driving(world, 6.0), ticks(T0, T0 + 8 * SECOND, 0.005)
-    orderly = outcome(world, delayed(events, lambda _: 0.0), at_ns, settings)
-    late = outcome(world, delayed(events, lambda e: 0.0 if e.pose else 1.995), at_ns, settings)
-    assert_same(orderly, late)
-    assert not late.estimator.drops
-
-
 def test_odometry_after_a_long_silence_may_be_late() -> None:
     world = small()
     rows = [odometry(t, 0.0) for t in (*np.arange(0.0, 1.0, 0.05), *np.arange(6.0, 8.0, 0.05))]
@@ -331,15 +310,6 @@ def test_a_repeated_message_counts_once_and_two_sightings_of_a_marker_twice() ->
     Event(0, T0 + 8 * SECOND // 10, None, twice).give(estimator, T0 + SECOND)
     estimator.tick(T0 + SECOND)
     assert estimator.used == len(events) - rows + 2
-
-
-def test_stored_states_keep_all_sightings_of_a_period() -> None:
-    world = small()
-    events = driving(world, 2.0)
-    estimator = Estimator(world.swarm, replace(EXACT, state_period_s=0.5))
-    play(estimator, delayed(events, lambda _: 0.0), ticks(T0, T0 + 2 * SECOND))
-    assert "duplicate" not in estimator.drops
-    assert sum(settled(estimator).values()) == sum(event.detections.size for event in events)
 
 
 def test_late_orders_count_at_their_own_time() -> None:

@@ -219,15 +219,14 @@ def test_an_error_of_a_model_leaves_nothing_fused_twice(monkeypatch: pytest.Monk
 
 
 def test_a_command_comes_after_the_measurements_of_its_instant_and_waiting_ones_are_counted() -> None:
-    for settings in (Settings(), Settings(state_period_s=1.0)):
-        estimator = Estimator(SWARM, settings)
-        fix = {"robot": 0, "stamp_s": 4.5, "pose": [[0.45, 0.0, 0.0]], "covariance": [np.eye(3) * 1e-4]}
-        estimator.step(4.9, odometry=DRIVEN, fixes=fix)
-        estimator.set_pose(0, round(4.55 * SECOND), (2.0, 0.0, 0.0), np.eye(3) * 1e-2)
-        assert estimator.step(4.9).estimate.poses[0, 0] > 1.9
-        estimator.forget(0, 4 * SECOND)
-        estimator.reset()
-        assert estimator.drops["reset"] == 1
+    estimator = Estimator(SWARM)
+    fix = {"robot": 0, "stamp_s": 4.55, "pose": [[0.45, 0.0, 0.0]], "covariance": [np.eye(3) * 1e-4]}
+    estimator.step(4.9, odometry=DRIVEN, fixes=fix)
+    estimator.set_pose(0, round(4.55 * SECOND), (2.0, 0.0, 0.0), np.eye(3) * 1e-2)
+    assert estimator.step(4.9).estimate.poses[0, 0] > 1.9
+    estimator.forget(0, 4 * SECOND)
+    estimator.reset()
+    assert estimator.drops["reset"] == 1
 
 
 def test_a_replay_with_rare_outputs_uses_all_data() -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
-from swarm_loc_estimator.timeline.settings import Settings
+from swarm_loc_estimator.timeline.settings import Policy, Settings
 
 END = T0 + 4 * SECOND
 
@@ -208,12 +208,11 @@ def test_precise_sightings_during_a_silence_keep_the_covariance_positive(turn_ra
         assert_sound(estimator.tick(now_ns))
 
 
-@pytest.mark.parametrize("state_period_s", [0.5, 1.0])
-def test_poses_before_the_newest_measurement_have_sound_covariances(state_period_s: float) -> None:
+@pytest.mark.parametrize("fusion_period_s", [0.5, 1.0])
+def test_poses_before_the_newest_measurement_have_sound_covariances(fusion_period_s: float) -> None:
     run = simulate(Plan(2, 4.0, speed=0.5), 2)
-    for estimate in play(
-        Estimator(run.swarm, Settings(state_period_s=state_period_s)), on_time(run), ticks(T0, END, 0.05)
-    ):
+    settings = Settings(fusion_period_s=fusion_period_s, policy=Policy(large_from=1))
+    for estimate in play(Estimator(run.swarm, settings), on_time(run), ticks(T0, END, 0.05)):
         assert_sound(estimate)
 
 
