@@ -3,7 +3,8 @@
 The library `mcap` reads the records: those of the summary if it agrees with the heads of all chunks, else all
 from the first to where the file was cut off. Chunks are then loaded in order of time; only those that overlap
 are in memory together. The messages of a chunk are found here, in 0.7 us each (`make bench-reading`,
-odometry), where the library takes 5.6 us and `rosbags`, which refuses cut files, 1.8 us.
+odometry), where the library takes 5.7 us and `rosbags`, which refuses cut files, 1.8 us. A file without
+a whole summary is read once more when it is opened; messages outside chunks take 5 us each then.
 
 Format: https://mcap.dev/spec
 """
