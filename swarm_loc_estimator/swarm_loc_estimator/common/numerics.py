@@ -12,7 +12,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import cast
 
-import llvmlite.binding  # type: ignore[import-untyped]
+import llvmlite.binding
 import numpy as np
 from numba import types
 from numba.extending import get_cython_function_address
