@@ -25,7 +25,7 @@ from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.poses import decode_odometry, encode_odometry
-from swarm_loc_estimator.common.se2 import between
+from swarm_loc_estimator.common.se2 import between, wrap_angle
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper, Located
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput, fix_covariance, inputs_of
@@ -127,15 +127,15 @@ class RestartedExploration(Exploration):
     """An exploration in which drivers restart."""
 
     planned: list[Restart] = field(default_factory=list)  # Restarts to come, in order of time by robot
-    # By robot that has restarted, the distance ahead [m]
-    lost: dict[int, float] = field(default_factory=dict)
+    # By robot that has restarted, the readings of its newest scan
+    lost: dict[int, Readings] = field(default_factory=dict)
 
     def _feed(self, robot: int, readings: Readings) -> None:
         now = next((one for one in self.planned if one.robot == robot), None)
         if now is None or readings.stamp_ns[-1] * 1e-9 < now.begin_s:
             super()._feed(robot, readings)
-            if robot in self.lost:
-                self.lost[robot] = 1.0 / readings.inverse[-1] if readings.inverse[-1] else math.inf
+            if robot in self.lost and np.ptp(readings.odometry[:, 2]) > math.pi:
+                self.lost[robot] = readings
             return
         count = int(np.searchsorted(readings.stamp_ns * 1e-9, now.begin_s))
         if count:
@@ -150,14 +150,23 @@ class RestartedExploration(Exploration):
     def _act(self, robot: int) -> None:
         try:
             if robot in self.lost and self.mapper.goal(robot) is None:
-                # as `StopAndGo` does: ahead, unless something is near
-                body = self.robots[robot]
-                others = [one for key, one in self.robots.items() if key != robot]
-                if (room := self.lost[robot] - _CLEARANCE) > 0.0:
-                    self._feed(robot, body.drive(min(_BLIND_DRIVE, room), others))
+                self._go_on(robot, self.lost[robot])
             super()._act(robot)
         except _Killed as killed:
             self._restart(robot, killed.readings)
+
+    def _go_on(self, robot: int, readings: Readings) -> None:
+        """Drive ahead, or to where it is farthest if something is near, as `StopAndGo` does."""
+        body = self.robots[robot]
+        others = [one for key, one in self.robots.items() if key != robot]
+        if readings.inverse[-1] > 1.0 / (_BLIND_DRIVE + _CLEARANCE):
+            seen = np.where(readings.inverse > 0.0, readings.inverse, np.inf)
+            away = readings.odometry[int(seen.argmin()), 2] - readings.odometry[-1, 2]
+            readings = body.turn(float(wrap_angle(away)), others)
+            self._feed(robot, readings)
+        room = (1.0 / readings.inverse[-1] if readings.inverse[-1] else math.inf) - _CLEARANCE
+        if room > 0.0:
+            self._feed(robot, body.drive(min(_BLIND_DRIVE, room), others))
 
     def _restart(self, robot: int, readings: Readings) -> None:
         """Move on unheard, and scan as at the start."""
@@ -177,7 +186,7 @@ class RestartedExploration(Exploration):
         # the new driver
         body.restart_odometry()
         self._odometry[robot] = np.zeros(3)
-        self.lost[robot] = 0.0
+        self.lost[robot] = readings
         try:
             for angle, rate in START_TURNS:
                 self._feed(robot, body.turn(angle, others, rate))

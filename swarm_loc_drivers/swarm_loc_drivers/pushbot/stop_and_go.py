@@ -27,7 +27,7 @@ _GAIN, _MIN_RATE, _MIN_SPEED, _COURSE_GAIN = 2.0, 0.15, 0.04, 1.5
 """[1/s], [rad/s], [m/s], [1/s]: slower towards the end, but fast enough to turn the wheels."""
 _TURNED, _ARRIVED = 0.01, 0.002
 _MAX_REMEMBERED = 1000
-_BLIND_DRIVE = 0.4  # Way ahead of a robot that gets no goal after a restart [m]
+_BLIND_DRIVE = 0.4  # Way of a robot that gets no goal after a restart, ahead or to where it is farthest [m]
 _MAX_JUMP, _MAX_PAUSE_NS = 0.5, 2_000_000_000
 """Odometry that jumps further [m], or that pauses or steps back for longer, has restarted."""
 _MIN_RATIO_TURN = math.pi
@@ -98,10 +98,15 @@ class StopAndGo:
         self._goal_ns = -1
         self._fixed: tuple[float, float] | None = None
         self._is_near = False
+        self._distances: deque[float] = deque(maxlen=3)
+        self._farthest = self._open_heading = 0.0
 
     def take_distance(self, distance: float) -> None:
         """Take a distance of the laser [m]; NaN: no detection."""
         self._is_near = distance < self._settings.clearance
+        self._distances.append(distance)
+        if self._track and (least := min(self._distances)) > self._farthest:  # one may be an outlier
+            self._farthest, self._open_heading = least, self._track[-1][3]
 
     def take_goal(self, goal: MapGoal) -> bool:
         """Take a goal; it replaces the remaining scan.
@@ -142,7 +147,11 @@ class StopAndGo:
             self._anchor, self._since_ns = None, stamp_ns
         if stamp_ns - self._since_ns > 1e9 * self._settings.patience_s:
             # after a restart, scans of several places tell the mapper where it is
-            self._moves += [_Drive(_BLIND_DRIVE)] if self.restarts and self._goal_ns < 0 else []
+            if self.restarts and self._goal_ns < 0:
+                if self._distances and self._distances[-1] < _BLIND_DRIVE + self._settings.clearance:
+                    self._moves.append(_Turn(self._open_heading, self._settings.turn_rate))
+                self._moves.append(_Drive(_BLIND_DRIVE))
+            self._farthest = 0.0
             self._moves.append(_Look(SCAN_TURN, self._settings.turn_rate))
         return STILL
 

@@ -203,13 +203,12 @@ class CooperativeMapper:
 
     def _is_found(self, robot: int, track: Track, stop: ScanStop) -> bool:
         """Whether the one place is found that explains the scans of a lost robot; it becomes its prior."""
-        search, known = track.search, self.graph.known_slips
+        search = track.search
         if search is None:
             return True
-        ratio = math.nan if stop.reach or robot in known else turn_ratio(stop.turn, stop.inverse, stop.sigma)
-        ratio = 1.0 - self.graph.slip[robot] if math.isnan(ratio) else ratio
-        others = self._map_of_others()
-        is_whole = search.add(stop, ratio, others)
+        if not stop.reach and robot not in self.graph.known_slips:
+            self._learn_slip(robot, stop, len(stop.turn))
+        is_whole = search.add(stop, 1.0 - self.graph.slip[robot], self._map_of_others())
         track.path = 0.0
         if is_whole and not self.graph.count and all(one.search is not None for one in self._tracks.values()):
             track.prior_sigma = np.array([*track.prior_sigma[:2], _UNKNOWN_HEADING])
@@ -221,6 +220,13 @@ class CooperativeMapper:
         track.prior, track.prior_sigma = search.poses[search.found, -1], _FOUND_SIGMA
         search.first = self.graph.count
         return True
+
+    def _learn_slip(self, robot: int, stop: ScanStop, count: int) -> None:
+        """Find the slip of a robot from the first `count` readings of a stop, if they tell it."""
+        ratio = turn_ratio(stop.turn[:count], stop.inverse[:count], stop.sigma)
+        if not math.isnan(ratio):
+            self.graph.slip[robot] = 1.0 - ratio
+            self.graph.known_slips.add(robot)
 
     def _under_test(self, robot: int, search: Search) -> IntArray:
         """Stops of a robot at the place where it was found."""
@@ -492,12 +498,8 @@ class CooperativeMapper:
 
     def _enter_first(self, robot: int, track: Track, stop: ScanStop, count: int) -> bool:
         """Add the parts of a first scan as nodes, of which the first fixes the heading; see `align_start`."""
-        turn, inverse = stop.turn[:count], stop.inverse[:count]
-        furthest = np.maximum.accumulate(np.abs(turn))
-        ratio = turn_ratio(turn, inverse, stop.sigma)
-        if not math.isnan(ratio):
-            self.graph.slip[robot] = 1.0 - ratio
-            self.graph.known_slips.add(robot)
+        self._learn_slip(robot, stop, count)
+        furthest = np.maximum.accumulate(np.abs(stop.turn[:count]))
         cuts = np.searchsorted(furthest, np.array(_START_PARTS) + 1e-6)
         bounds = sorted({0, *cuts[cuts < count].tolist(), count})
         nodes: list[int] = []

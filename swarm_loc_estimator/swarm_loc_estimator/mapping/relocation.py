@@ -24,6 +24,7 @@ from swarm_loc_estimator.mapping.scans import ScanStop
 _WALL_SIGMA, _UNKNOWN = 0.06, 0.7
 """Standard deviation of points from walls [m], and how well a beam fits where the map is unknown."""
 _FARTHEST, _BEAMS = 1.9, 120  # Distance up to which beams are compared [m], and their number per stop
+_NEAREST = 0.15  # Walls nearer than this may not be seen [m]
 _NEW_PLACE = 0.2  # Minimum distance of stops whose scans count separately [m]
 _SHIFT, RATES = np.array([0.5, math.radians(15.0)]), np.array([0.3, 3.0])
 """How far a robot is moved by hands [m, rad], and how fast it moves by itself [m/s, rad/s]."""
@@ -106,8 +107,7 @@ class Search:
             return -1
         total = self._totals()
         best = int(total.argmax())
-        nowhere = _UNKNOWN * self.fits.shape[1]  # it is where the map is unknown
-        rival = total[_apart(self.poses[best, -1], self.poses[:, -1])].max(initial=nowhere)
+        rival = total[_apart(self.poses[best, -1], self.poses[:, -1])].max(initial=self._nowhere)
         known, fits = self.known[best].sum(), self.fits[best].sum()
         is_seen = self.known[best, -_PLACES:].mean() > _MIN_KNOWN and fits > _FITS * known
         return best if is_seen and total[best] - rival > _RULED_OUT else -1
@@ -122,6 +122,11 @@ class Search:
     def is_over(self) -> bool:
         """Whether the place that was found has been confirmed, and all others are ruled out."""
         return len(self.poses) == 1 and (self.known[0] > _MIN_KNOWN).sum() >= _CONFIRMED
+
+    @property
+    def _nowhere(self) -> float:
+        """How many scans are explained if the robot is where the map is unknown."""
+        return _UNKNOWN * self.fits.shape[1]
 
     def _contradicts(self) -> BoolArray:
         """Whether the newest scans do not fit each hypothesis (h,)."""
@@ -167,22 +172,29 @@ class Search:
         cells = np.column_stack([view.cells(predicted[:, :2]), predicted[:, 2]])
         aligned = _align(view.score, view.walls, cells, _FINE / view.cell)
         poses = np.column_stack([view.places(aligned[:, :2]), aligned[:, 2]])
-        fits, known = _compare(view.score, view.occupied, view.ends, view.hits, aligned)
+        fits, known = _compare(
+            view.score, view.occupied, view.ends, view.hits, aligned, _NEAREST / view.cell
+        )
         self.poses = np.concatenate([self.poses, poses[:, None]], axis=1)
         self.fits = np.column_stack([self.fits, fits])
         self.known = np.column_stack([self.known, known])
 
     def _thin(self) -> None:
-        """Compare lights; drop hypotheses that are wrong, ruled out twice, or where better ones are."""
+        """Compare lights; drop hypotheses that are wrong, ruled out twice, or where better ones are.
+
+        All are dropped if none explains more than being nowhere in the map does: the search begins anew.
+        """
         for light in (one for one in self.lights if one.stop in self.stops):
             self.lit += _light_fits(light, self.poses[:, self.stops.index(light.stop)])
         self.lights = []
         total, wrong = self._totals(), self._contradicts()
+        best = total.max(initial=0.0)
+        least = math.inf if best < self._nowhere else best - 2.0 * _RULED_OUT
         keep: list[int] = []
         for one in np.argsort(-total, kind="stable").tolist():
             others = self.poses[keep, -1]
             is_good = not wrong[one] and _apart(self.poses[one, -1], others).all()
-            if one == self.found or (is_good and total.max() - total[one] < 2.0 * _RULED_OUT):
+            if one == self.found or (is_good and total[one] > least):
                 keep.append(one)
         self.found = keep.index(self.found) if self.found in keep else -1
         self.poses, self.fits = self.poses[keep], self.fits[keep]
@@ -293,11 +305,17 @@ def _align(score: FloatArray, walls: FloatArray, poses: FloatArray, step: float)
 
 @cached_njit
 def _compare(
-    score: FloatArray, occupied: BoolArray, ends: FloatArray, hits: BoolArray, poses: FloatArray
+    score: FloatArray,
+    occupied: BoolArray,
+    ends: FloatArray,
+    hits: BoolArray,
+    poses: FloatArray,
+    nearest: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Share of beams that fit (h,), and of those of which the map says anything (h,), from poses (h, 3).
 
-    A beam does not fit if the map has no wall where it ends at one, or a wall before that.
+    A beam does not fit if the map has no wall where it ends at one, or a wall before that. One without a
+    reflection tells nothing where the map has a wall that is too near to be seen.
     """
     fits, known = np.zeros(len(poses)), np.zeros(len(poses))
     for h in range(len(poses)):
@@ -314,7 +332,7 @@ def _compare(
                 i = math.floor(poses[h, 0] + dx * step / length)
                 j = math.floor(poses[h, 1] + dy * step / length)
                 if 0 <= i < occupied.shape[0] and 0 <= j < occupied.shape[1] and occupied[i, j]:
-                    value = 0.0
+                    value = 0.0 if hits[k] or step > nearest else math.nan
                     break
             if not math.isnan(value):
                 known[h] += 1.0 / len(ends)
