@@ -23,7 +23,7 @@ from collections.abc import Sequence
 
 from bench.shared.common import write_figures
 
-PARTS = ("tracker", "calibration", "driver", "restart", "mapping")
+PARTS = ("tracker", "calibration", "driver", "mapping")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -50,10 +50,6 @@ def _measure(part: str, options: argparse.Namespace) -> dict[str, float]:
         from bench.pushbot.driver import measure_driver  # noqa: PLC0415
 
         return measure_driver(options.tracker_seeds)
-    if part == "restart":
-        from bench.pushbot.restart import measure_restart  # noqa: PLC0415
-
-        return measure_restart(options.restart_seeds, options.processes)
     from bench.pushbot.mapping import MappingEffort, measure_mapping  # noqa: PLC0415
 
     return measure_mapping(
@@ -67,7 +63,6 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--tracker-seeds", type=int, default=5, help="of tracker, calibration and driver")
     parser.add_argument("--seeds", type=int, default=20, help="of each of three halls with one robot")
     parser.add_argument("--team-seeds", type=int, default=6, help="of teams, and other halls")
-    parser.add_argument("--restart-seeds", type=int, default=20, help="of each hall in which drivers restart")
     parser.add_argument("--minutes", type=float, default=20.0, help="of one robot; teams get half")
     parser.add_argument("--processes", type=int, default=2, help="at a time, 2 at most")
     return parser

@@ -13,6 +13,8 @@ folders and files are in the way; `kills` interrupts and kills commands at rando
 
 `load` runs fifty robots at three times the load that fits, over DDS and in real time, see `load.py`.
 
+`restart` kills drivers of PushBots that map a hall, see `restarts.py` and `live_restarts.py`.
+
 `time` lets clocks jump, stops processes for a while and loops a bag, see `clocks.py`.
 """
 
@@ -21,10 +23,10 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 
-from bench.robustness import clocks, files, kills, load, protocols, stamps
+from bench.robustness import clocks, files, kills, live_restarts, load, protocols, restarts, stamps
 from bench.shared.common import ProgressLine, table, write_figures
 
-_PARTS = ("stamps", "protocols", "files", "kills", "load", "time")
+_PARTS = ("stamps", "restart", "protocols", "files", "kills", "load", "time")
 
 
 def main() -> None:
@@ -36,6 +38,8 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=10, help="signals of each kind to each command")
     parser.add_argument("--minutes", type=float, default=10.0, help="at three times the load that fits")
     parser.add_argument("--image-rate", type=float, default=0.0, help="load instead of three times that [Hz]")
+    parser.add_argument("--restart-seeds", type=int, default=20, help="of each hall in which drivers restart")
+    parser.add_argument("--live-restarts", type=int, default=20, help="in a whole graph of each hall")
     parser.add_argument("--loops", type=int, default=20, help="of a bag")
     parser.add_argument("--parts", nargs="+", choices=_PARTS, default=[*_PARTS])
     arguments = parser.parse_args()
@@ -47,8 +51,14 @@ def main() -> None:
         print("\n" + table(("figure", "value"), list(of_part.items())), flush=True)
         print(write_figures("robustness", figures), flush=True)
 
+    def measure_restarts(say: ProgressLine) -> dict[str, float]:
+        """Offline first, then those of whole graphs."""
+        note(restarts.measure(arguments.restart_seeds, say))
+        return live_restarts.measure(arguments.live_restarts, say)
+
     measures: dict[str, Callable[[ProgressLine], dict[str, float]]] = {
         "stamps": lambda say: stamps.measure(arguments.seeds, say),
+        "restart": measure_restarts,
         "protocols": lambda say: protocols.measure(arguments.streams, say, note),
         "files": lambda say: files.measure(arguments.cuts, say),
         "kills": lambda say: kills.measure(arguments.kills, say),

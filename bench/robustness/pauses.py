@@ -73,11 +73,13 @@ def misleading_share(result: ReplayResult, truth: Mapping[str, Trajectory], begi
     return float(is_misleading(error[known], result.covariances[known]).sum()) / max(int(known.sum()), 1)
 
 
-def _options(kind: str, folder: Path) -> tuple[SimulationOptions, Swarm]:
-    """A simulation of two robots."""
+def _options(kind: str, folder: Path, plan: str) -> tuple[SimulationOptions, Swarm]:
+    """A simulation of two robots; PushBots stand where their hall has starts."""
     if kind == "pushbots":
-        file = str(BAG.parent / "pushbots_two" / "swarm.yaml")
-        return SimulationOptions(file), load_swarm(Path(file))
+        recorded = load_swarm(BAG.parent / "pushbots_two" / "swarm.yaml")
+        swarm = replace(recorded, robots=tuple(replace(one, start=None) for one in recorded.robots))
+        save_swarm(swarm, folder / "swarm.yaml")
+        return SimulationOptions(str(folder / "swarm.yaml"), plan=plan), swarm
     whole = load_swarm(BAG.parent / "eight_five_robots" / "swarm.yaml")
     swarm = replace(whole, robots=whole.robots[:_EPUCKS])
     save_swarm(swarm, folder / "swarm.yaml")
@@ -88,10 +90,12 @@ def _options(kind: str, folder: Path) -> tuple[SimulationOptions, Swarm]:
     return options, swarm
 
 
-def _over_tcp(nodes: Sequence[NodeSpec], links: Sequence[str]) -> list[NodeSpec]:
-    """The nodes with TCP ports in the place of the links to their robots."""
-    port = free_port()
-    place = {link: f"tcp://localhost:{port + robot}" for robot, link in enumerate(links)}
+def over_tcp(nodes: Sequence[NodeSpec], links: Sequence[str], port: int, ahead: int = 0) -> list[NodeSpec]:
+    """The nodes with TCP ports from `port` on in the place of the links to their robots.
+
+    Drivers connect `ahead` of these, where something must pass the bytes on.
+    """
+    place = {link: f"tcp://localhost:{port + ahead + robot}" for robot, link in enumerate(links)}
     changed = []
     for node in nodes:
         parameters = {name: place.get(str(value), value) for name, value in node.parameters.items()}
@@ -102,13 +106,18 @@ def _over_tcp(nodes: Sequence[NodeSpec], links: Sequence[str]) -> list[NodeSpec]
 
 
 @contextmanager
-def _simulated(kind: str) -> Iterator[tuple[LiveGraph, Swarm, dict[str, list[tuple[int, list[float]]]]]]:
-    """The graph of a simulation, its swarm, and the true poses as they come: stamps and poses by robot."""
+def simulated(
+    kind: str, plan: str = "corridor", port: int = 0, ahead: int = 0
+) -> Iterator[tuple[LiveGraph, Swarm, dict[str, list[tuple[int, list[float]]]]]]:
+    """The graph of a simulation, its swarm, and the true poses as they come: stamps and poses by robot.
+
+    With a port, drivers connect over TCP, see `over_tcp`.
+    """
     with TemporaryDirectory() as folder:
-        options, swarm = _options(kind, Path(folder))
+        options, swarm = _options(kind, Path(folder), plan)
         nodes = graph_of(options, swarm, folder)
-        if kind == "epucks_wifi":
-            nodes = _over_tcp(nodes, [f"{folder}/{one.name}" for one in swarm.robots])
+        if port:
+            nodes = over_tcp(nodes, [f"{folder}/{one.name}" for one in swarm.robots], port, ahead)
         truth: dict[str, list[tuple[int, list[float]]]] = {one.name: [] for one in swarm.robots}
         with LiveGraph(nodes, OUT / "robustness" / f"{kind}.log") as graph:
             for name, one in truth.items():
@@ -139,38 +148,45 @@ def _all_tracked(graph: LiveGraph, since_ns: int, measured: Sequence[bytes]) -> 
     return tracked_s, measured_s
 
 
-def _go(graph: LiveGraph, seconds: float) -> None:
+def go(graph: LiveGraph, seconds: float) -> None:
+    """Let time pass."""
     end_s = time.monotonic() + seconds
     graph.wait_for(lambda: time.monotonic() > end_s, "go on", START_PATIENCE_S)
+
+
+def trajectories(truth: Mapping[str, list[tuple[int, list[float]]]]) -> dict[str, Trajectory]:
+    """The paths of robots by name."""
+    return {
+        name: Trajectory(np.array([at for at, _ in one]), np.array([pose for _, pose in one]))
+        for name, one in truth.items()
+    }
 
 
 def measure(say: Say) -> dict[str, float]:
     """Figures of each pause, one after the other in one graph of each simulation."""
     figures: dict[str, float] = {}
     for kind, stops in STOPPED.items():
-        with _simulated(kind) as (graph, swarm, truth):
+        port = free_port() if kind == "epucks_wifi" else 0
+        with simulated(kind, port=port) as (graph, swarm, truth):
             measured: list[bytes] = []
             topic, message_type = _MEASURED[kind]
             graph.recorder.create_subscription(message_type, topic, measured.append, 1000, raw=True)
             _all_tracked(graph, 0, measured)
-            _go(graph, _BETWEEN_S)
+            go(graph, _BETWEEN_S)
             begin_ns = graph.recorder.poses()[-1].stamp_ns
             for what, node in stops.items():
                 for pause_s in PAUSES_S:
                     say(f"{kind} {what} {pause_s:g} s")
                     with stopped(graph.process(node).pid):
-                        _go(graph, pause_s)
+                        go(graph, pause_s)
                     name = f"time.{kind}.{what}_stopped_{pause_s:g}_s"
                     measured.clear()
                     since_ns = graph.recorder.poses()[-1].stamp_ns
                     tracked_s, measured_s = _all_tracked(graph, since_ns, measured)
                     figures[f"{name}.tracked_s"], figures[f"{name}.measured_s"] = tracked_s, measured_s
                     figures[f"{name}.recovery_s"] = max(0.0, tracked_s - measured_s)
-                    _go(graph, _BETWEEN_S)
-            paths = {
-                name: Trajectory(np.array([at for at, _ in one]), np.array([pose for _, pose in one]))
-                for name, one in truth.items()
-            }
+                    go(graph, _BETWEEN_S)
+            paths = trajectories(truth)
             result = graph.recorder.result(kind, swarm, paths)
         figures[f"time.{kind}.misleading_share"] = misleading_share(result, paths, begin_ns)
     return figures

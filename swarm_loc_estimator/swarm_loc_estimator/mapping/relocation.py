@@ -20,7 +20,7 @@ from swarm_loc_estimator.common.se2 import between, compose, wrap_angle
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.scans import ScanStop
 
-# The constants are checked by `make bench-pushbot`, part restart: three halls, 20 instants each.
+# The constants are checked by `make bench-robustness`, part restart: three halls, 20 instants each.
 _WALL_SIGMA, _UNKNOWN = 0.06, 0.7
 """Standard deviation of points from walls [m], and how well a beam fits where the map is unknown."""
 _FARTHEST, _BEAMS = 1.9, 120  # Distance up to which beams are compared [m], and their number per stop
@@ -33,6 +33,7 @@ _APART = np.array([0.15, math.radians(8.0)])
 _STEP, _TURN_STEP = 0.1, math.radians(3.0)  # Of the places that are tried first [m], [rad]
 _FINE, _FINE_TURN, _FINE_STEPS = 0.03, math.radians(1.5), 3
 """Of the places around these, and of those after each drive [m, rad], and their number to each side."""
+_STEP_COST = 0.002  # What a squared step costs: where the map tells little, odometry is followed
 _HYPOTHESES = 100  # Maximum number of places
 _RULED_OUT = 0.5  # By how many scans a place explains less than another one if it is ruled out by it
 _FITS, _CONTRADICTS = 0.88, 0.7
@@ -107,7 +108,8 @@ class Search:
             return -1
         total = self._totals()
         best = int(total.argmax())
-        rival = total[_apart(self.poses[best, -1], self.poses[:, -1])].max(initial=self._nowhere)
+        nowhere = _UNKNOWN * self.fits.shape[1]  # it is where the map is unknown
+        rival = total[_apart(self.poses[best, -1], self.poses[:, -1])].max(initial=nowhere)
         known, fits = self.known[best].sum(), self.fits[best].sum()
         is_seen = self.known[best, -_PLACES:].mean() > _MIN_KNOWN and fits > _FITS * known
         return best if is_seen and total[best] - rival > _RULED_OUT else -1
@@ -122,11 +124,6 @@ class Search:
     def is_over(self) -> bool:
         """Whether the place that was found has been confirmed, and all others are ruled out."""
         return len(self.poses) == 1 and (self.known[0] > _MIN_KNOWN).sum() >= _CONFIRMED
-
-    @property
-    def _nowhere(self) -> float:
-        """How many scans are explained if the robot is where the map is unknown."""
-        return _UNKNOWN * self.fits.shape[1]
 
     def _contradicts(self) -> BoolArray:
         """Whether the newest scans do not fit each hypothesis (h,)."""
@@ -172,29 +169,22 @@ class Search:
         cells = np.column_stack([view.cells(predicted[:, :2]), predicted[:, 2]])
         aligned = _align(view.score, view.walls, cells, _FINE / view.cell)
         poses = np.column_stack([view.places(aligned[:, :2]), aligned[:, 2]])
-        fits, known = _compare(
-            view.score, view.occupied, view.ends, view.hits, aligned, _NEAREST / view.cell
-        )
+        fits, known = _compare(view.score, view.occupied, view.ends, view.hits, aligned, _NEAREST / view.cell)
         self.poses = np.concatenate([self.poses, poses[:, None]], axis=1)
         self.fits = np.column_stack([self.fits, fits])
         self.known = np.column_stack([self.known, known])
 
     def _thin(self) -> None:
-        """Compare lights; drop hypotheses that are wrong, ruled out twice, or where better ones are.
-
-        All are dropped if none explains more than being nowhere in the map does: the search begins anew.
-        """
+        """Compare lights; drop hypotheses that are wrong, ruled out twice, or where better ones are."""
         for light in (one for one in self.lights if one.stop in self.stops):
             self.lit += _light_fits(light, self.poses[:, self.stops.index(light.stop)])
         self.lights = []
         total, wrong = self._totals(), self._contradicts()
-        best = total.max(initial=0.0)
-        least = math.inf if best < self._nowhere else best - 2.0 * _RULED_OUT
         keep: list[int] = []
         for one in np.argsort(-total, kind="stable").tolist():
             others = self.poses[keep, -1]
             is_good = not wrong[one] and _apart(self.poses[one, -1], others).all()
-            if one == self.found or (is_good and total[one] > least):
+            if one == self.found or (is_good and total.max() - total[one] < 2.0 * _RULED_OUT):
                 keep.append(one)
         self.found = keep.index(self.found) if self.found in keep else -1
         self.poses, self.fits = self.poses[keep], self.fits[keep]
@@ -296,7 +286,7 @@ def _align(score: FloatArray, walls: FloatArray, poses: FloatArray, step: float)
                 for c in range(-_FINE_STEPS, _FINE_STEPS + 1):
                     x, y = poses[h, 0] + a * step, poses[h, 1] + b * step
                     heading = poses[h, 2] + c * _FINE_TURN
-                    value = _mean_score(score, walls, x, y, heading)
+                    value = _mean_score(score, walls, x, y, heading) - _STEP_COST * (a * a + b * b + c * c)
                     if value > best:
                         best = value
                         aligned[h] = x, y, heading

@@ -2,14 +2,16 @@
 
 Each run has a robot that is not heard for two to six seconds, in which it goes on with what it did, and whose
 odometry then begins at zero. In every third run it happens again ten seconds later, in every fourth to both.
-Figures are `robustness.restart.HALL.NAME`: RMS position errors of all stops with and without restarts, their
-ratio, the largest error of a published pose, poses off by more than 5 sigma and 2 cm (misleading) with and
-without, the share of runs in which the robot was located again, and after how long (median of these).
+Figures are `restart.HALL.NAME`: RMS position errors of all stops with and without restarts, their ratio, the
+largest error of a published pose, poses off by more than 5 sigma and 2 cm (misleading) with and without, the
+share of runs in which the robot was located again, and after how long (median of these). Those of whole
+graphs, in real time, are `restart.live.HALL.NAME`, see `live_restarts.py`.
 """
 
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
@@ -20,7 +22,7 @@ from typing import NamedTuple
 import numpy as np
 
 from bench.pushbot.exploration import PERIOD_S, START_TURNS, Arrival, Exploration, PushBotNoise
-from bench.shared.common import Cell, table
+from bench.shared.common import ProgressLine
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
@@ -270,14 +272,16 @@ def _run(job: tuple[str, int, bool]) -> RestartRun:
     return replay(given) if plan == "bag" else explore(plan, seed, given)
 
 
-def measure_restart(seeds: int, processes: int) -> dict[str, float]:
-    """Run everything, print a table and return the figures."""
+def measure(seeds: int, say: ProgressLine) -> dict[str, float]:
+    """Figures of runs with and without restarts, offline."""
     jobs = [(plan, seed, way) for plan in PLANS for way in (False, True) for seed in range(1, seeds + 1)]
     jobs = [job for job in jobs if job[0] != "bag" or job[2] or job[1] == 1]
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        results = dict(zip(jobs, pool.map(_run, jobs), strict=True))
+    results: dict[tuple[str, int, bool], RestartRun] = {}
+    with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
+        for job, one in zip(jobs, pool.map(_run, jobs), strict=True):
+            results[job] = one
+            say(f"{len(results)} of {len(jobs)} runs")
     figures: dict[str, float] = {}
-    rows: list[list[Cell]] = []
     for plan in PLANS:
         runs = [one for job, one in results.items() if job[0] == plan and job[2]]
         plain = [one for job, one in results.items() if job[0] == plan and not job[2]]
@@ -285,17 +289,15 @@ def measure_restart(seeds: int, processes: int) -> dict[str, float]:
         numbers = {
             "position_cm": 100.0 * _rms(runs),
             "without_cm": 100.0 * _rms(plain),
-            "position_ratio": _rms(runs) / _rms(plain),
+            "rms_ratio": _rms(runs) / _rms(plain),
             "worst_cm": 100.0 * max(one.worst_m for one in runs),
             "misleading": float(sum(one.misleading for one in runs)),
             "misleading_without": float(sum(one.misleading for one in plain)),
-            "found_share": len(found) / len(runs),
-            "found_s": float(np.median(found)) if found else math.inf,
+            "located_again": len(found) / len(runs),
+            "wait_s": float(np.median(found)) if found else math.inf,
             "taken_back": float(sum(one.counters["places_taken_back"] for one in runs)),
         }
-        figures |= {f"robustness.restart.{plan}.{name}": value for name, value in numbers.items()}
-        rows.append([plan, *numbers.values()])
-    print(table(["hall", *numbers], rows))
+        figures |= {f"restart.{plan}.{name}": value for name, value in numbers.items()}
     return figures
 
 
