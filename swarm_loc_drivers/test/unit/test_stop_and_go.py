@@ -185,3 +185,18 @@ def test_after_a_restart_it_looks_from_another_place_while_it_gets_no_goal() -> 
     robot.until_still()
     assert math.dist(robot.pose[:2], place) == pytest.approx(0.4, abs=0.01)
     assert robot.turned - before == pytest.approx(SCAN_TURN, abs=0.03)
+
+
+def test_after_a_restart_it_turns_to_where_it_is_farthest_if_something_is_ahead() -> None:
+    robot, open_heading = looked_around(), 1.7
+    robot.odometry[0] += 1.0
+    while robot.step():
+        off = abs(wrap_angle(robot.pose[2] - open_heading))
+        robot.motion.take_distance(max(0.3, 2.0 - 2.0 * off))
+    place = robot.pose[:2].copy()
+    while not robot.step():
+        pass
+    robot.until_still()
+    x, y = robot.pose[:2] - place
+    assert math.hypot(x, y) == pytest.approx(0.4, abs=0.01)
+    assert wrap_angle(math.atan2(y, x) - open_heading) == pytest.approx(0.0, abs=0.05)

@@ -10,7 +10,7 @@ import pytest
 from mapping_world import ROOM, RoomRobot, distance_in_room
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.common.se2 import between, compose, wrap_angle
 from swarm_loc_estimator.mapping.mapper import SCAN_TURN, CooperativeMapper
 from swarm_loc_estimator.mapping.relocation import Search
 from swarm_loc_estimator.mapping.scans import LightSightings, MotionTracker, Readings, ScanStop
@@ -193,6 +193,25 @@ def test_a_robot_whose_scan_fits_two_places_leaves_the_map_as_it_is() -> None:
     assert mapper.located(0) is located
     assert np.array_equal(mapper.graph.poses, before)
     assert np.array_equal(mapper.occupancy().log_odds, walls)
+
+
+def test_a_lost_robot_follows_its_odometry_where_the_map_tells_nothing() -> None:
+    mapper, robot = CooperativeMapper(), RoomRobot(START, 0.0, np.random.default_rng(22))
+    explore(mapper, mapper.join(np.array(START), KNOWN), robot, 2)
+    restart(robot, 2.0, 0.0)
+    arrivals = [robot.pose.copy()]
+    feed(mapper, 0, look_around(robot))
+    search = mapper._tracks[0].search
+    assert search is not None
+    search.poses = np.array([[compose([50.0, 0.0, 0.0], arrivals[0])]])
+    search.fits, search.known, search.lit = *np.zeros((2, 1, 1)), np.zeros(1)
+    feed(mapper, 0, [robot.drive(0.3)])
+    arrivals.append(robot.pose.copy())
+    feed(mapper, 0, [robot.turn(SCAN_TURN), robot.rest(1.2)])
+    assert search.poses.shape == (1, 2, 3)
+    off = between(*search.poses[0]) - between(*arrivals)
+    assert math.hypot(off[0], off[1]) < 0.03
+    assert abs(wrap_angle(off[2])) < math.radians(2.0)
 
 
 def at_a_wrong_place(patch: pytest.MonkeyPatch) -> tuple[CooperativeMapper, RoomRobot, FloatArray]:
