@@ -5,12 +5,13 @@ whose beams end near walls, as far as its steps allow. The best are matched, and
 hypothesis, moved by odometry and matched again at every new place. A hypothesis that explains clearly less
 than the best one is ruled out. The last one is believed if it has fit at several places, and if a search with
 the newest scan finds no other that explains all of them.
+
+Each scan goes on with a search by one part, so that it costs no more in a large map; the search takes longer.
 """
 
 from __future__ import annotations
 
 import math
-from collections import OrderedDict
 from typing import NamedTuple
 
 import numpy as np
@@ -55,9 +56,10 @@ _DECLINE = 0.07
 """How much worse later scans may fit than the first, by which a place was found: wrong places fit it best."""
 _START = np.diag(np.square([0.1, 0.1, 0.05]))
 """Covariance (3, 3) added to that of a place, since the next scans, which see the same walls, replace it."""
+_COMPARED, _MATCHES = 400_000, 50  # Numbers of poses that are compared, and that are matched, at a scan
+_GRADES = 100  # Of nearness to a wall, at the first level
 _SEARCH_TURN = 0.1  # Turn during a sweep beyond which it searches no place [rad]
 _PAUSE_NS, _LONGEST_PAUSE_NS = 1_000_000_000, 16_000_000_000  # Between searches of a robot
-_CACHED = 16
 
 
 class SearchMap(NamedTuple):
@@ -65,6 +67,7 @@ class SearchMap(NamedTuple):
 
     walls: WallMap
     away: NDArray[np.float32]  # (nx, ny) distance from the nearest wall [m]
+    near: NDArray[np.uint8]  # (nx, ny) nearness to a wall at the first level, up to `_GRADES`
     places: FloatArray  # (p, 2) that are tried first [m]
 
 
@@ -89,14 +92,26 @@ class Look(NamedTuple):
     track: FloatArray  # (3,) pose by odometry
 
 
+class PlaceSearch(NamedTuple):
+    """A search of the whole map, under way, for the places (m,) that explain k looks."""
+
+    poses: FloatArray = np.zeros((0, 3))  # (n, 3) of the newest look that are matched next, the best first
+    score: FloatArray = np.zeros(0)  # (n,) of them
+    compared: int = 0  # Number of the map's places that were compared
+    transform: tuple[FloatArray, ...] = ()  # (m, 3) from `map` to the track
+    fits: tuple[FloatArray, ...] = ()  # (m, k)
+
+
 class PossiblePlaces(NamedTuple):
     """The places (h,) where a robot may be, and its looks (k,)."""
 
     transform: FloatArray  # (h, 3) from `map` to the track of its odometry
     fits: FloatArray  # (h, k) share of the beams of each look that fit
     looks: tuple[Look, ...]
-    searched_ns: int  # Stamp of the last search
+    searched_ns: int  # Stamp of the last search from the beginning
     pause_ns: int  # After it
+    search: PlaceSearch | None = None  # What is under way; no looks are added meanwhile
+    is_sole: bool = False  # Whether a search has found no place but the only one of these
 
     @property
     def is_ambiguous(self) -> bool:
@@ -120,11 +135,12 @@ def search_map(walls: WallMap) -> SearchMap:
     free[: walls.kind.shape[0], : walls.kind.shape[1]] = walls.kind == FREE
     blocks = np.argwhere(free.reshape(nx, step, ny, step).any(axis=(1, 3)))
     places: FloatArray = walls.corner + (blocks + 0.5) * step * walls.cell
-    return SearchMap(walls, away.astype(np.float32), places)
+    near = np.round(_GRADES * np.clip(1.0 - (away - 0.75 * _STEP_M) / _WIDTH_M, 0.0, 1.0)).astype(np.uint8)
+    return SearchMap(walls, away.astype(np.float32), near, places)
 
 
 class MapSearch:
-    """Searches places in a map; results are kept for steps that are computed again.
+    """Searches places in a map.
 
     Args:
         walls: The map.
@@ -135,7 +151,8 @@ class MapSearch:
     def __init__(self, walls: WallMap, scans: MapScans, swarm: Swarm) -> None:
         self._walls, self._scans, self._robots = walls, scans, swarm.robots
         self._map = search_map(walls)
-        self._cache: OrderedDict[bytes, FloatArray] = OrderedDict()
+        ahead = np.zeros((1, 2))  # compile before data come
+        _refined(self._map, ahead, _compared(self._map, ahead, PlaceSearch()))
 
     def place_of(self, state: SwarmState, one: Measurements) -> tuple[FoundPlace | None, Verdict]:
         """Search the place of a robot that is not located, by its scan; returns it once it is found.
@@ -148,20 +165,23 @@ class MapSearch:
         sweep, described = scans.sweep_of(one), self._robots[robot]
         if sweep is None or described.stands or not scans.tracks.has_started(robot, sweep.stamp_ns):
             return None, Verdict.NOT_LOCALIZED
+        before, walls = state.places.get(robot), scans.walls_of(self._walls, robot)
+        if before is not None and before.search is not None:
+            state.places[robot] = places = self._advanced(before, before.search, walls)
+            return None, _why_nowhere(places)
         delay = state.delays.get(robot) or described_delay(described.lidar.delay_s)
         if scans.turned(robot, sweep) > _SEARCH_TURN:
-            return None, _why_nowhere(state.places.get(robot))  # its delay and order of beams may be wrong
+            return None, _why_nowhere(before)  # its delay and order of beams may be wrong
         sweep = sweep.backwards() if delay.backwards > 0.0 else sweep
         beams, now, _ = scans.beams(robot, stamp_ns, sweep, delay.lag_s, int(delay.chance.argmax()))
-        walls, thinned = scans.walls_of(self._walls, robot), SweptBeams.thinned(*beams)
-        places, found = self.add(state.places.get(robot), stamp_ns, thinned, now, walls)
+        places, found = self._add(before, stamp_ns, SweptBeams.thinned(*beams), now, walls)
         if found is not None:
             state.places.pop(robot, None)
             return found, Verdict.USED
         state.places[robot] = places
         return None, _why_nowhere(places)
 
-    def add(
+    def _add(
         self,
         before: PossiblePlaces | None,
         stamp_ns: int,
@@ -185,9 +205,13 @@ class MapSearch:
             paused_ns = 0 if before is None else before.pause_ns
             if before is not None and stamp_ns < before.searched_ns + paused_ns:
                 return before, None
-            return self._begin(stamp_ns, paused_ns, Look(beams, track), walls), None
+            pause_ns = min(max(_PAUSE_NS, 2 * paused_ns), _LONGEST_PAUSE_NS)
+            look = Look(beams, track)
+            begun = PossiblePlaces(np.zeros((0, 3)), np.zeros((0, 1)), (look,), stamp_ns, pause_ns)
+            return self._advanced(begun, PlaceSearch(), walls), None
         away, turn = _moved(before.looks[-1].track, track)
-        if away < _LOOK_M and turn < _LOOK_TURN:
+        is_look = away >= _LOOK_M or turn >= _LOOK_TURN
+        if not (is_look or before.is_sole):
             return before, None
         # match each place again, and rule out what explains less
         covariance = np.diag(
@@ -201,111 +225,142 @@ class MapSearch:
             looks, fits = (looks[0], *looks[2:]), np.delete(fits, 1, axis=1)
         kept = _best(poses, fits)
         after = before._replace(transform=compose(poses, inverse(track))[kept], fits=fits[kept], looks=looks)
+        nowhere = after._replace(transform=np.zeros((0, 3)), is_sole=False)
         if after.fits[0].mean() < _MIN_FIT and len(looks) >= _LOOKS:
-            return after._replace(transform=np.zeros((0, 3))), None
-        return self._confirmed(after, [found[k] for k in kept], walls)
-
-    def _begin(self, stamp_ns: int, paused_ns: int, look: Look, walls: WallMap) -> PossiblePlaces:
-        """Search the whole map."""
-        pause_ns = min(max(_PAUSE_NS, 2 * paused_ns), _LONGEST_PAUSE_NS)
-        tried = self._candidates(look.beams)
-        found = [match(walls, *look.beams, pose, _SPREAD) for pose in tried]
-        poses, fits = (
-            np.array([one.pose for one in found]).reshape(-1, 3),
-            np.array([_fit(one) for one in found]),
-        )
-        kept = _best(poses, fits[:, None])[:_HYPOTHESES]
-        kept = kept[fits[kept] > 0.0]
-        transform = compose(poses, inverse(look.track))[kept]
-        return PossiblePlaces(transform, fits[kept, None], (look,), stamp_ns, pause_ns)
-
-    def _confirmed(
-        self, places: PossiblePlaces, found: list[Match], walls: WallMap
-    ) -> tuple[PossiblePlaces, FoundPlace | None]:
-        """Believe the last place if it has no rival anywhere."""
-        looks, best = places.looks, found[0]
+            return nowhere, None
+        # believe the last place if it has no rival anywhere
+        best = found[kept[0]]
         is_sure = len(looks) >= _LOOKS and best.determined == 3 and best.outcome not in (OFF_MAP, BLOCKED)
-        if len(places.transform) > 1 or not is_sure:
-            return places, None
-        # others that explain the newest scan, at all looks
-        least, now = float(places.fits[0].sum()) - _RULED_OUT, inverse(looks[-1].track)
-        transforms, fits = [places.transform[0]], [places.fits[0]]
-        for pose in self._candidates(looks[-1].beams):
-            then = latest = compose(pose, now)
-            own = np.ones(len(looks))
+        if len(kept) > 1 or not is_sure:
+            return after if is_look else before, None
+        if not before.is_sole:
+            return self._advanced(after, PlaceSearch(), walls), None
+        if after.fits[0, 0] - after.fits[0, 1:].mean() > _DECLINE:  # the true place was not among all
+            return nowhere, None
+        return after, FoundPlace(best.pose, best.covariance + _START)
+
+    def _advanced(self, places: PossiblePlaces, search: PlaceSearch, walls: WallMap) -> PossiblePlaces:
+        """Go on with a search by one part."""
+        looks, everywhere = places.looks, len(self._map.places)
+        # compare the newest look with the map, at the first level, then at all others
+        if search.compared < everywhere:
+            points = _spread(looks[-1].beams.ends)
+            search = _compared(self._map, points, search) if len(points) else PlaceSearch(compared=everywhere)
+            if search.compared < everywhere:
+                return places._replace(search=search)
+            search = search._replace(poses=_refined(self._map, points, search))
+        # match all looks, the newest first, as long as they may explain hardly less than the known place
+        least = float(places.fits.sum(axis=1).max(initial=-math.inf)) - _RULED_OUT
+        now, matches, tried, transform, fits = inverse(looks[-1].track), 0, 0, [], []
+        while matches < _MATCHES and tried < len(search.poses):
+            then = latest = compose(search.poses[tried], now)
+            tried, own = tried + 1, np.ones(len(looks))
             for k in range(len(looks) - 1, -1, -1):
                 one = match(walls, *looks[k].beams, compose(then, looks[k].track), _SPREAD)
-                then, own[k] = compose(one.pose, inverse(looks[k].track)), _fit(one)
+                then, own[k], matches = compose(one.pose, inverse(looks[k].track)), _fit(one), matches + 1
                 latest = then if k == len(looks) - 1 else latest
                 if own.sum() < least:
                     break
             else:
-                transforms.append(latest)
+                transform.append(latest)
                 fits.append(own)
-        poses, found_fits = compose(np.array(transforms), looks[-1].track), np.array(fits)
-        rivals = np.append(0, np.flatnonzero(_apart(best.pose, poses)))
-        kept = rivals[_best(poses[rivals], found_fits[rivals])]
-        if len(kept) > 1:
-            return places._replace(transform=np.array(transforms)[kept], fits=found_fits[kept]), None
-        if places.fits[0, 0] - places.fits[0, 1:].mean() > _DECLINE:  # the true place was not among all
-            return places._replace(transform=np.zeros((0, 3))), None
-        return places, FoundPlace(best.pose, best.covariance + _START)
+        search = search._replace(
+            poses=search.poses[tried:],
+            transform=(*search.transform, *transform),
+            fits=(*search.fits, *fits),
+        )
+        return places._replace(search=search) if len(search.poses) else _searched(places, search)
 
-    def _candidates(self, beams: SweptBeams) -> FloatArray:
-        """Poses (h, 3) from which the ends of beams are near walls, the best first, see the module."""
-        key = beams.ends.tobytes()
-        if key not in self._cache:
-            self._cache[key] = _candidates(self._map, beams.ends)
-            if len(self._cache) > _CACHED:
-                self._cache.popitem(last=False)
-        return self._cache[key]
+
+def _searched(places: PossiblePlaces, search: PlaceSearch) -> PossiblePlaces:
+    """What is known after a search: its places, beside the only one that was known before, if any."""
+    transform = np.concatenate([places.transform, np.reshape(search.transform, (-1, 3))])
+    fits = np.concatenate([places.fits, np.reshape(search.fits, (-1, len(places.looks)))])
+    poses, known = compose(transform, places.looks[-1].track), len(places.transform)
+    others = np.arange(known, len(poses))
+    if known:
+        others = others[_apart(poses[0], poses[known:])]
+    others = np.concatenate([np.arange(known), others])
+    kept = others[_best(poses[others], fits[others])][:_HYPOTHESES]
+    kept = kept[fits[kept].sum(axis=1) > 0.0]
+    is_sole = known == 1 and kept.tolist() == [0]
+    return places._replace(transform=transform[kept], fits=fits[kept], search=None, is_sole=is_sole)
 
 
 def _why_nowhere(places: PossiblePlaces | None) -> Verdict:
     """Why the scans of a robot do not locate it."""
     if places is None:
         return Verdict.NOT_LOCALIZED
-    if not len(places.transform):
+    if not len(places.transform) and places.search is None:
         return Verdict.NO_PLACE
     return Verdict.SEVERAL_PLACES if places.is_ambiguous else Verdict.NOT_LOCALIZED
 
 
-def _candidates(search: SearchMap, ends: FloatArray) -> FloatArray:
-    """Poses (h, 3) from which the ends (n, 2) of beams are near walls, coarse to fine."""
-    if not len(ends):
-        return np.zeros((0, 3))
-    # in an order in which any first ones look all around
-    spread = np.linspace(0, len(ends) - 1, _BEAMS).astype(np.int64)
-    points = ends[spread[np.argsort((np.arange(_BEAMS) * 0.618034) % 1.0)]]
-    step, turn = _STEP_M, 2.0 * math.pi / _ANGLES
-    x, y, theta = (
-        column.ravel()
-        for column in (
-            np.repeat(search.places[:, 0], _ANGLES),
-            np.repeat(search.places[:, 1], _ANGLES),
-            np.tile(turn * np.arange(_ANGLES), len(search.places)),
-        )
-    )
-    poses = np.stack([x, y, theta], axis=-1)
-    for level in range(_LEVELS):
-        score = _scores(search, points, poses, 0.75 * step)
-        kept = _largest(score, _KEPT)
-        poses, score = poses[kept], score[kept]
-        if level == _LEVELS - 1:
-            break
-        corners = [(a, b, c) for a in (-1.0, 1.0) for b in (-1.0, 1.0) for c in (-1.0, 1.0)]
-        offsets = np.array(corners) * [0.25 * step, 0.25 * step, 0.25 * turn]
-        if not level:  # headings are close enough for the first level
-            offsets = offsets[::2] * [1.0, 1.0, 0.0]
-        poses = (poses[:, None] + offsets).reshape(-1, 3)
-        step *= 0.5
-    return poses[_separate(poses, score, _TRIED)]
+def _spread(ends: FloatArray) -> FloatArray:
+    """Some ends (b, 2) of beams (n, 2), in an order in which any first ones look all around."""
+    some = np.linspace(0, len(ends) - 1, _BEAMS if len(ends) else 0).astype(np.int64)
+    return ends[some[np.argsort((np.arange(len(some)) * 0.618034) % 1.0)]]
+
+
+def _compared(search_map: SearchMap, points: FloatArray, search: PlaceSearch) -> PlaceSearch:
+    """Go on by a part of the places that are tried first; points (b, 2) are the ends of beams."""
+    end = search.compared + max(1, _COMPARED // _ANGLES)
+    places = search_map.places[search.compared : end]
+    score = _first_scores(search_map, points, places).ravel().astype(np.float64)
+    some = np.flatnonzero(score)
+    some = some[_largest(score[some], _KEPT)]
+    found = np.column_stack([places[some // _ANGLES], (2.0 * math.pi / _ANGLES) * (some % _ANGLES)])
+    poses, scores = np.concatenate([search.poses, found]), np.concatenate([search.score, score[some]])
+    kept = _largest(scores, _KEPT)
+    return PlaceSearch(poses[kept], scores[kept], end)
 
 
 @cached_njit
-def _scores(search: SearchMap, points: FloatArray, poses: FloatArray, reach: float) -> FloatArray:
+def _first_scores(search_map: SearchMap, points: FloatArray, places: FloatArray) -> IntArray:
+    """How well points (b, 2) end near walls, at places (p, 2) and all headings; 0 where they do not."""
+    walls, out = search_map.walls, np.zeros((len(places), _ANGLES), dtype=np.int64)
+    nx, ny = walls.kind.shape
+    least = _LEAST * _FIRST * _GRADES
+    for m in range(_ANGLES):
+        cos, sin = math.cos(2.0 * math.pi / _ANGLES * m), math.sin(2.0 * math.pi / _ANGLES * m)
+        shift = np.empty((len(points), 2), dtype=np.int64)  # in cells
+        for b in range(len(points)):
+            shift[b, 0] = round((cos * points[b, 0] - sin * points[b, 1]) / walls.cell)
+            shift[b, 1] = round((sin * points[b, 0] + cos * points[b, 1]) / walls.cell)
+        for k in range(len(places)):
+            x = math.floor((places[k, 0] - walls.corner[0]) / walls.cell)
+            y = math.floor((places[k, 1] - walls.corner[1]) / walls.cell)
+            total = 0
+            for b in range(len(points)):
+                i, j = x + shift[b, 0], y + shift[b, 1]
+                if 0 <= i < nx and 0 <= j < ny:
+                    total += search_map.near[i, j]
+                if b == _FIRST and total < least:
+                    total = 0
+                    break
+            out[k, m] = total
+    return out
+
+
+def _refined(search_map: SearchMap, points: FloatArray, search: PlaceSearch) -> FloatArray:
+    """Poses (h, 3) from which points (b, 2) are near walls, the best first, by those of the first level."""
+    step, turn, poses, score = _STEP_M, 2.0 * math.pi / _ANGLES, search.poses, search.score
+    corners = [(a, b, c) for a in (-1.0, 1.0) for b in (-1.0, 1.0) for c in (-1.0, 1.0)]
+    for level in range(1, _LEVELS):
+        offsets = np.array(corners) * [0.25 * step, 0.25 * step, 0.25 * turn]
+        if level == 1:  # headings are close enough for the first level
+            offsets = offsets[::2] * [1.0, 1.0, 0.0]
+        poses, step = (poses[:, None] + offsets).reshape(-1, 3), 0.5 * step
+        score = _scores(search_map, points, poses, 0.75 * step)
+        kept = _largest(score, _KEPT)
+        poses, score = poses[kept], score[kept]
+    return poses[_separate(poses, score.astype(np.float64), _TRIED)]
+
+
+@cached_njit
+def _scores(search_map: SearchMap, points: FloatArray, poses: FloatArray, reach: float) -> FloatArray:
     """How well (n,) points (b, 2) of poses (n, 3) end within a reach of walls; 0 where no place is free."""
-    walls, out = search.walls, np.zeros(len(poses))
+    walls, out = search_map.walls, np.zeros(len(poses))
     x0, y0, scale = walls.corner[0], walls.corner[1], 1.0 / walls.cell
     nx, ny = walls.kind.shape
     for k in range(len(poses)):
@@ -315,7 +370,7 @@ def _scores(search: SearchMap, points: FloatArray, poses: FloatArray, reach: flo
             i = math.floor(x + scale * (cos * points[b, 0] - sin * points[b, 1]))
             j = math.floor(y + scale * (sin * points[b, 0] + cos * points[b, 1]))
             if 0 <= i < nx and 0 <= j < ny:
-                total += max(0.0, 1.0 - max(0.0, search.away[i, j] - reach) / _WIDTH_M)
+                total += max(0.0, 1.0 - max(0.0, search_map.away[i, j] - reach) / _WIDTH_M)
             if b == _FIRST and total < _LEAST * _FIRST:
                 total = 0.0
                 break
