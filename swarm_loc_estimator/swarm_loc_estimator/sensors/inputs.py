@@ -111,7 +111,7 @@ def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
         for kind in kinds().values()
         if kind.of_each
         and (kind.expected_of(robot) or not kind.only_expected)
-        and (swarm.map is not None or not kind.needs_map)
+        and (swarm.map is not None or not kind.needs_map or robot.lidar.sees_robots)
     )
     of_cameras = (
         InputTopic(f"{camera.name}/{kind.topic}", kind, index)

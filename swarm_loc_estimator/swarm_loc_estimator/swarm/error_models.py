@@ -168,11 +168,23 @@ class LidarModel:
         1.0,
         "error of the walls of the map for localization, in addition to that of its cells",
     )
+    robot_radius: float = number(
+        0.0,
+        "m",
+        0.0,
+        5.0,
+        "of the bodies of other robots where it sees them, which are no walls but sightings; 0: it sees none",
+    )
 
     @property
     def is_used(self) -> bool:
         """Whether the robot has a lidar."""
         return self.range_sigma > 0.0
+
+    @property
+    def sees_robots(self) -> bool:
+        """Whether it sees other robots, so that it is of use without a map, too."""
+        return self.is_used and self.robot_radius > 0.0
 
 
 @dataclass(frozen=True)

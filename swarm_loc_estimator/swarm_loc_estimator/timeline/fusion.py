@@ -79,6 +79,7 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.aerial_images import PictureFusion, as_fixes, relieve_seen
 from swarm_loc_estimator.timeline.map_scans import MapScans, Sweeps
 from swarm_loc_estimator.timeline.map_search import MapSearch
+from swarm_loc_estimator.timeline.robots_in_scans import RobotsInScans
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.timeline import middle_of_period
 
@@ -123,6 +124,7 @@ class Fusion:
         self._scans = MapScans(swarm, settings, tracks, sweeps)
         walls = self._scans.walls
         self._search = None if walls is None else MapSearch(walls, self._scans, swarm)
+        self._others = RobotsInScans(swarm, settings, self._scans)
         robots, surveyed = len(swarm.robots), len(swarm.surveyed)
         self._sides = robots, 3 * robots + surveyed
         self._first_mount, self._first_direction = surveyed - len(swarm.cameras), 2 * robots + surveyed
@@ -229,7 +231,7 @@ class Fusion:
     def _fuse_scan(
         self, state: SwarmState, one: Measurements, verdicts: NDArray[np.uint8], nis: FloatArray
     ) -> None:
-        """Fuse the scan (1,) of a lidar."""
+        """Fuse the scan (1,) of a lidar: the robots that it sees, then its place in the map."""
         self.starts.initialize_measured(state, one)
         robot, stamp_ns = int(one.target[0]), int(one.stamp_ns[0])
         if self._search is not None and (state.origin != IN_MAP or not state.tracked[robot]):
@@ -238,7 +240,19 @@ class Fusion:
                 self._set_pose(state, robot, stamp_ns, found.pose, found.covariance)
             return
         state.places.pop(robot, None)
-        fix, verdicts[:], confirms = self._scans.fix_of(state, one.row(0))
+        sweep, verdicts[:] = self._scans.sweep_of(one.row(0)), Verdict.NOT_LOCALIZED
+        if sweep is None or not state.tracked[robot]:
+            return
+        if self._others.lidars[robot].sees_robots:
+            self.starts.initialize_pending(state, stamp_ns)  # they may never measure anything themselves
+        sweep, sighted = self._others.seen(state, one.row(0), sweep)
+        if sighted.size:
+            own = np.zeros(sighted.size, dtype=np.uint8), np.zeros(sighted.size)
+            self._fuse(state, sighted, *own)
+            verdicts[:] = Verdict.USED if (own[0] == Verdict.USED).any() else Verdict.UNASSIGNED
+        if self._search is None or not state.tracked[robot]:
+            return
+        fix, verdicts[:], confirms = self._scans.fix_of(state, one.row(0), sweep)
         if fix is not None:
             known, before = state.sources.confirmations, state.sources.confirmations.copy()
             self._fuse(state, fix, verdicts, nis)

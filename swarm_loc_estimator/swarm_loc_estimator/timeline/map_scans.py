@@ -25,7 +25,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import between, compose
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
@@ -335,6 +335,17 @@ def _distance(line: FloatArray, x: float, y: float) -> float:
 
 
 @cached_njit
+def are_near_walls(walls: WallMap, points: FloatArray, near: float) -> BoolArray:
+    """Which points (n, 2) are nearer to a wall than this [m]."""
+    out = np.zeros(len(points), dtype=np.bool_)
+    for k in range(len(points)):
+        i, j = _cell_of(walls, points[k, 0], points[k, 1])
+        wall = walls.nearest[i, j] if i >= 0 else -1
+        out[k] = wall >= 0 and _distance(walls.line[wall], points[k, 0], points[k, 1]) < near
+    return out
+
+
+@cached_njit
 def _goes_through(walls: WallMap, from_x: float, from_y: float, x: float, y: float, margin: float) -> bool:
     """Whether a wall cell lies on the way to a point, farther than a margin before it [m]."""
     way = math.hypot(x - from_x, y - from_y)
@@ -399,16 +410,18 @@ class MapScans:
         """The map with the error that the description of a robot says."""
         return walls._replace(variance=walls.variance + self._lidars[robot].map_sigma ** 2)
 
-    def fix_of(self, state: SwarmState, one: Measurements) -> tuple[Measurements | None, Verdict, bool]:
+    def fix_of(
+        self, state: SwarmState, one: Measurements, sweep: LidarSweep
+    ) -> tuple[Measurements | None, Verdict, bool]:
         """Match a scan; returns its fix (1,), or None and why there is none, and if it confirms a start.
 
         Args:
             state: Its fault scores are changed.
             one: Row of the scan, whose robot is located in the map.
+            sweep: Its beams that may end at walls.
         """
         robot, stamp_ns = int(one.target), int(one.stamp_ns)
-        sweep = self.sweep_of(one)
-        if self.walls is None or sweep is None:
+        if self.walls is None:
             return None, Verdict.NOT_LOCALIZED, False
         estimate = estimate_at(state, self.tracks.arrays, self._limits, stamp_ns)
         pose, covariance = estimate.poses[robot], estimate.covariances[robot]
