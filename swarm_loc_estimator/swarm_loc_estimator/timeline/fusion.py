@@ -124,7 +124,8 @@ class Fusion:
         self._scans = MapScans(swarm, settings, tracks, sweeps)
         walls = self._scans.walls
         self._search = None if walls is None else MapSearch(walls, self._scans, swarm)
-        self._others = RobotsInScans(swarm, settings, self._scans)
+        self._sees_robots = [robot.lidar.sees_robots for robot in swarm.robots]
+        self._others = RobotsInScans(swarm, settings, self._scans) if any(self._sees_robots) else None
         robots, surveyed = len(swarm.robots), len(swarm.surveyed)
         self._sides = robots, 3 * robots + surveyed
         self._first_mount, self._first_direction = surveyed - len(swarm.cameras), 2 * robots + surveyed
@@ -243,13 +244,13 @@ class Fusion:
         sweep, verdicts[:] = self._scans.sweep_of(one.row(0)), Verdict.NOT_LOCALIZED
         if sweep is None or not state.tracked[robot]:
             return
-        if self._others.lidars[robot].sees_robots:
+        if self._others is not None and self._sees_robots[robot]:
             self.starts.initialize_pending(state, stamp_ns)  # they may never measure anything themselves
-        sweep, sighted = self._others.seen(state, one.row(0), sweep)
-        if sighted.size:
-            own = np.zeros(sighted.size, dtype=np.uint8), np.zeros(sighted.size)
-            self._fuse(state, sighted, *own)
-            verdicts[:] = Verdict.USED if (own[0] == Verdict.USED).any() else Verdict.UNASSIGNED
+            sweep, sighted = self._others.seen(state, one.row(0), sweep)
+            if sighted.size:
+                own = np.zeros(sighted.size, dtype=np.uint8), np.zeros(sighted.size)
+                self._fuse(state, sighted, *own)
+                verdicts[:] = Verdict.USED if (own[0] == Verdict.USED).any() else Verdict.UNASSIGNED
         if self._search is None or not state.tracked[robot]:
             return
         fix, verdicts[:], confirms = self._scans.fix_of(state, one.row(0), sweep)

@@ -63,12 +63,10 @@ class RobotsInScans:
         settings: Required probability and gate of an assignment.
         scans: What knows the beams of sweeps.
 
-    Attributes:
-        lidars: Of each robot.
     """
 
     def __init__(self, swarm: Swarm, settings: Settings, scans: MapScans) -> None:
-        self._scans, self.lidars = scans, [robot.lidar for robot in swarm.robots]
+        self._scans, self._lidars = scans, [robot.lidar for robot in swarm.robots]
         self._limits = TrackedLimits.of(swarm, settings)
         self._probability = settings.aerial_probability
         self._gate = float(gate_threshold(settings.aerial_gate_probability))
@@ -85,10 +83,10 @@ class RobotsInScans:
             sweep: Its beams.
         """
         robot, stamp_ns, tracks = int(one.target), int(one.stamp_ns), self._scans.tracks
-        lidar, known = self.lidars[robot], state.tracked.copy()
+        lidar, known = self._lidars[robot], state.tracked.copy()
         known[robot] = False
         others = np.flatnonzero(known)
-        if not (lidar.sees_robots and others.size):
+        if not others.size:
             return sweep, NO_MEASUREMENTS
         # beams and robots, at the stamp of the scan
         delay = state.delays.get(robot) or described_delay(lidar.delay_s)
