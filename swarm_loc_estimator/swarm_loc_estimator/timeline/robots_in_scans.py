@@ -62,7 +62,6 @@ class RobotsInScans:
         swarm: Robots with lidars.
         settings: Required probability and gate of an assignment.
         scans: What knows the beams of sweeps.
-
     """
 
     def __init__(self, swarm: Swarm, settings: Settings, scans: MapScans) -> None:
