@@ -297,6 +297,8 @@ _SCALE, _YAW, _SIGNIFICANT = 0.15, math.radians(30.0), 8.0
 """Least errors of scale and yaw that are named, and least multiple of their sigma: of 120 s of real robots
 without these errors, one in ten is off by three sigmas, and the worst of 140 by seven."""
 _DEGREES, _SLACK = 20.0, 0.3  # Ratios of a wrong gyroscope to wheels from which units or sign are named
+_TURNED_RAD, _SHARE_TURNED = 1.0, 0.5
+"""Least turn by twists for a verdict on headings, and least share of it that these must turn, too."""
 _AHEAD = 0.4  # Least usual share of the optical z axis in the directions of markers
 
 Change = Callable[[FloatArray], FloatArray]
@@ -328,6 +330,31 @@ def _check_turns(evidence: Evidence, index: int, own: OdometryRows) -> Iterator[
     elif ratio < -_SLACK:
         remedy = "Turns are positive to the left: correct its driver or mount (imu.roll)"
     yield Finding(f"{robot.name}'s gyroscope", f"measures {ratio:.2g} times the turns of the wheels", remedy)
+
+
+def _check_headings(robot: Robot, own: OdometryRows) -> Iterator[Finding]:
+    """Headings of odometry that do not turn as its twists say, in both halves of the recording."""
+    own = select(own, np.argsort(own.stamp_ns, kind="stable"))
+    second = (own.stamp_ns[1:] - own.stamp_ns[:1]) // 1_000_000_000  # in which headings and twists may lag
+    seconds, second = np.unique(second, return_inverse=True)
+    passed_s = 1e-9 * np.diff(own.stamp_ns)
+    turned, wanted = (
+        np.bincount(second, weights, minlength=seconds.size)
+        for weights in (
+            se2.wrap_angle(np.diff(own.pose[:, 2])),
+            np.nan_to_num(own.twist[1:, 2]) * passed_s,
+        )
+    )
+    shares = [
+        float(turned[half] @ wanted[half] / (wanted[half] @ wanted[half]))
+        for half in np.array_split(np.arange(seconds.size), 2)
+        if np.abs(wanted[half]).sum() > _TURNED_RAD
+    ]
+    moves = np.ptp(own.pose[:, :2]) > _STANDS_M if own.robot.size else False
+    if moves and len(shares) == 2 and max(shares) < _SHARE_TURNED:
+        problem = f"has headings that turn {max(shares):.2g} times as its twists"
+        remedy = "Correct the driver: it publishes the orientation, and angular.z in radians per second"
+        yield Finding(f"{robot.name}'s odometry", problem, remedy)
 
 
 class _Sightings(NamedTuple):
@@ -364,6 +391,7 @@ def check_motion(evidence: Evidence) -> Iterator[Finding]:
     for index, robot in enumerate(evidence.swarm.robots):
         own, camera = select(rows, rows.robot == index), robot.camera
         yield from _check_turns(evidence, index, own)
+        yield from _check_headings(robot, own)
         if camera is None:
             continue
         seen = _sightings(evidence, index, robot)

@@ -96,6 +96,11 @@ def reversed_heading(message: Any, _arrival_ns: int) -> None:
     message.twist.twist.angular.z *= -1.0
 
 
+def frozen_heading(message: Any, _arrival_ns: int) -> None:
+    """As of a driver that publishes positions and twists, but leaves the orientation as it began."""
+    message.pose.pose.orientation.z, message.pose.pose.orientation.w = 0.0, 1.0
+
+
 def standing(message: Any, _arrival_ns: int, *, twist: bool = False) -> None:
     message.pose.pose.position.x = message.pose.pose.position.y = message.pose.pose.orientation.z = 0.0
     message.pose.pose.orientation.w = 1.0
@@ -402,6 +407,11 @@ WRONG: dict[str, tuple[Change, str, str]] = {
     "one driver for two": (two_robots_one_driver, f"epuck1 and {ROBOT}", "the same odometry"),
     "mirrored odometry": (edited([ODOM], mirrored), f"{ROBOT}'s odometry", "turns the other way"),
     "heading of the wrong sign": (edited([ODOM], reversed_heading), f"{ROBOT}'s odometry", "wrong sign"),
+    "heading that never turns": (
+        edited([ODOM], frozen_heading),
+        f"{ROBOT}'s odometry",
+        "turn 0 times as its twists",
+    ),
     "odometry stands": (edited([ODOM], standing), ROBOT, "stands while landmarks move"),
     "twist only": (edited([ODOM], twist_only), ROBOT, "constant in the pose of odometry"),
     "small markers": (farther(1.4), ROBOT, "times as far as its odometry says"),
