@@ -191,7 +191,7 @@ def test_after_a_restart_it_turns_to_where_it_is_farthest_if_something_is_ahead(
     robot, open_heading = looked_around(), 1.7
     robot.odometry[0] += 1.0
     while robot.step():
-        off = abs(wrap_angle(robot.pose[2] - open_heading))
+        off = float(np.abs(wrap_angle(robot.pose[2] - open_heading)))
         robot.motion.take_distance(max(0.3, 2.0 - 2.0 * off))
     place = robot.pose[:2].copy()
     while not robot.step():
