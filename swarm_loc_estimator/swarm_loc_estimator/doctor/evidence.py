@@ -96,7 +96,7 @@ class Evidence:
     def inputs(self) -> tuple[InputTopic, ...]:
         """Topics that the estimator reads: shared ones where there are messages on them."""
         shared = any(
-            topic.kind.stands_for and topic.name in self.topics and self.topics[topic.name].messages
+            topic.kind.is_shared and topic.name in self.topics and self.topics[topic.name].messages
             for topic in live_topics(self.swarm, shared=True)
         )
         return live_topics(self.swarm, shared=shared)

@@ -335,9 +335,10 @@ def _unusable(topics: Sequence[BagTopic], ingest: Ingest, swarm: Swarm) -> tuple
     """One sentence for each expected kind of input without a usable message, with topics that the bag has."""
     pairs = [*zip(ingest.topics, ingest.statistics, strict=True)]
     used = {topic.kind.rows for topic, statistics in pairs if statistics.received > statistics.malformed}
+    read = {topic.kind.name for topic in ingest.topics}
     sentences = []
     for kind in kinds().values():
-        if not kind.of_each or kind.rows in used or not kind.is_expected_of(swarm):
+        if not kind.of_each or kind.name not in read or kind.rows in used or not kind.is_expected_of(swarm):
             continue
         own = {
             topic.name: statistics.malformed for topic, statistics in pairs if topic.kind.rows == kind.rows

@@ -101,6 +101,7 @@ class InputTopic:
     robot: int  # Index into `Swarm.sources`, or THE_SWARM
     # True if missing messages are an error; False for detections of a robot without camera
     expected: bool = True
+    device: int = 0  # Address of the other radio on the topic of a pair
 
 
 def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
@@ -110,6 +111,8 @@ def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
         for index, robot in enumerate(swarm.robots)
         for kind in kinds().values()
         if kind.of_each
+        and not kind.of_pairs
+        and not (swarm.range_topic and kind.name == RangeSensor.name)
         and (kind.expected_of(robot) or not kind.only_expected)
         and (swarm.map is not None or not kind.needs_map or robot.lidar.sees_robots)
     )
@@ -124,18 +127,31 @@ def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
         for kind in kinds().values()
         if not kind.of_each
     )
-    return (*of_robots, *of_cameras, *of_swarm)
+    return (*of_robots, *_of_pairs(swarm), *of_cameras, *of_swarm)
+
+
+def _of_pairs(swarm: Swarm) -> Iterator[InputTopic]:
+    """Topics of the ranges of two radios, in both orders; at least one of them is on a robot."""
+    radios = [(one.uwb.address, k) for k, one in enumerate(swarm.robots) if one.uwb is not None]
+    radios += [(anchor.address, THE_SWARM) for anchor in swarm.anchors]
+    kind = kinds()[RangeSensor.PAIRS]
+    for (one, own), (other, robot) in itertools.permutations(radios if swarm.range_topic else (), 2):
+        name = swarm.range_topic.replace("{from}", str(one)).replace("{to}", str(other))
+        if own != THE_SWARM:
+            yield InputTopic(name, kind, own, expected=False, device=other)
+        elif robot != THE_SWARM:
+            yield InputTopic(name, kind, robot, expected=False, device=one)
 
 
 def live_topics(swarm: Swarm, *, shared: bool) -> tuple[InputTopic, ...]:
     """Topics to subscribe to: those of each robot or, with `shared`, the shared topics that replace them."""
-    stood_for = {kind.stands_for for kind in kinds().values() if kind.stands_for}
+    stood_for = {kind.stands_for for kind in kinds().values() if kind.is_shared}
     if not shared:
-        return tuple(topic for topic in input_topics(swarm) if not topic.kind.stands_for)
+        return tuple(topic for topic in input_topics(swarm) if not topic.kind.is_shared)
     return tuple(
-        replace(topic, expected=topic.kind.is_expected_of(swarm)) if topic.kind.stands_for else topic
+        replace(topic, expected=topic.kind.is_expected_of(swarm)) if topic.kind.is_shared else topic
         for topic in input_topics(swarm)
-        if topic.kind.rows == "aerial" or topic.kind.stands_for or _is_sent(topic, swarm, stood_for)
+        if topic.kind.rows == "aerial" or topic.kind.is_shared or _is_sent(topic, swarm, stood_for)
     )
 
 
@@ -444,7 +460,9 @@ class Ingest:
         offsets_s = [robot.clock.offset_s for robot in swarm.robots] + [0.0] * (len(swarm.cameras) + 1)
         self._clock_offset_ns = np.round(1e9 * np.array(offsets_s)).astype(np.int64)  # the last: the swarm
         self._corrects_clocks = bool(self._clock_offset_ns.any())
-        self._known = Known(map_frame, len(swarm.robots), swarm_key(robot.name for robot in swarm.robots))
+        devices = np.array([topic.device for topic in self.topics], dtype=np.uint64)
+        key = swarm_key(robot.name for robot in swarm.robots)
+        self._known = Known(map_frame, len(swarm.robots), key, devices)
         self._readers = [kind.create_reader(len(self.topics), self._known) for kind in self._kinds]
         self._counted = np.zeros(len(self.topics), dtype=_STATISTICS_DTYPE)
         self.statistics = [InputStatistics(self._counted[k : k + 1]) for k in range(len(self.topics))]

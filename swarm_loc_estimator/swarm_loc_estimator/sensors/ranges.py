@@ -7,6 +7,7 @@ and the other one is not, both change places and the sign. See doc/uwb.md.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -14,11 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.messages.cdr import RANGE as PAIR_TYPE
 from swarm_loc_estimator.common.messages.cdr import RANGES as MESSAGE_TYPE
-from swarm_loc_estimator.common.messages.streams import Messages
+from swarm_loc_estimator.common.messages.cdr import CdrError, decode, nanoseconds
+from swarm_loc_estimator.common.messages.streams import EachReader, MessageBatch, Messages
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements, select
 from swarm_loc_estimator.filter.models import MODELS, RANGE, RANGE_DIFFERENCE
-from swarm_loc_estimator.sensors.sensor import NO_ROWS, DropCounts, Sensor, SensorSettings
+from swarm_loc_estimator.sensors.sensor import NO_ROWS, DropCounts, InputKind, Known, Sensor, SensorSettings
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm, UwbDevice
 
 _FLOOR_M = 5e-3  # Least standard deviation of a range, whatever a message claims [m]
@@ -76,10 +79,34 @@ class _Devices(NamedTuple):
         return np.where(self.address[place] == address, place, 0)
 
 
+def _decode_pair(data: bytes) -> Any:
+    """Decode a sensor_msgs/Range; before ROS 2 Iron it had no variance, which stands last."""
+    try:
+        message = decode(data, PAIR_TYPE)
+    except CdrError:
+        message = decode(data + bytes(4), PAIR_TYPE)
+    message.stamp_ns, message.frame_id = nanoseconds(message.header.stamp), message.header.frame_id
+    return message
+
+
+def _read_pairs(
+    found: Messages[Any], batch: MessageBatch, robot: IntArray, known: Known
+) -> tuple[RangeRows, dict[str, int]]:
+    """Convert ranges of pairs; those outside of the limits that a message gives are none (REP 117)."""
+    of_message = [(m.min_range, m.max_range, m.range, m.variance) for m in found.decoded]
+    low, high, value, variance = np.array(of_message, dtype=float).reshape(-1, 4).T
+    within = np.isfinite(value) & ((high <= low) | ((low <= value) & (value <= high)))
+    kept = np.flatnonzero(found.valid)[within]
+    device = known.devices[batch.topic[kept]]
+    columns = found.stamp_ns[kept], device, np.zeros_like(device), value[within], variance[within]
+    return RangeRows(robot[kept], *columns, batch.log_ns[kept]), {"uwb_out_of_limits": int(np.sum(~within))}
+
+
 class RangeSensor(Sensor):
     """UWB radios of robots."""
 
     name, topic, message_type = "ranges", "ranges", MESSAGE_TYPE
+    PAIRS = "range_pairs"  # Name of the kind of topics with the ranges of two radios
     only_expected = True
     optional = MappingProxyType({"reference": 0, "variance": 0.0})
 
@@ -94,6 +121,22 @@ class RangeSensor(Sensor):
         self._scale = np.array([radio.range_scale for radio in radios])
         self._bias = np.array([radio.range_bias for radio in radios])
         self._gate = MODELS[RANGE].gate([radio.gate_probability for radio in radios])
+
+    @classmethod
+    def kinds(cls) -> tuple[InputKind, ...]:
+        """Kinds of its topics: of each robot, and of each pair of radios, see `Swarm.range_topic`."""
+        (own,) = super().kinds()
+        pairs = replace(
+            own,
+            name=cls.PAIRS,
+            topic="range_topic",
+            message_type=PAIR_TYPE,
+            create_reader=lambda topics, _: EachReader(topics, _decode_pair),
+            columns_of=_read_pairs,
+            stands_for=cls.name,
+            of_pairs=True,
+        )
+        return own, pairs
 
     @classmethod
     def columns(cls, messages: Messages[Any]) -> RangeRows:

@@ -66,6 +66,7 @@ class Known(NamedTuple):
     map_frame: str  #: Name of the frame `map` in messages
     robots: int  #: Number of robots in the swarm
     swarm: int  #: Number that identifies the swarm in messages of many robots, see `swarm_key`
+    devices: NDArray[np.uint64]  #: (t,) address of the other radio of each topic of a pair; 0 for others
 
 
 class Reader(Protocol):
@@ -158,6 +159,7 @@ class InputKind:
     in_map: bool = False  #: True if readings must be in the frame `map`
     needs_map: bool = False  #: True if there are such topics only for a swarm with a map
     stands_for: str = ""  #: Name of the sensor whose topics of single robots it replaces; "" if none
+    of_pairs: bool = False  #: True if each pair of radios has a topic, see `Swarm.range_topic`
 
     @property
     def rows(self) -> str:
@@ -169,9 +171,14 @@ class InputKind:
         return any(map(self.expected_of, swarm.robots))
 
     @property
+    def is_shared(self) -> bool:
+        """Whether one topic replaces those of all robots."""
+        return bool(self.stands_for) and not self.of_pairs
+
+    @property
     def pattern(self) -> str:
         """Pattern of its topic names, such as `<robot>/odom`."""
-        return f"<robot>/{self.topic}" if self.of_each else self.topic
+        return f"<robot>/{self.topic}" if self.of_each and not self.of_pairs else self.topic
 
 
 class Change(NamedTuple):

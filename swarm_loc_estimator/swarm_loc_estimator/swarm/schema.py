@@ -91,6 +91,7 @@ def swarm_schema() -> Schema:
             "landmarks": _section("static markers, by marker id", named={"^[0-9]+$": landmark}),
             "cameras": {**_section("fixed cameras", named={_PATTERN: camera}), "propertyNames": free_names},
             "anchors": {"type": ["array", "null"], "items": anchor, "description": "fixed radios"},
+            "range_topic": {"type": ["string", "null"], "description": "topic of the ranges of two radios"},
             "map": {"type": ["string", "null"], "minLength": 1, "description": "map's .yaml; null: none"},
         },
         "definitions": {**{name: _model(name) for name in MODELS}, **_other_sections()},

@@ -253,6 +253,9 @@ class Swarm:
     cameras: tuple[FixedCamera, ...] = ()
     anchors: tuple[Anchor, ...] = ()
     map: Path | None = None
+    #: Topic of the `sensor_msgs/Range` of two radios, in which {from} and {to} stand for their addresses; "":
+    #: ranges come on `<robot>/ranges`
+    range_topic: str = ""
     origin: tuple[float, float] = (0.0, 0.0)  #: Of all places in the frame of `map` and its file [m]
 
     def __post_init__(self) -> None:

@@ -40,6 +40,7 @@ cameras:                  # fixed ones, which see markers on robots
   ceiling1: {x: -1.0, y: 0.5, z: 2.5, position_sigma: 0.001, sensor: {residual_position_sigma: 0.001}}
 anchors:                  # UWB radios, see doc/uwb.md
   - {address: 0x10, x: 0.0, y: 5.0, z: 2.1}
+range_topic: uwb/{from}/{to}/distance  # sensor_msgs/Range of two radios, by their addresses
 map: floor.yaml           # walls that lidars see, as of map_server, from here; null or left out: none
 ```
 Numbers, units, ranges and defaults are those of the classes in `swarm/swarm.py`.
@@ -97,7 +98,9 @@ SCHEMA_FILE = "swarm.schema.json"  # Name of the schema next to a description
 SCHEMA_COMMENT = f"yaml-language-server: $schema={SCHEMA_FILE}"
 """First comment of a description, by which editors find the schema."""
 
-_SECTIONS = ("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors", "map")
+_SECTIONS = (
+    *("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors", "range_topic", "map"),
+)
 LAYER = (
     *("odometry", "imu", "lidar", "random_walk", "response", "camera", "sensor", "fix", "clock", "ir"),
     *("uwb", "faces", "start_sigma"),
@@ -126,6 +129,7 @@ MOUNT = ("x", "y", "z", "yaw", "pitch", "roll")  # Numbers that transforms tell 
 RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
 MAX_ID, MAX_ADDRESS = 2**32 - 1, 2**64 - 1
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+RANGE_TOPIC = re.compile(r"/?(?:\w+|\{from\}|\{to\})+(?:/(?:\w+|\{from\}|\{to\})+)*")
 MAX_NAME = 64  # Maximum length of a robot name; DDS limits the length of topic names
 _RESERVED = (
     *("aerial", "clock", "diagnostics", "estimator", "map", "mapper", "odom", "parameter_events"),
@@ -140,6 +144,12 @@ MAX_PARAMETERS = 10_000
 
 class SwarmFileError(UserError):
     """An invalid swarm description; the message is one sentence with file, key and value."""
+
+
+def is_range_topic(topic: str) -> bool:
+    """Whether it is a topic with {from} and {to} once each."""
+    once = topic.count("{from}") == topic.count("{to}") == 1
+    return once and RANGE_TOPIC.fullmatch(topic) is not None
 
 
 def load_swarm(path: Path | str) -> Swarm:
@@ -208,9 +218,13 @@ class _Loader(TreeChecks):
         if name is not None and (not isinstance(name, str) or not name):
             raise self.error("map", name, "must be the path of a map's .yaml file, from here")
         file = None if name is None else (self._folder / name).resolve()
+        ranges = sections.get("range_topic")
+        if ranges is not None and not (isinstance(ranges, str) and is_range_topic(ranges)):
+            rule = "must be a topic with {from} and {to} once each, for addresses"
+            raise self.error("range_topic", ranges, rule)
         # the swarm as a whole
         try:
-            swarm = Swarm(robots, landmarks, cameras, anchors, file)
+            swarm = Swarm(robots, landmarks, cameras, anchors, file, (ranges or "").lstrip("/"))
         except SwarmError as error:
             raise self.said(str(error).removesuffix(".")) from error
         states = ParameterTable.of(swarm.robots, swarm.surveyed).filter_size - 3 * len(robots)
@@ -444,6 +458,7 @@ def _tree(swarm: Swarm, folder: Path) -> Entries:
         "landmarks": landmarks,
         "cameras": cameras,
         "anchors": anchors,
+        "range_topic": swarm.range_topic,
         "map": None if swarm.map is None else relpath(swarm.map, folder),
     }
     return {key: value for key, value in tree.items() if value}

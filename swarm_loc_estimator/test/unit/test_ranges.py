@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.cdr import RANGE as PAIR_TYPE
 from swarm_loc_estimator.common.messages.cdr import RANGES as MESSAGE_TYPE
 from swarm_loc_estimator.common.messages.cdr import encode
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
@@ -26,6 +27,7 @@ from swarm_loc_estimator.filter.models import MODELS, RANGE, RANGE_DIFFERENCE
 from swarm_loc_estimator.precompile import size_of
 from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.swarm.swarm import Anchor, Robot, Swarm, UwbDevice
+from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm, save_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.settings import Policy, Settings
 
@@ -422,3 +424,56 @@ def test_the_biases_of_anchors_are_estimated(settings: Settings, seed: int) -> N
         assert (anchor.x, anchor.y, anchor.position_sigma) == (before.x, before.y, 0.0)
     error = errors(world, estimates)[20:]
     assert np.sqrt(np.square(error[..., :2]).sum(axis=-1).mean()) < 0.06
+
+
+def pair_message(value: float, variance: float, *, limits: tuple[float, float] = (0.0, 0.0)) -> bytes:
+    """A sensor_msgs/Range."""
+    low, high = limits
+    fields = {"min_range": low, "max_range": high, "range": value, "variance": variance}
+    return encode({"header": {"stamp": T0, "frame_id": "n_1"}, **fields}, PAIR_TYPE)
+
+
+def test_ranges_on_a_topic_of_two_radios_are_those_of_arrays(tmp_path: Path) -> None:
+    """Either order, a variance or none, as before ROS 2 Iron; what is outside of the limits is none."""
+    path = tmp_path / "swarm.yaml"
+    path.write_text(
+        "fileversion: 1\nrange_topic: /uwb/n_{from}/n_{to}/distance\n"
+        "robots: {a: {uwb: {address: 1}}, b: {uwb: {address: 2}}}\nanchors: [{address: 16, x: 0, y: 0}]\n"
+    )
+    swarm = load_swarm(path)
+    save_swarm(swarm, tmp_path / "again.yaml")
+    assert load_swarm(tmp_path / "again.yaml") == swarm
+    ingest = Ingest(swarm)
+    sent = [
+        ("uwb/n_1/n_2/distance", pair_message(1.5, 0.25)),
+        ("uwb/n_16/n_2/distance", pair_message(2.5, 0.0)[:-4]),
+        ("uwb/n_2/n_16/distance", pair_message(3.5, 0.0, limits=(0.5, 3.0))),
+        ("uwb/n_2/n_1/distance", pair_message(float("inf"), 0.0)),
+        ("uwb/n_2/n_1/distance", pair_message(4.5, 0.0)[:-8]),
+    ]
+    messages = [
+        SerializedMessage(ingest.handle_of[name], data, T0 + k) for k, (name, data) in enumerate(sent)
+    ]
+    (batch,) = ingest.read(MessageBatch.of(messages))
+    rows = batch["ranges"]
+    assert rows.robot.tolist() == [0, 1]
+    assert rows.device.tolist() == [2, 16]
+    assert rows.range.tolist() == [1.5, 2.5]
+    assert rows.variance.tolist() == [0.25, 0.0]
+    assert rows.stamp_ns.tolist() == [T0, T0]
+    assert rows.arrival_ns.tolist() == [T0, T0 + 1]
+    assert batch.dropped == {"uwb_out_of_limits": 2, "bad_message": 1}
+    names = {topic.name for topic in ingest.topics}
+    assert "a/ranges" not in names
+    assert "uwb/n_16/n_16/distance" not in names
+
+
+@pytest.mark.parametrize(
+    "topic",
+    ["uwb/{from}", "{to}/{from}/{from}", "/uwb//{from}/{to}", "a b/{from}/{to}", "/{from}/{to}/", "1"],
+)
+def test_a_topic_of_two_radios_has_both_names_once(topic: str, tmp_path: Path) -> None:
+    path = tmp_path / "swarm.yaml"
+    path.write_text(f"fileversion: 1\nrange_topic: '{topic}'\nrobots: {{a: {{}}}}\n")
+    with pytest.raises(SwarmFileError, match=r"range_topic is .* but must be a topic with"):
+        load_swarm(path)

@@ -31,6 +31,7 @@ MESSAGE_PACKAGE = "swarm_loc_msgs"
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 IMU = "sensor_msgs/msg/Imu"
+RANGE = "sensor_msgs/msg/Range"
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
 OCCUPANCY_GRID = "nav_msgs/msg/OccupancyGrid"
 POSE_STAMPED = "geometry_msgs/msg/PoseStamped"
@@ -85,6 +86,8 @@ sensor_msgs/Imu: Header header, geometry_msgs/Quaternion orientation, float64[9]
 sensor_msgs/LaserScan: Header header, float32 angle_min, float32 angle_max, float32 angle_increment,
     float32 time_increment, float32 scan_time, float32 range_min, float32 range_max, float32[] ranges,
     float32[] intensities
+sensor_msgs/Range: Header header, uint8 radiation_type, float32 field_of_view, float32 min_range,
+    float32 max_range, float32 range, float32 variance
 sensor_msgs/RegionOfInterest: uint32 x_offset, uint32 y_offset, uint32 height, uint32 width, bool do_rectify
 sensor_msgs/CameraInfo: Header header, uint32 height, uint32 width, string distortion_model, float64[] d,
     float64[9] k, float64[9] r, float64[12] p, uint32 binning_x, uint32 binning_y, RegionOfInterest roi
