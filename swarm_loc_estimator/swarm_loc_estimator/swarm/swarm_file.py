@@ -129,7 +129,7 @@ MOUNT = ("x", "y", "z", "yaw", "pitch", "roll")  # Numbers that transforms tell 
 RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
 MAX_ID, MAX_ADDRESS = 2**32 - 1, 2**64 - 1
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-RANGE_TOPIC = re.compile(r"/?(?:\w+|\{from\}|\{to\})+(?:/(?:\w+|\{from\}|\{to\})+)*")
+RANGE_TOPIC = re.compile(r"/?(?:\w|\{from\}|\{to\})+(?:/(?:\w|\{from\}|\{to\})+)*")
 MAX_NAME = 64  # Maximum length of a robot name; DDS limits the length of topic names
 _RESERVED = (
     *("aerial", "clock", "diagnostics", "estimator", "map", "mapper", "odom", "parameter_events"),

@@ -470,7 +470,15 @@ def test_ranges_on_a_topic_of_two_radios_are_those_of_arrays(tmp_path: Path) -> 
 
 @pytest.mark.parametrize(
     "topic",
-    ["uwb/{from}", "{to}/{from}/{from}", "/uwb//{from}/{to}", "a b/{from}/{to}", "/{from}/{to}/", "1"],
+    [
+        "uwb/{from}",
+        "{to}/{from}/{from}",
+        "/uwb//{from}/{to}",
+        "a b/{from}/{to}",
+        "/{from}/{to}/",
+        "1",
+        40 * "a" + "-{from}/{to}",
+    ],
 )
 def test_a_topic_of_two_radios_has_both_names_once(topic: str, tmp_path: Path) -> None:
     path = tmp_path / "swarm.yaml"
