@@ -350,7 +350,7 @@ def _check_headings(robot: Robot, own: OdometryRows) -> Iterator[Finding]:
         for half in np.array_split(np.arange(seconds.size), 2)
         if np.abs(wanted[half]).sum() > _TURNED_RAD
     ]
-    moves = np.ptp(own.pose[:, :2]) > _STANDS_M if own.robot.size else False
+    moves = own.robot.size > 0 and bool((np.ptp(own.pose[:, :2], axis=0) > _STANDS_M).any())
     if moves and len(shares) == 2 and max(shares) < _SHARE_TURNED:
         problem = f"has headings that turn {max(shares):.2g} times as its twists"
         remedy = "Correct the driver: it publishes the orientation, and angular.z in radians per second"
