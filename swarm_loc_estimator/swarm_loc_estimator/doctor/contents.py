@@ -274,9 +274,8 @@ def _same_odometry(evidence: Evidence) -> Iterator[Finding]:
     """Two robots with the same odometry: one driver for two names."""
     rows = evidence.rows("odometry")
     poses = {robot: rows.pose[rows.robot == robot] for robot in np.unique(rows.robot).tolist()}
-    moving = {
-        robot: pose for robot, pose in poses.items() if len(pose) > _MIN_ROWS and np.ptp(pose[:, :2]) > 0.01
-    }
+    long = {robot: pose for robot, pose in poses.items() if len(pose) > _MIN_ROWS}
+    moving = {robot: pose for robot, pose in long.items() if np.ptp(pose[:, :2], axis=0).max() > 0.01}
     for one, other in combinations(moving, 2):
         count = min(len(moving[one]), len(moving[other]))
         if np.array_equal(moving[one][:count], moving[other][:count]):
