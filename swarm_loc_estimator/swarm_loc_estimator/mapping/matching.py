@@ -161,7 +161,8 @@ def match_pairs(
     Args:
         scans: All stops.
         pairs: (p, 2).
-        places: (p,) number from 0 on of the first scan that the stop with the beams is part of; -1: none.
+        places: (p,) number from 0 on of the two places of a pair, of which a first scan was made at one, and
+            whose way along a corridor is tested together in both directions; -1: not tested.
         weights: (p,) weight of each pair, since its beams share errors.
         gate: See `beam_residual` [m].
         stride: Every `stride`-th beam is used, with `stride` times the weight.

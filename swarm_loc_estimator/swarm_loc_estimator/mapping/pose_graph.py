@@ -562,8 +562,9 @@ class PoseGraph:
                     weights.append(min(1.0, (_START_WEIGHT if start else _MATCH_WEIGHT) / len(targets)))
         if pairs:
             index = np.array(pairs, dtype=np.int64)
-            first = [self.place[stop] if stop in self.starts else -1 for stop, _ in pairs]
-            places: IntArray = np.unique([-1, *first], return_inverse=True)[1][1:] - 1
+            at = np.sort(self.place[index], axis=1)
+            _, places = np.unique(at[:, 0] * self.count + at[:, 1], return_inverse=True)
+            places[[not self.starts.intersection(pair) for pair in pairs]] = -1
             squares, gradient = match_pairs(self.scans, index, places, np.array(weights), gate, stride)
             unknowns = STOP_UNKNOWNS * index[:, :, None] + np.arange(STOP_UNKNOWNS)
             equations.add_blocks(unknowns.reshape(-1, 8), squares, gradient)

@@ -235,7 +235,7 @@ def at_a_wrong_place(patch: pytest.MonkeyPatch) -> tuple[CooperativeMapper, Room
 
 def test_a_place_that_later_stops_contradict_is_taken_back(monkeypatch: pytest.MonkeyPatch) -> None:
     mapper, robot, before = at_a_wrong_place(monkeypatch)
-    for _ in range(4):
+    for _ in range(6):
         goal = mapper.goal(0)
         if goal is None:
             seek(mapper, robot)
