@@ -90,8 +90,7 @@ def environment(tmp_path: Path) -> dict[str, str]:
 
 @pytest.mark.timeout(300)  # a build of C and Python code
 def test_named_poses_become_fixes(environment: dict[str, str], swarm_file: Path) -> None:
-    here = Path(__file__).parent
-    paths = [str(here), str(here.parent / "unit"), environment["PYTHONPATH"]]
+    paths = [str(Path(__file__).parents[1] / "worlds"), environment["PYTHONPATH"]]
     run = subprocess.run(
         [sys.executable, "-c", EXCHANGE, str(swarm_file)],
         env={**environment, "PYTHONPATH": os.pathsep.join(paths)},
