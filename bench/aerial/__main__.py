@@ -1,29 +1,19 @@
-"""Robots that find themselves among anonymous ones in images from above: success rates and the paper's.
-
-Paper (two robots): 96.9 % by turns, 84 % by straight ways, 82.2 % by random motion.
-"""
+"""Robots that find themselves among anonymous ones in images from above: success rates, times, detections."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from bench.aerial import calibration, cases, detector, driving, rendered, straight, turning
+from bench.aerial import calibration, cases, detector, driving, rendered
 from bench.aerial.rates import SWARMS, Results
 from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
 
 _METHODS = {
-    "angular": "angular.n{}.success",
-    "linear": "linear.n{}.success",
-    "random": "random.n{}.success",
     "chained, 4 images": "chained4.n{}.success",
     "... scale unknown": "random.n{}.scale_unknown.success",
 }
-_TIMES = {
-    "angular": "angular.n{}.us_per_robot_picture",
-    "linear": "linear.n{}.us_per_robot_picture",
-    "chained": "chained4.n{}.us_per_robot_picture",
-}
+_TIME = "chained4.n{}.us_per_robot_picture"
 
 
 def main() -> None:
@@ -33,28 +23,19 @@ def main() -> None:
     parser.add_argument("--share", type=float, default=1.0, help="of the usual number of trials")
     arguments = parser.parse_args()
     results, share, seed = Results(), arguments.share, arguments.seed
-    turning.measure(results, max(50, round(5000 * share)), seed)
-    straight.measure(results, max(20, round(1000 * share)), seed)
     driving.measure(results, max(10, round(200 * share)), seed)
     reliability = calibration.measure(results, max(20, round(300 * share)), seed)
-    results.values["heading_exact_rad"] = driving.heading_error(seed)
-    print(table(["success [%]", *(f"n = {n}" for n in SWARMS)], _rows(results)))
-    times: list[list[Cell]] = [
-        [name, *(results.values[key.format(n)] for n in SWARMS)] for name, key in _TIMES.items()
+    rows: list[list[Cell]] = [
+        [f"{name} [%]", *(f"{100.0 * results.rates[key.format(n)].share:.1f}" for n in SWARMS)]
+        for name, key in _METHODS.items()
     ]
-    print(table(["time [us per robot and image]", *(f"n = {n}" for n in SWARMS)], times))
+    rows.append(["time per robot and image [us]", *(results.values[_TIME.format(n)] for n in SWARMS)])
+    print(table(["success of", *(f"n = {n}" for n in SWARMS)], rows))
     seen = detector.measure(seed, max(2, round(detector.SEEDS * share)))
     seen |= cases.measure()
     seen |= rendered.measure(seed, max(1, round(rendered.WORLDS_RUN * share)))
     print(write_figures("aerial", {**results.figures(), **seen}))
     print(_drawn(results), _reliability_drawn(reliability), sep="\n")
-
-
-def _rows(results: Results) -> list[list[Cell]]:
-    return [
-        [name, *(f"{100.0 * results.rates[key.format(n)].share:.1f}" for n in SWARMS)]
-        for name, key in _METHODS.items()
-    ]
 
 
 def _drawn(results: Results) -> Path:
@@ -67,17 +48,14 @@ def _drawn(results: Results) -> Path:
         below = [max(0.0, share - end[0]) for share, end in zip(shares, ends, strict=True)]
         above = [max(0.0, end[1] - share) for share, end in zip(shares, ends, strict=True)]
         rates.errorbar(SWARMS, shares, yerr=[below, above], label=name, capsize=2, marker=".")
-    rates.plot(2, 96.9, "k^", 2, 84.0, "kv", 2, 82.2, "ks", markersize=5)
-    rates.set(xlabel="robots", ylabel="success [%] (black: paper)", xscale="log", ylim=(0.0, 102.0))
+    rates.set(xlabel="robots", ylabel="success [%]", xscale="log", ylim=(0.0, 102.0))
     rates.set_xticks(SWARMS, [str(n) for n in SWARMS])
     rates.minorticks_off()
     rates.legend(fontsize=8)
-    for name, key in _TIMES.items():
-        times.loglog(SWARMS, [results.values[key.format(n)] for n in SWARMS], marker=".", label=name)
+    times.loglog(SWARMS, [results.values[_TIME.format(n)] for n in SWARMS], marker=".")
     times.set(xlabel="robots", ylabel="time per robot and image [us]")
     times.set_xticks(SWARMS, [str(n) for n in SWARMS])
     times.minorticks_off()
-    times.legend(fontsize=8)
     return save_plot(figure, "aerial")
 
 

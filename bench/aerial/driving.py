@@ -1,4 +1,4 @@
-"""Random motion: two images as in the paper, and chains over more, also in a dense arena."""
+"""Random motion: chains over images, also in a dense arena."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.aerial.paper_methods import identify_by_way, own_displacement, relation
 from bench.aerial.rates import SWARMS, Results
 from bench.aerial.worlds import PERIOD_NS, Conditions, World, picture_of, simulate
 from swarm_loc_estimator.identification.anchors import Scale
@@ -25,7 +24,6 @@ _DENSE = (7, 9, 13)  # Numbers of images of the dense arena; the last one makes 
 def measure(results: Results, worlds: int, seed: int) -> None:
     """All success rates of random motion; robots of one world share the error of its scale."""
     for n in SWARMS:
-        _pairs(results, n, worlds, np.random.default_rng([seed, 3, n]))
         _chained(results, n, max(10, worlds // 2), np.random.default_rng([seed, 4, n]))
     for images in _DENSE:
         conditions = Conditions(SWARMS[-1], images, (4.0, 4.0))
@@ -35,20 +33,6 @@ def measure(results: Results, worlds: int, seed: int) -> None:
         results.count(
             name if images == _DENSE[-1] else f"dense.n50.images{images}.last_picture.success", right, trials
         )
-
-
-def _pairs(results: Results, n: int, worlds: int, rng: np.random.Generator) -> None:
-    """Two images, by the way alone."""
-    right = trials = 0
-    for _ in range(worlds):
-        world = simulate(Conditions(n, 2), rng)
-        for robot in range(min(n, _ROBOTS_PER_WORLD)):
-            first, second = world.images
-            own = complex(world.own[1, robot] - world.own[0, robot])
-            true = (world.place_of(robot, 0), world.place_of(robot, 1))
-            right += identify_by_way(first, second, own)[:2] == true
-            trials += 1
-    results.count(f"random.n{n}.success", right, trials)
 
 
 def _chained(results: Results, n: int, worlds: int, rng: np.random.Generator) -> None:
@@ -85,17 +69,3 @@ def followed(world: World, robot: int, conditions: Conditions, model: ChainModel
         picture = picture_of(positions, conditions.sigma)
         chains = chains.advanced(picture, world.track(robot, k), k * PERIOD_NS)
         yield chains
-
-
-def heading_error(seed: int) -> float:
-    """The largest error of the closed form's heading without noise [rad]."""
-    rng = np.random.default_rng([seed, 6])
-    worst = 0.0
-    for _ in range(1000):
-        heading, scale = rng.uniform(-np.pi, np.pi), rng.uniform(0.1, 100.0)
-        own = complex(own_displacement(rng.uniform(0.1, 0.5, 100), rng.uniform(-0.35, 0.35, 100), 0.1))
-        if abs(own) < 1e-3:
-            continue
-        found = relation(scale * np.exp(1j * heading) * own, own)
-        worst = max(worst, abs(float(np.angle(np.exp(1j * (found.heading - heading))))))
-    return worst

@@ -5,7 +5,8 @@ to 20 degrees/s, which change after 0 to 3 s; a robot that meets a wall or anoth
 the spot, at a random speed that it keeps until the way is free (10 to 20 degrees/s, either way: that is not
 printed). The arena's size is not printed, but its scale of about 21.4 pixels per unit is: an image of 640 x
 480 pixels shows 30 x 22 units of it. The dense arena has 4 x 4. The noise of a position (0.05 unit) and the
-scale's error (2 %) are not printed either; with them the printed method has about the printed success rate.
+scale's error (2 %) are not printed either; with them the method of the paper has about the printed success
+rate (`304ddb9b:bench/aerial/driving.py`).
 """
 
 from __future__ import annotations
@@ -18,8 +19,11 @@ import numpy as np
 from swarm_loc_estimator.identification.picture import Picture, TrackPoint
 
 if TYPE_CHECKING:
-    from bench.aerial.paper_methods import ComplexArray
+    from numpy.typing import NDArray
+
     from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+
+    ComplexArray = NDArray[np.complex128]
 
 PERIOD_S = 10.0
 PERIOD_NS = 10_000_000_000

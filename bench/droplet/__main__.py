@@ -3,11 +3,10 @@
     make bench-droplet
     make bench-droplet ARGS="--poses 500 --live 0 --replays 1"
 
-Bearings and headings are uniform, readings have one count of noise and saturate at 255. "closed form" are
-the Droplet paper's equations, corrected, on the power that suits; "likelihood" uses all readings of both
-powers. Beside it stands the Cramer-Rao bound, which no unbiased estimate betters. "mismatch" are robots whose
-elements differ by 10 %, before and after their gains were calibrated from 200 exchanges of the two, poses
-unknown and known. At the end a swarm of 20 is localized through infrared, see bench/droplet/swarm.py.
+Bearings and headings are uniform, readings have one count of noise and saturate at 255. Beside errors stands
+the Cramer-Rao bound, which no unbiased estimate betters. "mismatch" are robots whose elements differ by 10 %,
+before and after their gains were calibrated from 200 exchanges of the two, poses unknown and known. At the
+end a swarm of 20 is localized through infrared, see bench/droplet/swarm.py.
 """
 
 from __future__ import annotations
@@ -22,7 +21,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.droplet import swarm as droplet_swarm
-from bench.droplet.closed_form import ClosedForm, IrEstimator
 from bench.droplet.cramer_rao import information
 from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -37,7 +35,6 @@ CENTIMETRES = (6, 8, 10, 12, 13, 14, 15, 16, 18, 20, 24, 28)
 POSES, LIVE, REPLAYS = 12000, 2, 6
 MISMATCH, CALIBRATION, COUPLES = 0.1, 200, 12
 """How much elements of each of so many couples of robots differ, and their exchanges to calibrate with."""
-DIAMETER_CM = 4.4  # Within which the paper finds all ranges (section V)
 _TIMED, _REPEATS = 200, 20
 _SEED = 3
 _UNITS = np.array([100.0, np.degrees(1.0), np.degrees(1.0)])
@@ -52,7 +49,6 @@ class Errors:
     worst: FloatArray  # (3,) largest
     nees: float  # Ideally 3
     found: float  # Share of poses that there are
-    within: float  # Share of ranges that err by less than the robot's diameter
 
     @classmethod
     def of(cls, solutions: IrSolutions, poses: FloatArray) -> Errors:
@@ -68,7 +64,6 @@ class Errors:
             size.max(axis=0),
             float(np.mean(np.sum(errors * solved, axis=1))),
             float(found.mean()),
-            float(np.mean(size[:, 0] < DIAMETER_CM)),
         )
 
 
@@ -88,75 +83,44 @@ def readings_of(
 
 
 def accuracy(poses_each: int) -> dict[str, float]:
-    """Both estimators at all ranges, of elements that are alike; prints, draws, and returns figures."""
+    """Errors at all ranges, of elements that are alike; prints, draws, and returns figures."""
     platform = replace(load_ir_platform("droplet"), element_sigma=0.0)
-    estimators: dict[str, IrEstimator] = {
-        "closed_form": ClosedForm(platform),
-        "ml": MaximumLikelihood(platform),
-    }
+    estimator = MaximumLikelihood(platform)
     figures: dict[str, float] = {}
     rows: list[list[Cell]] = []
-    curves: dict[str, list[FloatArray]] = {"closed_form": [], "ml": [], "bound": []}
-    ratios = []
-    # at each range: errors of both, and the bound of Cramer and Rao
+    curves: dict[str, list[FloatArray]] = {"ml": [], "bound": []}
+    # at each range: errors, and the bound of Cramer and Rao
     for centimetres in CENTIMETRES:
         rng = np.random.default_rng([centimetres, _SEED])
         poses = random_poses(rng, poses_each, centimetres, centimetres)
         readings = readings_of(platform, poses, rng)
         bound = np.diagonal(np.linalg.inv(information(platform, poses)), axis1=1, axis2=2)
         limit = np.sqrt(np.mean(bound, axis=0)) * _UNITS
-        row: list[Cell] = [centimetres]
-        for name, estimator in estimators.items():
-            errors = Errors.of(estimator.solve(readings), poses)
-            figures |= named(f"{name}.r{centimetres}", errors.mean)
-            figures[f"{name}.r{centimetres}.nees"] = errors.nees
-            row += [*map(float, errors.mean), errors.nees]
-            curves[name].append(errors.rms)
-        ratio = curves["ml"][-1] / limit
+        errors = Errors.of(estimator.solve(readings), poses)
+        ratio = errors.rms / limit
+        figures |= named(f"ml.r{centimetres}", errors.mean)
+        figures[f"ml.r{centimetres}.nees"] = errors.nees
         figures[f"ml.r{centimetres}.rmse_over_crb"] = float(ratio.max())
-        rows.append([*row, float(errors.worst[0]), *map(float, ratio)])
+        values = (*errors.mean, errors.nees, errors.worst[0], *ratio)
+        rows.append([centimetres, *map(float, values)])
+        curves["ml"].append(errors.rms)
         curves["bound"].append(limit)
-        ratios.append(ratio)
         print(f"\rat {centimetres:2} cm", end="", flush=True)
     # table and plot
-    head = [
-        "R cm",
-        "closed cm",
-        "deg",
-        "deg",
-        "NEES",
-        "ml cm",
-        "deg",
-        "deg",
-        "NEES",
-        "worst cm",
-        "rms/CRB",
-        "",
-        "",
-    ]
+    head = ["R cm", "ml cm", "deg", "deg", "NEES", "worst cm", "rms/CRB", "", ""]
     print("\rmean errors of range, bearing, heading\n" + table(head, rows))
-    draw({name: np.array(curve) for name, curve in curves.items()}, np.array(ratios))
-    return figures | over_all_ranges(platform, estimators, poses_each)
-
-
-def over_all_ranges(platform: IrPlatform, estimators: dict[str, IrEstimator], count: int) -> dict[str, float]:
-    """What holds for all ranges together."""
+    draw({name: np.array(curve) for name, curve in curves.items()})
+    # all ranges together
     rng = np.random.default_rng(7)
-    far, near = random_poses(rng, count, 16, 28), random_poses(rng, 3 * count, 6, 28)
-    closed = Errors.of(estimators["closed_form"].solve(readings_of(platform, far, rng)), far)
-    likely = Errors.of(estimators["ml"].solve(readings_of(platform, near, rng)), near)
-    figures = {
-        "closed_form.within_diameter_16_28": closed.within,
-        "ml.worst_range_cm": float(likely.worst[0]),
-        "ml.found_6_28": likely.found,
-        "ml.nees_6_28": likely.nees,
+    poses = random_poses(rng, 3 * poses_each, 6, 28)
+    errors = Errors.of(estimator.solve(readings_of(platform, poses, rng)), poses)
+    together = {
+        "worst_range_cm": float(errors.worst[0]),
+        "found_6_28": errors.found,
+        "nees_6_28": errors.nees,
     }
-    print(
-        f"closed form within one diameter of {DIAMETER_CM} cm, 16-28 cm: {100.0 * closed.within:.2f} %"
-        f" (the paper: always); likelihood, 6-28 cm: worst range {likely.worst[0]:.2f} cm,"
-        f" NEES {likely.nees:.2f}, found {100.0 * likely.found:.2f} %"
-    )
-    return figures
+    print(table(["likelihood, 6-28 cm", "value"], list(together.items())))
+    return figures | {f"ml.{name}": value for name, value in together.items()}
 
 
 def mismatch(poses_each: int) -> dict[str, float]:
@@ -219,11 +183,7 @@ def times() -> dict[str, float]:
     alike, differing = (replace(load_ir_platform("droplet"), element_sigma=s) for s in (0.0, MISMATCH))
     rng = np.random.default_rng(3)
     readings = readings_of(alike, random_poses(rng, _TIMED, 6, 28), rng)
-    solvers: dict[str, IrEstimator] = {
-        "closed_form": ClosedForm(alike),
-        "ml": MaximumLikelihood(alike),
-        "ml.gains_unknown": MaximumLikelihood(differing),
-    }
+    solvers = {"ml": MaximumLikelihood(alike), "ml.gains_unknown": MaximumLikelihood(differing)}
     for name, estimator in solvers.items():
         single = best_time(estimator, np.split(readings, _TIMED))
         many = best_time(estimator, [readings])
@@ -233,7 +193,7 @@ def times() -> dict[str, float]:
     return figures
 
 
-def best_time(estimator: IrEstimator, calls: Sequence[FloatArray]) -> float:
+def best_time(estimator: MaximumLikelihood, calls: Sequence[FloatArray]) -> float:
     """Microseconds per pair of the fastest of some runs through all calls."""
     runs = []
     for _ in range(_REPEATS):
@@ -244,14 +204,10 @@ def best_time(estimator: IrEstimator, calls: Sequence[FloatArray]) -> float:
     return 1e6 * min(runs) / sum(len(readings) for readings in calls)
 
 
-def draw(curves: dict[str, FloatArray], ratios: FloatArray) -> None:
+def draw(curves: dict[str, FloatArray]) -> None:
     """Errors by range beside the bound."""
     figure, axes = new_plot(4, width=4.2, height=3.8)
-    names = {
-        "closed_form": ("closed form", "C3"),
-        "ml": ("likelihood", "C0"),
-        "bound": ("Cramer-Rao bound", "0.4"),
-    }
+    names = {"ml": ("likelihood", "C0"), "bound": ("Cramer-Rao bound", "0.4")}
     for place, unit in zip(range(3), ("range [cm]", "bearing [deg]", "heading [deg]"), strict=True):
         for name, (label, colour) in names.items():
             style = "--" if name == "bound" else "-"
@@ -259,8 +215,8 @@ def draw(curves: dict[str, FloatArray], ratios: FloatArray) -> None:
                 CENTIMETRES, curves[name][:, place], style, color=colour, label=label, marker="."
             )
         axes[place].set(xlabel="distance [cm]", ylabel=f"rms error of {unit}", yscale="log")
-    axes[0].axhline(DIAMETER_CM, color="C2", linewidth=1.0, label="the paper's bound")
     axes[0].legend()
+    ratios = curves["ml"] / curves["bound"]
     for place, label in enumerate(("range", "bearing", "heading")):
         axes[3].plot(CENTIMETRES, ratios[:, place], marker=".", label=label)
     axes[3].axhline(1.0, color="0.4", linestyle="--")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from bench.aerial import calibration, driving, straight, turning
+from bench.aerial import calibration, driving
 from bench.aerial.rates import Rate, Results
 from bench.aerial.worlds import Conditions, simulate
 from swarm_loc_estimator.identification.chain import ChainModel
@@ -30,16 +30,6 @@ def test_the_interval_of_a_rate_holds_it_and_narrows() -> None:
         assert 0.0 <= low <= rate.share <= high + 1e-12 <= 1.0 + 1e-9
     assert many.interval[1] - many.interval[0] < few.interval[1] - few.interval[0]
     assert few.interval == pytest.approx((0.596, 0.982), abs=0.001)  # as tables of Wilson's interval have it
-
-
-def test_all_figures_are_measured() -> None:
-    results = Results()
-    turning.measure(results, 50, SEED)
-    straight.measure(results, 20, SEED)
-    figures = results.figures()
-    assert figures["angular.n50.rotations4.success"] >= 0.9
-    assert figures["linear.n2.success"] >= 0.8
-    assert driving.heading_error(SEED) < 1e-9
 
 
 def test_chains_find_most_robots_and_sure_answers_are_right() -> None:

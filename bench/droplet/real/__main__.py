@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.droplet.closed_form import ClosedForm, IrEstimator
 from bench.droplet.real import firmware, graph
 from bench.droplet.real.recordings import Recorded, read_folder
 from bench.shared.common import OUT, Cell, ProgressLine, table, write_figures
@@ -38,10 +37,10 @@ from swarm_loc_estimator.offline.calibration.infrared.board import (
     turned,
     without_dead,
 )
-from swarm_loc_estimator.swarm.ir_board import IrPlatform, load_ir_platform
+from swarm_loc_estimator.swarm.ir_board import load_ir_platform
 
 DEFAULT_FOLDER = OUT.parent.parent / "shared" / "data" / "droplet_2016"
-METHODS = ("firmware", "closed_form", "stock", "board")
+METHODS = ("firmware", "stock", "board")
 RANGES = (0.05, 0.2)
 _CHI_SQUARE_99 = 11.345
 _UNITS = np.array([100.0, np.degrees(1.0), np.degrees(1.0)])
@@ -115,18 +114,7 @@ def add(done: BoardCalibration, data: BoardReadings, results: dict[str, Results]
     truth = turned(data.poses, yaw[data.receiver], yaw[data.transmitter])
     paper = load_ir_platform("droplet")
     stock = replace(paper, amplitudes=paper.amplitudes[:1])
-    far = IrPlatform(
-        stock.angles,
-        stock.sensor,
-        stock.emitter,
-        model.platform.amplitudes,
-        saturation=model.platform.saturation,
-    )
-    estimators: dict[str, IrEstimator] = {
-        "closed_form": ClosedForm(replace(far, noise=model.platform.noise)),
-        "stock": MaximumLikelihood(stock),
-        "board": MaximumLikelihood(model.platform),
-    }
+    estimators = {"stock": MaximumLikelihood(stock), "board": MaximumLikelihood(model.platform)}
     found = firmware.solve(data.readings, np.array(model.platform.angles))
     gather(results["firmware"], found, truth, None)
     readings = data.readings[:, None]

@@ -55,7 +55,6 @@ def robots() -> Robots:
         ("get_id", "My ID is: 0029\r\n"),
         ("move_steps 0 50", "walk direction 0, num_steps 50\r\n"),
         ("move_steps 0 0", ""),
-        ("walk 3 30", "In order to go in direction 3 for 30 mm, taking 100 steps.\r\n"),
         ("stop_walk", ""),
         ("set_ir 40", ""),
         ("rnb_b", ""),

@@ -11,6 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from workspace import install, shared
+from workspace.build import PYTHON_ONLY
+from workspace.stamps import digest
+
 PACKAGE = "motion_capture_tracking_interfaces"
 SOURCES = {
     "msg/NamedPose.msg": "string name\ngeometry_msgs/Pose pose\n",
@@ -71,27 +75,42 @@ ros.close()
 
 @pytest.fixture
 def environment(tmp_path: Path) -> dict[str, str]:
-    """The environment with the package in it."""
+    """The environment with the package in it, which is built once for all clones, as the workspace's own."""
     if find_spec(PACKAGE):
         return dict(os.environ)
     pytest.importorskip("colcon_core")
-    for name, text in SOURCES.items():
-        path = tmp_path / "src" / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text, encoding="utf-8")
-    command = [sys.executable, "-m", "colcon", "--log-base", "log", "build", "--merge-install"]
-    built = subprocess.run([*command, "--paths", "src"], cwd=tmp_path, check=False, capture_output=True)
-    assert built.returncode == 0, built.stderr.decode()
-    install = tmp_path / "install"
-    (python,) = [path.parent for path in install.glob("lib/python*/*-packages/*") if path.name == PACKAGE]
-    added = {"AMENT_PREFIX_PATH": install, "LD_LIBRARY_PATH": install / "lib", "PYTHONPATH": python}
+    built, versions = tmp_path / "install", install.versions()
+    key = f"{PACKAGE}-{digest([], versions, PYTHON_ONLY.read_text(encoding='utf-8'), *SOURCES.values())}"
+    if not versions or not shared.take(key, built):
+        for name, text in SOURCES.items():
+            path = tmp_path / "src" / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+        command = [
+            sys.executable,
+            "-m",
+            "colcon",
+            "--log-base",
+            "log",
+            "build",
+            "--merge-install",
+            "--paths",
+            "src",
+        ]
+        if versions:
+            command += ["--cmake-args", f"-Drosidl_default_generators_DIR={PYTHON_ONLY.parent}"]
+        done = subprocess.run(command, cwd=tmp_path, check=False, capture_output=True)
+        assert done.returncode == 0, done.stderr.decode()
+        if versions:
+            shared.keep(key, built)
+    (python,) = [path.parent for path in built.glob("lib/python*/*-packages/*") if path.name == PACKAGE]
+    added = {"AMENT_PREFIX_PATH": built, "LD_LIBRARY_PATH": built / "lib", "PYTHONPATH": python}
     return {**os.environ, **{name: f"{path}:{os.environ.get(name, '')}" for name, path in added.items()}}
 
 
 @pytest.mark.timeout(300)  # a build of C and Python code
 def test_named_poses_become_fixes(environment: dict[str, str], swarm_file: Path) -> None:
-    here = Path(__file__).parent
-    paths = [str(here), str(here.parent / "unit"), environment["PYTHONPATH"]]
+    paths = [str(Path(__file__).parents[1] / "worlds"), environment["PYTHONPATH"]]
     run = subprocess.run(
         [sys.executable, "-c", EXCHANGE, str(swarm_file)],
         env={**environment, "PYTHONPATH": os.pathsep.join(paths)},

@@ -34,7 +34,7 @@ def machines() -> Iterator[list[socket.socket]]:
                 process = stack.enter_context(
                     subprocess.Popen(
                         [sys.executable, "-c", END, *map(str, numbers)],
-                        cwd=Path(__file__).parent,
+                        cwd=Path(__file__).parents[1] / "worlds",
                         pass_fds=numbers,
                     )
                 )

@@ -135,8 +135,8 @@ def test_a_robot_with_sparse_truth_gains_from_its_type() -> None:
 
 
 def test_the_noise_makes_the_estimator_consistent_and_better() -> None:
-    recording, swarm = record(World((robot(1, TRUE),), 9, duration_s=120.0, turn_sigma=0.03))
-    done = calibrate(recording, swarm, Options(evaluations=12), quiet)
+    recording, swarm = record(World((robot(1, TRUE),), 9, duration_s=80.0, turn_sigma=0.03))
+    done = calibrate(recording, swarm, Options(evaluations=8), quiet)
     assert done.before is not None
     assert done.after is not None
     assert done.after.position_rmse < 0.5 * done.before.position_rmse
@@ -155,21 +155,21 @@ def test_a_plain_fit_changes_nothing_but_noise() -> None:
 
 def test_a_recording_that_is_too_short_to_fit_is_named() -> None:
     recording, swarm = record(World((robot(1, HONEST),), 2, duration_s=60.0, turn_sigma=0.03))
-    warning = calibrate(recording, swarm, Options(evaluations=8), quiet).warning
+    warning = calibrate(recording, swarm, Options(evaluations=4), quiet).warning
     assert warning.startswith("The recording is too short to fit, or the description was as good before")
     fitted, described = (float(text) for text in re.findall(r"([\d.]+) mm", warning))
     assert fitted > described
     recording, swarm = record(World((robot(1, TRUE),), 2, duration_s=60.0, turn_sigma=0.03))
-    assert not calibrate(recording, swarm, Options(evaluations=8), quiet).warning
+    assert not calibrate(recording, swarm, Options(evaluations=4), quiet).warning
 
 
 def test_the_command_names_a_bag_that_is_cut_too_short(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    copy_part(BAGS / "eight_five_robots", tmp_path / "bag", 75.0)
+    copy_part(BAGS / "eight_five_robots", tmp_path / "bag", 20.0)
     out = tmp_path / "out.yaml"
     command = [str(tmp_path / "bag"), "--swarm", str(BAGS / "eight_five_robots" / "swarm.yaml")]
-    assert main([*command, "--out", str(out), "--evaluations", "4"]) == 0
+    assert main([*command, "--out", str(out), "--evaluations", "2"]) == 0
     assert "The recording is too short to" in capsys.readouterr().out
     assert "The recording is too short to" in out.read_text(encoding="utf-8")
 

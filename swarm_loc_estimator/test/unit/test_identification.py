@@ -1,8 +1,7 @@
-"""Which detection is me: closed forms, the three methods, chains and their probabilities."""
+"""Which detection is me: chains and their probabilities."""
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -11,14 +10,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike
 
-from bench.aerial.paper_methods import (
-    fit_chains,
-    identify_by_speeds,
-    identify_by_turns,
-    identify_by_way,
-    own_displacement,
-    relation,
-)
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.identification.anchors import Scale
@@ -38,53 +29,6 @@ def picture(positions: FloatArray, headings: FloatArray | None = None) -> Pictur
 
 def point(pose: ArrayLike) -> TrackPoint:
     return TrackPoint(np.asarray(pose, dtype=float), np.zeros((3, 3)))
-
-
-@given(heading=st.floats(-3.1, 3.1), scale=st.floats(0.01, 100.0), seed=st.integers(0, 10**6))
-def test_heading_and_scale_are_exact_without_noise(heading: float, scale: float, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    own = own_displacement(rng.uniform(0.1, 0.5, 50), rng.uniform(-0.3, 0.3, 50), 0.1)
-    found = relation(scale * np.exp(1j * heading) * own, own)
-    assert abs(found.heading - heading) < 1e-9
-    assert abs(found.scale / scale - 1.0) < 1e-9
-
-
-def test_own_motion_is_that_of_the_steps_one_by_one() -> None:
-    rng = np.random.default_rng(1)
-    speeds, rates, heading, place = rng.uniform(0, 1, 20), rng.uniform(-1, 1, 20), 0.0, 0.0 + 0.0j
-    for speed, rate in zip(speeds, rates, strict=True):
-        heading += 0.1 * rate
-        place += 0.1 * speed * complex(math.cos(heading), math.sin(heading))
-    assert abs(own_displacement(speeds, rates, 0.1) - place) < 1e-12
-
-
-def test_a_chain_is_fitted_with_its_scale_known_and_not() -> None:
-    own = np.array([0.0, 1.0, 1.0 + 2.0j, -1.0 + 1.0j])
-    c = 1.3 * np.exp(0.7j)
-    positions = 5.0 + c * own
-    free, held = fit_chains(positions, own, 0.1), fit_chains(positions, own, 0.1, 1.0, 1e-6)
-    assert abs(free.coefficient - c) < 1e-12
-    assert free.cost < 1e-20
-    assert abs(abs(held.coefficient) - 1.0) < 1e-6
-    assert held.cost > 10.0
-
-
-def test_turns_are_told_by_their_sign_and_across_half_a_turn() -> None:
-    headings = np.array([[3.0, 3.0, 0.0], [3.0 - 0.5, 3.0 + 0.5 - 2 * np.pi, 0.5 + 0.2]])
-    assert identify_by_turns(headings, np.array([0.5])) == 1
-    assert identify_by_turns(headings, np.array([-0.5])) == 0
-
-
-def test_straight_motion_is_told_by_direction_where_the_ratio_is_the_same() -> None:
-    images = np.array([[0.0, 5.0], [1.0, 6.0], [3.0, 6.0 + 2.0j]])  # the second one turned
-    assert identify_by_speeds(images, np.array([0.0, 1.0, 3.0]), 0.05, 1.0, 0.03) == (0, 0, 0)
-
-
-def test_motion_between_two_images_gives_both_places_and_the_heading() -> None:
-    first, second = np.array([1.0 + 1.0j, 0.0]), np.array([4.0, 1.0 + 3.0j])
-    i, j, heading = identify_by_way(first, second, 2.0 + 0.0j)
-    assert (i, j) == (0, 1)
-    assert heading == pytest.approx(math.pi / 2, abs=1e-12)
 
 
 @given(x=finite, y=finite, heading=finite, moved=st.tuples(finite, finite, finite))

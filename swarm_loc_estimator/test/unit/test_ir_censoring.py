@@ -13,7 +13,6 @@ from ir_world import droplet, nees, pair_of, pose_errors, random_poses, readings
 from scipy.integrate import quad
 from scipy.optimize import minimize
 
-from bench.droplet.closed_form import ClosedForm, IrEstimator
 from bench.droplet.cramer_rao import information
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.infrared.brightness import expected_brightness
@@ -127,22 +126,6 @@ def test_every_pair_and_power_has_its_own_saturation() -> None:
         np.testing.assert_array_equal(alone.poses[0], together.poses[k])
     swapped = ALIKE.solve(readings, None, saturation[:, ::-1])
     assert np.mean(swapped.poses[:, 0] == together.poses[:, 0]) < 0.2
-
-
-def test_the_closed_form_takes_the_power_that_does_not_saturate() -> None:
-    platform, poses = droplet(), random_poses(500, 33, low=0.08, high=0.08)
-    readings = cut_readings(poses, 33)
-    readings[:, 1] = np.minimum(readings[:, 1], LIMIT - 1.0)  # the near power never saturates there
-    estimator: IrEstimator = ClosedForm(platform)
-    near_only = readings.copy()
-    near_only[:, 0] = np.nan
-    told, near = estimator.solve(readings, None, limits(readings)), estimator.solve(near_only)
-    dazzled = (near.outcomes == IrOutcome.FOUND) & (readings[:, 0] >= LIMIT).any(axis=(1, 2))
-    assert np.mean(dazzled) > 0.8
-    np.testing.assert_array_equal(told.poses[dazzled], near.poses[dazzled])
-    ignorant = estimator.solve(np.minimum(readings, 254.0))
-    errors = [np.mean(np.abs(solutions.poses[dazzled, 0] - 0.08)) for solutions in (told, ignorant)]
-    assert errors[0] < 0.01 < errors[1]
 
 
 def test_gains_are_not_sought_from_saturated_readings() -> None:

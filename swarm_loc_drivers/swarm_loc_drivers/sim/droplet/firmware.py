@@ -101,14 +101,12 @@ class DropletFirmware:
         self._commands: dict[str, Callable[[list[str]], None]] = {
             "get_id": lambda _: self._say(f"My ID is: {body.robot_id:04X}"),
             "move_steps": self._move_steps,
-            "walk": self._walk,
             "stop_walk": lambda _: self._stop(),
             "rnb_b": lambda _: self._later(EMIT_DELAY_NS, self._emit),
             "set_ir": self._set_power,
             "cmd": lambda words: self._send(0, " ".join(words)),
             "tgt_cmd": lambda words: self._send(int(words[0], 16), " ".join(words[1:])),
             "print_motor_settings": lambda _: self._print_settings(),
-            "reset": lambda _: self._reset(),
         }
 
     def receive(self, data: bytes) -> bytes:
@@ -203,13 +201,6 @@ class DropletFirmware:
         if steps > 0:
             self._say(f"walk direction {direction}, num_steps {steps}")
             self._begin_move(direction, steps)
-
-    def _walk(self, words: list[str]) -> None:
-        """A way in mm; turns in degrees."""
-        direction, way = int(words[0]), int(words[1])
-        steps = int(1000.0 * way / self._body.lengths[direction])
-        self._say(f"In order to go in direction {direction} for {way} mm, taking {steps} steps.")
-        self._begin_move(direction, steps)
 
     def _begin_move(self, direction: int, steps: int) -> None:
         """Move, unless moving."""

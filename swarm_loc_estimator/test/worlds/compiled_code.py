@@ -14,8 +14,8 @@ from numba.core.dispatcher import Dispatcher
 
 def printed_by_process(script: str, *arguments: str) -> list[str]:
     """The names that a script prints, run by itself: in this process other tests have compiled already."""
-    own = Path(__file__)
-    places = [str(own.parents[3]), str(own.parent)]  # for `bench` and this file, as in this process
+    own, worlds = Path(__file__), Path(script).parents[1] / "worlds"
+    places = [str(own.parents[3]), str(own.parent), str(worlds)]  # for `bench` and worlds, as in this process
     path = os.pathsep.join([*places, *filter(None, [os.environ.get("PYTHONPATH")])])
     env = {**os.environ, "PYTHONPATH": path}
     command = [sys.executable, script, *arguments]

@@ -33,7 +33,7 @@ class World:
 
     robots: tuple[Robot, ...]  # As they truly are; all of one type
     seed: int  # Of commands and noise
-    duration_s: float = 300.0  # [s]
+    duration_s: float = 150.0  # [s]
     range_sigma: float = 0.005  # Relative
     bearing_sigma: float = 0.005  # [rad]
     posed: bool = False  # Whether sightings have a heading

@@ -32,13 +32,11 @@ class EmulatorProcess:
     """
 
     def __init__(self, script: str, *arguments: str) -> None:
-        path = os.pathsep.join([str(HERE.parent / "unit"), os.environ.get("PYTHONPATH", "")])
         self._process = subprocess.Popen(
             [sys.executable, str(HERE / script), *arguments],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
-            env=os.environ | {"PYTHONPATH": path},
         )
         self.place = self._line()
 
