@@ -35,7 +35,8 @@ COMMANDS = (DOC / "commands.md").read_text(encoding="utf-8")
 def table_of(cls: type, *required: str) -> str:
     """The numbers of a dataclass as a table of Markdown."""
     lines = ["| Key | Default | Range | Meaning |", "|---|---|---|---|"]
-    defaults = {f.name: "null" if f.default is None else f"{f.default:g}" for f in fields(cls) if f.metadata}
+    given = {f.name: f.default for f in fields(cls) if f.name in number_specs(cls)}
+    defaults = {name: "null" if value is None else f"{value:g}" for name, value in given.items()}
     for name, spec in number_specs(cls).items():
         default = "required" if name in required else f"`{defaults[name]}`"
         lines.append(f"| `{name}` | {default} | {spec.range_text} | {spec.doc} |")
