@@ -1,50 +1,8 @@
 """Swarm descriptions: read `swarm.yaml` to a `Swarm`, and write one.
 
-```yaml
-fileversion: 1
-defaults:      # odometry, imu, lidar, random_walk, response, camera, sensor, fix, clock, ir, uwb, faces,
-               # start_sigma
-  sensor: {range_sigma: 0.1}
-  landmark: {size: 0.06, position_sigma: 0.01, yaw_sigma: 0.02}  # without sigmas: surveyed exactly
-types:
-  epuck:                  # the same keys; what is not said comes from defaults
-    odometry: {wheel_separation: 0.053}
-    response:                               # null: all of the reported motion is true
-      speeds: [0.0, 0.1]
-      turn_rates: [0.0, 0.5, 1.0]
-      speed_share: [[1.0, 0.9, 0.9], [1.0, 0.8, 0.7]]
-      turn_share: [[1.0, 0.9, 0.9], [1.0, 0.9, 0.9]]
-    camera: {x: 0.035, z: 0.028}            # null: it has none
-    faces:                                  # markers on the body; null takes one away
-      front: {x: 0.035, yaw: 0.0, size: 0.036, position_sigma: 0.001}
-      top: {z: 0.1, yaw: 0.0, size: 0.05, lies: true}   # lies flat, its own right is forward
-  droplet:
-    odometry: null                          # null: it has none, and stands where it is
-    random_walk: {position: 1e-4, heading: 0.05}   # or moves, nobody knows where to
-    camera: null
-    ir:                                     # its infrared board; null: it has none
-      platform: droplet                     # a packaged one, or the path of a file, from here
-robots:
-  epuck1:                 # the same keys; what is not said comes from its type
-    type: epuck
-    ids: {front: 12, top: 13}   # which marker is on which face
-    start: {x: 0.0, y: 0.0, theta: 0.0}     # null or left out: unknown
-  droplet1:
-    type: droplet
-    ir:
-      id: 0x6B6F          # by which exchanges name it
-      gains: {sensor: [1, 1, 1, 1, 1, 1], emitter: [1, 1, 1, 1, 1, 1]}   # null or left out: never calibrated
-landmarks:
-  100: {x: 1.2, y: -0.4, yaw: 3.14159, size: 0.05}      # yaw null or left out: shows no heading
-cameras:                  # fixed ones, which see markers on robots
-  ceiling1: {x: -1.0, y: 0.5, z: 2.5, position_sigma: 0.001, sensor: {residual_position_sigma: 0.001}}
-anchors:                  # UWB radios, see doc/uwb.md
-  - {address: 0x10, x: 0.0, y: 5.0, z: 2.1}
-range_topic: uwb/{from}/{to}/distance  # sensor_msgs/Range of two radios, by their addresses
-map: floor.yaml           # walls that lidars see, as of map_server, from here; null or left out: none
-```
-Numbers, units, ranges and defaults are those of the classes in `swarm/swarm.py`.
-When a description is written, values common to all robots of a type are written with the type.
+doc/swarm_description.md has an example with all sections. Numbers, units, ranges and defaults are those of
+the classes in `swarm/swarm.py`. When a description is written, values common to all robots of a type are
+written with the type.
 """
 
 from __future__ import annotations

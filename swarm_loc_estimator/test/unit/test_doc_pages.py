@@ -56,6 +56,16 @@ def test_every_number_of_a_fixed_camera_has_its_place() -> None:
     assert table_of(FixedCamera, "x", "y", "z") in SWARM_DESCRIPTION
 
 
+def test_the_example_with_all_sections_is_a_swarm(tmp_path: Path) -> None:
+    example = re.findall(r"```yaml\n(.*?)```", SWARM_DESCRIPTION, re.DOTALL)[-1]
+    (tmp_path / "swarm.yaml").write_text(example, encoding="utf-8")
+    swarm = load_swarm(tmp_path / "swarm.yaml")
+    assert [robot.type for robot in swarm.robots] == ["epuck", "droplet"]
+    assert len(swarm.landmarks) == len(swarm.cameras) == len(swarm.anchors) == 1
+    assert swarm.range_topic
+    assert swarm.map == tmp_path / "floor.yaml"
+
+
 def test_the_example_of_overhead_cameras_is_a_swarm(tmp_path: Path) -> None:
     page = (DOC / "overhead_cameras.md").read_text(encoding="utf-8")
     (example,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
