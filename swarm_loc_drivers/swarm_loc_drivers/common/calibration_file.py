@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from swarm_loc_estimator.common.codec import shown
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.common.yaml_tree import YamlTreeError, read_tree, shown
+from swarm_loc_estimator.common.yaml_tree import read_tree
 
 _COEFFICIENTS = {"plumb_bob": (5,), "rational_polynomial": (8,), "equidistant": (4,)}
 _IDENTITY = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
@@ -38,10 +39,7 @@ def load_calibration(path: Path, width: int, height: int) -> CameraCalibration:
     Raises:
         CalibrationFileError: The file cannot be read, is incomplete, or is for another image size.
     """
-    try:
-        tree = read_tree(path)
-    except YamlTreeError as error:
-        raise CalibrationFileError(str(error)) from error
+    tree = read_tree(path, CalibrationFileError)
     if not isinstance(tree, dict):
         raise CalibrationFileError(f"{path} is not a camera calibration.")
     return _Reader(path, tree).calibration(width, height)

@@ -44,6 +44,11 @@ class NumberSpec:
         )
 
     @property
+    def wanted(self) -> str:
+        """What is missing where the number is left out, for the end of a sentence."""
+        return f"a number in {self.range_text}"
+
+    @property
     def range_text(self) -> str:
         """The allowed range for an error message, such as "(0, 10] m"."""
         unit = "" if self.unit == "1" else f" {self.unit}"
@@ -57,12 +62,8 @@ def number(value: float | None, unit: str, low: float, high: float, doc: str, *,
 
 def number_specs(cls: type) -> dict[str, NumberSpec]:
     """The numbers of a dataclass: field name -> what it may be, in the order of definition."""
-    return {f.name: f.metadata["spec"] for f in fields(cls) if "spec" in f.metadata}
-
-
-def number_values(holder: Any) -> dict[str, Any]:
-    """The values of these numbers of an object."""
-    return {name: getattr(holder, name) for name in number_specs(type(holder))}
+    specs = {one.name: one.metadata.get("spec") for one in fields(cls)}
+    return {name: spec for name, spec in specs.items() if isinstance(spec, NumberSpec)}
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,10 @@
-"""YAML 1.2 files as trees, and their checks: decimal numbers, every key once, one sentence for each error."""
+"""YAML 1.2 files as trees: decimal numbers, every key once, one sentence for each error."""
 
 from __future__ import annotations
 
-import difflib
-import math
 import re
-import reprlib
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -19,10 +16,9 @@ from ruamel.yaml.nodes import Node, ScalarNode
 from ruamel.yaml.representer import SafeRepresenter
 from ruamel.yaml.resolver import VersionedResolver
 
+from swarm_loc_estimator.common.codec import Tree, shown
 from swarm_loc_estimator.common.files import write_whole
-from swarm_loc_estimator.common.parameters import NumberSpec, UserError
-
-Tree = Any  # dict, list, str, int, float, bool or None
+from swarm_loc_estimator.common.parameters import UserError
 
 MAX_BYTES = 2_000_000
 """Larger files are refused [byte]; the file of a thousand robots has a quarter of this size."""
@@ -38,9 +34,6 @@ _SCALARS = [
         ("float", _FLOAT),
     )
 ]
-
-_SHORT = reprlib.Repr()
-_SHORT.maxstring = _SHORT.maxother = 100
 
 
 class YamlTreeError(UserError):
@@ -108,46 +101,42 @@ class _Representer(SafeRepresenter):
 _Representer.add_representer(float, _Representer.represent_float)
 
 
-def shown(value: object) -> str:
-    """A value for an error message: short, on one line."""
-    return _SHORT.repr(value).replace("\n", " ")
-
-
-def read_file(path: Path, most_bytes: int) -> bytes:
+def read_file(path: Path, most_bytes: int, error_type: type[UserError] = YamlTreeError) -> bytes:
     """The content of a regular file.
 
     Raises:
-        YamlTreeError: It cannot be read, is no regular file, or is larger than `most_bytes`.
+        error_type: It cannot be read, is no regular file, or is larger than `most_bytes`.
     """
     try:
-        if path.exists() and not path.is_file():  # opening a pipe would never return
-            raise YamlTreeError(f"{path} cannot be read: it is no regular file.")
-        with path.open("rb") as file:
-            data = file.read(most_bytes + 1)
+        if is_regular := path.is_file() or not path.exists():  # opening a pipe would never return
+            with path.open("rb") as file:
+                data = file.read(most_bytes + 1)
     except (OSError, ValueError) as error:  # a ValueError is a null byte in the path
-        raise YamlTreeError(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
+        raise error_type(f"{path} cannot be read: {getattr(error, 'strerror', None) or error}.") from error
+    if not is_regular:
+        raise error_type(f"{path} cannot be read: it is no regular file.")
     if len(data) > most_bytes:
-        raise YamlTreeError(f"{path} has more than the {most_bytes} bytes that are allowed.")
+        raise error_type(f"{path} has more than the {most_bytes} bytes that are allowed.")
     return data
 
 
-def read_tree(path: Path, most_bytes: int = MAX_BYTES) -> Tree:
+def read_tree(path: Path, error_type: type[UserError] = YamlTreeError, most_bytes: int = MAX_BYTES) -> Tree:
     """Read a YAML file of at most `most_bytes` as nested dicts, lists and scalars.
 
     Raises:
-        YamlTreeError: It cannot be read, is too large, is not YAML, or has a key twice.
+        error_type: It cannot be read, is too large, is not YAML, or has a key twice.
     """
-    data = read_file(path, most_bytes)
+    data = read_file(path, most_bytes, error_type)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of anchors that are used twice
             return _yaml().load(data)
     except ConstructorError as error:
-        raise YamlTreeError(f"{path}: {_one_line(error)}.") from error
+        raise error_type(f"{path}: {_one_line(error)}.") from error
     except RecursionError:
-        raise YamlTreeError(f"{path} is nested too deeply.") from None
+        raise error_type(f"{path} is nested too deeply.") from None
     except (YAMLError, ValueError, LookupError, TypeError) as error:
-        raise YamlTreeError(f"{path} is not YAML: {_one_line(error)}.") from error
+        raise error_type(f"{path} is not YAML: {_one_line(error)}.") from error
 
 
 def tree_text(tree: Tree) -> str:
@@ -178,112 +167,3 @@ def _one_line(error: Exception) -> str:
     mark = getattr(error, "problem_mark", None)
     place = f" in line {mark.line + 1}" if mark is not None else ""
     return " ".join(f"{problem}{place}".split())
-
-
-Numbers = dict[str, "float | None"]
-
-WHOLE_FILE = "the file"  # The key of the outermost mapping
-
-
-class TreeChecks:
-    """Takes values out of one file; what is wrong becomes one sentence with file, dotted key and value."""
-
-    def __init__(self, path: Path, error: type[ValueError]) -> None:
-        self._path = path
-        self._error_type = error
-
-    def mapping(
-        self, tree: Tree, key: str, known: Iterable[str] | None = None, required: Iterable[str] = ()
-    ) -> dict[Any, Tree]:
-        """A mapping; with `known`, only of these keys; with all that are required."""
-        if tree is None:
-            tree = {}
-        if not isinstance(tree, dict):
-            raise self.error(key, tree, "must be a mapping of keys to values")
-        if known is not None:
-            allowed = tuple(known)
-            for name in tree:
-                if name not in allowed:
-                    where = shown(name) if key == WHOLE_FILE else shown(f"{key}.{name}")
-                    raise self.said(f"{where} is not a known key{nearest(name, allowed)}")
-        for name in required:
-            if name not in tree:
-                raise self.said(f"{key} lacks {name}")
-        return tree
-
-    def numbers(
-        self,
-        tree: Tree,
-        key: str,
-        specs: Mapping[str, NumberSpec],
-        required: Iterable[str] = (),
-        others: Iterable[str] = (),
-    ) -> Numbers:
-        """The numbers of a mapping, each in its range; other keys are allowed but left out."""
-        mapping = self.mapping(tree, key, (*specs, *others))
-        for name in required:
-            if name not in mapping:
-                raise self.said(f"{key} lacks {name}, a number in {specs[name].range_text}")
-        return {
-            name: self.number(value, f"{key}.{name}", specs[name])
-            for name, value in mapping.items()
-            if name in specs
-        }
-
-    def number(self, value: Tree, key: str, spec: NumberSpec) -> float | None:
-        """One number in its range."""
-        if value is None and spec.optional:
-            return None
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            raise self.error(key, value, f"must be a number in {spec.range_text}")
-        try:
-            number = float(value)
-        except OverflowError:  # a whole number of hundreds of digits
-            number = math.inf
-        if not spec.allows(number):
-            raise self.error(key, value, f"must lie in {spec.range_text}")
-        return number
-
-    def address(self, value: Tree, key: str, high: int) -> int:
-        """A whole number in [1, high], decimal or in hexadecimal, see `hexadecimal`."""
-        is_text = isinstance(value, str) and re.fullmatch(hexadecimal(high), value)
-        number = int(value, 16) if is_text else value
-        if isinstance(number, bool) or not isinstance(number, int) or not 1 <= number <= high:
-            raise self.error(key, value, f"must be a whole number in [1, {high}]")
-        return number
-
-    def items(self, tree: Tree, key: str) -> list[Tree]:
-        """A list."""
-        if not isinstance(tree, list):
-            raise self.error(key, tree, "must be a list")
-        return tree
-
-    def list_of_numbers(self, tree: Tree, key: str) -> tuple[float, ...]:
-        """A list of numbers."""
-        values = []
-        for index, value in enumerate(self.items(tree, key)):
-            if isinstance(value, bool) or not isinstance(value, int | float) or not -1e9 < value < 1e9:
-                raise self.error(f"{key}[{index}]", value, "must be a number")
-            values.append(float(value))
-        return tuple(values)
-
-    def error(self, key: str, value: object, rule: str) -> ValueError:
-        """The sentence about a value that breaks a rule."""
-        return self.said(f"{key} is {shown(value)} but {rule}")
-
-    def said(self, sentence: str) -> ValueError:
-        """A sentence, given without its full stop, about this file."""
-        return self._error_type(f"{self._path}: {sentence}.")
-
-
-def hexadecimal(high: int) -> str:
-    """The pattern of texts such as 0x1F for whole numbers in [1, high]; `high` has only the digit f."""
-    return rf"0[xX](?=.*[1-9A-Fa-f])[0-9A-Fa-f]{{1,{len(f'{high:x}')}}}"
-
-
-def nearest(name: object, known: Iterable[str]) -> str:
-    """The known word most like it, for the end of a sentence."""
-    words = list(known)
-    if not words:
-        return "; none is known here"
-    return f"; the nearest one is '{difflib.get_close_matches(str(name), words, 1, 0.0)[0]}'"

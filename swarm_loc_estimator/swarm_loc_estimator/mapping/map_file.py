@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.codec import WHOLE_FILE, TreeChecks
 from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError
-from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, TreeChecks, read_file, read_tree, write_tree
+from swarm_loc_estimator.common.yaml_tree import read_file, read_tree, write_tree
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205

@@ -41,7 +41,6 @@ from swarm_loc_estimator.nodes.estimator_topics import (
     NO_CLOCK,
     EstimateOutputs,
     EstimatorInputs,
-    MountListener,
     PoseCommands,
     StaticTransforms,
     newest_time_ns,
@@ -123,9 +122,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._outputs = EstimateOutputs(self, self._swarm, self.params)
         self._reported_s = time.monotonic()
         self._lost = 0
-        self._static_transforms = StaticTransforms(self, self._swarm, self.params)
-        per_robot = self.params.tf_per_robot
-        self._mounts = MountListener(self, self._swarm, self._ingest, tf_per_robot=per_robot)
+        self._static_transforms = StaticTransforms(self, self._swarm, self._ingest, self.params)
         horizon_s = self.params.settings.horizon_s
         self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop, horizon_s)
         frame = self.params.map_frame
@@ -218,7 +215,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
 
     def _follow_mounts(self) -> None:
         """Restart with mounts of sensors that static transforms tell."""
-        news = self._mounts.news()
+        news = self._static_transforms.mounts()
         if news is not None and news[0] != self._estimator.swarm:
             self._estimator.describe(news[0])
             self.get_logger().info(" ".join(news[1]))

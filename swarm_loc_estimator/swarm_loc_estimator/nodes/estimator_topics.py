@@ -312,13 +312,20 @@ def _children_by_topic(swarm: Swarm, parameters: EstimatorParameters) -> dict[st
 
 
 class StaticTransforms:
-    """Listens for static transforms into the estimator's own frames, which tf2 would accept."""
+    """Takes mounts that the description does not say from static transforms and the frames of sensors.
 
-    def __init__(self, node: Node, swarm: Swarm, parameters: EstimatorParameters) -> None:
+    It also notes static transforms into the estimator's own frames, which tf2 would accept.
+    """
+
+    def __init__(self, node: Node, swarm: Swarm, ingest: Ingest, parameters: EstimatorParameters) -> None:
+        self._mounts, self._ingest = Mounts(swarm), ingest
+        self._waiting = [k for k, topic in enumerate(ingest.topics) if topic.name in self._mounts.topics]
+        self._is_changed = False
         self._parents: dict[tuple[str, str], str] = {}
-        for name, children in _children_by_topic(swarm, parameters).items():
-            topic = f"{name}_static"
-            listener = partial(self._on_transforms, topic, frozenset(children))
+        own = {f"{name}_static": {*frames} for name, frames in _children_by_topic(swarm, parameters).items()}
+        names = [f"{robot.name}/{TF_STATIC}" for robot in swarm.robots] if parameters.tf_per_robot else []
+        for topic in dict.fromkeys([*own, f"/{TF_STATIC}", *names] if self._waiting else own):
+            listener = partial(self._on_transforms, topic, own.get(topic, ()))
             node.create_subscription(TFMessage, topic, listener, _TF_STATIC)
 
     @property
@@ -329,33 +336,7 @@ class StaticTransforms:
             for (topic, child), parent in self._parents.items()
         ]
 
-    def _on_transforms(self, topic: str, owned: Collection[str], message: TFMessage) -> None:
-        for transform in message.transforms:
-            child = transform.child_frame_id.lstrip("/")
-            if child in owned:
-                self._parents[topic, child] = transform.header.frame_id.lstrip("/")[:_MAX_FRAME_LENGTH]
-
-
-class MountListener:
-    """Takes mounts from static transforms and the frames of sensors, where the description says none.
-
-    Args:
-        node: The node.
-        swarm: The swarm as described.
-        ingest: Knows the frames of messages.
-        tf_per_robot: Whether each robot has transforms of its own.
-    """
-
-    def __init__(self, node: Node, swarm: Swarm, ingest: Ingest, *, tf_per_robot: bool) -> None:
-        self._mounts, self._ingest = Mounts(swarm), ingest
-        self._waiting = [k for k, topic in enumerate(ingest.topics) if topic.name in self._mounts.topics]
-        self._is_changed = False
-        names = [f"{robot.name}/{TF_STATIC}" for robot in swarm.robots] if tf_per_robot else []
-        for topic in (f"/{TF_STATIC}", *names) if self._waiting else ():
-            listener = partial(self._on_transforms, topic)
-            node.create_subscription(TFMessage, topic, listener, _TF_STATIC)
-
-    def news(self) -> tuple[Swarm, list[str]] | None:
+    def mounts(self) -> tuple[Swarm, list[str]] | None:
         """The swarm with all mounts and a sentence for each, if there may be new ones since the last call."""
         framed = [handle for handle in self._waiting if self._ingest.frame_id(handle)]
         for handle in framed:
@@ -366,9 +347,14 @@ class MountListener:
         self._is_changed = False
         return self._mounts.described(), self._mounts.remarks()
 
-    def _on_transforms(self, topic: str, message: TFMessage) -> None:
-        self._mounts.add_transforms(topic, message)
-        self._is_changed = True
+    def _on_transforms(self, topic: str, owned: Collection[str], message: TFMessage) -> None:
+        if self._mounts.topics:
+            self._mounts.add_transforms(topic, message)
+            self._is_changed = True
+        for transform in message.transforms:
+            child = transform.child_frame_id.lstrip("/")
+            if child in owned:
+                self._parents[topic, child] = transform.header.frame_id.lstrip("/")[:_MAX_FRAME_LENGTH]
 
 
 class _Transforms(NamedTuple):

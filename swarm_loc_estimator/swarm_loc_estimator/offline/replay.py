@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -83,8 +83,12 @@ def replay(
     """
     bag = Path(bag)
     swarm = load_swarm(swarm_beside(bag)) if swarm is None else swarm
-    periodic = PeriodicSchedule(_period_ns(tick_s))
-    schedule = periodic if stamp_ns is None else ListedSchedule(_increasing(stamp_ns))
+    schedule: ListedSchedule = PeriodicSchedule(_period_ns(tick_s))
+    if stamp_ns is not None:
+        stamps = np.asarray(stamp_ns)
+        if stamps.ndim != 1 or stamps.dtype.kind not in "iu" or np.any(stamps[1:] <= stamps[:-1]):
+            raise ScheduleError("stamp_ns must be increasing whole numbers (T,) [ns].")
+        schedule = ListedSchedule(stamps.astype(np.int64))
     estimator = Estimator(swarm, settings)
     mounts = mounts_of_bag(bag, swarm, remap)
     if mounts.remarks():
@@ -97,8 +101,8 @@ def replay(
         )
     runner.finish(summary.range_ns[1])
     remarks = [*mounts.remarks(), *summary.remarks]
-    if periodic.jumps:
-        jumps = f"The log time jumps ahead by more than an hour, {periodic.jumps} x"
+    if schedule.jumps:
+        jumps = f"The log time jumps ahead by more than an hour, {schedule.jumps} x"
         remarks.append(f"{jumps}; no poses are given meanwhile.")
     remarks += runner.notes(summary.range_ns)
     result = runner.result(bag.name, summary.range_ns, {**summary.truth, **truth}, summary.received)
@@ -145,17 +149,10 @@ def _period_ns(tick_s: object) -> int:
     return round(tick_s * 1e9)
 
 
-def _increasing(stamp_ns: npt.ArrayLike) -> npt.NDArray[np.int64]:
-    """Times of outputs (T,) [ns]."""
-    stamps = np.asarray(stamp_ns)
-    if stamps.ndim != 1 or stamps.dtype.kind not in "iu" or np.any(stamps[1:] <= stamps[:-1]):
-        raise ScheduleError("stamp_ns must be increasing whole numbers (T,) [ns].")
-    return stamps.astype(np.int64)
-
-
 MAX_DETECTIONS = 200_000
 """Maximum number of aerial detections stored for display; later ones of a long run are not stored."""
 _TICKS_AT_ONCE = 256
+_COLUMNS = ("stamp_ns", "pose", "covariance", "status", "heading_known", "is_local")
 _SIGHTINGS_PERIOD_NS = 500_000_000
 _MAX_SIGHTINGS = 500_000
 """Maximum number of sightings stored for display; later ones of a long run are not stored."""
@@ -164,24 +161,33 @@ _MAX_LOSSES = 100_000
 """Maximum number of losses of robots that are stored; later ones of a long run are not stored."""
 
 
-class Schedule(Protocol):
-    """Schedule of the outputs."""
+class ListedSchedule:
+    """Outputs at given times (T,) [ns], increasing."""
+
+    def __init__(self, stamp_ns: npt.NDArray[np.int64]) -> None:
+        self.jumps = 0  # Number of forward jumps of the clock by more than `MAX_PAUSE_NS`
+        self._stamp_ns = stamp_ns
+        self._done = 0
 
     def begin(self, now_ns: int) -> None:
         """Start at the first input after a long pause."""
 
     def due(self, now_ns: int) -> list[int]:
         """Output times until now that were not due before."""
+        first, self._done = self._done, int(self._stamp_ns.searchsorted(now_ns, side="right"))
+        stamps_ns: list[int] = self._stamp_ns[first : self._done].tolist()
+        return stamps_ns
 
     def rest(self, last_ns: int) -> list[int]:
-        """Output times after the last inputs of a recording that ends at `last_ns`."""
+        """Output times after the last inputs of a recording that ends at `last_ns`: all that remain."""
+        return self.due(max(last_ns, int(self._stamp_ns.max(initial=0))))
 
 
-class PeriodicSchedule:
+class PeriodicSchedule(ListedSchedule):
     """Outputs at every whole multiple of a period, except while the clock jumps ahead."""
 
     def __init__(self, period_ns: int) -> None:
-        self.jumps = 0  # Number of forward jumps of the clock by more than `MAX_PAUSE_NS`
+        super().__init__(np.zeros(0, dtype=np.int64))
         self._period_ns = period_ns
         self._next_ns: int | None = None
 
@@ -207,48 +213,22 @@ class PeriodicSchedule:
         return self.due(last_ns + self._period_ns)
 
 
-class ListedSchedule:
-    """Outputs at given times (T,) [ns], increasing."""
-
-    def __init__(self, stamp_ns: npt.NDArray[np.int64]) -> None:
-        self._stamp_ns = stamp_ns
-        self._done = 0
-
-    def begin(self, now_ns: int) -> None:
-        """Do nothing: the outputs are given."""
-
-    def due(self, now_ns: int) -> list[int]:
-        """Output times until now that were not due before."""
-        first, self._done = self._done, int(self._stamp_ns.searchsorted(now_ns, side="right"))
-        stamps_ns: list[int] = self._stamp_ns[first : self._done].tolist()
-        return stamps_ns
-
-    def rest(self, last_ns: int) -> list[int]:
-        """All remaining output times, whenever the recording ends."""
-        return self.due(max(last_ns, int(self._stamp_ns.max(initial=0))))
-
-
 class Runner:
     """Feeds an estimator, ticks it, and keeps its estimates in a temporary file: memory does not grow."""
 
-    def __init__(self, estimator: Estimator, schedule: Schedule, *, keep_sightings: bool = False) -> None:
+    def __init__(
+        self, estimator: Estimator, schedule: ListedSchedule, *, keep_sightings: bool = False
+    ) -> None:
         self._estimator = estimator
         self._schedule = schedule
         self._began_s = time.perf_counter()
         self._spool = Spool()
-        robots = len(estimator.swarm.robots)
-        self._stamp_ns = np.zeros(_TICKS_AT_ONCE, dtype=np.int64)
-        self._pose = np.zeros((_TICKS_AT_ONCE, robots, 3))
-        self._covariance = np.zeros((_TICKS_AT_ONCE, robots, 3, 3))
-        self._status = np.zeros((_TICKS_AT_ONCE, robots), dtype=np.uint8)
-        self._heading_known = np.zeros((_TICKS_AT_ONCE, robots), dtype=bool)
-        self._is_local = np.zeros(_TICKS_AT_ONCE, dtype=bool)
+        self._ticks: list[tuple[Any, ...]] = []  # Rows of `_COLUMNS` that are not spooled yet
         self._sightings_left = _MAX_SIGHTINGS if keep_sightings else 0
         self._sightings: list[tuple[int, Sightings]] = []
         self._images = AerialImages() if keep_sightings else None
         self._losses: dict[int, list[LossReport]] = {}
         self._losses_left = _MAX_LOSSES
-        self._filled = 0
         self._notes: dict[tuple[str, Contradicted], tuple[int, str]] = {}
         self._noted_ns = 0
 
@@ -321,10 +301,8 @@ class Runner:
         estimate = self._estimator.tick(now_ns)
         if now_ns - self._noted_ns >= _NOTE_PERIOD_NS:
             self._note(now_ns)
-        k, self._filled = self._filled, self._filled + 1
-        self._stamp_ns[k], self._pose[k], self._covariance[k] = now_ns, estimate.poses, estimate.covariances
-        self._status[k], self._heading_known[k] = estimate.status, estimate.heading_known
-        self._is_local[k] = bool(self._estimator.origin)
+        states = estimate.status, estimate.heading_known, bool(self._estimator.origin)
+        self._ticks.append((now_ns, estimate.poses, estimate.covariances, *states))
         self._note_losses()
         if self._images is not None:
             self._images.note(self._estimator.identities)
@@ -332,7 +310,7 @@ class Runner:
             seen = newest_sightings(self._estimator.recent(), now_ns)
             self._sightings.append((now_ns, seen))
             self._sightings_left -= len(seen.observer)
-        if self._filled == _TICKS_AT_ONCE:
+        if len(self._ticks) == _TICKS_AT_ONCE:
             self._flush()
 
     def _note_losses(self) -> None:
@@ -347,9 +325,9 @@ class Runner:
 
     def _flush(self) -> None:
         """Move the ticks in memory to the temporary file."""
-        filled, self._filled = slice(self._filled), 0
-        for name in ("stamp_ns", "pose", "covariance", "status", "heading_known", "is_local"):
-            self._spool.append(name, getattr(self, f"_{name}")[filled])
+        for name, column in zip(_COLUMNS, zip(*self._ticks, strict=True), strict=False):
+            self._spool.append(name, np.array(column))
+        self._ticks.clear()
 
 
 class AerialImages:

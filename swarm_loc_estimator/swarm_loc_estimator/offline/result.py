@@ -28,7 +28,6 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import LossReport, Status
 from swarm_loc_estimator.timeline.sightings import Sightings
 
-_COPY_BYTES = 1 << 20
 _MAX_LOST = 20  # Maximum number of robots whose losses are listed
 
 
@@ -65,19 +64,14 @@ class Spool:
             self._file.seek(begin)
             self._end = begin
             for offset, length in blocks:
-                self._copy(offset, length)
+                self._file.seek(offset)
+                data = self._file.read(length)
+                self._file.seek(self._end)
+                self._file.write(data)
+                self._end += length
             self._file.flush()
         mapped = mmap.mmap(self._file.fileno(), size, access=mmap.ACCESS_READ, offset=begin)
         return np.frombuffer(mapped, dtype=dtype).reshape(-1, *shape)
-
-    def _copy(self, offset: int, length: int) -> None:
-        """Copy a block to the end of the file."""
-        for start in range(offset, offset + length, _COPY_BYTES):
-            self._file.seek(start)
-            data = self._file.read(min(_COPY_BYTES, offset + length - start))
-            self._file.seek(self._end)
-            self._file.write(data)
-            self._end += len(data)
 
 
 class RecordedMap(NamedTuple):

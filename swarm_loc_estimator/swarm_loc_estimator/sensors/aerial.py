@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -9,7 +10,11 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DETECTIONS
-from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, AnonymousMessage, decode_anonymous
+from swarm_loc_estimator.common.messages.detections import (
+    ANONYMOUS_DTYPE,
+    DetectionArrayMessage,
+    decode_detections,
+)
 from swarm_loc_estimator.common.messages.streams import Messages
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
 from swarm_loc_estimator.filter.models import ANONYMOUS, MODELS
@@ -41,7 +46,7 @@ class AerialSensor(Sensor):
     optional = MappingProxyType({"covariance": _UNKNOWN_VARIANCE})
     unit = ("robot", "stamp_ns")  # a partial image would imply missing robots
 
-    decode = staticmethod(decode_anonymous)
+    decode = staticmethod(partial(decode_detections, message_type=ANONYMOUS_DETECTIONS))
 
     def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
         super().__init__(swarm, settings, drops)
@@ -50,7 +55,7 @@ class AerialSensor(Sensor):
         self._gate = float(MODELS[ANONYMOUS].gate(settings.aerial_gate_probability))
 
     @classmethod
-    def fault_of(cls, message: AnonymousMessage, map_frame: str) -> str:
+    def fault_of(cls, message: DetectionArrayMessage, map_frame: str) -> str:
         """Reason to drop an image, "" if there is none."""
         too_many = TOO_MANY if message.detections.size > MAX_ANONYMOUS else ""
         return super().fault_of(message, map_frame) or too_many

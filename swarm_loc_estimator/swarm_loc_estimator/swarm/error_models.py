@@ -7,13 +7,24 @@ from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+from swarm_loc_estimator.common.codec import EntrySpec, TreeChecks, entry, listed
 from swarm_loc_estimator.common.parameters import number
 
 
 class MotionResponseError(ValueError):
     """An inconsistent response."""
+
+
+def _rows(checks: TreeChecks, tree: object, key: str) -> tuple[tuple[float, ...], ...]:
+    rows = enumerate(checks.items(tree, key))
+    return tuple(checks.list_of_numbers(row, f"{key}[{index}]") for index, row in rows)
+
+
+_NUMBERS = listed("a list of numbers")
+_AXIS = entry(_NUMBERS)
+_TABLE = entry(EntrySpec(_rows, {"type": "array", "items": _NUMBERS.schema}, _NUMBERS.wanted))
 
 
 @dataclass(frozen=True)
@@ -26,10 +37,13 @@ class MotionResponse:
         MotionResponseError: Sizes differ, an axis does not ascend, or a share is not in [0, 10].
     """
 
-    speeds: tuple[float, ...]  #: (V,) reported speeds [m/s], ascending from 0
-    turn_rates: tuple[float, ...]  #: (W,) absolute reported turn rates [rad/s], ascending from 0
-    speed_share: tuple[tuple[float, ...], ...]  #: (V, W) true speed per reported speed
-    turn_share: tuple[tuple[float, ...], ...]  #: (V, W) true turn rate per reported turn rate
+    speeds: tuple[float, ...] = field(metadata=_AXIS)  #: (V,) reported speeds [m/s], ascending from 0
+    #: (W,) absolute reported turn rates [rad/s], ascending from 0
+    turn_rates: tuple[float, ...] = field(metadata=_AXIS)
+    #: (V, W) true speed per reported speed
+    speed_share: tuple[tuple[float, ...], ...] = field(metadata=_TABLE)
+    #: (V, W) true turn rate per reported turn rate
+    turn_share: tuple[tuple[float, ...], ...] = field(metadata=_TABLE)
 
     def __post_init__(self) -> None:
         for name in ("speeds", "turn_rates"):

@@ -7,34 +7,37 @@ The curves S of sensors and E of emitters over an angle are data, either pieces 
 Droplet paper prints (19) and (20), or a table. Both are sampled once into piecewise cubics with exact joints,
 which are fast to evaluate and have the exact one-sided slopes at a kink.
 
-config/ir/*.yaml of this package show the format of a board's file. `IrSection` reads the section `ir` of a
-swarm description, a robot's board.
+config/ir/*.yaml of this package show the format of a board's file.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number, number_specs, number_values
-from swarm_loc_estimator.common.yaml_tree import (
+from swarm_loc_estimator.common.codec import (
     WHOLE_FILE,
+    EntrySpec,
     Tree,
     TreeChecks,
-    YamlTreeError,
-    read_tree,
+    address,
+    entry,
+    entry_specs,
+    listed,
+    properties,
     shown,
-    write_tree,
+    to_tree,
 )
+from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number, number_specs
+from swarm_loc_estimator.common.yaml_tree import read_tree, write_tree
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -121,8 +124,8 @@ class TabulatedCurve:
     """
 
     # (K,) ascending within [-pi, pi] [rad]; the curve is constant beyond the first and last
-    angles: tuple[float, ...]
-    values: tuple[float, ...]  # (K,) non-negative values at these angles [1]
+    angles: tuple[float, ...] = field(metadata=entry(listed()))
+    values: tuple[float, ...] = field(metadata=entry(listed()))  # (K,) not negative, at these angles [1]
 
     def __post_init__(self) -> None:
         if len(self.angles) < 2 or len(self.angles) != len(self.values):
@@ -145,6 +148,37 @@ class TabulatedCurve:
 
 
 AngleCurve = PowerCurve | TabulatedCurve
+_BELOW = NumberSpec("rad", 0.0, math.pi, True, "where the next piece begins")
+
+
+def _read_curve(checks: TreeChecks, tree: Tree, key: str) -> AngleCurve:
+    """S or E, as pieces or as a table."""
+    table = entry_specs(TabulatedCurve)
+    keys = checks.mapping(tree, key, ("pieces", *table))
+    if "pieces" not in keys:
+        return checks.made(f"{key}.", TabulatedCurve, **checks.values(tree, key, table, table))
+    checks.mapping(tree, key, ("pieces",))
+    pieces = checks.items(keys["pieces"], f"{key}.pieces") or [None]
+    last = len(pieces) - 1
+    read = [_read_piece(checks, one, f"{key}.pieces[{k}]", is_last=k == last) for k, one in enumerate(pieces)]
+    return checks.made(f"{key}.", PowerCurve, pieces=tuple(read))
+
+
+def _read_piece(checks: TreeChecks, tree: Tree, key: str, *, is_last: bool) -> PowerPiece:
+    """One sum of powers; the last one ends at pi."""
+    known = ("terms",) if is_last else ("below", "terms")
+    keys = checks.mapping(tree, key, known, known)
+    terms = []
+    for k, item in enumerate(checks.items(keys["terms"], f"{key}.terms")):
+        term = checks.list_of_numbers(item, f"{key}.terms[{k}]")
+        if len(term) != 2:
+            raise checks.error(f"{key}.terms[{k}]", item, "must be [coefficient, exponent]")
+        terms.append((term[0], term[1]))
+    below = math.pi if is_last else checks.number(keys["below"], f"{key}.below", _BELOW)
+    return PowerPiece(below or 0.0, tuple(terms))
+
+
+_CURVE = EntrySpec(_read_curve, {})
 
 
 @dataclass(frozen=True)
@@ -208,6 +242,7 @@ POWERS = ("far", "near")
 """Powers of the emitters in the order of BrightnessMatrix's POWER_* constants; the second is optional."""
 MAX_ELEMENTS = 32
 GAIN_RANGE = (0.05, 20.0)
+_GAINS = listed(minimum=GAIN_RANGE[0], maximum=GAIN_RANGE[1])
 _TOGETHER = 1e-3  # Minimum angle between two elements [rad]
 
 
@@ -246,9 +281,9 @@ class IrPlatform:
     """
 
     # (n,) directions of the elements in base_link [rad], counter-clockwise positive
-    angles: tuple[float, ...]
-    sensor: AngleCurve  # S, sensor reading over the angle of incidence
-    emitter: AngleCurve  # E, emitted light over the angle to the emitter's axis
+    angles: tuple[float, ...] = field(metadata=entry(listed()))
+    sensor: AngleCurve = field(metadata=entry(_CURVE))  # S, sensor reading over the angle of incidence
+    emitter: AngleCurve = field(metadata=entry(_CURVE))  # E, light over the angle to the emitter's axis
     amplitudes: tuple[Amplitude, ...]  # A for each power of the emitters, in the order of `POWERS`
     radius: float = number(0.022, "m", 0.0, 10.0, "from the centre to the elements", above=True)
     saturation: float = number(255.0, "count", 0.0, 1e9, "readings from here on are lower bounds", above=True)
@@ -349,8 +384,8 @@ class IrGains:
         IrPlatformError: A factor is not in [0.05, 20], sizes differ, or an element does not exist.
     """
 
-    sensor: tuple[float, ...]  # (n,) factors of the sensors [1]
-    emitter: tuple[float, ...]  # (n,) factors of the emitters [1]
+    sensor: tuple[float, ...] = field(metadata=entry(_GAINS))  # (n,) factors of the sensors [1]
+    emitter: tuple[float, ...] = field(metadata=entry(_GAINS))  # (n,) factors of the emitters [1]
     sigma: float = number(0.0, "1", 0.0, 1.0, "how unsure each factor still is, relative, by itself")
     common_sigma: float = number(0.0, "1", 0.0, 1.0, "how unsure all of a robot's factors are together")
     dead_sensors: tuple[int, ...] = ()  # Numbers of sensors to ignore
@@ -407,16 +442,61 @@ def _without(factors: FloatArray, dead: list[tuple[int, ...]]) -> FloatArray:
     return factors
 
 
+def _read_elements(checks: TreeChecks, value: Tree, key: str) -> tuple[int, ...]:
+    numbers = checks.list_of_numbers(value, key)
+    if any(number != int(number) or number < 0 for number in numbers):
+        raise checks.error(key, value, "must be a list of numbers of elements, from 0 on")
+    return tuple(int(number) for number in numbers)
+
+
+def _elements(doc: str) -> EntrySpec:
+    items = {"type": "integer", "minimum": 0}
+    return EntrySpec(_read_elements, {"type": "array", "items": items, "description": doc})
+
+
+def _read_gains(checks: TreeChecks, tree: Tree, key: str) -> IrGains | None:
+    """Factors of all elements; null: never calibrated."""
+    if tree is None:
+        return None
+    values = checks.values(tree, key, entry_specs(IrGains), GAIN_LISTS)
+    return checks.made(key.removesuffix("gains"), IrGains, **values)
+
+
+def _read_source(checks: TreeChecks, value: Tree, key: str) -> str:
+    if not isinstance(value, str):
+        raise checks.error(key, value, f"must be {_PLATFORM}")
+    return value
+
+
+FOLDER = Path(__file__).parents[1] / "config" / "ir"
+PACKAGED = tuple(sorted(path.stem for path in FOLDER.glob("*.yaml")))  # Names of platforms
+GAIN_LISTS = ("sensor", "emitter")
+_PLATFORM = "the name of a packaged one or the path of a file"
+_PLATFORM_SCHEMA = {"type": "string", "description": f"one of {', '.join(PACKAGED)}, or the path of a file"}
+_GAINS_SCHEMA = {
+    "description": "factors of the elements",
+    "type": ["object", "null"],
+    "additionalProperties": False,
+    "properties": properties(entry_specs(IrGains), IrGains),
+    "required": list(GAIN_LISTS),
+}
+
+
 @dataclass(frozen=True)
 class RobotIr:
     """The infrared board of one robot."""
 
-    id: int  #: Id in its exchanges, 1 to 65535, unique in the swarm
-    platform: IrPlatform  #: Model of the board
+    #: Id in its exchanges, 1 to 65535, unique in the swarm
+    id: int = field(metadata=entry(address(2**16 - 1, "id in exchanges")))
+    #: Model of the board
+    platform: IrPlatform = field(metadata=entry(EntrySpec(_read_source, _PLATFORM_SCHEMA, _PLATFORM)))
     source: str  #: Name of a packaged platform, or absolute path of its file
-    gains: IrGains | None = None  #: Calibrated gains of its elements; None: never calibrated
-    dead_sensors: tuple[int, ...] = ()  #: Numbers of sensors to ignore
-    dead_emitters: tuple[int, ...] = ()  #: Numbers of emitters to ignore
+    #: Calibrated gains of its elements; None: never calibrated
+    gains: IrGains | None = field(default=None, metadata=entry(EntrySpec(_read_gains, _GAINS_SCHEMA)))
+    #: Numbers of sensors to ignore
+    dead_sensors: tuple[int, ...] = field(default=(), metadata=entry(_elements("sensors to ignore")))
+    #: Numbers of emitters to ignore
+    dead_emitters: tuple[int, ...] = field(default=(), metadata=entry(_elements("emitters to ignore")))
     gate_probability: float = number(
         0.9999, "1", 0.5, 1.0, "share of good measurements that must pass the gate; 1 passes all"
     )
@@ -428,118 +508,12 @@ class RobotIr:
         return replace(gains, dead_sensors=self.dead_sensors, dead_emitters=self.dead_emitters)
 
 
-_SECTION_NUMBERS = number_specs(RobotIr)
-DEAD = ("dead_sensors", "dead_emitters")
-_LAYER = ("platform", "gains", *DEAD, *_SECTION_NUMBERS)
-GAIN_LISTS = ("sensor", "emitter")
-_GAIN_NUMBERS = number_specs(IrGains)
-MAX_BOARD_ID = 2**16 - 1
-
-Values = dict[str, Any]
-
-
-class IrSection:
-    """Reads the section of one file; paths of platforms are relative to its folder."""
-
-    def __init__(self, checks: TreeChecks, folder: Path) -> None:
-        self._checks = checks
-        self._folder = folder
-        self._platforms: dict[str, IrPlatform] = {}
-
-    def layer(self, tree: Tree, key: str, *, of_robot: bool) -> Values | None:
-        """The values of one layer (defaults, type or robot); only a robot has an id. None: no board."""
-        if tree is None:
-            return None
-        if isinstance(tree, dict) and "estimator" in tree:
-            raise self._checks.said(
-                f"{key}.estimator is no longer an option: poses are always estimated by likelihood; remove it"
-            )
-        mapping = self._checks.mapping(tree, key, ("id", *_LAYER) if of_robot else _LAYER)
-        readers: dict[str, Callable[[Tree, str], Any]] = {
-            "id": partial(self._checks.address, high=MAX_BOARD_ID),
-            "platform": self._platform,
-            "gains": self._gains,
-            **dict.fromkeys(DEAD, self._elements),
-        }
-        return {
-            name: readers[name](value, f"{key}.{name}")
-            if name in readers
-            else self._checks.number(value, f"{key}.{name}", _SECTION_NUMBERS[name])
-            for name, value in mapping.items()
-        }
-
-    def board(self, values: Values | None, key: str) -> RobotIr | None:
-        """The board of a robot from the merged values of its layers."""
-        if values is None or not values:
-            return None
-        if "platform" not in values:
-            raise self._checks.said(f"{key} lacks platform, the name of a packaged one or the path of a file")
-        if "id" not in values:
-            raise self._checks.said(f"{key} lacks id, a whole number in [1, {MAX_BOARD_ID}]")
-        source = values["platform"]
-        platform, gains = self._platforms[source], values.get("gains")
-        if gains is not None and len(gains.sensor) != platform.n:
-            raise self._checks.said(
-                f"{key}.gains has {len(gains.sensor)} sensors and emitters"
-                f" but must have the {platform.n} of its platform"
-            )
-        for name in DEAD:
-            if wrong := [k for k in values.get(name, ()) if k >= platform.n]:
-                raise self._checks.said(
-                    f"{key}.{name} has {wrong[0]} but elements are numbered 0 to {platform.n - 1}"
-                )
-        rest = {name: value for name, value in values.items() if name not in ("platform", "gains")}
-        return RobotIr(platform=platform, source=source, gains=gains, **rest)
-
-    def _platform(self, value: Tree, key: str) -> str:
-        """The source of a platform; also loads the platform."""
-        if not isinstance(value, str):
-            raise self._checks.error(key, value, "must be the name of a packaged one or the path of a file")
-        is_path = value.endswith((".yaml", ".yml"))
-        source = str((self._folder / value).resolve()) if is_path else value
-        try:
-            self._platforms[source] = self._platforms.get(source) or load_ir_platform(source)
-        except IrPlatformFileError as error:
-            raise self._checks.said(f"{key}: {str(error).removesuffix('.')}") from error
-        return source
-
-    def _elements(self, value: Tree, key: str) -> tuple[int, ...]:
-        numbers = self._checks.list_of_numbers(value, key)
-        if any(number != int(number) or number < 0 for number in numbers):
-            raise self._checks.error(key, value, "must be a list of numbers of elements, from 0 on")
-        return tuple(int(number) for number in numbers)
-
-    def _gains(self, tree: Tree, key: str) -> IrGains | None:
-        """Factors of all elements; null: never calibrated."""
-        if tree is None:
-            return None
-        mapping = self._checks.mapping(tree, key, required=GAIN_LISTS)
-        values: Values = {**self._checks.numbers(tree, key, _GAIN_NUMBERS, others=GAIN_LISTS)}
-        for name in GAIN_LISTS:
-            values[name] = self._checks.list_of_numbers(mapping[name], f"{key}.{name}")
-        try:
-            return IrGains(**values)
-        except IrPlatformError as error:
-            raise self._checks.said(f"{key.removesuffix('gains')}{str(error).removesuffix('.')}") from error
-
-
 FILE_VERSION = 1
-_FOLDER = Path(__file__).parents[1] / "config" / "ir"
-_NUMBERS = number_specs(IrPlatform)
-_PARTS = ("fileversion", "angles", "sensor", "emitter", "powers")
-_TABLE = ("angles", "values")
-_BELOW = NumberSpec("rad", 0.0, math.pi, True, "where the next piece begins")
-
-Made = TypeVar("Made")
+_KEYS = ("fileversion", "powers")  # Of a file, in addition to the entries of `IrPlatform`
 
 
 class IrPlatformFileError(UserError):
     """An invalid platform file; the message is one sentence with file, key and value."""
-
-
-def packaged_platforms() -> tuple[str, ...]:
-    """Names of the platforms in this package."""
-    return tuple(sorted(path.stem for path in _FOLDER.glob("*.yaml")))
 
 
 def load_ir_platform(name: str) -> IrPlatform:
@@ -548,19 +522,29 @@ def load_ir_platform(name: str) -> IrPlatform:
     Raises:
         IrPlatformFileError: One sentence with file, key, value and what is allowed.
     """
-    if name.endswith((".yaml", ".yml")):
-        path = Path(name)
-    elif name in packaged_platforms():
-        path = _FOLDER / f"{name}.yaml"
-    else:
-        raise IrPlatformFileError(
-            f"{shown(name)} is no packaged infrared platform ({', '.join(packaged_platforms())})"
-            " and no path of a .yaml file."
+    path = Path(name)
+    if not name.endswith((".yaml", ".yml")):
+        path = FOLDER / f"{name}.yaml"
+        if name not in PACKAGED:
+            raise IrPlatformFileError(
+                f"{shown(name)} is no packaged infrared platform ({', '.join(PACKAGED)})"
+                " and no path of a .yaml file."
+            )
+    checks, specs = TreeChecks(path, IrPlatformFileError), entry_specs(IrPlatform)
+    tree = read_tree(path, IrPlatformFileError)
+    keys = checks.mapping(tree, WHOLE_FILE, (*_KEYS, *specs), (*_KEYS, "angles", *GAIN_LISTS))
+    checks.version(keys["fileversion"], FILE_VERSION)
+    values = checks.values(keys, WHOLE_FILE, specs, others=_KEYS)
+    powers = checks.mapping(keys["powers"], "powers", POWERS, POWERS[:1])
+    values["amplitudes"] = tuple(
+        checks.made(
+            f"powers.{power}.",
+            Amplitude,
+            **checks.values(powers[power], f"powers.{power}", entry_specs(Amplitude), ("scale",)),
         )
-    try:
-        return _Reader(path, IrPlatformFileError).platform(read_tree(path))
-    except YamlTreeError as error:
-        raise IrPlatformFileError(str(error)) from error
+        for power in POWERS[: len(powers)]
+    )
+    return checks.made("", IrPlatform, **values)
 
 
 def save_ir_platform(platform: IrPlatform, path: Path, comment: str = "") -> None:
@@ -569,85 +553,21 @@ def save_ir_platform(platform: IrPlatform, path: Path, comment: str = "") -> Non
     An existing file is replaced, a missing folder created.
     """
     laws = dict(zip(platform.powers, platform.amplitudes, strict=True))
+    numbers = entry_specs(IrPlatform)
     tree = {
         "fileversion": FILE_VERSION,
         "angles": list(platform.angles),
         "sensor": _curve_tree(platform.sensor),
         "emitter": _curve_tree(platform.emitter),
-        "powers": {name: number_values(law) for name, law in laws.items()},
-        **number_values(platform),
+        "powers": {name: to_tree(law, keep=entry_specs(Amplitude)) for name, law in laws.items()},
+        **to_tree(platform, keep=numbers, without=("angles", *GAIN_LISTS)),
     }
     write_tree(tree, path, comment.splitlines())
 
 
-class _Reader(TreeChecks):
-    """Converts the tree of one file to a platform, and checks it."""
-
-    def platform(self, tree: Tree) -> IrPlatform:
-        """The whole file."""
-        keys = self.mapping(tree, WHOLE_FILE, (*_PARTS, *_NUMBERS), _PARTS)
-        if keys["fileversion"] != FILE_VERSION or isinstance(keys["fileversion"], bool):
-            raise self.error("fileversion", keys["fileversion"], f"must be {FILE_VERSION}")
-        return self._made(
-            "",
-            IrPlatform,
-            angles=self.list_of_numbers(keys["angles"], "angles"),
-            sensor=self._curve(keys["sensor"], "sensor"),
-            emitter=self._curve(keys["emitter"], "emitter"),
-            amplitudes=self._amplitudes(keys["powers"]),
-            **{name: self.number(keys[name], name, spec) for name, spec in _NUMBERS.items() if name in keys},
-        )
-
-    def _curve(self, tree: Tree, key: str) -> AngleCurve:
-        """S or E, as pieces or as a table."""
-        keys = self.mapping(tree, key, ("pieces", "angles", "values"))
-        if "pieces" not in keys:
-            self.mapping(tree, key, required=_TABLE)
-            lists = {name: self.list_of_numbers(keys[name], f"{key}.{name}") for name in _TABLE}
-            return self._made(f"{key}.", TabulatedCurve, **lists)
-        self.mapping(tree, key, ("pieces",))
-        *inner, last = self.items(keys["pieces"], f"{key}.pieces") or [None]
-        pieces = [self._piece(piece, f"{key}.pieces[{k}]") for k, piece in enumerate(inner)]
-        pieces.append(self._piece(last, f"{key}.pieces[{len(inner)}]", below=math.pi))
-        return self._made(f"{key}.", PowerCurve, pieces=tuple(pieces))
-
-    def _piece(self, tree: Tree, key: str, below: float | None = None) -> PowerPiece:
-        """One sum of powers; `below` is where the last one ends."""
-        known = ("terms",) if below is not None else ("below", "terms")
-        keys = self.mapping(tree, key, known, known)
-        terms = []
-        for k, item in enumerate(self.items(keys["terms"], f"{key}.terms")):
-            term = self.list_of_numbers(item, f"{key}.terms[{k}]")
-            if len(term) != 2:
-                raise self.error(f"{key}.terms[{k}]", item, "must be [coefficient, exponent]")
-            terms.append((term[0], term[1]))
-        if below is None:
-            below = self.number(keys["below"], f"{key}.below", _BELOW)
-        return PowerPiece(below or 0.0, tuple(terms))
-
-    def _amplitudes(self, tree: Tree) -> tuple[Amplitude, ...]:
-        keys = self.mapping(tree, "powers", POWERS, POWERS[:1])
-        specs = number_specs(Amplitude)
-        return tuple(
-            self._made(
-                f"powers.{name}.",
-                Amplitude,
-                **self.numbers(keys[name], f"powers.{name}", specs, required=("scale",)),
-            )
-            for name in POWERS[: len(keys)]
-        )
-
-    def _made(self, prefix: str, cls: Callable[..., Made], **arguments: Any) -> Made:
-        """Create an object; add file and key to the message of its error."""
-        try:
-            return cls(**arguments)
-        except IrPlatformError as error:
-            raise IrPlatformFileError(f"{self._path}: {prefix}{error}") from error
-
-
 def _curve_tree(curve: TabulatedCurve | PowerCurve) -> dict[str, object]:
     if isinstance(curve, TabulatedCurve):
-        return {"angles": list(curve.angles), "values": list(curve.values)}
+        return to_tree(curve)
     pieces: list[dict[str, object]] = [
         {"below": piece.below, "terms": [list(term) for term in piece.terms]} for piece in curve.pieces
     ]

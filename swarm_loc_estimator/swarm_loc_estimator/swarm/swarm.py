@@ -15,6 +15,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from swarm_loc_estimator.common.codec import EntrySpec, address, entry, entry_specs, switch
 from swarm_loc_estimator.common.parameters import number
 from swarm_loc_estimator.swarm.error_models import (
     TURN,
@@ -31,6 +32,12 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.swarm.error_models import MotionResponse
     from swarm_loc_estimator.swarm.ir_board import RobotIr
 
+_ADDRESS = address(2**64 - 1, "address in messages")
+_SENSOR = EntrySpec(
+    lambda checks, tree, key: SensorModel(**checks.values(tree, key, entry_specs(SensorModel))),
+    {"$ref": "#/definitions/sensor"},
+)
+
 
 @dataclass(frozen=True)
 class UwbDevice:
@@ -39,7 +46,8 @@ class UwbDevice:
     A measured range is range_scale times the true one, plus the range_bias of both devices.
     """
 
-    address: int  #: Number by which messages name it, unique among robots and anchors
+    #: Number by which messages name it, unique among robots and anchors
+    address: int = field(metadata=entry(_ADDRESS))
     x: float = number(0.0, "m", -10.0, 10.0, "antenna forward of base_link")
     y: float = number(0.0, "m", -10.0, 10.0, "antenna left of base_link")
     z: float = number(0.0, "m", -10.0, 10.0, "antenna above the ground")
@@ -60,7 +68,8 @@ class UwbDevice:
 class Anchor:
     """Radio at a fixed place in `map`."""
 
-    address: int  #: Number by which messages name it, unique among robots and anchors
+    #: Number by which messages name it, unique among robots and anchors
+    address: int = field(metadata=entry(_ADDRESS))
     x: float = number(0.0, "m", -1e8, 1e8, "in map")
     y: float = number(0.0, "m", -1e8, 1e8, "in map")
     z: float = number(0.0, "m", -1e4, 1e4, "above the ground")
@@ -120,7 +129,7 @@ class Face:
         0.0, "m", 0.0, 10.0, "standard deviation of x and y; added to the noise of its sightings"
     )
     #: Whether it lies flat and looks up; its yaw is then the direction of its x axis, to the right
-    lies: bool = False
+    lies: bool = field(default=False, metadata=entry(switch("lies flat and looks up")))
 
 
 @dataclass(frozen=True)
@@ -215,7 +224,7 @@ class FixedCamera:
     yaw_sigma: float = number(
         0.002, "rad", 0.0, 1.0, "standard deviation of yaw, estimated with the poses", above=True
     )
-    sensor: SensorModel = SensorModel()
+    sensor: SensorModel = field(default=SensorModel(), metadata=entry(_SENSOR))
 
     @property
     def is_estimated(self) -> bool:

@@ -1,50 +1,8 @@
 """Swarm descriptions: read `swarm.yaml` to a `Swarm`, and write one.
 
-```yaml
-fileversion: 1
-defaults:      # odometry, imu, lidar, random_walk, response, camera, sensor, fix, clock, ir, uwb, faces,
-               # start_sigma
-  sensor: {range_sigma: 0.1}
-  landmark: {size: 0.06, position_sigma: 0.01, yaw_sigma: 0.02}  # without sigmas: surveyed exactly
-types:
-  epuck:                  # the same keys; what is not said comes from defaults
-    odometry: {wheel_separation: 0.053}
-    response:                               # null: all of the reported motion is true
-      speeds: [0.0, 0.1]
-      turn_rates: [0.0, 0.5, 1.0]
-      speed_share: [[1.0, 0.9, 0.9], [1.0, 0.8, 0.7]]
-      turn_share: [[1.0, 0.9, 0.9], [1.0, 0.9, 0.9]]
-    camera: {x: 0.035, z: 0.028}            # null: it has none
-    faces:                                  # markers on the body; null takes one away
-      front: {x: 0.035, yaw: 0.0, size: 0.036, position_sigma: 0.001}
-      top: {z: 0.1, yaw: 0.0, size: 0.05, lies: true}   # lies flat, its own right is forward
-  droplet:
-    odometry: null                          # null: it has none, and stands where it is
-    random_walk: {position: 1e-4, heading: 0.05}   # or moves, nobody knows where to
-    camera: null
-    ir:                                     # its infrared board; null: it has none
-      platform: droplet                     # a packaged one, or the path of a file, from here
-robots:
-  epuck1:                 # the same keys; what is not said comes from its type
-    type: epuck
-    ids: {front: 12, top: 13}   # which marker is on which face
-    start: {x: 0.0, y: 0.0, theta: 0.0}     # null or left out: unknown
-  droplet1:
-    type: droplet
-    ir:
-      id: 0x6B6F          # by which exchanges name it
-      gains: {sensor: [1, 1, 1, 1, 1, 1], emitter: [1, 1, 1, 1, 1, 1]}   # null or left out: never calibrated
-landmarks:
-  100: {x: 1.2, y: -0.4, yaw: 3.14159, size: 0.05}      # yaw null or left out: shows no heading
-cameras:                  # fixed ones, which see markers on robots
-  ceiling1: {x: -1.0, y: 0.5, z: 2.5, position_sigma: 0.001, sensor: {residual_position_sigma: 0.001}}
-anchors:                  # UWB radios, see doc/uwb.md
-  - {address: 0x10, x: 0.0, y: 5.0, z: 2.1}
-range_topic: uwb/{from}/{to}/distance  # sensor_msgs/Range of two radios, by their addresses
-map: floor.yaml           # walls that lidars see, as of map_server, from here; null or left out: none
-```
-Numbers, units, ranges and defaults are those of the classes in `swarm/swarm.py`.
-When a description is written, values common to all robots of a type are written with the type.
+doc/swarm_description.md has an example with all sections. Numbers, units, ranges and defaults are those of
+the classes in `swarm/swarm.py`. When a description is written, values common to all robots of a type are
+written with the type.
 """
 
 from __future__ import annotations
@@ -52,21 +10,20 @@ from __future__ import annotations
 import re
 import textwrap
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import asdict, dataclass
 from os.path import relpath
 from pathlib import Path
 from typing import Any
 
-from swarm_loc_estimator.common.parameters import UserError, number_specs, number_values
-from swarm_loc_estimator.common.yaml_tree import (
-    Numbers,
+from swarm_loc_estimator.common.codec import (
+    WHOLE_FILE,
     Tree,
     TreeChecks,
-    YamlTreeError,
+    entry_specs,
     nearest,
-    read_tree,
-    write_tree,
+    to_tree,
 )
+from swarm_loc_estimator.common.parameters import UserError, number_specs
+from swarm_loc_estimator.common.yaml_tree import read_tree, write_tree
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import (
     ClockModel,
@@ -74,12 +31,16 @@ from swarm_loc_estimator.swarm.error_models import (
     ImuModel,
     LidarModel,
     MotionResponse,
-    MotionResponseError,
     OdometryModel,
     RandomWalk,
     SensorModel,
 )
-from swarm_loc_estimator.swarm.ir_board import DEAD, GAIN_LISTS, IrSection, RobotIr, Values
+from swarm_loc_estimator.swarm.ir_board import (
+    IrPlatform,
+    IrPlatformFileError,
+    RobotIr,
+    load_ir_platform,
+)
 from swarm_loc_estimator.swarm.swarm import (
     Anchor,
     CameraMount,
@@ -89,7 +50,6 @@ from swarm_loc_estimator.swarm.swarm import (
     Robot,
     StartSigma,
     Swarm,
-    SwarmError,
     UwbDevice,
 )
 
@@ -118,16 +78,14 @@ MODELS: dict[str, type] = {
     "clock": ClockModel,
     "start_sigma": StartSigma,
 }
-MAY_BE_NONE = ("odometry", "camera")
-START = {
-    "x": number_specs(Landmark)["x"],
-    "y": number_specs(Landmark)["y"],
-    "theta": number_specs(CameraMount)["yaw"],
-}
+SECTIONS: dict[str, type] = {**MODELS, "ir": RobotIr, "uwb": UwbDevice}
+MAY_BE_NONE = ("odometry", "camera", "ir", "uwb")
+OWN = ("id", "address")  # Layer of sections that only a robot has
+PLACED = ("x", "y")  # Layer that landmarks and anchors must have
+START = {name: number_specs(Landmark)[name] for name in PLACED} | {"theta": number_specs(CameraMount)["yaw"]}
 LANDMARK_DEFAULTS = {name: number_specs(Landmark)[name] for name in ("size", "position_sigma", "yaw_sigma")}
 MOUNT = ("x", "y", "z", "yaw", "pitch", "roll")  # Numbers that transforms tell where no description does
-RESPONSE = ("speeds", "turn_rates", "speed_share", "turn_share")
-MAX_ID, MAX_ADDRESS = 2**32 - 1, 2**64 - 1
+MAX_ID = 2**32 - 1
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 RANGE_TOPIC = re.compile(r"/?(?:\w|\{from\}|\{to\})+(?:/(?:\w|\{from\}|\{to\})+)*")
 MAX_NAME = 64  # Maximum length of a robot name; DDS limits the length of topic names
@@ -162,11 +120,7 @@ def load_swarm(path: Path | str) -> Swarm:
         SwarmFileError: One sentence with file, dotted key, value and what is allowed.
     """
     path = Path(path)
-    try:
-        tree = read_tree(path)
-    except YamlTreeError as error:
-        raise SwarmFileError(str(error)) from error
-    return parse_swarm(tree, path)
+    return parse_swarm(read_tree(path, SwarmFileError), path)
 
 
 def parse_swarm(tree: Tree, path: Path) -> Swarm:
@@ -174,14 +128,8 @@ def parse_swarm(tree: Tree, path: Path) -> Swarm:
     return _Loader(path, SwarmFileError).swarm(tree)
 
 
-@dataclass
-class _Layer:
-    """Settings of one layer: defaults, type or robot; keys that the layer omits are omitted here."""
-
-    sections: dict[str, Values | None]  # Values by section; None: null in the file
-    response: MotionResponse | None  # Motion response of the layer
-    says_response: bool  # True if the layer has the key `response`
-    faces: dict[str, Numbers | None]  # Face by name; None: removed
+Layer = dict[str, Any]
+"""What one of defaults, type and robot says: entries of a section, faces by name; None: null in the file."""
 
 
 class _Loader(TreeChecks):
@@ -189,14 +137,13 @@ class _Loader(TreeChecks):
 
     def __init__(self, path: Path, error: type[ValueError]) -> None:
         super().__init__(path, error)
-        self._ir, self._folder = IrSection(self, path.parent), path.parent
+        self._folder = path.parent
+        self._platforms: dict[str, IrPlatform] = {}
 
     def swarm(self, tree: Tree) -> Swarm:
         """Parse the whole file."""
-        sections = self.mapping(tree, "the file", _SECTIONS)
-        version = sections.get("fileversion")
-        if version != FILE_VERSION or isinstance(version, bool):
-            raise self.error("fileversion", version, f"must be {FILE_VERSION}")
+        sections = self.mapping(tree, WHOLE_FILE, _SECTIONS)
+        self.version(sections.get("fileversion"), FILE_VERSION)
         # what robots have in common, then the robots
         defaults = self._layer(sections.get("defaults", {}), "defaults", _DEFAULTS)
         types = {
@@ -211,9 +158,16 @@ class _Loader(TreeChecks):
         robots = tuple(self._robot(name, tree, defaults, types) for name, tree in named)
         # what is fixed in map
         landmarks = self._landmarks(sections.get("landmarks", {}), sections.get("defaults", {}))
-        fixed = self._named(sections.get("cameras", {}), "cameras")
-        cameras = tuple(self._fixed_camera(name, tree) for name, tree in fixed)
-        anchors = self._anchors(sections.get("anchors"))
+        specs = entry_specs(FixedCamera)
+        cameras = tuple(
+            FixedCamera(name, **self.values(tree, f"cameras.{name}", specs, ("x", "y", "z")))
+            for name, tree in self._named(sections.get("cameras", {}), "cameras")
+        )
+        specs, radios = entry_specs(Anchor), sections.get("anchors")
+        anchors = tuple(
+            Anchor(**self.values(tree, f"anchors[{k}]", specs, (*PLACED, "address")))
+            for k, tree in enumerate(self.items([] if radios is None else radios, "anchors"))
+        )
         name = sections.get("map")
         if name is not None and (not isinstance(name, str) or not name):
             raise self.error("map", name, "must be the path of a map's .yaml file, from here")
@@ -223,10 +177,16 @@ class _Loader(TreeChecks):
             rule = "must be a topic with {from} and {to} once each, for addresses"
             raise self.error("range_topic", ranges, rule)
         # the swarm as a whole
-        try:
-            swarm = Swarm(robots, landmarks, cameras, anchors, file, (ranges or "").lstrip("/"))
-        except SwarmError as error:
-            raise self.said(str(error).removesuffix(".")) from error
+        swarm = self.made(
+            "",
+            Swarm,
+            robots=robots,
+            landmarks=landmarks,
+            cameras=cameras,
+            anchors=anchors,
+            map=file,
+            range_topic=(ranges or "").lstrip("/"),
+        )
         states = ParameterTable.of(swarm.robots, swarm.surveyed).filter_size - 3 * len(robots)
         if states > MAX_PARAMETERS:
             raise self.said(
@@ -235,7 +195,7 @@ class _Loader(TreeChecks):
             )
         return swarm
 
-    def _robot(self, name: str, tree: Tree, defaults: _Layer, types: Mapping[str, _Layer]) -> Robot:
+    def _robot(self, name: str, tree: Tree, defaults: Layer, types: Mapping[str, Layer]) -> Robot:
         """Parse one robot from its three layers."""
         key = f"robots.{name}"
         mapping = self.mapping(tree, key, _ROBOT)
@@ -244,112 +204,104 @@ class _Loader(TreeChecks):
             raise self.error(f"{key}.type", type_name, f"must be one of the types{nearest(type_name, types)}")
         own = self._layer(mapping, key, _ROBOT, of_robot=True)
         layers = [defaults, *([types[type_name]] if type_name else []), own]
-        sections = {section: _said(layers, section) for section in (*MODELS, "ir", "uwb")}
-        models: dict[str, Any] = {
+        sections = {section: _merged(layers, section) for section in SECTIONS}
+        models: Layer = {
             section: None if (values := sections[section]) is None else cls(**values)
             for section, cls in MODELS.items()
         }
-        uwb, start = sections["uwb"], mapping.get("start")
+        start = mapping.get("start")
         if start is not None:  # else it is unknown
-            pose = self.numbers(start, f"{key}.start", START, required=tuple(START))
-            start = tuple(float(pose[axis] or 0.0) for axis in START)
+            pose = self.values(start, f"{key}.start", START, START)
+            start = tuple(float(pose[axis]) for axis in START)
+        uwb = sections["uwb"]
+        if uwb:
+            self.require(uwb, f"{key}.uwb", {"address": entry_specs(UwbDevice)["address"]})
         return Robot(
             name=name,
             type=type_name or "",
-            response=next((layer.response for layer in reversed(layers) if layer.says_response), None),
+            response=next((layer["response"] for layer in reversed(layers) if "response" in layer), None),
             faces=self._faces(key, layers, mapping.get("ids", {})),
             start=start,
             stands=models["odometry"] is None,
-            ir=self._ir.board(sections["ir"], f"{key}.ir"),
-            uwb=UwbDevice(**{**uwb, **self._address(uwb, f"{key}.uwb")}) if uwb else None,
+            ir=self._board(sections["ir"], f"{key}.ir"),
+            uwb=UwbDevice(**uwb) if uwb else None,
             said=frozenset(f"{name}.{key}" for name, values in sections.items() for key in values or ()),
             **{**models, "odometry": models["odometry"] or OdometryModel()},
         )
 
-    def _layer(self, tree: Tree, key: str, known: Collection[str], *, of_robot: bool = False) -> _Layer:
+    def _layer(self, tree: Tree, key: str, known: Collection[str], *, of_robot: bool = False) -> Layer:
         mapping = self.mapping(tree, key, known)
-        sections: dict[str, Values | None] = {
+        if isinstance(mapping.get("ir"), dict) and "estimator" in mapping["ir"]:
+            gone = "is no longer an option: poses are always estimated by likelihood; remove it"
+            raise self.said(f"{key}.ir.estimator {gone}")
+        layer: Layer = {
             section: None
             if mapping[section] is None and section in MAY_BE_NONE
-            else self.numbers(mapping[section], f"{key}.{section}", number_specs(cls))
-            for section, cls in MODELS.items()
+            else self.values(
+                mapping[section], f"{key}.{section}", entry_specs(cls, without=() if of_robot else OWN)
+            )
+            for section, cls in SECTIONS.items()
             if section in mapping
         }
-        if "ir" in mapping:
-            sections["ir"] = self._ir.layer(mapping["ir"], f"{key}.ir", of_robot=of_robot)
-        if "uwb" in mapping:
-            sections["uwb"] = self._radio(mapping["uwb"], f"{key}.uwb", of_robot=of_robot)
+        if "platform" in (layer.get("ir") or {}):
+            layer["ir"]["platform"] = self._platform(layer["ir"]["platform"], f"{key}.ir.platform")
+        if "response" in mapping:
+            layer["response"] = self._response(mapping["response"], f"{key}.response")
         faces = self._named(mapping.get("faces", {}), f"{key}.faces")
-        return _Layer(
-            sections,
-            self._response(mapping.get("response"), f"{key}.response"),
-            "response" in mapping,
-            {name: None if face is None else self._face(face, f"{key}.faces.{name}") for name, face in faces},
-        )
-
-    def _radio(self, tree: Tree, key: str, *, of_robot: bool) -> Values | None:
-        """Parse the radio of one layer; only a robot has an address. None: no radio."""
-        if tree is None:
-            return None
-        others = ("address",) if of_robot else ()
-        values: Values = {**self.numbers(tree, key, number_specs(UwbDevice), others=others)}
-        return values if "address" not in tree else {**values, **self._address(tree, key)}
-
-    def _anchors(self, tree: Tree) -> tuple[Anchor, ...]:
-        anchors, specs = [], number_specs(Anchor)
-        for index, entry in enumerate(self.items([] if tree is None else tree, "anchors")):
-            key = f"anchors[{index}]"
-            numbers: Values = {**self.numbers(entry, key, specs, ("x", "y"), ("address",))}
-            anchors.append(Anchor(**numbers, **self._address(entry, key)))
-        return tuple(anchors)
-
-    def _address(self, tree: Values, key: str) -> Values:
-        """Parse the address of a radio, which must be there."""
-        if "address" not in tree:
-            raise self.said(f"{key} lacks address, a whole number in [1, {MAX_ADDRESS}]")
-        return {"address": self.address(tree["address"], f"{key}.address", MAX_ADDRESS)}
-
-    def _face(self, tree: Tree, key: str) -> Numbers:
-        specs = number_specs(Face)
-        place = self.numbers(tree, key, specs, others=("lies",))
-        if "lies" in self.mapping(tree, key):
-            if not isinstance(tree["lies"], bool):
-                raise self.error(f"{key}.lies", tree["lies"], "must be true or false")
-            place["lies"] = tree["lies"]
-        return place
-
-    def _fixed_camera(self, name: str, tree: Tree) -> FixedCamera:
-        key, specs = f"cameras.{name}", number_specs(FixedCamera)
-        pose: Any = self.numbers(tree, key, specs, ("x", "y", "z"), ("sensor",))
-        sensor: Any = self.numbers(tree.get("sensor"), f"{key}.sensor", number_specs(SensorModel))
-        return FixedCamera(name, **pose, sensor=SensorModel(**sensor))
+        layer["faces"] = {
+            name: None if face is None else self.values(face, f"{key}.faces.{name}", entry_specs(Face))
+            for name, face in faces
+        }
+        return layer
 
     def _response(self, tree: Tree, key: str) -> MotionResponse | None:
         """Parse a motion response or null; layers are not merged."""
         if tree is None:
             return None
-        mapping = self.mapping(tree, key, RESPONSE)
-        for name in RESPONSE:
-            if name not in mapping:
-                raise self.said(f"{key} lacks {name}, a list of numbers")
-        lists: Values = {name: self.list_of_numbers(mapping[name], f"{key}.{name}") for name in RESPONSE[:2]}
-        for name in RESPONSE[2:]:
-            rows = enumerate(self.items(mapping[name], f"{key}.{name}"))
-            lists[name] = tuple(self.list_of_numbers(row, f"{key}.{name}[{index}]") for index, row in rows)
-        try:
-            return MotionResponse(**lists)
-        except MotionResponseError as error:
-            raise self.said(f"{key.removesuffix('response')}{error}".removesuffix(".")) from error
+        specs = entry_specs(MotionResponse)
+        return self.made(
+            key.removesuffix("response"), MotionResponse, **self.values(tree, key, specs, required=specs)
+        )
 
-    def _faces(self, key: str, layers: Iterable[_Layer], ids_tree: Tree) -> tuple[Face, ...]:
+    def _board(self, values: Layer | None, key: str) -> RobotIr | None:
+        """The infrared board of a robot from the merged values of its layers."""
+        if not values:
+            return None
+        specs = entry_specs(RobotIr)
+        self.require(values, key, {name: specs[name] for name in ("platform", "id")})
+        source = values["platform"]
+        platform, gains = self._platforms[source], values.get("gains")
+        if gains is not None and len(gains.sensor) != platform.n:
+            raise self.said(
+                f"{key}.gains has {len(gains.sensor)} sensors and emitters"
+                f" but must have the {platform.n} of its platform"
+            )
+        for name in ("dead_sensors", "dead_emitters"):
+            if wrong := [k for k in values.get(name, ()) if k >= platform.n]:
+                raise self.said(
+                    f"{key}.{name} has {wrong[0]} but elements are numbered 0 to {platform.n - 1}"
+                )
+        return RobotIr(**{**values, "platform": platform, "source": source})
+
+    def _platform(self, name: str, key: str) -> str:
+        """The source of a platform; also loads the platform."""
+        is_path = name.endswith((".yaml", ".yml"))
+        source = str((self._folder / name).resolve()) if is_path else name
+        try:
+            self._platforms[source] = self._platforms.get(source) or load_ir_platform(source)
+        except IrPlatformFileError as error:
+            raise self.said(f"{key}: {str(error).removesuffix('.')}") from error
+        return source
+
+    def _faces(self, key: str, layers: Iterable[Layer], ids_tree: Tree) -> tuple[Face, ...]:
         """Parse the robot's markers: poses from the layers, marker ids from the robot."""
-        places: dict[str, Numbers] = {}
+        places: dict[str, Layer] = {}
         for layer in layers:
-            for name, numbers in layer.faces.items():
-                if numbers is None:
+            for name, values in layer["faces"].items():
+                if values is None:
                     places.pop(name, None)
                 else:
-                    places[name] = {**places.get(name, {}), **numbers}
+                    places[name] = {**places.get(name, {}), **values}
         ids = self.mapping(ids_tree, f"{key}.ids", places)
         missing = [name for name in places if name not in ids]
         if missing:
@@ -357,18 +309,18 @@ class _Loader(TreeChecks):
                 f"{key}.ids has no id for face '{missing[0]}'; give one or set faces.{missing[0]} to null"
             )
         return tuple(
-            Face(name, self._marker_id(ids[name], f"{key}.ids.{name}"), **numbers)  # type: ignore[arg-type]
-            for name, numbers in places.items()
+            Face(name, self._marker_id(ids[name], f"{key}.ids.{name}"), **values)
+            for name, values in places.items()
         )
 
     def _landmarks(self, tree: Tree, defaults: Tree) -> tuple[Landmark, ...]:
         shared_tree = self.mapping(defaults, "defaults").get("landmark", {})
-        shared = self.numbers(shared_tree, "defaults.landmark", LANDMARK_DEFAULTS)
+        shared = self.values(shared_tree, "defaults.landmark", LANDMARK_DEFAULTS)
         result = []
         for number, place in self.mapping(tree, "landmarks").items():
             key = f"landmarks.{number}"
-            numbers = self.numbers(place, key, number_specs(Landmark), required=("x", "y"))
-            result.append(Landmark(self._marker_id(number, key), **{**shared, **numbers}))  # type: ignore[arg-type]
+            values = self.values(place, key, entry_specs(Landmark), PLACED)
+            result.append(Landmark(self._marker_id(number, key), **{**shared, **values}))
         return tuple(result)
 
     def _marker_id(self, value: Tree, key: str) -> int:
@@ -391,18 +343,18 @@ class _Loader(TreeChecks):
         return list(mapping.items())
 
 
-def _said(layers: Iterable[_Layer], section: str) -> Values | None:
+def _merged(layers: Iterable[Layer], section: str) -> Layer | None:
     """Merge the values of a section over layers; null removes it, and a later layer can restore it."""
-    values: Values | None = {}
+    values: Layer | None = {}
     for layer in layers:
-        if section in layer.sections:
-            said = layer.sections[section]
+        if section in layer:
+            said = layer[section]
             values = None if said is None else {**(values or {}), **said}
     return values
 
 
 _WHOLE = frozenset({"camera", "faces", "response"})
-Entries = dict[Any, Any]
+_WRITTEN = (*(one for one in MODELS if one != "camera"), "response", "camera", "ir", "uwb", "faces")
 
 
 def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
@@ -436,35 +388,30 @@ def _units() -> list[str]:
     return lines
 
 
-def _tree(swarm: Swarm, folder: Path) -> Entries:
-    types: Entries = {}
+def _tree(swarm: Swarm, folder: Path) -> Layer:
+    types: Layer = {}
     for robot in swarm.robots:
         if robot.type and robot.type not in types:
             alike = [_layer(other, folder) for other in swarm.robots if other.type == robot.type]
             types[robot.type] = _shared(alike)
     robots = {robot.name: _robot(robot, types.get(robot.type, {}), folder) for robot in swarm.robots}
-    landmarks = {mark.id: _numbers(mark, keep=("x", "y")) for mark in swarm.landmarks}
+    landmarks = {mark.id: to_tree(mark, PLACED) for mark in swarm.landmarks}
     defaults = _taken_out(LANDMARK_DEFAULTS, list(landmarks.values()))
-    anchors = [{"address": one.address, **_numbers(one, keep=("x", "y"))} for one in swarm.anchors]
-    cameras = {one.name: _numbers(one, keep=("x", "y", "z")) for one in swarm.cameras}
-    for one in swarm.cameras:
-        if sensor := _numbers(one.sensor):
-            cameras[one.name]["sensor"] = sensor
     tree = {
         "fileversion": FILE_VERSION,
         "defaults": {"landmark": defaults} if defaults else {},
         "types": types,
         "robots": robots,
         "landmarks": landmarks,
-        "cameras": cameras,
-        "anchors": anchors,
+        "cameras": {one.name: to_tree(one, ("x", "y", "z")) for one in swarm.cameras},
+        "anchors": [to_tree(one, PLACED) for one in swarm.anchors],
         "range_topic": swarm.range_topic,
         "map": None if swarm.map is None else relpath(swarm.map, folder),
     }
     return {key: value for key, value in tree.items() if value}
 
 
-def _taken_out(names: Iterable[str], entries: list[Entries]) -> Entries:
+def _taken_out(names: Iterable[str], entries: list[Layer]) -> Layer:
     """Those of the named values that all entries share, taken out of them."""
     shared = {name: entries[0][name] for name in names if entries and name in entries[0]}
     shared = {name: value for name, value in shared.items() if all(e.get(name) == value for e in entries)}
@@ -474,53 +421,30 @@ def _taken_out(names: Iterable[str], entries: list[Entries]) -> Entries:
     return shared
 
 
-def _numbers(model: Any, keep: tuple[str, ...] = ()) -> Entries:
-    """The numbers of a dataclass that differ from its defaults."""
-    fields = type(model).__dataclass_fields__
-    return {n: v for n, v in number_values(model).items() if v != fields[n].default or n in keep}
-
-
-def _board(ir: RobotIr, folder: Path) -> Entries:
-    """An infrared board without its id."""
-    is_path = Path(ir.source).is_absolute()
-    board: Entries = {"platform": relpath(ir.source, folder.resolve()) if is_path else ir.source}
-    if ir.gains is not None:
-        board["gains"] = {name: list(getattr(ir.gains, name)) for name in GAIN_LISTS} | _numbers(ir.gains)
-    return board | {name: list(getattr(ir, name)) for name in DEAD if getattr(ir, name)} | _numbers(ir)
-
-
-def _layer(robot: Robot, folder: Path) -> Entries:
+def _layer(robot: Robot, folder: Path) -> Layer:
     """Everything about a robot that a type can say, as far as it differs from the defaults."""
-    layer: Entries = {
-        section: _numbers(getattr(robot, section), _said_of(robot, section))
-        for section in MODELS
-        if section != "camera"
-    }
-    response = {} if robot.response is None else asdict(robot.response)
-    layer["response"] = {name: _listed(value) for name, value in response.items()}
-    layer["camera"] = None if robot.camera is None else _numbers(robot.camera, _said_of(robot, "camera"))
+    layer: Layer = {}
+    for section in _WRITTEN:
+        model = getattr(robot, section)
+        said = [key for key in MOUNT if f"{section}.{key}" in robot.said]
+        if section == "faces":
+            layer[section] = {face.name: to_tree(face) for face in model}
+        elif model is not None:
+            layer[section] = to_tree(model, keep=said, without=(*OWN, "platform"))
+        else:
+            layer[section] = None if section == "camera" else {}
     if robot.stands:
         layer["odometry"] = None
-    layer["ir"] = {} if robot.ir is None else _board(robot.ir, folder)
-    layer["uwb"] = {} if robot.uwb is None else _numbers(robot.uwb, _said_of(robot, "uwb"))
-    layer["faces"] = {f.name: _numbers(f) | ({"lies": True} if f.lies else {}) for f in robot.faces}
+    if robot.ir is not None:
+        is_path = Path(robot.ir.source).is_absolute()
+        source = relpath(robot.ir.source, folder.resolve()) if is_path else robot.ir.source
+        layer["ir"] = {"platform": source, **layer["ir"]}
     return layer
 
 
-def _said_of(robot: Robot, section: str) -> tuple[str, ...]:
-    """The numbers of a mount that the robot's file says, also those that are the defaults."""
-    said = (key.partition(".") for key in robot.said)
-    return tuple(key for name, _, key in said if name == section and key in MOUNT)
-
-
-def _listed(value: Any) -> Any:
-    """Tuples as lists, which YAML has."""
-    return [_listed(item) for item in value] if isinstance(value, tuple) else value
-
-
-def _shared(layers: list[Entries]) -> Entries:
+def _shared(layers: list[Layer]) -> Layer:
     """What all robots of a type have in common; cameras and faces as a whole, the rest number by number."""
-    shared: Entries = {}
+    shared: Layer = {}
     for section, first in layers[0].items():
         if section in _WHOLE or any(layer[section] is None for layer in layers):
             if all(layer[section] == first for layer in layers):
@@ -534,9 +458,9 @@ def _shared(layers: list[Entries]) -> Entries:
     return {section: value for section, value in shared.items() if value != {}}
 
 
-def _robot(robot: Robot, shared: Entries, folder: Path) -> Entries:
+def _robot(robot: Robot, shared: Layer, folder: Path) -> Layer:
     """A robot without what its type says."""
-    entry: Entries = {"type": robot.type} if robot.type else {}
+    entry: Layer = {"type": robot.type} if robot.type else {}
     for section, value in _layer(robot, folder).items():
         rest = value
         if section in shared:

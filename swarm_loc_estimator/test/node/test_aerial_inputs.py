@@ -6,7 +6,7 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from node_world import STEP_NS, T0_NS, TRUE_POSES, Robots, Ros, newest_status, stamp_ns, values_of
 
-from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, encode_anonymous
+from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, encode_detections
 from swarm_loc_msgs.msg import AnonymousDetectionArray, RobotIdentities
 
 
@@ -16,7 +16,7 @@ def image(frame: str, at_ns: int) -> bytes:
     shown["x"], shown["y"] = np.array([TRUE_POSES["beta"], TRUE_POSES["alpha"], (5.0, 5.0, 0.0)]).T[:2]
     shown["theta"] = np.nan
     shown["covariance"][:, 0, 0] = -1.0
-    return encode_anonymous(frame, at_ns, shown)
+    return encode_detections(frame, at_ns, shown)
 
 
 def test_robots_seen_from_above_are_told_apart_and_a_wrong_frame_is_named(ros: Ros, robots: Robots) -> None:

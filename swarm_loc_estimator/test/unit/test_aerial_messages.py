@@ -14,8 +14,8 @@ from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.cdr import ANONYMOUS_DETECTIONS, ROBOT_IDENTITIES, CdrError
 from swarm_loc_estimator.common.messages.detections import (
     ANONYMOUS_DTYPE,
-    decode_anonymous,
-    encode_anonymous,
+    decode_detections,
+    encode_detections,
     encode_identities,
 )
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
@@ -53,31 +53,34 @@ def test_images_read_as_the_type_store_writes_them(
     frame: str, stamp_ns: int, count: int, seed: int, swapped: bool
 ) -> None:
     shown = detections(count, seed)
-    data = encode_anonymous(frame, stamp_ns, shown)
+    data = encode_detections(frame, stamp_ns, shown)
     message = typestore().deserialize_cdr(data, ANONYMOUS_DETECTIONS)
     rewritten = typestore().serialize_cdr(message, ANONYMOUS_DETECTIONS, little_endian=not swapped)
-    for one in (decode_anonymous(data), decode_anonymous(bytes(rewritten))):
+    for one in (
+        decode_detections(data, ANONYMOUS_DETECTIONS),
+        decode_detections(bytes(rewritten), ANONYMOUS_DETECTIONS),
+    ):
         assert (one.stamp_ns, one.frame_id) == (stamp_ns, frame)
         assert one.detections.tobytes() == shown.tobytes()
 
 
 @pytest.mark.parametrize("count", [0, 2])
 def test_damaged_bytes_are_refused(count: int) -> None:
-    good = encode_anonymous("map", 5, detections(count))
+    good = encode_detections("map", 5, detections(count))
     for damaged in (b"", good[:3], good[:20], good[:-9], good + bytes(8)):
         with pytest.raises(CdrError):
-            decode_anonymous(damaged)
+            decode_detections(damaged, ANONYMOUS_DETECTIONS)
 
 
 def test_images_become_rows_and_those_that_cannot_be_used_are_counted() -> None:
-    far_too_many = encode_anonymous("map", 4, detections(MAX_ANONYMOUS + 1))
+    far_too_many = encode_detections("map", 4, detections(MAX_ANONYMOUS + 1))
     images = [
-        (encode_anonymous("map", 1, detections(2)), 10),
-        (encode_anonymous("odom", 2, detections(3)), 11),
-        (encode_anonymous("map", 3, detections(0)), 12),
+        (encode_detections("map", 1, detections(2)), 10),
+        (encode_detections("odom", 2, detections(3)), 11),
+        (encode_detections("map", 3, detections(0)), 12),
         (far_too_many, 13),
         (b"nonsense", 14),
-        (encode_anonymous("map", 5, detections(1, 2)), 15),
+        (encode_detections("map", 5, detections(1, 2)), 15),
     ]
     found, ingest = read(*images)
     rows = found["aerial"]

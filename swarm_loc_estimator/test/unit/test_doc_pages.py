@@ -35,7 +35,8 @@ COMMANDS = (DOC / "commands.md").read_text(encoding="utf-8")
 def table_of(cls: type, *required: str) -> str:
     """The numbers of a dataclass as a table of Markdown."""
     lines = ["| Key | Default | Range | Meaning |", "|---|---|---|---|"]
-    defaults = {f.name: "null" if f.default is None else f"{f.default:g}" for f in fields(cls) if f.metadata}
+    given = {f.name: f.default for f in fields(cls) if f.name in number_specs(cls)}
+    defaults = {name: "null" if value is None else f"{value:g}" for name, value in given.items()}
     for name, spec in number_specs(cls).items():
         default = "required" if name in required else f"`{defaults[name]}`"
         lines.append(f"| `{name}` | {default} | {spec.range_text} | {spec.doc} |")
@@ -53,6 +54,16 @@ def test_every_number_of_a_landmark_has_its_place() -> None:
 
 def test_every_number_of_a_fixed_camera_has_its_place() -> None:
     assert table_of(FixedCamera, "x", "y", "z") in SWARM_DESCRIPTION
+
+
+def test_the_example_with_all_sections_is_a_swarm(tmp_path: Path) -> None:
+    example = re.findall(r"```yaml\n(.*?)```", SWARM_DESCRIPTION, re.DOTALL)[-1]
+    (tmp_path / "swarm.yaml").write_text(example, encoding="utf-8")
+    swarm = load_swarm(tmp_path / "swarm.yaml")
+    assert [robot.type for robot in swarm.robots] == ["epuck", "droplet"]
+    assert len(swarm.landmarks) == len(swarm.cameras) == len(swarm.anchors) == 1
+    assert swarm.range_topic
+    assert swarm.map == tmp_path / "floor.yaml"
 
 
 def test_the_example_of_overhead_cameras_is_a_swarm(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 from ir_world import droplet, droplet_matrix, random_poses
 
 from swarm_loc_estimator.infrared.brightness import expected_brightness, expected_with_slopes
-from swarm_loc_estimator.swarm.ir_board import IrGains, PairGains, load_ir_platform, packaged_platforms
+from swarm_loc_estimator.swarm.ir_board import PACKAGED, IrGains, PairGains, load_ir_platform
 
 
 def test_readings_are_those_of_the_corrected_equations() -> None:
@@ -30,7 +30,7 @@ def test_robots_that_face_each_other_read_most_with_the_elements_between_them() 
     assert np.unravel_index(bright.argmax(), bright.shape) == (5, 5)
 
 
-@pytest.mark.parametrize("name", packaged_platforms())
+@pytest.mark.parametrize("name", PACKAGED)
 def test_slopes_are_those_of_the_readings(name: str) -> None:
     platform = load_ir_platform(name)
     poses = random_poses(40, 3, low=0.1)

@@ -19,6 +19,7 @@ from swarm_loc_estimator.infrared.brightness import (
     distance_at,
 )
 from swarm_loc_estimator.swarm.ir_board import (
+    PACKAGED,
     Amplitude,
     IrGains,
     IrPlatformError,
@@ -28,7 +29,6 @@ from swarm_loc_estimator.swarm.ir_board import (
     PowerPiece,
     TabulatedCurve,
     load_ir_platform,
-    packaged_platforms,
 )
 
 DROPLET_FILE = Path(__file__).parents[2] / "swarm_loc_estimator" / "config" / "ir" / "droplet.yaml"
@@ -173,7 +173,7 @@ def test_gains_that_cannot_be_are_refused(
         IrGains(sensor, emitter)
 
 
-@pytest.mark.parametrize("name", packaged_platforms())
+@pytest.mark.parametrize("name", PACKAGED)
 def test_every_packaged_platform_loads(name: str) -> None:
     platform = load_ir_platform(name)
     assert platform.n == {"droplet": 6, "droplet_2016": 6, "epuck_twelve": 12}[name]

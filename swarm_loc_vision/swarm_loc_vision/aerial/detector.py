@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
-from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, encode_anonymous
+from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, encode_detections
 from swarm_loc_vision.aerial.circles import (
     PARTLY,
     SIDES,
@@ -413,7 +413,7 @@ class AerialCamera(CalibratedCamera):
         self.used += 1
         self.robots += len(detections)
         self.headings += int(np.isfinite(detections.theta).sum())
-        return encode_anonymous(MAP, nanoseconds(message.header.stamp), anonymous_rows(detections))
+        return encode_detections(MAP, nanoseconds(message.header.stamp), anonymous_rows(detections))
 
     def _seen(self, gray: Gray) -> AerialDetections:
         ground = self.control.look(gray) if self.control else None

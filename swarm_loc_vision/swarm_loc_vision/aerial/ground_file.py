@@ -7,19 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from swarm_loc_estimator.common.codec import WHOLE_FILE, Tree, TreeChecks, entry_specs, nearest, to_tree
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number_specs
-from swarm_loc_estimator.common.yaml_tree import (
-    WHOLE_FILE,
-    Tree,
-    TreeChecks,
-    YamlTreeError,
-    nearest,
-    read_tree,
-    write_tree,
-)
-from swarm_loc_vision.aerial.control_points import ControlPointError, ControlPoints, check_points
+from swarm_loc_estimator.common.yaml_tree import read_tree, write_tree
+from swarm_loc_vision.aerial.control_points import ControlPoints, check_points
 from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground
-from swarm_loc_vision.common.camera import Camera, CameraError
+from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.families import Family, families
 
 _PLACE = NumberSpec("m", -1e4, 1e4, False, "in map")
@@ -43,11 +36,7 @@ def load_ground(path: Path) -> Ground:
     Raises:
         GroundFileError: It cannot be read, a value is wrong, or the points do not determine a pose.
     """
-    try:
-        tree = read_tree(path)
-    except YamlTreeError as error:
-        raise GroundFileError(str(error)) from error
-    return _Reader(path, GroundFileError).ground(tree)
+    return _Reader(path, GroundFileError).ground(read_tree(path, GroundFileError))
 
 
 def save_ground(ground: Ground, path: Path, comment: str = "") -> None:
@@ -57,9 +46,7 @@ def save_ground(ground: Ground, path: Path, comment: str = "") -> None:
     tree = {
         "points": {name: dict(zip("xyzuv", [*place, *pixel], strict=True)) for name, place, pixel in rows},
         "family": ground.family.name,
-        "markers": {
-            one.id: {name: getattr(one, name) for name in number_specs(FloorMarker)} for one in ground.markers
-        },
+        "markers": {one.id: to_tree(one, keep=number_specs(FloorMarker)) for one in ground.markers},
     }
     write_tree(tree, path, comment.splitlines())
 
@@ -73,14 +60,11 @@ class _Reader(TreeChecks):
         family = self._family(sections.get("family", "aruco_mip_36h12"))
         markers = self._markers(self.mapping(sections.get("markers"), "markers"), family)
         if not markers:
-            try:
-                check_points(points)
-            except ControlPointError as error:
-                raise GroundFileError(f"{self._path}: {error}") from error
+            self.made("", check_points, points=points)
         return Ground(points, markers, family, self._camera(sections.get("camera")))
 
     def _points(self, tree: dict[Any, Tree]) -> ControlPoints:
-        rows = [self.numbers(entry, f"points.{name}", _POINT, _REQUIRED) for name, entry in tree.items()]
+        rows = [self.values(entry, f"points.{name}", _POINT, _REQUIRED) for name, entry in tree.items()]
         values = np.array([[row.get(key) or 0.0 for key in _POINT] for row in rows], float).reshape(-1, 5)
         return ControlPoints([str(name) for name in tree], values[:, :3], values[:, 3:])
 
@@ -98,19 +82,17 @@ class _Reader(TreeChecks):
                     f"markers has {marker_id!r}, but ids of {family.name} are 0 to {len(family.words) - 1}"
                 )
             required = ("x", "y", "size")
-            numbers: Any = self.numbers(entry, f"markers.{marker_id}", number_specs(FloorMarker), required)
-            markers.append(FloorMarker(marker_id, **numbers))
+            values = self.values(entry, f"markers.{marker_id}", entry_specs(FloorMarker), required)
+            markers.append(FloorMarker(marker_id, **values))
         return tuple(markers)
 
     def _camera(self, tree: Tree) -> Camera | None:
         if tree is None:
             return None
         section = self.mapping(tree, "camera", (*_CAMERA, "distortion_model", "distortion"), _CAMERA)
-        numbers: Any = {k: self.number(section[k], f"camera.{k}", spec) for k, spec in _CAMERA.items()}
-        distortion = self.list_of_numbers(section.get("distortion", []), "camera.distortion")
-        model = str(section.get("distortion_model", "plumb_bob"))
-        width, height = (int(numbers.pop(key)) for key in ("width", "height"))
-        try:
-            return Camera(width, height, **numbers, distortion=distortion, model=model)
-        except CameraError as error:
-            raise GroundFileError(f"{self._path}: {error}") from error
+        values: dict[str, Any] = {
+            k: self.number(section[k], f"camera.{k}", spec) for k, spec in _CAMERA.items()
+        }
+        values |= {key: int(values[key]) for key in ("width", "height")}
+        values["distortion"] = self.list_of_numbers(section.get("distortion", []), "camera.distortion")
+        return self.made("", Camera, model=str(section.get("distortion_model", "plumb_bob")), **values)

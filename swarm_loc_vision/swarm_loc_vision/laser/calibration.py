@@ -17,18 +17,19 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
 from swarm_loc_estimator import decode_laser
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.codec import WHOLE_FILE, EntrySpec, Tree, TreeChecks, entry, entry_specs
 from swarm_loc_estimator.common.files import write_whole
 from swarm_loc_estimator.common.messages.cdr import LASER, ODOMETRY, CdrError
 from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number, number_specs
-from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, YamlTreeError, read_tree
+from swarm_loc_estimator.common.yaml_tree import read_tree
 
 _MAX_SAMPLES = 100_000
 _MAX_OFF_COURSE = 0.1  # A robot that turns by more does not drive straight at a wall [rad]
@@ -282,13 +283,26 @@ def _loss(residuals: FloatArray, sigma: float) -> float:
 STEP_PX = 0.2  # Distance of two knots: the bias has a period of one pixel, with harmonics
 
 
+_OFFSET = NumberSpec("px", -10.0, 10.0, False, "tracked row minus true row at each knot")
+_MAX_KNOTS = 10_000
+
+
+def _read_offsets(checks: TreeChecks, tree: Tree, key: str) -> tuple[float, ...]:
+    offsets = checks.items(tree, key)
+    if len(offsets) > _MAX_KNOTS:
+        raise checks.said(f"{key} has {len(offsets)} numbers but must have at most {_MAX_KNOTS}")
+    return tuple(checks.number(offset, f"{key}[{k}]", _OFFSET) or 0.0 for k, offset in enumerate(offsets))
+
+
 @dataclass(frozen=True)
 class RowBias:
     """Tracked row minus true row, linear between knots."""
 
     first_row: float = number(0.0, "px", -1000.0, 10_000.0, "row of the first knot")
     step: float = number(STEP_PX, "px", 0.0, 10.0, "from knot to knot", above=True)
-    offsets: tuple[float, ...] = ()  # (K,) bias at each knot [px]; empty: unknown
+    offsets: tuple[float, ...] = field(
+        default=(), metadata=entry(EntrySpec(_read_offsets, {}))
+    )  # (K,) bias at each knot [px]; empty: unknown
 
     def reaches(self, row: float) -> bool:
         """Whether a tracked row [px] lies between knots."""
@@ -318,6 +332,11 @@ class Distance(NamedTuple):
 UNKNOWN = Distance(math.nan, math.nan)
 
 
+def _read_bias(checks: TreeChecks, tree: Tree, key: str) -> RowBias:
+    specs = entry_specs(RowBias)
+    return RowBias() if tree is None else RowBias(**checks.values(tree, key, specs, specs))
+
+
 @dataclass(frozen=True)
 class LaserCalibration:
     """Geometry of one robot's laser and camera; `row_bias` is subtracted from tracked rows."""
@@ -328,7 +347,7 @@ class LaserCalibration:
     camera_x: float = number(0.04, "m", -1.0, 1.0, "position of the camera ahead of base_link")
     min_depth: float = number(0.1, "m", 0.001, 100.0, "smallest depth, from the camera, that was calibrated")
     max_depth: float = number(2.5, "m", 0.01, 100.0, "largest depth")
-    row_bias: RowBias = field(default_factory=RowBias)
+    row_bias: RowBias = field(default=RowBias(), metadata=entry(EntrySpec(_read_bias, {})))
 
     def row(self, depth: float) -> float:
         """Row [px] of the spot on an object at a depth from the camera [m]."""
@@ -358,8 +377,6 @@ _HEAD = (
     "# Laser and event camera of one robot: the spot of what is at depth d lies at the row p_inf + f b / d.\n"
 )
 _BIAS = "row_bias"
-_OFFSET = NumberSpec("px", -10.0, 10.0, False, "tracked row minus true row at each knot")
-_MAX_KNOTS = 10_000
 
 
 class LaserFileError(UserError):
@@ -394,31 +411,11 @@ def load_laser(path: Path) -> LaserCalibration:
     Raises:
         LaserFileError: There is none, or a number is missing, unknown or out of its range.
     """
-    try:
-        tree = read_tree(path)
-    except YamlTreeError as error:
-        raise LaserFileError(str(error)) from error
-    checks, specs = TreeChecks(path, LaserFileError), number_specs(LaserCalibration)
-    content = checks.mapping(tree, WHOLE_FILE, (*specs, _BIAS), required=specs)
-    numbers: Any = {name: checks.number(content[name], name, spec) for name, spec in specs.items()}
-    calibration = LaserCalibration(**numbers, row_bias=_row_bias(checks, content.get(_BIAS)))
+    checks, specs = TreeChecks(path, LaserFileError), entry_specs(LaserCalibration)
+    tree = read_tree(path, LaserFileError)
+    calibration = LaserCalibration(**checks.values(tree, WHOLE_FILE, specs, number_specs(LaserCalibration)))
     if calibration.min_depth >= calibration.max_depth:
         raise checks.error(
             "min_depth", calibration.min_depth, f"must be below max_depth = {calibration.max_depth}"
         )
     return calibration
-
-
-def _row_bias(checks: TreeChecks, tree: Tree) -> RowBias:
-    if tree is None:
-        return RowBias()
-    specs, key = number_specs(RowBias), f"{_BIAS}.offsets"
-    section = checks.mapping(tree, _BIAS, (*specs, "offsets"), required=(*specs, "offsets"))
-    offsets = checks.items(section["offsets"], key)
-    if len(offsets) > _MAX_KNOTS:
-        raise checks.said(f"{key} has {len(offsets)} numbers but must have at most {_MAX_KNOTS}")
-    numbers: Any = {
-        name: checks.number(section[name], f"{_BIAS}.{name}", spec) for name, spec in specs.items()
-    }
-    knots: Any = tuple(checks.number(offset, f"{key}[{k}]", _OFFSET) for k, offset in enumerate(offsets))
-    return RowBias(**numbers, offsets=knots)

@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator import load_map
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.codec import WHOLE_FILE, Tree, TreeChecks
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, read_tree
+from swarm_loc_estimator.common.yaml_tree import read_tree
 
 Rectangle = tuple[float, float, float, float]  # Left, lower, right and upper edge [m]
 _SUFFIXES = (".yaml", ".yml", ".json")

@@ -47,7 +47,6 @@ from swarm_loc_estimator.common.messages.cdr import (
 from swarm_loc_estimator.common.messages.detections import (
     ANONYMOUS_DTYPE,
     DETECTION_DTYPE,
-    encode_anonymous,
     encode_brightness,
     encode_detections,
 )
@@ -171,7 +170,7 @@ def write_bag(run: SimulatedRun, folder: Path, comment: str) -> int:
 def write_aerial_bag(run: AerialRun, folder: Path, comment: str) -> int:
     """Write `aerial/detections`, and per robot `odom` and `ground_truth`; see `write_bag`."""
     data = [
-        encode_anonymous("map", stamp_ns, image)
+        encode_detections("map", stamp_ns, image)
         for stamp_ns, image in zip(run.stamp_ns.tolist(), run.images, strict=True)
     ]
     aerial = Stream("aerial/detections", ANONYMOUS_DETECTIONS, run.arrival_ns, data)

@@ -301,7 +301,7 @@ class BagReader:
         """File names in the folder's metadata; none when a crash left it without."""
         path = self._path / "metadata.yaml"
         try:
-            tree = read_tree(path, _METADATA_BYTES) if path.exists() else None
+            tree = read_tree(path, most_bytes=_METADATA_BYTES) if path.exists() else None
         except YamlTreeError as error:
             self._own_losses.append(str(error))
             return []

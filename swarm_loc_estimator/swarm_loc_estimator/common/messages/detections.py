@@ -58,15 +58,7 @@ ANONYMOUS_DTYPE = renamed(
 
 
 class DetectionArrayMessage(NamedTuple):
-    """swarm_loc_msgs/MarkerDetectionArray: `detections` has dtype `DETECTION_DTYPE`."""
-
-    stamp_ns: int
-    frame_id: str
-    detections: Rows
-
-
-class AnonymousMessage(NamedTuple):
-    """swarm_loc_msgs/AnonymousDetectionArray: `detections` has dtype `ANONYMOUS_DTYPE`."""
+    """Detections of dtype `DETECTION_DTYPE` or, of an overhead camera, `ANONYMOUS_DTYPE`."""
 
     stamp_ns: int
     frame_id: str
@@ -85,37 +77,25 @@ class SharedMessage(NamedTuple):
     columns: tuple[NDArray[Any], ...]  # (n, k) numbers of each, or (n,) detections
 
 
-def decode_detections(data: bytes) -> DetectionArrayMessage:
-    """Read a swarm_loc_msgs/MarkerDetectionArray.
+def decode_detections(data: bytes, message_type: str = DETECTIONS) -> DetectionArrayMessage:
+    """Read a swarm_loc_msgs/MarkerDetectionArray, or AnonymousDetectionArray.
 
     Returns:
-        Stamp, frame and a new array of `DETECTION_DTYPE`.
+        Stamp, frame and a new array of `DETECTION_DTYPE` or `ANONYMOUS_DTYPE`.
 
     Raises:
         CdrError: The bytes are not one whole message.
     """
-    message = decode(data, DETECTIONS)
-    rows = message.detections.view(DETECTION_DTYPE)
+    message = decode(data, message_type)
+    rows = message.detections.view(DETECTION_DTYPE if message_type == DETECTIONS else ANONYMOUS_DTYPE)
     return DetectionArrayMessage(nanoseconds(message.header.stamp), message.header.frame_id, rows)
 
 
-def decode_anonymous(data: bytes) -> AnonymousMessage:
-    """Read a swarm_loc_msgs/AnonymousDetectionArray; raises CdrError unless the bytes are a whole one."""
-    message = decode(data, ANONYMOUS_DETECTIONS)
-    rows = message.detections.view(ANONYMOUS_DTYPE)
-    return AnonymousMessage(nanoseconds(message.header.stamp), message.header.frame_id, rows)
-
-
 def encode_detections(frame_id: str, stamp_ns: int, detections: Rows) -> bytes:
-    """Serialize one swarm_loc_msgs/MarkerDetectionArray from (n,) detections of `DETECTION_DTYPE`."""
+    """Serialize one such message from (n,) detections, whose dtype decides of which type."""
     header = {"stamp": stamp_ns, "frame_id": frame_id}
-    return encode({"header": header, "detections": detections}, DETECTIONS)
-
-
-def encode_anonymous(frame_id: str, stamp_ns: int, detections: Rows) -> bytes:
-    """Serialize one swarm_loc_msgs/AnonymousDetectionArray from (n,) detections of `ANONYMOUS_DTYPE`."""
-    header = {"stamp": stamp_ns, "frame_id": frame_id}
-    return encode({"header": header, "detections": detections}, ANONYMOUS_DETECTIONS)
+    message_type = ANONYMOUS_DETECTIONS if detections.dtype == ANONYMOUS_DTYPE else DETECTIONS
+    return encode({"header": header, "detections": detections}, message_type)
 
 
 def encode_identities(

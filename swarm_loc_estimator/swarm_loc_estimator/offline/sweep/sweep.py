@@ -31,6 +31,7 @@ import numpy as np
 from joblib._parallel_backends import LokyBackend
 
 from swarm_loc_estimator.common.bags.reader import is_storage
+from swarm_loc_estimator.common.codec import WHOLE_FILE, Tree, TreeChecks
 from swarm_loc_estimator.common.files import check_file, naming
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.parameters import (
@@ -42,7 +43,7 @@ from swarm_loc_estimator.common.parameters import (
     parameter_specs,
 )
 from swarm_loc_estimator.common.processes import end_with, uninterrupted
-from swarm_loc_estimator.common.yaml_tree import WHOLE_FILE, Tree, TreeChecks, read_tree
+from swarm_loc_estimator.common.yaml_tree import read_tree
 from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.offline.metrics import pool
 from swarm_loc_estimator.offline.recorded_bag import Loss, Progress
