@@ -5,13 +5,10 @@ pose explains the readings of its neighbours. Each element is tested by the like
 hypotheses: it gives about all of its light, or a third of it or less. Under the first, the ratio exceeds 1 /
 p with a probability of at most p (Markov's inequality). Each element is tested at p / elements, so the
 probability of any false alarm is p (Wald's sequential test). In any one geometry of a pair an obstacle may
-block all light of an element, which is modelled by the board's share of blocked readings; so a few geometries
-carry little evidence, however often they were measured.
+block all light of an element, so a geometry counts with a limited ratio, however often it was measured.
 
-Since the relative pose is unknown, the likelihood is marginalized over a grid of relative poses. It is
-computed for a few relative gains of each sensor of the receiver and emitter of the transmitter; all other
-elements follow the board. Residuals are computed after a variance-stabilizing transform. Any reading may be
-blocked or too bright, at the rates of the board.
+Since the relative pose is unknown, likelihoods are sums over a grid of relative poses. Any reading may be
+blocked or too bright: its residual, after a variance-stabilizing transform, is limited.
 
 For saturation and noise, neither poses nor curves are used, since a board's curves may be wrong.
 
@@ -28,16 +25,15 @@ scale of the noise. Changes along the other directions are noise.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import bdtrc, fdtrc
+from scipy.special import bdtrc, fdtrc, logsumexp
 
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
-from swarm_loc_estimator.common.jit import cached_njit
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.infrared.brightness import expected_brightness, start_table
 from swarm_loc_estimator.infrared.gains import Exchanges
@@ -46,14 +42,18 @@ from swarm_loc_estimator.swarm.ir_board import IrPlatform
 
 FALSE_ALARM = 0.01  # Probability of a false alarm for any element: that it is dead, or that it saturates
 # Dead elements: checked by test_dead_elements.py and, on recordings of 2016, by make bench-droplet_real.
-_LOST, _WHOLE_SHARES = slice(0, 3), slice(3, None)
-"""Relative gains (of `SHARES`) under the hypotheses dead or shaded, and working."""
-_SAME_GEOMETRY = 1.5  # Maximum difference of directions within one geometry, in steps of the grid
+_DEAD_SHARES = (0.0, 0.15, 0.35)  # Shares of its light that a dead or shaded element gives
 _BRIGHT = 10.0
 """Minimum of the brightest reading of a usable exchange [sigma]; below, robots are out of range or sight."""
-_MIN_BLOCKED = 0.05  # Minimum assumed share of geometries with an obstacle on the line of sight
+_MIN_BLOCKED = 0.15  # Minimum assumed share of geometries with an obstacle on the line of sight
+_DIRECTIONS = 24  # Number of bearings, and of headings, of the grid
+_SAME_GEOMETRY = 3.0 * math.pi / _DIRECTIONS  # Maximum difference of directions within one geometry [rad]
+_SHOWN = 10.0  # Minimum of readings that determine the discretization error of the grid [sigma]
+_NOISE_RATIO = 1.2  # Maximum relative difference in noise of exchanges that share a table
+LIMIT = 3.0  # Residual from which readings count as outliers [sigma]
+_NEGLIGIBLE = 10.0  # Maximum log-likelihood ratio to the best pose; less likely poses are skipped
 
-_MIN_SIGMA = 0.05  # Minimum relative standard deviation of the gains of working elements
+Float32Array = NDArray[np.float32]
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,6 @@ class ElementVerdicts:
 
     dead: BoolArray  # (2, robots, n) sensors and emitters that are dead or shaded
     works: BoolArray  # (2, robots, n) sensors and emitters that certainly work
-    share: FloatArray  # (2, robots, n) most likely relative gain
 
     @property
     def undecided(self) -> BoolArray:
@@ -88,306 +87,127 @@ def find_dead_elements(platform: IrPlatform, robots: int, exchanges: Exchanges) 
     ambiguous. If exchanges do not discriminate between two elements of a robot (at the same probability),
     both are reported.
     """
-    n = platform.n
     bright = np.nan_to_num(exchanges.readings[:, 0]).max(axis=(1, 2)) > _BRIGHT * platform.noise
     readings: FloatArray = exchanges.readings[bright, 0]
     saturation = exchanges.saturation[bright, 0]
     robot_of = np.stack([exchanges.receiver[bright], exchanges.transmitter[bright]])
-    dead = np.zeros((2, robots, n), dtype=np.bool_)
-    shares, scores = np.ones((2, robots, n)), np.zeros((2, robots, n))
-    enough = math.log(dead.size / FALSE_ALARM)
-    likelihoods = element_likelihoods(platform, readings, saturation)
-    judged = np.ones((2, robots), dtype=np.bool_)
-    while judged.any():
-        _score(platform, robot_of, likelihoods, judged, scores, shares)
+    dead = np.zeros((2, robots, platform.n), dtype=np.bool_)
+    most, enough = -math.log(max(platform.blocked_share, _MIN_BLOCKED)), math.log(dead.size / FALSE_ALARM)
+    ratios, directions = _log_ratios(platform, readings, saturation)
+    while True:
+        # sum of the evidence of all geometries
+        alike = _geometries(robot_of, lambda k, others: _same_directions(directions, k, others))
+        places, number = np.unique(alike, return_inverse=True)
+        of_geometry = np.zeros((places.size, 2, platform.n))
+        np.add.at(of_geometry, number, ratios)
+        scores = np.zeros(dead.shape)
+        for side in range(2):
+            np.add.at(scores[side], robot_of[side, places], np.clip(of_geometry[:, side], -most, most))
+        # the worst elements of each robot
         scores[dead] = -math.inf
         best = scores.max(axis=2, keepdims=True)
         named = (best > enough) & (best - scores < -math.log(FALSE_ALARM))
+        if not named.any():
+            return ElementVerdicts(dead, ~dead & (scores < math.log(FALSE_ALARM)))
+        # once more without them
         dead |= named
         changed = named[0, robot_of[0]].any(axis=1) | named[1, robot_of[1]].any(axis=1)
         readings[dead[0, robot_of[0]]] = np.nan
         np.swapaxes(readings, 1, 2)[dead[1, robot_of[1]]] = np.nan
-        likelihoods.log[changed], likelihoods.directions[changed] = element_likelihoods(
-            platform, readings[changed], saturation[changed]
-        )
-        judged = np.zeros((2, robots), dtype=np.bool_)
-        for side in range(2):
-            judged[side, robot_of[side, changed]] = True
-    return ElementVerdicts(dead, ~dead & (scores < math.log(FALSE_ALARM)), shares)
+        ratios[changed], directions[changed] = _log_ratios(platform, readings[changed], saturation[changed])
 
 
-def _score(
-    platform: IrPlatform,
-    robot_of: NDArray[np.int64],
-    likelihoods: ElementLikelihoods,
-    wanted: BoolArray,
-    scores: FloatArray,
-    shares: FloatArray,
-) -> None:
-    """Write log likelihood ratios and likeliest shares (2, robots, n), of robots `wanted` (2, robots)."""
-    geometry = _geometries(robot_of, likelihoods.directions, _SAME_GEOMETRY * direction_step(platform))
-    # gains of elements that work differ by the board's `element_sigma`
-    sigma = max(platform.element_sigma, _MIN_SIGMA)
-    weight = -0.5 * (np.log(SHARES[_WHOLE_SHARES]) / sigma) ** 2
-    weight -= np.logaddexp.reduce(weight)
-    for side, robot in zip(*np.nonzero(wanted), strict=True):
-        rows = np.flatnonzero(robot_of[side] == robot)
-        logs = likelihoods.log[rows, side]
-        whole, lost = _by_hypothesis(logs, geometry[rows], max(platform.blocked_share, _MIN_BLOCKED))
-        scores[side, robot] = _log_sum(lost, np.full(lost.shape[-1], -math.log(lost.shape[-1])))
-        scores[side, robot] -= _log_sum(whole, weight)
-        both = np.concatenate([lost, whole], axis=-1)
-        shares[side, robot] = SHARES[np.argmax(both, axis=-1)]
+def _geometries(robot_of: IntArray, same: Callable[[int, list[int]], BoolArray]) -> IntArray:
+    """Index (k,) of the first exchange in the geometry of each exchange of receivers and transmitters (2, k).
 
-
-def _by_hypothesis(
-    logs: FloatArray, geometry: NDArray[np.int64], blocked: float
-) -> tuple[FloatArray, FloatArray]:
-    """Log likelihoods (n, S') of all exchanges by share, of elements that work and of those that do not.
-
-    Of an element that works the light may be lost altogether, and of one that does not it may be there: in
-    single exchanges, and in all of a geometry.
-
-    Args:
-        logs: (k, n, S) of the exchanges.
-        geometry: (k,) numbers.
-        blocked: How often.
+    `same` tells in which of some earlier exchanges of its pair (m,) the geometry is that of an exchange.
     """
-    none, all_of_it = logs[..., :1], logs[..., WHOLE : WHOLE + 1]
-    rare, usual = math.log(blocked), math.log1p(-blocked)
-    darkened, lit = (np.logaddexp(usual + logs, rare + other) for other in (none, all_of_it))
-    places, number = np.unique(geometry, return_inverse=True)
-    sums = np.zeros((2, places.size, *logs.shape[1:]))
-    np.add.at(sums[0], number, darkened)
-    np.add.at(sums[1], number, lit)
-    darkened, lit = sums
-    whole = np.logaddexp(usual + darkened, rare + lit[..., :1])
-    lost = np.logaddexp(usual + lit, rare + darkened[..., WHOLE : WHOLE + 1])
-    return whole.sum(axis=0)[:, _WHOLE_SHARES], lost.sum(axis=0)[:, _LOST]
-
-
-def _log_sum(logs: FloatArray, weight: FloatArray) -> FloatArray:
-    """Logarithm of the weighted sum over the last axis."""
-    return np.asarray(np.logaddexp.reduce(logs + weight, axis=-1))
-
-
-def _geometries(robot_of: NDArray[np.int64], directions: FloatArray, width: float) -> NDArray[np.int64]:
-    """Number (k,) of each exchange's geometry: bearing and heading of a pair are about the same."""
-    number = np.empty(len(directions), dtype=np.int64)
-    seen = dict[tuple[int, int], list[int]]()
+    number, seen = np.arange(robot_of.shape[1]), dict[tuple[int, ...], list[int]]()
     for k, pair in enumerate(zip(*robot_of.tolist(), strict=True)):
         firsts = seen.setdefault(pair, [])
-        apart = np.abs(wrap_angle(directions[firsts] - directions[k])).max(axis=1, initial=0.0)
-        near = np.flatnonzero(apart < width)
-        if not near.size:
+        near = np.flatnonzero(same(k, firsts)) if firsts else []
+        if len(near):
+            number[k] = firsts[near[0]]
+        else:
             firsts.append(k)
-        number[k] = firsts[near[0]] if near.size else k
     return number
 
 
-SHARES: FloatArray = np.array([0.0, 0.15, 0.35, 0.7, 1.0, 1.4])
-"""Relative gains of an element that are compared; the first is zero."""
-WHOLE = 4  # Index of the relative gain one
-_PER_ELEMENT, _MAX_DIRECTIONS = 4, 24  # Number of bearings, and of headings, of the grid
-_SHOWN = 10.0  # Minimum of readings that determine the discretization error of the grid [sigma]
-_NOISE_RATIO = 1.2  # Maximum relative difference in noise of exchanges that share a table
-_NEGLIGIBLE = 8.0  # Maximum log-likelihood ratio to the best pose; less likely poses are skipped
-BRIGHT_SPAN = 20.0  # Width of the uniform distribution of readings that are too bright [sigma]
-MIN_SHARE = 1e-3  # Minimum assumed share of outliers
-PEAK = 1.0 / math.sqrt(2.0 * math.pi)
-LOWEST = 1e-300
-_FAR_OFF = 8.0  # Maximum residual with a non-negligible likelihood [sigma]
-
-Float32Array = NDArray[np.float32]
+def _same_directions(directions: FloatArray, k: int, others: list[int]) -> BoolArray:
+    """Whether bearing and heading (of k, 2) are about the same."""
+    apart: FloatArray = np.abs(wrap_angle(directions[others] - directions[k])).max(axis=1)
+    return apart < _SAME_GEOMETRY
 
 
-class ElementLikelihoods(NamedTuple):
-    """Likelihoods of the elements of exchanges."""
-
-    # (k, 2, n, S) log likelihood for each relative gain of `SHARES`, of the receiver's sensors and the
-    # transmitter's emitters
-    log: FloatArray
-    directions: FloatArray  # (k, 2) bearing and heading [rad] of the most likely pose
-
-
-def element_likelihoods(
+def _log_ratios(
     platform: IrPlatform, readings: FloatArray, saturation: FloatArray
-) -> ElementLikelihoods:
-    """Log likelihoods of k exchanges as functions of the relative gain of each element.
+) -> tuple[FloatArray, FloatArray]:
+    """Log-likelihood ratios (k, 2, n) of each sensor and emitter being dead to its working.
 
     Args:
         platform: The board of both robots.
-        readings: (k, n, n) [count] at full power, [sensor, emitter]; NaN where not measured or left out.
+        readings: (k, n, n) at full power [count], [sensor, emitter]; NaN where not measured or left out.
         saturation: (k,) of each exchange [count].
+
+    Returns:
+        The ratios, and (k, 2) bearing and heading [rad] of the most likely pose if all elements work.
     """
-    count, n = len(readings), platform.n
-    poses, light, log_prior = _grid(platform)
-    found = np.empty((count, 2, n, SHARES.size))
-    best = np.zeros(count, dtype=np.int64)
-    relative = math.sqrt(
-        platform.relative**2 + 2.0 * platform.element_sigma**2 + _grid_variance(platform, light)
-    )
-    bright = np.nan_to_num(readings, nan=0.0).max(axis=(1, 2))
+    poses, light, grid_variance = _grid(platform)
+    log_prior = 2.0 * np.log(poses[:, 0])  # uniform over the plane
+    ratios, directions = np.empty((len(readings), 2, platform.n)), np.empty((len(readings), 2))
+    relative = math.sqrt(platform.relative**2 + 2.0 * platform.element_sigma**2 + grid_variance)
+    bright = np.nan_to_num(readings).max(axis=(1, 2))
     noise = np.hypot(platform.noise, platform.stray_noise * np.minimum(bright, saturation))
-    level = np.rint(np.log(noise / platform.noise) / math.log(_NOISE_RATIO)).astype(np.int64)
-    blocked, stray = max(platform.blocked_share, MIN_SHARE), max(platform.bright_share, MIN_SHARE)
+    level = np.rint(np.log(noise / platform.noise) / math.log(_NOISE_RATIO))
     for one in np.unique(level).tolist():
-        rows = np.flatnonzero(level == one)
         sigma = platform.noise * _NOISE_RATIO**one
-        table = np.stack([_stabilized(share * light, sigma, relative) for share in SHARES])
-        present = np.isfinite(readings[rows]) & (readings[rows] >= DARKEST * sigma)
-        limit = saturation[rows, None, None]
-        saturated = present & (readings[rows] >= limit)
-        stable = _stabilized(np.where(present, np.minimum(readings[rows], limit), 0.0), sigma, relative)
-        kinds = present.astype(np.int8) + saturated
-        dark = np.where(saturated, 0.0, blocked * PEAK * np.exp(-0.5 * np.square(stable, dtype=np.float64)))
-        outlier = dark + stray / BRIGHT_SPAN
-        part, places = np.empty((rows.size, 2, n, SHARES.size)), np.zeros(rows.size, dtype=np.int64)
-        _marginalize(table, log_prior, stable.astype(np.float64), kinds, outlier, part, places)
-        found[rows], best[rows] = part, places
-    return ElementLikelihoods(found, poses[best, 1:])
+        shares = np.array([1.0, *_DEAD_SHARES], dtype=np.float32)
+        working, *shaded = stabilized(shares[:, None, None, None] * light, sigma, relative)
+        for k in np.flatnonzero(level == one).tolist():
+            # log likelihoods of the readings at all poses, if all elements work
+            measured = np.isfinite(readings[k]) & (readings[k] >= DARKEST * sigma)
+            cut = np.where(measured, np.minimum(readings[k], saturation[k]), 0.0)
+            stable, top = (
+                stabilized(value.astype(np.float32), sigma, relative) for value in (cut, saturation[k])
+            )
+            each = _fits(stable, measured, np.minimum(working, top))
+            whole = log_prior + each.sum(axis=(0, 1))
+            directions[k] = poses[whole.argmax(), 1:]
+            # the same if one element is dead, at all poses that the other elements allow
+            without = whole - np.stack([each.sum(axis=1), each.sum(axis=0)])
+            likely = np.any(without > without.max(axis=2, keepdims=True) - _NEGLIGIBLE, axis=(0, 1))
+            dead = [_fits(stable, measured, np.minimum(table[..., likely], top)) for table in shaded]
+            logs = [without[..., likely] + np.stack([one.sum(axis=1), one.sum(axis=0)]) for one in dead]
+            ratios[k] = logsumexp(np.concatenate(logs, axis=2), axis=2) - math.log(len(logs))
+            ratios[k] -= logsumexp(whole)
+    return ratios, directions
 
 
-def direction_step(platform: IrPlatform) -> float:
-    """Step of the grid in bearing and heading [rad]."""
-    return 2.0 * math.pi / min(_PER_ELEMENT * platform.n, _MAX_DIRECTIONS)
+def _fits(stable: Float32Array, measured: BoolArray, expected: Float32Array) -> Float32Array:
+    """Log likelihoods (n, n, g) of readings (n, n) at expectations (n, n, g), both stabilized and limited."""
+    off = np.minimum(np.abs(stable[..., None] - expected), LIMIT)
+    return np.where(measured[..., None], -0.5 * off * off, 0.0)
 
 
-def _grid(platform: IrPlatform) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Poses (g, 3), expected readings (g, n, n), and log prior (g,), uniform over the plane."""
+def _grid(platform: IrPlatform) -> tuple[FloatArray, FloatArray, float]:
+    """Poses (g, 3), expected readings (n, n, g), and their squared relative error between the poses."""
     full = replace(platform, amplitudes=platform.amplitudes[:1])
-    ranges = start_table(full).ranges
-    angles = np.arange(-math.pi, math.pi - 1e-9, direction_step(platform))
-    poses = np.stack(np.meshgrid(ranges, angles, angles, indexing="ij"), axis=-1).reshape(-1, 3)
-    return poses, expected_brightness(full, poses)[:, 0], 2.0 * np.log(poses[:, 0] / ranges[-1])
-
-
-def _grid_variance(platform: IrPlatform, light: FloatArray) -> float:
-    """Mean squared relative error of readings due to the discretization of poses."""
-    n, size = platform.n, round(2.0 * math.pi / direction_step(platform))
-    logs = np.log(np.clip(light, platform.noise, platform.saturation)).reshape(-1, size, size, n * n)
-    shown = logs > math.log(_SHOWN * platform.noise)
-    total = 0.0
-    for axis in range(3):
-        steps = np.diff(logs, axis=axis)
+    angles = 2.0 * math.pi / _DIRECTIONS * np.arange(_DIRECTIONS) - math.pi
+    poses = np.stack(np.meshgrid(start_table(full).ranges, angles, angles, indexing="ij"), axis=-1)
+    flat = poses.reshape(-1, 3)
+    light = np.moveaxis(expected_brightness(full, flat)[:, 0], 0, 2).astype(np.float32)
+    logs = np.log(np.clip(light, platform.noise, platform.saturation)).reshape(-1, *poses.shape[:3])
+    shown, variance = logs > math.log(_SHOWN * platform.noise), 0.0
+    for axis in range(1, 4):
         one, other = (np.delete(shown, end, axis=axis) for end in (-1, 0))
-        total += float(np.mean(np.square(steps[one | other])))
-    return total / 12.0  # uniform within a step
+        steps = np.diff(logs, axis=axis)[one | other]
+        variance += float(np.mean(np.square(steps))) / 12.0  # uniform within a step
+    return flat, light, variance
 
 
-def _stabilized(values: FloatArray, noise: float, relative: float) -> Float32Array:
+def stabilized(values: FloatArray, noise: FloatArray | float, relative: FloatArray | float) -> FloatArray:
     """Variance-stabilizing transform of readings with additive and relative noise [sigma]."""
-    stable: Float32Array = (np.arcsinh(relative / noise * values) / relative).astype(np.float32)
-    return stable
-
-
-@cached_njit
-def _marginalize(
-    table: Float32Array,
-    log_prior: FloatArray,
-    stable: FloatArray,
-    kinds: NDArray[np.int8],
-    outlier: FloatArray,
-    found: FloatArray,
-    best: NDArray[np.int64],
-) -> None:
-    """Write `found` (k, 2, n, S) and the most likely pose of each exchange.
-
-    Args:
-        table: (S, g, n, n) expected readings by relative gain.
-        log_prior: (g,).
-        stable: (k, n, n) readings.
-        kinds: (k, n, n) 0 missing, 1 measured, 2 saturated.
-        outlier: (k, n, n) densities under the outlier hypotheses.
-        found: Written.
-        best: (k,) written.
-    """
-    shares, poses, n = table.shape[0], table.shape[1], stable.shape[1]
-    sides, logs, tops = np.empty((poses, 2, n)), np.empty(poses), np.empty((2, n))
-    dark, changed = np.empty((2, n)), np.empty((shares, 2, n))
-    for k in range(stable.shape[0]):
-        # log likelihood of each pose with all elements working, and with each single one dead
-        _likelihoods(table[0, 0], stable[k], kinds[k], outlier[k], changed[0])  # the same at all poses
-        dark[:] = np.log(changed[0])
-        tops[:] = -math.inf
-        best[k] = 0
-        for g in range(poses):
-            logs[g] = log_prior[g] + _by_side(table[WHOLE, g], stable[k], kinds[k], outlier[k], sides[g])
-            if logs[g] > logs[best[k]]:
-                best[k] = g
-            for side in range(2):
-                for e in range(n):
-                    tops[side, e] = max(tops[side, e], logs[g] - sides[g, side, e] + dark[side, e])
-        # sum over the poses that count, with each relative gain of each element
-        found[k] = 0.0
-        base = logs[best[k]]
-        for g in range(poses):
-            if not _counts(logs[g], base, sides[g], dark, tops):
-                continue
-            changed[WHOLE] = np.exp(sides[g])
-            for s in range(1, shares):
-                if s != WHOLE:
-                    _likelihoods(table[s, g], stable[k], kinds[k], outlier[k], changed[s])
-            for side in range(2):
-                for e in range(n):
-                    others = math.exp(logs[g] - sides[g, side, e] - base)
-                    for s in range(shares):
-                        found[k, side, e, s] += others * changed[s, side, e]
-        # back to logarithms
-        for side in range(2):
-            for e in range(n):
-                for s in range(shares):
-                    found[k, side, e, s] = base + math.log(max(found[k, side, e, s], LOWEST))
-
-
-@cached_njit
-def _counts(log: float, base: float, sides: FloatArray, dark: FloatArray, tops: FloatArray) -> bool:
-    """Whether a pose is not negligible, with all elements working or any one of them dead."""
-    if log > base - _NEGLIGIBLE:
-        return True
-    for side in range(2):
-        for e in range(sides.shape[1]):
-            if log - sides[side, e] + dark[side, e] > tops[side, e] - _NEGLIGIBLE:
-                return True
-    return False
-
-
-@cached_njit
-def _by_side(
-    light: Float32Array, stable: FloatArray, kinds: NDArray[np.int8], outlier: FloatArray, sides: FloatArray
-) -> float:
-    """Write the log likelihood of each sensor's and each emitter's readings (2, n); returns the total."""
-    _likelihoods(light, stable, kinds, outlier, sides)
-    total = 0.0
-    for e in range(stable.shape[0]):
-        sides[0, e], sides[1, e] = math.log(sides[0, e]), math.log(sides[1, e])
-        total += sides[0, e]
-    return total
-
-
-@cached_njit
-def _likelihoods(
-    light: Float32Array, stable: FloatArray, kinds: NDArray[np.int8], outlier: FloatArray, sides: FloatArray
-) -> None:
-    """Write the likelihood of each sensor's and each emitter's readings (2, n), at least `LOWEST`."""
-    n = stable.shape[0]
-    for e in range(n):
-        sides[1, e] = 1.0
-    for i in range(n):
-        row = 1.0
-        for j in range(n):
-            if kinds[i, j] == 0:
-                continue
-            off, density = stable[i, j] - light[i, j], outlier[i, j]
-            if kinds[i, j] == 2:
-                density += 0.5 * math.erfc(off / math.sqrt(2.0))
-            elif abs(off) < _FAR_OFF:
-                density += PEAK * math.exp(-0.5 * off * off)
-            row *= density
-            sides[1, j] *= density
-        sides[0, i] = max(row, LOWEST)
-    for e in range(n):
-        sides[1, e] = max(sides[1, e], LOWEST)
+    return np.asarray(np.arcsinh(relative / noise * values) / relative)
 
 
 # Saturation and noise: checked by test_reading_limits.py.
@@ -448,7 +268,11 @@ def find_reading_limits(platform: IrPlatform, robots: int, exchanges: Exchanges)
     are in order of time.
     """
     saturation = np.full((robots, platform.n), np.nan)
-    firsts = _first_of_geometries(exchanges)
+    pairs, read = (
+        np.stack([exchanges.receiver, exchanges.transmitter]),
+        np.nan_to_num(exchanges.readings[:, 0]),
+    )
+    firsts = _geometries(pairs, lambda k, others: _same_readings(read, k, others)) == np.arange(len(read))
     alarm = FALSE_ALARM / (max(np.unique(exchanges.receiver).size, 1) * platform.n)
     for robot in range(robots):
         own = firsts & (exchanges.receiver == robot)
@@ -494,19 +318,11 @@ def _median_of_known(values: FloatArray) -> float:
     return float(np.median(known)) if known.size else math.nan
 
 
-def _first_of_geometries(exchanges: Exchanges) -> BoolArray:
-    """(k,) True for the first exchange of a pair in each geometry."""
-    first = np.zeros(len(exchanges.receiver), dtype=np.bool_)
-    readings = np.nan_to_num(exchanges.readings[:, 0])
-    for rows in _rows_of_pairs(exchanges):
-        own, brightest = readings[rows], readings[rows].max(axis=(1, 2))
-        seen: list[int] = []
-        for k in range(rows.size):
-            apart = np.abs(own[seen] - own[k]).max(axis=(1, 2), initial=0.0)
-            if not np.any(apart <= _SAME * np.maximum(brightest[seen], brightest[k])):
-                seen.append(k)
-        first[rows[seen]] = True
-    return first
+def _same_readings(readings: FloatArray, k: int, others: list[int]) -> BoolArray:
+    """Whether readings (of k, n, n) are about the same."""
+    apart = np.abs(readings[others] - readings[k]).max(axis=(1, 2))
+    same: BoolArray = apart <= _SAME * np.maximum(readings[others].max(axis=(1, 2)), readings[k].max())
+    return same
 
 
 def _rows_of_pairs(exchanges: Exchanges) -> list[NDArray[np.int64]]:

@@ -5,9 +5,8 @@ held-out exchanges is evaluated. They are accepted where it is higher than with 
 gains. Errors of the curves are correlated over time, so the sum over all robots must exceed its scatter over
 blocks. Single robots need only a positive sum, since some have few readings.
 
-The relative pose of an exchange is unknown or uncertain, so the likelihood is marginalized over the pose by
-importance sampling around the solutions with and without gains. All hypotheses on a pair's gains are compared
-at the same poses. Any reading may be an outlier, blocked or too bright, at the rates of the board.
+The likelihood is that at the most likely pose, which depends on the gains, or at the known one. Any reading
+may be blocked or too bright: its residual, after a variance-stabilizing transform, is limited.
 """
 
 from __future__ import annotations
@@ -16,30 +15,25 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.infrared.gains import POSE_SIGMA, Exchanges, GainsError, GainsFit, estimate_gains
+from swarm_loc_estimator.infrared.gains import Exchanges, GainsError, GainsFit, estimate_gains
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.search import DARKEST, IrSolutions
+from swarm_loc_estimator.infrared.search import DARKEST
 from swarm_loc_estimator.offline.calibration.infrared.elements import (
-    BRIGHT_SPAN,
-    LOWEST,
-    MIN_SHARE,
-    PEAK,
+    LIMIT,
     ElementVerdicts,
     ReadingLimits,
     contradictions,
     find_dead_elements,
     find_reading_limits,
+    stabilized,
 )
 from swarm_loc_estimator.offline.calibration.motion import DENSE_GAP_NS
 from swarm_loc_estimator.offline.calibration.recording import CalibrationError, Recording
@@ -55,8 +49,6 @@ GAINS, ALIKE, UNKNOWN = range(3)
 """Hypotheses on a robot's gains: the estimate; unit gains with the same uncertainty; unknown gains with the
 board's `element_sigma`."""
 HYPOTHESES = 3
-_POINTS = 48  # Number of poses sampled around each solution
-_SEED = 1
 
 
 def helpful_gains(
@@ -115,15 +107,6 @@ def _by_block(
     return gains
 
 
-class _PairElements(NamedTuple):
-    """Gains (H, n) of the receiver's sensors and the transmitter's emitters, and their sigmas (H,)."""
-
-    sensor: FloatArray
-    emitter: FloatArray
-    of_receiver: FloatArray
-    of_transmitter: FloatArray
-
-
 def held_out_likelihoods(
     platform: IrPlatform, gains: tuple[IrGains, ...], exchanges: Exchanges
 ) -> FloatArray:
@@ -131,128 +114,38 @@ def held_out_likelihoods(
 
     A constant per exchange is omitted; NaN where no pose is found. The gains were estimated without them.
     """
-    found = np.full((len(exchanges.receiver), HYPOTHESES, HYPOTHESES), np.nan)
-    factors, sigmas = _by_hypothesis(platform, gains)
-    brightest = np.nan_to_num(exchanges.readings).max(axis=(1, 2, 3))
+    # gains of sensors and emitters by hypothesis, and the standard deviations of their logarithms
+    factors = np.ones((2, HYPOTHESES, len(gains), platform.n))
+    sigmas = np.full((HYPOTHESES, len(gains)), platform.element_sigma)
+    factors[:, GAINS] = np.swapaxes([(one.sensor, one.emitter) for one in gains], 0, 1)
+    sigmas[[GAINS, ALIKE]] = [math.hypot(one.sigma, one.common_sigma) for one in gains]
+    # readings, their noise, and the log density of outliers
+    readings = np.minimum(exchanges.readings, exchanges.saturation[..., None, None])
+    brightest = np.nan_to_num(exchanges.readings).max(axis=(1, 2, 3), keepdims=True)
     noise = np.hypot(platform.noise, platform.stray_noise * np.minimum(brightest, platform.saturation))
-    shares = (max(platform.blocked_share, MIN_SHARE), max(platform.bright_share, MIN_SHARE))
-    for k, (poses, log_weights) in enumerate(_samples(platform, gains, exchanges)):
-        if not len(poses):
-            continue
-        one, other = exchanges.receiver[k], exchanges.transmitter[k]
-        logs = np.empty((HYPOTHESES, HYPOTHESES, len(poses)))
-        _write_likelihoods(
-            expected_brightness(platform, poses),
-            exchanges.readings[k],
-            exchanges.saturation[k],
-            _PairElements(factors[0, one], factors[1, other], sigmas[one], sigmas[other]),
-            float(noise[k]),
-            platform.relative,
-            shares,
-            logs,
+    measured = readings >= DARKEST * noise  # False for NaN
+    readings = np.where(measured, readings, 0.0)
+    saturated = readings >= exchanges.saturation[..., None, None]
+    outlier = -0.5 * LIMIT**2 - np.log(np.hypot(noise, platform.relative * readings))
+    # likelihoods at the known or most likely pose
+    estimator, known = MaximumLikelihood(platform), np.isfinite(exchanges.poses[:, :1])
+    found = np.empty((len(readings), HYPOTHESES, HYPOTHESES))
+    for a, b in np.ndindex(HYPOTHESES, HYPOTHESES):
+        of_receiver, of_transmitter = sigmas[a, exchanges.receiver], sigmas[b, exchanges.transmitter]
+        zero = np.zeros_like(of_receiver)
+        pairs = PairGains(
+            factors[0, a, exchanges.receiver],
+            factors[1, b, exchanges.transmitter],
+            np.stack([of_receiver, zero, of_transmitter, zero], axis=1),
         )
-        found[k] = np.logaddexp.reduce(logs + log_weights, axis=-1)
+        solved = estimator.solve(exchanges.readings, pairs, exchanges.saturation).poses
+        expected = expected_brightness(platform, np.where(known, exchanges.poses, solved), pairs)
+        relative = np.sqrt(platform.relative**2 + of_receiver**2 + of_transmitter**2)[:, None, None, None]
+        off = stabilized(readings, noise, relative) - stabilized(expected, noise, relative)
+        off = np.where(saturated, np.maximum(off, 0.0), off)
+        density = -0.5 * off**2 - np.log(np.hypot(noise, relative * readings))
+        found[:, a, b] = np.sum(np.where(measured, np.maximum(density, outlier), 0.0), axis=(1, 2, 3))
     return found
-
-
-def _by_hypothesis(platform: IrPlatform, gains: tuple[IrGains, ...]) -> tuple[FloatArray, FloatArray]:
-    """Gains (2, robots, H, n) of sensors and emitters, and their standard deviations (robots, H)."""
-    factors = np.ones((2, len(gains), HYPOTHESES, platform.n))
-    sigmas = np.full((len(gains), HYPOTHESES), platform.element_sigma)
-    for robot, one in enumerate(gains):
-        factors[:, robot, GAINS] = one.sensor, one.emitter
-        sigmas[robot, [GAINS, ALIKE]] = math.hypot(one.sigma, one.common_sigma)
-    return factors, sigmas
-
-
-def _samples(
-    platform: IrPlatform, gains: tuple[IrGains, ...], exchanges: Exchanges
-) -> list[tuple[FloatArray, FloatArray]]:
-    """Sampled poses (P, 3) of each exchange and log weights (P,); empty where the solver finds no pose."""
-    of_pair = [
-        [gains[robot] for robot in side.tolist()] for side in (exchanges.receiver, exchanges.transmitter)
-    ]
-    estimator, count = MaximumLikelihood(platform), len(exchanges.receiver)
-    solved = [
-        estimator.solve(exchanges.readings, one, exchanges.saturation)
-        for one in (platform.unknown_gains(count), PairGains.of(*of_pair))
-    ]
-    draws = np.random.default_rng(_SEED).standard_normal((2 * len(solved), _POINTS, 3))
-    known: BoolArray = np.isfinite(exchanges.poses[:, 0])
-    offsets = draws.reshape(-1, 3) * POSE_SIGMA
-    return [
-        (exchanges.poses[k] + offsets, np.zeros(len(offsets)))
-        if known[k]
-        else _about_found(solved, k, draws, platform.radius)
-        for k in range(count)
-    ]
-
-
-def _about_found(
-    solved: list[IrSolutions], k: int, draws: FloatArray, radius: float
-) -> tuple[FloatArray, FloatArray]:
-    """Samples around the solutions of exchange k, with a uniform prior over the plane."""
-    centres = np.array([pose[k] for one in solved for pose in (one.poses, one.alternatives)])
-    spreads = np.array([one.covariances[k] for one in solved for _ in range(2)])
-    there = np.isfinite(centres).all(axis=1)
-    centres, roots = centres[there], np.linalg.cholesky(spreads[there])
-    poses = (centres[:, None] + draws[there] @ np.swapaxes(roots, 1, 2)).reshape(-1, 3)
-    poses = poses[poses[:, 0] > 2.0 * radius]
-    apart = poses[:, None] - centres
-    apart[..., 1:] = wrap_angle(apart[..., 1:])
-    half = np.linalg.solve(roots, apart[..., None])[..., 0]
-    drawn = -0.5 * np.sum(half**2, axis=-1) - np.log(np.einsum("maa->ma", roots)).sum(axis=-1)
-    return poses, np.log(poses[:, 0]) - np.logaddexp.reduce(drawn, axis=1, initial=-np.inf)
-
-
-@cached_njit
-def _write_likelihoods(
-    light: FloatArray,
-    readings: FloatArray,
-    saturation: FloatArray,
-    elements: _PairElements,
-    noise: float,
-    curves: float,
-    shares: tuple[float, float],
-    logs: FloatArray,
-) -> None:
-    """Write the log likelihoods (H, H, P) of one exchange at P poses.
-
-    Args:
-        light: (P, modes, n, n) expected readings for unit gains [count].
-        readings: (modes, n, n) [count]; NaN where not measured.
-        saturation: (modes,) minimum of saturated readings [count].
-        elements: Gains of both robots.
-        noise: Additive standard deviation of a reading [count].
-        curves: Additional relative standard deviation of a reading.
-        shares: Shares of readings that are blocked, and that are too bright.
-        logs: Written.
-    """
-    sensor, emitter, of_receiver, of_transmitter = elements
-    blocked, bright = shares
-    sure = 1.0 - blocked - bright
-    for a in range(logs.shape[0]):
-        for b in range(logs.shape[1]):
-            relative = math.sqrt(curves**2 + of_receiver[a] ** 2 + of_transmitter[b] ** 2)
-            logs[a, b] = 0.0
-            for m, i, j in np.ndindex(readings.shape):
-                reading = min(readings[m, i, j], saturation[m])
-                if not reading >= DARKEST * noise:
-                    continue
-                scale = relative / noise
-                stable = math.asinh(scale * reading) / relative
-                # densities are per count, since the scale depends on the hypothesis
-                slope = 1.0 / math.hypot(noise, relative * reading)
-                outlier = blocked * PEAK * math.exp(-0.5 * (reading / noise) ** 2) / noise
-                outlier += bright / BRIGHT_SPAN / math.hypot(noise, curves * reading)
-                for p in range(light.shape[0]):
-                    light_here = light[p, m, i, j] * sensor[a, i] * emitter[b, j]
-                    off = stable - math.asinh(scale * light_here) / relative
-                    if reading >= saturation[m]:
-                        density = sure * 0.5 * math.erfc(off / math.sqrt(2.0)) + bright
-                    else:
-                        density = sure * PEAK * math.exp(-0.5 * off * off) * slope + outlier
-                    logs[a, b, p] += math.log(max(density, LOWEST))
 
 
 MIN_EXCHANGES = 20  # Minimum number of exchanges between robots with one kind of board
