@@ -230,83 +230,105 @@ class NormalFactor:
         return np.asarray(0.5 * (covariance + covariance.T))
 
 
-_Row = tuple[int, int, FloatArray]
+class _Rows:
+    """Constraints of one kind in order of insertion: two stops, and numbers.
+
+    Args:
+        width: How many numbers each has.
+    """
+
+    def __init__(self, width: int) -> None:
+        self._stops: IntArray = np.zeros((64, 2), dtype=np.int64)
+        self._values = np.zeros((64, width))
+        self.count = 0
+
+    def add(self, begin: int, end: int, *values: FloatArray | float) -> None:
+        """Add one."""
+        if self.count == len(self._stops):
+            self._stops, self._values = _doubled(self._stops), _doubled(self._values)
+        self._stops[self.count] = begin, end
+        self._values[self.count] = np.hstack(values)
+        self.count += 1
+
+    def remove(self, gone: BoolArray) -> None:
+        """Remove those (m,)."""
+        self.count = int((~gone).sum())
+        for rows in (self._stops, self._values):
+            rows[: self.count] = rows[: len(gone)][~gone]
+
+    @property
+    def columns(self) -> tuple[IntArray, IntArray, FloatArray]:
+        """First stop (m,), second (m,), and numbers (m, width)."""
+        begin, end = self._stops[: self.count].T
+        return begin, end, self._values[: self.count]
 
 
 class ConstraintLists:
     """Priors, odometry, ties and bearings in order of insertion."""
 
     def __init__(self) -> None:
-        self._priors: list[_Row] = []
-        self._departures: list[_Row] = []
-        self._ties: list[_Row] = []
-        self._bearings: list[_Row] = []
+        self._priors, self._departures, self._ties, self._bearings = map(_Rows, (6, 7, 12, 3))
 
     def add_prior(self, stop: int, pose: FloatArray, sigma: FloatArray) -> None:
         """Add a prior on the pose (3,) of a stop with standard deviations (3,)."""
-        self._priors.append((stop, stop, np.concatenate([pose, sigma])))
+        self._priors.add(stop, stop, pose, sigma)
 
     def add_departure(self, begin: int, end: int, turn: float, motion: FloatArray, sigma: FloatArray) -> None:
         """Add odometry from stop to stop, see `constraints.Departures`."""
-        self._departures.append((begin, end, np.concatenate([[turn], motion, sigma])))
+        self._departures.add(begin, end, turn, motion, sigma)
 
     def add_tie(self, begin: int, end: int, pose: FloatArray, root: FloatArray) -> None:
         """Add a relative pose, see `Ties`."""
-        self._ties.append((begin, end, np.concatenate([pose, root.ravel()])))
-
-    def remove_priors(self, stops: Collection[int]) -> None:
-        """Remove the priors of stops."""
-        self._priors[:] = [one for one in self._priors if one[0] not in stops]
-
-    def remove_tie(self, begin: int, end: int) -> None:
-        """Remove the ties of two stops."""
-        self._ties[:] = [one for one in self._ties if one[:2] != (begin, end)]
+        self._ties.add(begin, end, pose, root.ravel())
 
     def add_bearing(self, begin: int, end: int, turn: float, bearing: float, sigma: float) -> None:
         """Add the bearing of a robot's light at another stop, see `constraints.Bearings`."""
-        self._bearings.append((begin, end, np.array([turn, bearing, sigma])))
+        self._bearings.add(begin, end, turn, bearing, sigma)
 
-    @property
-    def bearing_count(self) -> int:
-        """Number of bearings."""
-        return len(self._bearings)
+    def remove_priors(self, stops: Collection[int]) -> None:
+        """Remove the priors of stops."""
+        self._priors.remove(np.isin(self._priors.columns[0], list(stops)))
+
+    def remove_tie(self, begin: int, end: int) -> None:
+        """Remove the ties of two stops."""
+        first, last, _ = self._ties.columns
+        self._ties.remove((first == begin) & (last == end))
 
     def remove_stop(self, stop: int) -> None:
         """Remove all constraints on a stop."""
         for rows in (self._priors, self._departures, self._ties, self._bearings):
-            rows[:] = [one for one in rows if stop not in one[:2]]
+            begin, end, _ = rows.columns
+            rows.remove((begin == stop) | (end == stop))
+
+    @property
+    def bearing_count(self) -> int:
+        """Number of bearings."""
+        return self._bearings.count
 
     def worst_tie(self, states: FloatArray) -> float:
         """The greatest squared residual of a tie at states (k, 4), in variances."""
-        if not self._ties:
-            return 0.0
-        begin, end, v = _arrays(self._ties)
-        residual = ties(states, Ties(begin, end, v[:, :3], v[:, 3:].reshape(-1, 3, 3))).residual
-        return float(np.square(residual).sum(axis=1).max())
+        return float(np.square(self._tied(states).residual).sum(axis=1).max(initial=0.0))
 
-    def departures(self) -> Iterator[_Row]:
+    def departures(self) -> Iterator[tuple[int, int, FloatArray]]:
         """Stop of departure, of arrival, and turn, motion and sigmas, see `constraints.Departures`."""
-        yield from self._departures
+        begin, end, values = self._departures.columns
+        yield from zip(begin.tolist(), end.tolist(), values, strict=True)
 
-    def linearised(self, states: FloatArray) -> Iterator[Linearised]:
+    def linearised(self, states: FloatArray) -> list[Linearised]:
         """Linearize all constraints at states (k, 4)."""
-        if self._priors:
-            stop, _, v = _arrays(self._priors)
-            yield priors(states, stop, v[:, :3], v[:, 3:])
-        if self._departures:
-            begin, end, v = _arrays(self._departures)
-            yield odometry(states, Departures(begin, end, v[:, 0], v[:, 1:4], v[:, 4:]))
-        if self._ties:
-            begin, end, v = _arrays(self._ties)
-            yield ties(states, Ties(begin, end, v[:, :3], v[:, 3:].reshape(-1, 3, 3)))
-        if self._bearings:
-            begin, end, v = _arrays(self._bearings)
-            yield bearings(states, Bearings(begin, end, *v.T))
+        stop, _, prior = self._priors.columns
+        begin, end, driven = self._departures.columns
+        seer, seen, light = self._bearings.columns
+        return [
+            priors(states, stop, prior[:, :3], prior[:, 3:]),
+            odometry(states, Departures(begin, end, driven[:, 0], driven[:, 1:4], driven[:, 4:])),
+            self._tied(states),
+            bearings(states, Bearings(seer, seen, *light.T)),
+        ]
 
-
-def _arrays(rows: list[_Row]) -> tuple[IntArray, IntArray, FloatArray]:
-    begin, end, values = zip(*rows, strict=True)
-    return np.array(begin), np.array(end), np.array(values)
+    def _tied(self, states: FloatArray) -> Linearised:
+        begin, end, v = self._ties.columns
+        return ties(states, Ties(begin, end, v[:, :3], v[:, 3:].reshape(-1, 3, 3)))
 
 
 _REFIT_RATIO = 0.0006  # Threshold of the change of the turn ratio above which lines are refitted

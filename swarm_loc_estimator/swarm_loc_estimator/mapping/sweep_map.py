@@ -37,7 +37,7 @@ _APART, _FAR, _MIN_POINTS = 0.08, 18.0, 20
 _RECENT, _RECENT_PATH = 15, 10.0  # Newest sweeps that the next one is matched with: number, path [m]
 _REACH, _REACH_PER_M, _MAX_REACH = 0.35, 1.2, 2.0
 """Search for a sweep: offset [m], per path, and greatest [m]."""
-_TURN, _TURN_SHARE, _MAX_TURN = math.radians(15.0), 0.5, math.radians(50.0)
+_TURN, _TURN_SHARE, _MAX_TURN = math.radians(30.0), 0.5, math.radians(50.0)
 """Search for its heading: turn [rad], share of the turn by odometry, and greatest [rad]."""
 _PREDICTED, _PREDICTED_PER_M, _PREDICTED_TURN = 0.10, 0.25, math.radians(5.0)
 """Standard deviations of the prediction [m], per path, and of its heading [rad]."""
@@ -49,7 +49,8 @@ _MIN_SCORE = 0.30  # Least score of a sweep among the newest ones
 _CONTRADICTS = 16.0  # Squared difference of match and odometry, in variances, from which they contradict
 _MEMORY, _MAX_SQUARE = 0.05, 400.0  # Weight of a new difference in the noise of odometry, and its maximum
 _KNOWN = 0.3  # Greatest deviation of a match from which that noise is learned [m]
-_LOOK_EVERY = 0.5  # Path after which old sweeps are looked for again [m]
+_LOOK_EVERY, _LOOK_TIED = 0.5, 2.0
+"""Path after which old sweeps are looked for again [m], and that after a tie that is believed at once."""
 _OLD = 20  # Sweeps of the same robot in between from which one is old
 _NEAR, _REFERENCE, _REFERENCE_WAY = 3.0, 20, 5.0
 """Distance of old sweeps that are matched [m], their number, and greatest way between them [m]."""
@@ -97,7 +98,7 @@ class Chain:
     noise: FloatArray = field(default_factory=lambda: np.ones(2))  # Of paths and turns, over the described
     searched: float = 0.0  # Driven until it was looked for everywhere [m]
     score: float = 0.0  # Usual one of its sweeps
-    looked: float = 0.0  # Driven until old ones were looked for [m]
+    look_from: float = _LOOK_EVERY  # Driven until old ones are looked for again [m]
     floats: bool = False  # Whether nobody knows where its robot began
     pending: list[LoopTie] = field(default_factory=list)  # That are not believed yet
 
@@ -227,8 +228,8 @@ class SweepMap:
         self._ways.add(begin, node, path if fits else 3.0 * path + _UNTIED_M)
         chain.nodes.append(node)
         chain.path.append(chain.path[-1] + path)
-        if fits and chain.path[-1] - chain.looked > _LOOK_EVERY:
-            chain.looked = chain.path[-1]
+        if fits and chain.path[-1] > chain.look_from:
+            chain.look_from = chain.path[-1] + _LOOK_EVERY
             self._close_loops(chain, node)
         return fits
 
@@ -376,6 +377,7 @@ class SweepMap:
         if one is None:
             return
         if one.way < _SHORT:
+            chain.look_from = chain.path[-1] + _LOOK_TIED
             self._believe([one])
         else:
             chain.pending.append(one)

@@ -3,8 +3,8 @@
 The first scan is compared with the map at all free places and headings, coarse to fine: a level keeps those
 whose beams end near walls, as far as its steps allow. The best are matched, and each that fits is a
 hypothesis, moved by odometry and matched again at every new place. A hypothesis that explains clearly less
-than the best one is ruled out. The last one is believed if it has fit at several places, and if a search with
-the newest scan finds no other that explains all of them.
+than the best one is ruled out. Once one is left that has fit at several places, the map is searched with the
+newest scan for others that explain all of them. These are followed, too, and the last one is believed.
 
 Each scan goes on with a search by one part, so that it costs no more in a large map; the search takes longer.
 """
@@ -111,12 +111,19 @@ class PossiblePlaces(NamedTuple):
     searched_ns: int  # Stamp of the last search from the beginning
     pause_ns: int  # After it
     search: PlaceSearch | None = None  # What is under way; no looks are added meanwhile
-    is_sole: bool = False  # Whether a search has found no place but the only one of these
+    is_complete: bool = False  # Whether a search by several looks has found all of these
+    had_rivals: bool = False  # Whether it was ambiguous before the last look
+
+    @property
+    def is_sole(self) -> bool:
+        """Whether no other place explains what the robot has seen than the only one of these."""
+        return self.is_complete and len(self.transform) == 1
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether several places explain what the robot has seen while it drove."""
-        return len(self.transform) > 1 and len(self.looks) >= _LOOKS
+        """Whether several places explain what the robot saw while it drove, or did until the last look."""
+        least = 1 if self.had_rivals and not self.is_complete else 2
+        return len(self.looks) >= _LOOKS and len(self.transform) >= least
 
 
 class FoundPlace(NamedTuple):
@@ -224,8 +231,11 @@ class MapSearch:
         if len(looks) > _MEMORY:  # the first look stays
             looks, fits = (looks[0], *looks[2:]), np.delete(fits, 1, axis=1)
         kept = _best(poses, fits)
-        after = before._replace(transform=compose(poses, inverse(track))[kept], fits=fits[kept], looks=looks)
-        nowhere = after._replace(transform=np.zeros((0, 3)), is_sole=False)
+        transform = compose(poses, inverse(track))[kept]
+        after = before._replace(
+            transform=transform, fits=fits[kept], looks=looks, had_rivals=before.is_ambiguous
+        )
+        nowhere = after._replace(transform=np.zeros((0, 3)), is_complete=False)
         if after.fits[0].mean() < _MIN_FIT and len(looks) >= _LOOKS:
             return nowhere, None
         # believe the last place if it has no rival anywhere
@@ -233,7 +243,7 @@ class MapSearch:
         is_sure = len(looks) >= _LOOKS and best.determined == 3 and best.outcome not in (OFF_MAP, BLOCKED)
         if len(kept) > 1 or not is_sure:
             return after if is_look else before, None
-        if not before.is_sole:
+        if not after.is_complete:
             return self._advanced(after, PlaceSearch(), walls), None
         if after.fits[0, 0] - after.fits[0, 1:].mean() > _DECLINE:  # the true place was not among all
             return nowhere, None
@@ -283,8 +293,8 @@ def _searched(places: PossiblePlaces, search: PlaceSearch) -> PossiblePlaces:
     others = np.concatenate([np.arange(known), others])
     kept = others[_best(poses[others], fits[others])][:_HYPOTHESES]
     kept = kept[fits[kept].sum(axis=1) > 0.0]
-    is_sole = known == 1 and kept.tolist() == [0]
-    return places._replace(transform=transform[kept], fits=fits[kept], search=None, is_sole=is_sole)
+    is_complete = len(places.looks) >= _LOOKS
+    return places._replace(transform=transform[kept], fits=fits[kept], search=None, is_complete=is_complete)
 
 
 def _why_nowhere(places: PossiblePlaces | None) -> Verdict:

@@ -10,13 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 from core_geometry import wrapped
-from mapping_world import BEAMS, ROOM, SWEEP_NS, LidarRobot, room_map, scan_bytes
+from mapping_world import BEAMS, LIDAR, ROOM, SWEEP_NS, LidarRobot, room_map, scan_bytes
 from test_lidar_in_map import CELL, ODOMETRY_NS, hand_in, sent, swarm_at
 
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.se2 import compose
+from swarm_loc_estimator.filter.measurements import Verdict
+from swarm_loc_estimator.filter.models import SCAN
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import save_map
+from swarm_loc_estimator.mapping.messages import ScanMessage
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
 
@@ -95,6 +98,30 @@ def test_a_robot_in_a_symmetric_room_says_that_it_may_be_at_several_places(tmp_p
     estimates = hand_in(estimator, messages)
     assert {int(one.status[0]) for one in estimates} == {Status.WAITING}
     assert estimator.drops["scan_ambiguous"] > 10
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_robot_is_ambiguous_until_a_search_finds_no_other_place(room: Path, seed: int) -> None:
+    """The niche, which tells the ends of the room apart, returns nothing: only the map shows it."""
+
+    def without_niche(scan: ScanMessage) -> ScanMessage:
+        beams = np.arange(BEAMS)
+        robot = compose(LidarRobot.start, LidarRobot().odometry(scan.stamp_ns + SWEEP_NS // BEAMS * beams))
+        angle = robot[:, 2] + LIDAR.yaw + scan.angle_increment * beams
+        mount_y = compose(robot, [LIDAR.x, LIDAR.y, 0.0])[:, 1]
+        is_niche = mount_y + scan.ranges * np.sin(angle) > ROOM[3] + 0.1
+        return scan._replace(ranges=np.where(is_niche, math.inf, scan.ranges))
+
+    estimator, verdicts = Estimator(without_start(room)), []
+    for message in sent(20 * SECOND, seed, change=without_niche):
+        if hand_in(estimator, [message])[0].status[0] == Status.TRACKED:
+            break
+        recent = estimator.recent()
+        verdicts += recent.verdicts[recent.measurements.model == SCAN][-1:].tolist()
+    of_a_scan = 1 + SWEEP_NS // ODOMETRY_NS
+    assert len(verdicts) < 100 * of_a_scan
+    first = verdicts.index(Verdict.SEVERAL_PLACES)
+    assert set(verdicts[first:-of_a_scan]) == {Verdict.SEVERAL_PLACES}
 
 
 def test_a_lost_robot_comes_back_by_the_map(room: Path) -> None:
