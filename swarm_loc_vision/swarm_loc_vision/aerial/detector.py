@@ -17,6 +17,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, encode_anonymous
 from swarm_loc_vision.aerial.circles import (
+    INNER,
     PARTLY,
     SIDES,
     TOP,
@@ -25,7 +26,6 @@ from swarm_loc_vision.aerial.circles import (
     Light,
     Rims,
     Sides,
-    likely,
     peaks,
 )
 from swarm_loc_vision.aerial.ground_camera import GroundCamera
@@ -70,6 +70,12 @@ _SAME_SIZE = 0.2  # Largest relative difference of a disc's radius from the othe
 _SAME_CONTRAST = 0.45  # Least contrast of a disc over that of the others: shadows have less
 _TOUCHING, _USUAL = 1.3, 0.65
 """Largest distance of touching discs, in diameters; least share of the usual coverage of any other disc."""
+_RAGGED = 0.1  # Quality of a disc with a ragged rim, over the square of its coverage
+_LIDS = 0.55, 0.7, 0.85  # Radii of inner circles that are tried, in radii of discs
+_LID_AWAY, _SAME_LID = 0.3, 0.1
+"""Largest distance of their centres in radii of discs, and largest difference of their radii from the others."""
+_MOST_LIDS = 0.5  # Least share of clear discs that show an inner circle, if any does
+_LID_SIGMA = 0.1  # Error of a disc's centre by its inner circle, one standard deviation in radii
 _MARK_ROUNDS = 2
 _MOST, _CLEAR = 0.6, 0.85  # If this share of discs shows a mark, discs without one need this coverage
 
@@ -140,12 +146,11 @@ class AerialDetector:
         settings = self._settings
         wide = diameter / grid.metres_per_px
         image = brightness(grid.apply(gray), wide, noise)
-        edges = Edges(image.log, grid.seen, settings.min_contrast)
+        edges = Edges(image, grid.seen, settings.min_contrast)
         kinds: list[tuple[_Found, dict[str, int]]] = []
         for polarity in self._polarities:
             centres = peaks(edges.votes(wide, polarity), wide, most)
             rims = Rims(image, polarity, settings.min_contrast, self._sides(grid))
-            centres = likely(rims, centres, 0.5 * wide)
             circles = _outlined(rims, centres, np.full(len(centres), 0.5 * wide))
             kinds.append(self._chosen(rims, circles, grid))
         return max(kinds, key=lambda kind: kind[0].score)
@@ -157,13 +162,17 @@ class AerialDetector:
 
     def _chosen(self, rims: Rims, circles: Circles, grid: Rectification) -> tuple[_Found, dict[str, int]]:
         """Select discs that do not overlap and are alike."""
-        covered = circles.coverage >= self._settings.min_coverage
-        circles = circles.select((_quality(circles) > 0.0) & covered & _inside(grid, circles.centre))
+        # some have clear rims; hidden or ragged rims count for others of their size
+        circles = circles.select(_inside(grid, circles.centre))
+        least = self._settings.min_coverage
+        clear = (_quality(circles) > 0.0) & (circles.coverage >= least)
+        if not clear.any():
+            return _Found(rims, circles.select(clear)), {}
+        size = commonest(circles.radius[clear], _quality(circles)[clear])
+        circles = _with_lids(rims, circles, clear, size, least)
+        circles = circles.select(circles.coverage >= least)
         circles = circles.select(_apart(circles))
-        if not len(circles.radius):
-            return _Found(rims, circles), {}
-        quality = _quality(circles)
-        alike = np.abs(circles.radius / commonest(circles.radius, quality) - 1.0) <= _SAME_SIZE
+        alike = np.abs(circles.radius / size - 1.0) <= _SAME_SIZE
         dropped = {"other_size": int(np.sum(~alike))}
         circles = circles.select(alike)
         whole = _whole(circles)
@@ -171,7 +180,7 @@ class AerialDetector:
         circles = circles.select(whole)
         most = self._settings.max_robots
         dropped["too_many"] = max(len(circles.radius) - most, 0)
-        order = np.argsort(-_quality(circles), kind="stable")[:most]
+        order = np.argsort(-_rank(circles), kind="stable")[:most]
         return _Found(rims, circles.select(order)), dropped
 
     def _located(self, grid: Rectification, found: _Found, dropped: dict[str, int]) -> AerialDetections:
@@ -180,11 +189,12 @@ class AerialDetector:
         if not len(circles.radius):
             return _nothing(dropped)
         # the mark, then the rim again without its light, in turns
-        is_strong = circles.contrast >= _SAME_CONTRAST * commonest(circles.contrast, _quality(circles))
+        is_strong = circles.contrast >= _SAME_CONTRAST * commonest(circles.contrast, _rank(circles))
         for _ in range(_MARK_ROUNDS):
             marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
             again = rims.measure(circles.centre, circles.radius, circles.kind, circles.soft, marks.light)
             better = (marks.step != 0.0) & (again.coverage >= settings.min_coverage)
+            better &= circles.kind != INNER
             circles = circles.updated(np.flatnonzero(better), again.select(better))
         marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
         # discs that are too weak, or that lack the mark of the others, are no robots
@@ -249,6 +259,44 @@ def _quality(circles: Circles) -> FloatArray:
     return np.asarray(circles.coverage**2 * np.maximum(1.0 - misfit, 0.0))
 
 
+def _rank(circles: Circles) -> FloatArray:
+    """(C,) quality of discs of which some have ragged or hidden rims."""
+    return np.maximum(_quality(circles), _RAGGED * circles.coverage**2)
+
+
+def _with_lids(
+    rims: Rims, circles: Circles, clear: NDArray[np.bool_], size: float, least: float
+) -> Circles:
+    """Circles with those that show an inner circle instead of their rim.
+
+    Where robots touch, little is left of their rims. What is on top of them, as a lid, has a rim of its own,
+    of the other polarity, which counts if most of the `clear` ones of radius `size` show it as well.
+    """
+    inner = Rims(rims.image, -rims.polarity, rims.min_contrast, rims.sides)
+    sharp = np.zeros(len(circles.radius), np.bool_)
+    best = circles._replace(coverage=np.zeros(len(sharp)))
+    for share in _LIDS:
+        kind, radius = np.full(len(sharp), INNER), np.full(len(sharp), share * size)
+        other = inner.measure(circles.centre, radius, kind, sharp)
+        away = np.linalg.norm(other.centre - circles.centre, axis=1)
+        better = (_quality(other) > _quality(best)) & (other.coverage >= least) & (away <= _LID_AWAY * size)
+        best = best.updated(np.flatnonzero(better), other.select(better))
+    has_lid = best.coverage > 0.0
+    if has_lid[clear].mean() < _MOST_LIDS:
+        return circles
+    radius = commonest(best.radius[has_lid & clear], _quality(best)[has_lid & clear])
+    both = 0.5 * (circles.coverage + best.coverage)
+    taken = has_lid & ~clear & (np.abs(best.radius / radius - 1.0) <= _SAME_LID) & (both > circles.coverage)
+    lids = best.select(taken)._replace(
+        radius=np.full(int(taken.sum()), size),
+        coverage=both[taken],
+        contrast=np.full(int(taken.sum()), np.median(circles.contrast[clear])),
+    )
+    return circles.updated(np.flatnonzero(taken), lids._replace(
+        covariance=lids.covariance + (_LID_SIGMA * size) ** 2 * np.eye(2)
+    ))
+
+
 def _whole(circles: Circles) -> NDArray[np.bool_]:
     """Which discs show enough of their rims.
 
@@ -263,7 +311,7 @@ def _whole(circles: Circles) -> NDArray[np.bool_]:
 
 def _marked_alike(circles: Circles, has_mark: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which discs may carry the same pattern: where most show a mark, the others need a high coverage."""
-    quality = _quality(circles)
+    quality = _rank(circles)
     if quality[has_mark].sum() < _MOST * quality.sum():
         return np.ones(len(quality), np.bool_)
     return np.asarray(has_mark | (circles.coverage >= _CLEAR))
@@ -281,7 +329,7 @@ def _inside(grid: Rectification, centre: FloatArray) -> NDArray[np.bool_]:
 def _apart(circles: Circles) -> NDArray[np.int64]:
     """Rows of the circles of highest quality that do not overlap."""
     kept: list[int] = []
-    for row in np.argsort(-_quality(circles), kind="stable").tolist():
+    for row in np.argsort(-_rank(circles), kind="stable").tolist():
         away = np.linalg.norm(circles.centre[kept] - circles.centre[row], axis=1)
         if (away >= 2.0 * _LEAST_DISTANCE * circles.radius[row]).all():
             kept.append(row)
@@ -299,7 +347,7 @@ def _refined(rims: Rims, circles: Circles, light: Light) -> Circles:
     fine = rims.measure(circles.centre, circles.radius, circles.kind, sharp, light, fine=True)
     shift = fine.centre - circles.centre
     sigmas = [np.sqrt(np.trace(one.covariance, axis1=1, axis2=2)) for one in (fine, circles)]
-    good = (fine.coverage >= _PART) & (sigmas[0] <= _MAX_GROWTH * sigmas[1])
+    good = (circles.kind != INNER) & (fine.coverage >= _PART) & (sigmas[0] <= _MAX_GROWTH * sigmas[1])
     good &= np.linalg.norm(shift, axis=1) <= _MAX_SHIFT * circles.radius
     rough = circles.covariance + (_UNREFINED * circles.radius[:, None, None]) ** 2 * np.eye(2)
     spread = np.where(good[:, None, None], fine.covariance + _SHIFT_SHARE * _outer(shift), rough)
