@@ -140,21 +140,22 @@ class Edges:
         if len(strength) > _MAX_EDGES:
             kept = np.argpartition(-strength, _MAX_EDGES)[:_MAX_EDGES]
             rows, columns, strength = rows[kept], columns[kept], strength[kept]
-        self._place = np.stack([columns, rows], axis=1).astype(np.float32)
-        towards = np.stack([across[rows, columns], down[rows, columns]], axis=1)
-        self._towards = towards / np.maximum(strength, 1e-12)[:, None]
+        self._x, self._y = columns.astype(np.float32), rows.astype(np.float32)
+        self._across, self._down = (part[rows, columns] / strength for part in (across, down))
         # strong edges count little more than weak ones: a shadow may weaken one side of a disc
         self._weight = strength / (strength + 2.0 * least)
 
     def votes(self, diameter_px: float, polarity: float) -> Plain:
         """(rows, columns) votes for centres of discs."""
-        rows, columns = self._shape
-        reach = (0.5 * polarity * diameter_px * _RADII).astype(np.float32)[:, None, None]
-        cells = np.rint(self._place + reach * self._towards).astype(np.int32)
-        inside = ((cells >= 0) & (cells < np.array([columns, rows], np.int32))).all(axis=2)
-        flat = cells[inside] @ np.array([1, columns], np.int32)
-        weight = np.broadcast_to(self._weight, inside.shape)[inside]
-        votes = np.bincount(flat, weight, rows * columns).reshape(self._shape).astype(np.float32)
+        margin = int(0.5 * diameter_px * _RADII[-1]) + 2
+        rows, columns = (n + 2 * margin for n in self._shape)
+        middle, flat = np.float32(margin + 0.5), []
+        for reach in (0.5 * polarity * diameter_px * _RADII).astype(np.float32):
+            row, column = self._y + reach * self._down + middle, self._x + reach * self._across + middle
+            flat.append(row.astype(np.int32) * columns + column.astype(np.int32))
+        total = np.bincount(np.concatenate(flat), np.tile(self._weight, len(_RADII)), rows * columns)
+        inner = slice(margin, -margin)
+        votes = total.reshape(rows, columns)[inner, inner].astype(np.float32)
         return np.asarray(cv2.GaussianBlur(votes, (0, 0), max(_BLUR_SHARE * diameter_px, 0.8)), np.float32)
 
 
@@ -176,6 +177,8 @@ _OFF = 0.08  # Largest distance of an edge from its circle, in radii
 _ALONG = 0.92  # Least cosine of the angle between the slope of brightness at an edge and the normal of the outline
 _BLOCK = 30_000  # OpenCV's images have fewer than 2^15 rows
 _ROUNDS = 3
+_EVERY, _LIKELY = 4, 0.4
+"""Candidates are first tested on every fourth ray; this share of them must meet an edge."""
 _MIN_RAYS = 12
 _NOISES = 0.5  # Least step of an edge over the noise of one pixel: its two sides are means over many pixels
 _TOGETHER = 3.0  # Neighbouring rays that share pixels, and so one error
@@ -255,7 +258,7 @@ class Sides(NamedTuple):
         return length, normal
 
 
-def sampled(image: Plain, cells: FloatArray) -> FloatArray:
+def sampled(image: Plain, cells: FloatArray) -> Plain:
     """Values (...) or (..., K) of an image at columns and rows (..., 2), linear between pixels."""
     columns, rows = np.ascontiguousarray(cells.reshape(-1, 2).T, np.float32)[..., None]
     out = np.empty((len(columns), *image.shape[2:]), np.float32)
@@ -265,7 +268,7 @@ def sampled(image: Plain, cells: FloatArray) -> FloatArray:
             image, columns[part], rows[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
         out[part] = values[:, 0]
-    return out.reshape(*cells.shape[:-1], *image.shape[2:]).astype(float)
+    return out.reshape(*cells.shape[:-1], *image.shape[2:])
 
 
 Light = Callable[[FloatArray], FloatArray]
@@ -301,7 +304,7 @@ class Rims:
             start = np.clip(found, low, high)
             length, normal = self.sides.outline(centre, start, kind)
             reach = start[:, None] * length
-            edge, step, is_edge = self._edges(centre, start, reach, normal, soft, without, fine)
+            edge, step, is_edge = self.edges(centre, start, reach, normal, soft, without, fine)
             away = edge - reach
             # narrower sides end anywhere between the rim of the top and those of a cylinder
             hidden = (kind[:, None] == PARTLY) & (length > 1.0)
@@ -314,7 +317,7 @@ class Rims:
         contrast = _masked_median(step, own, np.zeros(len(step)))
         return Circles(centre, found, coverage, contrast, spread, oval, covariance, kind, soft)
 
-    def _edges(
+    def edges(
         self,
         centre: FloatArray,
         radius: FloatArray,
@@ -324,12 +327,14 @@ class Rims:
         without: Light | None,
         fine: bool,
     ) -> EdgesOnRays:
-        """The strongest edge on each ray near the outline at `reach` (C, R) [px]."""
-        places = reach[..., None, None] * (SHARES[:, None] * DIRECTIONS[:, None])
+        """The strongest edge on each ray near the outline at `reach` (C, R) [px], R a divisor of `RAYS`."""
+        rays = DIRECTIONS[:: RAYS // reach.shape[1]]
+        places = reach[..., None, None] * (SHARES[:, None] * rays[:, None])
         cells = centre[:, None, None] + places
         values, *slope = np.moveaxis(sampled(self.image.log, cells), -1, 0)
-        across = -self.polarity * (slope[0] * normal[..., :1] + slope[1] * normal[..., 1:])
-        is_rim = across > _ALONG * np.hypot(*slope)
+        towards = (-self.polarity * normal).astype(np.float32)
+        across = slope[0] * towards[..., :1] + slope[1] * towards[..., 1:]
+        is_rim = (across > 0.0) & (across**2 > np.float32(_ALONG**2) * (slope[0] ** 2 + slope[1] ** 2))
         if without is not None:
             plain = sampled(self.image.plain, cells)
             values = logarithm(plain - without(places / radius[:, None, None, None]))
@@ -339,6 +344,14 @@ class Rims:
     def _least(self, darkest: FloatArray) -> FloatArray:
         """Least steps of edges by the logarithm of brightness on their darker side."""
         return np.maximum(self.min_contrast, _NOISES * self.image.noise * np.exp(-darkest))
+
+
+def likely(rims: Rims, centres: FloatArray, radius: float) -> FloatArray:
+    """The candidates (C, 2) with enough edges around to be discs of about a radius [px]."""
+    size = np.full(len(centres), radius)
+    reach, normal = np.tile(size[:, None], RAYS // _EVERY), np.broadcast_to(DIRECTIONS[::_EVERY], (len(centres), RAYS // _EVERY, 2))
+    is_edge = rims.edges(centres, size, reach, normal, np.zeros(len(centres), np.bool_), None, False).is_edge
+    return np.asarray(centres[is_edge.mean(axis=1) >= _LIKELY], float)
 
 
 def _masked_median(values: FloatArray, mask: NDArray[np.bool_], otherwise: FloatArray) -> FloatArray:

@@ -26,6 +26,7 @@ from swarm_loc_vision.aerial.circles import (
     Light,
     Rims,
     Sides,
+    likely,
     peaks,
 )
 from swarm_loc_vision.aerial.ground_camera import GroundCamera
@@ -151,6 +152,7 @@ class AerialDetector:
         for polarity in self._polarities:
             centres = peaks(edges.votes(wide, polarity), wide, most)
             rims = Rims(image, polarity, settings.min_contrast, self._sides(grid))
+            centres = likely(rims, centres, 0.5 * wide)
             circles = _outlined(rims, centres, np.full(len(centres), 0.5 * wide))
             kinds.append(self._chosen(rims, circles, grid))
         return max(kinds, key=lambda kind: kind[0].score)
