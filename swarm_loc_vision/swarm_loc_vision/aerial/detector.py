@@ -34,6 +34,7 @@ from swarm_loc_vision.aerial.ground_control import NO_GROUND, Ground, GroundCont
 from swarm_loc_vision.aerial.parameters import POLARITIES, AerialSettings
 from swarm_loc_vision.aerial.pattern import Marks, find_marks
 from swarm_loc_vision.aerial.rectification import (
+    Brightness,
     Rectification,
     RectificationError,
     brightness,
@@ -47,7 +48,7 @@ from swarm_loc_vision.common.images import Gray, ImageError
 # Numbers below were chosen on drawn pictures (bench/aerial/pictures.py), not on those of seeds 101 to 104,
 # which doc/aerial_camera_node.md reports on (`make bench-aerial`).
 _SIZES_PX = 16.0, 32.0  # Least and largest diameter of robots in the rectified image
-_ROUGH_PX = 14.0
+_ROUGH_PX = 10.0, 20.0  # The same where the diameter is not known yet
 _MAX_SHARE = 0.25  # Largest robot that is searched for, over the shorter side of the image
 _SPARE, _SPARE_SHARE = 60, 4
 _ROUGH_MOST = 100  # Candidates of each size that is tried
@@ -98,6 +99,14 @@ class AerialDetections:
         return len(self.place)
 
 
+class _Look(NamedTuple):
+    """A rectified image."""
+
+    grid: Rectification
+    image: Brightness
+    edges: Edges
+
+
 class _Found(NamedTuple):
     """Discs of one polarity."""
 
@@ -128,46 +137,52 @@ class AerialDetector:
         Raises:
             RectificationError: The camera does not see the plane, or robots on it look too small.
         """
-        noise = noise_of(gray)
         if not self.diameter:
-            self.diameter = self._estimated(gray, noise)
+            self.diameter = self._estimated(gray)
             if not self.diameter:
                 return _nothing({"size_unknown": 1})
         if self._grid is None:
-            settings = self._settings
-            self._grid = rectification(self._ground, settings, self.diameter, _SIZES_PX)
+            self._grid = rectification(self._ground, self._settings, self.diameter, _SIZES_PX)
         most = _SPARE_SHARE * self._settings.max_robots + _SPARE
-        found, dropped = self._discs(gray, self._grid, self.diameter, noise, most)
+        look = self._look(self._grid, gray, noise_of(gray), self.diameter)
+        found, dropped = self._discs(look, self.diameter, most)
         return self._located(self._grid, found, dropped)
 
-    def _discs(
-        self, gray: Gray, grid: Rectification, diameter: float, noise: float, most: int
-    ) -> tuple[_Found, dict[str, int]]:
+    def _look(self, grid: Rectification, gray: Gray, noise: float, diameter: float) -> _Look:
+        """The image on a grid, for robots of about a diameter [m]."""
+        image = brightness(grid.apply(gray), diameter / grid.metres_per_px, noise)
+        return _Look(grid, image, Edges(image, grid.seen, self._settings.min_contrast))
+
+    def _discs(self, look: _Look, diameter: float, most: int) -> tuple[_Found, dict[str, int]]:
         """Discs of the polarity with the higher score, and numbers of dropped ones."""
-        settings = self._settings
-        wide = diameter / grid.metres_per_px
-        image = brightness(grid.apply(gray), wide, noise)
-        edges = Edges(image, grid.seen, settings.min_contrast)
+        wide = diameter / look.grid.metres_per_px
         kinds: list[tuple[_Found, dict[str, int]]] = []
         for polarity in self._polarities:
-            centres = peaks(edges.votes(wide, polarity), wide, most)
-            rims = Rims(image, polarity, settings.min_contrast, self._sides(grid))
-            centres = likely(rims, centres, 0.5 * wide)
+            rims, centres = self._candidates(look, wide, polarity, most)
             circles = _outlined(rims, centres, np.full(len(centres), 0.5 * wide))
-            kinds.append(self._chosen(rims, circles, grid))
+            kinds.append(self._chosen(rims, circles, look.grid))
         return max(kinds, key=lambda kind: kind[0].score)
+
+    def _candidates(self, look: _Look, wide: float, polarity: float, most: int) -> tuple[Rims, FloatArray]:
+        """Candidates (C, 2) for discs of about a diameter [px]."""
+        centres = peaks(look.edges.votes(wide, polarity), wide, most)
+        rims = Rims(look.image, polarity, self._settings.min_contrast, self._sides(look.grid))
+        return rims, likely(rims, centres, 0.5 * wide)
 
     def _sides(self, grid: Rectification) -> Sides:
         """The sides of the robots on a grid."""
         foot = self._ground.centre
         return Sides((foot[:2] - grid.origin) / grid.metres_per_px, max(grid.height, 0.0) / foot[2])
 
+    def _clear(self, circles: Circles) -> NDArray[np.bool_]:
+        """Which discs (C,) have clear rims."""
+        return np.asarray((_quality(circles) > 0.0) & (circles.coverage >= self._settings.min_coverage))
+
     def _chosen(self, rims: Rims, circles: Circles, grid: Rectification) -> tuple[_Found, dict[str, int]]:
         """Select discs that do not overlap and are alike."""
         # some have clear rims; hidden or ragged rims count for others of their size
         circles = circles.select(_inside(grid, circles.centre))
-        least = self._settings.min_coverage
-        clear = (_quality(circles) > 0.0) & (circles.coverage >= least)
+        least, clear = self._settings.min_coverage, self._clear(circles)
         if not clear.any():
             return _Found(rims, circles.select(clear)), {}
         size = commonest(circles.radius[clear], _quality(circles)[clear])
@@ -224,7 +239,7 @@ class AerialDetector:
             dropped=dropped,
         )
 
-    def _estimated(self, gray: Gray, noise: float) -> float:
+    def _estimated(self, gray: Gray) -> float:
         """Estimate the diameter of the robots from one image [m]; 0: there are none."""
         settings, ground = self._settings, self._ground
         middle = ground.places(np.array([0.5 * gray.shape[1], 0.5 * gray.shape[0]]), settings.robot_height)
@@ -233,17 +248,33 @@ class AerialDetector:
         per_metre = float(ground.scale(np.append(middle, settings.robot_height)))
         least, largest = settings.min_diameter_px / per_metre, _MAX_SHARE * min(gray.shape) / per_metre
         diameters, scores = [np.zeros(0)], [np.zeros(0)]
+        look, noise = None, noise_of(gray)
         for diameter in ladder(1.2 * least, largest).tolist():
-            grid = rectification(ground, settings, diameter, (_ROUGH_PX, _ROUGH_PX))
-            found, _ = self._discs(gray, grid, diameter, noise, _ROUGH_MOST)
-            diameters.append(2.0 * found.circles.radius * grid.metres_per_px)
-            scores.append(_quality(found.circles))
+            # a pyramid: one image for all diameters that are neither small nor large in it
+            if look is None or diameter > _ROUGH_PX[1] * look.grid.metres_per_px:
+                grid = rectification(ground, settings, diameter, (0.0, _ROUGH_PX[0]))
+                look = self._look(grid, gray, noise, diameter)
+            wide, kinds = diameter / look.grid.metres_per_px, []
+            for polarity in self._polarities:
+                rims, centres = self._candidates(look, wide, polarity, _ROUGH_MOST)
+                circles = _measured(rims, centres, np.full(len(centres), 0.5 * wide))
+                clear = self._clear(circles) & _inside(look.grid, circles.centre)
+                circles = circles.select(clear)
+                kinds.append(_Found(rims, circles.select(_apart(circles))))
+            circles = max(kinds, key=lambda kind: kind.score).circles
+            diameters.append(2.0 * circles.radius * look.grid.metres_per_px)
+            scores.append(_quality(circles))
         return commonest(np.concatenate(diameters), np.concatenate(scores))
+
+
+def _measured(rims: Rims, centre: FloatArray, radius: FloatArray) -> Circles:
+    """Measured discs (C,) that are flat and at rest."""
+    return rims.measure(centre, radius, np.full(len(centre), TOP), np.zeros(len(centre), np.bool_))
 
 
 def _outlined(rims: Rims, centre: FloatArray, radius: FloatArray) -> Circles:
     """Measured discs (C,), each with the outline that fits best."""
-    best = rims.measure(centre, radius, np.full(len(centre), TOP), np.zeros(len(centre), np.bool_))
+    best = _measured(rims, centre, radius)
     for kind, soft, weight in _TALL if rims.sides.share > 0.0 else _FLAT:
         rows = np.flatnonzero((_quality(best) < weight) & (best.coverage >= _PART))
         other = rims.measure(centre[rows], radius[rows], np.full(len(rows), kind), np.full(len(rows), soft))
