@@ -41,6 +41,7 @@ class WifiSession:
     The robot reads new values into a second buffer as soon as it has sent a message, and sends them with the
     next message of that kind. So the stamp of a message is the arrival of the previous one. Messages without
     a reliable stamp are not used: the first one of a connection, one that arrives late, and its successor.
+    Nor are they signs of life: among corrupted bytes, one message may look right by chance.
     Counts `messages`, `stray_bytes`, `resyncs`.
     """
 
@@ -63,20 +64,17 @@ class WifiSession:
 
     def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
         """See `EpuckSession.step`."""
-        messages, awaited = self._parsed(data, now_ns), protocol.SENSORS_ID
-        if self.ending:
-            awaited = protocol.NOTHING_ID
-        is_heard = any(message.id == awaited for message in messages)
-        self._check_silence(is_heard, now_ns, steady_s)
         newest: dict[int, protocol.Message] = {}
-        for message in messages:
-            self.connected |= message.id == protocol.SENSORS_ID
-            self.ended |= self.ending and message.id == protocol.NOTHING_ID
+        for message in self._parsed(data, now_ns):
             before = self._arrivals.get(message.id)
             arrival = before.next(message.stamp_ns) if before else _Arrival(message.stamp_ns)
             if before is not None and not before.is_late and not arrival.is_late:
                 newest[message.id] = replace(message, stamp_ns=before.stamp_ns)
             self._arrivals[message.id] = arrival
+        is_heard = (protocol.NOTHING_ID if self.ending else protocol.SENSORS_ID) in newest
+        self._check_silence(is_heard, now_ns, steady_s)
+        self.connected |= is_heard and not self.ending
+        self.ended |= is_heard and self.ending
         self._keep(newest)
         return self._command(steady_s)
 

@@ -16,7 +16,7 @@ from epuck_wire import MS, SECOND, Wire
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.session import SessionError
-from swarm_loc_drivers.epuck import serial_session
+from swarm_loc_drivers.epuck import serial_session, wifi_protocol
 from swarm_loc_drivers.epuck.hardware import EPUCK1
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.session import CameraImage, Reading
@@ -260,6 +260,24 @@ def test_bytes_of_a_stream_that_make_no_sense_are_no_sign_of_life() -> None:
     wire.firmware.stream = lambda: rng.bytes(20)
     with pytest.raises(SessionError, match="made no sense"):
         wire.run(3.0)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_message_that_looks_right_by_chance_is_no_sign_of_life(seed: int) -> None:
+    """Among bytes that make no sense, one whole message comes within the time of silence."""
+    wire = Wire(WIFI)
+    wire.run(0.5)
+    assert wire.session.connected
+    rng = np.random.default_rng(seed)
+    message = bytes([wifi_protocol.SENSORS_ID]) + bytes(wifi_protocol.SENSORS_DTYPE.itemsize)
+    chance_ns = wire.now_ns + int(rng.integers(500, 1900)) * MS
+    wire.firmware.stream = lambda: (
+        message + bytes([wifi_protocol.NOTHING_ID]) if wire.now_ns == chance_ns else rng.bytes(20)
+    )
+    count = wire.counts["messages"]
+    with pytest.raises(SessionError, match="made no sense"):
+        wire.run(2.1)
+    assert wire.counts["messages"] > count
 
 
 def test_counters_that_jump_about_are_no_sign_of_life() -> None:

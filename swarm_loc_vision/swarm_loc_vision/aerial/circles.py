@@ -37,15 +37,17 @@ class EdgesOnRays(NamedTuple):
 
 def strongest(
     values: FloatArray,
+    is_rim: NDArray[np.bool_],
     reach: FloatArray,
     polarity: float,
     least: Callable[[FloatArray], FloatArray],
-    soft: NDArray[np.bool_] | None,
+    soft: NDArray[np.bool_],
 ) -> EdgesOnRays:
     """The strongest edges of values (C, R, S), logarithms of brightness, along rays.
 
     Args:
         values: At `SHARES` of `reach`.
+        is_rim: (C, R, S) whether brightness changes across the outline there, and not along it.
         reach: (C, R) [px].
         polarity: Polarity of the discs.
         least: Least steps of edges by the logarithm of brightness on their darker side.
@@ -55,11 +57,12 @@ def strongest(
     inner = (sums[..., _SIDE:-_SIDE] - sums[..., : -2 * _SIDE]) / _SIDE
     outer = (sums[..., 2 * _SIDE :] - sums[..., _SIDE:-_SIDE]) / _SIDE
     steps = polarity * (inner - outer)
-    best = np.argmax(steps, axis=2)
+    may_be = is_rim[..., _SIDE - 1 : -_SIDE] | is_rim[..., _SIDE : 1 - _SIDE]
+    best = np.argmax(np.where(may_be, steps, 0.0), axis=2)
     between = np.clip(best, 1, steps.shape[2] - 2)
     pitch = SHARES[1] - SHARES[0]
     share = SHARES[0] + pitch * (between + _vertex(steps, between) + _SIDE - 0.5)
-    if soft is not None and soft.any():
+    if soft.any():
         share[soft] = _halfway(np.exp(values[soft]), best[soft] + _SIDE, polarity)
     step = np.take_along_axis(steps, best[..., None], axis=2)[..., 0]
     darkest = np.minimum(inner.min(axis=2), outer.min(axis=2))
@@ -119,21 +122,15 @@ _RADII = np.array([0.82, 0.91, 1.0, 1.09, 1.18])
 _MAX_EDGES = 400_000
 _EDGE_SHARE = 0.15  # Least slope of an edge per pixel, over the least contrast
 _BLUR_SHARE, _APART_SHARE = 0.08, 0.3  # Smoothing of votes and least distance of candidates, in diameters
+_LEAST_VOTES = 0.2  # Least votes of a candidate, over the most
 
 
 class Edges:
-    """Edges of an image, of the logarithm of brightness (rows, columns) where it is `seen` (rows, columns).
+    """Edges of an image where it is `seen` (rows, columns); `contrast` is the least step of an edge."""
 
-    `contrast` is the least step of an edge.
-    """
-
-    def __init__(self, log: Plain, seen: NDArray[np.bool_], contrast: float) -> None:
-        self._shape = log.shape
-        # divided by 32 Scharr's kernel gives the change per pixel
-        across, down = (
-            np.asarray(cv2.Scharr(log, cv2.CV_32F, *axis), np.float32) / np.float32(32.0)
-            for axis in ((1, 0), (0, 1))
-        )
+    def __init__(self, image: Brightness, seen: NDArray[np.bool_], contrast: float) -> None:
+        self._shape = seen.shape
+        across, down = image.log[..., 1], image.log[..., 2]
         slope = np.hypot(across, down)
         # the rim of the valid area is no edge
         slope[cv2.erode(seen.astype(np.uint8), np.ones((5, 5), np.uint8)) == 0] = 0.0
@@ -143,37 +140,41 @@ class Edges:
         if len(strength) > _MAX_EDGES:
             kept = np.argpartition(-strength, _MAX_EDGES)[:_MAX_EDGES]
             rows, columns, strength = rows[kept], columns[kept], strength[kept]
-        self._place = np.stack([columns, rows], axis=1).astype(np.float32)
-        towards = np.stack([across[rows, columns], down[rows, columns]], axis=1)
-        self._towards = towards / np.maximum(strength, 1e-12)[:, None]
+        self._x, self._y = columns.astype(np.float32), rows.astype(np.float32)
+        self._across, self._down = (part[rows, columns] / strength for part in (across, down))
         # strong edges count little more than weak ones: a shadow may weaken one side of a disc
         self._weight = strength / (strength + 2.0 * least)
 
     def votes(self, diameter_px: float, polarity: float) -> Plain:
         """(rows, columns) votes for centres of discs."""
-        rows, columns = self._shape
-        total = np.zeros(rows * columns)
-        for radius in 0.5 * diameter_px * _RADII:
-            cells = np.rint(self._place + polarity * radius * self._towards).astype(np.int64)
-            inside = ((cells >= 0) & (cells < [columns, rows])).all(axis=1)
-            flat = cells[inside, 1] * columns + cells[inside, 0]
-            total += np.bincount(flat, self._weight[inside], rows * columns)
-        votes = total.reshape(self._shape).astype(np.float32)
+        margin = int(0.5 * diameter_px * _RADII[-1]) + 2
+        rows, columns = (n + 2 * margin for n in self._shape)
+        middle, flat = np.float32(margin + 0.5), []
+        for reach in (0.5 * polarity * diameter_px * _RADII).astype(np.float32):
+            row, column = self._y + reach * self._down + middle, self._x + reach * self._across + middle
+            flat.append(row.astype(np.int32) * columns + column.astype(np.int32))
+        total = np.bincount(np.concatenate(flat), np.tile(self._weight, len(_RADII)), rows * columns)
+        inner = slice(margin, -margin)
+        votes = total.reshape(rows, columns)[inner, inner].astype(np.float32)
         return np.asarray(cv2.GaussianBlur(votes, (0, 0), max(_BLUR_SHARE * diameter_px, 0.8)), np.float32)
 
 
 def peaks(votes: Plain, diameter_px: float, most: int) -> FloatArray:
-    """(C, 2) columns and rows of the highest peaks of votes, in descending order, at most `most`."""
+    """(C, 2) columns and rows of the highest peaks of votes, in descending order, at most `most`.
+
+    Robots that look alike get alike many votes, unless their rims are hidden.
+    """
     side = 2 * max(int(_APART_SHARE * diameter_px), 1) + 1
     highest = cv2.dilate(votes, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)))
-    rows, columns = np.nonzero((votes >= highest) & (votes > 0.0))
+    rows, columns = np.nonzero((votes >= highest) & (votes > _LEAST_VOTES * votes.max(initial=0.0)))
     order = np.argsort(-votes[rows, columns], kind="stable")[:most]
     return np.stack([columns[order], rows[order]], axis=1).astype(float)
 
 
 RAYS = 64
 _WIDEST = 0.3  # Largest relative difference of a rim from the expected radius
-_OFF = 0.12  # Largest distance of an edge from its circle, in radii
+_OFF = 0.08  # Largest distance of an edge from its circle, in radii
+_ALONG = 0.92  # Least cosine of the angle between the slope of brightness at an edge and the normal of the outline
 _BLOCK = 30_000  # OpenCV's images have fewer than 2^15 rows
 _ROUNDS = 3
 _EVERY, _LIKELY = 4, 0.4
@@ -200,7 +201,7 @@ class Circles(NamedTuple):
     spread: FloatArray  # (C,) root mean square distance of these edges from the outline [px]
     oval: FloatArray  # (C, 2) cosine and sine of the second harmonic of the outline, as left by motion [px]
     covariance: FloatArray  # (C, 2, 2) of the centre [px^2]
-    kind: NDArray[np.int64]  # (C,) `TOP`, `SIDES` or `PARTLY`: what the outline is
+    kind: NDArray[np.int64]  # (C,) `TOP`, `SIDES`, `PARTLY` or `INNER`: what the outline is
     soft: NDArray[np.bool_]  # (C,) whether the edges are taken for blurred ones
 
     def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Circles:
@@ -216,8 +217,9 @@ class Circles(NamedTuple):
         return Circles(*columns)
 
 
-TOP, SIDES, PARTLY = range(3)
-"""What the outline of a robot is: its top, top and sides, or the top and sides that are narrower below."""
+TOP, SIDES, PARTLY, INNER = range(4)
+"""What the outline of a robot is: its top, top and sides, the top and sides that are narrower below, or a
+circle on the top, as the rim of a lid."""
 
 
 class Sides(NamedTuple):
@@ -236,7 +238,7 @@ class Sides(NamedTuple):
         length, normal = np.ones((len(centre), RAYS)), np.tile(DIRECTIONS, (len(centre), 1, 1))
         base = (self.foot - centre) * (self.share / radius)[:, None]
         away = np.linalg.norm(base, axis=1)
-        rows = np.flatnonzero((kind != TOP) & (away > self.share))  # otherwise the top hides the base
+        rows = np.flatnonzero((kind != TOP) & (kind != INNER) & (away > self.share))  # otherwise the top hides the base
         base, away, size = base[rows], away[rows], 1.0 - self.share
         along = base @ DIRECTIONS.T
         # where a ray meets the base's circle, and the tangent of both circles on its side
@@ -256,17 +258,17 @@ class Sides(NamedTuple):
         return length, normal
 
 
-def sampled(image: Plain, cells: FloatArray) -> FloatArray:
-    """Values (...) of an image at columns and rows (..., 2), linear between pixels."""
+def sampled(image: Plain, cells: FloatArray) -> Plain:
+    """Values (...) or (..., K) of an image at columns and rows (..., 2), linear between pixels."""
     columns, rows = np.ascontiguousarray(cells.reshape(-1, 2).T, np.float32)[..., None]
-    out = np.empty(len(columns), np.float32)
+    out = np.empty((len(columns), *image.shape[2:]), np.float32)
     for begin in range(0, len(columns), _BLOCK):
         part = slice(begin, begin + _BLOCK)
         values = cv2.remap(
             image, columns[part], rows[part], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
         out[part] = values[:, 0]
-    return out.reshape(cells.shape[:-1]).astype(float)
+    return out.reshape(*cells.shape[:-1], *image.shape[2:])
 
 
 Light = Callable[[FloatArray], FloatArray]
@@ -302,9 +304,7 @@ class Rims:
             start = np.clip(found, low, high)
             length, normal = self.sides.outline(centre, start, kind)
             reach = start[:, None] * length
-            edge, step, is_edge = self.edges(
-                centre, reach, without=without, radius=start, soft=soft, fine=fine
-            )
+            edge, step, is_edge = self.edges(centre, start, reach, normal, soft, without, fine)
             away = edge - reach
             # narrower sides end anywhere between the rim of the top and those of a cylinder
             hidden = (kind[:, None] == PARTLY) & (length > 1.0)
@@ -320,24 +320,25 @@ class Rims:
     def edges(
         self,
         centre: FloatArray,
+        radius: FloatArray,
         reach: FloatArray,
-        *,
-        every: int = 1,
-        without: Light | None = None,
-        radius: FloatArray | None = None,
-        soft: NDArray[np.bool_] | None = None,
-        fine: bool = False,
+        normal: FloatArray,
+        soft: NDArray[np.bool_],
+        without: Light | None,
+        fine: bool,
     ) -> EdgesOnRays:
-        """The strongest edge on each `every`-th ray near `reach` (C, R) [px]."""
-        places = reach[..., None, None] * (SHARES[:, None] * DIRECTIONS[::every, None])
+        """The strongest edge on each ray near the outline at `reach` (C, R) [px], R a divisor of `RAYS`."""
+        rays = DIRECTIONS[:: RAYS // reach.shape[1]]
+        places = reach[..., None, None] * (SHARES[:, None] * rays[:, None])
         cells = centre[:, None, None] + places
-        if without is None or radius is None:
-            values = sampled(self.image.log, cells)
-        else:
-            values = logarithm(
-                sampled(self.image.plain, cells) - without(places / radius[:, None, None, None])
-            )
-        edges = strongest(values, reach, self.polarity, self._least, soft)
+        values, *slope = np.moveaxis(sampled(self.image.log, cells), -1, 0)
+        towards = (-self.polarity * normal).astype(np.float32)
+        across = slope[0] * towards[..., :1] + slope[1] * towards[..., 1:]
+        is_rim = (across > 0.0) & (across**2 > np.float32(_ALONG**2) * (slope[0] ** 2 + slope[1] ** 2))
+        if without is not None:
+            plain = sampled(self.image.plain, cells)
+            values = logarithm(plain - without(places / radius[:, None, None, None]))
+        edges = strongest(values, is_rim, reach, self.polarity, self._least, soft)
         return steepest(values, reach, self.polarity, edges) if fine else edges
 
     def _least(self, darkest: FloatArray) -> FloatArray:
@@ -347,7 +348,9 @@ class Rims:
 
 def likely(rims: Rims, centres: FloatArray, radius: float) -> FloatArray:
     """The candidates (C, 2) with enough edges around to be discs of about a radius [px]."""
-    is_edge = rims.edges(centres, np.full((len(centres), RAYS // _EVERY), radius), every=_EVERY)[2]
+    size = np.full(len(centres), radius)
+    reach, normal = np.tile(size[:, None], RAYS // _EVERY), np.broadcast_to(DIRECTIONS[::_EVERY], (len(centres), RAYS // _EVERY, 2))
+    is_edge = rims.edges(centres, size, reach, normal, np.zeros(len(centres), np.bool_), None, False).is_edge
     return np.asarray(centres[is_edge.mean(axis=1) >= _LIKELY], float)
 
 

@@ -17,6 +17,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.detections import ANONYMOUS_DTYPE, encode_detections
 from swarm_loc_vision.aerial.circles import (
+    INNER,
     PARTLY,
     SIDES,
     TOP,
@@ -33,6 +34,7 @@ from swarm_loc_vision.aerial.ground_control import NO_GROUND, Ground, GroundCont
 from swarm_loc_vision.aerial.parameters import POLARITIES, AerialSettings
 from swarm_loc_vision.aerial.pattern import Marks, find_marks
 from swarm_loc_vision.aerial.rectification import (
+    Brightness,
     Rectification,
     RectificationError,
     brightness,
@@ -46,7 +48,7 @@ from swarm_loc_vision.common.images import Gray, ImageError
 # Numbers below were chosen on drawn pictures (bench/aerial/pictures.py), not on those of seeds 101 to 104,
 # which doc/aerial_camera_node.md reports on (`make bench-aerial`).
 _SIZES_PX = 16.0, 32.0  # Least and largest diameter of robots in the rectified image
-_ROUGH_PX = 14.0
+_ROUGH_PX = 10.0, 20.0  # The same where the diameter is not known yet
 _MAX_SHARE = 0.25  # Largest robot that is searched for, over the shorter side of the image
 _SPARE, _SPARE_SHARE = 60, 4
 _ROUGH_MOST = 100  # Candidates of each size that is tried
@@ -70,6 +72,12 @@ _SAME_SIZE = 0.2  # Largest relative difference of a disc's radius from the othe
 _SAME_CONTRAST = 0.45  # Least contrast of a disc over that of the others: shadows have less
 _TOUCHING, _USUAL = 1.3, 0.65
 """Largest distance of touching discs, in diameters; least share of the usual coverage of any other disc."""
+_RAGGED = 0.1  # Quality of a disc with a ragged rim, over the square of its coverage
+_LIDS = 0.55, 0.7, 0.85  # Radii of inner circles that are tried, in radii of discs
+_LID_AWAY, _SAME_LID = 0.3, 0.1
+"""Largest distance of their centres in radii of discs, and largest difference of their radii from the others."""
+_MOST_LIDS = 0.5  # Least share of clear discs that show an inner circle, if any does
+_LID_SIGMA = 0.1  # Error of a disc's centre by its inner circle, one standard deviation in radii
 _MARK_ROUNDS = 2
 _MOST, _CLEAR = 0.6, 0.85  # If this share of discs shows a mark, discs without one need this coverage
 
@@ -89,6 +97,14 @@ class AerialDetections:
 
     def __len__(self) -> int:
         return len(self.place)
+
+
+class _Look(NamedTuple):
+    """A rectified image."""
+
+    grid: Rectification
+    image: Brightness
+    edges: Edges
 
 
 class _Found(NamedTuple):
@@ -121,49 +137,59 @@ class AerialDetector:
         Raises:
             RectificationError: The camera does not see the plane, or robots on it look too small.
         """
-        noise = noise_of(gray)
         if not self.diameter:
-            self.diameter = self._estimated(gray, noise)
+            self.diameter = self._estimated(gray)
             if not self.diameter:
                 return _nothing({"size_unknown": 1})
         if self._grid is None:
-            settings = self._settings
-            self._grid = rectification(self._ground, settings, self.diameter, _SIZES_PX)
+            self._grid = rectification(self._ground, self._settings, self.diameter, _SIZES_PX)
         most = _SPARE_SHARE * self._settings.max_robots + _SPARE
-        found, dropped = self._discs(gray, self._grid, self.diameter, noise, most)
+        look = self._look(self._grid, gray, noise_of(gray), self.diameter)
+        found, dropped = self._discs(look, self.diameter, most)
         return self._located(self._grid, found, dropped)
 
-    def _discs(
-        self, gray: Gray, grid: Rectification, diameter: float, noise: float, most: int
-    ) -> tuple[_Found, dict[str, int]]:
+    def _look(self, grid: Rectification, gray: Gray, noise: float, diameter: float) -> _Look:
+        """The image on a grid, for robots of about a diameter [m]."""
+        image = brightness(grid.apply(gray), diameter / grid.metres_per_px, noise)
+        return _Look(grid, image, Edges(image, grid.seen, self._settings.min_contrast))
+
+    def _discs(self, look: _Look, diameter: float, most: int) -> tuple[_Found, dict[str, int]]:
         """Discs of the polarity with the higher score, and numbers of dropped ones."""
-        settings = self._settings
-        wide = diameter / grid.metres_per_px
-        image = brightness(grid.apply(gray), wide, noise)
-        edges = Edges(image.log, grid.seen, settings.min_contrast)
+        wide = diameter / look.grid.metres_per_px
         kinds: list[tuple[_Found, dict[str, int]]] = []
         for polarity in self._polarities:
-            centres = peaks(edges.votes(wide, polarity), wide, most)
-            rims = Rims(image, polarity, settings.min_contrast, self._sides(grid))
-            centres = likely(rims, centres, 0.5 * wide)
+            rims, centres = self._candidates(look, wide, polarity, most)
             circles = _outlined(rims, centres, np.full(len(centres), 0.5 * wide))
-            kinds.append(self._chosen(rims, circles, grid))
+            kinds.append(self._chosen(rims, circles, look.grid))
         return max(kinds, key=lambda kind: kind[0].score)
+
+    def _candidates(self, look: _Look, wide: float, polarity: float, most: int) -> tuple[Rims, FloatArray]:
+        """Candidates (C, 2) for discs of about a diameter [px]."""
+        centres = peaks(look.edges.votes(wide, polarity), wide, most)
+        rims = Rims(look.image, polarity, self._settings.min_contrast, self._sides(look.grid))
+        return rims, likely(rims, centres, 0.5 * wide)
 
     def _sides(self, grid: Rectification) -> Sides:
         """The sides of the robots on a grid."""
         foot = self._ground.centre
         return Sides((foot[:2] - grid.origin) / grid.metres_per_px, max(grid.height, 0.0) / foot[2])
 
+    def _clear(self, circles: Circles) -> NDArray[np.bool_]:
+        """Which discs (C,) have clear rims."""
+        return np.asarray((_quality(circles) > 0.0) & (circles.coverage >= self._settings.min_coverage))
+
     def _chosen(self, rims: Rims, circles: Circles, grid: Rectification) -> tuple[_Found, dict[str, int]]:
         """Select discs that do not overlap and are alike."""
-        covered = circles.coverage >= self._settings.min_coverage
-        circles = circles.select((_quality(circles) > 0.0) & covered & _inside(grid, circles.centre))
+        # some have clear rims; hidden or ragged rims count for others of their size
+        circles = circles.select(_inside(grid, circles.centre))
+        least, clear = self._settings.min_coverage, self._clear(circles)
+        if not clear.any():
+            return _Found(rims, circles.select(clear)), {}
+        size = commonest(circles.radius[clear], _quality(circles)[clear])
+        circles = _with_lids(rims, circles, clear, size, least)
+        circles = circles.select(circles.coverage >= least)
         circles = circles.select(_apart(circles))
-        if not len(circles.radius):
-            return _Found(rims, circles), {}
-        quality = _quality(circles)
-        alike = np.abs(circles.radius / commonest(circles.radius, quality) - 1.0) <= _SAME_SIZE
+        alike = np.abs(circles.radius / size - 1.0) <= _SAME_SIZE
         dropped = {"other_size": int(np.sum(~alike))}
         circles = circles.select(alike)
         whole = _whole(circles)
@@ -171,7 +197,7 @@ class AerialDetector:
         circles = circles.select(whole)
         most = self._settings.max_robots
         dropped["too_many"] = max(len(circles.radius) - most, 0)
-        order = np.argsort(-_quality(circles), kind="stable")[:most]
+        order = np.argsort(-_rank(circles), kind="stable")[:most]
         return _Found(rims, circles.select(order)), dropped
 
     def _located(self, grid: Rectification, found: _Found, dropped: dict[str, int]) -> AerialDetections:
@@ -180,11 +206,12 @@ class AerialDetector:
         if not len(circles.radius):
             return _nothing(dropped)
         # the mark, then the rim again without its light, in turns
-        is_strong = circles.contrast >= _SAME_CONTRAST * commonest(circles.contrast, _quality(circles))
+        is_strong = circles.contrast >= _SAME_CONTRAST * commonest(circles.contrast, _rank(circles))
         for _ in range(_MARK_ROUNDS):
             marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
             again = rims.measure(circles.centre, circles.radius, circles.kind, circles.soft, marks.light)
             better = (marks.step != 0.0) & (again.coverage >= settings.min_coverage)
+            better &= circles.kind != INNER
             circles = circles.updated(np.flatnonzero(better), again.select(better))
         marks = find_marks(rims.image.plain, circles.centre, circles.radius, rims.polarity)
         # discs that are too weak, or that lack the mark of the others, are no robots
@@ -212,7 +239,7 @@ class AerialDetector:
             dropped=dropped,
         )
 
-    def _estimated(self, gray: Gray, noise: float) -> float:
+    def _estimated(self, gray: Gray) -> float:
         """Estimate the diameter of the robots from one image [m]; 0: there are none."""
         settings, ground = self._settings, self._ground
         middle = ground.places(np.array([0.5 * gray.shape[1], 0.5 * gray.shape[0]]), settings.robot_height)
@@ -221,17 +248,33 @@ class AerialDetector:
         per_metre = float(ground.scale(np.append(middle, settings.robot_height)))
         least, largest = settings.min_diameter_px / per_metre, _MAX_SHARE * min(gray.shape) / per_metre
         diameters, scores = [np.zeros(0)], [np.zeros(0)]
+        look, noise = None, noise_of(gray)
         for diameter in ladder(1.2 * least, largest).tolist():
-            grid = rectification(ground, settings, diameter, (_ROUGH_PX, _ROUGH_PX))
-            found, _ = self._discs(gray, grid, diameter, noise, _ROUGH_MOST)
-            diameters.append(2.0 * found.circles.radius * grid.metres_per_px)
-            scores.append(_quality(found.circles))
+            # a pyramid: one image for all diameters that are neither small nor large in it
+            if look is None or diameter > _ROUGH_PX[1] * look.grid.metres_per_px:
+                grid = rectification(ground, settings, diameter, (0.0, _ROUGH_PX[0]))
+                look = self._look(grid, gray, noise, diameter)
+            wide, kinds = diameter / look.grid.metres_per_px, []
+            for polarity in self._polarities:
+                rims, centres = self._candidates(look, wide, polarity, _ROUGH_MOST)
+                circles = _measured(rims, centres, np.full(len(centres), 0.5 * wide))
+                clear = self._clear(circles) & _inside(look.grid, circles.centre)
+                circles = circles.select(clear)
+                kinds.append(_Found(rims, circles.select(_apart(circles))))
+            circles = max(kinds, key=lambda kind: kind.score).circles
+            diameters.append(2.0 * circles.radius * look.grid.metres_per_px)
+            scores.append(_quality(circles))
         return commonest(np.concatenate(diameters), np.concatenate(scores))
+
+
+def _measured(rims: Rims, centre: FloatArray, radius: FloatArray) -> Circles:
+    """Measured discs (C,) that are flat and at rest."""
+    return rims.measure(centre, radius, np.full(len(centre), TOP), np.zeros(len(centre), np.bool_))
 
 
 def _outlined(rims: Rims, centre: FloatArray, radius: FloatArray) -> Circles:
     """Measured discs (C,), each with the outline that fits best."""
-    best = rims.measure(centre, radius, np.full(len(centre), TOP), np.zeros(len(centre), np.bool_))
+    best = _measured(rims, centre, radius)
     for kind, soft, weight in _TALL if rims.sides.share > 0.0 else _FLAT:
         rows = np.flatnonzero((_quality(best) < weight) & (best.coverage >= _PART))
         other = rims.measure(centre[rows], radius[rows], np.full(len(rows), kind), np.full(len(rows), soft))
@@ -249,6 +292,44 @@ def _quality(circles: Circles) -> FloatArray:
     return np.asarray(circles.coverage**2 * np.maximum(1.0 - misfit, 0.0))
 
 
+def _rank(circles: Circles) -> FloatArray:
+    """(C,) quality of discs of which some have ragged or hidden rims."""
+    return np.maximum(_quality(circles), _RAGGED * circles.coverage**2)
+
+
+def _with_lids(
+    rims: Rims, circles: Circles, clear: NDArray[np.bool_], size: float, least: float
+) -> Circles:
+    """Circles with those that show an inner circle instead of their rim.
+
+    Where robots touch, little is left of their rims. What is on top of them, as a lid, has a rim of its own,
+    of the other polarity, which counts if most of the `clear` ones of radius `size` show it as well.
+    """
+    inner = Rims(rims.image, -rims.polarity, rims.min_contrast, rims.sides)
+    sharp = np.zeros(len(circles.radius), np.bool_)
+    best = circles._replace(coverage=np.zeros(len(sharp)))
+    for share in _LIDS:
+        kind, radius = np.full(len(sharp), INNER), np.full(len(sharp), share * size)
+        other = inner.measure(circles.centre, radius, kind, sharp)
+        away = np.linalg.norm(other.centre - circles.centre, axis=1)
+        better = (_quality(other) > _quality(best)) & (other.coverage >= least) & (away <= _LID_AWAY * size)
+        best = best.updated(np.flatnonzero(better), other.select(better))
+    has_lid = best.coverage > 0.0
+    if has_lid[clear].mean() < _MOST_LIDS:
+        return circles
+    radius = commonest(best.radius[has_lid & clear], _quality(best)[has_lid & clear])
+    both = 0.5 * (circles.coverage + best.coverage)
+    taken = has_lid & ~clear & (np.abs(best.radius / radius - 1.0) <= _SAME_LID) & (both > circles.coverage)
+    lids = best.select(taken)._replace(
+        radius=np.full(int(taken.sum()), size),
+        coverage=both[taken],
+        contrast=np.full(int(taken.sum()), np.median(circles.contrast[clear])),
+    )
+    return circles.updated(np.flatnonzero(taken), lids._replace(
+        covariance=lids.covariance + (_LID_SIGMA * size) ** 2 * np.eye(2)
+    ))
+
+
 def _whole(circles: Circles) -> NDArray[np.bool_]:
     """Which discs show enough of their rims.
 
@@ -263,7 +344,7 @@ def _whole(circles: Circles) -> NDArray[np.bool_]:
 
 def _marked_alike(circles: Circles, has_mark: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Which discs may carry the same pattern: where most show a mark, the others need a high coverage."""
-    quality = _quality(circles)
+    quality = _rank(circles)
     if quality[has_mark].sum() < _MOST * quality.sum():
         return np.ones(len(quality), np.bool_)
     return np.asarray(has_mark | (circles.coverage >= _CLEAR))
@@ -281,7 +362,7 @@ def _inside(grid: Rectification, centre: FloatArray) -> NDArray[np.bool_]:
 def _apart(circles: Circles) -> NDArray[np.int64]:
     """Rows of the circles of highest quality that do not overlap."""
     kept: list[int] = []
-    for row in np.argsort(-_quality(circles), kind="stable").tolist():
+    for row in np.argsort(-_rank(circles), kind="stable").tolist():
         away = np.linalg.norm(circles.centre[kept] - circles.centre[row], axis=1)
         if (away >= 2.0 * _LEAST_DISTANCE * circles.radius[row]).all():
             kept.append(row)
@@ -299,7 +380,7 @@ def _refined(rims: Rims, circles: Circles, light: Light) -> Circles:
     fine = rims.measure(circles.centre, circles.radius, circles.kind, sharp, light, fine=True)
     shift = fine.centre - circles.centre
     sigmas = [np.sqrt(np.trace(one.covariance, axis1=1, axis2=2)) for one in (fine, circles)]
-    good = (fine.coverage >= _PART) & (sigmas[0] <= _MAX_GROWTH * sigmas[1])
+    good = (circles.kind != INNER) & (fine.coverage >= _PART) & (sigmas[0] <= _MAX_GROWTH * sigmas[1])
     good &= np.linalg.norm(shift, axis=1) <= _MAX_SHIFT * circles.radius
     rough = circles.covariance + (_UNREFINED * circles.radius[:, None, None]) ** 2 * np.eye(2)
     spread = np.where(good[:, None, None], fine.covariance + _SHIFT_SHARE * _outer(shift), rough)

@@ -133,7 +133,9 @@ class Brightness:
     """A rectified image."""
 
     plain: Plain  # (rows, columns) counts, slightly smoothed
-    log: Plain  # (rows, columns) their logarithm, in which uneven light and shadows change edges little
+    # (rows, columns, 3) their logarithm, in which uneven light and shadows change edges little, and the change
+    # of that to the next column and row
+    log: Plain
     noise: float  # Standard deviation of the noise of the raw image [counts]
 
 
@@ -146,7 +148,10 @@ def brightness(flat: Plain, diameter_px: float, noise: float) -> Brightness:
     """Smooth a rectified image; `noise` is that of the raw image."""
     sigma = max(_SMOOTHING_SHARE * diameter_px, _MIN_SMOOTHING_PX)
     plain = np.asarray(cv2.GaussianBlur(flat, (0, 0), sigma), np.float32)
-    return Brightness(plain, np.asarray(logarithm(plain), np.float32), noise)
+    log = np.asarray(logarithm(plain), np.float32)
+    # divided by 32 Scharr's kernel gives the change per pixel
+    slopes = [cv2.Scharr(log, cv2.CV_32F, *axis, scale=1.0 / 32.0) for axis in ((1, 0), (0, 1))]
+    return Brightness(plain, np.asarray(cv2.merge([log, *slopes]), np.float32), noise)
 
 
 def noise_of(image: Gray) -> float:
