@@ -64,7 +64,7 @@ from swarm_loc_estimator.common.numerics import (
 )
 from swarm_loc_estimator.filter.measurements import Measurements
 from swarm_loc_estimator.filter.models import ANY_HEADING, has_kernel
-from swarm_loc_estimator.filter.sources import find_link, is_fix, robot_of
+from swarm_loc_estimator.filter.sources import REPEATED, find_link, is_fix, robot_of
 from swarm_loc_estimator.filter.state import PAIR_ROWS, BeliefArrays, Innovations, covariance_within
 from swarm_loc_estimator.odometry.track_arrays import OdometrySample
 
@@ -397,12 +397,9 @@ def without_repeats(measurements: Measurements) -> list[slice]:
     return [slice(begin, end) for begin, end in itertools.pairwise([*edges, measurements.size])]
 
 
-# Systematic; tuned on MRCLAM set 1, where 80 % of the variances of sightings repeat. Of ranges to twelve real
-# anchors (LIAS-CUHKSZ, libRSF) 30 to 60 % do while the range changes by 0.15 m, and 1/e of that at 0.3 m.
-REPEATED = 0.5  # Share of the variance of a sighting that repeats at the same place
+# Systematic; tuned on MRCLAM set 1, where 80 % of the variances of sightings repeat.
 _LEAST_OWN = 1e-3  # Least share of a standard deviation that the place of a source does not have, too
 LENGTH_M = 0.03  # Motion of one end, as the other sees it, after which its correlation is 1/e
-RADIO_LENGTH_M = 0.3  # Change of a range after which its correlation is 1/e
 
 
 @cached_njit
@@ -435,7 +432,6 @@ def note_update(
         if sides[i] >= 0 and by_gain:
             gain = correction[3 * sides[i] : 3 * sides[i] + 3] / innovation
             left[i] = np.eye(3) - np.outer(gain, work.jacobian[0, 0, 3 * i : 3 * i + 3])
-            added[i] = work.noise[0, 0, 0] * np.outer(gain, gain)
             _count_learned(belief, sides[i], left[i])
         elif sides[i] >= 0:
             own = before[i].copy()
@@ -558,10 +554,10 @@ def _weight(
 ) -> float:
     """Twice the correlation of the error of measurement k with those of its link before, as they are left.
 
-    Times the share by which it counted, since its noise was divided by that.
+    Times the share by which it counted, since its noise was divided by that. That of ranges is in their share.
     """
     place, state, robot = find_link(measurements, k, belief), belief.sources, robot_of(measurements, k)
-    if place < 0:
+    if place < 0 or not has_kernel(measurements, k):
         return 0.0
     last = state.last_look[robot, place]
     moved, since = math.hypot(seen[0] - last[0], seen[1] - last[1]), last[2] - state.learned[robot]
@@ -569,7 +565,7 @@ def _weight(
     alone = is_fix(measurements, k) or measurements.systematic_share[k, 0] > 0.0
     if alone or not moved >= 0.0:
         return 0.0
-    left = math.exp(since - moved / (LENGTH_M if has_kernel(measurements, k) else RADIO_LENGTH_M))
+    left = math.exp(since - moved / LENGTH_M)
     return 2.0 * share * REPEATED * left / max(1.0 - left, 1e-3)
 
 

@@ -35,8 +35,8 @@ class JointFilter(Protocol):
     def marginal(self) -> FloatArray:
         """Marginal covariances (bodies, w, w); (0, 3, 3) for a dense filter. Predictions write to them.
 
-        w is 9 if parameters are estimated, for each robot's pose and its parameters, else 3. A dense filter
-        has these blocks in `covariance`.
+        w is 3 for the pose and for each block of a robot's parameters, up to the last one that any robot has.
+        A dense filter has these in `covariance`.
         """
 
     @property

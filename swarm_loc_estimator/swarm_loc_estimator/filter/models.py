@@ -103,6 +103,8 @@ class MeasurementModel:
     #: pose of the target is the correction of its survey. The pose of a missing side is undefined. None: its
     #: measurements become others when they are fused
     predict: Predict | None
+    #: By how much the biases of the radios of observer and target, where these are robots, add to its value
+    radios: tuple[float, float] = (0.0, 0.0)
 
     @property
     def initializes(self) -> str:
@@ -197,9 +199,15 @@ MODELS: dict[int, MeasurementModel] = {
         MeasurementModel("anonymous", ANONYMOUS, _XY, (False, False, True), 2, None),
         MeasurementModel("scan", SCAN, (), (), 2, None),
         MeasurementModel("bearing", BEARING, ("bearing [rad]",), (True,), 1, _predict_bearing),
-        MeasurementModel("range", RANGE, ("range [m]",), (False,), 1, _predict_range),
+        MeasurementModel("range", RANGE, ("range [m]",), (False,), 1, _predict_range, (1.0, 1.0)),
         MeasurementModel(
-            "range difference", RANGE_DIFFERENCE, ("difference [m]",), (False,), 1, _predict_difference
+            "range difference",
+            RANGE_DIFFERENCE,
+            ("difference [m]",),
+            (False,),
+            1,
+            _predict_difference,
+            (0.0, 1.0),
         ),
     )
 }

@@ -21,7 +21,8 @@ from swarm_loc_estimator.swarm.calibration_states import PARAMETERS, ParameterTa
 NEVER_NS = np.iinfo(np.int64).min
 PAIR_ROWS = 10  # Rows of three numbers stored per pair, see `correlated_noise.py`
 DEPENDS_ON = 9
-"""Filter columns per measurement: three of the observer, three of the target, three of the camera."""
+"""Filter columns per measurement: three of the observer, three of the target, three of the observer's camera,
+of which those of a range are the biases of both radios."""
 _LINKS = 16  # Most recent links of a robot that are remembered
 _DOUBTED_POSE_SIGMA = (0.02, 0.02, 0.03)
 """Standard deviation added to the pose of a contradicted robot [m], [m], [rad]."""
@@ -40,7 +41,8 @@ class SourceArrays(NamedTuple):
     evidence: FloatArray  # (N, K) evidence against the link
     # (N, K, 2) mean of the last whitened innovations; of a radio, the second is the share of repeated values
     drift: FloatArray
-    # (N, K, 3) x, y of the target as seen last [m], or its range, and `learned` of the robot then
+    # (N, K, 7) x, y of the target as seen last [m], and `learned` of the robot then; of two radios the range,
+    # the information that counts, x, y of both antennas where it did [m], and the newest whitened innovation
     last_look: FloatArray
     score: FloatArray  # (S,) fault score
     confirmations: FloatArray  # (N,) number of measurements that agree with the robot's initial pose
@@ -212,7 +214,7 @@ def new_sources(robots: int, surveyed: int) -> SourceArrays:
         finding=np.zeros(links, dtype=np.int64),
         evidence=np.zeros(links),
         drift=np.zeros((*links, 2)),
-        last_look=np.full((*links, 3), np.nan),
+        last_look=np.full((*links, 7), np.nan),
         score=np.zeros(3 * robots + surveyed),
         confirmations=np.zeros(robots),
         gated=np.zeros(robots),

@@ -26,6 +26,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.numerics import assign, assign_matrix
@@ -48,6 +49,7 @@ from swarm_loc_estimator.filter.models import (
 )
 from swarm_loc_estimator.filter.prediction import new_scratch, predict
 from swarm_loc_estimator.filter.sources import (
+    LEAST_SHARE,
     OCCUPIED_M,
     LossLimits,
     assess,
@@ -63,6 +65,7 @@ from swarm_loc_estimator.filter.sources import (
     is_uncertain,
     robot_of,
     share_of,
+    share_of_range,
     small_variances,
     source_of,
 )
@@ -84,7 +87,13 @@ from swarm_loc_estimator.odometry.track_arrays import (
     new_sample,
     rate_at,
 )
-from swarm_loc_estimator.swarm.calibration_states import CAMERA_OFFSET, CAMERA_SCALE, CAMERA_YAW, PARAMETERS
+from swarm_loc_estimator.swarm.calibration_states import (
+    CAMERA_OFFSET,
+    CAMERA_SCALE,
+    CAMERA_YAW,
+    PARAMETERS,
+    RADIO_BIAS,
+)
 
 _USED, _GATED = int(Verdict.USED), int(Verdict.GATED)
 _UNCERTAIN, _REFUTED = int(LossReason.UNCERTAIN), int(LossReason.REFUTED)
@@ -358,15 +367,16 @@ def _is_of_same_image(measurements: Measurements, k: int, side: int) -> bool:
 
 @cached_njit
 def related_columns(measurements: Measurements, belief: BeliefArrays) -> IntArray:
-    """First filter columns (m, 3) of observers, targets and observers' cameras; -1: none."""
+    """First filter columns (m, 3) of observers, targets and observers' cameras or radios; -1: none."""
     columns = np.empty((measurements.stamp_ns.size, 3), dtype=np.int64)
     for k in range(columns.shape[0]):
         columns[k, 0], columns[k, 1] = body_columns(measurements, k, belief)
         columns[k, 2] = -1
-        for m in range(CAMERA_YAW, PARAMETERS):
+        camera = has_kernel(measurements, k)
+        for m in range(CAMERA_YAW if camera else RADIO_BIAS, RADIO_BIAS if camera else PARAMETERS):
             column = belief.table.column[max(measurements.observer[k], 0), m]
             if measurements.observer[k] >= 0 and column >= 0:
-                columns[k, 2] = column - (m - CAMERA_YAW)
+                columns[k, 2] = column - (m - (CAMERA_YAW if camera else RADIO_BIAS))
     return columns
 
 
@@ -636,12 +646,15 @@ def evaluate_link(
         if sides[i] >= 0:
             slope += jacobian @ _motion(tracks, sides[i], stamp_ns, work.pose[k, i])
     noise += one.stamp_variance * np.outer(slope, slope)
-    jacobian = work.jacobian[k, :count, :6]
-    s = jacobian @ _covariance(columns, belief, joint, work.cross_covariance[k]) @ jacobian.T + noise
-    innovation = model.innovation(one.value, predicted.value)
+    bias = _write_radios(one, belief, work.columns[k], work.jacobian[k])
+    if not belief.is_dense and sides[1] >= 0:
+        noise[0, 0] += model.radios[1] ** 2 * own_within(belief, sides[1], 3 + RADIO_BIAS, 3 + RADIO_BIAS)
+    jacobian = work.jacobian[k, :count]
+    covariance = _covariance(one, belief, joint, work.columns[k], work.cross_covariance[k])
+    s = jacobian @ covariance @ jacobian.T + noise
+    innovation = model.innovation(one.value, predicted.value + bias)
     gated = slice(model.gated)
     work.share[k] = share_of(one.columns(), 0, belief)
-    noise /= work.share[k]
     work.noise[k, :count, :count], work.innovation[k, :count] = noise, innovation
     work.whitened[k], work.elsewhere[k] = 0.0, False
     work.place[k] = one.value[0], 0.0
@@ -655,6 +668,18 @@ def evaluate_link(
     else:
         work.jacobian[k], work.innovation[k], work.noise[k] = 0.0, 0.0, np.eye(3)
         work.distance[k], work.nis[k], work.accepted[k] = np.inf, np.nan, False
+    # What its link has from these places already counts less.
+    places = [*_antenna(one.sensor, tracks, sides[0], stamp_ns), *_antenna(one.marker, tracks, sides[1], stamp_ns)]
+    news = share_of_range(one.columns(), 0, belief, np.array(places), bool(work.accepted[k]))
+    work.noise[k, :count, :count] /= min(news, work.share[k]) if work.share[k] == LEAST_SHARE else news
+
+
+def _antenna(place: FloatArray, tracks: TrackArrays, robot: int, stamp_ns: int) -> list[float]:
+    """x and y of a place (3,) on a robot, by its odometry alone [m]; fixed without a robot."""
+    pose = np.zeros(3)
+    if robot >= 0:
+        look_up_pose(tracks, robot, stamp_ns, pose)
+    return se2.transform_points(pose, place[:2]).tolist()
 
 
 def _columns(one: Measurements, belief: BeliefArrays) -> tuple[int, int]:
@@ -669,20 +694,41 @@ def _columns(one: Measurements, belief: BeliefArrays) -> tuple[int, int]:
     return sides[0], sides[1]
 
 
+def _write_radios(one: Measurements, belief: BeliefArrays, columns: IntArray, jacobian: FloatArray) -> float:
+    """Write columns and Jacobian (3, c) by the biases of both robots' radios; return what these add.
+
+    A sparse filter has columns of the observer only, as of a camera.
+    """
+    bias, weights = 0.0, MODELS[int(one.model)].radios
+    for i, (robot, weight) in enumerate(zip((int(one.observer), int(one.target)), weights, strict=True)):
+        if robot >= 0 and weight != 0.0:
+            bias += weight * belief.parameter[robot, RADIO_BIAS]
+            column = belief.table.column[robot, RADIO_BIAS]
+            if column >= 0 and (i == 0 or belief.is_dense):
+                columns[6 + i], jacobian[0, 6 + i] = column, weight
+    return float(bias)
+
+
 def _covariance(
-    columns: tuple[int, int], belief: BeliefArrays, joint: JointFilter, cross_covariance: FloatArray
+    one: Measurements, belief: BeliefArrays, joint: JointFilter, columns: IntArray, cross_covariance: FloatArray
 ) -> FloatArray:
-    """Covariance (6, 6) of the errors of observer and target; zero for a side without columns."""
-    covariance = np.zeros((6, 6))
-    for i, first in enumerate(columns):
-        if first >= 0:
-            covariance[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] = joint.block(first + _BODY)
-    if min(columns) >= 0:
-        o, t = columns
-        if joint.is_dense:
-            cross_covariance[:, :3] = belief.covariance[o : o + 3, t : t + 3]
-        shared = cross_covariance[:, :3]
-        covariance[:3, 3:], covariance[3:, :3] = shared, shared.T
+    """Covariance (c, c) of the columns (c,) of one link."""
+    if joint.is_dense:
+        return joint.block(columns)
+    covariance, (o, t) = np.zeros((columns.size, columns.size)), _columns(one, belief)
+    radio = belief.table.column[one.observer, RADIO_BIAS] if one.observer >= 0 else -1
+    own, of_target = [0, 1, 2, 6], np.s_[3:6]
+    if radio >= 0:
+        covariance[np.ix_(own, own)] = joint.block(np.append(o + _BODY, radio))
+    elif o >= 0:
+        covariance[:3, :3] = joint.block(o + _BODY)
+    if t >= 0:
+        covariance[of_target, of_target] = joint.block(t + _BODY)
+    if min(o, t) >= 0:
+        covariance[:3, of_target] = cross_covariance[:, :3]
+        covariance[of_target, :3] = cross_covariance[:, :3].T
+    if min(radio, t) >= 0:
+        covariance[6, of_target] = covariance[of_target, 6] = cross_covariance[:, 3]
     return covariance
 
 

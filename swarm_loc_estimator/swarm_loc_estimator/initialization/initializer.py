@@ -44,7 +44,7 @@ from swarm_loc_estimator.initialization.alignment import (
 from swarm_loc_estimator.initialization.window import NO_WINDOW, Window, is_redundant, locate, with_row
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, RADIO_BIAS
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 _INDEPENDENT_NS = 100_000_000  # Sightings of one marker within this time are redundant
@@ -108,7 +108,7 @@ class Initializer:
         same = old[(old["marker_id"] == one.reading) & (old["other"] == other)]
         if same.size and abs(now_ns - int(same["stamp_ns"][-1])) < _INDEPENDENT_NS:
             return True
-        camera = np.zeros(3) if observer == NOBODY else state.parameter[observer, CAMERA_YAW:]
+        camera = np.zeros(3) if observer == NOBODY else state.parameter[observer, CAMERA_YAW:RADIO_BIAS]
         waiting, seen = Waiting(robot, track.pose[0], at.covariance), self._located(state, other, one)
         constraints = with_constraint(old, one, camera, waiting, seen, self._window_ns)
         state.constraints[robot] = constraints

@@ -1,8 +1,8 @@
 """Self-calibration states: systematic errors of odometry, cameras and the map, estimated with the poses.
 
 The first three parameters of a robot are errors of its motion, whose effect on the pose grows with distance
-and turn. The last three are the yaw offset, the scale error and the range offset of its camera: a range r is
-measured as (1 + scale) r + offset. A landmark with an inexact survey and a fixed camera are static bodies:
+and turn. The next three are the yaw offset, the scale error and the range offset of its camera: a range r is
+measured as (1 + scale) r + offset. The last one is the bias of its radio. A landmark with an inexact survey and a fixed camera are static bodies:
 their state is a correction of the survey, with a right-invariant error about the identity. That of an anchor
 is a displacement and the bias of its ranges.
 Parameters with a standard deviation in the description are estimated from the start, others only after a
@@ -28,15 +28,16 @@ TURN_SCALE = 2  # Relative error of the turn
 CAMERA_YAW = 3  # Yaw offset of the camera, positive to the left [rad]; constant, or it changes slowly
 CAMERA_SCALE = 4  # Relative error of distances measured by the camera
 CAMERA_OFFSET = 5  # Error of ranges of sightings without heading, the same at each range [m]
+RADIO_BIAS = 6  # Error of ranges from or to its radio [m]
 
 DRIVES = 3  # Number of leading parameters that act through the motion
-PARAMETERS = 6
+PARAMETERS = 7
 BLOCKS = -(-PARAMETERS // DRIVES)
-"""Number of blocks of three columns for a robot's parameters: one for motion, one for the camera."""
+"""Number of blocks of three columns for a robot's parameters: of motion, of the camera, of the radio."""
 _BLOCK, _SLOT = np.divmod(np.arange(PARAMETERS), DRIVES)
 """Block of each parameter, and its index in the block."""
 
-_CONTRADICTED_SIGMA = (0.0, 0.05, 0.1, 0.03, 0.03, 0.0)
+_CONTRADICTED_SIGMA = (0.0, 0.05, 0.1, 0.03, 0.03, 0.0, 0.0)
 """Standard deviations of parameters that are exact in the description, after a contradiction."""
 CONTRADICTED_SURVEY_SIGMA = (0.02, 0.03)
 """Standard deviations of a landmark's position [m] and yaw [rad] after a contradiction."""
@@ -79,9 +80,11 @@ class ParameterTable(NamedTuple):
                 sigma[i, CAMERA_SCALE] = robot.sensor.distance_scale_sigma
                 sigma[i, CAMERA_OFFSET] = robot.sensor.range_offset_sigma
                 time_s[i, CAMERA_YAW] = robot.camera.yaw_time_s
+            if robot.uwb is not None:
+                sigma[i, RADIO_BIAS] = robot.uwb.range_bias_sigma
         wanted = sigma > 0.0
         doubted = np.where(wanted, sigma, _CONTRADICTED_SIGMA)
-        doubted[[robot.camera is None for robot in robots], DRIVES:] = 0.0
+        doubted[[robot.camera is None for robot in robots], DRIVES:RADIO_BIAS] = 0.0
         times = np.where(time_s > 0.0, time_s, np.inf)
         surveys = np.array([_survey(mark) for mark in landmarks]).reshape(-1, 3, 3)
         drives = np.array([not robot.stands for robot in robots], dtype=bool)

@@ -56,6 +56,9 @@ class UwbDevice:
         0.15, "m", 0.0, 10.0, "noise of a range difference without variance", above=True
     )
     range_bias: float = number(0.0, "m", -10.0, 10.0, "added to each range from or to this device")
+    range_bias_sigma: float = number(
+        0.2, "m", 0.0, 10.0, "standard deviation of range_bias; 0: exact, else estimated with the poses"
+    )
     range_scale: float = number(
         1.0, "1", 0.5, 2.0, "measured over true distance, of ranges that this device measures"
     )

@@ -15,6 +15,7 @@ from swarm_loc_estimator.swarm.calibration_states import (
     CAMERA_SCALE,
     CAMERA_YAW,
     DISTANCE_SCALE,
+    RADIO_BIAS,
     TURN_BIAS,
     TURN_SCALE,
     ParameterTable,
@@ -62,7 +63,7 @@ def swapped_signs(swarm: Swarm) -> list[str]:
 def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
     """Robot with its estimated parameters."""
     value, sigma = state.parameter[index].tolist(), state.parameter_sigma(index).tolist()
-    odometry, camera, sensor = robot.odometry, robot.camera, robot.sensor
+    odometry, camera, sensor, radio = robot.odometry, robot.camera, robot.sensor, robot.uwb
     path, turn, seen = (1.0 + value[which] for which in (DISTANCE_SCALE, TURN_SCALE, CAMERA_SCALE))
     turns = robot.turn_sensor
     turning = {
@@ -88,6 +89,12 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
             distance_scale_sigma=min(1.0, sigma[CAMERA_SCALE] / abs(seen)),
             range_offset=(sensor.range_offset - value[CAMERA_OFFSET]) / seen,
             range_offset_sigma=sigma[CAMERA_OFFSET] / abs(seen),
+        ),
+        uwb=radio
+        and replace(
+            radio,
+            range_bias=radio.range_bias + radio.range_scale * value[RADIO_BIAS],
+            range_bias_sigma=radio.range_scale * sigma[RADIO_BIAS],
         ),
     )
 

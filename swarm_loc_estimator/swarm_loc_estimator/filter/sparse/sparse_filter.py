@@ -141,7 +141,7 @@ class Marginals:
             transition, blocks = self.transition[robots], self.groups.member[robots, 1:]
             follow = np.tile(np.eye(before.shape[1]), (bodies.size, 1, 1))
             follow[of_robots, :3, _DRIVEN] = transition[:, :3]
-            follow[of_robots[:, None], own, own] = transition[:, 3:].reshape(robots.size, own.size)
+            follow[of_robots[:, None], own, own] = transition[:, 3:].reshape(robots.size, -1)[:, : own.size]
             before = follow @ before @ follow.transpose(0, 2, 1)
             moved = transition[:, :3].any(axis=(1, 2))
             moves.beside[robots[moved]] = blocks[moved, 0]
@@ -154,8 +154,8 @@ class Marginals:
 
 
 def _width(groups: Groups) -> int:
-    """Columns of a body with its parameters, or of the body alone where there are no parameters."""
-    return 3 * (1 + BLOCKS) if (groups.member[:, 1:] >= 0).any() else 3
+    """Columns of a body with its parameters, up to the last block that any robot has."""
+    return 3 * (1 + int(np.flatnonzero((groups.member >= 0).any(axis=0)).max(initial=0)))
 
 
 def _enlarged(known: FloatArray, groups: Groups) -> FloatArray:
