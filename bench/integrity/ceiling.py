@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -30,6 +31,7 @@ _LEVEL = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
 """Rotation from the optical frame of a camera that looks straight down to forward, left, up."""
 
 
+@lru_cache(maxsize=2)  # scenarios of one seed share it
 def drive_under_ceiling(seed: int, duration_s: float) -> LivedRun:
     """Drive the eight; no robot has a camera, and no start is known."""
     settings = replace(settings_of(seed, CLEAN, duration_s), start_known=False)

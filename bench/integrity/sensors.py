@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -141,6 +142,7 @@ def _face_turned_90(seed: int) -> Fault:
     return _under_ceiling(seed, turned, {f"marker of epuck{which + 1}"}, which, span_s=span_s)
 
 
+@lru_cache(maxsize=2)  # scenarios of one seed share it
 def _eight(seed: int, errors: ErrorModel = CLEAN) -> SimulatedRun:
     """The eight, for longer than other scenarios."""
     return faults.simulate(settings_of(seed, errors, _DURATION_S))

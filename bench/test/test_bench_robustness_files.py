@@ -37,7 +37,7 @@ def here() -> Iterator[Place]:
         yield one
 
 
-@pytest.mark.parametrize("name", ["new", "print_markers", "generate_bag_eight"])
+@pytest.mark.parametrize("name", ["new", "generate_bag_eight"])
 def test_real_commands_leave_nothing_cut(name: str, here: Place) -> None:
     trials = Trials(next(one for one in COMMANDS if one.name == name), here)
     sizes = trials.spread(20)

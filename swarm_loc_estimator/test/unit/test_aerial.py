@@ -130,12 +130,6 @@ def test_any_lateness_loss_and_repetition_gives_the_same(
     }
 
 
-def test_the_same_images_give_the_same_bytes() -> None:
-    world = seen_from_above(UNKNOWN, View(detected=0.9, false=0.5), 4).world
-    (_, one), (_, other) = (run(world, on_time(world)) for _ in range(2))
-    assert b"".join(e.poses.tobytes() for e in one) == b"".join(e.poses.tobytes() for e in other)
-
-
 def test_blobs_that_are_nobodys_are_counted_and_change_nothing() -> None:
     """Known starts, and many more blobs than robots, all far away."""
     world = seen_from_above(replace(UNKNOWN, start_known=(True,)), View(), 5).world

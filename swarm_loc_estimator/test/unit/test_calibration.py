@@ -329,7 +329,7 @@ def test_the_score_counts_error_consistency_and_poses_not_given() -> None:
 @pytest.mark.parametrize("seed", [7, 8])
 def test_without_ground_truth_the_models_are_found_by_landmarks_alone(seed: int) -> None:
     centred = replace(TRUE, odometry=replace(TRUE.odometry, course_offset=0.0, axle_offset=0.0))
-    recording, swarm = record(World((robot(1, centred), robot(2, centred)), seed))
+    recording, swarm = record(World((robot(1, centred),), seed, 300.0))
     alone = fit_models(replace(recording, truth={}), swarm, Options(alone=True), quiet)
     for found in alone.swarm.robots:
         assert found.sensor.range_curve == pytest.approx(0.5, abs=0.06)

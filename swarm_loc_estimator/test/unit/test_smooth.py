@@ -70,7 +70,7 @@ def with_fixes(world: World, seed: int) -> tuple[Recording, Swarm]:
 
 
 def with_ranges(world: World, seed: int) -> tuple[Recording, Swarm]:
-    """Ranges to four anchors and to each other, ten times a second."""
+    """Ranges to four anchors and to each other, five times a second."""
     rng = np.random.default_rng([seed, 8])
     radios = [
         UwbDevice(1 + k, x=0.05, z=0.1, range_sigma=RANGE_SIGMA) for k in range(len(world.swarm.robots))
@@ -85,7 +85,7 @@ def with_ranges(world: World, seed: int) -> tuple[Recording, Swarm]:
         for one in ANCHORS
     )
     rows = []
-    for k in range(0, world.stamp_ns.size, 2):
+    for k in range(0, world.stamp_ns.size, 4):
         poses = world.truth[k]
         ahead = [se2.transform_points(pose, np.array([[0.05, 0.0]]))[0].tolist() for pose in poses]
         places = [(x, y, 0.1) for x, y in ahead]
