@@ -57,7 +57,7 @@ class BestPose(NamedTuple):
     pose: FloatArray  # (3,)
     covariance: FloatArray  # (3, 3)
     score: float  # Mean value of the field, 0 to 1
-    rival: float  # The best score of another place that has been looked for; 0: clearly less
+    rival: float  # The score of another place that has been looked for; 0: clearly less
 
 
 @cached_njit
@@ -238,7 +238,7 @@ def _search(
     floor: float,
     avoid: FloatArray,
 ) -> tuple[float, FloatArray]:
-    """The best offset (3,) [cells, rad] and its score, if above a floor; places near one are left out."""
+    """The best offset (3,) [cells, rad] and its score, if above a floor; any that is not near another one."""
     top = _LEVELS - 1
     width = 1 << top
     blocks = (2 * reach) // width + 1
@@ -273,6 +273,8 @@ def _search(
             if level == 0:
                 best = bound
                 place[0], place[1], place[2] = i, j, turn
+                if not math.isnan(avoid[0]):
+                    return best, place  # one rival is enough
                 continue
             half = 1 << (level - 1)
             for c in range(4):

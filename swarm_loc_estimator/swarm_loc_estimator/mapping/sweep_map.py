@@ -49,8 +49,7 @@ _MIN_SCORE = 0.30  # Least score of a sweep among the newest ones
 _CONTRADICTS = 16.0  # Squared difference of match and odometry, in variances, from which they contradict
 _MEMORY, _MAX_SQUARE = 0.05, 400.0  # Weight of a new difference in the noise of odometry, and its maximum
 _KNOWN = 0.3  # Greatest deviation of a match from which that noise is learned [m]
-_LOOK_EVERY, _LOOK_TIED = 0.5, 2.0
-"""Path after which old sweeps are looked for again [m], and that after a tie that is believed at once."""
+_LOOK_EVERY = 1.5  # Path after which old sweeps are looked for again [m]
 _OLD = 20  # Sweeps of the same robot in between from which one is old
 _NEAR, _REFERENCE, _REFERENCE_WAY = 3.0, 20, 5.0
 """Distance of old sweeps that are matched [m], their number, and greatest way between them [m]."""
@@ -75,6 +74,7 @@ _TORN = 25.0  # Squared residual of a tie, in variances, from which it contradic
 _DOUBT_EVERY, _DOUBT_NEAR, _DOUBT_SHARE, _DOUBT_APART = 4, 1.0, 0.6, 2.0
 """Sweeps that are checked, how near others are that see the same [m], share of the best score that they must
 have, and distance of places [m]."""
+_TORN_M, _TORN_TURN = 0.25, math.radians(5.0)  # Offset from which a place is torn, and no wall just blurred
 _DOUBT_WINDOW = PoseWindow(1.0, math.radians(10.0), math.inf, math.inf)
 _UNTIED_M = 1.0  # Way that counts for a sweep that fits nothing [m], and three times its path
 
@@ -98,7 +98,7 @@ class Chain:
     noise: FloatArray = field(default_factory=lambda: np.ones(2))  # Of paths and turns, over the described
     searched: float = 0.0  # Driven until it was looked for everywhere [m]
     score: float = 0.0  # Usual one of its sweeps
-    look_from: float = _LOOK_EVERY  # Driven until old ones are looked for again [m]
+    looked: float = 0.0  # Driven until old ones were looked for [m]
     floats: bool = False  # Whether nobody knows where its robot began
     pending: list[LoopTie] = field(default_factory=list)  # That are not believed yet
 
@@ -228,8 +228,8 @@ class SweepMap:
         self._ways.add(begin, node, path if fits else 3.0 * path + _UNTIED_M)
         chain.nodes.append(node)
         chain.path.append(chain.path[-1] + path)
-        if fits and chain.path[-1] > chain.look_from:
-            chain.look_from = chain.path[-1] + _LOOK_EVERY
+        if fits and chain.path[-1] - chain.looked > _LOOK_EVERY:
+            chain.looked = chain.path[-1]
             self._close_loops(chain, node)
         return fits
 
@@ -277,18 +277,24 @@ class SweepMap:
         """Places (n, 2) in map where sweeps fit nothing, or fit others elsewhere better [m]."""
         graph, count = self._graph, self._graph.count
         nodes = np.flatnonzero(self._points.counts[:count] >= _MIN_POINTS)
-        places = [graph.states[one, :2] for one in self.refused if self._points.counts[one]]
-        middles = self._middles(nodes)
-        for node, middle in zip(nodes[::_DOUBT_EVERY].tolist(), middles[::_DOUBT_EVERY], strict=True):
+        refused = [one for one in self.refused if self._points.counts[one]]
+        middles, places = self._middles(nodes), []
+        for node in sorted({*nodes[::_DOUBT_EVERY].tolist(), *refused}):
+            # the nearest sweep of another time that sees the same
             is_other = self._points.counts[:count] >= _MIN_POINTS
             is_other[max(0, node - _OLD) : node + _OLD] = False
+            middle = self._middles(np.array([node]))
             away = np.where(is_other[nodes], np.hypot(*(middles - middle).T), np.inf)
-            if away.min(initial=np.inf) > _DOUBT_NEAR:
+            if away.min(initial=np.inf) > (_NEAR if node in refused else _DOUBT_NEAR):
+                places += [graph.states[node, :2]] if node in refused else []
                 continue
+            # whether this one fits those around it clearly better elsewhere
             pose, points = graph.states[node, :3].copy(), self._points.at(np.array([node]), np.zeros((1, 3)))
             field = self._around(int(nodes[np.argmin(away)]), is_other)
-            here = score_at(field, points, pose)
-            if here < _GOOD and here < _DOUBT_SHARE * match(field, points, pose, _DOUBT_WINDOW).score:
+            here, best = score_at(field, points, pose), match(field, points, pose, _DOUBT_WINDOW)
+            x, y, turn = between(pose, best.pose)
+            is_apart = math.hypot(x, y) > _TORN_M or abs(turn) > _TORN_TURN
+            if is_apart and here < _GOOD and here < _DOUBT_SHARE * best.score:
                 places.append(pose[:2])
         kept: list[FloatArray] = []
         for place in places:
@@ -377,7 +383,6 @@ class SweepMap:
         if one is None:
             return
         if one.way < _SHORT:
-            chain.look_from = chain.path[-1] + _LOOK_TIED
             self._believe([one])
         else:
             chain.pending.append(one)

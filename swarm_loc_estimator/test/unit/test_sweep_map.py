@@ -144,14 +144,29 @@ def test_loops_are_closed(seed: int) -> None:
     assert not len(mapper.sweeps.doubts())
 
 
-def test_a_map_that_is_torn_is_in_doubt_there() -> None:
+@pytest.mark.parametrize(("tear", "at_least"), [((0.6, 0.6, 0.0), 3), ((0.35, 0.0, 0.0), 2), ((0.0, 0.0, 0.15), 2)])
+def test_a_map_that_is_torn_is_in_doubt_there(tear: tuple[float, float, float], at_least: int) -> None:
     mapper = CooperativeMapper()
     robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
     drive(mapper, robot, laps(2.0), np.random.default_rng(1))
     mapper.finish()
-    half = mapper.graph.count // 2
-    mapper.graph.states[half : mapper.graph.count, :2] += 0.6
-    assert len(mapper.sweeps.doubts()) >= 3
+    half, count = mapper.graph.count // 2, mapper.graph.count
+    mapper.graph.states[half:count, :3] = compose(tear, mapper.graph.states[half:count, :3])
+    assert len(mapper.sweeps.doubts()) >= at_least
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_sweep_that_fitted_nothing_is_in_doubt_until_others_say_the_same(seed: int) -> None:
+    """The first sweep of the second lap is taken from where nothing is known, and moved into the ring."""
+    mapper = CooperativeMapper()
+    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
+    drive(mapper, robot, laps(2.0), np.random.default_rng(seed))
+    mapper.finish()
+    node = mapper.graph.count // 2
+    mapper.sweeps.refused.append(node)
+    assert not len(mapper.sweeps.doubts())
+    mapper.graph.states[node, :2] += 0.5
+    assert np.abs(mapper.sweeps.doubts() - mapper.graph.states[node, :2]).max() < 1e-9
 
 
 @pytest.mark.parametrize("seed", range(3))
