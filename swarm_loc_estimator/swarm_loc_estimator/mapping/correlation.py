@@ -29,6 +29,7 @@ _SHAPE_CELLS, _SHAPE_TURNS, _SHAPE_TURN = 8, 5, 0.005
 _RIDGE = 0.1  # Standard deviation on the lattice from which a direction is unknown [m]
 _UNKNOWN = 3.0  # Standard deviation of such a direction [m]
 _LEAST_VARIANCE = np.array([0.01, 0.01, 0.002]) ** 2  # [m, m, rad]
+_ON_CELLS = 0.8  # Share of its score that the best pose has at least on the cells of the search
 _STEPS = 8  # Number of Gauss-Newton steps to a place between cells
 _APART_TURN = math.radians(12.0)  # Turn from which a pose is another place
 _APART = 0.5  # Distance from which it is one [m]
@@ -57,7 +58,7 @@ class BestPose(NamedTuple):
     pose: FloatArray  # (3,)
     covariance: FloatArray  # (3, 3)
     score: float  # Mean value of the field, 0 to 1
-    rival: float  # The best score of another place that has been looked for; 0: clearly less
+    rival: float  # The score of another place that has been looked for; 0: clearly less
 
 
 @cached_njit
@@ -133,7 +134,12 @@ def _draw(cells: FloatArray, nx: int, ny: int) -> NDArray[np.uint8]:
 
 
 def match(
-    field: PointField, points: FloatArray, pose: FloatArray, window: PoseWindow, rival: float = 0.0
+    field: PointField,
+    points: FloatArray,
+    pose: FloatArray,
+    window: PoseWindow,
+    rival: float = 0.0,
+    least: float = 0.0,
 ) -> BestPose:
     """Find where points (n, 2) in the frame of a robot fit best around a predicted pose (3,).
 
@@ -143,6 +149,7 @@ def match(
         pose: (3,) predicted.
         window: What is searched.
         rival: Share of the best score from which another place is looked for; 0: it is not.
+        least: A score below which no pose is of use: the predicted one is returned with a score of 0.
     """
     far = float(np.percentile(np.hypot(points[:, 0], points[:, 1]), 85.0))
     cells = points / _CELL
@@ -153,7 +160,10 @@ def match(
     sigmas = np.array([window.sigma / _CELL, window.turn_sigma])
     nothing = np.full(3, np.nan)
     rotated = _rotated(_some(cells, _SEARCH_POINTS), centre, turns, step)
-    best, place = _search(field.levels, rotated, reach, turns, step, sigmas, 0.0, nothing)
+    floor = _ON_CELLS * least
+    best, place = _search(field.levels, rotated, reach, turns, step, sigmas, floor, nothing)
+    if least and best <= floor:
+        return BestPose(pose, np.eye(3), 0.0, 0.0)
     other = 0.0
     if rival:
         other, _ = _search(field.levels, rotated, reach, turns, step, sigmas, rival * best, place)
@@ -238,7 +248,7 @@ def _search(
     floor: float,
     avoid: FloatArray,
 ) -> tuple[float, FloatArray]:
-    """The best offset (3,) [cells, rad] and its score, if above a floor; places near one are left out."""
+    """The best offset (3,) [cells, rad] and its score, if above a floor; any that is not near another one."""
     top = _LEVELS - 1
     width = 1 << top
     blocks = (2 * reach) // width + 1
@@ -273,6 +283,8 @@ def _search(
             if level == 0:
                 best = bound
                 place[0], place[1], place[2] = i, j, turn
+                if not math.isnan(avoid[0]):
+                    return best, place  # one rival is enough
                 continue
             half = 1 << (level - 1)
             for c in range(4):

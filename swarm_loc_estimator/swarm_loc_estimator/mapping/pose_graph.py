@@ -160,12 +160,16 @@ class NormalEquations:
 
     Args:
         free: (u,) True for free unknowns.
+
+    Attributes:
+        squares: Sum of the squared residuals of constraints, in variances.
     """
 
     def __init__(self, free: BoolArray) -> None:
         self._place: IntArray = np.where(free, np.cumsum(free) - 1, -1)
         self._size = int(free.sum())
         self._free = free
+        self.squares = 0.0
         self._gradient = np.zeros(self._size)
         self._values: list[FloatArray] = []
         self._rows: list[IntArray] = []
@@ -174,6 +178,7 @@ class NormalEquations:
     def add(self, constraints: Sequence[Linearised]) -> None:
         """Add constraints."""
         for one in constraints:
+            self.squares += float((one.weight * one.residual**2).sum())
             weighted = one.jacobian * one.weight[:, :, None]
             squares = np.einsum("mea,meb->mab", weighted, one.jacobian)
             self.add_blocks(one.unknowns, squares, -np.einsum("mea,me->ma", weighted, one.residual))
@@ -198,14 +203,14 @@ class NormalEquations:
         columns = np.concatenate([*self._columns, diagonal])
         return csc_matrix((values, (rows, columns)), shape=(self._size, self._size)), self._gradient
 
-    def solve(self) -> tuple[FloatArray, NormalFactor]:
-        """The step (u,), zero for fixed unknowns, and the factor for covariances."""
+    def solve(self) -> tuple[FloatArray, NormalFactor, float]:
+        """The step (u,), zero for fixed unknowns, the factor for covariances, and the fall of `squares`."""
         matrix, gradient = self.system()
         options = {"SymmetricMode": True}
         factor = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
-        step = np.zeros(len(self._free))
-        step[self._free] = factor.solve(gradient)
-        return step, NormalFactor(factor, self._place)
+        step, free = np.zeros(len(self._free)), factor.solve(gradient)
+        step[self._free] = free
+        return step, NormalFactor(factor, self._place), float(free @ gradient)
 
 
 class NormalFactor:
@@ -305,10 +310,6 @@ class ConstraintLists:
         """Number of bearings."""
         return self._bearings.count
 
-    def worst_tie(self, states: FloatArray) -> float:
-        """The greatest squared residual of a tie at states (k, 4), in variances."""
-        return float(np.square(self._tied(states).residual).sum(axis=1).max(initial=0.0))
-
     def departures(self) -> Iterator[tuple[int, int, FloatArray]]:
         """Stop of departure, of arrival, and turn, motion and sigmas, see `constraints.Departures`."""
         begin, end, values = self._departures.columns
@@ -318,17 +319,14 @@ class ConstraintLists:
         """Linearize all constraints at states (k, 4)."""
         stop, _, prior = self._priors.columns
         begin, end, driven = self._departures.columns
+        first, last, tied = self._ties.columns
         seer, seen, light = self._bearings.columns
         return [
             priors(states, stop, prior[:, :3], prior[:, 3:]),
             odometry(states, Departures(begin, end, driven[:, 0], driven[:, 1:4], driven[:, 4:])),
-            self._tied(states),
+            ties(states, Ties(first, last, tied[:, :3], tied[:, 3:].reshape(-1, 3, 3))),
             bearings(states, Bearings(seer, seen, *light.T)),
         ]
-
-    def _tied(self, states: FloatArray) -> Linearised:
-        begin, end, v = self._ties.columns
-        return ties(states, Ties(begin, end, v[:, :3], v[:, 3:].reshape(-1, 3, 3)))
 
 
 _REFIT_RATIO = 0.0006  # Threshold of the change of the turn ratio above which lines are refitted
@@ -501,7 +499,7 @@ class PoseGraph:
 
     def solve(
         self, iterations: int, free: Iterable[int] | None = None, gate: float = MATCH_GATE, stride: int = 2
-    ) -> None:
+    ) -> float:
         """Gauss-Newton optimization of all or some stops; slips are always free.
 
         Args:
@@ -509,6 +507,9 @@ class PoseGraph:
             free: Stops that may move; None: all.
             gate: See `beam_residual` [m].
             stride: Every `stride`-th beam is used.
+
+        Returns:
+            Change of the sum of the squared residuals of constraints, in variances.
         """
         count = self.count
         moves = np.ones(count, dtype=bool)
@@ -516,8 +517,11 @@ class PoseGraph:
             moves[:] = False
             moves[list(free)] = True
         unknowns = np.concatenate([np.repeat(moves, STOP_UNKNOWNS), np.ones(len(self.slip), dtype=bool)])
+        before = after = math.nan
         for _ in range(iterations):
-            step, factor = self.equations(unknowns, gate, stride).solve()
+            equations = self.equations(unknowns, gate, stride)
+            step, factor, fall = equations.solve()
+            before, after = equations.squares if math.isnan(before) else before, equations.squares - fall
             if free is None:
                 self._factor, self._factored = factor, count
             if self._apply(step):
@@ -526,6 +530,7 @@ class PoseGraph:
             changed = abs(self.states[stop, 3] - self._fitted_ratio[stop]) > _REFIT_RATIO
             if changed and self._beams.counts[stop]:
                 self.fit(int(stop))
+        return after - before
 
     def equations(self, free: BoolArray, gate: float = MATCH_GATE, stride: int = 2) -> NormalEquations:
         """The normal equations at the present states.

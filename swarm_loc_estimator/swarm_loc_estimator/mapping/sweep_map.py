@@ -46,11 +46,11 @@ _ANYWHERE = PoseWindow(2.5, math.pi, math.inf, math.inf)
 _GOOD, _LESS, _BETTER = 0.5, 0.8, 0.15
 """Score, and share of the usual one, below which it is searched elsewhere, and is there if so much better."""
 _MIN_SCORE = 0.30  # Least score of a sweep among the newest ones
-_CONTRADICTS = 16.0  # Squared difference of match and odometry, in variances, from which they contradict
+_CONTRADICTS = 16.0
+"""Squared difference, in variances, from which a match and odometry, or a tie and all else, contradict."""
 _MEMORY, _MAX_SQUARE = 0.05, 400.0  # Weight of a new difference in the noise of odometry, and its maximum
 _KNOWN = 0.3  # Greatest deviation of a match from which that noise is learned [m]
-_LOOK_EVERY, _LOOK_TIED = 0.5, 2.0
-"""Path after which old sweeps are looked for again [m], and that after a tie that is believed at once."""
+_LOOK_EVERY = 1.5  # Path after which old sweeps are looked for again [m]
 _OLD = 20  # Sweeps of the same robot in between from which one is old
 _NEAR, _REFERENCE, _REFERENCE_WAY = 3.0, 20, 5.0
 """Distance of old sweeps that are matched [m], their number, and greatest way between them [m]."""
@@ -71,10 +71,10 @@ _EVERYWHERE_EVERY, _EVERYWHERE_PATH, _EVERYWHERE_SCORE = 2.0, 12.0, 0.6
 compared [m], and its least score."""
 _SOLVE, _SOLVE_SHARE = 9.0, 0.03
 """Squared residual of a tie, in variances, and share of the stops with new ties, from which all is solved."""
-_TORN = 25.0  # Squared residual of a tie, in variances, from which it contradicts
 _DOUBT_EVERY, _DOUBT_NEAR, _DOUBT_SHARE, _DOUBT_APART = 4, 1.0, 0.6, 2.0
 """Sweeps that are checked, how near others are that see the same [m], share of the best score that they must
 have, and distance of places [m]."""
+_TORN_M, _TORN_TURN = 0.25, math.radians(5.0)  # Offset from which a place is torn, and no wall just blurred
 _DOUBT_WINDOW = PoseWindow(1.0, math.radians(10.0), math.inf, math.inf)
 _UNTIED_M = 1.0  # Way that counts for a sweep that fits nothing [m], and three times its path
 
@@ -98,7 +98,7 @@ class Chain:
     noise: FloatArray = field(default_factory=lambda: np.ones(2))  # Of paths and turns, over the described
     searched: float = 0.0  # Driven until it was looked for everywhere [m]
     score: float = 0.0  # Usual one of its sweeps
-    look_from: float = _LOOK_EVERY  # Driven until old ones are looked for again [m]
+    looked: float = 0.0  # Driven until old ones were looked for [m]
     floats: bool = False  # Whether nobody knows where its robot began
     pending: list[LoopTie] = field(default_factory=list)  # That are not believed yet
 
@@ -228,8 +228,8 @@ class SweepMap:
         self._ways.add(begin, node, path if fits else 3.0 * path + _UNTIED_M)
         chain.nodes.append(node)
         chain.path.append(chain.path[-1] + path)
-        if fits and chain.path[-1] > chain.look_from:
-            chain.look_from = chain.path[-1] + _LOOK_EVERY
+        if fits and chain.path[-1] - chain.looked > _LOOK_EVERY:
+            chain.looked = chain.path[-1]
             self._close_loops(chain, node)
         return fits
 
@@ -242,7 +242,7 @@ class SweepMap:
         points = _points_of(beams_of(stop))
         if newest is None or len(points) < _MIN_POINTS:
             return None
-        found = match(newest, points, self._graph.states[node, :3], _ANYWHERE, _RIVAL)
+        found = match(newest, points, self._graph.states[node, :3], _ANYWHERE, _RIVAL, _GOOD)
         return found.pose if found.score > _GOOD and not found.rival else None
 
     def drop(self, node: int) -> None:
@@ -277,18 +277,24 @@ class SweepMap:
         """Places (n, 2) in map where sweeps fit nothing, or fit others elsewhere better [m]."""
         graph, count = self._graph, self._graph.count
         nodes = np.flatnonzero(self._points.counts[:count] >= _MIN_POINTS)
-        places = [graph.states[one, :2] for one in self.refused if self._points.counts[one]]
-        middles = self._middles(nodes)
-        for node, middle in zip(nodes[::_DOUBT_EVERY].tolist(), middles[::_DOUBT_EVERY], strict=True):
+        refused = [one for one in self.refused if self._points.counts[one]]
+        middles, places = self._middles(nodes), []
+        for node in sorted({*nodes[::_DOUBT_EVERY].tolist(), *refused}):
+            # the nearest sweep of another time that sees the same
             is_other = self._points.counts[:count] >= _MIN_POINTS
             is_other[max(0, node - _OLD) : node + _OLD] = False
+            middle = self._middles(np.array([node]))
             away = np.where(is_other[nodes], np.hypot(*(middles - middle).T), np.inf)
-            if away.min(initial=np.inf) > _DOUBT_NEAR:
+            if away.min(initial=np.inf) > (_NEAR if node in refused else _DOUBT_NEAR):
+                places += [graph.states[node, :2]] if node in refused else []
                 continue
+            # whether this one fits those around it clearly better elsewhere
             pose, points = graph.states[node, :3].copy(), self._points.at(np.array([node]), np.zeros((1, 3)))
             field = self._around(int(nodes[np.argmin(away)]), is_other)
-            here = score_at(field, points, pose)
-            if here < _GOOD and here < _DOUBT_SHARE * match(field, points, pose, _DOUBT_WINDOW).score:
+            here, best = score_at(field, points, pose), match(field, points, pose, _DOUBT_WINDOW)
+            x, y, turn = between(pose, best.pose)
+            is_apart = math.hypot(x, y) > _TORN_M or abs(turn) > _TORN_TURN
+            if is_apart and here < _GOOD and here < _DOUBT_SHARE * best.score:
                 places.append(pose[:2])
         kept: list[FloatArray] = []
         for place in places:
@@ -314,8 +320,9 @@ class SweepMap:
             return None
         found = match(newest, points, self._graph.states[node, :3], _window(motion))
         if found.score < max(_GOOD, _LESS * chain.score):
-            anywhere = match(newest, points, self._graph.states[chain.nodes[-1], :3], _ANYWHERE, _RIVAL)
-            if not anywhere.rival and anywhere.score > max(_GOOD, found.score + _BETTER):
+            before, least = self._graph.states[chain.nodes[-1], :3], max(_GOOD, found.score + _BETTER)
+            anywhere = match(newest, points, before, _ANYWHERE, _RIVAL, least)
+            if not anywhere.rival and anywhere.score > least:
                 return anywhere
         return found
 
@@ -377,8 +384,7 @@ class SweepMap:
         if one is None:
             return
         if one.way < _SHORT:
-            chain.look_from = chain.path[-1] + _LOOK_TIED
-            self._believe([one])
+            self.believe([one])
         else:
             chain.pending.append(one)
             self._test_together(chain)
@@ -409,7 +415,9 @@ class SweepMap:
         )
         low, high = known.min(axis=0), known.max(axis=0)
         window = PoseWindow(0.5 * float((high - low).max()), math.pi, math.inf, math.inf)
-        found = match(field_of(known), query, np.array([*(0.5 * (low + high)), 0.0]), window, _RIVAL)
+        found = match(
+            field_of(known), query, np.array([*(0.5 * (low + high)), 0.0]), window, _RIVAL, _EVERYWHERE_SCORE
+        )
         if found.score < _EVERYWHERE_SCORE or found.rival:
             return
         old = int(others[np.argmin(np.hypot(*(graph.states[others, :2] - found.pose[:2]).T))])
@@ -431,7 +439,7 @@ class SweepMap:
         graph.states[mine, :3] = compose(shift, graph.states[mine, :3])
         graph.constraints.remove_priors(set(mine.tolist()))
         chain.floats, chain.pending = False, []
-        self._believe(agree)
+        self.believe(agree)
 
     def _middles(self, nodes: IntArray) -> FloatArray:
         """Middles (n, 2) of what was seen in sweeps, in map [m]."""
@@ -455,6 +463,7 @@ class SweepMap:
                 math.inf,
             ),
             _RIVAL,
+            _LOOP_SCORE,
         )
         sigma = math.sqrt(float(np.linalg.eigvalsh(found.covariance[:2, :2])[-1]))
         if found.score < _LOOP_SCORE or found.rival or sigma > _LOOP_RIDGE:
@@ -479,7 +488,7 @@ class SweepMap:
         agree = [one for one in chain.pending if self._agree(one, newest, now - where[one.end])]
         if len(agree) >= _TOGETHER and now - where[agree[0].end] >= _SPAN:
             chain.pending = []
-            self._believe(agree)
+            self.believe(agree)
 
     def _agree(self, one: LoopTie, other: LoopTie, way: float) -> bool:
         """Whether two ties move the newest sweeps to the same place."""
@@ -489,27 +498,22 @@ class SweepMap:
         off = between(first, compose(states[other.begin, :3], other.pose))
         return bool(math.hypot(off[0], off[1]) < _AGREE + _AGREE_PER_M * way and abs(off[2]) < _AGREE_TURN)
 
-    def _believe(self, new: list[LoopTie]) -> None:
+    def believe(self, new: list[LoopTie]) -> None:
         """Add ties; those that the graph contradicts when it is solved are taken back."""
         graph = self._graph
         states, slip = graph.states[: graph.count].copy(), graph.slip.copy()
-        worst = max(_square(one, graph.states) for one in new)
+        squares = [_square(one, graph.states) for one in new]
         for one in new:
             graph.constraints.add_tie(one.begin, one.end, one.pose, one.root)
             self._ways.add(one.begin, one.end, 0.1)
         self.loops += new
         self._unsolved += len(new)
-        if worst < _SOLVE and self._unsolved < _SOLVE_SHARE * graph.count:
+        if max(squares) < _SOLVE and self._unsolved < _SOLVE_SHARE * graph.count:
             return
         self._unsolved = 0
-        graph.solve(3)
-        if self._stress() > _TORN:
+        if sum(squares) + graph.solve(3) > _CONTRADICTS * len(new):  # what all has to give way to these
             graph.states[: graph.count], graph.slip = states, slip
             self._take_back(new)
-
-    def _stress(self) -> float:
-        """The greatest squared residual of a tie, in variances."""
-        return self._graph.constraints.worst_tie(self._graph.states)
 
     def _take_back(self, ties: list[LoopTie]) -> None:
         """Remove ties."""

@@ -68,7 +68,7 @@ def test_sparse_equations_are_the_dense_ones() -> None:
             g[index] -= jacobian.T @ (weight * residual)
     equations = NormalEquations(np.ones(size, dtype=bool))
     equations.add(parts)
-    step, factor = equations.solve()
+    step, factor, _ = equations.solve()
     assert np.allclose(step, np.linalg.solve(H, g))
     chosen = np.array([4, 5, 6])
     assert np.allclose(factor.covariance(chosen), np.linalg.inv(H)[np.ix_(chosen, chosen)])
@@ -80,7 +80,7 @@ def test_what_is_not_free_stays() -> None:
     free[4:8] = False
     equations = NormalEquations(free)
     equations.add([make(rng.normal(0.0, 1.0, (STOPS, 4)), np.zeros(2)) for make in kinds(rng).values()])
-    step, _ = equations.solve()
+    step, _, _ = equations.solve()
     assert (step[4:8] == 0.0).all()
     assert np.abs(step[free]).min() > 0.0
 

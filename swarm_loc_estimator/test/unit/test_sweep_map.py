@@ -13,6 +13,7 @@ from swarm_loc_estimator.mapping.correlation import PoseWindow, field_of, match,
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.scans import Scan, ScanStop
 from swarm_loc_estimator.mapping.settings import MapperSettings
+from swarm_loc_estimator.mapping.sweep_map import LoopTie
 
 REACH, NOISE, STEP_NS = 8.0, 0.01, 1_000_000_000
 SIGMA = NOISE / REACH**2
@@ -144,14 +145,63 @@ def test_loops_are_closed(seed: int) -> None:
     assert not len(mapper.sweeps.doubts())
 
 
-def test_a_map_that_is_torn_is_in_doubt_there() -> None:
+@pytest.mark.parametrize("seed", range(3))
+def test_loops_that_contradict_the_others_are_taken_back(seed: int) -> None:
+    """Three ties in a row say that the robot is a metre beside the way on which all others lead."""
+    mapper = CooperativeMapper()
+    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
+    truth = drive(mapper, robot, laps(1.5), np.random.default_rng(seed))
+    mapper.finish()
+    before, loops = mapper.graph.poses.copy(), list(mapper.sweeps.loops)
+    root, first = 50.0 * np.eye(3), mapper.graph.count - 3
+    right = [LoopTie(k, first + k, between(truth[k], truth[first + k]), root, 40.0) for k in range(3)]
+    mapper.sweeps.believe([tie._replace(pose=tie.pose + np.array([0.0, 1.0, 0.0])) for tie in right])
+    assert mapper.sweeps.taken_back == 3
+    assert mapper.sweeps.loops == loops
+    assert mapper.graph.poses == pytest.approx(before)
+    mapper.finish()
+    assert mapper.graph.poses == pytest.approx(before, abs=2e-3)
+    mapper.sweeps.believe(right)
+    assert mapper.sweeps.loops == [*loops, *right]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_what_scores_less_than_is_of_use_is_not_found(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    field, window = field_of(rng.uniform(-3.0, 3.0, (60, 2))), PoseWindow(0.4, 0.2, math.inf, math.inf)
+    points, pose = rng.uniform(-2.5, 2.5, (40, 2)), rng.uniform(-0.5, 0.5, 3)
+    found = match(field, points, pose, window)
+    again = match(field, points, pose, window, least=0.99 * found.score)
+    assert again.score == found.score
+    assert again.pose.tolist() == found.pose.tolist()
+    assert match(field, points, pose, window, least=1.5 * found.score).score == 0.0
+
+
+@pytest.mark.parametrize(
+    ("tear", "at_least"), [((0.6, 0.6, 0.0), 3), ((0.35, 0.0, 0.0), 2), ((0.0, 0.0, 0.15), 2)]
+)
+def test_a_map_that_is_torn_is_in_doubt_there(tear: tuple[float, float, float], at_least: int) -> None:
     mapper = CooperativeMapper()
     robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
     drive(mapper, robot, laps(2.0), np.random.default_rng(1))
     mapper.finish()
-    half = mapper.graph.count // 2
-    mapper.graph.states[half : mapper.graph.count, :2] += 0.6
-    assert len(mapper.sweeps.doubts()) >= 3
+    half, count = mapper.graph.count // 2, mapper.graph.count
+    mapper.graph.states[half:count, :3] = compose(tear, mapper.graph.states[half:count, :3])
+    assert len(mapper.sweeps.doubts()) >= at_least
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_sweep_that_fitted_nothing_is_in_doubt_until_others_say_the_same(seed: int) -> None:
+    """The first sweep of the second lap is taken from where nothing is known, and moved into the ring."""
+    mapper = CooperativeMapper()
+    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
+    drive(mapper, robot, laps(2.0), np.random.default_rng(seed))
+    mapper.finish()
+    node = mapper.graph.count // 2
+    mapper.sweeps.refused.append(node)
+    assert not len(mapper.sweeps.doubts())
+    mapper.graph.states[node, :2] += 0.5
+    assert np.abs(mapper.sweeps.doubts() - mapper.graph.states[node, :2]).max() < 1e-9
 
 
 @pytest.mark.parametrize("seed", range(3))
