@@ -173,8 +173,10 @@ def peaks(votes: Plain, diameter_px: float, most: int) -> FloatArray:
 
 RAYS = 64
 _WIDEST = 0.3  # Largest relative difference of a rim from the expected radius
-_OFF = 0.08  # Largest distance of an edge from its circle, in radii
-_ALONG = 0.92  # Least cosine of the angle between the slope of brightness at an edge and the normal of the outline
+_OFF, _NEAR = 0.08, 0.12
+"""Largest distance of an edge of a circle, and of one that shows its errors, from the circle in radii."""
+_ALONG = 0.94
+"""Least cosine of the angle between the slope of brightness at an edge and the normal of the outline."""
 _BLOCK = 30_000  # OpenCV's images have fewer than 2^15 rows
 _ROUNDS = 3
 _EVERY, _LIKELY = 4, 0.4
@@ -382,11 +384,11 @@ def _fit(
         weights = np.swapaxes(used, 1, 2)
         solution = np.linalg.solve(weights @ design + ridge, weights @ away[..., None])
         residual = away - (design @ solution)[..., 0]
-    own = is_edge & (np.abs(residual) <= _OFF * size)
+    near, own = (is_edge & (np.abs(residual) <= limit * size) for limit in (_NEAR, _OFF))
     count = own.sum(axis=1)
     spread = np.sqrt(np.sum(own * residual**2, axis=1) / np.maximum(count - 5, 1))
     used = design * own[..., None]
-    variance = _TOGETHER * _moving(residual, own, spread)
+    variance = _TOGETHER * _moving(residual, near, spread)
     covariance = variance[:, None, None] * np.linalg.inv(np.swapaxes(used, 1, 2) @ design + ridge)[:, :2, :2]
     few = count < _MIN_RAYS
     own[few] = False

@@ -137,16 +137,20 @@ class AerialDetector:
         Raises:
             RectificationError: The camera does not see the plane, or robots on it look too small.
         """
-        if not self.diameter:
-            self.diameter = self._estimated(gray)
-            if not self.diameter:
-                return _nothing({"size_unknown": 1})
+        diameter = self.diameter or self._estimated(gray)
+        if not diameter:
+            return _nothing({"size_unknown": 1})
         if self._grid is None:
-            self._grid = rectification(self._ground, self._settings, self.diameter, _SIZES_PX)
+            self._grid = rectification(self._ground, self._settings, diameter, _SIZES_PX)
         most = _SPARE_SHARE * self._settings.max_robots + _SPARE
-        look = self._look(self._grid, gray, noise_of(gray), self.diameter)
-        found, dropped = self._discs(look, self.diameter, most)
-        return self._located(self._grid, found, dropped)
+        look = self._look(self._grid, gray, noise_of(gray), diameter)
+        found, dropped = self._discs(look, diameter, most)
+        located = self._located(self._grid, found, dropped)
+        if len(located):
+            self.diameter = diameter
+        elif not self.diameter:  # what was measured was no robot
+            self._grid = None
+        return located
 
     def _look(self, grid: Rectification, gray: Gray, noise: float, diameter: float) -> _Look:
         """The image on a grid, for robots of about a diameter [m]."""
