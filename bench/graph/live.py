@@ -19,6 +19,7 @@ import numpy as np
 
 from bench.shared.bags import copy_part
 from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
+from bench.shared.live import settled
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.offline.datasets.mrclam import Delay, convert, read_dataset
 from swarm_loc_estimator.offline.live_run import Agreement, LiveRun, compare_with_replay, play_live
@@ -49,7 +50,8 @@ def run_mrclam(folder: Path, work: Path, duration_s: float, rate: float) -> Outc
 def figures_of(outcome: Outcome) -> dict[str, float]:
     """All figures of one bag."""
     live, compared = outcome
-    settled_m = compared.distance_m[compared.settled]
+    at_rest = settled(live)
+    settled_m = compared.distance_m[at_rest]
     figures = {
         "lost_messages": float(live.lost),
         "estimator_core": live.estimator_core,
@@ -59,7 +61,7 @@ def figures_of(outcome: Outcome) -> dict[str, float]:
         "difference_rms_m": compared.rms_m,
         "equal_share": compared.equal_share,
         "settled_difference_max_m": float(np.nanmax(settled_m)) if settled_m.size else float("nan"),
-        "settled_stamps": float(compared.settled.sum()),
+        "settled_stamps": float(at_rest.sum()),
     }
     return {name: value for name, value in figures.items() if np.isfinite(value)}
 

@@ -15,63 +15,24 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 
-from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS
 from swarm_loc_drivers.sim.simulation import (
-    ROBOT_TYPES,
+    WORLD_NAMES,
     SimulationOptions,
     graph_of,
     robot_type_of,
     simulated_swarm,
 )
-from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
+from swarm_loc_estimator.common.command_line import exit_with_message
 from swarm_loc_estimator.common.files import temporary_folder
 from swarm_loc_estimator.common.jit import is_precompiled
-from swarm_loc_estimator.common.launch import print_line, run_graph
-from swarm_loc_estimator.common.parameters import number_specs
+from swarm_loc_estimator.common.launch import parsed_options, print_line, run_graph
 from swarm_loc_vision.markers.detector import precompile
-
-
-def parse(arguments: Sequence[str] | None) -> SimulationOptions:
-    """Read the command line."""
-    parser = command_parser(__doc__)
-    parser.add_argument("swarm_file", metavar="SWARM_FILE", help="the swarm description")
-    defaults = SimulationOptions("")
-    parser.add_argument(
-        "--world",
-        choices=[world for kind in ROBOT_TYPES.values() for world in kind.worlds],
-        default=defaults.world,
-        help="error model of robots and sensors (default: w2 for e-pucks, d1 for Droplets)",
-    )
-    # one option for each number of SimulationOptions
-    for name, spec in number_specs(SimulationOptions).items():
-        default = getattr(defaults, name)
-        kind = type(default)
-        parser.add_argument(
-            f"--{name}",
-            type=number_in(kind(spec.low), kind(spec.high), spec.unit.strip("1")),
-            default=default,
-            help=f"{spec.doc} (default: {default:g})",
-        )
-    # the environment, and how robots are seen
-    parser.add_argument(
-        "--plan",
-        default=defaults.plan,
-        help=f"the hall of PushBots: {', '.join(FLOOR_PLANS)}, or the path of a floor plan"
-        f" (default: {defaults.plan})",
-    )
-    parser.add_argument(
-        "--aerial",
-        action="store_true",
-        help="locate e-pucks only by an overhead camera, which cannot tell them apart",
-    )
-    parser.add_argument("--params-file", dest="parameter_file", help="ROS parameter file for all nodes")
-    return SimulationOptions(**vars(parser.parse_args(arguments)))
 
 
 @exit_with_message
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run until a node ends or Ctrl-C."""
-    options = parse(arguments)
+    options = parsed_options(SimulationOptions, __doc__, arguments, {"world": WORLD_NAMES})
     swarm = simulated_swarm(options)
     detects = robot_type_of(swarm).has_markers and not options.aerial
     if detects and not is_precompiled(precompile):  # once here instead of in every detector

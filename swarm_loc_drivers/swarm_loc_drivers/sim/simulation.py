@@ -7,14 +7,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from swarm_loc_drivers.sim.droplet.world import check_droplets
 from swarm_loc_drivers.sim.epuck.world import check_swarm
-from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
+from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import MAX_ROBOTS, laser_hz, led_hz
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
@@ -24,7 +24,7 @@ from swarm_loc_drivers.sim.scenarios.eight import ARENA, eight_floor, eight_star
 from swarm_loc_drivers.sim.worlds import WorldError
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, check_parameter_file
-from swarm_loc_estimator.common.parameters import ParameterError, number
+from swarm_loc_estimator.common.parameters import ParameterError, flag, number, text
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_vision.aerial.ground_file import save_ground
@@ -50,19 +50,18 @@ _AERIAL_CAMERA: Parameters = {
 class SimulationOptions:
     """Options of a simulation."""
 
-    swarm_file: str  # Path of the swarm description
-    world: str = ""  # Error model of robots and sensors; "": the default of the robots' type
-    seed: int = number(1, "1", 0, 2**31 - 1, "random seed of these errors")  # Random seed of these errors
-    # Speed of e-pucks along the eight [m/s]
+    swarm_file: str = field(metadata={"doc": "the swarm description"})
+    world: str = text("", "error model of robots and sensors (default: w2 for e-pucks, d1 for Droplets)")
+    seed: int = number(1, "1", 0, 2**31 - 1, "random seed of these errors")
     speed: float = number(0.06, "m/s", 0.001, 0.12, "speed of e-pucks along the eight")
-    # Simulated seconds per second, as far as the machine keeps up
     rate: float = number(
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
     )
-    plan: str = "corridor"  # The hall of PushBots, see `floor_plan`
-    # Whether e-pucks are located only by an overhead camera, which cannot tell them apart
-    aerial: bool = False
-    parameter_file: str | None = None  # Path of a ROS parameter file for all nodes, None for none
+    plan: str = text(
+        "corridor", f"the hall of PushBots: {', '.join(FLOOR_PLANS)}, or the path of a floor plan"
+    )
+    aerial: bool = flag(False, "locate e-pucks only by an overhead camera, which cannot tell them apart")
+    parameter_file: str | None = text(None, "ROS parameter file for all nodes")
 
 
 @dataclass(frozen=True)
@@ -292,3 +291,4 @@ ROBOT_TYPES = {
     )
 }
 """The kinds of robots that can be simulated, by the type in a swarm description."""
+WORLD_NAMES = [world for kind in ROBOT_TYPES.values() for world in kind.worlds]

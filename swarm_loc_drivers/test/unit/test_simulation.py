@@ -12,9 +12,17 @@ import pytest
 from swarm_loc_drivers.sim import simulate
 from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
 from swarm_loc_drivers.sim.epuck.parts import Unanswered
-from swarm_loc_drivers.sim.simulation import ROBOT_TYPES, SimulationOptions, graph_of, placed, simulated_swarm
+from swarm_loc_drivers.sim.simulation import (
+    ROBOT_TYPES,
+    WORLD_NAMES,
+    SimulationOptions,
+    graph_of,
+    placed,
+    simulated_swarm,
+)
 from swarm_loc_drivers.sim.worlds import WORLDS, WorldError
 from swarm_loc_estimator.cli import new
+from swarm_loc_estimator.common.launch import parsed_options
 from swarm_loc_estimator.common.parameters import ParameterError, parameter_specs
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
@@ -157,7 +165,7 @@ def test_every_error_model_belongs_to_a_robot_type_and_no_other_is_accepted() ->
 def test_the_command_line_becomes_options() -> None:
     line = ["swarm.yaml", "--world", "w0", "--seed", "7", "--speed", "0.08", "--rate", "2", "--aerial"]
     expected = SimulationOptions("swarm.yaml", world="w0", seed=7, speed=0.08, rate=2.0, aerial=True)
-    assert simulate.parse(line) == expected
+    assert parsed_options(SimulationOptions, None, line, {"world": WORLD_NAMES}) == expected
 
 
 @pytest.mark.parametrize(

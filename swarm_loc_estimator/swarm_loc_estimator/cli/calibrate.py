@@ -14,15 +14,15 @@ picture of the same name as --out shows the errors before and after.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from functools import partial
 
 from swarm_loc_estimator.common.command_line import (
     ProgressLine,
     add_bag,
     add_remap,
     add_truth,
-    command_parser,
-    exit_with_message,
+    argument,
+    command,
     number_in,
     swarm_beside,
     yaml_and_picture,
@@ -35,10 +35,28 @@ from swarm_loc_estimator.offline.export import read_truth
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+@command(
+    __doc__,
+    partial(add_bag, content=" with <robot>/ground_truth, with --truth or --self"),
+    add_remap,
+    add_truth,
+    argument("--out", type=yaml_and_picture, required=True, help="swarm description to write"),
+    argument("--self", dest="alone", action="store_true", help="use no ground truth"),
+    argument("--plain", action="store_true", help="fit only noise, calibrate nothing"),
+    argument(
+        "--no-response",
+        action="store_true",
+        help="one share of speed and one of turn rate instead of a table",
+    ),
+    argument(
+        "--evaluations",
+        type=number_in(1, 10_000),
+        default=EVALUATIONS,
+        help=f"runs of the estimator to fit the noise (default {EVALUATIONS})",
+    ),
+)
+def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
     chosen = Options(
         plain=options.plain,
         response=not options.no_response,
@@ -61,25 +79,3 @@ def _unused(recording: Recording) -> list[str]:
     counts = {"brightness": recording.brightness.robot.size, "fix": recording.fixes.robot.size}
     said = " and ".join(f"{count} messages on <robot>/{name}" for name, count in counts.items() if count)
     return [f"Not used: {said}. Infrared boards are calibrated by calibrate_ir."] if said else []
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
-    add_bag(parser, " with <robot>/ground_truth, with --truth or --self")
-    add_remap(parser)
-    add_truth(parser)
-    parser.add_argument("--out", type=yaml_and_picture, required=True, help="swarm description to write")
-    parser.add_argument("--self", dest="alone", action="store_true", help="use no ground truth")
-    parser.add_argument("--plain", action="store_true", help="fit only noise, calibrate nothing")
-    parser.add_argument(
-        "--no-response",
-        action="store_true",
-        help="one share of speed and one of turn rate instead of a table",
-    )
-    parser.add_argument(
-        "--evaluations",
-        type=number_in(1, 10_000),
-        default=EVALUATIONS,
-        help=f"runs of the estimator to fit the noise (default {EVALUATIONS})",
-    )
-    return parser

@@ -13,14 +13,14 @@ the same name as --out shows the residuals before and after, and the gains.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from functools import partial
 
 from swarm_loc_estimator.common.command_line import (
     ProgressLine,
     add_bag,
     add_remap,
-    command_parser,
-    exit_with_message,
+    argument,
+    command,
     swarm_beside,
     yaml_and_picture,
 )
@@ -33,10 +33,25 @@ from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+@command(
+    __doc__,
+    partial(add_bag, content=" with <robot>/brightness"),
+    add_remap,
+    argument(
+        "--out",
+        type=yaml_and_picture,
+        default="out/calibrated_ir.yaml",
+        help="swarm description to write (default out/calibrated_ir.yaml)",
+    ),
+    argument(
+        "--board",
+        type=yaml_and_picture,
+        help="find what the board itself is, by ground truth, and write it to this file",
+    ),
+    argument("--without-truth", action="store_true", help="do as if there were no ground truth"),
+)
+def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
     if options.board is not None:
         return _board(options, swarm)
@@ -61,22 +76,3 @@ def _board(options: argparse.Namespace, swarm: Swarm) -> int:
     picture = draw_board(board, done, options.board.with_suffix(".png"))
     print(f"{options.board} and {options.out} written, picture: {picture}")
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
-    add_bag(parser, " with <robot>/brightness")
-    add_remap(parser)
-    parser.add_argument(
-        "--out",
-        type=yaml_and_picture,
-        default="out/calibrated_ir.yaml",
-        help="swarm description to write (default out/calibrated_ir.yaml)",
-    )
-    parser.add_argument(
-        "--board",
-        type=yaml_and_picture,
-        help="find what the board itself is, by ground truth, and write it to this file",
-    )
-    parser.add_argument("--without-truth", action="store_true", help="do as if there were no ground truth")
-    return parser

@@ -14,15 +14,14 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.command_line import (
-    command_parser,
-    exit_with_message,
+    argument,
+    command,
     folder_to_write,
     number_in,
     swarm_beside,
@@ -59,10 +58,21 @@ _REDRAW_S = 0.2
 _REDRAW_UNWATCHED_S = 5.0
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+@command(
+    __doc__,
+    argument("bag", nargs="?", type=Path, default=BAG, help=f"what to play (default: {BAG})"),
+    argument(
+        "--rate", type=number_in(0.1, 100.0), default=RATE, help=f"speed of the bag (default: {RATE:g})"
+    ),
+    argument(
+        "--out",
+        type=folder_to_write(*REPORT_FILES, "*.log"),
+        default="out/demo",
+        help="folder for the report",
+    ),
+)
+def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
     swarm_file = swarm_beside(options.bag)
     progress = _Progress(load_swarm(swarm_file))
     print(f"Playing {options.bag} at {options.rate:g} x into the live graph", flush=True)
@@ -176,14 +186,3 @@ class _Progress:
         )
         total_s = (content.end_ns - content.begin_ns) * 1e-9
         return f"  {at_s:5.1f} of {total_s:.1f} s, {tracked} of {len(poses.status)} robots tracked{rms}"
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
-    parser.add_argument("bag", nargs="?", type=Path, default=BAG, help=f"what to play (default: {BAG})")
-    parser.add_argument(
-        "--rate", type=number_in(0.1, 100.0), default=RATE, help=f"speed of the bag (default: {RATE:g})"
-    )
-    folder = folder_to_write(*REPORT_FILES, "*.log")
-    parser.add_argument("--out", type=folder, default="out/demo", help="folder for the report")
-    return parser

@@ -9,29 +9,25 @@ anything is wrong.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import argparse
+from functools import partial
 from importlib import import_module
 
-from swarm_loc_estimator.common.command_line import (
-    ProgressLine,
-    add_live_or_bag,
-    command_parser,
-    described,
-    exit_with_message,
-    is_live,
-)
+from swarm_loc_estimator.common.command_line import ProgressLine, add_live_or_bag, command, described, is_live
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag, examine, lines_of
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 _LIVE_S, _BAG_S = 20.0, 120.0
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+@command(
+    __doc__,
+    partial(
+        add_live_or_bag, seconds=f"how long to look (default: {_LIVE_S:g} s live, {_BAG_S:g} s of a bag)"
+    ),
+)
+def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    parser = command_parser(__doc__)
-    add_live_or_bag(parser, f"how long to look (default: {_LIVE_S:g} s live, {_BAG_S:g} s of a bag)")
-    options = parser.parse_args(arguments)
     live = is_live(options)
     swarm = load_swarm(described(options))
     seconds = options.seconds or (_LIVE_S if live else _BAG_S)

@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
-from swarm_loc_estimator.common.launch import GraphOptions, check_parameter_file, graph_nodes, run_graph
+from swarm_loc_estimator.common.command_line import exit_with_message
+from swarm_loc_estimator.common.launch import (
+    GraphOptions,
+    check_parameter_file,
+    graph_nodes,
+    parsed_options,
+    run_graph,
+)
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-
-
-def parse(arguments: Sequence[str]) -> GraphOptions:
-    """Read the command line."""
-    parser = command_parser(__doc__)
-    parser.add_argument("swarm_file", metavar="SWARM_FILE", help="the swarm description")
-    parser.add_argument("--bag", help="play this bag into the graph, which then runs on the bag's clock")
-    parser.add_argument(
-        "--rate", type=number_in(0.01, 1000.0), default=1.0, help="speed of the bag (default: 1)"
-    )
-    parser.add_argument("--use-sim-time", action="store_true", help="take time from /clock without a bag")
-    parser.add_argument("--watch", action="store_true", help="show the swarm on a page of this machine")
-    parser.add_argument(
-        "--watch-port", type=number_in(0, 65535), default=8420, help="port of that page (default: 8420)"
-    )
-    parser.add_argument("--params-file", dest="parameter_file", help="ROS parameter file for all nodes")
-    return GraphOptions(**vars(parser.parse_args(arguments)))
 
 
 def check_graph(options: GraphOptions) -> None:
@@ -44,8 +32,8 @@ def check_graph(options: GraphOptions) -> None:
 
 
 @exit_with_message
-def main() -> int:
+def main(arguments: Sequence[str] | None = None) -> int:
     """Run until a node ends or Ctrl-C."""
-    options = parse(sys.argv[1:])
+    options = parsed_options(GraphOptions, __doc__, arguments)
     check_graph(options)
     return run_graph(graph_nodes(options))

@@ -10,16 +10,10 @@ the camera are corrected: misread ids, orientations wrong by quarter turns, robo
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import argparse
 from pathlib import Path
 
-from swarm_loc_estimator.common.command_line import (
-    ProgressLine,
-    bag_to_write,
-    command_parser,
-    exit_with_message,
-    number_in,
-)
+from swarm_loc_estimator.common.command_line import ProgressLine, argument, bag_to_write, command, number_in
 from swarm_loc_estimator.offline.datasets.droplets import (
     METRES_PER_PIXEL,
     ImportSettings,
@@ -28,22 +22,20 @@ from swarm_loc_estimator.offline.datasets.droplets import (
 )
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit status."""
-    parser = command_parser(__doc__)
-    parser.add_argument("recording", type=Path, help="text file, one exchange a line")
-    parser.add_argument("bag", type=bag_to_write, help="bag folder to create")
-    parser.add_argument(
-        "--platform", default="droplet_2016", help="board of the robots (default droplet_2016)"
-    )
-    parser.add_argument(
+@command(
+    __doc__,
+    argument("recording", type=Path, help="text file, one exchange a line"),
+    argument("bag", type=bag_to_write, help="bag folder to create"),
+    argument("--platform", default="droplet_2016", help="board of the robots (default droplet_2016)"),
+    argument(
         "--metres-per-pixel",
         type=number_in(1e-6, 1.0, "m"),
         default=METRES_PER_PIXEL,
         help="of the camera's image (default: robots of 44 mm that touch are 42 pixels apart)",
-    )
-    options = parser.parse_args(arguments)
+    ),
+)
+def main(options: argparse.Namespace) -> int:
+    """Run the command; returns its exit status."""
     settings = ImportSettings(options.platform, options.metres_per_pixel)
     with ProgressLine() as progress:
         done = import_recording(options.recording, options.bag, settings, progress)

@@ -8,40 +8,37 @@ The bag holds <robot>/odom, <robot>/detections and <robot>/ground_truth; `swarm.
 
 from __future__ import annotations
 
+import argparse
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from swarm_loc_estimator.common.command_line import (
-    ProgressLine,
-    bag_to_write,
-    command_parser,
-    exit_with_message,
-)
+from swarm_loc_estimator.common.command_line import ProgressLine, argument, bag_to_write, command
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.offline.datasets.mrclam import Delay, convert, read_dataset
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    pass
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command; returns its exit status."""
-    parser = command_parser(__doc__)
-    parser.add_argument("folder", type=Path, help="folder with Robot*_Odometry.dat and the other files")
-    parser.add_argument("bag", type=bag_to_write, help="bag folder to create")
-    parser.add_argument(
+@command(
+    __doc__,
+    argument("folder", type=Path, help="folder with Robot*_Odometry.dat and the other files"),
+    argument("bag", type=bag_to_write, help="bag folder to create"),
+    argument(
         "--delay-ms",
         nargs=3,
         type=int,
         default=(0, 0, 0),
         metavar=("LO", "HI", "SEED"),
         help="detections arrive evenly between LO and HI milliseconds late (default: at once)",
-    )
-    options = parser.parse_args(arguments)
+    ),
+)
+def main(options: argparse.Namespace) -> int:
+    """Run the command; returns its exit status."""
     low_ms, high_ms, seed = options.delay_ms
     if not 0 <= low_ms <= high_ms or seed < 0:
-        parser.error(f"--delay-ms {low_ms} {high_ms} {seed}: 0 <= LO <= HI and 0 <= SEED are needed")
+        raise UserError(f"--delay-ms {low_ms} {high_ms} {seed}: 0 <= LO <= HI and 0 <= SEED are needed.")
     began = time.monotonic()
     delay = Delay(low_ms * 1_000_000, high_ms * 1_000_000, seed)
     with ProgressLine() as progress:

@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in
+from swarm_loc_estimator.common.command_line import argument, command, number_in
 from swarm_loc_estimator.common.files import write_whole
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.swarm.new_swarm import FAMILY_IDS, KNOWN_ROBOTS, SENSORS, SwarmPlan, planned_swarm
@@ -183,10 +183,16 @@ def remarks(plan: SwarmPlan, swarm: Swarm) -> str:
     return "\n".join(part for line in lines for part in textwrap.wrap(line, 100))
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+@command(
+    __doc__,
+    argument(
+        "swarm_file", type=Path, nargs="?", default=Path("swarm.yaml"), help="file to write (swarm.yaml)"
+    ),
+    argument("--yes", action="store_true", help="ask nothing; take defaults where no option is given"),
+    *(argument(f"--{name}", help=question) for name, question in QUESTIONS.items()),
+)
+def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
     path: Path = options.swarm_file
     if path.exists():
         raise UserError(f"{path} exists and is not overwritten.")
@@ -199,19 +205,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(f"{path} describes {len(swarm.robots)} robots and {len(swarm.landmarks)} landmarks. To start it:\n")
     print("\n".join(start_lines(plan, shlex.quote(str(path)))))
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
-    parser.add_argument(
-        "swarm_file", type=Path, nargs="?", default=Path("swarm.yaml"), help="file to write (swarm.yaml)"
-    )
-    parser.add_argument(
-        "--yes", action="store_true", help="ask nothing; take defaults where no option is given"
-    )
-    for name, question in QUESTIONS.items():
-        parser.add_argument(f"--{name}", help=question)
-    return parser
 
 
 def _one_of(words: Sequence[str] | Mapping[str, object]) -> Callable[[str], str]:

@@ -20,8 +20,8 @@ from __future__ import annotations
 import argparse
 import csv
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -32,8 +32,8 @@ from swarm_loc_estimator.common.command_line import (
     add_remap,
     add_set,
     add_truth,
-    command_parser,
-    exit_with_message,
+    argument,
+    command,
     file_to_write,
     folder_to_write,
     number_in,
@@ -60,10 +60,36 @@ _COVARIANCE = ("xx", "xy", "xtheta", "yy", "ytheta", "thetatheta")
 _COLUMNS = ("stamp_ns", "robot", "x_m", "y_m", "theta_rad", *_COVARIANCE)
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+@command(
+    __doc__,
+    add_bag,
+    add_remap,
+    add_truth,
+    argument(
+        "--out",
+        type=folder_to_write(*REPORT_FILES, "poses.csv", "smoothed.csv"),
+        default="out/replay",
+        help="folder for the report",
+    ),
+    argument("--smooth", action="store_true", help="estimate all poses again, from the whole recording"),
+    argument("--learned", type=yaml_to_write, metavar="FILE", help="where to write what was learned"),
+    argument(
+        "--mcap",
+        type=file_to_write(".mcap"),
+        metavar="FILE",
+        help="where to write poses, /tf and markers for viewers",
+    ),
+    argument(
+        "--tum",
+        type=folder_to_write("*.tum"),
+        metavar="FOLDER",
+        help="where to write trajectories and ground truth for evo",
+    ),
+    argument("--tick", type=number_in(*TICKS_S, "s"), default=TICK_S, help="seconds between outputs"),
+    partial(add_set, what="parameter of the estimator"),
+)
+def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
     # replay, and write all files
     settings = parameters_of(Settings, options.set)
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
@@ -120,35 +146,3 @@ def write_poses(result: ReplayResult, path: Path) -> None:
             for robot, pose, covariance in zip(result.swarm.robots, poses, covariances, strict=True):
                 if np.isfinite(pose).all():
                     writer.writerow([stamp_ns, robot.name, *pose.tolist(), *covariance[upper].tolist()])
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
-    add_bag(parser)
-    add_remap(parser)
-    add_truth(parser)
-    folder = folder_to_write(*REPORT_FILES, "poses.csv", "smoothed.csv")
-    parser.add_argument("--out", type=folder, default="out/replay", help="folder for the report")
-    parser.add_argument(
-        "--smooth", action="store_true", help="estimate all poses again, from the whole recording"
-    )
-    parser.add_argument(
-        "--learned", type=yaml_to_write, metavar="FILE", help="where to write what was learned"
-    )
-    parser.add_argument(
-        "--mcap",
-        type=file_to_write(".mcap"),
-        metavar="FILE",
-        help="where to write poses, /tf and markers for viewers",
-    )
-    parser.add_argument(
-        "--tum",
-        type=folder_to_write("*.tum"),
-        metavar="FOLDER",
-        help="where to write trajectories and ground truth for evo",
-    )
-    parser.add_argument(
-        "--tick", type=number_in(*TICKS_S, "s"), default=TICK_S, help="seconds between outputs"
-    )
-    add_set(parser, "parameter of the estimator")
-    return parser

@@ -15,7 +15,8 @@ from __future__ import annotations
 import argparse
 import csv
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -25,8 +26,8 @@ from swarm_loc_estimator.common.command_line import (
     ProgressLine,
     add_bag,
     add_set,
-    command_parser,
-    exit_with_message,
+    argument,
+    command,
     folder_to_write,
     parameters_of,
     swarm_beside,
@@ -47,10 +48,21 @@ class WallsError(UserError):
     """An invalid file of walls."""
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+@command(
+    __doc__,
+    add_bag,
+    argument(
+        "--out",
+        type=folder_to_write("map.*", "stops.csv"),
+        default="out/map",
+        help="folder for map and picture",
+    ),
+    argument("--walls", type=Path, help="floor plan to draw below the map: x0,y0,x1,y1 a line"),
+    argument("--led", action="append", default=[], metavar="ROBOT=HZ", help="frequency of LEDs"),
+    partial(add_set, what="a number of the mapper; may be given several times"),
+)
+def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
     settings = parameters_of(MapperSettings, options.set)
     swarm = load_swarm(options.swarm or swarm_beside(options.bag))
     walls = read_walls(options.walls) if options.walls else np.zeros((0, 4))
@@ -125,14 +137,3 @@ def write_stops(mapper: CooperativeMapper, name_of: Mapping[int, str], path: Pat
         writer.writerow(["robot", "stamp_ns", "x_m", "y_m", "theta_rad"])
         for stop, (robot, pose) in enumerate(zip(robots, mapper.graph.poses.tolist(), strict=True)):
             writer.writerow([name_of[robot], mapper.begin_ns.get(stop, ""), *pose])
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
-    add_bag(parser)
-    folder = folder_to_write("map.*", "stops.csv")
-    parser.add_argument("--out", type=folder, default="out/map", help="folder for map and picture")
-    parser.add_argument("--walls", type=Path, help="floor plan to draw below the map: x0,y0,x1,y1 a line")
-    parser.add_argument("--led", action="append", default=[], metavar="ROBOT=HZ", help="frequency of LEDs")
-    add_set(parser, "a number of the mapper; may be given several times")
-    return parser

@@ -7,15 +7,14 @@ A description in the same folder names it in its first line: # yaml-language-ser
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import argparse
 
-from swarm_loc_estimator.common.command_line import command_parser, exit_with_message
+from swarm_loc_estimator.common.command_line import command
 from swarm_loc_estimator.swarm.schema import schema_text
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+@command(__doc__)
+def main(_options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    command_parser(__doc__).parse_args(arguments)
     print(schema_text(), end="")
     return 0

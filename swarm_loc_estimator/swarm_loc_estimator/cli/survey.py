@@ -14,16 +14,16 @@ shows the arena.
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from importlib import import_module
 
 from swarm_loc_estimator.common.command_line import (
     ProgressLine,
     add_live_or_bag,
-    command_parser,
+    argument,
+    command,
     described,
-    exit_with_message,
     is_live,
     yaml_and_picture,
 )
@@ -40,10 +40,19 @@ _SENSORS = ("odometry", "imu", "detections", "ranges")
 _SURVEYED = ("unknown_id", "uwb_unknown_address")  # Reasons for which the estimator drops what a survey needs
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+@command(
+    __doc__,
+    partial(
+        add_live_or_bag,
+        seconds=f"how long to listen to a live graph (default: {_LIVE_S:g} s, or until Ctrl-C)",
+    ),
+    argument("--out", type=yaml_and_picture, required=True, help="swarm description to write"),
+    argument(
+        "--all", action="store_true", help="survey landmarks, anchors and cameras that are described, too"
+    ),
+)
+def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
     live = is_live(options)
     if not live and (options.seconds or options.namespace):
         raise UserError("--seconds and --namespace are for a live graph; a bag is surveyed as a whole.")
@@ -80,13 +89,3 @@ def _heard(evidence: Evidence) -> Recording:
         ranges=evidence.rows("ranges"),
         dropped=evidence.converted[1].total,
     )
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
-    add_live_or_bag(parser, f"how long to listen to a live graph (default: {_LIVE_S:g} s, or until Ctrl-C)")
-    parser.add_argument("--out", type=yaml_and_picture, required=True, help="swarm description to write")
-    parser.add_argument(
-        "--all", action="store_true", help="survey landmarks, anchors and cameras that are described, too"
-    )
-    return parser

@@ -13,31 +13,26 @@ the best values, by optuna.
 
 from __future__ import annotations
 
+import argparse
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
-from swarm_loc_estimator.common.command_line import (
-    ProgressLine,
-    command_parser,
-    exit_with_message,
-    folder_to_write,
-)
+from swarm_loc_estimator.common.command_line import ProgressLine, argument, command, folder_to_write
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.offline.sweep.report import SWEEP_FILES, rows_of, write_results
 from swarm_loc_estimator.offline.sweep.sweep import NAMES, Backend, Best, Line, read_sweep, run_fit, run_sweep
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+@command(
+    __doc__,
+    argument("file", metavar="SWEEP_FILE", type=Path, help="what is replayed"),
+    argument("--out", type=folder_to_write(*SWEEP_FILES), default="out/sweep", help="folder for the results"),
+    argument("--backend", choices=NAMES, default=NAMES[0], help="what runs the replays"),
+    argument("--cluster", metavar="ADDRESS", help="a running cluster of Ray or Dask"),
+)
+def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    parser = command_parser(__doc__)
-    parser.add_argument("file", metavar="SWEEP_FILE", type=Path, help="what is replayed")
-    folder = folder_to_write(*SWEEP_FILES)
-    parser.add_argument("--out", type=folder, default="out/sweep", help="folder for the results")
-    parser.add_argument("--backend", choices=NAMES, default=NAMES[0], help="what runs the replays")
-    parser.add_argument("--cluster", metavar="ADDRESS", help="a running cluster of Ray or Dask")
-    options = parser.parse_args(arguments)
     if options.cluster and options.backend == "loky":
         raise UserError("--cluster is for --backend ray or dask; loky has the processes of this machine.")
     sweep = read_sweep(options.file)

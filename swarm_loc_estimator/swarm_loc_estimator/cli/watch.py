@@ -9,11 +9,10 @@ The page loads nothing from other hosts. --address allows access from other mach
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
 from swarm_loc_estimator.cli.graph import check_graph
-from swarm_loc_estimator.common.command_line import command_parser, exit_with_message, number_in, swarm_beside
+from swarm_loc_estimator.common.command_line import argument, command, number_in, swarm_beside
 from swarm_loc_estimator.common.launch import GraphOptions, NodeSpec, ParameterValue, graph_nodes, run_graph
 from swarm_loc_estimator.nodes.parameters import WatchParameters
 from swarm_loc_estimator.watch.server import Access
@@ -22,10 +21,24 @@ _DEFAULT = WatchParameters()
 _DESCRIPTIONS = (".yaml", ".yml")
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+@command(
+    __doc__,
+    argument("source", metavar="SWARM_FILE|BAG", type=Path, help="swarm description, or a bag"),
+    argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)"),
+    argument("--address", default=_DEFAULT.address, help="what to listen on (default: 127.0.0.1)"),
+    argument("--port", type=number_in(0, 65535), default=_DEFAULT.port, help="where (default: 8420; 0: any)"),
+    argument(
+        "--token",
+        default="",
+        help="token that browsers must send as ?token=, 8 characters or more, 5 different",
+    ),
+    argument("--rate", type=number_in(0.01, 1000.0), default=1.0, help="speed of the bag (default: 1)"),
+    argument("--loop", action="store_true", help="play the bag again and again"),
+    argument("--teleop", action="store_true", help="let pages drive robots by <robot>/cmd_vel"),
+    argument("--use-sim-time", action="store_true", help="take time from /clock without a bag"),
+)
+def main(options: argparse.Namespace) -> int:
     """Run until Ctrl-C, or until the bag has ended."""
-    options = parser().parse_args(arguments)
     Access(options.address, options.token)  # a wrong address is refused before anything starts
     return run_graph(watch_nodes(options))
 
@@ -61,26 +74,3 @@ def watch_nodes(options: argparse.Namespace) -> list[NodeSpec]:
     player_parameters = {**player.parameters, "loop": options.loop}
     player = NodeSpec(player.package, player.executable, player.name, parameters=player_parameters)
     return [node, estimator, player]
-
-
-def parser() -> argparse.ArgumentParser:
-    """The command line."""
-    parser = command_parser(__doc__)
-    parser.add_argument("source", metavar="SWARM_FILE|BAG", type=Path, help="swarm description, or a bag")
-    parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)")
-    parser.add_argument("--address", default=_DEFAULT.address, help="what to listen on (default: 127.0.0.1)")
-    parser.add_argument(
-        "--port", type=number_in(0, 65535), default=_DEFAULT.port, help="where (default: 8420; 0: any)"
-    )
-    parser.add_argument(
-        "--token",
-        default="",
-        help="token that browsers must send as ?token=, 8 characters or more, 5 different",
-    )
-    parser.add_argument(
-        "--rate", type=number_in(0.01, 1000.0), default=1.0, help="speed of the bag (default: 1)"
-    )
-    parser.add_argument("--loop", action="store_true", help="play the bag again and again")
-    parser.add_argument("--teleop", action="store_true", help="let pages drive robots by <robot>/cmd_vel")
-    parser.add_argument("--use-sim-time", action="store_true", help="take time from /clock without a bag")
-    return parser

@@ -14,7 +14,7 @@ from functools import wraps
 from importlib import import_module
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, ParamSpec, TextIO, TypeVar
+from typing import Any, ParamSpec, Protocol, TextIO, TypeVar
 
 from typing_extensions import Self
 
@@ -108,6 +108,36 @@ def command_parser(description: str | None) -> argparse.ArgumentParser:
     """The parser of a command, whose description keeps its line breaks."""
     formatter = argparse.RawDescriptionHelpFormatter
     return argparse.ArgumentParser(description=description, formatter_class=formatter)
+
+
+class Command(Protocol):
+    """A command as it is called."""
+
+    def __call__(self, arguments: Sequence[str] | None = None) -> int:
+        """Run it, by default with the command line; returns the exit status."""
+
+
+def command(
+    description: str | None, *add: Callable[[argparse.ArgumentParser], object]
+) -> Callable[[Callable[[argparse.Namespace], int]], Command]:
+    """Decorate the `main` of a command, which gets the options that `add` has put into its parser."""
+
+    def decorated(main: Callable[[argparse.Namespace], int]) -> Command:
+        @exit_with_message
+        def run(arguments: Sequence[str] | None = None) -> int:
+            parser = command_parser(description)
+            for one in add:
+                one(parser)
+            return main(parser.parse_args(arguments))
+
+        return run
+
+    return decorated
+
+
+def argument(*names: str, **about: Any) -> Callable[[argparse.ArgumentParser], object]:
+    """An argument of a command, as `add_argument` of a parser has it."""
+    return lambda parser: parser.add_argument(*names, **about)
 
 
 def number_in(low: Number, high: Number, unit: str = "") -> Callable[[str], Number]:

@@ -15,9 +15,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import MISSING, Field, dataclass, field, fields
 from math import nan
 from pathlib import Path
+from types import MappingProxyType
 from typing import IO, Any, TypeVar
 
-from swarm_loc_estimator.common.parameters import ParameterError, UserError, number
+from swarm_loc_estimator.common.command_line import command_parser, number_in
+from swarm_loc_estimator.common.parameters import ParameterError, UserError, flag, number, text
 from swarm_loc_estimator.common.yaml_tree import read_tree
 
 Options = TypeVar("Options")
@@ -26,7 +28,6 @@ ParameterValue = bool | int | float | str | list[str]
 GRACE_S = 5.0  # Timeout of processes after SIGINT, and again after SIGTERM
 STOP_SIGNALS = {signal.SIGINT, signal.SIGTERM}
 AWAITED_SIGNALS = STOP_SIGNALS | {signal.SIGCHLD}
-_ARGUMENTS = {"parameter_file": "params_file"}
 _TIED_TO_PARENT = """
 import ctypes, os, signal, sys
 signal.pthread_sigmask(signal.SIG_SETMASK, {signal.SIGINT})
@@ -50,14 +51,13 @@ class GraphError(UserError):
 class GraphOptions:
     """Options of a swarm's graph."""
 
-    swarm_file: str  # Path of the swarm description
-    # Path of a bag to play into the graph, which then runs on the bag's clock; None: live robots
-    bag: str | None = None
-    rate: float = number(1.0, "1", 0.01, 1000.0, "speed of the bag")  # Speed of that bag, 1 for real time
-    use_sim_time: bool = False  # Whether the nodes take their time from /clock though no bag is played here
-    parameter_file: str | None = None  # Path of a ROS parameter file for all nodes, None for none
-    watch: bool = False  # Whether a page shows the swarm to browsers of this machine
-    watch_port: int = number(8420, "1", 0, 65535, "port of the page")  # Port of that page, 0 for any free one
+    swarm_file: str = field(metadata={"doc": "the swarm description"})
+    bag: str | None = text(None, "play this bag into the graph, which then runs on the bag's clock")
+    rate: float = number(1.0, "1", 0.01, 1000.0, "speed of the bag")
+    use_sim_time: bool = flag(False, "take time from /clock without a bag")
+    parameter_file: str | None = text(None, "ROS parameter file for all nodes")
+    watch: bool = flag(False, "show the swarm on a page of this machine")
+    watch_port: int = number(8420, "1", 0, 65535, "port of that page, 0 for any free one")
 
 
 @dataclass(frozen=True)
@@ -120,13 +120,65 @@ def graph_nodes(options: GraphOptions) -> list[NodeSpec]:
     return nodes
 
 
+def parsed_options(
+    kind: type[Options],
+    description: str | None,
+    arguments: Sequence[str] | None,
+    choices: Mapping[str, Sequence[str]] = MappingProxyType({}),
+) -> Options:
+    """A dataclass of options from a command line; some texts must be among `choices`."""
+    parser = command_parser(description)
+    for one in fields(kind):  # type: ignore[arg-type]  # any dataclass
+        default: Any = one.default
+        spec, said = one.metadata.get("spec"), _doc(one)
+        flags = f"--{_argument(one)}".replace("_", "-")
+        if default is MISSING:
+            parser.add_argument(one.name, metavar=one.name.upper(), help=said)
+        elif isinstance(default, bool):
+            parser.add_argument(flags, dest=one.name, action="store_true", help=said)
+        else:
+            kind_of = type(default)
+            read = number_in(kind_of(spec.low), kind_of(spec.high), spec.unit.strip("1")) if spec else str
+            said += f" (default: {default})" if default else ""
+            allowed = choices.get(one.name)
+            parser.add_argument(flags, dest=one.name, type=read, default=default, choices=allowed, help=said)
+    return kind(**vars(parser.parse_args(arguments)))
+
+
+def launch_arguments(kind: type, choices: Mapping[str, Sequence[str]] = MappingProxyType({})) -> list[Any]:
+    """The same options as actions of `launch` that declare its arguments."""
+    from launch.actions import DeclareLaunchArgument  # noqa: PLC0415 - `graph` works without launch
+
+    declared = []
+    for one in fields(kind):
+        about: dict[str, Any] = {"description": _doc(one)}
+        if one.default is not MISSING:
+            about["default_value"] = "" if one.default is None else str(one.default)
+        if one.name in choices:
+            about["choices"] = ["", *choices[one.name]]
+        if isinstance(one.default, bool):
+            about |= {"default_value": str(one.default).lower(), "choices": ["true", "false"]}
+        declared.append(DeclareLaunchArgument(_argument(one), **about))
+    return declared
+
+
+def _argument(option: Field[Any]) -> str:
+    """The name of an option in command lines."""
+    return {"parameter_file": "params_file"}.get(option.name, option.name)
+
+
+def _doc(option: Field[Any]) -> str:
+    spec = option.metadata.get("spec")
+    return str(spec.doc if spec else option.metadata["doc"])
+
+
 def options_from(kind: type[Options], texts: Mapping[str, str]) -> Options:
-    """A dataclass of options from texts by field name; an empty text means the default.
+    """A dataclass of options from the texts of a `launch.LaunchContext`; an empty one means the default.
 
     Raises:
         ParameterError: An option is missing, or is not a number in its range.
     """
-    return kind(**{one.name: _value(one, texts.get(one.name, "")) for one in fields(kind)})  # type: ignore[arg-type]
+    return kind(**{one.name: _value(one, texts.get(_argument(one), "")) for one in fields(kind)})  # type: ignore[arg-type]
 
 
 def _value(option: Field[Any], text: str) -> object:
@@ -158,12 +210,6 @@ def check_parameter_file(path: str | None) -> None:
 def _has_parameters(tree: object) -> bool:
     """Whether some node gets parameters, in whatever namespace."""
     return isinstance(tree, dict) and ("ros__parameters" in tree or any(map(_has_parameters, tree.values())))
-
-
-def argument_texts(context: Any, kind: type) -> dict[str, str]:
-    """The arguments of a `launch.LaunchContext` by option; `params_file` is the option `parameter_file`."""
-    arguments = context.launch_configurations
-    return {one.name: arguments[_ARGUMENTS.get(one.name, one.name)] for one in fields(kind)}
 
 
 def node_action(spec: NodeSpec) -> Any:

@@ -496,9 +496,7 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode[Parameters]):
         """Take back what the configuration has made."""
         return self._take_back(0)
 
-    def on_shutdown(self, _state: LifecycleState) -> TransitionCallbackReturn:
-        """Take back everything."""
-        return self._take_back(0)
+    on_shutdown = on_cleanup  # which takes back everything
 
     def _configure(self) -> None:
         self.params = read_parameters(self, self._cls, read_only=False)

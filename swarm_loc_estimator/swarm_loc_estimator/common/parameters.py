@@ -105,7 +105,7 @@ class ParameterSpec:
         return value
 
 
-def text(default: str, doc: str, *, required: bool = False) -> Any:
+def text(default: str | None, doc: str, *, required: bool = False) -> Any:
     """A dataclass field for a text; a required text must not be empty."""
     return field(default=default, metadata={"doc": doc, "required": required})
 

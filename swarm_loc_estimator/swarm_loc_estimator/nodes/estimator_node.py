@@ -114,7 +114,10 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._origin = ""
         self._pace = FusionPace(self.params.fusion_load, self.params.settings.horizon_s)
         self._shedding = Shedding(self.params.fusion_load, self.params.settings.horizon_s)
-        self._thinning = self._create_thinning()
+        # whole fusion periods of a large swarm, whose measurements are fused together
+        period_s = self._estimator.settings.fusion_period_s
+        is_large = len(self._swarm.robots) >= self._estimator.settings.sparse_from
+        self._thinning = Thinning(len(self._swarm.robots), round(period_s * 1e9) if is_large else 0)
         self._measurements: Counter[str] = Counter()  # Read so far, by sensor
         self._cost = TickCost()
         sole = ["swarm/poses", *(["/clock"] if self.get_clock().ros_time_is_active else [])]
@@ -138,12 +141,6 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
     def subscriptions(self) -> Iterator[Subscription]:
         """Subscriptions that an executor handles; the raw ones, the inputs, are taken by ticks."""
         return (one for one in super().subscriptions if not one.raw)
-
-    def _create_thinning(self) -> Thinning:
-        """Thinning by whole fusion periods for large swarms, whose measurements are fused together."""
-        robots, settings = len(self._swarm.robots), self._estimator.settings
-        is_large = robots >= settings.sparse_from
-        return Thinning(robots, round(settings.fusion_period_s * 1e9) if is_large else 0)
 
     def _start_ticks(self) -> None:
         self.at_end(Ticks(self, self.params.tick_period_s, self._on_tick).stop)

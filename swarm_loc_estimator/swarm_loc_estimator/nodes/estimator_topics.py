@@ -8,19 +8,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import PoseWithCovariance, PoseWithCovarianceStamped
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.detections import encode_identities
 from swarm_loc_estimator.common.messages.poses import (
@@ -357,14 +355,6 @@ class StaticTransforms:
                 self._parents[topic, child] = transform.header.frame_id.lstrip("/")[:_MAX_FRAME_LENGTH]
 
 
-class _Transforms(NamedTuple):
-    """Publisher of the transforms of some robots, with their indices (n,)."""
-
-    publisher: Publisher
-    encoder: TransformsEncoder
-    robots: IntArray
-
-
 class EstimateOutputs:
     """Publishes estimates."""
 
@@ -390,7 +380,7 @@ class EstimateOutputs:
         self._frame = frame
         self._swarm_poses_encoder = SwarmPosesEncoder(self._names, frame)
         self._transforms = [
-            _Transforms(publisher, TransformsEncoder(frame, [*children]), np.array([*children.values()]))
+            (publisher, TransformsEncoder(frame, [*children]), np.array([*children.values()]))
             for publisher, children in zip(self._tf, self._children.values(), strict=True)
         ]
 

@@ -18,15 +18,9 @@ from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of, listed
-from swarm_loc_estimator.common.messages.poses import encode_pose_stamped, encode_poses
+from swarm_loc_estimator.common.messages.poses import encode_fix, encode_pose_stamped
 from swarm_loc_estimator.common.node import ConfiguredNode, message_class, run_node
-from swarm_loc_estimator.nodes.localizer_robots import (
-    BODY,
-    SOURCES,
-    BridgeParameters,
-    LocalizedRobots,
-    RobotPose,
-)
+from swarm_loc_estimator.nodes.localizer_robots import BODY, SOURCES, BridgeParameters, LocalizedRobots
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 _INPUT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -60,13 +54,13 @@ class LocalizerBridge(ConfiguredNode[BridgeParameters]):
         self.health.received(topic)
         arrival_ns = self.get_clock().now().nanoseconds
         for pose in self._robots.convert(self._source.bodies(message), body, arrival_ns):
-            self._outputs[pose.robot].publish(self._encoded(pose))
-
-    def _encoded(self, pose: RobotPose) -> bytes:
-        frame, stamps, poses = self.params.map_frame, np.array([pose.stamp_ns]), pose.pose[None]
-        if self.params.output == "fix":
-            return encode_poses(frame, stamps, poses, pose.covariance[None])[0]
-        return encode_pose_stamped(frame, stamps, poses)[0]
+            if self.params.output == "fix":
+                data = encode_fix(self.params.map_frame, pose.stamp_ns, pose.pose, pose.covariance)
+            else:
+                (data,) = encode_pose_stamped(
+                    self.params.map_frame, np.array([pose.stamp_ns]), pose.pose[None]
+                )
+            self._outputs[pose.robot].publish(data)
 
     def _on_diagnostics(self) -> None:
         robots, missing = self._robots, self._missing()

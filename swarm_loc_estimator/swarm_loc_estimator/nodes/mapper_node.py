@@ -73,7 +73,12 @@ class MapperNode(ConfiguredNode[MapperParameters]):
             self.get_logger().info("compiling the mapper for this machine: about half a minute")
         precompile()
         self._clear()
-        self._create_publishers()
+        self._map = self.create_publisher(OccupancyGrid, "map", _LATCHED)
+        self._visitation = self.create_publisher(OccupancyGrid, "visitation", _LATCHED)
+        self._goals = [self.create_publisher(PoseStamped, f"{name}/goal", _LATCHED) for name in names]
+        self._fixes = [
+            self.create_publisher(PoseWithCovarianceStamped, f"{name}/fix", _OUTPUT_QOS) for name in names
+        ]
         for index, robot in enumerate(self._robots):
             for kind in inputs_of(robot, lights=bool(self._frequencies)):
                 take = partial(self._on_message, index, kind)
@@ -94,15 +99,6 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self.feed = MapperFeed(self._robots, self._mapper, self._frequencies)
         self._located: dict[int, Located] = {}
         self._published: OccupancyMap | None = None
-
-    def _create_publishers(self) -> None:
-        self._map = self.create_publisher(OccupancyGrid, "map", _LATCHED)
-        self._visitation = self.create_publisher(OccupancyGrid, "visitation", _LATCHED)
-        names = [robot.name for robot in self._robots]
-        self._goals = [self.create_publisher(PoseStamped, f"{name}/goal", _LATCHED) for name in names]
-        self._fixes = [
-            self.create_publisher(PoseWithCovarianceStamped, f"{name}/fix", _OUTPUT_QOS) for name in names
-        ]
 
     def _on_message(self, robot: int, kind: MapperInput, data: bytes) -> None:
         self.feed.add(robot, kind, data)
@@ -152,7 +148,9 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         return response
 
     def _on_diagnostics(self) -> None:
-        missing = [self._why(topic) for topic in self.feed.missing()]
+        type_of = {kind.topic: kind.message_type for kind in MapperInput}
+        named = [(topic, type_of[topic.rpartition("/")[2]]) for topic in self.feed.missing()]
+        missing = [f"{topic}{self.why_missing(topic, kind)}" for topic, kind in named]
         sentence = f"no messages received on {listed(missing)}" if missing else ""
         self.health.warn_of("missing", {"": sentence} if missing else {}, PATIENCE_S)
         self.health.warn_of_drops(self.feed.all_drops)
@@ -168,10 +166,6 @@ class MapperNode(ConfiguredNode[MapperParameters]):
             values[f"<robot>/{kind.topic} received"] = count
         message = sentence or f"{graph.count} stops"
         self.publish_reports(Report(self.get_name(), message, level_of(missing), values))
-
-    def _why(self, topic: str) -> str:
-        kind = next(one for one in MapperInput if topic.endswith(f"/{one.topic}"))
-        return f"{topic}{self.why_missing(topic, kind.message_type)}"
 
 
 def _grid(occupancy: OccupancyMap, values: FloatArray, header: Header) -> OccupancyGrid:

@@ -27,7 +27,6 @@ from rclpy.qos import QoSProfile
 from rclpy.signals import SignalHandlerOptions
 from typing_extensions import Self
 
-from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.launch import (
@@ -454,15 +453,11 @@ class Agreement:
     """Live poses compared with those of a replay at the same stamps.
 
     The live estimator lacks inputs that are still in transport when it gives a pose: those of up to a step of
-    the player's clock, and more on a busy machine. Only at settled stamps both have the same inputs; there
-    the poses must be equal.
+    the player's clock, and more on a busy machine.
     """
 
     replayed: ReplayResult  # The replay
     distance_m: FloatArray  # (T, N) between the positions; NaN if neither is located, infinite if one is not
-    turn_rad: FloatArray  # (T, N) absolute difference of the headings; NaN and infinite as above
-    # (T,) whether the estimator had received exactly what had arrived by then in the bag
-    settled: NDArray[np.bool_]
 
     @property
     def equal_share(self) -> float:
@@ -481,21 +476,5 @@ def compare_with_replay(live: LiveRun, bag: Path, settings: Settings | None = No
     difference = live.result.poses - replayed.poses
     located = np.isfinite(live.result.poses).all(axis=2)
     one_only = located != np.isfinite(replayed.poses).all(axis=2)
-    turn = np.where(one_only, np.inf, np.abs(se2.wrap_angle(difference[..., 2])))
     distance = np.where(one_only, np.inf, np.hypot(difference[..., 0], difference[..., 1]))
-    return Agreement(replayed, distance, turn, _settled(live))
-
-
-def _settled(live: LiveRun) -> NDArray[np.bool_]:
-    """(T,) whether the poses include exactly the inputs that had arrived by their stamp, as far as known."""
-    stamp_ns = live.result.stamp_ns
-    counted_ns = np.array(sorted(live.taken), dtype=np.int64)
-    before = np.searchsorted(counted_ns, stamp_ns, side="right")
-    after = np.searchsorted(counted_ns, stamp_ns, side="left") + 1
-    settled = np.ones(stamp_ns.size, dtype=bool)
-    for topic, arrival_ns in live.arrival_ns.items():
-        # the messages of a topic come in order: equal counts mean equal messages
-        taken = np.array([0, *(live.taken[at].get(topic, 0) for at in counted_ns.tolist()), arrival_ns.size])
-        arrived = np.searchsorted(arrival_ns, stamp_ns, side="right")
-        settled &= (taken[before] == arrived) & (taken[after] == arrived)
-    return settled
+    return Agreement(replayed, distance)

@@ -28,8 +28,6 @@ from swarm_loc_estimator.common.messages.cdr import (
     nanoseconds,
 )
 from swarm_loc_estimator.common.messages.poses import (
-    FixMessage,
-    OdometryMessage,
     PoseMessage,
     decode_fix,
     decode_odometry,
@@ -53,7 +51,7 @@ def _decode_transform(data: bytes) -> PoseMessage:
     return PoseMessage(nanoseconds(message.header.stamp), message.header.frame_id, pose)
 
 
-_READ: Mapping[str, tuple[Callable[[bytes], OdometryMessage | PoseMessage | FixMessage], int]] = {
+_READ: Mapping[str, tuple[Callable[[bytes], PoseMessage], int]] = {
     POSE_STAMPED: (decode_pose_stamped, 1),
     POSE_WITH_COVARIANCE: (decode_fix, 1),
     ODOMETRY: (decode_odometry, 2),

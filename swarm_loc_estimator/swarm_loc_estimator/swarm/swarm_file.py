@@ -104,12 +104,6 @@ class SwarmFileError(UserError):
     """An invalid swarm description; the message is one sentence with file, key and value."""
 
 
-def is_range_topic(topic: str) -> bool:
-    """Whether it is a topic with {from} and {to} once each."""
-    once = topic.count("{from}") == topic.count("{to}") == 1
-    return once and RANGE_TOPIC.fullmatch(topic) is not None
-
-
 def load_swarm(path: Path | str) -> Swarm:
     """Read and check a swarm description.
 
@@ -173,7 +167,11 @@ class _Loader(TreeChecks):
             raise self.error("map", name, "must be the path of a map's .yaml file, from here")
         file = None if name is None else (self._folder / name).resolve()
         ranges = sections.get("range_topic")
-        if ranges is not None and not (isinstance(ranges, str) and is_range_topic(ranges)):
+        if ranges is not None and not (
+            isinstance(ranges, str)
+            and RANGE_TOPIC.fullmatch(ranges)
+            and ranges.count("{from}") == ranges.count("{to}") == 1
+        ):
             rule = "must be a topic with {from} and {to} once each, for addresses"
             raise self.error("range_topic", ranges, rule)
         # the swarm as a whole

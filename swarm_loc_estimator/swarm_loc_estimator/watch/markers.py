@@ -6,7 +6,7 @@ Robots are points of one list in the colours of their status; headings, 95 % ell
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,16 +39,8 @@ _HEIGHT = 0.01
 _BODY_PER_WHEELS = 1.32  # Ratio of body diameter to wheel separation, as of an e-puck
 
 
-class _Marker(NamedTuple):
-    """The fields in which the markers differ."""
-
-    name: str
-    kind: int
-    scale: tuple[float, float, float]
-    points: FloatArray
-    colours: FloatArray
-    text: str = ""
-    number: int = 0
+Marker = dict[str, Any]
+"""The fields of a visualization_msgs/Marker; those left out are zero, so that it lasts until the next."""
 
 
 class MarkersEncoder:
@@ -70,21 +62,33 @@ class MarkersEncoder:
         colours = _COLOURS[np.minimum(estimate.status[located], len(_COLOURS) - 1)]
         line = (0.15 * size, 0.0, 0.0)
         markers = [
-            _Marker("landmarks", CUBE_LIST, (0.4 * size,) * 3, self._landmarks, _inked(self._landmarks)),
-            _Marker("landmarks_facing", LINE_LIST, line, self._faces, _inked(self._faces)),
-            _Marker("cameras", CUBE_LIST, (0.6 * size,) * 3, self._cameras, _inked(self._cameras)),
-            _Marker("robots", SPHERE_LIST, (size, size, 0.5 * size), _lifted(pose), colours),
-            _lines("headings", line, _headings(estimate.pose[estimate.heading_known], size)),
-            _lines("ellipses_95", (0.06 * size, 0.0, 0.0), ellipses(pose, estimate.covariance[located])),
+            _marker("landmarks", CUBE_LIST, (0.4 * size,) * 3, self._landmarks),
+            _marker("landmarks_facing", LINE_LIST, line, self._faces),
+            _marker("cameras", CUBE_LIST, (0.6 * size,) * 3, self._cameras),
+            _marker("robots", SPHERE_LIST, (size, size, 0.5 * size), _lifted(pose), colours),
+            _marker("headings", LINE_LIST, line, _headings(estimate.pose[estimate.heading_known], size)),
+            _marker(
+                "ellipses_95",
+                LINE_LIST,
+                (0.06 * size, 0.0, 0.0),
+                ellipses(pose, estimate.covariance[located]),
+            ),
         ]
         if sightings is not None:
             markers.append(self._sightings(estimate, sightings))
+        markers = [one for one in markers if len(one["points"])]
         if len(self._names) <= _MAX_LABELS:
             names = [name for name, there in zip(self._names, located.tolist(), strict=True) if there]
-            markers += self._labels(names, pose)
-        return self._message(estimate.stamp_ns, [one for one in markers if one.text or len(one.points)])
+            above = _lifted(pose) + np.array([0.0, 0.0, size])
+            for number, (name, at) in enumerate(zip(names, above, strict=True)):
+                label = _marker("names", TEXT, (0.0, 0.0, 0.6 * size), above[:0])
+                label["pose"]["position"] = _vector(at)
+                markers.append({**label, "id": number, "text": name})
+        header = {"stamp": estimate.stamp_ns, "frame_id": self._frame_id}
+        delete_all = {"action": _DELETE_ALL}
+        return encode({"markers": [{"header": header, **one} for one in (delete_all, *markers)]}, MARKERS)
 
-    def _sightings(self, estimate: EstimateMessage, seen: Sightings) -> _Marker:
+    def _sightings(self, estimate: EstimateMessage, seen: Sightings) -> Marker:
         places = np.concatenate([estimate.pose[:, :2], self._landmarks[:, :2]])
         target = np.where(seen.target < 0, len(estimate.pose) - 1 - seen.target, seen.target)
         ends = np.stack([places[seen.observer], places[target]], axis=1)
@@ -92,51 +96,30 @@ class MarkersEncoder:
         colours = _VERDICT_COLOURS[np.minimum(seen.verdict[shown], len(_VERDICT_COLOURS) - 1)]
         scale = (0.05 * self._size, 0.0, 0.0)
         points = _lifted(ends[shown].reshape(-1, 2))
-        return _Marker("sightings", LINE_LIST, scale, points, np.repeat(colours, 2, axis=0))
-
-    def _labels(self, names: list[str], pose: FloatArray) -> list[_Marker]:
-        above = _lifted(pose) + np.array([0.0, 0.0, self._size])
-        size = (0.0, 0.0, 0.6 * self._size)
-        pairs = enumerate(zip(names, above, strict=True))
-        return [_Marker("names", TEXT, size, at[None], _inked(at[None]), name, k) for k, (name, at) in pairs]
-
-    def _message(self, stamp_ns: int, markers: list[_Marker]) -> bytes:
-        header = {"stamp": stamp_ns, "frame_id": self._frame_id}
-        delete_all = {"header": header, "action": _DELETE_ALL}
-        return encode(
-            {"markers": [delete_all, *({"header": header, **_fields(one)} for one in markers)]}, MARKERS
-        )
+        return _marker("sightings", LINE_LIST, scale, points, np.repeat(colours, 2, axis=0))
 
 
-def _fields(marker: _Marker) -> dict[str, Any]:
-    """The fields of a visualization_msgs/Marker; those left out are zero, so that it lasts until the next."""
-    position, points, colours = np.zeros(3), marker.points, marker.colours
-    if marker.kind == TEXT:
-        position, points, colours = marker.points[0], marker.points[:0], marker.colours[:0]
+def _marker(
+    name: str,
+    kind: int,
+    scale: tuple[float, float, float],
+    points: FloatArray,
+    colours: FloatArray | None = None,
+) -> Marker:
+    """A marker of points (n, 3) in colours (n, 4), by default the ink."""
     return {
-        "ns": marker.name,
-        "id": marker.number,
-        "type": marker.kind,
-        "pose": {"position": _vector(position), "orientation": {"w": 1.0}},
-        "scale": _vector(marker.scale),
+        "ns": name,
+        "type": kind,
+        "pose": {"orientation": {"w": 1.0}},
+        "scale": _vector(scale),
         "color": dict(zip("rgba", _INK, strict=True)),
         "points": points,
-        "colors": colours,
-        "text": marker.text,
+        "colors": np.tile(_INK, (len(points), 1)) if colours is None else colours,
     }
 
 
 def _vector(numbers: Iterable[float]) -> dict[str, float]:
     return dict(zip("xyz", numbers, strict=True))
-
-
-def _lines(name: str, scale: tuple[float, float, float], points: FloatArray) -> _Marker:
-    return _Marker(name, LINE_LIST, scale, points, _inked(points))
-
-
-def _inked(points: FloatArray) -> FloatArray:
-    """The colour of lines for each point."""
-    return np.tile(_INK, (len(points), 1))
 
 
 def _lifted(points: FloatArray) -> FloatArray:

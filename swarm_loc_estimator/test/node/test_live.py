@@ -13,15 +13,16 @@ from node_world import T0_NS, Ros
 from rclpy.time import Time
 
 from bench.shared.bags import copy_part
+from bench.shared.live import settled
 from swarm_loc_estimator.cli.demo import main
 from swarm_loc_estimator.common.launch import GraphOptions, graph_nodes
+from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.offline.live_run import (
     ESTIMATOR,
     LiveError,
     LiveGraph,
     Recorder,
-    _settled,
     compare_with_replay,
     play_live,
     read_content,
@@ -56,13 +57,15 @@ def test_live_poses_are_those_of_replay(bag: Path, tmp_path: Path) -> None:
 
     assert live.received == live.sent > 1000
     compared = compare_with_replay(live, bag, settings)
-    assert compared.settled[-1]
-    assert np.nanmax(compared.distance_m[compared.settled]) < 1e-6
-    assert np.nanmax(compared.turn_rad[compared.settled]) < 1e-6
+    same = settled(live)
+    assert same[-1]
+    assert np.nanmax(compared.distance_m[same]) < 1e-6
+    turn = wrap_angle(live.result.poses[same, :, 2] - compared.replayed.poses[same, :, 2])
+    assert np.nanmax(np.abs(turn)) < 1e-6
     assert np.nanmedian(compared.distance_m) < 1e-3
 
     lacking = {at: {topic: count - 1 for topic, count in taken.items()} for at, taken in live.taken.items()}
-    assert not _settled(replace(live, taken=lacking)).any()
+    assert not settled(replace(live, taken=lacking)).any()
 
 
 def test_the_recorder_counts_inputs_by_the_estimators_diagnostics_alone(ros: Ros) -> None:

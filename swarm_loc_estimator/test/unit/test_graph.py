@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from swarm_loc_estimator.cli import graph as command
-from swarm_loc_estimator.common.launch import GraphOptions, NodeSpec, graph_nodes
+from swarm_loc_estimator.common.launch import GraphOptions, NodeSpec, graph_nodes, parsed_options
 
 
 def test_a_live_graph_is_the_estimator_on_the_wall_clock() -> None:
@@ -53,4 +52,5 @@ def test_arguments_keep_types_spaces_and_order() -> None:
 def test_the_command_line_becomes_options() -> None:
     line = ["swarm.yaml", "--bag", "bags/eight", "--rate", "2", "--params-file", "all.yaml"]
 
-    assert command.parse(line) == GraphOptions("swarm.yaml", "bags/eight", 2.0, parameter_file="all.yaml")
+    expected = GraphOptions("swarm.yaml", "bags/eight", 2.0, parameter_file="all.yaml")
+    assert parsed_options(GraphOptions, None, line) == expected

@@ -218,5 +218,5 @@ def test_what_is_no_dataset_is_said(folder: Path, tmp_path: Path, capsys: pytest
     (folder / "Barcodes.dat").unlink()
     assert main([str(folder), str(tmp_path / "bag")]) == 1
     assert "Barcodes.dat' cannot be read" in capsys.readouterr().err
-    with pytest.raises(SystemExit):
-        main([str(folder), str(tmp_path / "bag"), "--delay-ms", "300", "150", "7"])
+    assert main([str(folder), str(tmp_path / "bag"), "--delay-ms", "300", "150", "7"]) == 1
+    assert "--delay-ms 300 150 7: 0 <= LO <= HI and 0 <= SEED are needed." in capsys.readouterr().err

@@ -15,7 +15,7 @@ from __future__ import annotations
 import argparse
 import sys
 import warnings
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -24,13 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.command_line import (
-    add_set,
-    command_parser,
-    exit_with_message,
-    number_in,
-    parameters_of,
-)
+from swarm_loc_estimator.common.command_line import add_set, argument, command, number_in, parameters_of
 from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.yaml_tree import read_file, tree_text
 from swarm_loc_estimator.swarm.swarm import FixedCamera
@@ -103,10 +97,18 @@ def floor_sigmas(ground: GroundCamera, height: float) -> tuple[float, float]:
     return float(position), float(np.sqrt(spread[:, 2, 2].max()))
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+@command(
+    __doc__,
+    argument("name", help="the camera's name in the swarm description"),
+    argument("control_points", type=Path, help="file of control points"),
+    argument("pictures", type=Path, nargs="*", help="PNG or JPEG with floor markers"),
+    argument(
+        "--height", type=number_in(0.0, 10.0, "m"), default=0.0, help="of the robots' lying markers [m]"
+    ),
+    partial(add_set, what="parameter of aerial_camera_node about control points"),
+)
+def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
     ground = load_ground(options.control_points)
     if ground.camera is None:
         raise LocateError(f"{options.control_points} lacks camera, the intrinsics of the camera.")
@@ -133,17 +135,6 @@ def _picture(path: Path, size: Size) -> Gray:
         return decoded_image(message, size)
     except ImageError as error:
         raise LocateError(f"{path} cannot be used: {error}") from error
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
-    parser.add_argument("name", help="the camera's name in the swarm description")
-    parser.add_argument("control_points", type=Path, help="file of control points")
-    parser.add_argument("pictures", type=Path, nargs="*", help="PNG or JPEG with floor markers")
-    height = number_in(0.0, 10.0, "m")
-    parser.add_argument("--height", type=height, default=0.0, help="of the robots' lying markers [m]")
-    add_set(parser, "parameter of aerial_camera_node about control points")
-    return parser
 
 
 if __name__ == "__main__":

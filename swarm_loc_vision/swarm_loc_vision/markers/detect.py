@@ -17,6 +17,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from swarm_loc_estimator.common.bags.bag_file import BagError, BagTopic
@@ -26,9 +27,9 @@ from swarm_loc_estimator.common.command_line import (
     ProgressLine,
     add_bag,
     add_set,
+    argument,
     bag_to_write,
-    command_parser,
-    exit_with_message,
+    command,
     parameters_of,
     swarm_beside,
 )
@@ -149,10 +150,14 @@ def _calibrate(camera: CameraDetector, data: bytes) -> None:
         camera.calibrate(message)
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+@command(
+    __doc__,
+    add_bag,
+    argument("--output", type=bag_to_write, required=True, metavar="FOLDER", help="the new bag"),
+    partial(add_set, what="parameter of marker_detector_node"),
+)
+def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
     recorded = swarm_beside(options.bag)
     swarm_file = options.swarm or (recorded if recorded.exists() else None)
     given: dict[str, Value] = {"autostart": True, "image_transport": "raw", "robot": ""}
@@ -188,14 +193,6 @@ def _summary(name: str, camera: CameraDetector) -> str:
     trouble = f" ({camera.trouble})" if camera.trouble else ""
     markers = f"{camera.markers} markers ({camera.misfits} fit no square)"
     return f"{name or 'camera'}: {markers} in {camera.images} images{dropped}{trouble}"
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
-    add_bag(parser)
-    parser.add_argument("--output", type=bag_to_write, required=True, metavar="FOLDER", help="the new bag")
-    add_set(parser, "parameter of marker_detector_node")
-    return parser
 
 
 if __name__ == "__main__":

@@ -12,15 +12,9 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
-from swarm_loc_estimator.common.command_line import (
-    command_parser,
-    exit_with_message,
-    file_to_write,
-    number_in,
-)
+from swarm_loc_estimator.common.command_line import argument, command, file_to_write, number_in
 from swarm_loc_estimator.common.files import check_file
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
@@ -41,10 +35,38 @@ _BOARD_SIDE_M = 0.05
 _GRID = re.compile(r"([1-9]\d?)x([1-9]\d?)")
 
 
-@exit_with_message
-def main(arguments: Sequence[str] | None = None) -> int:
+def _grid(text: str) -> list[int]:
+    match = _GRID.fullmatch(text)
+    if match is None:
+        raise argparse.ArgumentTypeError(f"'{text}' must be columns and rows, such as 3x4")
+    return [int(number) for number in match.groups()]
+
+
+@command(
+    __doc__,
+    argument("swarm_file", metavar="SWARM_FILE", type=Path, nargs="?", help="swarm description"),
+    argument(
+        "--out",
+        type=file_to_write(".pdf"),
+        default="markers.pdf",
+        help="the PDF (default: markers.pdf)",
+    ),
+    argument(
+        "--family", choices=list(families()), default="artoolkit_bch_thin", help="as of marker_detector_node"
+    ),
+    argument("--paper", choices=list(PAPERS), default="a4", help="size of the sheets (default: a4)"),
+    argument("--board", type=_grid, metavar="COLUMNSxROWS", help="add a grid of markers"),
+    argument(
+        "--size", type=number_in(0.005, 1.0, "m"), help=f"side of those markers (default: {_BOARD_SIDE_M} m)"
+    ),
+    argument(
+        "--first-id",
+        type=number_in(0, 2**32 - 1),
+        help="id of the first one (default: the next after the swarm's)",
+    ),
+)
+def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    options = _parser().parse_args(arguments)
     if not options.board and (options.size is not None or options.first_id is not None):
         raise SheetError("--size and --first-id are those of a board: give --board, too.")
     family = family_named(options.family)
@@ -75,40 +97,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         save_ground(Ground(markers=floor_markers(pages[-1]), family=family), file, origin)
         print(f"places of the markers of the board in {file}")
     return 0
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = command_parser(__doc__)
-    parser.add_argument("swarm_file", metavar="SWARM_FILE", type=Path, nargs="?", help="swarm description")
-    parser.add_argument(
-        "--out",
-        type=file_to_write(".pdf"),
-        default="markers.pdf",
-        help="the PDF (default: markers.pdf)",
-    )
-    parser.add_argument(
-        "--family", choices=list(families()), default="artoolkit_bch_thin", help="as of marker_detector_node"
-    )
-    parser.add_argument(
-        "--paper", choices=list(PAPERS), default="a4", help="size of the sheets (default: a4)"
-    )
-    parser.add_argument("--board", type=_grid, metavar="COLUMNSxROWS", help="add a grid of markers")
-    parser.add_argument(
-        "--size", type=number_in(0.005, 1.0, "m"), help=f"side of those markers (default: {_BOARD_SIDE_M} m)"
-    )
-    parser.add_argument(
-        "--first-id",
-        type=number_in(0, 2**32 - 1),
-        help="id of the first one (default: the next after the swarm's)",
-    )
-    return parser
-
-
-def _grid(text: str) -> list[int]:
-    match = _GRID.fullmatch(text)
-    if match is None:
-        raise argparse.ArgumentTypeError(f"'{text}' must be columns and rows, such as 3x4")
-    return [int(number) for number in match.groups()]
 
 
 if __name__ == "__main__":

@@ -42,32 +42,15 @@ _COVARIANCE = POSE_DOUBLES + np.arange(36).reshape(6, 6)[PLANE].ravel()
 """Where a planar covariance stands after a pose."""
 
 
-class OdometryMessage(NamedTuple):
-    """The part of nav_msgs/Odometry that the estimator uses."""
-
-    stamp_ns: int  # Acquisition time
-    frame_id: str  # Frame of the pose
-    child_frame_id: str  # Frame of the twist
-    pose: tuple[float, float, float]  # (x [m], y [m], yaw [rad]); yaw is NaN when the quaternion is zero
-    twist: tuple[float, float, float]  # (vx [m/s], vy [m/s], yaw rate [rad/s])
-    covariance: FloatArray  # 3x3, of x, y, yaw, as published
-
-
 class PoseMessage(NamedTuple):
-    """A geometry_msgs/PoseStamped in the plane: pose is (x [m], y [m], yaw [rad])."""
-
-    stamp_ns: int
-    frame_id: str
-    pose: tuple[float, float, float]
-
-
-class FixMessage(NamedTuple):
-    """A geometry_msgs/PoseWithCovarianceStamped in the plane."""
+    """A stamped pose in the plane: a nav_msgs/Odometry, or one of geometry_msgs."""
 
     stamp_ns: int  # When the robot was there
     frame_id: str  # Frame of the pose
     pose: tuple[float, float, float]  # (x [m], y [m], yaw [rad]); yaw is NaN when the quaternion is zero
-    covariance: FloatArray  # 3x3, of x, y, yaw, as published
+    covariance: FloatArray = np.full((3, 3), np.nan)  # Of x, y, yaw, as published; NaN: it has none
+    twist: tuple[float, float, float] = (math.nan,) * 3  # (vx [m/s], vy [m/s], yaw rate [rad/s])
+    child_frame_id: str = ""  # Frame of the twist
 
 
 @cached_njit
@@ -83,18 +66,12 @@ def planar_pose(pose: Any) -> tuple[float, float, float]:
     return pose.position.x, pose.position.y, yaw_of(turn.x, turn.y, turn.z, turn.w)
 
 
-def decode_odometry(data: bytes) -> OdometryMessage:
+def decode_odometry(data: bytes) -> PoseMessage:
     """Read a nav_msgs/Odometry; raises CdrError unless the bytes are a whole one."""
     message = decode(data, ODOMETRY)
-    header, pose, twist = message.header, message.pose, message.twist.twist
-    return OdometryMessage(
-        nanoseconds(header.stamp),
-        header.frame_id,
-        message.child_frame_id,
-        planar_pose(pose.pose),
-        (twist.linear.x, twist.linear.y, twist.angular.z),
-        pose.covariance.reshape(6, 6)[PLANE],
-    )
+    twist = message.twist.twist
+    known = (twist.linear.x, twist.linear.y, twist.angular.z), message.child_frame_id
+    return _with_covariance(message, *known)
 
 
 def decode_pose_stamped(data: bytes) -> PoseMessage:
@@ -103,12 +80,17 @@ def decode_pose_stamped(data: bytes) -> PoseMessage:
     return PoseMessage(nanoseconds(message.header.stamp), message.header.frame_id, planar_pose(message.pose))
 
 
-def decode_fix(data: bytes) -> FixMessage:
+def decode_fix(data: bytes) -> PoseMessage:
     """Read a geometry_msgs/PoseWithCovarianceStamped; raises CdrError unless the bytes are a whole one."""
-    message = decode(data, POSE_WITH_COVARIANCE)
-    header, pose = message.header, message.pose
-    covariance = pose.covariance.reshape(6, 6)[PLANE]
-    return FixMessage(nanoseconds(header.stamp), header.frame_id, planar_pose(pose.pose), covariance)
+    return _with_covariance(decode(data, POSE_WITH_COVARIANCE))
+
+
+def _with_covariance(message: Any, *known: Any) -> PoseMessage:
+    """What a message says whose pose has a covariance, and what else is known of it."""
+    header, covariance = message.header, message.pose.covariance.reshape(6, 6)[PLANE]
+    return PoseMessage(
+        nanoseconds(header.stamp), header.frame_id, planar_pose(message.pose.pose), covariance, *known
+    )
 
 
 def position_and_quaternion(poses: FloatArray) -> FloatArray:

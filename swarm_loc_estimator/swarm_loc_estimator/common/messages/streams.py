@@ -29,8 +29,6 @@ from swarm_loc_estimator.common.messages.detections import (
 )
 from swarm_loc_estimator.common.messages.poses import (
     POSE_DOUBLES,
-    FixMessage,
-    OdometryMessage,
     PoseMessage,
     yaw_of,
 )
@@ -227,9 +225,7 @@ class PoseReader:
     `decode` reads one message completely. `names` frame names lie before the pose, that of the header, too.
     """
 
-    def __init__(
-        self, topics: int, decode: Callable[[bytes], OdometryMessage | PoseMessage | FixMessage], names: int
-    ) -> None:
+    def __init__(self, topics: int, decode: Callable[[bytes], PoseMessage], names: int) -> None:
         self.frame_ids = [""] * topics  # Per topic the frame of the newest message, "" before the first
         self._decode = decode
         self._names = names
@@ -244,15 +240,13 @@ class PoseReader:
         while k < n:
             try:
                 message = self._learn(int(batch.topic[k]), batch.message(k))
-                columns.stamp_ns[k], pose[k] = message.stamp_ns, message.pose
-                if isinstance(message, OdometryMessage):
-                    twist[k] = message.twist
+                columns.stamp_ns[k], pose[k], twist[k] = message.stamp_ns, message.pose, message.twist
             except CdrError:
                 columns.valid[k] = False
             k = _read_poses(batch, self._models, k + 1, columns.stamp_ns, pose, twist)
         return columns
 
-    def _learn(self, topic: int, data: bytes) -> OdometryMessage | PoseMessage | FixMessage:
+    def _learn(self, topic: int, data: bytes) -> PoseMessage:
         """Read one message completely; the next ones are compared with it."""
         message = self._decode(data)
         self.frame_ids[topic] = message.frame_id

@@ -46,12 +46,6 @@ def length_unit(length: float) -> tuple[float, str]:
     return (1e3, "mm") if abs(length) < _MILLIMETRES_BELOW_M else (1.0, "m")
 
 
-def length_text(length: float) -> str:
-    """A length [m] in its readable unit."""
-    metre, unit = length_unit(length)
-    return f"{metre * length:.{1 if unit == 'mm' else 2}f} {unit}"
-
-
 def seconds_since(begin_ns: int, stamp_ns: npt.NDArray[np.int64]) -> npt.NDArray[np.float64]:
     """Stamps as seconds since `begin_ns`."""
     return (stamp_ns - begin_ns).astype(np.float64) * 1e-9
@@ -256,7 +250,9 @@ def _title(result: ReplayResult) -> str:
     if not result.errors:
         return robots
     row = result.overall
-    position, heading = length_text(row.position_rmse), f"{math.degrees(row.heading_rmse):.1f}°"
+    metre, unit = length_unit(row.position_rmse)
+    position = f"{metre * row.position_rmse:.{1 if unit == 'mm' else 2}f} {unit}"
+    heading = f"{math.degrees(row.heading_rmse):.1f}°"
     return f"{robots}: RMS error {position} and {heading}, NEES {row.nees:.1f} (ideal 3)"
 
 
