@@ -50,7 +50,7 @@ _DIRECTIONS = 24  # Number of bearings, and of headings, of the grid
 _SAME_GEOMETRY = 3.0 * math.pi / _DIRECTIONS  # Maximum difference of directions within one geometry [rad]
 _SHOWN = 10.0  # Minimum of readings that determine the discretization error of the grid [sigma]
 _NOISE_RATIO = 1.2  # Maximum relative difference in noise of exchanges that share a table
-LIMIT = 3.0  # Residual from which readings count as outliers [sigma]
+_LIMIT = 3.0  # Residual from which readings count as outliers [sigma]
 _NEGLIGIBLE = 10.0  # Maximum log-likelihood ratio to the best pose; less likely poses are skipped
 
 Float32Array = NDArray[np.float32]
@@ -185,7 +185,7 @@ def _log_ratios(
 
 def _fits(stable: Float32Array, measured: BoolArray, expected: Float32Array) -> Float32Array:
     """Log likelihoods (n, n, g) of readings (n, n) at expectations (n, n, g), both stabilized and limited."""
-    off = np.minimum(np.abs(stable[..., None] - expected), LIMIT)
+    off = np.minimum(np.abs(stable[..., None] - expected), _LIMIT)
     return np.where(measured[..., None], -0.5 * off * off, 0.0)
 
 
