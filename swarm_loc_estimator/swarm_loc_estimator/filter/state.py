@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -244,6 +245,13 @@ class InitialPose(NamedTuple):
     covariance: FloatArray  # (3, 3) of the independent part of the right-invariant error
     columns: IntArray = _ALONE  # (s,) first filter columns of the other bodies
     shares: FloatArray = _NO_SHARES  # (s, 3, 3) Jacobians of the error with respect to theirs
+
+    def whole_covariance(self, shared: Mapping[int, FloatArray]) -> FloatArray:
+        """Covariance (3, 3) of the error, from those of the other bodies by their columns."""
+        covariance = self.covariance.copy()
+        for column, share in zip(self.columns.tolist(), self.shares, strict=True):
+            covariance += share @ shared[column] @ share.T
+        return covariance
 
 
 class Starts(NamedTuple):

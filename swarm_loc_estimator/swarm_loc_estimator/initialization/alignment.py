@@ -20,7 +20,6 @@ from swarm_loc_estimator.common.numerics import (
     carry,
     cholesky3,
     composed,
-    factor_numbers,
     moved_by_twist,
     solve3,
     wrap,
@@ -80,19 +79,14 @@ def turned(xx: float, xy: float, yy: float, cos: float, sin: float) -> tuple[flo
 
 
 @cached_njit
-def spread_at(spread: FloatArray, x: float, y: float) -> tuple[float, float, float]:
-    """Covariance xx, xy, yy of a point on a frame whose right-invariant error has the covariance (3, 3)."""
-    return (
-        spread[0, 0] - 2.0 * y * spread[0, 2] + y * y * spread[2, 2],
-        spread[0, 1] + x * spread[0, 2] - y * spread[1, 2] - x * y * spread[2, 2],
-        spread[1, 1] + 2.0 * x * spread[1, 2] + x * x * spread[2, 2],
-    )
-
-
-@cached_njit
 def _spread_around(spread: FloatArray, x: float, y: float) -> tuple[float, float, float]:
-    """As `spread_at`; a circle about that ellipse where the heading is so unknown that errors lie on arcs."""
-    xx, xy, yy = spread_at(spread, x, y)
+    """Covariance xx, xy, yy of a point on a frame whose right-invariant error has the covariance (3, 3).
+
+    A circle about that ellipse where the heading is so unknown that errors lie on arcs.
+    """
+    xx = spread[0, 0] - 2.0 * y * spread[0, 2] + y * y * spread[2, 2]
+    xy = spread[0, 1] + x * spread[0, 2] - y * spread[1, 2] - x * y * spread[2, 2]
+    yy = spread[1, 1] + 2.0 * x * spread[1, 2] + x * x * spread[2, 2]
     return (xx + yy, 0.0, xx + yy) if spread[2, 2] > _ARC else (xx, xy, yy)
 
 
@@ -206,14 +200,17 @@ def align(
     transform, covariance, weight = _refined(constraints, hypotheses[best])
     if np.count_nonzero(weight) < enough:
         return None
-    position, heading = _uncertainty(constraints, track_noise, weight, transform, covariance)
+    initial = _split_errors(constraints, track_noise, weight, transform, covariance)
+    shared = dict(zip(constraints["column"].tolist(), constraints["shared"], strict=True))
+    centre = np.array([[constraints["map_x"].mean(), constraints["map_y"].mean()]])
+    (tie,) = _ties(centre)
+    x, y, heading = np.sqrt(np.diag(tie @ initial.whole_covariance(shared) @ tie.T)).tolist()
+    position = max(x, y)
     if not (position < POSITION_SIGMA and heading < heading_sigma):
         return None
     rivals = hypotheses[support >= _RIVAL_SHARE * support[best]]
     limits = (_APART_M + 3.0 * position, _APART_RAD + 3.0 * heading)
-    if _is_ambiguous(constraints, transform, rivals, limits):
-        return None
-    return _split_errors(constraints, track_noise, weight, transform, covariance)
+    return None if _is_ambiguous(constraints, transform, rivals, limits) else initial
 
 
 def _is_ambiguous(
@@ -297,38 +294,21 @@ def _place(turn: float, lx: float, ly: float, mx: float, my: float, out: FloatAr
     return h + 1
 
 
-@cached_njit
 def _drifted(constraints: ConstraintArray, track_noise: FloatArray) -> ConstraintArray:
     """The constraints (k,) with the drift of the track added to the covariance of their points on it."""
-    out, drift = np.empty_like(constraints), np.empty((3, 3))
-    for k in range(constraints.size):
-        out[k] = constraints[k]
-        constraint = out[k]
-        for i in range(3):
-            for j in range(3):
-                drift[i, j] = track_noise[i, j] - constraint.track_noise[i, j]
-        if not _is_noise(drift):  # late odometry has replaced a larger noise that was assumed without it
-            assign_matrix(constraint.track_noise, track_noise)
-            continue
-        xx, xy, yy = _spread_around(drift, constraint.local_x, constraint.local_y)
-        if drift[2, 2] > _ARC:
-            constraint.turn_variance += drift[2, 2]
-        constraint.local_xx += xx
-        constraint.local_xy += xy
-        constraint.local_yy += yy
+    out = constraints.copy()
+    drift = track_noise - out["track_noise"]
+    # late odometry has replaced a larger noise that was assumed without it
+    late = np.linalg.eigvalsh(drift)[:, 0] < -1e-12 - 1e-9 * np.abs(np.trace(drift, axis1=1, axis2=2))
+    out["track_noise"][late], drift[late] = track_noise, 0.0
+    tie = _ties(np.column_stack([out["local_x"], out["local_y"]]))
+    spread = tie @ drift @ np.swapaxes(tie, 1, 2)
+    wide = drift[:, 2, 2] > _ARC
+    spread[wide, :2, :2] = (spread[wide, 0, 0] + spread[wide, 1, 1])[:, None, None] * np.eye(2)
+    out["turn_variance"][wide] += drift[wide, 2, 2]
+    for name, part in (("xx", spread[:, 0, 0]), ("xy", spread[:, 0, 1]), ("yy", spread[:, 1, 1])):
+        out[f"local_{name}"] += part
     return out
-
-
-@cached_njit
-def _is_noise(drift: FloatArray) -> bool:
-    """Whether a matrix (3, 3) is positive semidefinite, but for rounding."""
-    work, rounding = drift.copy(), 1e-12
-    for i in range(3):
-        rounding += 1e-9 * abs(drift[i, i])
-    for i in range(3):
-        work[i, i] += rounding
-    first, _, second, _, _, third = factor_numbers(work)
-    return math.isfinite(first + second + third)
 
 
 @cached_njit
@@ -482,36 +462,3 @@ def _matrices(constraints: ConstraintArray, side: str) -> FloatArray:
     """Covariances (k, 2, 2) of the points of a side."""
     xx, xy, yy = (constraints[f"{side}_{name}"] for name in ("xx", "xy", "yy"))
     return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-1)
-
-
-@cached_njit
-def _uncertainty(
-    constraints: ConstraintArray,
-    track_noise: FloatArray,
-    weight: FloatArray,
-    transform: FloatArray,
-    covariance: FloatArray,
-) -> tuple[float, float]:
-    """Standard deviations at the centre of the constraints, the larger of x and y [m], and of the heading.
-
-    Errors that do not average out count with their weighted mean (k,): those of other robots, taken as fully
-    correlated, and the drift of the track.
-    """
-    x, y, total = 0.0, 0.0, 0.0
-    whole, drift, carried = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
-    for k in range(constraints.size):
-        x += constraints[k].map_x / constraints.size
-        y += constraints[k].map_y / constraints.size
-        total += weight[k]
-    for k in range(constraints.size):
-        share = weight[k] / total
-        for i in range(3):
-            for j in range(3):
-                whole[i, j] += share * constraints[k].shared[i, j]
-                drift[i, j] += share * (track_noise[i, j] - constraints[k].track_noise[i, j])
-    carry(transform, drift, carried)
-    for i in range(3):
-        for j in range(3):
-            whole[i, j] += covariance[i, j] + carried[i, j]
-    xx, _, yy = spread_at(whole, x, y)
-    return math.sqrt(max(xx, yy)), math.sqrt(whole[2, 2])

@@ -293,11 +293,8 @@ class Problem:
 
     def covariance(self, initial: InitialPose) -> FloatArray:
         """Covariance (3, 3) of x, y and heading of the newest pose on the track."""
-        whole = initial.covariance.copy()
-        for column, share in zip(initial.columns.tolist(), initial.shares, strict=True):
-            whole += share @ self._shared[column] @ share.T
         pose = se2.compose(initial.transform, self._window.track[-1])
-        return se2.pose_covariance(pose, whole)
+        return se2.pose_covariance(pose, initial.whole_covariance(self._shared))
 
 
 def locate(
