@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.numerics import (
@@ -24,7 +25,6 @@ from swarm_loc_estimator.common.numerics import (
     solve3,
     wrap,
 )
-from swarm_loc_estimator.common.se2 import adjoint
 from swarm_loc_estimator.filter.models import POLAR, gate_threshold
 from swarm_loc_estimator.filter.state import BeliefArrays, InitialPose, covariance_within
 from swarm_loc_estimator.initialization.window import Window
@@ -232,7 +232,6 @@ def _is_ambiguous(
     return False
 
 
-@cached_njit
 def _apart(
     constraints: ConstraintArray, one: FloatArray, others: FloatArray, limits: tuple[float, float]
 ) -> FloatArray:
@@ -240,17 +239,10 @@ def _apart(
 
     The larger one of the distance at the centre of the constraints and of the angle.
     """
-    x, y = 0.0, 0.0
-    for k in range(constraints.size):
-        x += constraints[k].local_x / constraints.size
-        y += constraints[k].local_y / constraints.size
-    apart = np.empty(others.shape[0])
-    for h in range(apart.size):
-        cos, sin = math.cos(others[h, 2]) - math.cos(one[2]), math.sin(others[h, 2]) - math.sin(one[2])
-        dx, dy = others[h, 0] - one[0] + cos * x - sin * y, others[h, 1] - one[1] + sin * x + cos * y
-        turn = abs(wrap(others[h, 2] - one[2]))
-        apart[h] = max(math.hypot(dx, dy) / limits[0], turn / limits[1])
-    return apart
+    centre = np.array([constraints["local_x"].mean(), constraints["local_y"].mean(), 0.0])
+    away = (se2.compose(others, centre) - se2.compose(one, centre))[:, :2]
+    turn = np.abs(se2.wrap_angle(others[:, 2] - one[2]))
+    return np.maximum(np.hypot(*away.T) / limits[0], turn / limits[1])
 
 
 def _refined(constraints: ConstraintArray, begin: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -445,7 +437,7 @@ def _split_errors(
     gain = np.linalg.inv(information.sum(axis=0) + _PRIOR * np.eye(3))
     rest = (np.swapaxes(weighted, 1, 2) @ ((1.0 + _MARGIN) * noise - common) @ weighted).sum(axis=0)
     drift = np.average(track_noise - constraints["track_noise"], axis=0, weights=weight)
-    own = covariance @ rest @ gain + adjoint(transform) @ drift @ adjoint(transform).T
+    own = covariance @ rest @ gain + se2.adjoint(transform) @ drift @ se2.adjoint(transform).T
     columns = np.unique(constraints["column"][constraints["column"] >= 0])
     shares = np.array([gain @ information[constraints["column"] == column].sum(axis=0) for column in columns])
     return InitialPose(transform, 0.5 * (own + own.T), columns, shares.reshape(-1, 3, 3))
