@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -245,6 +246,13 @@ class InitialPose(NamedTuple):
     columns: IntArray = _ALONE  # (s,) first filter columns of the other bodies
     shares: FloatArray = _NO_SHARES  # (s, 3, 3) Jacobians of the error with respect to theirs
 
+    def whole_covariance(self, shared: Mapping[int, FloatArray]) -> FloatArray:
+        """Covariance (3, 3) of the error, from those of the other bodies by their columns."""
+        covariance = self.covariance.copy()
+        for column, share in zip(self.columns.tolist(), self.shares, strict=True):
+            covariance += share @ shared[column] @ share.T
+        return covariance
+
 
 class Starts(NamedTuple):
     """Initial poses of the tracks of robots (k,), with independent errors."""
@@ -281,10 +289,9 @@ class SwarmState:
         pair_robot: (N, pairs) robots observed by each robot; -1 for an empty slot.
         pair_stamp_ns: (N, pairs) stamp of the last measurement of the pair.
         pair_history: (N, pairs, PAIR_ROWS, 3) mean of the measurements, see `correlated_noise.py`.
-        constraints: Stored sightings per robot that is not tracked (see `initializer.py`).
-        next_attempt_ns: (N,) earliest instant of the next attempt to initialize the robot.
-        windows: Stored measurements of one degree of freedom per such robot (see `window.py`).
-        next_window_ns: (N,) earliest instant of the next attempt with them.
+        windows: Stored measurements by robot that is not tracked, and whether they are of one degree of
+            freedom (see `initializer.py`).
+        next_attempt_ns: (N, 2) earliest instant of the next attempt to initialize the robot with them.
         images: Memory of aerial images; None before the first.
         delays: What is known of the delays of lidars, by robot, see `sensors/lidar.py`.
         places: Where robots with lidars that are not located may be in the map, see `map_search.py`.
@@ -317,10 +324,8 @@ class SwarmState:
         self.pair_robot: NDArray[np.int64] = np.full((robots, pairs), -1)
         self.pair_stamp_ns: NDArray[np.int64] = np.full((robots, pairs), NEVER_NS)
         self.pair_history: FloatArray = np.zeros((robots, pairs, PAIR_ROWS, 3))
-        self.constraints: dict[int, NDArray[np.void]] = {}
-        self.next_attempt_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
-        self.windows: dict[int, Any] = {}  # of `window.Window`
-        self.next_window_ns: NDArray[np.int64] = np.full(robots, NEVER_NS)
+        self.windows: dict[tuple[int, bool], Any] = {}  # of `window.Window`
+        self.next_attempt_ns: NDArray[np.int64] = np.full((robots, 2), NEVER_NS)
         self.images: IdentityMemory | None = None
         self.delays: dict[int, Any] = {}  # of `lidar.DelayBelief`
         self.places: dict[int, Any] = {}  # of `map_search.PossiblePlaces`
@@ -395,8 +400,8 @@ class SwarmState:
         self.start_pending[robots] = False
         self._trust(robots, confirmations, starts.stamp_ns)
         for robot in robots.tolist():
-            self.constraints.pop(robot, None)
-            self.windows.pop(robot, None)
+            self.windows.pop((robot, False), None)
+            self.windows.pop((robot, True), None)
 
     def move(self, robot: int, initial: InitialPose) -> None:
         """Move all poses rigidly such that one robot, predicted to the same instant, is at an initial pose.
@@ -423,7 +428,6 @@ class SwarmState:
             covariance[rows] += cross
             covariance[:, rows] += cross.T
         self.filter.covariance[:] = 0.5 * (covariance + covariance.T)
-        self.constraints.clear()
         self.windows.clear()
         self.sources.excess[:] = 0.0
 

@@ -1,17 +1,18 @@
 """Alignment of a robot's track with the map: the transform on which most constraints agree, if it is unique.
 
-Constraints are sightings by or of a robot that is not localized. The parts are compiled because every waiting
-robot tries repeatedly; they are not inlined, which would lengthen compilation.
+Constraints are sightings by or of a robot that is not localized, as of the present belief. The parts are
+compiled because every waiting robot tries repeatedly; they are not inlined, which would lengthen compilation.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.numerics import (
@@ -20,23 +21,18 @@ from swarm_loc_estimator.common.numerics import (
     carry,
     cholesky3,
     composed,
-    factor_numbers,
     moved_by_twist,
     solve3,
     wrap,
 )
-from swarm_loc_estimator.common.se2 import adjoint
-from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
 from swarm_loc_estimator.filter.models import POLAR, gate_threshold
 from swarm_loc_estimator.filter.state import BeliefArrays, InitialPose, covariance_within
+from swarm_loc_estimator.initialization.window import Window
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW
 
 CONSTRAINT_DTYPE = np.dtype(
     [
-        ("stamp_ns", np.int64),
-        ("marker_id", np.int64),
-        ("other", np.int64),  # the robot on the other side, or NOBODY
-        ("landmark", np.int64),  # the landmark on the other side, or -1
-        ("column", np.int64),  # first of the other side's error in the filter, or -1; once `refreshed`
+        ("column", np.int64),  # first of the other side's error in the filter, or -1
         ("local_x", np.float64),  # point in the track's frame [m]
         ("local_y", np.float64),
         ("local_xx", np.float64),  # its covariance
@@ -44,113 +40,31 @@ CONSTRAINT_DTYPE = np.dtype(
         ("local_yy", np.float64),
         ("map_x", np.float64),  # the same point in map [m]
         ("map_y", np.float64),
-        ("map_xx", np.float64),  # its covariance, that of the other side only once `refreshed`
+        ("map_xx", np.float64),  # its covariance
         ("map_xy", np.float64),
         ("map_yy", np.float64),
         ("turn", np.float64),  # heading of the transform that the sighting shows [rad], NaN: none
         ("other_turn", np.float64),  # of its mirrored solution, NaN: none
         ("turn_variance", np.float64),
         ("track_noise", np.float64, (3, 3)),  # preintegrated covariance of the track
-        ("frame", np.float64, (3,)),  # frame of the other side's error: T, or a landmark's correction
-        ("frame_noise", np.float64, (3, 3)),  # preintegrated covariance of the other side's track
-        ("shared", np.float64, (3, 3)),  # covariance of the other side's error, once `refreshed`
+        ("shared", np.float64, (3, 3)),  # covariance of the other side's error
     ]
 )
 
 ConstraintArray = NDArray[np.void]
 Constraint = Any  # A row of a ConstraintArray inside compiled code, where the fields are attributes
 
-NO_CONSTRAINTS: ConstraintArray = np.zeros(0, dtype=CONSTRAINT_DTYPE)
-_MAX_CONSTRAINTS = 20
 _ARC = 0.3**2  # Variance of a heading beyond which errors of points that turn with it lie on arcs [rad^2]
 
 
-class Waiting(NamedTuple):
-    """A robot without a pose at the time of a sighting by or of it."""
+def constraints_of(window: Window, robot: int, belief: BeliefArrays) -> ConstraintArray:
+    """Constraints of a waiting robot's sightings (m,), without those by or of robots that are lost.
 
-    robot: int  # Its index
-    pose: FloatArray  # (3,) on its track
-    covariance: FloatArray  # (3, 3) preintegrated until then
-
-
-class OtherSide(NamedTuple):
-    """The other side of a sighting: a localized robot, a landmark, or the map itself."""
-
-    robot: int  # Its index, or NOBODY
-    landmark: int  # Index of the landmark; -1: none
-    pose: FloatArray  # (3,) in `map` at the stamp; for a landmark, its displacement from the survey
-    frame: FloatArray  # (3,) frame of its error: T of a robot, the pose of a landmark
-    noise: FloatArray  # (3, 3) covariance of its track preintegrated until the stamp
-
-
-THE_MAP = OtherSide(NOBODY, -1, np.zeros(3), np.zeros(3), np.zeros((3, 3)))
-
-
-def with_constraint(
-    constraints: ConstraintArray,
-    one: Measurements,
-    camera: FloatArray,
-    waiting: Waiting,
-    other: OtherSide,
-    window_ns: int,
-) -> ConstraintArray:
-    """Constraints (k,) and that of a newer measurement; of too many, the most redundant one is dropped.
-
-    Args:
-        constraints: In order of time; not changed.
-        one: Row of a measurement between the robot and a localized side.
-        camera: (3,) estimated yaw offset [rad], scale error and range offset [m] of its sensor.
-        waiting: The robot without a pose.
-        other: The localized side.
-        window_ns: Age up to which constraints are kept.
+    They refer to the present estimates of the other sides, so that the errors of another side are the same in
+    all its constraints, and can be shared with the robot that is initialized from them.
     """
-    out = np.empty(_MAX_CONSTRAINTS + 1, dtype=CONSTRAINT_DTYPE)
-    count = _take_over(constraints, int(one.stamp_ns) - window_ns, out)
-    _describe(one, camera, waiting, other, out[count : count + 1])
-    if count < _MAX_CONSTRAINTS:
-        return out[: count + 1]
-    _thin_out(out)
-    return out[:_MAX_CONSTRAINTS]
-
-
-@cached_njit
-def _take_over(constraints: ConstraintArray, oldest_ns: int, out: ConstraintArray) -> int:
-    """Write the constraints (k,) that are not older than an instant; return their number."""
-    count = 0
-    for k in range(constraints.size):
-        if constraints[k].stamp_ns >= oldest_ns:
-            out[count] = constraints[k]
-            count += 1
-    return count
-
-
-@cached_njit
-def _thin_out(constraints: ConstraintArray) -> None:
-    """Move the constraint (of k, in order of time) that leaves the smallest gap for its age to the end.
-
-    Gaps are between constraints of one marker. Where no marker has three constraints, it is the oldest one.
-    """
-    least, gone = math.inf, 0
-    newest_ns = constraints[constraints.size - 1].stamp_ns
-    for k in range(constraints.size):
-        before, after = -1, -1
-        for i in range(constraints.size):
-            if (
-                constraints[i].marker_id == constraints[k].marker_id
-                and constraints[i].other == constraints[k].other
-            ):
-                if i < k:
-                    before = i
-                elif i > k and after < 0:
-                    after = i
-        if before >= 0 and after >= 0:
-            gap = (constraints[after].stamp_ns - constraints[before].stamp_ns) / max(
-                1, newest_ns - constraints[k].stamp_ns
-            )
-            if gap < least:
-                least, gone = gap, k
-    for k in range(gone, constraints.size - 1):
-        constraints[k] = constraints[k + 1]
+    out = np.zeros(window.size, dtype=CONSTRAINT_DTYPE)
+    return out[: _describe(window, robot, belief, out)]
 
 
 @cached_njit
@@ -165,128 +79,89 @@ def turned(xx: float, xy: float, yy: float, cos: float, sin: float) -> tuple[flo
 
 
 @cached_njit
-def spread_at(spread: FloatArray, x: float, y: float) -> tuple[float, float, float]:
-    """Covariance xx, xy, yy of a point on a frame whose right-invariant error has the covariance (3, 3)."""
-    return (
-        spread[0, 0] - 2.0 * y * spread[0, 2] + y * y * spread[2, 2],
-        spread[0, 1] + x * spread[0, 2] - y * spread[1, 2] - x * y * spread[2, 2],
-        spread[1, 1] + 2.0 * x * spread[1, 2] + x * x * spread[2, 2],
-    )
-
-
-@cached_njit
 def _spread_around(spread: FloatArray, x: float, y: float) -> tuple[float, float, float]:
-    """As `spread_at`; a circle about that ellipse where the heading is so unknown that errors lie on arcs."""
-    xx, xy, yy = spread_at(spread, x, y)
+    """Covariance xx, xy, yy of a point on a frame whose right-invariant error has the covariance (3, 3).
+
+    A circle about that ellipse where the heading is so unknown that errors lie on arcs.
+    """
+    xx = spread[0, 0] - 2.0 * y * spread[0, 2] + y * y * spread[2, 2]
+    xy = spread[0, 1] + x * spread[0, 2] - y * spread[1, 2] - x * y * spread[2, 2]
+    yy = spread[1, 1] + 2.0 * x * spread[1, 2] + x * x * spread[2, 2]
     return (xx + yy, 0.0, xx + yy) if spread[2, 2] > _ARC else (xx, xy, yy)
 
 
 @cached_njit
-def _describe(
-    one: Measurements, camera: FloatArray, waiting: Waiting, other: OtherSide, constraints: ConstraintArray
-) -> None:
-    """Write the constraint (1,) of a row of measurements, see `with_constraint`."""
-    constraint = constraints[0]
-    value, covariance, sensor, marker = one.value, one.covariance, one.sensor, one.marker
-    # Sensor and marker on the track and in map, with the estimated errors of the camera.
-    sees, track = one.observer == waiting.robot, waiting.pose
-    on_track, on_map = (sensor, marker) if sees else (marker, sensor)
-    lx, ly, ltheta = composed(track[0], track[1], track[2], on_track[0], on_track[1], on_track[2])
-    base = other.pose
-    mx, my, mtheta = composed(base[0], base[1], base[2], on_map[0], on_map[1], on_map[2])
-    if sees:
-        ltheta += camera[0]
-    else:
-        mtheta += camera[0]
-    # The measured point and its covariance, turned to the frame of the side that sees.
-    x, y, angle = value[0], value[1], ltheta if sees else mtheta
-    xx, xy, yy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
-    if one.model == POLAR:  # along and across the line of sight
-        x, y, angle = value[0] - camera[2], 0.0, angle + value[1]
-        xy, yy = value[0] * xy, value[0] * value[0] * yy
-    size = 1.0 / (1.0 + camera[1])
-    x, y, xx, xy, yy = size * x, size * y, size * size * xx, size * size * xy, size * size * yy
-    cos, sin = math.cos(angle), math.sin(angle)
-    x, y = cos * x - sin * y, sin * x + cos * y
-    xx, xy, yy = turned(xx, xy, yy, cos, sin)
-    constraint.stamp_ns, constraint.marker_id = one.stamp_ns, one.reading
-    constraint.other, constraint.landmark = other.robot, other.landmark
-    # the measurement noise acts on the side of the sensor: on the track or on the map
-    local, there, sign = (1.0, 0.0, 1.0) if sees else (0.0, 1.0, -1.0)
-    constraint.local_x, constraint.local_y = lx + local * x, ly + local * y
-    constraint.local_xx, constraint.local_xy, constraint.local_yy = local * xx, local * xy, local * yy
-    constraint.map_x, constraint.map_y = mx + there * x, my + there * y
-    constraint.map_xx, constraint.map_xy, constraint.map_yy = there * xx, there * xy, there * yy
-    # Headings of the transform, also by a second solution.
-    constraint.turn = constraint.other_turn = math.nan
-    if one.has_heading:
-        constraint.turn = mtheta - ltheta - sign * value[2]
-    if one.has_second:
-        constraint.other_turn = mtheta - ltheta - sign * one.second[2]
-    constraint.turn_variance = covariance[2, 2]
-    assign_matrix(constraint.track_noise, waiting.covariance)
-    assign(constraint.frame, other.frame)
-    assign_matrix(constraint.frame_noise, other.noise)
-
-
-@cached_njit
-def refreshed(constraints: ConstraintArray, belief: BeliefArrays) -> ConstraintArray:
-    """Constraints (k,) moved to the present estimates of their other sides, without those of lost robots.
-
-    So the errors of another side are the same in all its constraints, and can be shared with the robot that
-    is initialized from them.
-    """
-    out = np.empty_like(constraints)
-    count = 0
-    none, drift, shared, spread = np.zeros((3, 3)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    for k in range(constraints.size):
-        # Keep it, unless its other side was lost.
-        robot, mark, constraint = constraints[k].other, constraints[k].landmark, out[count]
-        if robot >= 0 and not belief.tracked[robot]:
+def _describe(window: Window, robot: int, belief: BeliefArrays, out: ConstraintArray) -> int:
+    """Write the constraints of a window (m,), see `constraints_of`; return their number."""
+    one, count = window.measured, 0
+    drift, spread, none, camera = np.empty((3, 3)), np.empty((3, 3)), np.zeros(3), np.zeros(3)
+    for k in range(one.stamp_ns.size):
+        sees, mark = one.observer[k] == robot, max(one.landmark[k], one.mount[k])
+        other = one.target[k] if sees else one.observer[k]
+        if other >= 0 and not belief.tracked[other]:
             continue
+        constraint = out[count]
         count += 1
-        out[count - 1] = constraints[k]
-        assign_matrix(constraint.shared, none)
-        column = 3 * robot if robot >= 0 else (belief.table.survey_column[mark] if mark >= 0 else -1)
+        # Sensor and marker on the track and in map, with the estimated errors of the camera.
+        for i in range(3):
+            camera[i] = belief.parameter[one.observer[k], CAMERA_YAW + i] if one.observer[k] >= 0 else 0.0
+        sensor, marker, track, frame = one.sensor[k], one.marker[k], window.track[k], none
+        column = 3 * other if other >= 0 else (belief.table.survey_column[mark] if mark >= 0 else -1)
+        if other >= 0:
+            frame = belief.transform[other]
+        elif mark >= 0:
+            frame = belief.landmark[mark]
+        at = window.other_track[k]
+        bx, by, btheta = composed(frame[0], frame[1], frame[2], at[0], at[1], at[2])
+        on_track, on_map = (sensor, marker) if sees else (marker, sensor)
+        lx, ly, ltheta = composed(track[0], track[1], track[2], on_track[0], on_track[1], on_track[2])
+        mx, my, mtheta = composed(bx, by, btheta, on_map[0], on_map[1], on_map[2])
+        if sees:
+            ltheta += camera[0]
+        else:
+            mtheta += camera[0]
+        # The measured point and its covariance, turned to the frame of the side that sees.
+        value, covariance = one.value[k], one.covariance[k]
+        x, y, angle = value[0], value[1], ltheta if sees else mtheta
+        xx, xy, yy = covariance[0, 0], covariance[0, 1], covariance[1, 1]
+        if one.model[k] == POLAR:  # along and across the line of sight
+            x, y, angle = value[0] - camera[2], 0.0, angle + value[1]
+            xy, yy = value[0] * xy, value[0] * value[0] * yy
+        size = 1.0 / (1.0 + camera[1])
+        x, y, xx, xy, yy = size * x, size * y, size * size * xx, size * size * xy, size * size * yy
+        cos, sin = math.cos(angle), math.sin(angle)
+        x, y = cos * x - sin * y, sin * x + cos * y
+        xx, xy, yy = turned(xx, xy, yy, cos, sin)
+        # The measurement noise acts on the side of the sensor: on the track or on the map.
+        local, there, sign = (1.0, 0.0, 1.0) if sees else (0.0, 1.0, -1.0)
+        constraint.local_x, constraint.local_y = lx + local * x, ly + local * y
+        constraint.local_xx, constraint.local_xy, constraint.local_yy = local * xx, local * xy, local * yy
+        constraint.map_x, constraint.map_y = mx + there * x, my + there * y
+        # Headings of the transform, also by a second solution.
+        constraint.turn = constraint.other_turn = math.nan
+        if one.has_heading[k]:
+            constraint.turn = mtheta - ltheta - sign * value[2]
+        if one.has_second[k]:
+            constraint.other_turn = mtheta - ltheta - sign * one.second[k, 2]
+        assign_matrix(constraint.track_noise, window.noise[k])
+        # The error of the other side, and the drift of its track since.
         constraint.column = column
-        if column < 0:
-            continue
-        # Move it to the present estimate of the other side.
-        now = belief.transform[robot] if robot >= 0 else belief.landmark[mark]
-        turn = _move(constraint, now)
         for i in range(3):
             for j in range(3):
-                shared[i, j] = covariance_within(belief, column, i, j)
+                constraint.shared[i, j] = covariance_within(belief, column, i, j) if column >= 0 else 0.0
                 drift[i, j] = 0.0
-                if robot >= 0:
-                    drift[i, j] = constraint.frame_noise[i, j] - belief.preintegrated_covariance[robot, i, j]
-        # Add the error of the other side and the drift of its track since.
-        sign = 1.0 if drift[0, 0] + drift[1, 1] + drift[2, 2] > 0.0 else -1.0
-        carry(now, drift, spread)
+                if other >= 0:
+                    drift[i, j] = window.other_noise[k, i, j] - belief.preintegrated_covariance[other, i, j]
+        later = 1.0 if drift[0, 0] + drift[1, 1] + drift[2, 2] > 0.0 else -1.0
+        carry(frame, drift, spread)
         for i in range(3):
             for j in range(3):
-                spread[i, j] = shared[i, j] + sign * spread[i, j]
-        assign_matrix(constraint.shared, shared)
-        xx, xy, yy = turned(
-            constraint.map_xx, constraint.map_xy, constraint.map_yy, math.cos(turn), math.sin(turn)
-        )
+                spread[i, j] = constraint.shared[i, j] + later * spread[i, j]
         at_xx, at_xy, at_yy = _spread_around(spread, constraint.map_x, constraint.map_y)
-        constraint.map_xx, constraint.map_xy, constraint.map_yy = xx + at_xx, xy + at_xy, yy + at_yy
-        constraint.turn_variance += spread[2, 2]
-    return out[:count]
-
-
-@cached_njit
-def _move(constraint: Constraint, frame: FloatArray) -> float:
-    """Move a constraint's place on the map and its heading with its frame; return the rotation."""
-    then = constraint.frame
-    turn = wrap(frame[2] - then[2])
-    cos, sin = math.cos(turn), math.sin(turn)
-    dx, dy = constraint.map_x - then[0], constraint.map_y - then[1]
-    constraint.map_x, constraint.map_y = frame[0] + cos * dx - sin * dy, frame[1] + sin * dx + cos * dy
-    constraint.turn += turn
-    constraint.other_turn += turn
-    return turn
+        constraint.map_xx, constraint.map_xy = there * xx + at_xx, there * xy + at_xy
+        constraint.map_yy = there * yy + at_yy
+        constraint.turn_variance = covariance[2, 2] + spread[2, 2]
+    return count
 
 
 MIN_CONSTRAINTS = 3
@@ -309,7 +184,7 @@ def align(
     """The transform on which a robot's constraints (k,) agree; None while it is ambiguous or uncertain.
 
     Args:
-        constraints: Of CONSTRAINT_DTYPE, refreshed.
+        constraints: Of CONSTRAINT_DTYPE.
         track_noise: (3, 3) covariance of the track preintegrated until now.
         heading_sigma: Largest standard deviation of the heading [rad].
     """
@@ -325,14 +200,17 @@ def align(
     transform, covariance, weight = _refined(constraints, hypotheses[best])
     if np.count_nonzero(weight) < enough:
         return None
-    position, heading = _uncertainty(constraints, track_noise, weight, transform, covariance)
+    initial = _split_errors(constraints, track_noise, weight, transform, covariance)
+    shared = dict(zip(constraints["column"].tolist(), constraints["shared"], strict=True))
+    centre = np.array([[constraints["map_x"].mean(), constraints["map_y"].mean()]])
+    (tie,) = _ties(centre)
+    x, y, heading = np.sqrt(np.diag(tie @ initial.whole_covariance(shared) @ tie.T)).tolist()
+    position = max(x, y)
     if not (position < POSITION_SIGMA and heading < heading_sigma):
         return None
     rivals = hypotheses[support >= _RIVAL_SHARE * support[best]]
     limits = (_APART_M + 3.0 * position, _APART_RAD + 3.0 * heading)
-    if _is_ambiguous(constraints, transform, rivals, limits):
-        return None
-    return _split_errors(constraints, track_noise, weight, transform, covariance)
+    return None if _is_ambiguous(constraints, transform, rivals, limits) else initial
 
 
 def _is_ambiguous(
@@ -354,7 +232,6 @@ def _is_ambiguous(
     return False
 
 
-@cached_njit
 def _apart(
     constraints: ConstraintArray, one: FloatArray, others: FloatArray, limits: tuple[float, float]
 ) -> FloatArray:
@@ -362,17 +239,10 @@ def _apart(
 
     The larger one of the distance at the centre of the constraints and of the angle.
     """
-    x, y = 0.0, 0.0
-    for k in range(constraints.size):
-        x += constraints[k].local_x / constraints.size
-        y += constraints[k].local_y / constraints.size
-    apart = np.empty(others.shape[0])
-    for h in range(apart.size):
-        cos, sin = math.cos(others[h, 2]) - math.cos(one[2]), math.sin(others[h, 2]) - math.sin(one[2])
-        dx, dy = others[h, 0] - one[0] + cos * x - sin * y, others[h, 1] - one[1] + sin * x + cos * y
-        turn = abs(wrap(others[h, 2] - one[2]))
-        apart[h] = max(math.hypot(dx, dy) / limits[0], turn / limits[1])
-    return apart
+    centre = np.array([constraints["local_x"].mean(), constraints["local_y"].mean(), 0.0])
+    away = (se2.compose(others, centre) - se2.compose(one, centre))[:, :2]
+    turn = np.abs(se2.wrap_angle(others[:, 2] - one[2]))
+    return np.maximum(np.hypot(*away.T) / limits[0], turn / limits[1])
 
 
 def _refined(constraints: ConstraintArray, begin: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -416,38 +286,21 @@ def _place(turn: float, lx: float, ly: float, mx: float, my: float, out: FloatAr
     return h + 1
 
 
-@cached_njit
 def _drifted(constraints: ConstraintArray, track_noise: FloatArray) -> ConstraintArray:
     """The constraints (k,) with the drift of the track added to the covariance of their points on it."""
-    out, drift = np.empty_like(constraints), np.empty((3, 3))
-    for k in range(constraints.size):
-        out[k] = constraints[k]
-        constraint = out[k]
-        for i in range(3):
-            for j in range(3):
-                drift[i, j] = track_noise[i, j] - constraint.track_noise[i, j]
-        if not _is_noise(drift):  # late odometry has replaced a larger noise that was assumed without it
-            assign_matrix(constraint.track_noise, track_noise)
-            continue
-        xx, xy, yy = _spread_around(drift, constraint.local_x, constraint.local_y)
-        if drift[2, 2] > _ARC:
-            constraint.turn_variance += drift[2, 2]
-        constraint.local_xx += xx
-        constraint.local_xy += xy
-        constraint.local_yy += yy
+    out = constraints.copy()
+    drift = track_noise - out["track_noise"]
+    # late odometry has replaced a larger noise that was assumed without it
+    late = np.linalg.eigvalsh(drift)[:, 0] < -1e-12 - 1e-9 * np.abs(np.trace(drift, axis1=1, axis2=2))
+    out["track_noise"][late], drift[late] = track_noise, 0.0
+    tie = _ties(np.column_stack([out["local_x"], out["local_y"]]))
+    spread = tie @ drift @ np.swapaxes(tie, 1, 2)
+    wide = drift[:, 2, 2] > _ARC
+    spread[wide, :2, :2] = (spread[wide, 0, 0] + spread[wide, 1, 1])[:, None, None] * np.eye(2)
+    out["turn_variance"][wide] += drift[wide, 2, 2]
+    for name, part in (("xx", spread[:, 0, 0]), ("xy", spread[:, 0, 1]), ("yy", spread[:, 1, 1])):
+        out[f"local_{name}"] += part
     return out
-
-
-@cached_njit
-def _is_noise(drift: FloatArray) -> bool:
-    """Whether a matrix (3, 3) is positive semidefinite, but for rounding."""
-    work, rounding = drift.copy(), 1e-12
-    for i in range(3):
-        rounding += 1e-9 * abs(drift[i, i])
-    for i in range(3):
-        work[i, i] += rounding
-    first, _, second, _, _, third = factor_numbers(work)
-    return math.isfinite(first + second + third)
 
 
 @cached_njit
@@ -584,7 +437,7 @@ def _split_errors(
     gain = np.linalg.inv(information.sum(axis=0) + _PRIOR * np.eye(3))
     rest = (np.swapaxes(weighted, 1, 2) @ ((1.0 + _MARGIN) * noise - common) @ weighted).sum(axis=0)
     drift = np.average(track_noise - constraints["track_noise"], axis=0, weights=weight)
-    own = covariance @ rest @ gain + adjoint(transform) @ drift @ adjoint(transform).T
+    own = covariance @ rest @ gain + se2.adjoint(transform) @ drift @ se2.adjoint(transform).T
     columns = np.unique(constraints["column"][constraints["column"] >= 0])
     shares = np.array([gain @ information[constraints["column"] == column].sum(axis=0) for column in columns])
     return InitialPose(transform, 0.5 * (own + own.T), columns, shares.reshape(-1, 3, 3))
@@ -601,36 +454,3 @@ def _matrices(constraints: ConstraintArray, side: str) -> FloatArray:
     """Covariances (k, 2, 2) of the points of a side."""
     xx, xy, yy = (constraints[f"{side}_{name}"] for name in ("xx", "xy", "yy"))
     return np.stack([np.stack([xx, xy], axis=-1), np.stack([xy, yy], axis=-1)], axis=-1)
-
-
-@cached_njit
-def _uncertainty(
-    constraints: ConstraintArray,
-    track_noise: FloatArray,
-    weight: FloatArray,
-    transform: FloatArray,
-    covariance: FloatArray,
-) -> tuple[float, float]:
-    """Standard deviations at the centre of the constraints, the larger of x and y [m], and of the heading.
-
-    Errors that do not average out count with their weighted mean (k,): those of other robots, taken as fully
-    correlated, and the drift of the track.
-    """
-    x, y, total = 0.0, 0.0, 0.0
-    whole, drift, carried = np.zeros((3, 3)), np.zeros((3, 3)), np.empty((3, 3))
-    for k in range(constraints.size):
-        x += constraints[k].map_x / constraints.size
-        y += constraints[k].map_y / constraints.size
-        total += weight[k]
-    for k in range(constraints.size):
-        share = weight[k] / total
-        for i in range(3):
-            for j in range(3):
-                whole[i, j] += share * constraints[k].shared[i, j]
-                drift[i, j] += share * (track_noise[i, j] - constraints[k].track_noise[i, j])
-    carry(transform, drift, carried)
-    for i in range(3):
-        for j in range(3):
-            whole[i, j] += covariance[i, j] + carried[i, j]
-    xx, _, yy = spread_at(whole, x, y)
-    return math.sqrt(max(xx, yy)), math.sqrt(whole[2, 2])

@@ -32,22 +32,16 @@ from swarm_loc_estimator.filter.state import IN_MAP, InitialPose, Meetings, Star
 from swarm_loc_estimator.initialization.alignment import (
     HEADING_SIGMA,
     MIN_CONSTRAINTS,
-    NO_CONSTRAINTS,
     POSITION_SIGMA,
-    THE_MAP,
-    OtherSide,
-    Waiting,
     align,
-    refreshed,
-    with_constraint,
+    constraints_of,
 )
 from swarm_loc_estimator.initialization.window import NO_WINDOW, Window, is_redundant, locate, with_row
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, RADIO_BIAS
 from swarm_loc_estimator.swarm.swarm import Swarm
 
-_INDEPENDENT_NS = 100_000_000  # Sightings of one marker within this time are redundant
+_MAX_SIGHTINGS, _MAX_PARTIAL = 20, 48  # Maximum number of kept measurements of a robot, by kind
 _LONGEST_PAUSE_NS = 300_000_000
 _PAUSE_SHARE = 8
 """After a failed attempt the robot collects constraints for an eighth of the time that they span.
@@ -96,83 +90,50 @@ class Initializer:
 
         `located` is called when the measurements determine the pose of the robot. Returns True.
         """
-        observer, now_ns = int(one.observer), int(one.stamp_ns)
+        now_ns = int(one.stamp_ns)
         track = self._tracks.at(np.array([robot]), np.array([now_ns]))
         at = Preintegrated(now_ns, track.covariance[0], track.jacobian[0])
         if locates_alone(one.columns(), 0) and self._is_sure(robot, one.covariance):
             located(state, robot, _fixed(one, track.pose[0]), at, CONFIRMED + 1.0)
             return True
-        if MODELS[int(one.model)].initializes != "alone":
-            return self._note_partial(state, one, robot, other, at, located)
-        old = state.constraints.get(robot, NO_CONSTRAINTS)
-        same = old[(old["marker_id"] == one.reading) & (old["other"] == other)]
-        if same.size and abs(now_ns - int(same["stamp_ns"][-1])) < _INDEPENDENT_NS:
-            return True
-        camera = np.zeros(3) if observer == NOBODY else state.parameter[observer, CAMERA_YAW:RADIO_BIAS]
-        waiting, seen = Waiting(robot, track.pose[0], at.covariance), self._located(state, other, one)
-        constraints = with_constraint(old, one, camera, waiting, seen, self._window_ns)
-        state.constraints[robot] = constraints
-        few = constraints.size < MIN_CONSTRAINTS or constraints["stamp_ns"][0] == now_ns
-        if few or now_ns < state.next_attempt_ns[robot]:
-            return True
-        initial = align(refreshed(constraints, state.arrays()), at.covariance, self._heading_sigma[robot])
-        if initial is not None:
-            located(state, robot, initial, at, CONFIRMED)
-        else:
-            waited_ns = now_ns - int(constraints["stamp_ns"][0])
-            state.next_attempt_ns[robot] = now_ns + min(_LONGEST_PAUSE_NS, waited_ns // _PAUSE_SHARE)
-        return True
-
-    def _note_partial(
-        self,
-        state: SwarmState,
-        one: Measurements,
-        robot: int,
-        other: int,
-        at: Preintegrated,
-        located: Located,
-    ) -> bool:
-        """Keep a measurement of one degree of freedom, see `window.py`."""
-        stamp_ns, none = np.array([at.stamp_ns]), (np.zeros((1, 3)), np.zeros((1, 3, 3)))
-        track = self._tracks.at(np.array([robot]), stamp_ns).pose
+        # keep it with the tracks of both sides
+        is_partial = MODELS[int(one.model)].initializes != "alone"
+        other_track, other_noise = np.zeros((1, 3)), np.zeros((1, 3, 3))
         if other != NOBODY:
-            sample = self._tracks.at(np.array([other]), stamp_ns)
-            none = sample.pose, sample.covariance
-        row = Window(one.columns(), track, at.covariance[None], *none)
-        old = state.windows.get(robot, NO_WINDOW)
+            sample = self._tracks.at(np.array([other]), np.array([now_ns]))
+            other_track, other_noise = sample.pose, sample.covariance
+        row = Window(one.columns(), track.pose, track.covariance, other_track, other_noise)
+        old = state.windows.get((robot, is_partial), NO_WINDOW)
         if is_redundant(old, row):
             return True
-        window = state.windows[robot] = with_row(old, row, self._window_ns)
-        if at.stamp_ns < state.next_window_ns[robot]:
+        if other != NOBODY and not is_partial:
+            # so that how it erred until now is shared by all that are located by it
+            reached = Preintegrated(now_ns, sample.covariance[0], sample.jacobian[0])
+            predict(state.arrays(), other, reached, new_scratch())
+        most = _MAX_PARTIAL if is_partial else _MAX_SIGHTINGS
+        window = state.windows[robot, is_partial] = with_row(old, row, self._window_ns, most)
+        # try, though not at every measurement
+        waited_ns = now_ns - int(window.measured.stamp_ns[0])
+        is_early = not is_partial and (window.size < MIN_CONSTRAINTS or not waited_ns)
+        if is_early or now_ns < state.next_attempt_ns[robot, int(is_partial)]:
             return True
-        first_ns = int(window.measured.stamp_ns[0])
-        state.next_window_ns[robot] = at.stamp_ns + max(
-            _SHORTEST_WINDOW_PAUSE_NS, (at.stamp_ns - first_ns) // _WINDOW_PAUSE_SHARE
-        )
-        initial = locate(state, robot, window, at.covariance, self._heading_sigma[robot])
+        largest = self._heading_sigma[robot]
+        if is_partial:
+            pause_ns = max(_SHORTEST_WINDOW_PAUSE_NS, waited_ns // _WINDOW_PAUSE_SHARE)
+            initial = locate(state, robot, window, at.covariance, largest)
+        else:
+            pause_ns = min(_LONGEST_PAUSE_NS, waited_ns // _PAUSE_SHARE)
+            initial = align(constraints_of(window, robot, state.arrays()), at.covariance, largest)
         if initial is not None:
-            located(state, robot, initial, at, 0)
+            located(state, robot, initial, at, 0.0 if is_partial else CONFIRMED)
+        else:
+            state.next_attempt_ns[robot, int(is_partial)] = now_ns + pause_ns
         return True
 
     def _is_sure(self, robot: int, covariance: FloatArray) -> bool:
         """Whether a pose with a covariance (3, 3) may initialize the robot."""
         x, y, heading = np.sqrt(np.diag(covariance)).tolist()
         return bool(max(x, y) < POSITION_SIGMA and heading < self._heading_sigma[robot])
-
-    def _located(self, state: SwarmState, other: int, one: Measurements) -> OtherSide:
-        """The side of a measurement that is located, brought up to its stamp."""
-        landmark = max(int(one.landmark), int(one.mount))
-        if landmark >= 0:
-            moved = state.landmark[landmark].copy()
-            return OtherSide(NOBODY, landmark, moved, moved, np.zeros((3, 3)))
-        if other == NOBODY:
-            return THE_MAP
-        sample = self._tracks.at(np.array([other]), np.array([one.stamp_ns]))
-        at = Preintegrated(int(one.stamp_ns), sample.covariance[0], sample.jacobian[0])
-        # so that how it erred until now is shared by all that are located by it
-        predict(state.arrays(), other, at, new_scratch())
-        transform = state.transform[other].copy()
-        return OtherSide(other, -1, se2.compose(transform, sample.pose[0]), transform, at.covariance)
 
 
 def _fixed(one: Measurements, on_track: FloatArray) -> InitialPose:
@@ -371,5 +332,4 @@ class LocalFrame:
         state.origin = IN_MAP
         for other in np.flatnonzero(state.tracked).tolist():
             state.deinitialize(other, LossReason.FRAME, stamp_ns)
-        state.constraints.clear()
         state.windows.clear()

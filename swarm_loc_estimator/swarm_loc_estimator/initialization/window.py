@@ -23,7 +23,7 @@ from swarm_loc_estimator.filter.state import InitialPose, SwarmState
 
 
 class Window(NamedTuple):
-    """Measurements (k,) of one component of a waiting robot, with the tracks of both sides."""
+    """Measurements (k,) of a waiting robot, in order of time, with the tracks of both sides."""
 
     measured: Measurements  # (k,) between it and localized sides
     track: FloatArray  # (k, 3) pose on the track of the waiting robot
@@ -48,8 +48,8 @@ class Window(NamedTuple):
 
 NO_WINDOW = Window(NO_MEASUREMENTS, *(np.zeros((0, *shape)) for shape in ((3,), (3, 3), (3,), (3, 3))))
 
-_MAX_ROWS = 48
 _INDEPENDENT_NS = 100_000_000  # Measurements of one link within this time are redundant
+_LINK = ("observer", "target", "landmark", "reading")  # Equal for measurements between the same bodies
 _MIN_ROWS = 8
 _FIRST_ROWS = 16  # Number of rows from which the first fits are made
 _HEADINGS = 8
@@ -69,14 +69,14 @@ _APART_M, _APART_RAD = 0.1, 0.1
 _MIN_SPREAD_M = 1.0
 
 
-def with_row(window: Window, row: Window, window_ns: int) -> Window:
+def with_row(window: Window, row: Window, window_ns: int, most: int) -> Window:
     """Window (k,) and a newer row (1,), without those that are too old; of too many, the most redundant goes.
 
     It is the row that leaves the smallest gap between rows of its link, for its age.
     """
     stamp_ns, now_ns = window.measured.stamp_ns, int(row.measured.stamp_ns[0])
     out = window.some(stamp_ns >= now_ns - window_ns).with_newest(row)
-    if out.size <= _MAX_ROWS:
+    if out.size <= most:
         return out
     stamp_ns, link = out.measured.stamp_ns, links(out)
     least, gone = np.inf, 0
@@ -93,17 +93,15 @@ def with_row(window: Window, row: Window, window_ns: int) -> Window:
 
 def links(window: Window) -> IntArray:
     """Number of the link of each row (k,): equal for rows between the same bodies."""
-    one = window.measured
-    sides = np.stack([one.observer, one.target, one.landmark, one.reading])
+    sides = np.stack([getattr(window.measured, name) for name in _LINK])
     return np.unique(sides, axis=1, return_inverse=True)[1].reshape(-1)
 
 
 def is_redundant(window: Window, row: Window) -> bool:
-    """Whether the newest row of a link follows another one of the window (k,) too closely."""
-    both = window.with_newest(row)
-    link, stamp_ns = links(both), both.measured.stamp_ns
-    same = stamp_ns[:-1][link[:-1] == link[-1]]
-    return bool(same.size) and int(stamp_ns[-1] - same[-1]) < _INDEPENDENT_NS
+    """Whether a newer row (1,) follows another one of its link in the window (k,) too closely."""
+    same = [getattr(window.measured, name) == getattr(row.measured, name) for name in _LINK]
+    stamp_ns = window.measured.stamp_ns[np.logical_and.reduce(same)]
+    return bool(stamp_ns.size) and int(row.measured.stamp_ns[0] - stamp_ns[-1]) < _INDEPENDENT_NS
 
 
 class _Fit(NamedTuple):
@@ -295,11 +293,8 @@ class Problem:
 
     def covariance(self, initial: InitialPose) -> FloatArray:
         """Covariance (3, 3) of x, y and heading of the newest pose on the track."""
-        whole = initial.covariance.copy()
-        for column, share in zip(initial.columns.tolist(), initial.shares, strict=True):
-            whole += share @ self._shared[column] @ share.T
         pose = se2.compose(initial.transform, self._window.track[-1])
-        return se2.pose_covariance(pose, whole)
+        return se2.pose_covariance(pose, initial.whole_covariance(self._shared))
 
 
 def locate(

@@ -16,27 +16,17 @@ from swarm_loc_estimator.filter.measurements import NOBODY, Measurements
 from swarm_loc_estimator.filter.models import CARTESIAN, POLAR
 from swarm_loc_estimator.filter.state import BeliefArrays, InitialPose, SwarmState
 from swarm_loc_estimator.initialization import alignment, initializer
-from swarm_loc_estimator.initialization.alignment import (
-    CONSTRAINT_DTYPE,
-    NO_CONSTRAINTS,
-    THE_MAP,
-    ConstraintArray,
-    OtherSide,
-    Waiting,
-    refreshed,
-    with_constraint,
-)
+from swarm_loc_estimator.initialization.alignment import CONSTRAINT_DTYPE, ConstraintArray, constraints_of
+from swarm_loc_estimator.initialization.window import NO_WINDOW, Window, with_row
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.swarm.calibration_states import ParameterTable
+from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, ParameterTable
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot
 
 SEEDS = st.integers(0, 10**6)
 SIGMA, TURN_SIGMA = 0.01, 0.05
 NO_NOISE = np.zeros((3, 3))
 EXACT = np.zeros(2)
-LONG_NS = 3600 * SECOND
-ORIGIN = OtherSide(1, -1, np.zeros(3), np.zeros(3), NO_NOISE)  # Robot 1 at the origin
 
 
 def any_pose(rng: np.random.Generator) -> FloatArray:
@@ -77,36 +67,31 @@ def sighting(
 def test_a_constraint_lies_on_the_map_where_the_true_transform_puts_it(
     seed: int, sees: bool, model: int, yaw: float, stretch: float
 ) -> None:
-    rng, camera = np.random.default_rng(seed), np.array([yaw, stretch, 0.0])
+    rng, camera = np.random.default_rng(seed), np.array([yaw, stretch])
     one, robot = sighting(rng, sees, model, camera)
     transform = any_pose(rng)
     track = pose_of(np.linalg.inv(planar(transform)) @ planar(robot))
     one.has_second[:], one.second[:] = True, one.value + np.array([0.0, 0.0, 0.7])
-    waiting = Waiting(0, track, NO_NOISE)
-    (constraint,) = with_constraint(NO_CONSTRAINTS, one.row(0), camera, waiting, ORIGIN, LONG_NS)
+    (constraint,) = constraints_of(window_of(one, track), 0, belief_of(np.zeros(3), NO_NOISE, camera))
     place = planar(transform) @ [constraint["local_x"], constraint["local_y"], 1.0]
     np.testing.assert_allclose(place[:2], [constraint["map_x"], constraint["map_y"]], atol=1e-9)
     off = np.array([constraint["turn"], constraint["other_turn"]]) - transform[2]
     np.testing.assert_allclose(np.cos(off), [1.0, math.cos(0.7)], atol=1e-9)
-    assert (constraint["marker_id"], constraint["other"], constraint["landmark"]) == (0, 1, -1)
+    assert constraint["column"] == 3
 
 
 @pytest.mark.parametrize("sees", [True, False])
 @pytest.mark.parametrize("model", [CARTESIAN, POLAR])
 def test_a_constraint_is_as_unsure_as_sampled_sightings_and_located_robots(model: int, sees: bool) -> None:
     rng = np.random.default_rng(model + 2 * sees)
-    camera = np.array([0.1, 0.3, 0.0])
+    camera = np.array([0.1, 0.3])
     one, robot = sighting(rng, sees, model, camera)
     spread = np.diag([1e-4, 2e-4, 3e-4])
     samples, value = [], one.value.copy()
     for _ in range(1500):
         one.value[:] = value + rng.multivariate_normal(np.zeros(3), one.covariance[0])
         base = rng.multivariate_normal(np.zeros(3), spread)
-        other = OtherSide(1, -1, base, base, NO_NOISE)
-        (constraint,) = refreshed(
-            with_constraint(NO_CONSTRAINTS, one.row(0), camera, Waiting(0, robot, NO_NOISE), other, LONG_NS),
-            belief_of(base, spread),
-        )
+        (constraint,) = constraints_of(window_of(one, robot), 0, belief_of(base, spread, camera))
         samples.append([constraint[name] for name in ("local_x", "local_y", "map_x", "map_y")])
     sampled = np.cov(np.array(samples).T)
     local, there = (
@@ -123,46 +108,47 @@ def test_a_constraint_is_as_unsure_as_sampled_sightings_and_located_robots(model
     np.testing.assert_allclose(there, sampled[2:, 2:], atol=tolerance)
 
 
-def belief_of(transform: FloatArray, spread: FloatArray) -> BeliefArrays:
-    """Of robots 0, which waits, and 1, which is believed to be at `transform` with an error like `spread`."""
+def window_of(
+    one: Measurements, track: FloatArray, other_track: FloatArray | None = None, other_noise: float = 0.0
+) -> Window:
+    """A single sighting from a pose on the track of robot 0, while robot 1 is at one on its own."""
+    there = np.zeros(3) if other_track is None else other_track
+    return Window(one, track[None], NO_NOISE[None], there[None], other_noise * np.eye(3)[None])
+
+
+def belief_of(transform: FloatArray, spread: FloatArray, camera: FloatArray = EXACT) -> BeliefArrays:
+    """Of robots 0, which waits, and 1, which is believed to be at `transform` with an error like `spread`.
+
+    Both believe that their cameras are turned and stretch distances.
+    """
     state = SwarmState(ParameterTable.of([Robot("a"), Robot("b")]))
+    state.parameter[:, CAMERA_YAW : CAMERA_YAW + 2] = camera
     state.initialize(1, InitialPose(transform, spread), Preintegrated.begin(T0))
     return state.arrays()
 
 
-def test_a_constraint_moves_with_what_is_believed_of_the_robot_on_the_other_side() -> None:
-    """As if that had been known when it was noted; its track since makes it less sure."""
+def test_a_constraint_is_less_sure_the_further_the_other_robot_has_driven_since() -> None:
+    """It is where the other robot is believed to be now."""
     rng = np.random.default_rng(3)
-    then, now, spread, drift = any_pose(rng), any_pose(rng), np.diag([1e-4, 2e-4, 3e-4]), 1e-4 * np.eye(3)
+    now, spread, track = any_pose(rng), np.diag([1e-4, 2e-4, 3e-4]), any_pose(rng)
     one, robot = sighting(rng, True, CARTESIAN, EXACT)
-    track = any_pose(rng)
-    constraints = [
-        refreshed(
-            with_constraint(
-                NO_CONSTRAINTS,
-                one.row(0),
-                EXACT,
-                Waiting(0, robot, NO_NOISE),
-                OtherSide(1, -1, se2.compose(transform, track), transform, noise),
-                LONG_NS,
-            ),
-            belief_of(now, spread),
-        )[0]
-        for transform, noise in ((then, NO_NOISE), (now, NO_NOISE), (then, drift))
-    ]
-    for name in ("local_x", "map_x", "map_y", "map_xx", "map_xy", "map_yy", "turn_variance"):
-        np.testing.assert_allclose(constraints[0][name], constraints[1][name], atol=1e-12)
-    assert math.cos(constraints[0]["turn"] - constraints[1]["turn"]) == pytest.approx(1.0)
-    assert constraints[2]["turn_variance"] == pytest.approx(constraints[0]["turn_variance"] + 1e-4)
-    assert constraints[2]["map_xx"] > constraints[0]["map_xx"] + 0.9e-4
-    np.testing.assert_array_equal(constraints[2]["shared"], spread)
+    (still,), (driven,) = (
+        constraints_of(window_of(one, robot, track, drift), 0, belief_of(now, spread))
+        for drift in (0.0, 1e-4)
+    )
+    for name in ("local_x", "map_x", "map_y", "turn"):
+        assert still[name] == driven[name]
+    place = planar(now) @ planar(track) @ [*one.marker[0, :2], 1.0]
+    np.testing.assert_allclose(place[:2], [still["map_x"], still["map_y"]], atol=1e-12)
+    assert driven["turn_variance"] == pytest.approx(still["turn_variance"] + 1e-4)
+    assert driven["map_xx"] > still["map_xx"] + 0.9e-4
+    np.testing.assert_array_equal(driven["shared"], spread)
 
 
 def test_constraints_of_a_robot_that_was_lost_do_not_count() -> None:
     one, robot = sighting(np.random.default_rng(0), True, CARTESIAN, EXACT)
-    waiting = Waiting(0, robot, NO_NOISE)
-    constraints = with_constraint(NO_CONSTRAINTS, one.row(0), EXACT, waiting, ORIGIN, LONG_NS)
-    assert refreshed(constraints, SwarmState(ParameterTable.of([Robot("a"), Robot("b")])).arrays()).size == 0
+    state = SwarmState(ParameterTable.of([Robot("a"), Robot("b")]))
+    assert constraints_of(window_of(one, robot), 0, state.arrays()).size == 0
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -212,14 +198,13 @@ def sight_of(
     return one.row(0)
 
 
-def constraints_of(
+def made_up(
     rng: np.random.Generator, transform: FloatArray, marks: FloatArray, headings: Sequence[float] = ()
 ) -> ConstraintArray:
-    """Noisy constraints (k,), .1 s apart, of marks (k, 2) in map; headings off by so much where given."""
+    """Noisy constraints (k,) of marks (k, 2) in map; headings off by so much where given."""
     constraints = np.zeros(len(marks), dtype=CONSTRAINT_DTYPE)
     local = (np.linalg.inv(planar(transform)) @ np.column_stack([marks, np.ones(len(marks))]).T)[:2]
     local += SIGMA * rng.standard_normal(local.shape)
-    constraints["stamp_ns"] = T0 + np.arange(len(marks)) * SECOND // 10
     constraints["local_x"], constraints["local_y"] = local
     constraints["map_x"], constraints["map_y"] = marks.T
     constraints["local_xx"] = constraints["local_yy"] = SIGMA**2
@@ -236,7 +221,7 @@ def test_the_fix_is_the_truth_also_among_wrong_constraints(seed: int, count: int
     rng = np.random.default_rng(seed)
     transform = any_pose(rng)
     angles = 2.0 * np.pi * (np.arange(count) * 0.381966) + rng.uniform(0, 6)
-    constraints = constraints_of(rng, transform, np.column_stack([np.cos(angles), np.sin(angles)]))
+    constraints = made_up(rng, transform, np.column_stack([np.cos(angles), np.sin(angles)]))
     bad = rng.permutation(count)[: int(wrong * count)]
     constraints["map_x"][bad] += rng.choice([-1.0, 1.0], bad.size) * rng.uniform(0.5, 2.0, bad.size)
     found = alignment.align(constraints, NO_NOISE)
@@ -249,7 +234,7 @@ def test_the_fix_is_the_truth_also_among_wrong_constraints(seed: int, count: int
 def test_odometry_that_comes_late_after_a_dropout_was_assumed_leaves_a_covariance(seed: int) -> None:
     rng = np.random.default_rng(seed)
     transform, swerve = any_pose(rng), rng.uniform(0.2, 0.8, 3)
-    constraints = constraints_of(rng, transform, rng.uniform(-1.0, 1.0, (12, 2)))
+    constraints = made_up(rng, transform, rng.uniform(-1.0, 1.0, (12, 2)))
     constraints["track_noise"][6:] = np.outer(swerve, swerve) + 1e-3 * np.eye(3)
     found = alignment.align(constraints, 1e-3 * np.eye(3))
     assert found is not None
@@ -269,7 +254,7 @@ def test_the_fix_moves_with_the_map(seed: int) -> None:
     rng = np.random.default_rng(seed)
     transform, moved = any_pose(rng), any_pose(rng)
     marks = rng.uniform(-1, 1, (8, 2))
-    constraints = constraints_of(rng, transform, marks, headings=[0.0] * 8)
+    constraints = made_up(rng, transform, marks, headings=[0.0] * 8)
     elsewhere = constraints.copy()
     elsewhere["map_x"], elsewhere["map_y"] = (planar(moved) @ np.column_stack([marks, np.ones(8)]).T)[:2]
     elsewhere["turn"] += moved[2]
@@ -283,37 +268,34 @@ def test_the_fix_moves_with_the_map(seed: int) -> None:
 def test_one_heading_against_two_of_one_marker_leaves_the_robot_waiting(seed: int) -> None:
     """Two mirrored headings without their second solutions; the points say nothing, as they are all one."""
     rng = np.random.default_rng(seed)
-    constraints = constraints_of(rng, any_pose(rng), np.tile([0.5, 0.3], (3, 1)), headings=[0.9, 0.0, 0.9])
+    constraints = made_up(rng, any_pose(rng), np.tile([0.5, 0.3], (3, 1)), headings=[0.9, 0.0, 0.9])
     assert alignment.align(constraints, NO_NOISE) is None
 
 
-def many_constraints(stamps_s: FloatArray, markers: Sequence[int], window_s: float) -> ConstraintArray:
+def kept_of(stamps_s: FloatArray, markers: Sequence[int], window_s: float) -> Measurements:
     """What is kept of sightings of all markers at each stamp."""
-    one, constraints = Measurements.empty(1), NO_CONSTRAINTS
-    one.observer[:], one.target[:], one.covariance[:] = 0, NOBODY, np.eye(3)
+    window = NO_WINDOW
     for seconds in stamps_s:
         for marker in markers:
-            one.stamp_ns[:], one.reading[:] = T0 + round(seconds * 1e9), marker
-            waiting = Waiting(0, np.zeros(3), NO_NOISE)
-            constraints = with_constraint(
-                constraints, one.row(0), EXACT, waiting, THE_MAP, round(window_s * 1e9)
-            )
-    return constraints
+            one = Measurements.empty(1)
+            one.observer[:], one.stamp_ns[:], one.reading[:] = 0, T0 + round(seconds * 1e9), marker
+            window = with_row(window, window_of(one, np.zeros(3)), round(window_s * 1e9), 20)
+    return window.measured
 
 
 @settings(max_examples=30)
 @given(seed=SEEDS, markers=st.integers(1, 6))
-def test_constraints_kept_are_few_and_spread_over_time_and_markers(seed: int, markers: int) -> None:
+def test_sightings_kept_are_few_and_spread_over_time_and_markers(seed: int, markers: int) -> None:
     steps = np.random.default_rng(seed).uniform(0.05, 0.2, 200)
     stamps_s = np.cumsum(steps)
-    constraints = many_constraints(stamps_s, range(markers), 15.0)
-    age_s = (constraints["stamp_ns"][-1] - constraints["stamp_ns"]) * 1e-9
+    kept = kept_of(stamps_s, range(markers), 15.0)
+    age_s = (kept.stamp_ns[-1] - kept.stamp_ns) * 1e-9
     last_20_s = stamps_s[-1] - stamps_s[-math.ceil(20 / markers)]
-    assert constraints.size == 20
-    assert (np.diff(constraints["stamp_ns"]) >= 0).all()
+    assert kept.size == 20
+    assert (np.diff(kept.stamp_ns) >= 0).all()
     assert age_s.max() <= 15.0
     for marker in range(markers):
-        of_marker = age_s[constraints["marker_id"] == marker]
+        of_marker = age_s[kept.reading == marker]
         assert of_marker.min() < 0.25
         assert of_marker.max() > 2.0 * last_20_s
     assert np.mean(age_s < 5.0) > 0.4  # a robot moved by hand meanwhile is soon outvoted
@@ -324,8 +306,9 @@ def test_attempts_become_rarer_but_never_stop(monkeypatch: pytest.MonkeyPatch) -
     tracks.extend(np.zeros(2, dtype=np.int64), np.array([T0, T0 + 20 * SECOND]), np.zeros((2, 3)))
     attempts: list[int] = []
     monkeypatch.setattr(
-        initializer, "align", lambda constraints, *_: attempts.append(int(constraints["stamp_ns"][-1]))
+        initializer, "constraints_of", lambda window, *_: attempts.append(int(window.measured.stamp_ns[-1]))
     )
+    monkeypatch.setattr(initializer, "align", lambda *_: None)
     state, waiting = SwarmState(ParameterTable.of(robots)), initializer.Initializer(tracks, 20.0)
     one = Measurements.empty(1)
     one.observer[:], one.target[:], one.covariance[:] = 0, NOBODY, np.eye(3)

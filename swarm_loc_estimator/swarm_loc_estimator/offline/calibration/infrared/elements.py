@@ -8,7 +8,8 @@ probability of any false alarm is p (Wald's sequential test). In any one geometr
 block all light of an element, so a geometry counts with a limited ratio, however often it was measured.
 
 Since the relative pose is unknown, likelihoods are sums over a grid of relative poses. Any reading may be
-blocked or too bright: its residual, after a variance-stabilizing transform, is limited.
+blocked or too bright, at the rates of the board: its residual, after a variance-stabilizing transform, is
+limited.
 
 For saturation and noise, neither poses nor curves are used, since a board's curves may be wrong.
 
@@ -50,7 +51,8 @@ _DIRECTIONS = 24  # Number of bearings, and of headings, of the grid
 _SAME_GEOMETRY = 3.0 * math.pi / _DIRECTIONS  # Maximum difference of directions within one geometry [rad]
 _SHOWN = 10.0  # Minimum of readings that determine the discretization error of the grid [sigma]
 _NOISE_RATIO = 1.2  # Maximum relative difference in noise of exchanges that share a table
-LIMIT = 3.0  # Residual from which readings count as outliers [sigma]
+_MIN_SHARE = 1e-3  # Minimum assumed share of outliers
+_BRIGHT_SPAN = 8.0  # Range of readings that are too bright, in widths of the density of one that is not
 _NEGLIGIBLE = 10.0  # Maximum log-likelihood ratio to the best pose; less likely poses are skipped
 
 Float32Array = NDArray[np.float32]
@@ -154,6 +156,8 @@ def _log_ratios(
     """
     poses, light, grid_variance = _grid(platform)
     log_prior = 2.0 * np.log(poses[:, 0])  # uniform over the plane
+    log_blocked = np.float32(math.log(max(platform.blocked_share, _MIN_SHARE)))
+    log_bright = np.float32(math.log(max(platform.bright_share, _MIN_SHARE) / _BRIGHT_SPAN))
     ratios, directions = np.empty((len(readings), 2, platform.n)), np.empty((len(readings), 2))
     relative = math.sqrt(platform.relative**2 + 2.0 * platform.element_sigma**2 + grid_variance)
     bright = np.nan_to_num(readings).max(axis=(1, 2))
@@ -170,23 +174,24 @@ def _log_ratios(
             stable, top = (
                 stabilized(value.astype(np.float32), sigma, relative) for value in (cut, saturation[k])
             )
-            each = _fits(stable, measured, np.minimum(working, top))
+            outlier = np.where(measured, np.maximum(log_blocked - 0.5 * stable**2, log_bright), 0.0)
+            each = _fits(stable, outlier, np.minimum(working, top))
             whole = log_prior + each.sum(axis=(0, 1))
             directions[k] = poses[whole.argmax(), 1:]
             # the same if one element is dead, at all poses that the other elements allow
             without = whole - np.stack([each.sum(axis=1), each.sum(axis=0)])
             likely = np.any(without > without.max(axis=2, keepdims=True) - _NEGLIGIBLE, axis=(0, 1))
-            dead = [_fits(stable, measured, np.minimum(table[..., likely], top)) for table in shaded]
+            dead = [_fits(stable, outlier, np.minimum(table[..., likely], top)) for table in shaded]
             logs = [without[..., likely] + np.stack([one.sum(axis=1), one.sum(axis=0)]) for one in dead]
             ratios[k] = logsumexp(np.concatenate(logs, axis=2), axis=2) - math.log(len(logs))
             ratios[k] -= logsumexp(whole)
     return ratios, directions
 
 
-def _fits(stable: Float32Array, measured: BoolArray, expected: Float32Array) -> Float32Array:
-    """Log likelihoods (n, n, g) of readings (n, n) at expectations (n, n, g), both stabilized and limited."""
-    off = np.minimum(np.abs(stable[..., None] - expected), LIMIT)
-    return np.where(measured[..., None], -0.5 * off * off, 0.0)
+def _fits(stable: FloatArray, outlier: FloatArray, expected: FloatArray) -> FloatArray:
+    """Log likelihoods (n, n, g) of stabilized readings at expectations, at least those of outliers (n, n)."""
+    fits: FloatArray = np.maximum(-0.5 * np.square(stable[..., None] - expected), outlier[..., None])
+    return fits
 
 
 def _grid(platform: IrPlatform) -> tuple[FloatArray, FloatArray, float]:

@@ -5,8 +5,9 @@ held-out exchanges is evaluated. They are accepted where it is higher than with 
 gains. Errors of the curves are correlated over time, so the sum over all robots must exceed its scatter over
 blocks. Single robots need only a positive sum, since some have few readings.
 
-The likelihood is that at the most likely pose, which depends on the gains, or at the known one. Any reading
-may be blocked or too bright: its residual, after a variance-stabilizing transform, is limited.
+The relative pose of an exchange is unknown or uncertain, so the likelihood is marginalized over the pose by
+importance sampling around the solutions with and without gains. All hypotheses on a pair's gains are compared
+at the same poses. Any reading may be blocked or too bright, with the cost `_OUTLIER`.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.infrared.brightness import expected_brightness
-from swarm_loc_estimator.infrared.gains import Exchanges, GainsError, GainsFit, estimate_gains
+from swarm_loc_estimator.infrared.gains import POSE_SIGMA, Exchanges, GainsError, GainsFit, estimate_gains
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
-from swarm_loc_estimator.infrared.search import DARKEST
+from swarm_loc_estimator.infrared.search import DARKEST, IrSolutions
 from swarm_loc_estimator.offline.calibration.infrared.elements import (
-    LIMIT,
     ElementVerdicts,
     ReadingLimits,
     contradictions,
@@ -49,6 +50,9 @@ GAINS, ALIKE, UNKNOWN = range(3)
 """Hypotheses on a robot's gains: the estimate; unit gains with the same uncertainty; unknown gains with the
 board's `element_sigma`."""
 HYPOTHESES = 3
+_POINTS = 48  # Number of poses sampled around each solution
+_SEED = 1
+_OUTLIER = 10.0  # Cost of a blocked or too bright reading
 
 
 def helpful_gains(
@@ -119,33 +123,67 @@ def held_out_likelihoods(
     sigmas = np.full((HYPOTHESES, len(gains)), platform.element_sigma)
     factors[:, GAINS] = np.swapaxes([(one.sensor, one.emitter) for one in gains], 0, 1)
     sigmas[[GAINS, ALIKE]] = [math.hypot(one.sigma, one.common_sigma) for one in gains]
-    # readings, their noise, and the log density of outliers
-    readings = np.minimum(exchanges.readings, exchanges.saturation[..., None, None])
-    brightest = np.nan_to_num(exchanges.readings).max(axis=(1, 2, 3), keepdims=True)
-    noise = np.hypot(platform.noise, platform.stray_noise * np.minimum(brightest, platform.saturation))
-    measured = readings >= DARKEST * noise  # False for NaN
-    readings = np.where(measured, readings, 0.0)
-    saturated = readings >= exchanges.saturation[..., None, None]
-    outlier = -0.5 * LIMIT**2 - np.log(np.hypot(noise, platform.relative * readings))
-    # likelihoods at the known or most likely pose
-    estimator, known = MaximumLikelihood(platform), np.isfinite(exchanges.poses[:, :1])
-    found = np.empty((len(readings), HYPOTHESES, HYPOTHESES))
-    for a, b in np.ndindex(HYPOTHESES, HYPOTHESES):
-        of_receiver, of_transmitter = sigmas[a, exchanges.receiver], sigmas[b, exchanges.transmitter]
-        zero = np.zeros_like(of_receiver)
-        pairs = PairGains(
-            factors[0, a, exchanges.receiver],
-            factors[1, b, exchanges.transmitter],
-            np.stack([of_receiver, zero, of_transmitter, zero], axis=1),
-        )
-        solved = estimator.solve(exchanges.readings, pairs, exchanges.saturation).poses
-        expected = expected_brightness(platform, np.where(known, exchanges.poses, solved), pairs)
-        relative = np.sqrt(platform.relative**2 + of_receiver**2 + of_transmitter**2)[:, None, None, None]
-        off = stabilized(readings, noise, relative) - stabilized(expected, noise, relative)
-        off = np.where(saturated, np.maximum(off, 0.0), off)
-        density = -0.5 * off**2 - np.log(np.hypot(noise, relative * readings))
-        found[:, a, b] = np.sum(np.where(measured, np.maximum(density, outlier), 0.0), axis=(1, 2, 3))
+    found = np.full((len(exchanges.receiver), HYPOTHESES, HYPOTHESES), np.nan)
+    for k, (poses, log_weights) in enumerate(_samples(platform, gains, exchanges)):
+        if not len(poses):
+            continue
+        # readings, their noise, and the log density of outliers per count, since scales depend on hypotheses
+        limits, brightest = exchanges.saturation[k, :, None, None], np.nan_to_num(exchanges.readings[k]).max()
+        noise = math.hypot(platform.noise, platform.stray_noise * min(brightest, platform.saturation))
+        measured = exchanges.readings[k] >= DARKEST * noise  # False for NaN
+        readings = np.where(measured, np.minimum(exchanges.readings[k], limits), 0.0)
+        outlier = -_OUTLIER - np.log(np.hypot(noise, platform.relative * readings))
+        light = expected_brightness(platform, poses)
+        one, other = exchanges.receiver[k], exchanges.transmitter[k]
+        for a, b in np.ndindex(HYPOTHESES, HYPOTHESES):
+            relative = math.sqrt(platform.relative**2 + sigmas[a, one] ** 2 + sigmas[b, other] ** 2)
+            expected = light * np.outer(factors[0, a, one], factors[1, b, other])
+            off = stabilized(readings, noise, relative) - stabilized(expected, noise, relative)
+            off = np.where(readings >= limits, np.maximum(off, 0.0), off)
+            density = np.maximum(-0.5 * off**2 - np.log(np.hypot(noise, relative * readings)), outlier)
+            logs = np.sum(density * measured, axis=(1, 2, 3))
+            found[k, a, b] = np.logaddexp.reduce(logs + log_weights)
     return found
+
+
+def _samples(
+    platform: IrPlatform, gains: tuple[IrGains, ...], exchanges: Exchanges
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Sampled poses (P, 3) of each exchange and log weights (P,); empty where the solver finds no pose."""
+    of_pair = [
+        [gains[robot] for robot in side.tolist()] for side in (exchanges.receiver, exchanges.transmitter)
+    ]
+    estimator, count = MaximumLikelihood(platform), len(exchanges.receiver)
+    solved = [
+        estimator.solve(exchanges.readings, one, exchanges.saturation)
+        for one in (platform.unknown_gains(count), PairGains.of(*of_pair))
+    ]
+    draws = np.random.default_rng(_SEED).standard_normal((2 * len(solved), _POINTS, 3))
+    known: BoolArray = np.isfinite(exchanges.poses[:, 0])
+    offsets = draws.reshape(-1, 3) * POSE_SIGMA
+    return [
+        (exchanges.poses[k] + offsets, np.zeros(len(offsets)))
+        if known[k]
+        else _about_found(solved, k, draws, platform.radius)
+        for k in range(count)
+    ]
+
+
+def _about_found(
+    solved: list[IrSolutions], k: int, draws: FloatArray, radius: float
+) -> tuple[FloatArray, FloatArray]:
+    """Samples around the solutions of exchange k, with a uniform prior over the plane."""
+    centres = np.array([pose[k] for one in solved for pose in (one.poses, one.alternatives)])
+    spreads = np.array([one.covariances[k] for one in solved for _ in range(2)])
+    there = np.isfinite(centres).all(axis=1)
+    centres, roots = centres[there], np.linalg.cholesky(spreads[there])
+    poses = (centres[:, None] + draws[there] @ np.swapaxes(roots, 1, 2)).reshape(-1, 3)
+    poses = poses[poses[:, 0] > 2.0 * radius]
+    apart = poses[:, None] - centres
+    apart[..., 1:] = wrap_angle(apart[..., 1:])
+    half = np.linalg.solve(roots, apart[..., None])[..., 0]
+    drawn = -0.5 * np.sum(half**2, axis=-1) - np.log(np.einsum("maa->ma", roots)).sum(axis=-1)
+    return poses, np.log(poses[:, 0]) - np.logaddexp.reduce(drawn, axis=1, initial=-np.inf)
 
 
 MIN_EXCHANGES = 20  # Minimum number of exchanges between robots with one kind of board
