@@ -20,8 +20,8 @@ from swarm_loc_drivers.sim.run import CAMERA_LATENESS, START_NS, arrival_ns
 from swarm_loc_estimator import FixRows, OdometryRows, Robot, Swarm
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.health import Health
-from swarm_loc_estimator.nodes.localizer_robots import SOURCES, BridgeParameters, LocalizedRobots
 from swarm_loc_estimator.offline.metrics import nees
+from swarm_loc_estimator.sensors.localizers import SOURCES, BridgeParameters, LocalizedRobots
 from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 

@@ -1,7 +1,12 @@
-"""Write a first description of a swarm from a few answers, and show how to start its graph.
+"""Write a first description of a swarm, from a few answers or from what it publishes.
 
     new                                                                       # asks on the terminal
     new epucks.yaml --yes --type epuck2 --robots 5 --arena 2.4x1.6            # asks nothing
+    new recording.mcap swarm.yaml                                             # from a bag
+    new --live swarm.yaml                                                     # from the running graph
+
+From a bag or the running graph it takes robots, topics, mounts, clocks, radios, maps and, where there is
+ground truth, starts and places. What must be written by hand stands in comments with "# ?".
 
 Options answer questions in advance; --yes takes the default for all others. Marker ids are given so that none
 appears twice. A JSON Schema is written to the same folder, with which editors complete it.
@@ -14,12 +19,21 @@ import shlex
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from swarm_loc_estimator.common.command_line import argument, command, number_in
+from swarm_loc_estimator.common.codec import Tree
+from swarm_loc_estimator.common.command_line import (
+    ProgressLine,
+    argument,
+    command,
+    is_description,
+    number_in,
+)
 from swarm_loc_estimator.common.files import write_whole
 from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.common.yaml_tree import write_tree
 from swarm_loc_estimator.swarm.new_swarm import FAMILY_IDS, KNOWN_ROBOTS, SENSORS, SwarmPlan, planned_swarm
 from swarm_loc_estimator.swarm.schema import schema_text
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -37,8 +51,10 @@ QUESTIONS = {
     "arena": "length along x and along y [m], such as 2.4x1.6",
     "pitch": "distance of landmarks along the walls [m]",
     "landmark-size": "side of the landmarks [m]",
+    "map": "the map's .yaml file, as of map_server",
 }
 _LENGTH = number_in(0.001, 10.0, "m")
+_LIVE_S = 10.0  # How long to listen
 
 
 class Dialog:
@@ -93,14 +109,18 @@ def asked_plan(dialog: Dialog) -> SwarmPlan:
     if name == "own" and known.odometry:
         wheels = dialog.answer("wheel-separation", f"{known.odometry.wheel_separation:g}", _LENGTH)
         plan = replace(plan, wheel_separation=wheels)
-    if {"robots", "landmarks", "aerial"} & set(sensors):
+    if {"robots", "landmarks", "aerial", "ceiling"} & set(sensors):
         plan = replace(plan, family=dialog.answer("family", plan.family, _one_of(FAMILY_IDS)))
-    if "robots" in sensors:
+    if {"robots", "ceiling"} & set(sensors):
         plan = replace(plan, size=dialog.answer("size", f"{known.marker_size:g}", _LENGTH))
+    if "map" in sensors:
+        plan = replace(plan, map=dialog.answer("map", plan.map, str))
+    if {"landmarks", "uwb", "ceiling"} & set(sensors):
+        usual_arena = "x".join(f"{length:g}" for length in plan.arena)
+        plan = replace(plan, arena=dialog.answer("arena", usual_arena, _arena))
     if "landmarks" in sensors:
         plan = replace(
             plan,
-            arena=dialog.answer("arena", "x".join(f"{length:g}" for length in plan.arena), _arena),
             pitch=dialog.answer("pitch", f"{plan.pitch:g}", number_in(0.01, 100.0, "m")),
             landmark_size=dialog.answer("landmark-size", f"{plan.landmark_size:g}", _LENGTH),
         )
@@ -115,9 +135,10 @@ def start_lines(plan: SwarmPlan, file: str) -> list[str]:
     robot, sensors, known = f"{plan.prefix}1", set(plan.sensors), plan.known
     sheets = f"{plan.prefix.rstrip('_')}_markers"
     sees = bool(sensors & {"robots", "landmarks"})
+    prints = sees or sensors & {"aerial", "ceiling"}
     lines = []
     # markers to print
-    if sees or "aerial" in sensors:
+    if prints:
         board = " --board 3x4" if "aerial" in sensors else ""
         lines.append(
             f"./run swarm_loc_vision print_markers {file} --family {plan.family}{board} --out {sheets}.pdf"
@@ -126,6 +147,7 @@ def start_lines(plan: SwarmPlan, file: str) -> list[str]:
     if known.driver:
         lines.append(f"./run swarm_loc_drivers {known.driver.format(robot=robot, file=file)}")
     needs = [] if known.driver or known.odometry is None else [("odom", "nav_msgs/Odometry")]
+    needs += [("scan", "sensor_msgs/LaserScan")] if sensors & {"lidar", "map"} else []
     needs += [("imu", "sensor_msgs/Imu")] if "imu" in sensors else []
     needs += [(f"{known.image}image_raw, camera_info", "calibrated images")] if sees else []
     lines += [f"# another node must publish {robot}/{topic}: {kind}" for topic, kind in needs]
@@ -137,11 +159,11 @@ def start_lines(plan: SwarmPlan, file: str) -> list[str]:
         lines.append(
             f"./run swarm_loc_vision marker_detector_node --ros-args -r __ns:=/{robot}{remapped} {described}"
         )
-    if "fix" in sensors:
-        lines.append(
-            f"./run swarm_loc_estimator localizer_bridge --ros-args -p swarm_file:={file} -p source:=pose"
-            "  # of vrpn_mocap; its page has others"
-        )
+    if sensors & {"fix", "mocap"}:
+        source = "" if "mocap" in sensors else " -p source:=pose  # of vrpn_mocap; its page has others"
+        lines.append(f"./run swarm_loc_estimator localizer_bridge --ros-args -p swarm_file:={file}{source}")
+    if "uwb" in sensors:
+        lines.append("# another node must publish uwb/FROM/TO/distance of each pair: sensor_msgs/Range")
     if "mapper" in sensors:
         tracker = f"-r __ns:=/{robot} -p calibration:={robot}.yaml"
         lines += [
@@ -154,12 +176,40 @@ def start_lines(plan: SwarmPlan, file: str) -> list[str]:
             f"# the lines with {robot} are needed for {plan.prefix}2 to {plan.prefix}{plan.robots}, too"
         )
     # what runs once for the swarm
+    for camera in ("ceiling1", "ceiling2") if "ceiling" in sensors else ():
+        described = f"-p family:={plan.family} -p swarm_file:={file} -p robot:={camera}"
+        lines.append(f"./run swarm_loc_vision marker_detector_node --ros-args -r __ns:=/{camera} {described}")
     if "aerial" in sensors:
         lines.append(
             "./run swarm_loc_vision aerial_camera_node --ros-args -r __ns:=/aerial"
             f" -p control_points_file:={sheets}_board.yaml  # its page says more, such as robot_height"
         )
-    return [*lines, f"./run swarm_loc_estimator graph {file} --watch"]
+    parameters = f" --params-file {parameter_file(file)}" if known.tf_per_robot else ""
+    return [*lines, f"./run swarm_loc_estimator graph {file} --watch{parameters}"]
+
+
+def parameter_file(file: str) -> str:
+    """The file of ROS parameters beside that of a description."""
+    return f"{file.removesuffix('.yaml')}_params.yaml"
+
+
+def launch_tree(plan: SwarmPlan, lines: Sequence[str], file: str) -> Tree:
+    """A launch file, as YAML, of the nodes that `lines` start, those on robots for each one."""
+    arguments = {"swarm_file": file, "watch": "true"}
+    if plan.known.tf_per_robot:
+        arguments["params_file"] = parameter_file(file)
+    given = [{"name": name, "value": value} for name, value in arguments.items()]
+    graph = "$(find-pkg-share swarm_loc_estimator)/launch/swarm.launch.py"
+    actions: list[Tree] = [{"include": {"file": graph, "arg": given}}]
+    first = f"{plan.prefix}1"
+    for line in lines:
+        package, executable, *rest = line.removeprefix("./run ").partition("  #")[0].split(maxsplit=2)
+        if line.startswith("#") or "--ros-args" not in line:
+            continue
+        for k in range(plan.robots if f"/{first}" in line else 1):
+            arguments_of = rest[0].replace(first, f"{plan.prefix}{k + 1}").removeprefix("--ros-args ")
+            actions.append({"node": {"pkg": package, "exec": executable, "ros_args": arguments_of}})
+    return {"launch": actions}
 
 
 def remarks(plan: SwarmPlan, swarm: Swarm) -> str:
@@ -173,8 +223,10 @@ def remarks(plan: SwarmPlan, swarm: Swarm) -> str:
             f"Markers are of the family {plan.family}. Measure where they and the cameras are, and write it"
             " below; a landmark whose place is not exact gets position_sigma and yaw_sigma."
         )
-    if not {"landmarks", "aerial", "fix", "mapper"} & set(plan.sensors):
+    if not {"landmarks", "aerial", "fix", "mapper", "map", "uwb", "ceiling", "mocap"} & set(plan.sensors):
         lines.append("Nothing here says where the robots are in map, unless one of them gets a start.")
+    if {"uwb", "ceiling"} & set(plan.sensors):
+        lines.append("? Places of anchors and ceiling cameras are guesses: measure them, or use survey.")
     if "fix" in plan.sensors:
         lines.append("fix: the sigmas are used for fixes without covariance.")
     lines.append(
@@ -183,27 +235,72 @@ def remarks(plan: SwarmPlan, swarm: Swarm) -> str:
     return "\n".join(part for line in lines for part in textwrap.wrap(line, 100))
 
 
+def proposed_from(bag: Path | None, seconds: float, dialog: Dialog, *, use_sim_time: bool) -> Any:
+    """The `Proposal` of what a bag tells, or of what the running graph tells in some seconds."""
+    doctor = "swarm_loc_estimator.doctor"
+    of_heard = import_module(f"{doctor}.proposal")  # needs packages that a plan does without
+    with ProgressLine() as progress:
+        if bag is None:
+            listen = import_module(f"{doctor}.listener").listen
+            is_wanted = of_heard.is_proposed_from
+            evidence = listen(Swarm(), seconds, progress, "", is_wanted, use_sim_time=use_sim_time)
+        else:
+            evidence = of_heard.heard_in(bag, progress)
+    known = _one_of(KNOWN_ROBOTS)
+    folder = None if bag is None else bag if bag.is_dir() else bag.parent
+    found = of_heard.proposed(evidence.topics, lambda likely: dialog.answer("type", likely, known), folder)
+    if dialog.unused:
+        raise UserError(f"--{dialog.unused[0]} has no meaning for a description of what was heard.")
+    return found
+
+
 @command(
     __doc__,
     argument(
-        "swarm_file", type=Path, nargs="?", default=Path("swarm.yaml"), help="file to write (swarm.yaml)"
+        "files", type=Path, nargs="*", metavar="FILE", help="a bag, if any, and a .yaml to write (swarm.yaml)"
     ),
+    argument("--live", action="store_true", help="describe what the running graph publishes"),
+    argument("--seconds", type=number_in(1.0, 3600.0, "s"), default=_LIVE_S, help="how long to listen to it"),
+    argument("--use-sim-time", action="store_true", help="take time from /clock"),
     argument("--yes", action="store_true", help="ask nothing; take defaults where no option is given"),
     *(argument(f"--{name}", help=question) for name, question in QUESTIONS.items()),
 )
 def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    path: Path = options.swarm_file
+    # files, and answers in advance
+    bags = [one for one in options.files if not is_description(one)]
+    paths = [one for one in options.files if is_description(one)] or [Path("swarm.yaml")]
+    if len(bags) > (not options.live) or len(paths) > 1:
+        raise UserError("new takes one bag at most, none with --live, and one .yaml file to write.")
+    bag, path = bags[0] if bags else None, paths[0]
     if path.exists():
         raise UserError(f"{path} exists and is not overwritten.")
     answers = {name: getattr(options, name.replace("-", "_")) for name in QUESTIONS}
     given = {name: answer for name, answer in answers.items() if answer is not None}
-    plan = asked_plan(Dialog(given, asks=not options.yes))
-    swarm = planned_swarm(plan)
+    dialog = Dialog(given, asks=not options.yes)
+    # from what was heard, or from answers
+    if bag or options.live:
+        found = proposed_from(bag, options.seconds, dialog, use_sim_time=options.use_sim_time)
+        swarm, asked = found.swarm, [f"? {one}" for one in found.asked]
+        said = [f"From {bag or 'the running graph'}.", *found.facts, *asked]
+        comment = "\n".join(part for line in said for part in textwrap.wrap(line, 100))
+        quoted = shlex.quote(str(path))
+        lines = [*asked, f"./run swarm_loc_estimator doctor {quoted}"]
+        if bag:
+            lines[-1:] = [f"./run swarm_loc_estimator replay {shlex.quote(str(bag))} --swarm {quoted}"]
+    else:
+        plan = asked_plan(dialog)
+        swarm = planned_swarm(plan)
+        comment, lines = remarks(plan, swarm), start_lines(plan, shlex.quote(str(path)))
+        write_tree(launch_tree(plan, lines, str(path)), path.with_suffix(".launch.yaml"))
+        if plan.known.tf_per_robot:
+            tree = {"/**/estimator": {"ros__parameters": {"tf_per_robot": True}}}
+            write_tree(tree, Path(parameter_file(str(path))))
+        lines.append(f"# all of this on one machine: ros2 launch {path.with_suffix('.launch.yaml')}")
     write_whole(path.parent / SCHEMA_FILE, schema_text())
-    save_swarm(swarm, path, remarks(plan, swarm))
-    print(f"{path} describes {len(swarm.robots)} robots and {len(swarm.landmarks)} landmarks. To start it:\n")
-    print("\n".join(start_lines(plan, shlex.quote(str(path)))))
+    save_swarm(swarm, path, comment)
+    print(f"{path} describes {len(swarm.robots)} robots and {len(swarm.landmarks)} landmarks.\n")
+    print("\n".join(lines))
     return 0
 
 
@@ -225,8 +322,9 @@ def _some_of(words: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
         chosen = tuple(dict.fromkeys(word.strip() for word in text.split(",")))
         if not set(chosen) <= set(words):
             raise argparse.ArgumentTypeError(f"'{text}' must be of {', '.join(words)}")
-        if {"mapper", "fix"} <= set(chosen):
-            raise argparse.ArgumentTypeError("mapper and fix publish on the same topic: choose one of them")
+        if len(same := {"mapper", "fix", "mocap"} & set(chosen)) > 1:
+            names = " and ".join(sorted(same, reverse=True))
+            raise argparse.ArgumentTypeError(f"{names} publish on the same topic: choose one of them")
         return chosen
 
     return read

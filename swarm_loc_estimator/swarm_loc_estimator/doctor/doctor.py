@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -22,7 +22,7 @@ from swarm_loc_estimator.doctor.contents import (
 )
 from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, Message
 from swarm_loc_estimator.doctor.topics import DIAGNOSTICS, check_clocks, check_frames, check_topics
-from swarm_loc_estimator.offline.recorded_bag import Progress, renamed_topics, same_type
+from swarm_loc_estimator.offline.recorded_bag import BagLocalizer, Progress, renamed_topics, same_type
 from swarm_loc_estimator.sensors.inputs import input_topics, kinds
 from swarm_loc_estimator.sensors.mounts import TF_STATIC, Mounts
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -44,7 +44,7 @@ def examine(evidence: Evidence) -> list[Finding]:
     Mounts are those of static transforms where the description says none. What the estimator contradicts
     often follows from the rest, so it is added only where nothing else is.
     """
-    mounts = _mounts(evidence)
+    mounts = mounts_of(evidence)
     evidence = replace(evidence, swarm=mounts.described())
     found = [
         Finding(
@@ -58,7 +58,7 @@ def examine(evidence: Evidence) -> list[Finding]:
     return found or [*check_estimate(evidence)]
 
 
-def _mounts(evidence: Evidence) -> Mounts:
+def mounts_of(evidence: Evidence) -> Mounts:
     """Mounts of sensors by static transforms."""
     mounts = Mounts(evidence.swarm)
     for name, heard in evidence.topics.items():
@@ -89,8 +89,11 @@ def evidence_of_bag(
     progress: Progress,
     remap: Mapping[str, str] = MappingProxyType({}),
     namespace: str = "",
+    is_wanted: Callable[[str], bool] | None = None,
 ) -> Evidence:
     """The first `seconds` of a bag; `remap` as in `renamed_topics`, `namespace` of the whole swarm or "".
+
+    Messages of types that `is_wanted` selects are kept; without it, those that a check looks at.
 
     Raises:
         BagError: Nothing in the bag can be read, or a topic cannot be mapped.
@@ -98,11 +101,16 @@ def evidence_of_bag(
     known = [topic.name for topic in input_topics(swarm)]
     messages: dict[str, list[Message]] = {}
     with BagReader(bag, renamed_topics(remap, swarm, known)) as reader:
-        types = {topic.name: topic.type for topic in reader.topics}
+        localizer = BagLocalizer(swarm, reader.topics)
+        types = {topic.name: topic.type for topic in (*reader.topics, *localizer.outputs.values())}
         end_ns = reader.time_range_ns[0] + round(seconds * 1e9)
-        for name, _, log_ns, data in reader.messages([n for n, kind in types.items() if is_looked_at(kind)]):
+        wanted = [name for name, kind in types.items() if (is_wanted or is_looked_at)(kind)]
+        for name, _, log_ns, data in reader.messages([*wanted, *localizer.topics]):
             if log_ns > end_ns:
                 break
+            of_robots = localizer.read(name, log_ns, data) if name in localizer.topics else ()
+            for topic, serialized in of_robots:
+                messages.setdefault(topic.name, []).append(Message(log_ns, serialized))
             keep(messages.setdefault(name, []), types[name], Message(log_ns, data))
             progress(min(1.0, reader.progress), "reading")
         prefix = f"{namespace.strip('/')}/"

@@ -3,24 +3,24 @@
     ./run swarm_loc_estimator localizer_bridge --ros-args -p swarm_file:=swarm.yaml -p source:=pose
 
 It subscribes to topics of the localiser, and publishes `<robot>/fix` or `<robot>/ground_truth`, and
-`/diagnostics`. Parameters: see `doc/motion_capture.md`.
+`/diagnostics`. Parameters that are not set are those of `localizer` in the description: see
+`doc/motion_capture.md`.
 """
 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of, listed
-from swarm_loc_estimator.common.messages.poses import encode_fix, encode_pose_stamped
 from swarm_loc_estimator.common.node import ConfiguredNode, message_class, run_node
-from swarm_loc_estimator.nodes.localizer_robots import BODY, SOURCES, BridgeParameters, LocalizedRobots
+from swarm_loc_estimator.sensors.localizers import BODY, SOURCES, BridgeParameters, LocalizedRobots
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 _INPUT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
@@ -33,8 +33,11 @@ class LocalizerBridge(ConfiguredNode[BridgeParameters]):
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("localizer_bridge", BridgeParameters, **node_arguments)
-        parameters = self.params
-        swarm = load_swarm(Path(parameters.swarm_file))
+        swarm = load_swarm(Path(self.params.swarm_file))
+        described = vars(swarm.localizer or BridgeParameters())
+        usual = vars(BridgeParameters())
+        unset = {name: value for name, value in described.items() if vars(self.params)[name] == usual[name]}
+        parameters = self.params = replace(self.params, **{**unset, "swarm_file": self.params.swarm_file})
         self._source = SOURCES[parameters.source]
         self._robots = LocalizedRobots(parameters, list(swarm.index_of), self.health)
         self._counts, self._trouble = (0, 0), ""
@@ -53,14 +56,8 @@ class LocalizerBridge(ConfiguredNode[BridgeParameters]):
     def _on_message(self, topic: str, body: str, message: Any) -> None:
         self.health.received(topic)
         arrival_ns = self.get_clock().now().nanoseconds
-        for pose in self._robots.convert(self._source.bodies(message), body, arrival_ns):
-            if self.params.output == "fix":
-                data = encode_fix(self.params.map_frame, pose.stamp_ns, pose.pose, pose.covariance)
-            else:
-                (data,) = encode_pose_stamped(
-                    self.params.map_frame, np.array([pose.stamp_ns]), pose.pose[None]
-                )
-            self._outputs[pose.robot].publish(data)
+        for robot, data in self._robots.serialized(message, body, arrival_ns):
+            self._outputs[robot].publish(data)
 
     def _on_diagnostics(self) -> None:
         robots, missing = self._robots, self._missing()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import MappingProxyType
@@ -16,7 +16,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.reader import BagError, BagReader, BagTopic
-from swarm_loc_estimator.common.health import listed
+from swarm_loc_estimator.common.health import Health, listed
 from swarm_loc_estimator.common.messages.cdr import (
     ODOMETRY,
     POSE_STAMPED,
@@ -34,12 +34,13 @@ from swarm_loc_estimator.common.messages.poses import (
     decode_pose_stamped,
     yaw_of,
 )
-from swarm_loc_estimator.common.messages.streams import MessageBatch, PoseReader
+from swarm_loc_estimator.common.messages.streams import MessageBatch, PoseReader, SerializedMessage, merged
 from swarm_loc_estimator.common.parameters import UserError, number, number_specs
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.offline.result import RecordedMap, Spool
-from swarm_loc_estimator.sensors.inputs import Batch, Ingest, kinds
+from swarm_loc_estimator.sensors.inputs import TRUTH, Batch, Ingest, kinds
+from swarm_loc_estimator.sensors.localizers import SOURCES, LocalizedRobots
 from swarm_loc_estimator.sensors.mounts import TF_STATIC, Mounts
 from swarm_loc_estimator.swarm.swarm import Swarm
 
@@ -62,7 +63,63 @@ _READ: Mapping[str, tuple[Callable[[bytes], PoseMessage], int]] = {
 
 def truth_topics(swarm: Swarm) -> list[str]:
     """The topic of the ground truth of each robot."""
-    return [f"{robot.name}/ground_truth" for robot in swarm.robots]
+    return [swarm.topic(robot.name, TRUTH) for robot in swarm.robots]
+
+
+class BagLocalizer:
+    """Turns messages of the localizer of a swarm into fixes or ground truth, as `localizer_bridge` does live.
+
+    Args:
+        swarm: Describes the localizer, or none.
+        recorded: Topics of the bag.
+
+    Attributes:
+        topics: Topics of the localizer that are recorded.
+        outputs: Topics of the robots that it locates.
+    """
+
+    def __init__(self, swarm: Swarm, recorded: Iterable[BagTopic]) -> None:
+        self.topics: list[str] = []
+        self.outputs: dict[str, BagTopic] = {}
+        self._health = Health(lambda _: None)
+        if (localizer := swarm.localizer) is None:
+            return
+        self._robots = LocalizedRobots(localizer, [*swarm.index_of], self._health)
+        self._type = SOURCES[localizer.source].message_type
+        self._body_of = {topic.lstrip("/"): body for topic, body in self._robots.topics.items()}
+        types = {topic.name: topic.type for topic in recorded}
+        self.topics = [name for name in self._body_of if same_type(types.get(name, ""), self._type)]
+        kind = POSE_WITH_COVARIANCE if localizer.output == "fix" else POSE_STAMPED
+        names = {robot: swarm.topic(robot, localizer.output) for robot in self._robots.robot_of.values()}
+        self.outputs = {robot: BagTopic(name, kind) for robot, name in names.items()}
+
+    def read(self, topic: str, log_ns: int, data: bytes) -> Iterator[tuple[BagTopic, bytes]]:
+        """The messages in place of one of the localizer."""
+        try:
+            message = decode(data, self._type)
+        except CdrError:
+            self._health.drop("malformed")
+            return
+        for robot, serialized in self._robots.serialized(message, self._body_of[topic], log_ns):
+            yield self.outputs[robot], serialized
+
+    def converted(self, batch: MessageBatch, names: Sequence[str]) -> MessageBatch:
+        """Messages of topics by their numbers in `names`, with those in place of the localizer's."""
+        number_of = {name: number for number, name in enumerate(names)}
+        of_localizer = np.isin(batch.topic, [number_of[name] for name in self.topics])
+        if not of_localizer.any():
+            return batch
+        made = [
+            SerializedMessage(number_of[topic.name], serialized, log_ns)
+            for number, log_ns, data in batch.chosen(of_localizer).messages()
+            for topic, serialized in self.read(names[number], log_ns, data)
+        ]
+        return merged([batch.chosen(~of_localizer), *([MessageBatch.of(made)] if made else [])])
+
+    def remarks(self) -> tuple[str, ...]:
+        """Sentences for the user."""
+        said = [f"{count} {reason}" for reason, count in sorted(self._health.drops.items())]
+        return (f"Dropped messages of the localizer: {', '.join(said)}.",) if said else ()
 
 
 class TruthReader:
@@ -217,12 +274,15 @@ def read_bag(
     network = Network(loss, [*ingest.handle_of])
     known = [*ingest.handle_of, *truth_topics(swarm), *maps.topics]
     with BagReader(bag, renamed_topics(remap, swarm, known)) as reader:
-        truth = TruthReader(swarm, reader.topics)
+        localizer = BagLocalizer(swarm, reader.topics)
+        truth = TruthReader(swarm, [*reader.topics, *localizer.outputs.values()])
         first_truth = len(ingest.topics)
         first_map = first_truth + len(truth.topics)
         range_ns = reader.time_range_ns
         foreign = _foreign(reader.topics, ingest)
-        for batch in reader.batches(["" if name in foreign else name for name in known]):
+        names = ["" if name in foreign else name for name in known] + localizer.topics
+        for recorded in reader.batches(names):
+            batch = localizer.converted(recorded, [*known, *localizer.topics])
             for inputs in ingest.read(network.passed(batch.chosen(batch.topic < first_truth))):
                 take(inputs)
             truth.add(_from(batch.chosen(batch.topic < first_map), first_truth))
@@ -236,7 +296,8 @@ def read_bag(
         )
         if network.lost:
             found = (f"{network.lost} messages were dropped at random: {loss.share:g} of all.", *found)
-        remarks = (*reader.losses, *found, *clocks, *truth.remarks(), *maps.remarks())
+        remarks = (*reader.losses, *found, *clocks, *localizer.remarks())
+        remarks += (*truth.remarks(), *maps.remarks())
         unusable = () if any(one.received > one.malformed for one in ingest.statistics) else unusable
         tracks, shown = truth.tracks(), (maps.maps(), maps.goals())
         return BagSummary(range_ns, tracks, ingest.received(), remarks, unusable, *shown)

@@ -18,6 +18,7 @@ from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.detections import swarm_key
 from swarm_loc_estimator.common.messages.streams import MessageBatch
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.filter.measurements import Measurements, select
 from swarm_loc_estimator.filter.models import MODELS, MeasurementModel
 from swarm_loc_estimator.filter.models import register as register_model
@@ -83,6 +84,7 @@ def register(sensor: type[Sensor]) -> type[Sensor]:
     return sensor
 
 
+TRUTH = "ground_truth"  # Topic of the ground truth of a robot
 THE_SWARM = -1  # Robot index of topics about the whole swarm
 
 
@@ -105,9 +107,16 @@ class InputTopic:
 
 
 def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
-    """All possible input topics of a swarm: of each robot, of each fixed camera, then of the swarm."""
+    """All possible input topics of a swarm: of each robot, of each fixed camera, then of the swarm.
+
+    Raises:
+        UserError: `Swarm.topics` has a topic that is not read.
+    """
+    known = {kind.topic for kind in kinds().values() if kind.of_each} | {TRUTH}
+    if unknown := [key for key in swarm.topics if key.rpartition("/")[2] not in known]:
+        raise UserError(f"topics has {unknown[0]}, but topics of robots are {', '.join(sorted(known))}.")
     of_robots = (
-        InputTopic(f"{robot.name}/{kind.topic}", kind, index, kind.expected_of(robot))
+        InputTopic(swarm.topic(robot.name, kind.topic), kind, index, kind.expected_of(robot))
         for index, robot in enumerate(swarm.robots)
         for kind in kinds().values()
         if kind.of_each
@@ -117,7 +126,7 @@ def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
         and (swarm.map is not None or not kind.needs_map or robot.lidar.sees_robots)
     )
     of_cameras = (
-        InputTopic(f"{camera.name}/{kind.topic}", kind, index)
+        InputTopic(swarm.topic(camera.name, kind.topic), kind, index)
         for index, camera in enumerate(swarm.cameras, len(swarm.robots))
         for kind in kinds().values()
         if kind.of_cameras

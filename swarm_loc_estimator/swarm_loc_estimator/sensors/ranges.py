@@ -79,7 +79,7 @@ class _Devices(NamedTuple):
         return np.where(self.address[place] == address, place, 0)
 
 
-def _decode_pair(data: bytes) -> Any:
+def decode_pair(data: bytes) -> Any:
     """Decode a sensor_msgs/Range; before ROS 2 Iron it had no variance, which stands last."""
     try:
         message = decode(data, PAIR_TYPE)
@@ -131,7 +131,7 @@ class RangeSensor(Sensor):
             name=cls.PAIRS,
             topic="range_topic",
             message_type=PAIR_TYPE,
-            create_reader=lambda topics, _: EachReader(topics, _decode_pair),
+            create_reader=lambda topics, _: EachReader(topics, decode_pair),
             columns_of=_read_pairs,
             stands_for=cls.name,
             of_pairs=True,

@@ -11,12 +11,23 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from itertools import chain
+from pathlib import Path
 from types import MappingProxyType
 
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.swarm.error_models import FixModel, ImuModel, OdometryModel, RandomWalk
+from swarm_loc_estimator.swarm.error_models import FixModel, ImuModel, LidarModel, OdometryModel, RandomWalk
 from swarm_loc_estimator.swarm.ir_board import RobotIr, load_ir_platform
-from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Landmark, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import (
+    Anchor,
+    CameraMount,
+    Face,
+    FixedCamera,
+    Landmark,
+    Localizer,
+    Robot,
+    Swarm,
+    UwbDevice,
+)
 
 SENSORS = MappingProxyType(
     {
@@ -26,16 +37,24 @@ SENSORS = MappingProxyType(
         "fix": "poses from motion capture or another tracker, on <robot>/fix",
         "imu": "a gyroscope on each robot, on <robot>/imu",
         "infrared": "infrared boards",
+        "lidar": "a lidar on each robot, on <robot>/scan",
+        "map": "a map of map_server, in which lidars locate the robots",
+        "uwb": "radios on the robots and at four corners, sensor_msgs/Range on a topic for each pair",
+        "ceiling": "two cameras at the ceiling, which see a lying marker on each robot",
+        "mocap": "motion capture, which localizer_bridge converts to <robot>/fix",
         "mapper": "poses from mapper_node by lasers and event cameras",
     }
 )
 """What a swarm can be located by."""
-_CAMERAS = ("robots", "landmarks", "aerial", "fix")
+_CAMERAS = ("robots", "landmarks", "aerial", "fix", "ceiling", "mocap")
 _PENTAGON = MappingProxyType(
     {"front_left": 36.0, "left": 108.0, "back": 180.0, "right": -108.0, "front_right": -36.0}
 )
 _SQUARE = MappingProxyType({"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0})
 """Names and directions of markers [deg]."""
+
+
+_MOCAP = Localizer()
 
 
 @dataclass(frozen=True)
@@ -49,6 +68,11 @@ class KnownRobot:
     faces: tuple[Face, ...] = ()  # Usual markers on its body, with id 0
     imu: ImuModel = ImuModel()  # Error model of its gyroscope
     random_walk: RandomWalk = RandomWalk()  # Random walk without odometry
+    lidar: LidarModel = LidarModel()  # Its lidar, as far as its transforms do not say
+    lidar_frame: str = ""  # Frame of its scans; "": it has no lidar
+    fix: FixModel = FixModel(position_sigma=0.002, heading_sigma=0.01)  # Of fixes without covariance
+    localizer: Localizer = _MOCAP  # How motion capture is usually published for it
+    tf_per_robot: bool = False  # Whether it publishes transforms on <robot>/tf, in frames without its name
     image: str = ""  # Namespace of its images below its own
     # Executable of swarm_loc_drivers and its arguments, of {robot} and {file}; "": others drive it
     driver: str = ""
@@ -82,7 +106,9 @@ def _ring(places: Mapping[str, float], radius: float, height: float, size: float
     )
 
 
-_GYROSCOPE = ImuModel(turn_noise_density=5e-4, turn_bias_sigma=0.01)
+_DRIVEN = OdometryModel(distance_scale_sigma=0.05, turn_scale_sigma=0.05)
+LIDAR = LidarModel(range_sigma=0.01)
+GYROSCOPE = ImuModel(turn_noise_density=5e-4, turn_bias_sigma=0.01)
 _MEMS = "imu: three times the noise density of an MPU-9250 (0.01 deg/s/Hz^0.5, data sheet PS-MPU-9250A)."
 _EPUCK_DRIVER = "epuck_driver_node --ros-args -r __ns:=/{robot}"
 _EPUCK_CAMERA = CameraMount(x=0.03, z=0.08)
@@ -123,7 +149,7 @@ KNOWN_ROBOTS = MappingProxyType(
             (*_CAMERAS, "imu"),
             camera=_EPUCK_CAMERA,
             faces=_EPUCK_FACES,
-            imu=_GYROSCOPE,
+            imu=GYROSCOPE,
             driver=f"{_EPUCK_DRIVER} -p address:=tcp://192.168.1.1 -p model:=epuck2",
             sources=f"{_EPUCK_SOURCES} {_MEMS}",
         ),
@@ -132,7 +158,7 @@ KNOWN_ROBOTS = MappingProxyType(
             (*_CAMERAS, "imu"),
             camera=_EPUCK_CAMERA,
             faces=_EPUCK_FACES,
-            imu=_GYROSCOPE,
+            imu=GYROSCOPE,
             sources=f"wheels: those of the e-puck below the Pi-puck board. {_EPUCK_SOURCES} {_MEMS}",
         ),
         "pushbot": KnownRobot(
@@ -151,27 +177,51 @@ KNOWN_ROBOTS = MappingProxyType(
         ),
         "turtlebot3": KnownRobot(
             "TurtleBot 3 Burger",
-            (*_CAMERAS, "imu"),
-            OdometryModel(wheel_separation=0.160),
+            (*_CAMERAS, "imu", "lidar", "map", "uwb"),
+            replace(_DRIVEN, wheel_separation=0.160),
             CameraMount(x=0.05, z=0.1),
             _ring(_SQUARE, 0.09, 0.1, 0.08),
-            _GYROSCOPE,
+            GYROSCOPE,
+            lidar=replace(LIDAR, range_sigma=0.02, max_range=3.5),
+            lidar_frame="base_scan",
+            tf_per_robot=True,
             sources=(
-                f"wheel_separation: burger.yaml of ROBOTIS-GIT/turtlebot3. camera and faces: guesses. {_MEMS}"
+                "wheel_separation: burger.yaml of ROBOTIS-GIT/turtlebot3. camera and faces: guesses. lidar:"
+                f" data sheet of the LDS-01. scales: as of real TurtleBot 4s. {_MEMS}"
             ),
         ),
         "turtlebot4": KnownRobot(
             "TurtleBot 4",
-            (*_CAMERAS, "imu"),
-            OdometryModel(wheel_separation=0.233),
+            (*_CAMERAS, "imu", "lidar", "map", "uwb"),
+            replace(_DRIVEN, wheel_separation=0.233),
             CameraMount(x=-0.06, z=0.186),
             _ring(_SQUARE, 0.17, 0.1, 0.1),
-            _GYROSCOPE,
+            GYROSCOPE,
+            lidar=LIDAR,
+            lidar_frame="rplidar_link",
+            tf_per_robot=True,
             image="oakd/rgb/preview/",
             sources=(
                 "wheel_separation: Create 3 of iRobotEducation/create3_sim. camera: turtlebot4.urdf.xacro of"
-                f" turtlebot/turtlebot4. faces: guesses at the rim of the base. {_MEMS}"
+                " turtlebot/turtlebot4. faces: guesses at the rim of the base. scales: real ones drove up to"
+                f" a tenth less than they said (TIERS/uwb-cooperative-mrs-localization). {_MEMS}"
             ),
+        ),
+        "dotbot": KnownRobot(
+            "DotBot",
+            ("fix",),
+            None,
+            random_walk=RandomWalk(position=0.01, heading=1.0),
+            fix=FixModel(position_sigma=0.01, heading_sigma=0.1),
+            sources="random_walk and fix: guesses for 10 cm/s and its Lighthouse.",
+        ),
+        "crazyflie": KnownRobot(
+            "Crazyflie at one height",
+            ("mocap", "fix"),
+            None,
+            random_walk=RandomWalk(position=0.25, heading=0.3),
+            localizer=Localizer("named_poses"),
+            sources="random_walk: a guess for 0.5 m/s. localizer: topic /poses of Crazyswarm2.",
         ),
         "kilobot": KnownRobot(
             "Kilobot below a tracker",
@@ -185,7 +235,7 @@ KNOWN_ROBOTS = MappingProxyType(
             (*_CAMERAS, "imu"),
             camera=CameraMount(x=0.05, z=0.1),
             faces=_ring(_SQUARE, 0.05, 0.1, 0.05),
-            imu=_GYROSCOPE,
+            imu=GYROSCOPE,
             sources=f"All numbers but wheel_separation are guesses. {_MEMS}",
         ),
     }
@@ -208,7 +258,11 @@ FAMILY_IDS = MappingProxyType(
 )
 """Families of markers that the detector has -> number of their ids."""
 _FIRST_BOARD = 0x1001
-_TRACKED = FixModel(position_sigma=0.002, heading_sigma=0.01)
+_TOP = Face("top", 0, yaw=0.0, lies=True)
+_CEILING = (
+    FixedCamera("ceiling1", -0.5, 0.0, 2.5, position_sigma=0.05, yaw_sigma=0.05),
+    FixedCamera("ceiling2", 0.5, 0.0, 2.5, position_sigma=0.05, yaw_sigma=0.05),
+)
 _MAPPED = FixModel(systematic_share=1.0)
 
 
@@ -230,6 +284,7 @@ class SwarmPlan:
     arena: tuple[float, float] = (2.4, 1.6)  # Length along x and along y; the middle is the origin of map
     pitch: float = 0.4  # Distance of the landmarks along the walls
     landmark_size: float = 0.05  # Side of the landmarks
+    map: str = "map.yaml"  # File of map_server
 
     @property
     def known(self) -> KnownRobot:
@@ -247,6 +302,8 @@ def planned_swarm(plan: SwarmPlan) -> Swarm:
     # places and ids of all markers
     places = list(_wall_places(plan)) if "landmarks" in sensors else []
     faces = known.faces if "robots" in sensors else ()
+    if "ceiling" in sensors:
+        faces = (*faces, replace(_TOP, z=known.camera.z))
     face_ids, landmark_ids = _ids(plan, len(faces), len(places))
     # what all robots have in common
     board = load_ir_platform("droplet") if "infrared" in known.sensors else None
@@ -260,20 +317,33 @@ def planned_swarm(plan: SwarmPlan) -> Swarm:
         stands=odometry is None,
         random_walk=known.random_walk,
         camera=known.camera if {"robots", "landmarks"} & set(sensors) else None,
+        lidar=known.lidar if {"lidar", "map"} & set(sensors) else LidarModel(),
         imu=known.imu if "imu" in sensors else ImuModel(),
-        fix=_MAPPED if "mapper" in sensors else _TRACKED if "fix" in sensors else FixModel(),
+        fix=_MAPPED if "mapper" in sensors else known.fix if "fix" in sensors else FixModel(),
+        uwb=UwbDevice(1) if "uwb" in sensors else None,
     )
     # the robots with their own ids, and the landmarks along the walls
     robots, ids = [], iter(face_ids)
     for k in range(plan.robots):
         own = tuple(replace(face, id=next(ids), size=size) for face in faces)
         ir = None if board is None else RobotIr(_FIRST_BOARD + k, board, "droplet")
-        robots.append(replace(common, name=f"{plan.prefix}{k + 1}", faces=own, ir=ir))
+        uwb = replace(common.uwb, address=k + 1) if common.uwb else None
+        robots.append(replace(common, name=f"{plan.prefix}{k + 1}", faces=own, ir=ir, uwb=uwb))
     landmarks = tuple(
         Landmark(marker_id, *place, size=plan.landmark_size)
         for marker_id, place in zip(landmark_ids, places, strict=True)
     )
-    return Swarm(tuple(robots), landmarks)
+    x, y = (0.5 * length for length in plan.arena)
+    corners = [(x, y), (-x, y), (-x, -y), (x, -y)] if "uwb" in sensors else []
+    return Swarm(
+        tuple(robots),
+        landmarks,
+        tuple(replace(one, x=one.x * x) for one in _CEILING) if "ceiling" in sensors else (),
+        tuple(Anchor(plan.robots + k, *corner, z=2.0) for k, corner in enumerate(corners, 1)),
+        Path(plan.map).absolute() if "map" in sensors else None,
+        "uwb/{from}/{to}/distance" if "uwb" in sensors else "",
+        localizer=known.localizer if "mocap" in sensors else None,
+    )
 
 
 def _ids(plan: SwarmPlan, faces: int, landmarks: int) -> tuple[list[int], list[int]]:

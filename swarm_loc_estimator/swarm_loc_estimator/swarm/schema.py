@@ -6,8 +6,9 @@ import json
 from collections.abc import Iterable
 
 from swarm_loc_estimator.common.codec import Schema, entry_specs, properties
+from swarm_loc_estimator.common.parameters import parameter_specs
 from swarm_loc_estimator.swarm.error_models import MotionResponse
-from swarm_loc_estimator.swarm.swarm import Anchor, Face, FixedCamera, Landmark
+from swarm_loc_estimator.swarm.swarm import Anchor, Face, FixedCamera, Landmark, Localizer
 from swarm_loc_estimator.swarm.swarm_file import (
     FILE_VERSION,
     LANDMARK_DEFAULTS,
@@ -84,6 +85,8 @@ def swarm_schema() -> Schema:
             "cameras": {**_section("fixed cameras", named={_PATTERN: camera}), "propertyNames": free_names},
             "anchors": {"type": ["array", "null"], "items": anchor, "description": "fixed radios"},
             "range_topic": {"type": ["string", "null"], "description": "topic of the ranges of two radios"},
+            "topics": {"type": ["object", "null"], "additionalProperties": {"type": "string"}},
+            "localizer": _section("motion capture or another localizer", _localizer()),
             "map": {"type": ["string", "null"], "minLength": 1, "description": "map's .yaml; null: none"},
         },
         "definitions": _definitions(),
@@ -105,6 +108,13 @@ def _definitions() -> Schema:
         "faces": {**faces, "propertyNames": {"maxLength": MAX_NAME}},
         **{name: _section(said, _of_class(SECTIONS[name], OWN)) for name, said in _SAID.items()},
     }
+
+
+def _localizer() -> Schema:
+    """The keys of a localizer, which are checked when they are read."""
+    types = {str: "string", bool: "boolean", float: "number", tuple: "array"}
+    specs = parameter_specs(Localizer)
+    return {one.name: {"type": types[type(one.default)], "description": one.doc} for one in specs}
 
 
 def _section(

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from swarm_loc_estimator.common.codec import EntrySpec, address, entry, entry_specs, switch
-from swarm_loc_estimator.common.parameters import number
+from swarm_loc_estimator.common.parameters import choice, flag, number, text, texts
 from swarm_loc_estimator.swarm.error_models import (
     TURN,
     ClockModel,
@@ -247,6 +247,51 @@ class MarkerOwner:
     marker: Face | Landmark  #: The face (in base_link) or the landmark (in map)
 
 
+LOCALIZERS = ("pose", "pose_with_covariance", "odometry", "tf", "named_poses", "rigid_bodies")
+"""Kinds of messages of localizers, see `sensors/localizers.py`."""
+
+
+@dataclass(frozen=True)
+class Localizer:
+    """Motion capture, AMCL or another localizer, and which of its bodies are robots."""
+
+    source: str = choice("pose", LOCALIZERS, "kind of messages, see the table of sources")
+    topic: str = text(
+        "",
+        "topic of the messages, with <body> in place of the body's name; empty: that of the table of sources",
+    )
+    output: str = choice(
+        "fix",
+        ("fix", "ground_truth"),
+        "<robot>/fix for the estimator, or <robot>/ground_truth to evaluate it",
+    )
+    bodies: tuple[str, ...] = texts(
+        "tracked bodies, such as cf1=epuck1, or epuck2 for a body with the robot's name;"
+        " empty: each robot has a body of its own name"
+    )
+    offsets: tuple[str, ...] = texts(
+        "poses of bodies in base_link, such as epuck1=0.01,0,1.5708 [m, m, rad];"
+        " the body of a robot not named here is at base_link"
+    )
+    source_frame: str = text("", "frame that the poses must be in; empty: map_frame or world")
+    map_frame: str = text("map", "frame of the published poses", required=True)
+    latency_s: float = number(
+        0.0, "s", 0.0, 2.0, "time from the exposure to the stamp of a message, subtracted from the stamp"
+    )
+    stamp_on_arrival: bool = flag(
+        False, "take the time of arrival in place of stamps, for a source with another clock or none"
+    )
+    position_sigma: float = number(
+        0.001, "m", 0.0, 10.0, "noise of x and of y, for poses without covariance", above=True
+    )
+    heading_sigma: float = number(
+        0.005, "rad", 0.0, 3.0, "noise of the heading, for poses without covariance", above=True
+    )
+    max_tilt: float = number(
+        0.35, "rad", 0.0, 3.1416, "largest angle between the z axes of a body and of the frame"
+    )
+
+
 class SwarmError(ValueError):
     """An inconsistent swarm."""
 
@@ -268,6 +313,9 @@ class Swarm:
     #: Topic of the `sensor_msgs/Range` of two radios, in which {from} and {to} stand for their addresses; "":
     #: ranges come on `<robot>/ranges`
     range_topic: str = ""
+    #: Expected topic, such as `robot1/odom` or `<robot>/odom` for all robots -> the topic in its place
+    topics: Mapping[str, str] = field(default_factory=dict)
+    localizer: Localizer | None = None  #: What tells the poses of robots from outside; None: nothing
     origin: tuple[float, float] = (0.0, 0.0)  #: Of all places in the frame of `map` and its file [m]
 
     def __post_init__(self) -> None:
@@ -300,6 +348,11 @@ class Swarm:
     def sources(self) -> tuple[Robot | FixedCamera, ...]:
         """All that have input topics, as these count them: robots, then fixed cameras."""
         return (*self.robots, *self.cameras)
+
+    def topic(self, source: str, topic: str) -> str:
+        """The topic in place of one of a robot or fixed camera, such as that of epuck1 in place of odom."""
+        named = self.topics.get(f"{source}/{topic}", self.topics.get(f"<robot>/{topic}", f"<robot>/{topic}"))
+        return named.replace("<robot>", source).lstrip("/")
 
     @cached_property
     def index_of(self) -> Mapping[str, int]:

@@ -22,7 +22,12 @@ from swarm_loc_estimator.common.codec import (
     nearest,
     to_tree,
 )
-from swarm_loc_estimator.common.parameters import UserError, number_specs
+from swarm_loc_estimator.common.parameters import (
+    ParameterError,
+    UserError,
+    number_specs,
+    parameter_specs,
+)
 from swarm_loc_estimator.common.yaml_tree import read_tree, write_tree
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import (
@@ -47,6 +52,7 @@ from swarm_loc_estimator.swarm.swarm import (
     Face,
     FixedCamera,
     Landmark,
+    Localizer,
     Robot,
     StartSigma,
     Swarm,
@@ -60,6 +66,7 @@ SCHEMA_COMMENT = f"yaml-language-server: $schema={SCHEMA_FILE}"
 
 _SECTIONS = (
     *("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors", "range_topic", "map"),
+    *("topics", "localizer"),
 )
 LAYER = (
     *("odometry", "imu", "lidar", "random_walk", "response", "camera", "sensor", "fix", "clock", "ir"),
@@ -88,6 +95,8 @@ MOUNT = ("x", "y", "z", "yaw", "pitch", "roll")  # Numbers that transforms tell 
 MAX_ID = 2**32 - 1
 NAME = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 RANGE_TOPIC = re.compile(r"/?(?:\w|\{from\}|\{to\})+(?:/(?:\w|\{from\}|\{to\})+)*")
+ROBOT = "<robot>"  # Stands for the name of each robot in a topic
+TOPIC = re.compile(r"/?(?:\w|<robot>)+(?:/(?:\w|<robot>)+)*")
 MAX_NAME = 64  # Maximum length of a robot name; DDS limits the length of topic names
 _RESERVED = (
     *("aerial", "clock", "diagnostics", "estimator", "map", "mapper", "odom", "parameter_events"),
@@ -184,6 +193,10 @@ class _Loader(TreeChecks):
             anchors=anchors,
             map=file,
             range_topic=(ranges or "").lstrip("/"),
+            topics=self._topics(
+                sections.get("topics"), [one.name for one in robots], [one.name for one in cameras]
+            ),
+            localizer=self._localizer(sections.get("localizer")),
         )
         states = ParameterTable.of(swarm.robots, swarm.surveyed).filter_size - 3 * len(robots)
         if states > MAX_PARAMETERS:
@@ -251,6 +264,31 @@ class _Loader(TreeChecks):
             for name, face in faces
         }
         return layer
+
+    def _topics(self, tree: Tree, robots: Collection[str], cameras: Collection[str]) -> dict[str, str]:
+        """Parse the topics in place of expected ones."""
+        topics: dict[str, str] = {}
+        for own, topic in self.mapping(tree, "topics").items():
+            key, (source, _, name) = f"topics.{own}", str(own).partition("/")
+            if source not in (ROBOT, *robots, *cameras) or not name:
+                raise self.said(f"{key} must begin with {ROBOT} or the name of a robot or camera, and /")
+            if not isinstance(topic, str) or not TOPIC.fullmatch(topic):
+                raise self.error(key, topic, f"must be a topic, in which {ROBOT} stands for each robot")
+            if topic in topics.values() or (len(robots) > 1 and source == ROBOT and ROBOT not in topic):
+                raise self.error(key, topic, "must be the topic of only one robot")
+            topics[own] = topic
+        return topics
+
+    def _localizer(self, tree: Tree) -> Localizer | None:
+        """Parse the localizer, whose keys are the parameters of `localizer_bridge`."""
+        specs = {spec.name: spec for spec in parameter_specs(Localizer)}
+        given = self.mapping(tree, "localizer", specs)
+        try:
+            values: Layer = {name: specs[name].checked(value) for name, value in given.items()}
+        except ParameterError as error:
+            said = str(error).removeprefix("parameter ").removesuffix(".")
+            raise self.said(f"localizer.{said}") from error
+        return Localizer(**values) if tree is not None else None
 
     def _response(self, tree: Tree, key: str) -> MotionResponse | None:
         """Parse a motion response or null; layers are not merged."""
@@ -404,9 +442,21 @@ def _tree(swarm: Swarm, folder: Path) -> Layer:
         "cameras": {one.name: to_tree(one, ("x", "y", "z")) for one in swarm.cameras},
         "anchors": [to_tree(one, PLACED) for one in swarm.anchors],
         "range_topic": swarm.range_topic,
+        "topics": dict(swarm.topics),
+        "localizer": _unusual(swarm.localizer),
         "map": None if swarm.map is None else relpath(swarm.map, folder),
     }
     return {key: value for key, value in tree.items() if value}
+
+
+def _unusual(localizer: Localizer | None) -> Layer:
+    """What is not as usual of a localizer."""
+    usual = vars(Localizer())
+    return {
+        name: list(value) if isinstance(value, tuple) else value
+        for name, value in (vars(localizer) if localizer else {}).items()
+        if value != usual[name] or name == "source"
+    }
 
 
 def _taken_out(names: Iterable[str], entries: list[Layer]) -> Layer:

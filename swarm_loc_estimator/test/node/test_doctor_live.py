@@ -14,7 +14,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 
 from swarm_loc_estimator.doctor.doctor import examine
 from swarm_loc_estimator.doctor.listener import Listener
+from swarm_loc_estimator.doctor.proposal import is_proposed_from, proposed
 from swarm_loc_estimator.offline.recorded_bag import unwatched
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_msgs.msg import MarkerDetectionArray
 
@@ -54,4 +56,32 @@ def test_a_live_graph_is_heard(ros: Ros, swarm_file: Path, namespace: str) -> No
         ("beta/odom", "has the type geometry_msgs/msg/PoseStamped, not nav_msgs/msg/Odometry"),
         ("beta/detections", "has no messages"),
         ("alpha/odom", "is published best effort, so lost messages are missing"),
+    ]
+
+
+def test_a_live_graph_is_described(ros: Ros) -> None:
+    """What `new --live` does: two robots, one with odometry of another name."""
+    names = {"alpha": "lab/alpha/odom", "beta": "lab/beta/odom"}
+    publishers = {one: ros.tester.create_publisher(Odometry, name, 10) for one, name in names.items()}
+    listener = Listener(Swarm(), "", is_proposed_from, use_sim_time=False)
+    stop = threading.Event()
+
+    def drive() -> None:
+        while not stop.wait(0.05):
+            for name, publisher in publishers.items():
+                publisher.publish(odometry_bytes(name, time.time_ns()))
+
+    driver = threading.Thread(target=drive)
+    driver.start()
+    try:
+        evidence = listener.listen(3.0, unwatched)
+    finally:
+        stop.set()
+        driver.join()
+        listener.destroy_node()
+    found = proposed(evidence.topics, lambda likely: likely)
+    assert [robot.name for robot in found.swarm.robots] == [*names]
+    assert found.swarm.topics == {"<robot>/odom": "lab/<robot>/odom"}
+    assert found.asked == [
+        "alpha, beta: each has an unknown start. Write start, or leave it to the estimator."
     ]

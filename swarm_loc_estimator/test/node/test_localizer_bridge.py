@@ -50,6 +50,20 @@ def header_of(message: Any, frame: str = "world") -> Any:
     return message
 
 
+def test_the_description_names_the_localizer(ros: Ros, swarm_file: Path, tmp_path: Path) -> None:
+    path = tmp_path / "swarm.yaml"
+    localizer = "localizer: {source: odometry, topic: <body>/mocap, bodies: [cf1=alpha], latency_s: 0.5}\n"
+    path.write_text(swarm_file.read_text(encoding="utf-8") + localizer)
+    bridged = Bridged(ros, path, latency_s=0.25)  # a parameter wins
+    fixes = ros.listen(PoseWithCovarianceStamped, "alpha/fix")
+    message = header_of(Odometry())
+    message.pose.pose.orientation.w = 1.0
+    publisher = ros.tester.create_publisher(Odometry, "cf1/mocap", RELIABLE)
+    ros.publish_until(publisher, message, fixes.__len__)
+    assert stamp_ns(fixes[0]) == T0_NS - 250_000_000
+    bridged.says("bridging")
+
+
 @pytest.mark.parametrize("qos", [qos_profile_sensor_data, RELIABLE])
 def test_a_topic_of_each_body_becomes_a_fix_of_its_robot(ros: Ros, swarm_file: Path, qos: QoSProfile) -> None:
     bridged = Bridged(ros, swarm_file, bodies=["cf1=alpha", "beta"], latency_s=0.5)

@@ -8,7 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from swarm_loc_estimator.cli.graph import check_graph
 from swarm_loc_estimator.cli.new import main
+from swarm_loc_estimator.common.launch import GraphOptions
+from swarm_loc_estimator.common.yaml_tree import read_tree
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.new_swarm import (
     FAMILY_IDS,
@@ -25,8 +28,9 @@ from swarm_loc_estimator.swarm.swarm_file import SCHEMA_FILE, load_swarm
 def sensor_sets(name: str) -> list[tuple[str, ...]]:
     """What robots of a type can be located by."""
     known = KNOWN_ROBOTS[name].sensors
-    sets = [some for count in range(1, len(known) + 1) for some in combinations(known, count)]
-    return [some for some in sets if not {"mapper", "fix"} <= set(some)]
+    sets = [some for count in (1, 2) for some in combinations(known, count)]
+    sets += [known[:k] + known[k + 1 :] for k in range(len(known))]
+    return [some for some in dict.fromkeys(sets) if some and len({"mapper", "fix", "mocap"} & set(some)) < 2]
 
 
 def answer(monkeypatch: pytest.MonkeyPatch, *answers: str) -> None:
@@ -45,14 +49,20 @@ def test_every_type_with_all_its_sensors_loads(tmp_path: Path, name: str) -> Non
         odometry = KNOWN_ROBOTS[name].odometry or OdometryModel()
         assert [robot.odometry for robot in swarm.robots] == [odometry] * 2
         assert len(swarm.landmarks) == (4 if "landmarks" in sensors else 0)
+        assert len(swarm.anchors) == (4 if "uwb" in sensors else 0)
+        assert [one.name for one in swarm.cameras] == ["ceiling1", "ceiling2"] * ("ceiling" in sensors)
+        assert (swarm.map is not None) == ("map" in sensors)
+        assert (swarm.localizer is not None) == ("mocap" in sensors)
         for robot in swarm.robots:
-            assert bool(robot.faces) == ("robots" in sensors)
+            assert bool(robot.faces) == bool({"robots", "ceiling"} & set(sensors))
+            assert robot.lidar.is_used == bool({"lidar", "map"} & set(sensors))
+            assert (robot.uwb is not None) == ("uwb" in sensors)
             assert (robot.camera is not None) == bool({"robots", "landmarks"} & set(sensors))
             assert robot.imu.is_used == ("imu" in sensors)
             assert (robot.fix.position_sigma > 0.0) == ("fix" in sensors)
             assert robot.fix.systematic_share == ("mapper" in sensors)
             assert (robot.ir is not None) == (name == "droplet")
-            assert robot.stands == robot.random_walk.moves == (name == "kilobot")
+            assert robot.stands == robot.random_walk.moves == (name in ("kilobot", "dotbot", "crazyflie"))
             assert {face.size for face in robot.faces} <= {KNOWN_ROBOTS[name].marker_size}
 
 
@@ -111,7 +121,7 @@ def test_wrong_answers_are_asked_again_with_those_that_are_allowed(
         "0 must be a number in [1, 5000].",
         "many must be a number in [1, 5000].",
         "'2 robots' must be at most 60 letters, digits and underscores and start with a letter.",
-        "'infrared' must be of robots, landmarks, aerial, fix.",
+        "'infrared' must be of robots, landmarks, aerial, fix, ceiling, mocap.",
         f"'qr' must be one of {', '.join(FAMILY_IDS)}.",
         "'wide' must be two lengths in [0.1, 1000] m, such as 2.4x1.6.",
         "'0.01x2' must be two lengths in [0.1, 1000] m, such as 2.4x1.6.",
@@ -126,7 +136,7 @@ def test_wrong_answers_are_asked_again_with_those_that_are_allowed(
     [
         (["--robots", "0"], "--robots: 0 must be a number in [1, 5000]."),
         (["--type", "tank"], "--type: 'tank' must be one of epuck,"),
-        (["--sensors", "imu"], "--sensors: 'imu' must be of robots, landmarks, aerial, fix."),
+        (["--sensors", "imu"], "--sensors: 'imu' must be of robots, landmarks, aerial, fix, ceiling, mocap."),
         (["--type", "pushbot", "--sensors", "mapper,fix"], "mapper and fix publish on the same topic"),
         (["--robots", "100", "--family", "aruco_mip_36h12"], "The swarm needs 520 markers, but"),
         (["--arena", "1x"], "--arena: '1x' must be two lengths"),
@@ -179,3 +189,28 @@ def test_ids_are_in_the_family_and_landmarks_above_all_others(family: str, robot
     if robots <= 9 and FAMILY_IDS[family] >= 250:
         assert faces[0] == 10
         assert min(marks) == 100
+
+
+def test_turtlebots_get_a_launch_file_and_parameters(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two TurtleBot 4s by their lidars, cameras and motion capture."""
+    path = tmp_path / "swarm.yaml"
+    options = ["--type", "turtlebot4", "--robots", "2", "--sensors", "robots,map,ceiling,mocap"]
+    assert main([str(path), "--yes", "--map", str(tmp_path / "floor.yaml"), *options]) == 0
+    assert load_swarm(path).map == tmp_path / "floor.yaml"
+    parameters = tmp_path / "swarm_params.yaml"
+    assert read_tree(parameters) == {"/**/estimator": {"ros__parameters": {"tf_per_robot": True}}}
+    include, *nodes = read_tree(tmp_path / "swarm.launch.yaml")["launch"]
+    given = {one["name"]: one["value"] for one in include["include"]["arg"]}
+    assert given == {"swarm_file": str(path), "watch": "true", "params_file": str(parameters)}
+    check_graph(GraphOptions(str(path), parameter_file=str(parameters)))
+    arguments = [one["node"]["ros_args"] for one in nodes]
+    remaps = [f"-r {name}:=oakd/rgb/preview/{name}" for name in ("image_raw", "camera_info")]
+    assert [one.partition(" -p ")[0] for one in arguments if "robot:=turtlebot4_" in one] == [
+        " ".join([f"-r __ns:=/turtlebot4_{k}", *remaps]) for k in (1, 2)
+    ]
+    assert sorted(one["node"]["exec"] for one in nodes) == ["localizer_bridge", *["marker_detector_node"] * 4]
+    said = capsys.readouterr().out
+    assert f"graph {path} --watch --params-file {parameters}" in said
+    assert f"ros2 launch {tmp_path / 'swarm.launch.yaml'}" in said

@@ -16,7 +16,6 @@ from swarm_loc_estimator.common.parameters import (
     from_values,
     parameter_specs,
 )
-from swarm_loc_estimator.nodes.localizer_robots import BridgeParameters
 from swarm_loc_estimator.nodes.parameters import (
     EstimatorParameters,
     MapperParameters,
@@ -24,6 +23,7 @@ from swarm_loc_estimator.nodes.parameters import (
     PlayerParameters,
     WatchParameters,
 )
+from swarm_loc_estimator.sensors.localizers import BridgeParameters
 from swarm_loc_estimator.timeline.settings import Settings
 
 DOC = Path(__file__).parents[2] / "doc"

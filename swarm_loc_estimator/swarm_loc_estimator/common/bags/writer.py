@@ -26,7 +26,7 @@ from typing_extensions import Self
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.bag_file import BagError
 from swarm_loc_estimator.common.files import naming, temporary_folder
-from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS, MESSAGE_PACKAGE, message_folder
+from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS, FOREIGN, MESSAGE_PACKAGE, message_folder
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -62,6 +62,9 @@ def typestore() -> Typestore:
     for path in sorted(message_folder().glob("*.msg")):
         name = f"{MESSAGE_PACKAGE}/msg/{path.stem}"
         types.update(get_types_from_msg(path.read_text(encoding="utf-8"), name))
+    for line in FOREIGN.split("\n")[1:-1]:
+        name, _, fields = line.partition(": ")
+        types.update(get_types_from_msg(fields.replace(", ", "\n"), name.replace("/", "/msg/")))
     types[EVENT_PACKETS[0]] = types[EVENT_PACKETS[1]]
     store.register(types)
     return store

@@ -103,6 +103,15 @@ visualization_msgs/Marker: Header header, string ns, int32 id, int32 type, int32
 visualization_msgs/MarkerArray: Marker[] markers
 """.replace(",\n", ",")
 """Type and fields, as ROS 2 Jazzy defines them; `test_cdr.py` compares them with `rosbags`."""
+FOREIGN = """
+motion_capture_tracking_interfaces/NamedPose: string name, geometry_msgs/Pose pose
+motion_capture_tracking_interfaces/NamedPoseArray: std_msgs/Header header, NamedPose[] poses
+mocap4r2_msgs/Marker: int64 index, geometry_msgs/Point translation
+mocap4r2_msgs/RigidBody: std_msgs/Header header, uint32 frame_number, string rigid_body_name,
+    Marker[] markers, geometry_msgs/Pose pose
+mocap4r2_msgs/RigidBodies: std_msgs/Header header, uint32 frame_number, RigidBody[] rigidbodies
+""".replace(",\n", ",")
+"""Types of motion capture, as their packages define them."""
 
 NUMBERS = {
     "bool": "?",
@@ -169,7 +178,7 @@ def fields_of(message_type: str) -> tuple[Field, ...]:
         path = message_folder() / f"{name}.msg"
         if path.is_file():
             return parse(path.read_text(encoding="utf-8"), package)
-    for line in STANDARD.splitlines():
+    for line in (STANDARD + FOREIGN).splitlines():
         title, _, fields = line.partition(": ")
         if title == f"{package}/{name}":
             return parse(fields.replace(",", "\n"), package)

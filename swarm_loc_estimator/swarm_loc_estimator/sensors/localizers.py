@@ -23,9 +23,10 @@ from swarm_loc_estimator.common.messages.cdr import (
     TRANSFORMS,
     nanoseconds,
 )
-from swarm_loc_estimator.common.messages.poses import PLANE, yaw_of
-from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text, texts
+from swarm_loc_estimator.common.messages.poses import PLANE, encode_fix, encode_pose_stamped, yaw_of
+from swarm_loc_estimator.common.parameters import ParameterError, text
 from swarm_loc_estimator.sensors.fix import HEADING_UNKNOWN, has_heading, is_unknown
+from swarm_loc_estimator.swarm.swarm import Localizer
 
 BODY = "<body>"  # Stands for the name of a body in a topic
 _UNKNOWN: FloatArray = np.zeros((3, 3))
@@ -103,45 +104,10 @@ SOURCES: Mapping[str, LocalizerSource] = {
 
 
 @dataclass(frozen=True)
-class BridgeParameters:
+class BridgeParameters(Localizer):
     """Parameters of `localizer_bridge`."""
 
     swarm_file: str = text("", "path of the swarm description", required=True)
-    source: str = choice("pose", tuple(SOURCES), "kind of messages, see the table of sources")
-    topic: str = text(
-        "",
-        "topic of the messages, with <body> in place of the body's name; empty: that of the table of sources",
-    )
-    output: str = choice(
-        "fix",
-        ("fix", "ground_truth"),
-        "<robot>/fix for the estimator, or <robot>/ground_truth to evaluate it",
-    )
-    bodies: tuple[str, ...] = texts(
-        "tracked bodies, such as cf1=epuck1, or epuck2 for a body with the robot's name;"
-        " empty: each robot has a body of its own name"
-    )
-    offsets: tuple[str, ...] = texts(
-        "poses of bodies in base_link, such as epuck1=0.01,0,1.5708 [m, m, rad];"
-        " the body of a robot not named here is at base_link"
-    )
-    source_frame: str = text("", "frame that the poses must be in; empty: map_frame or world")
-    map_frame: str = text("map", "frame of the published poses", required=True)
-    latency_s: float = number(
-        0.0, "s", 0.0, 2.0, "time from the exposure to the stamp of a message, subtracted from the stamp"
-    )
-    stamp_on_arrival: bool = flag(
-        False, "take the time of arrival in place of stamps, for a source with another clock or none"
-    )
-    position_sigma: float = number(
-        0.001, "m", 0.0, 10.0, "noise of x and of y, for poses without covariance", above=True
-    )
-    heading_sigma: float = number(
-        0.005, "rad", 0.0, 3.0, "noise of the heading, for poses without covariance", above=True
-    )
-    max_tilt: float = number(
-        0.35, "rad", 0.0, 3.1416, "largest angle between the z axes of a body and of the frame"
-    )
 
 
 _IN_TOPICS = re.compile(r"[A-Za-z0-9_/]+")
@@ -174,7 +140,7 @@ class LocalizedRobots:
         ParameterError: A parameter cannot be used.
     """
 
-    def __init__(self, parameters: BridgeParameters, robots: Collection[str], health: Health) -> None:
+    def __init__(self, parameters: Localizer, robots: Collection[str], health: Health) -> None:
         self._parameters, self._health = parameters, health
         # which body is which robot, and where on it
         self.robot_of = _robots_of_bodies(parameters.bodies, robots)  # Body -> robot
@@ -232,6 +198,15 @@ class LocalizedRobots:
                 self._health.drop(error.reason, str(error))
             else:
                 self.used += 1
+
+    def serialized(self, message: Any, of_topic: str, arrival_ns: int) -> Iterator[tuple[str, bytes]]:
+        """The robots of one message, each with its pose as a message of the output; see `convert`."""
+        bodies, frame = SOURCES[self._parameters.source].bodies(message), self._parameters.map_frame
+        for one in self.convert(bodies, of_topic, arrival_ns):
+            if self._parameters.output == "fix":
+                yield one.robot, encode_fix(frame, one.stamp_ns, one.pose, one.covariance)
+            else:
+                yield one.robot, encode_pose_stamped(frame, np.array([one.stamp_ns]), one.pose[None])[0]
 
     def note_stranger(self, name: str) -> None:
         """Note a body of no robot."""

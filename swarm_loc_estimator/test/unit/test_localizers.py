@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -11,35 +10,16 @@ import pytest
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.health import Health
-from swarm_loc_estimator.common.messages import cdr
 from swarm_loc_estimator.common.messages.cdr import decode, encode
 from swarm_loc_estimator.common.messages.poses import planar_covariance
 from swarm_loc_estimator.common.parameters import ParameterError
-from swarm_loc_estimator.nodes.localizer_robots import SOURCES, BridgeParameters, LocalizedRobots, RobotPose
 from swarm_loc_estimator.sensors.fix import HEADING_UNKNOWN
+from swarm_loc_estimator.sensors.localizers import SOURCES, BridgeParameters, LocalizedRobots, RobotPose
 
 ROBOTS = ["alpha", "beta"]
 STAMP_NS = 5_000_000_123
 ARRIVAL_NS = 7_000_000_000
 POSE = (1.5, -0.5, 0.7)
-FOREIGN_TYPES = """
-motion_capture_tracking_interfaces/NamedPose: string name, geometry_msgs/Pose pose
-motion_capture_tracking_interfaces/NamedPoseArray: Header header, NamedPose[] poses
-mocap4r2_msgs/Marker: int64 index, geometry_msgs/Point translation
-mocap4r2_msgs/RigidBody: Header header, uint32 frame_number, string rigid_body_name, Marker[] markers,
-    geometry_msgs/Pose pose
-mocap4r2_msgs/RigidBodies: Header header, uint32 frame_number, mocap4r2_msgs/RigidBody[] rigidbodies
-""".replace(",\n", ",")
-"""As their packages define them."""
-
-
-@pytest.fixture
-def _foreign_types(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Let the tables of CDR know messages of packages that are not installed."""
-    monkeypatch.setattr(cdr, "STANDARD", cdr.STANDARD + FOREIGN_TYPES)
-    cdr.fields_of.cache_clear()
-    yield
-    cdr.fields_of.cache_clear()
 
 
 def turn(yaw: float, roll: float = 0.0) -> dict[str, float]:
@@ -126,7 +106,6 @@ MESSAGES: dict[str, dict[str, Any]] = {
 }
 
 
-@pytest.mark.usefixtures("_foreign_types")
 @pytest.mark.parametrize("source", SOURCES)
 def test_all_kinds_of_messages_give_the_pose_of_the_robot(source: str) -> None:
     bridge = Bridge(source=source)
@@ -143,7 +122,6 @@ def test_all_kinds_of_messages_give_the_pose_of_the_robot(source: str) -> None:
     assert bridge.robots.used == 1
 
 
-@pytest.mark.usefixtures("_foreign_types")
 def test_bodies_are_mapped_by_name_and_those_of_no_robot_are_noted_once() -> None:
     bridge = Bridge(source="named_poses", bodies=("cf1=beta", "alpha"))
     poses = [{"name": name, "pose": pose_of()} for name in ("cf1", "alpha", "beta", "ghost", "ghost")]

@@ -1,0 +1,262 @@
+"""`new BAG` describes what a recording shows: the description replays, and what it says is right."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from swarm_loc_estimator.cli.new import main
+from swarm_loc_estimator.cli.replay import main as replay_main
+from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.cdr import ODOMETRY, POSE_STAMPED, RANGE, TRANSFORMS, encode
+from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry, encode_pose_stamped
+from swarm_loc_estimator.doctor.proposal import Proposal, heard_in, proposed
+from swarm_loc_estimator.offline.recorded_bag import unwatched
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.settings import Settings
+
+BAGS = Path(__file__).parents[3] / "bags"
+NAMES = ("lab/r01", "lab/r03", "lab/r04", "lab/r05")
+NODES = {"r01": 7, "r03": 3, "r04": 4, "r05": 5}
+ANCHORS = {1: (-3.0, -2.0), 6: (4.0, 3.0)}
+TURNED = 0.5  # Of the body of r01
+
+
+def proposal(bag: Path) -> Proposal:
+    return proposed(heard_in(bag, unwatched).topics, lambda likely: likely, bag.parent)
+
+
+@pytest.mark.parametrize(
+    ("bag", "asked"),
+    [
+        ("aerial_five", []),
+        ("droplets_twenty", ["droplet1"]),
+        ("eight_five_robots", ["all markers"]),
+        ("eight_five_robots_w2", ["all markers"]),
+        ("eight_one_robot_fast", ["all markers"]),
+        ("eight_one_robot_slow", ["all markers"]),
+        ("eight_pictures", ["epuck1, epuck2: each has images but no detections"]),
+        ("pushbot_one", []),
+        ("pushbots_two", []),
+    ],
+)
+def test_the_description_of_a_bag_replays_without_an_edit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], bag: str, asked: list[str]
+) -> None:
+    path = tmp_path / "swarm.yaml"
+    assert main(["--yes", str(BAGS / bag), str(path)]) == 0
+    lines = [line for line in path.read_text(encoding="utf-8").splitlines() if line.startswith("# ?")]
+    assert [line[4 : 4 + len(one)] for line, one in zip(lines, asked, strict=True)] == asked
+    assert f"replay {BAGS / bag} --swarm {path}" in capsys.readouterr().out
+    assert replay_main([str(BAGS / bag), "--swarm", str(path), "--out", str(tmp_path / "out")]) == 0
+    found, described = load_swarm(path), load_swarm(BAGS / bag / "swarm.yaml")
+    assert [robot.name for robot in found.robots] == [robot.name for robot in described.robots]
+    assert [robot.type for robot in found.robots] == [robot.type for robot in described.robots]
+    assert [robot.ir and robot.ir.id for robot in found.robots] == [
+        r.ir and r.ir.id for r in described.robots
+    ]
+
+
+@pytest.mark.parametrize("bag", ["eight_five_robots", "eight_five_robots_w2"])
+def test_markers_are_where_ground_truth_shows_them(bag: str) -> None:
+    found, described = proposal(BAGS / bag).swarm, load_swarm(BAGS / bag / "swarm.yaml")
+    assert {mark.id for mark in found.landmarks} == {mark.id for mark in described.landmarks}
+    for robot, true in zip(found.robots, described.robots, strict=True):
+        assert {face.id for face in robot.faces} == {face.id for face in true.faces}
+    places = {mark.id: mark for mark in described.landmarks}
+    for mark in found.landmarks:
+        true_mark = places[mark.id]
+        off = np.hypot(mark.x - true_mark.x, mark.y - true_mark.y)
+        assert off < 3.0 * mark.position_sigma
+    result = replay(BAGS / bag, found, Settings())
+    errors = np.concatenate([one.error[:, :2] for one in result.errors.values()])
+    assert np.sqrt(np.mean(np.sum(errors**2, axis=1))) < 0.03
+
+
+def drive(seconds: float, radius: float, place: tuple[float, float], heading: float) -> np.ndarray:
+    """Poses (k, 3) at 20 Hz of a robot on a circle; radius 0: it stands."""
+    times = np.arange(0.0, seconds, 0.05)
+    turn = 0.3 * times if radius else 0.0 * times
+    local = np.stack([radius * np.sin(turn), radius * (1.0 - np.cos(turn)), turn], axis=1)
+    return se2.compose(np.array([*place, heading]), local)
+
+
+def lab(bag: Path, *, apart_s: float = 0.0, before_iron: bool = False) -> Mapping[str, np.ndarray]:
+    """Four robots with radios and motion capture, two anchors and a chair; returns the true poses."""
+    rng = np.random.default_rng(1)
+    tracks = {
+        name: drive(20.0, radius, place, heading)
+        for name, radius, place, heading in zip(
+            NAMES,
+            (0.6, 0.9, 0.0, 0.5),
+            ((0.0, 0.0), (2.0, 0.5), (-1.0, 1.5), (1.0, 2.0)),
+            (0.3, -1.0, 2.0, 1.0),
+            strict=True,
+        )
+    }
+    antennas = {NODES[name[4:]]: track[:, :2] for name, track in tracks.items()}
+    antennas |= {node: np.tile(place, (400, 1)) for node, place in ANCHORS.items()}
+    with BagWriter(bag) as writer:
+        for name in NAMES:
+            writer.add_topic(f"{name}/odom", ODOMETRY)
+        for body in ("robot1_cap", "robot3_cap", "robot4_cap", "robot5_cap", "chair1"):
+            writer.add_topic(f"vrpn/{body}/pose", POSE_STAMPED)
+        pairs = [(a, b) for a in sorted(antennas) for b in sorted(antennas) if a < b]
+        for a, b in pairs:
+            writer.add_topic(f"uwb/n_{a}/n_{b}/distance", RANGE)
+        for k in range(400):
+            stamp_ns = 1_000_000_000_000 + k * 50_000_000
+            at_ns = stamp_ns + round(apart_s * 1e9) + 5_000_000
+            for name, track in tracks.items():
+                pose = se2.between(track[0], track[k])[None]
+                frames = "odom", "base_link"
+                row = np.array([stamp_ns]), pose, np.zeros((1, 3)), *[UNKNOWN_COVARIANCE] * 2
+                writer.write(f"{name}/odom", at_ns, encode_odometry(*frames, *row)[0])
+                body = se2.compose(track[k], [0.0, 0.0, TURNED if name == NAMES[0] else 0.0])
+                topic = f"vrpn/robot{int(name[-2:])}_cap/pose"
+                writer.write(topic, at_ns, encode_pose_stamped("world", np.array([stamp_ns]), body[None])[0])
+            chair = np.array([[3.0, 3.0, 0.0]])
+            writer.write(
+                "vrpn/chair1/pose", at_ns, encode_pose_stamped("world", np.array([stamp_ns]), chair)[0]
+            )
+            a, b = pairs[k % len(pairs)]
+            distance = float(np.hypot(*(antennas[a][k] - antennas[b][k]))) + 0.3 + 0.05 * rng.normal()
+            fields = {"header": {"stamp": stamp_ns, "frame_id": "uwb"}, "max_range": 50.0, "range": distance}
+            data = encode(fields, RANGE)
+            writer.write(f"uwb/n_{a}/n_{b}/distance", at_ns, data[:-4] if before_iron else data)
+    return tracks
+
+
+@pytest.mark.parametrize(("apart_s", "before_iron"), [(0.0, False), (4e6, True)])
+def test_radios_clocks_and_motion_capture_are_found(
+    tmp_path: Path, apart_s: float, before_iron: bool
+) -> None:
+    tracks = lab(tmp_path / "bag", apart_s=apart_s, before_iron=before_iron)
+    found = proposal(tmp_path / "bag")
+    swarm = found.swarm
+    assert [robot.name for robot in swarm.robots] == ["r01", "r03", "r04", "r05"]
+    assert swarm.topics == {"<robot>/odom": "lab/<robot>/odom"}
+    assert swarm.range_topic == "uwb/n_{from}/n_{to}/distance"
+    assert {robot.name: robot.uwb and robot.uwb.address for robot in swarm.robots} == NODES
+    assert {anchor.address for anchor in swarm.anchors} <= {*ANCHORS}
+    for robot, track in zip(swarm.robots, tracks.values(), strict=True):
+        assert robot.clock.offset_s == pytest.approx(-apart_s, abs=0.1)
+        assert robot.start == pytest.approx(track[0].tolist(), abs=0.02)
+        assert robot.uwb is not None
+        assert robot.uwb.range_bias == pytest.approx(0.15, abs=0.05)
+    localizer = swarm.localizer
+    assert localizer is not None
+    assert localizer.topic == "/vrpn/<body>/pose"
+    assert localizer.bodies[0] == "robot1_cap=r01"
+    (offset,) = localizer.offsets
+    assert offset.startswith("r01=0,0,")
+    assert float(offset.rpartition(",")[2]) == pytest.approx(TURNED, abs=0.02)
+    assert any("chair1" in fact for fact in found.facts)
+    result = replay(tmp_path / "bag", swarm, Settings())
+    assert {*result.truth} == {robot.name for robot in swarm.robots}
+
+
+def test_what_nothing_shows_is_asked(tmp_path: Path) -> None:
+    """Radios, clocks that stand and starts without any ground truth."""
+    with BagWriter(tmp_path / "bag") as writer:
+        for name in ("r1/odom", "r2/odom"):
+            writer.add_topic(name, ODOMETRY)
+        writer.add_topic("uwb/1/2", RANGE)
+        for k in range(100):
+            at_ns = 1_000_000_000_000 + k * 50_000_000
+            pose = np.array([[0.01 * k, 0.0, 0.0]])
+            for name, stamp_ns in (("r1/odom", at_ns), ("r2/odom", 0)):
+                row = np.array([stamp_ns]), pose, np.zeros((1, 3)), *[UNKNOWN_COVARIANCE] * 2
+                writer.write(name, at_ns, encode_odometry("odom", "base_link", *row)[0])
+            fields = {"header": {"stamp": at_ns}, "max_range": 50.0, "range": 2.0}
+            writer.write("uwb/1/2", at_ns, encode(fields, RANGE))
+    asked = "\n".join(proposal(tmp_path / "bag").asked)
+    for words in (
+        "r2 has always the same stamp",
+        "r1, r2: each has an unknown start",
+        "radio 1, 2 measures ranges, but nothing shows which robot carries it",
+    ):
+        assert words in asked
+
+
+def test_mounts_are_those_of_static_transforms(tmp_path: Path) -> None:
+    """One robot without a namespace, whose lidar is turned by a quarter, and a map beside the bag."""
+    scan = {
+        "header": {"frame_id": "rplidar_link"},
+        "angle_min": -3.0,
+        "angle_max": 3.0,
+        "angle_increment": 0.1,
+        "range_max": 12.0,
+        "ranges": np.ones(61, np.float32),
+    }
+    joint = {"translation": {"x": 0.1}, "rotation": {"z": np.sqrt(0.5), "w": np.sqrt(0.5)}}
+    header = {"frame_id": "base_link"}
+    static = {"transforms": [{"header": header, "child_frame_id": "rplidar_link", "transform": joint}]}
+    (tmp_path / "floor.yaml").write_text("image: floor.pgm\nresolution: 0.05\norigin: [0, 0, 0]\n")
+    with BagWriter(tmp_path / "bag") as writer:
+        for name, kind in (
+            ("odom", ODOMETRY),
+            ("scan", "sensor_msgs/msg/LaserScan"),
+            ("tf_static", TRANSFORMS),
+        ):
+            writer.add_topic(name, kind)
+        writer.write("tf_static", 1_000_000_000_000, encode(static, TRANSFORMS))
+        for k in range(50):
+            at_ns = 1_000_000_000_000 + k * 100_000_000
+            row = np.array([at_ns]), np.zeros((1, 3)), np.zeros((1, 3)), *[UNKNOWN_COVARIANCE] * 2
+            writer.write("odom", at_ns, encode_odometry("odom", "base_link", *row)[0])
+            data = encode(
+                {**scan, "header": {"frame_id": "rplidar_link", "stamp": at_ns}}, "sensor_msgs/msg/LaserScan"
+            )
+            writer.write("scan", at_ns, data)
+    swarm = proposal(tmp_path / "bag").swarm
+    (robot,) = swarm.robots
+    assert robot.type == "turtlebot4"
+    assert swarm.topics == {"robot/odom": "odom", "robot/scan": "scan"}
+    assert robot.lidar.is_used
+    assert (robot.lidar.x, robot.lidar.yaw) == pytest.approx((0.1, np.pi / 2))
+    assert swarm.map == tmp_path / "floor.yaml"
+
+
+def test_what_robots_publish_of_themselves_is_no_ground_truth(tmp_path: Path) -> None:
+    """Filtered odometry and transforms of frames with the robot's name."""
+    with BagWriter(tmp_path / "bag") as writer:
+        for name, kind in (("r1/odom", ODOMETRY), ("r1/odometry/filtered", ODOMETRY), ("tf", TRANSFORMS)):
+            writer.add_topic(name, kind)
+        for k in range(100):
+            at_ns = 1_000_000_000_000 + k * 50_000_000
+            row = (
+                np.array([at_ns]),
+                np.array([[0.01 * k, 0.0, 0.0]]),
+                np.zeros((1, 3)),
+                *[UNKNOWN_COVARIANCE] * 2,
+            )
+            for name in ("r1/odom", "r1/odometry/filtered"):
+                writer.write(name, at_ns, encode_odometry("r1/odom", "r1/base_link", *row)[0])
+            joints = [
+                {"header": {"frame_id": parent, "stamp": at_ns}, "child_frame_id": child}
+                for parent, child in (
+                    *(("map", "r1/odom"), ("r1/odom", "r1/base_link")),
+                    ("r1/base_link", "r1/laser"),
+                )
+            ]
+            joints = [{**one, "transform": {"rotation": {"w": 1.0}}} for one in joints]
+            writer.write("tf", at_ns, encode({"transforms": joints}, TRANSFORMS))
+    found = proposal(tmp_path / "bag")
+    assert found.swarm.localizer is None
+    assert found.swarm.topics == {}
+    assert found.asked == ["r1 has an unknown start. Write start, or leave it to the estimator."]
+
+
+def test_a_recording_without_robots_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("tf", TRANSFORMS)
+        writer.write("tf", 1_000_000_000, encode({"transforms": []}, TRANSFORMS))
+    assert main(["--yes", str(tmp_path / "bag"), str(tmp_path / "swarm.yaml")]) == 1
+    assert "No robot was found: none of the topics tf is odometry." in capsys.readouterr().err
+    assert not (tmp_path / "swarm.yaml").exists()
