@@ -48,6 +48,8 @@ LOOKS: Mapping[str, Look] = {
     **{f"motion_{percent}percent": Look(motion=0.01 * percent) for percent in (15, 25)},
     "motion_20percent_boards": Look(motion=0.2, kind="board", diameter_px=30.0),
     "motion_20percent_height_30mm": Look(motion=0.2, height=0.03, touching=0.3),
+    "rails": Look(kind="board", diameter_px=28.0, rails=0.7, robots=8),
+    "lids_touching": Look(kind="lid", diameter_px=32.0, touching=1.0, robots=16, shadow=0.4),
     "brown_on_parquet": Look(kind="dark", floor=0.26, boards=0.025, diameter_px=28.0),
     "all_at_once": Look(
         tilt=0.4,

@@ -29,6 +29,8 @@ _FAR = 1.2
 _POSE_SIGMA = 1e-6
 _WHITE = 235.0
 _SLICES, _EXPOSURES, _PARTS = 12, 13, 14
+_CORNERS = (-1, -1), (-1, 1), (1, 1), (1, -1)
+_LID = 0.66  # Radius of a lid, in radii of its robot
 
 
 @dataclass(frozen=True)
@@ -37,8 +39,8 @@ class Look:
 
     diameter_px: float = 24.0  # Of robots in the middle of the picture
     robots: int = 12  # How many
-    # `pattern`, or plain discs: `dark`, `bright`; `board`, dark with bright parts; `led`, a bright spot with
-    # soft rims
+    # `pattern`, or plain discs: `dark`, `bright`; `board`, dark with bright parts; `lid`, a board with a bright
+    # lid; `led`, a bright spot with soft rims
     kind: str = "pattern"
     tilt: float = 0.0  # Of the camera [rad]
     barrel: float = 0.0  # Radial distortion k1 of the lens
@@ -55,6 +57,7 @@ class Look:
     wall: float = 0.06  # Brightness of their sides
     taper: float = 0.0  # Share of the diameter that is missing at the floor
     motion: float = 0.0  # Way of each robot while the shutter is open, in any direction, in diameters
+    rails: float = 0.0  # Share of the robots that stand at a bright rail
     boards: float = 0.0  # One standard deviation of the brightness of the floor's boards
 
 
@@ -99,6 +102,7 @@ def draw_picture(look: Look, seed: int) -> Picture:
     plan = _Plan(low, fine, (rows, columns), rng)
     plan.paint_floor(look)
     plan.scatter(look, poses)
+    plan.lay_rails(look, poses)
     # whatever is over the floor hides a place that is farther from the foot of the camera
     foot, lift = ground.centre[:2], ground.centre[2] / (ground.centre[2] - look.height)
     tops = poses.copy()
@@ -202,6 +206,8 @@ def _paint_top(
         _lay(image, inside_mark(offset @ np.array([[cos, -sin], [sin, cos]])) * radius, 0.9)
     else:
         _lay(image, (1.0 - distance) * radius, 0.92 if look.kind == "bright" else 0.12)
+    if look.kind == "lid":
+        _lay(image, (_LID - distance) * radius, 0.45 + 0.25 * math.cos(heading))
     for part in parts:
         away = np.linalg.norm(offset - 0.8 * part / max(1.0, float(np.linalg.norm(part))), axis=-1)
         _lay(image, (0.09 - away) * radius, 0.7)
@@ -257,6 +263,17 @@ class _Plan:
                 box = cv2.boxPoints(((x, y), (size, across), angle))
                 cv2.fillConvexPoly(self.image, np.rint(box).astype(np.int32), shade, cv2.LINE_AA)
 
+    def lay_rails(self, look: Look, poses: FloatArray) -> None:
+        """Lay bright rails with dark edges beside the first robots, away from the others."""
+        size = DIAMETER / self._step
+        for pose in poses[: round(look.rails * len(poses))]:
+            angle = float(self._rng.uniform(-math.pi, math.pi))
+            towards, along = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+            for share, wide, shade in ((0.5, 0.1, 0.15), (0.62, 0.15, 0.95), (0.9, 0.35, 0.7)):
+                middle = (pose[:2] - self._low) / self._step - 0.5 + (share + 0.5 * wide) * size * towards
+                corners = [middle + k * 2.0 * size * along + m * 0.5 * wide * size * towards for k, m in _CORNERS]
+                cv2.fillConvexPoly(self.image, np.rint(corners).astype(np.int32), shade, cv2.LINE_AA)
+
     def put_robot(self, look: Look, pose: FloatArray, top: FloatArray, lift: float) -> None:
         """One robot, in a window around it: the floor that its top and its sides hide while it moves."""
         radius = 0.5 * DIAMETER / self._step
@@ -269,7 +286,7 @@ class _Plan:
         window, grid = _window(self.image, 0.5 * (base + centre), reach)
         if not window.size:
             return
-        parts = self._rng.uniform(-1.0, 1.0, (_PARTS, 2)) if look.kind == "board" else np.zeros((0, 2))
+        parts = self._rng.uniform(-1.0, 1.0, (_PARTS, 2)) if look.kind in {"board", "lid"} else np.zeros((0, 2))
         shares = np.linspace(-0.5, 0.5, _EXPOSURES) if look.motion > 0.0 else np.zeros(1)
         exposures = []
         for share in shares:

@@ -175,7 +175,7 @@ RAYS = 64
 _WIDEST = 0.3  # Largest relative difference of a rim from the expected radius
 _OFF, _NEAR = 0.08, 0.12
 """Largest distance of an edge of a circle, and of one that shows its errors, from the circle in radii."""
-_ALONG = 0.94
+_ALONG = 0.92
 """Least cosine of the angle between the slope of brightness at an edge and the normal of the outline."""
 _BLOCK = 30_000  # OpenCV's images have fewer than 2^15 rows
 _ROUNDS = 3
@@ -190,7 +190,7 @@ _OVAL_RIDGE = 1.0  # Prior information on the oval, in edges: half a rim says li
 
 _ANGLES = 2.0 * np.pi * np.arange(RAYS) / RAYS
 DIRECTIONS = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)
-_OVALS = np.stack([np.cos(2.0 * _ANGLES), np.sin(2.0 * _ANGLES)], axis=1)
+_OVALS, _SQUARES = (np.stack([np.cos(n * _ANGLES), np.sin(n * _ANGLES)], axis=1) for n in (2, 4))
 
 
 class Circles(NamedTuple):
@@ -203,6 +203,7 @@ class Circles(NamedTuple):
     spread: FloatArray  # (C,) root mean square distance of these edges from the outline [px]
     oval: FloatArray  # (C, 2) cosine and sine of the second harmonic of the outline, as left by motion [px]
     covariance: FloatArray  # (C, 2, 2) of the centre [px^2]
+    squareness: FloatArray  # (C,) how much these edges lie on four sides; about 0.7: those of a square
     kind: NDArray[np.int64]  # (C,) `TOP`, `SIDES`, `PARTLY` or `INNER`: what the outline is
     soft: NDArray[np.bool_]  # (C,) whether the edges are taken for blurred ones
 
@@ -317,7 +318,8 @@ class Rims:
             centre = centre + shift
         coverage = np.where((found >= low) & (found <= high), (own | loose).mean(axis=1), 0.0)
         contrast = _masked_median(step, own, np.zeros(len(step)))
-        return Circles(centre, found, coverage, contrast, spread, oval, covariance, kind, soft)
+        squareness = np.hypot(*(own @ _SQUARES).T) / np.maximum(own.sum(axis=1), 1)
+        return Circles(centre, found, coverage, contrast, spread, oval, covariance, squareness, kind, soft)
 
     def edges(
         self,

@@ -78,6 +78,7 @@ _LID_AWAY, _SAME_LID = 0.3, 0.1
 """Largest distance of their centres in radii of discs, and largest difference of their radii from the others."""
 _MOST_LIDS = 0.5  # Least share of clear discs that show an inner circle, if any does
 _LID_SIGMA = 0.1  # Error of a disc's centre by its inner circle, one standard deviation in radii
+_MAX_SQUARENESS = 0.4
 _MARK_ROUNDS = 2
 _MOST, _CLEAR = 0.6, 0.85  # If this share of discs shows a mark, discs without one need this coverage
 
@@ -337,13 +338,15 @@ def _with_lids(
 def _whole(circles: Circles) -> NDArray[np.bool_]:
     """Which discs show enough of their rims.
 
-    A touching disc may hide a rim, hardly anything else; so a disc alone must show as much as the others.
+    A touching disc may hide a rim, hardly anything else; so a disc alone must show as much as the others, and
+    not only where a square would.
     """
     away = np.linalg.norm(circles.centre[:, None] - circles.centre, axis=2)
     np.fill_diagonal(away, np.inf)
     alone = away.min(axis=1, initial=np.inf) > _TOUCHING * 2.0 * circles.radius
     usual = np.median(circles.coverage) if len(circles.coverage) else 0.0
-    return np.asarray(~alone | (circles.coverage >= _USUAL * usual))
+    is_round = (circles.coverage >= _USUAL * usual) & (circles.squareness <= _MAX_SQUARENESS)
+    return np.asarray(~alone | is_round)
 
 
 def _marked_alike(circles: Circles, has_mark: NDArray[np.bool_]) -> NDArray[np.bool_]:

@@ -35,6 +35,8 @@ LOOKS = {
     "tall and narrower below": Look(height=0.06, taper=0.35),
     "moving": Look(motion=0.2),
     "moving boards": Look(motion=0.15, kind="board", diameter_px=30.0),
+    "at rails": Look(kind="board", diameter_px=28.0, robots=8, rails=0.7),
+    "lids that touch": Look(kind="lid", diameter_px=32.0, robots=16, touching=1.0, shadow=0.4),
 }
 
 
@@ -85,6 +87,27 @@ def test_the_size_is_found_out(kind: str) -> None:
     score = score_picture(picture, detector.detect(picture.gray))
     assert (score.missed, score.false) == (0, 0)
     assert detector.diameter == pytest.approx(DIAMETER, rel=0.12)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("kind", ["board", "dark"])
+def test_robots_at_rails_are_found_without_their_size(kind: str, seed: int) -> None:
+    picture = draw_picture(Look(kind=kind, diameter_px=30.0, robots=8, rails=1.0), seed)
+    assert scored(picture, AerialSettings()).missed == 0
+
+
+def test_a_size_by_which_nothing_was_found_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    picture = draw_picture(Look(kind="dark", diameter_px=18.0), seed=3)
+    detector = AerialDetector(AerialSettings(), picture.ground)
+    with monkeypatch.context() as patch:
+        patch.setattr(detector, "_estimated", lambda _: 5.0 * DIAMETER)
+        assert len(detector.detect(picture.gray)) == 0
+    assert score_picture(picture, detector.detect(picture.gray)).missed == 0
+
+
+def test_a_square_of_the_size_of_robots_is_none() -> None:
+    picture = draw_picture(Look(kind="lid", diameter_px=32.0, robots=16, touching=1.0, shadow=0.4), seed=2)
+    assert scored(picture).false == 0
 
 
 def test_the_polarity_can_be_told() -> None:
