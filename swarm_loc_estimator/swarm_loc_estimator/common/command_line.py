@@ -246,7 +246,7 @@ def is_live(options: argparse.Namespace) -> bool:
     Raises:
         UserError: Options do not fit the source, or the namespace is none.
     """
-    live = _is_description(options.source)
+    live = is_description(options.source)
     if live and options.remap:
         raise UserError("--remap is for bags; remap topics of a live graph in their nodes.")
     if options.use_sim_time and not live:
@@ -259,11 +259,11 @@ def is_live(options: argparse.Namespace) -> bool:
 
 def described(options: argparse.Namespace) -> Path:
     """Path of the swarm description: --swarm, the source itself, or the one next to the bag."""
-    live = _is_description(options.source)
+    live = is_description(options.source)
     return options.swarm or (options.source if live else swarm_beside(options.source))
 
 
-def _is_description(source: Path) -> bool:
+def is_description(source: Path) -> bool:
     """Whether a path is that of a description; a folder of any name is a bag."""
     return source.suffix in _DESCRIPTIONS and not source.is_dir()
 
