@@ -118,9 +118,9 @@ def cells(name: str, row: ErrorSummary) -> list[str]:
     ]
 
 
-def _errors(rows: Sequence[tuple[str, ErrorSummary]]) -> Table:
+def _errors(result: ReplayResult) -> Table:
     titles, units = zip(*HEADER, strict=True)
-    return Table([cells(name, row) for name, row in rows], titles, units, GROUPS)
+    return Table([cells(name, row) for name, row in summaries(result)], titles, units, GROUPS)
 
 
 SELF_CALIBRATED = (
@@ -185,9 +185,8 @@ def text_report(result: ReplayResult) -> str:
     """The whole report as text."""
     lines = [result.title, "=" * len(result.title), ""]
     lines += _pairs(facts(result))
-    rows = summaries(result)
-    if rows:
-        lines += ["", *_errors(rows).text()]
+    if result.errors:
+        lines += ["", *_errors(result).text()]
     else:
         lines += ["", "No ground truth to compare with."]
     robots = self_calibrated_robots(result)
@@ -285,17 +284,13 @@ small { display: block; color: var(--soft); }
 def html_report(result: ReplayResult, pictures: dict[str, Path]) -> str:
     """One self-contained HTML page, with pictures: heading -> PNG file below it."""
     remarks = "".join(f"<li>{escape(remark)}</li>" for remark in result.remarks)
-    run, rows, counters = (
-        recorded(result),
-        summaries(result),
-        [[name, str(count)] for name, count in result.counters.items()],
-    )
+    run, counters = recorded(result), [[name, str(count)] for name, count in result.counters.items()]
     parts = [
         f"<h1>{escape(result.title)}</h1>",
         _facts(result),
         remarks and f"<h2>Remarks</h2><ul>{remarks}</ul>",
         "<h2>Errors against ground truth</h2>"
-        + (_errors(rows).html() if rows else "<p>No ground truth to compare with.</p>"),
+        + (_errors(result).html() if result.errors else "<p>No ground truth to compare with.</p>"),
         run and f'<h2>Run</h2><iframe class="player" title="The run" srcdoc="{escape(page(run))}"></iframe>',
         *(picture(heading, path) for heading, path in pictures.items()),
         _self_calibration(result),
