@@ -12,13 +12,18 @@ import argparse
 from pathlib import Path
 
 from swarm_loc_estimator.cli.graph import check_graph
-from swarm_loc_estimator.common.command_line import argument, command, number_in, swarm_beside
+from swarm_loc_estimator.common.command_line import (
+    argument,
+    command,
+    described,
+    is_description,
+    number_in,
+)
 from swarm_loc_estimator.common.launch import GraphOptions, NodeSpec, ParameterValue, graph_nodes, run_graph
 from swarm_loc_estimator.nodes.parameters import WatchParameters
 from swarm_loc_estimator.watch.server import Access
 
 _DEFAULT = WatchParameters()
-_DESCRIPTIONS = (".yaml", ".yml")
 
 
 @command(
@@ -49,8 +54,8 @@ def watch_nodes(options: argparse.Namespace) -> list[NodeSpec]:
     Raises:
         UserError: A file cannot be used.
     """
-    is_bag = options.source.suffix not in _DESCRIPTIONS
-    swarm_file = options.swarm or (swarm_beside(options.source) if is_bag else options.source)
+    is_bag = not is_description(options.source)
+    swarm_file = described(options)
     graph = GraphOptions(
         str(swarm_file),
         bag=str(options.source) if is_bag else None,

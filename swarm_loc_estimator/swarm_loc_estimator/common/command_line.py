@@ -110,7 +110,7 @@ def command_parser(description: str | None) -> argparse.ArgumentParser:
     return argparse.ArgumentParser(description=description, formatter_class=formatter)
 
 
-class Command(Protocol):
+class EntryPoint(Protocol):
     """A command as it is called."""
 
     def __call__(self, arguments: Sequence[str] | None = None) -> int:
@@ -119,10 +119,10 @@ class Command(Protocol):
 
 def command(
     description: str | None, *add: Callable[[argparse.ArgumentParser], object]
-) -> Callable[[Callable[[argparse.Namespace], int]], Command]:
+) -> Callable[[Callable[[argparse.Namespace], int]], EntryPoint]:
     """Decorate the `main` of a command, which gets the options that `add` has put into its parser."""
 
-    def decorated(main: Callable[[argparse.Namespace], int]) -> Command:
+    def decorated(main: Callable[[argparse.Namespace], int]) -> EntryPoint:
         @exit_with_message
         def run(arguments: Sequence[str] | None = None) -> int:
             parser = command_parser(description)

@@ -181,16 +181,51 @@ _NEWEST_ONLY = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 class Places:
-    """The newest place of each robot; with `keeps` it is valid until the next one, at any age."""
+    """The newest place of each robot, of a topic `<robot>/...` that is subscribed to once it has a publisher.
 
-    def __init__(self, kind: str, drop: Callable[[str], None], *, keeps: bool) -> None:
+    With `keeps` a place is valid until the next one, at any age. No executor may handle the subscriptions.
+    """
+
+    def __init__(
+        self, node: Node, kind: str, topics: Sequence[str], drop: Callable[[str], None], *, keeps: bool
+    ) -> None:
+        self._node = node
         self._kind = kind
         self._drop = drop
         self._keeps = keeps
+        self._topics = {node.resolve_topic_name(topic): robot for robot, topic in enumerate(topics)}
+        self._subscriptions: dict[int, Subscription] = {}
         self._newest: dict[int, tuple[int, tuple[float, float, float]]] = {}
         self._sent_ns = -1
 
-    def take(self, robot: int, data: bytes) -> None:
+    def look_for_publishers(self, published: Mapping[str, object]) -> None:
+        """Subscribe to the topics that have a publisher by now."""
+        for topic, robot in self._topics.items():
+            if robot not in self._subscriptions and topic in published:
+                self._subscriptions[robot] = self._node.create_subscription(
+                    PoseStamped, topic, lambda _data: None, _NEWEST_ONLY, raw=True
+                )
+
+    @property
+    def subscriptions(self) -> frozenset[Subscription]:
+        """Subscriptions that no executor may handle."""
+        return frozenset(self._subscriptions.values())
+
+    def frame(self) -> Frame | None:
+        """All places, of the messages received by now; None if none has changed since the last call."""
+        for robot, subscription in self._subscriptions.items():
+            taken = subscription.handle.take_message(PoseStamped, True)
+            if taken is not None:
+                self._take(robot, taken[0])
+        newest_ns = max((stamp_ns for stamp_ns, _ in self._newest.values()), default=-1)
+        if newest_ns == self._sent_ns:
+            return None
+        self._sent_ns = newest_ns
+        limit_ns = 0 if self._keeps else newest_ns - _OLD_NS
+        shown = {robot: pose for robot, (at_ns, pose) in self._newest.items() if at_ns >= limit_ns}
+        return places_frame(self._kind, newest_ns, [*shown], np.array([*shown.values()]).reshape(-1, 3))
+
+    def _take(self, robot: int, data: bytes) -> None:
         """Store a serialized PoseStamped of a robot."""
         try:
             message = decode_pose_stamped(data)
@@ -201,16 +236,6 @@ class Places:
             self._drop("not_finite")
             return
         self._newest[robot] = (message.stamp_ns, message.pose)
-
-    def frame(self) -> Frame | None:
-        """All places; None if none has changed since the last call."""
-        newest_ns = max((stamp_ns for stamp_ns, _ in self._newest.values()), default=-1)
-        if newest_ns == self._sent_ns:
-            return None
-        self._sent_ns = newest_ns
-        limit_ns = 0 if self._keeps else newest_ns - _OLD_NS
-        shown = {robot: pose for robot, (at_ns, pose) in self._newest.items() if at_ns >= limit_ns}
-        return places_frame(self._kind, newest_ns, [*shown], np.array([*shown.values()]).reshape(-1, 3))
 
     def clear(self) -> None:
         """Clear all places."""
@@ -251,43 +276,6 @@ class AerialNames:
         return aerial_frame(stamp_ns, position, robot, probability)
 
 
-class NewestMessages:
-    """Topics of one type, one per robot in their order; each is subscribed to once it has a publisher.
-
-    No executor may handle the subscriptions.
-    """
-
-    def __init__(self, node: Node, message_class: type, topics: Sequence[str]) -> None:
-        self._node = node
-        self._class = message_class
-        self._topics = {node.resolve_topic_name(topic): index for index, topic in enumerate(topics)}
-        self._subscriptions: dict[int, Subscription] = {}
-
-    def look_for_publishers(self, published: Mapping[str, object]) -> None:
-        """Subscribe to the topics that have a publisher by now."""
-        for topic, index in self._topics.items():
-            if index not in self._subscriptions and topic in published:
-                self._subscriptions[index] = self._node.create_subscription(
-                    self._class, topic, _unused, _NEWEST_ONLY, raw=True
-                )
-
-    @property
-    def subscriptions(self) -> frozenset[Subscription]:
-        """Subscriptions that no executor may handle."""
-        return frozenset(self._subscriptions.values())
-
-    def take(self, use: Callable[[int, bytes], None]) -> None:
-        """Return the newest message of each robot with a message since the last call."""
-        for index, subscription in self._subscriptions.items():
-            taken = subscription.handle.take_message(self._class, True)
-            if taken is not None:
-                use(index, taken[0])
-
-
-def _unused(_data: bytes) -> None:
-    """No executor calls back."""
-
-
 _FLEETING = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Matches every publisher; messages that arrive too fast are lost only for this node."""
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
@@ -310,8 +298,11 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         self._known_drops: Counter[str] = Counter()
         self._aerial = AerialNames(dict(self._swarm.index_of))
         self._sightings: Subscription | None = None
-        self._truth, self._truth_places = self._places("truth", "ground_truth", keeps=False)
-        self._goals, self._goal_places = self._places("goals", "goal", keeps=True)
+        self._places: list[Places] = []
+        for kind, topic in (("truth", "ground_truth"), ("goals", "goal")):
+            topics = [f"{name}/{topic}" for name in self._names]
+            drop = partial(self._drop, f"<robot>/{topic}")
+            self._places.append(Places(self, kind, topics, drop, keeps=kind == "goals"))
         self._commands = RobotCommands(self, self._names, self.params, time.monotonic_ns)
         title = self.params.title or path.resolve().parent.name
         first = about(self._swarm, title, teleop=self.params.teleop, commands=self.params.commands)
@@ -326,18 +317,13 @@ class WatchNode(ConfiguredNode[WatchParameters]):
     @property
     def subscriptions(self) -> Iterator[Subscription]:
         """Subscriptions that an executor handles; the others are polled when new poses arrive."""
-        taken = self._truth.subscriptions | self._goals.subscriptions if hasattr(self, "_goals") else ()
+        taken = {one for places in getattr(self, "_places", ()) for one in places.subscriptions}
         return (one for one in super().subscriptions if one not in taken)
 
     def destroy_node(self) -> None:
         """Close the connections of pages and destroy the node."""
         self.server.close()
         super().destroy_node()
-
-    def _places(self, kind: str, topic: str, *, keeps: bool) -> tuple[NewestMessages, Places]:
-        topics = [f"{name}/{topic}" for name in self._names]
-        drop = partial(self._drop, f"<robot>/{topic}")
-        return NewestMessages(self, PoseStamped, topics), Places(kind, drop, keeps=keeps)
 
     def _subscribe(self) -> None:
         raw: Callable[..., Subscription] = partial(self.create_subscription, raw=True)
@@ -382,17 +368,15 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         if (
             estimate.stamp_ns < self._newest_ns
         ):  # the clock has jumped back, and the server clears its history
-            self._truth_places.clear()
-            self._goal_places.clear()
+            for places in self._places:
+                places.clear()
         self._newest_ns = estimate.stamp_ns
         self._heard_s = time.monotonic()
         self.server.publish(poses_frame(estimate))
         if self._heard_s > self._places_s + _PLACES_PERIOD_S:
             self._places_s = self._heard_s
-            self._truth.take(self._truth_places.take)
-            self._goals.take(self._goal_places.take)
-            self._publish(self._truth_places.frame())
-            self._publish(self._goal_places.frame())
+            for places in self._places:
+                self._publish(places.frame())
 
     def _on_sightings(self, data: bytes) -> None:
         try:
@@ -423,8 +407,8 @@ class WatchNode(ConfiguredNode[WatchParameters]):
     def _look_around(self) -> None:
         """Subscribe to published topics, and to sightings while a page is open; report missing ones."""
         published = dict(self.get_topic_names_and_types())
-        self._truth.look_for_publishers(published)
-        self._goals.look_for_publishers(published)
+        for places in self._places:
+            places.look_for_publishers(published)
         if self.server.has_viewers and self._sightings is None:
             self._sightings = self.create_subscription(
                 SwarmSightings, "swarm/sightings", self._on_sightings, _FLEETING, raw=True

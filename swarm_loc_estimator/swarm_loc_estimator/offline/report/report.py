@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import base64
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -52,6 +52,48 @@ HEADER = (
 GROUPS = (("", 2), ("position", 5), ("heading", 5), ("", 1))
 """Headings over the columns, with the number of columns below each."""
 
+
+class Table(NamedTuple):
+    """Texts under titles, for a terminal and for a page; below groups, the last row is set apart."""
+
+    rows: Sequence[Sequence[str]]
+    titles: Sequence[str] = ()
+    units: Sequence[str] = ()  # Of the columns, "" for none
+    groups: Sequence[tuple[str, int]] = ()  # Headings over the titles, with the number of columns of each
+
+    def text(self) -> list[str]:
+        """Lines with aligned columns: names to the left, numbers to the right."""
+        units = [[unit and f"[{unit}]" for unit in self.units]] if self.units else []
+        shown = [self.titles, *units, *self.rows]
+        widths = [max(map(len, column)) for column in zip(*shown, strict=True)]
+        lines = []
+        for first, *others in shown:
+            numbers = [f"{text:>{width}}" for text, width in zip(others, widths[1:], strict=True)]
+            lines.append("  ".join([f"{first:<{widths[0]}}", *numbers]).rstrip())
+        if not self.groups:
+            return lines
+        rule, groups, left = "-" * (sum(widths) + 2 * (len(widths) - 1)), [], [*widths]
+        for name, count in self.groups:
+            groups.append(f"{name:<{sum(left[:count]) + 2 * (count - 1)}}")
+            del left[:count]
+        return ["  ".join(groups).rstrip(), *lines[:2], rule, *lines[2:-1], rule, lines[-1]]
+
+    def html(self) -> str:
+        """The same, which scrolls sideways where it is wide."""
+        units = [
+            unit and f"<small>[{escape(unit)}]</small>" for unit in self.units or [""] * len(self.titles)
+        ]
+        titles = zip(self.titles, units, strict=True)
+        groups = [f'<th class="group" colspan="{count}">{escape(name)}</th>' for name, count in self.groups]
+        heads = [groups, [f"<th>{escape(name)}{unit}</th>" for name, unit in titles]]
+        head = "".join(f"<tr>{''.join(cells)}</tr>" for cells in heads if cells)
+        rows = ["<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in self.rows]
+        if groups:
+            rows[-1] = rows[-1].replace("<tr>", "<tr class=pooled>", 1)
+        above = f"<thead>{head}</thead>" if head else ""
+        return f'<div class="wide"><table>{above}<tbody>{"".join(rows)}</tbody></table></div>'
+
+
 POOLED, SMOOTHED = "all", "all, smoothed"
 
 
@@ -74,6 +116,11 @@ def cells(name: str, row: ErrorSummary) -> list[str]:
         *(_number(math.degrees(value), 2) for value in heading),
         _number(row.nees, 2),
     ]
+
+
+def _errors(result: ReplayResult) -> Table:
+    titles, units = zip(*HEADER, strict=True)
+    return Table([cells(name, row) for name, row in summaries(result)], titles, units, GROUPS)
 
 
 SELF_CALIBRATED = (
@@ -138,17 +185,14 @@ def text_report(result: ReplayResult) -> str:
     """The whole report as text."""
     lines = [result.title, "=" * len(result.title), ""]
     lines += _pairs(facts(result))
-    rows = summaries(result)
-    if rows:
-        lines += ["", *_table([cells(name, row) for name, row in rows])]
+    if result.errors:
+        lines += ["", *_errors(result).text()]
     else:
         lines += ["", "No ground truth to compare with."]
     robots = self_calibrated_robots(result)
     if robots:
-        shown = [list(SELF_CALIBRATED), *robots]
-        widths = [max(map(len, column)) for column in zip(*shown, strict=True)]
         lines += ["", "Self-calibration, with one standard deviation"]
-        lines += [_line(row, widths) for row in shown]
+        lines += Table(robots, SELF_CALIBRATED).text()
     lines += ["", self_calibrated_landmarks(result)] if self_calibrated_landmarks(result) else []
     if result.counters:
         lines += ["", "Counters", *_pairs(result.counters)]
@@ -168,36 +212,6 @@ def _pairs(rows: Mapping[str, object]) -> list[str]:
     """One line per name and value."""
     width = max(map(len, rows), default=0)
     return [f"  {name:<{width}}  {value}" for name, value in rows.items()]
-
-
-def _table(rows: list[list[str]]) -> list[str]:
-    """Aligned columns under their titles, the pooled row set apart."""
-    titles = [name for name, _ in HEADER]
-    units = [f"[{unit}]" if unit else "" for _, unit in HEADER]
-    widths = [max(len(text) for text in column) for column in zip(titles, units, *rows, strict=True)]
-    groups, start = [], 0
-    for name, count in GROUPS:
-        groups.append(f"{name:<{sum(widths[start : start + count]) + 2 * (count - 1)}}")
-        start += count
-    rule = "-" * (sum(widths) + 2 * (len(widths) - 1))
-    body = [_line(row, widths) for row in rows]
-    return [
-        "  ".join(groups).rstrip(),
-        _line(titles, widths),
-        _line(units, widths),
-        rule,
-        *body[:-1],
-        rule,
-        body[-1],
-    ]
-
-
-def _line(texts: list[str], widths: list[int]) -> str:
-    """One line: names to the left, numbers to the right."""
-    first = f"{texts[0]:<{widths[0]}}"
-    return "  ".join(
-        [first, *(f"{text:>{width}}" for text, width in zip(texts[1:], widths[1:], strict=True))]
-    ).rstrip()
 
 
 REPORT_FILES = ("report.*", "overview.png", "paths.png", "errors.png")
@@ -275,11 +289,12 @@ def html_report(result: ReplayResult, pictures: dict[str, Path]) -> str:
         f"<h1>{escape(result.title)}</h1>",
         _facts(result),
         remarks and f"<h2>Remarks</h2><ul>{remarks}</ul>",
-        _errors(result),
+        "<h2>Errors against ground truth</h2>"
+        + (_errors(result).html() if result.errors else "<p>No ground truth to compare with.</p>"),
         run and f'<h2>Run</h2><iframe class="player" title="The run" srcdoc="{escape(page(run))}"></iframe>',
         *(picture(heading, path) for heading, path in pictures.items()),
         _self_calibration(result),
-        f"<h2>Counters</h2>{html_table(counters)}" if counters else "",
+        f"<h2>Counters</h2>{Table(counters).html()}" if counters else "",
     ]
     return page_of(result.title, parts)
 
@@ -292,15 +307,6 @@ def page_of(title: str, parts: Sequence[str]) -> str:
     )
     body = "\n".join(part for part in parts if part)
     return f'<!doctype html>\n<html lang="en"><head>{head}</head>\n<body>\n{body}\n</body></html>\n'
-
-
-def html_table(rows: Iterable[Sequence[str]], titles: Sequence[str] = (), *, head: str = "") -> str:
-    """A table of texts under titles, or under rows of HTML, which scrolls sideways where it is wide."""
-    if titles:
-        head = "<tr>" + "".join(f"<th>{escape(name)}</th>" for name in titles) + "</tr>"
-    above = f"<thead>{head}</thead>" if head else ""
-    body = "".join("<tr>" + "".join(f"<td>{escape(text)}</td>" for text in row) + "</tr>" for row in rows)
-    return f'<div class="wide"><table>{above}<tbody>{body}</tbody></table></div>'
 
 
 def _facts(result: ReplayResult) -> str:
@@ -322,28 +328,12 @@ def _facts(result: ReplayResult) -> str:
     return f'<dl class="facts">{shown}</dl>'
 
 
-def _errors(result: ReplayResult) -> str:
-    """The error table."""
-    title = "<h2>Errors against ground truth</h2>"
-    rows = summaries(result)
-    if not rows:
-        return f"{title}<p>No ground truth to compare with.</p>"
-    groups = "".join(f'<th class="group" colspan="{count}">{escape(name)}</th>' for name, count in GROUPS)
-    titles = "".join(
-        f"<th>{escape(name)}{f'<small>[{escape(unit)}]</small>' if unit else ''}</th>"
-        for name, unit in HEADER
-    )
-    table = html_table((cells(*row) for row in rows), head=f"<tr>{groups}</tr><tr>{titles}</tr>")
-    before, _, pooled = table.rpartition("<tr>")
-    return f"{title}{before}<tr class=pooled>{pooled}"
-
-
 def _self_calibration(result: ReplayResult) -> str:
     """The table of estimated calibration parameters."""
     rows, sentence = self_calibrated_robots(result), self_calibrated_landmarks(result)
     if not rows and not sentence:
         return ""
-    table = html_table(rows, SELF_CALIBRATED) if rows else ""
+    table = Table(rows, SELF_CALIBRATED).html() if rows else ""
     return f"<h2>Self-calibration, with one standard deviation</h2>{table}<p>{escape(sentence)}</p>"
 
 

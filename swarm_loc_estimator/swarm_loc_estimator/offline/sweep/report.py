@@ -16,7 +16,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.files import replacing, write_whole
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.offline.report.plots import INK, SOFT, colour_of, length_unit, save, style
-from swarm_loc_estimator.offline.report.report import html_table, page_of, picture
+from swarm_loc_estimator.offline.report.report import Table, page_of, picture
 from swarm_loc_estimator.offline.sweep.sweep import FIGURES, Line, Sweep
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -80,7 +80,7 @@ def write_results(rows: Sequence[Row], varied: Sequence[str], folder: Path) -> P
     remarks = [*([] if judged else [_WITHOUT_TRUTH]), *([f"{failed} {_FAILED}"] if failed else [])]
     remark = "".join(f"<p>{one}</p>" for one in remarks)
     shown = [picture(heading, path) for heading, path in pictures.items()]
-    table = f"<h2>All replays</h2>{html_table(cells[1:], cells[0])}"
+    table = f"<h2>All replays</h2>{Table(cells[1:], cells[0]).html()}"
     write_whole(page, page_of("Sweep", ["<h1>Sweep</h1>", remark, *shown, table]))
     return page
 
