@@ -53,7 +53,6 @@ class Solution:
     parameter: FloatArray  # (N, p) changes of parameters of the description
     parameter_sigma: FloatArray  # (N, p) their standard deviations
     landmark_covariance: FloatArray  # (S, 3, 3) of x, y, yaw
-    frame_covariance: FloatArray  # (3, 3) of a knot in the middle: what is common to all is as uncertain
     weight: FloatArray  # (m,) of the sightings, from 0 for wrong ones to 1
     used: BoolArray  # (m,) whether both sides of the sighting are connected with the origin
     variance_ratio: float  # Mean squared residual of sightings by the described noise; 1 is ideal
@@ -157,7 +156,7 @@ class Solver:
         self._size = next_column + self._prior.size
         self._weight, self._is_rigid = np.ones(self._rows.size), True
         self._landmarks = len(places)
-        self._origin: FloatArray | None = None
+        self._origin: tuple[int, FloatArray] | None = None  # First knot of a robot that stays at this pose
 
     def solve(self, progress: Progress) -> Solution:
         """Solve, and compute covariances."""
@@ -355,11 +354,12 @@ class Solver:
             sigma = np.array([spread.x, spread.y, spread.theta])
             found.append(self._first_pose(int(own[0]), np.array(robot.start), sigma))
         if not has_frame:
-            first = int(np.flatnonzero(self._knot_column >= 0)[0])
-            track = problem.knots.sample.pose[first]
-            origin = se2.compose(self._knot[first], track) if self._origin is None else self._origin
-            self._origin = origin
-            found.append(self._first_pose(first, origin, np.full(3, _ORIGIN_SIGMA)))
+            if self._origin is None:
+                _, first = np.unique(problem.knots.robot, return_index=True)
+                pose = se2.compose(self._knot[first], problem.knots.sample.pose[first])
+                nearest = int(np.nanargmin(np.linalg.norm(pose, axis=1)))
+                self._origin = int(first[nearest]), pose[nearest]
+            found.append(self._first_pose(*self._origin, np.full(3, _ORIGIN_SIGMA)))
         return found
 
     def _first_pose(
@@ -432,8 +432,6 @@ class Solver:
             error = factor.covariance(self._landmark_column[index] + np.arange(3))
             covariance[index] = se2.pose_covariance(self._landmark[index], error)
         sigma = np.array([np.sqrt(np.diag(factor.covariance(one))) for one in self._parameter_column])
-        placed = self._knot_column[self._knot_column >= 0]
-        frame = factor.covariance(placed[placed.size // 2] + np.arange(3))
         weight = np.zeros(self.used.size)
         weight[self._rows] = self._weight
         return Solution(
@@ -443,7 +441,6 @@ class Solver:
             self._parameter,
             sigma,
             covariance,
-            frame,
             weight,
             self.used,
             ratio,

@@ -33,7 +33,8 @@ from swarm_loc_estimator.offline.calibration.recording import CalibrationError, 
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.report.plots import INK, SOFT, colour_of, label_map, save, style
 from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
-from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, Swarm, UwbDevice
+from swarm_loc_estimator.swarm.calibration_states import shared_error
+from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, MapError, Swarm, UwbDevice
 
 # Checked by test_survey_cameras_and_anchors.py.
 MIN_MEASUREMENTS = 30  # Minimum number of sightings or ranges that place a camera or an anchor
@@ -55,7 +56,8 @@ class Paths:
 
     # Poses (k, 3) in map of robots (k,) at instants (k,) [ns]; NaN: not known
     at: Callable[[IntArray, IntArray], FloatArray]
-    frame: FloatArray  # (3, 3) covariance of the right-invariant error that is common to all
+    # (3, 3) covariance of the right-invariant error that is common to all, beyond the error of the map
+    frame: FloatArray
 
     def variances(self, place: FloatArray) -> FloatArray:
         """Variances (3,) of x, y and directions at a place (2,) by the frame."""
@@ -405,9 +407,8 @@ def survey(
     problem, solution = _solved(recording, swarm, problem, progress)
     shared = _shared(solution)
     marks = tuple(_landmarks(problem, solution, shared.place))
-    found = replace(_calibrated(swarm, solution, shared), landmarks=marks)
-    frame = max(1.0, solution.variance_ratio) * solution.frame_covariance
-    paths = Paths(solution.at, frame)
+    found = replace(_calibrated(swarm, solution, shared), landmarks=marks, map_error=shared.error)
+    paths = Paths(solution.at, shared.frame)
     placed = place_fixed(recording, found, paths, cameras=cameras)
     found = replace(found, cameras=placed.cameras, anchors=placed.anchors)
     path = se2.compose(solution.knot, problem.knots.sample.pose)
@@ -436,57 +437,51 @@ def _solved(
 
 
 class _Shared(NamedTuple):
-    """What one standard deviation of the error of the map's scale changes."""
+    """Error that all landmarks share."""
 
-    scale: float  # The scale
-    place: FloatArray  # (L, 2) places of landmarks [m]
-    parameter: FloatArray  # (N, p) parameters of robots
+    error: MapError
+    place: FloatArray  # (L, 3, 4) errors of landmarks by one standard deviation, first of the scale
+    parameter: FloatArray  # (N, p) those of parameters by the scale
+    frame: FloatArray  # (3, 3) covariance of a knot in the middle beyond it: all paths are as uncertain
 
 
 def _shared(solution: Solution) -> _Shared:
-    """The error of the scale of all landmarks that were estimated, and of what is correlated with it."""
-    # the scale as a function of the unknowns
-    column, place = solution.landmark_column, solution.landmark[:, :2]
-    free = np.flatnonzero(column >= 0)
-    away = place[free] - place[free].mean(axis=0) if free.size else place[free]
-    if not (away**2).sum() > 0.0:
-        return _Shared(0.0, np.zeros(place.shape), np.zeros(solution.parameter.shape))
-    away /= (away**2).sum()
-    moved = np.zeros((free.size, 2, 3))  # of errors (3,) to places
-    moved[:, :, :2], moved[:, 0, 2], moved[:, 1, 2] = np.eye(2), -place[free, 1], place[free, 0]
-    unknowns = column[free][:, None] + np.arange(3)
-    scale = np.zeros(solution.factor.size)
-    scale[unknowns] = np.einsum("ki,kij->kj", away, moved)
-    # what all unknowns are expected to be when it is off by its standard deviation
-    change = solution.factor.solve(scale)
-    change *= math.sqrt(max(1.0, solution.variance_ratio) / float(scale @ change))
-    found = np.zeros(place.shape)
-    found[free] = np.einsum("kij,kj->ki", moved, change[unknowns])
-    return _Shared(float(scale @ change), found, change[solution.parameter_column])
+    """The error that all landmarks share that were estimated, and what is correlated with their scale."""
+    column, place = solution.landmark_column, solution.landmark
+    free, parameters = np.flatnonzero(column >= 0), solution.parameter_column
+    knots = solution.column[solution.column >= 0]
+    bodies = np.append(column[free], knots[knots.size // 2])
+    unknowns = np.concatenate([(bodies[:, None] + np.arange(3)).ravel(), parameters.ravel()])
+    covariance = max(1.0, solution.variance_ratio) * solution.factor.covariance(unknowns)
+    own = slice(3 * free.size, 3 * bodies.size)
+    none = np.zeros((column.size, 3, 4)), np.zeros(parameters.shape), covariance[own, own]
+    if not free.size or not np.ptp(place[free, :2], axis=0).any():
+        return _Shared(MapError(), *none)
+    error, change = shared_error(place[free, :2], covariance)
+    moved = np.tile(np.eye(3), (free.size, 1, 1))  # places by errors
+    moved[:, 0, 2], moved[:, 1, 2] = -place[free, 1], place[free, 0]
+    places = none[0]
+    places[free] = moved @ change[: own.start].reshape(-1, 3, 4)
+    by_scale = change[own.stop :, 0].reshape(parameters.shape)
+    return _Shared(error, places, by_scale, covariance[own, own] - change[own] @ change[own].T)
 
 
 def _landmarks(problem: BatchProblem, solution: Solution, shared: FloatArray) -> list[Landmark]:
     """All landmarks that are connected, with standard deviations for those that were estimated."""
-    factor = max(1.0, solution.variance_ratio)
+    variance = np.einsum("kii->ki", max(1.0, solution.variance_ratio) * solution.landmark_covariance)
+    variance = np.maximum(variance - np.sum(shared**2, axis=2), _LEAST_SIGMA**2)
     found = []
-    for mark, pose, covariance, is_known, common in zip(
-        problem.swarm.landmarks,
-        solution.landmark.tolist(),
-        factor * solution.landmark_covariance,
-        problem.is_known,
-        shared,
-        strict=True,
+    for mark, pose, own, is_known in zip(
+        problem.swarm.landmarks, solution.landmark.tolist(), variance, problem.is_known, strict=True
     ):
         if is_known and not mark.is_estimated:
             found.append(mark)
         elif np.isfinite(pose).all():
             x, y, yaw = pose
-            own = float(covariance[0, 0] + covariance[1, 1] - common @ common)
-            position_sigma = math.sqrt(max(0.5 * own, _LEAST_SIGMA**2))
-            yaw_sigma = 0.0 if mark.yaw is None else math.sqrt(float(covariance[2, 2]))
-            place = {"x": x, "y": y, "yaw": None if mark.yaw is None else yaw}
-            place |= {"shared_x": float(common[0]), "shared_y": float(common[1])}
-            found.append(replace(mark, **place, position_sigma=position_sigma, yaw_sigma=yaw_sigma))
+            position_sigma, yaw_sigma = math.sqrt(0.5 * float(own[0] + own[1])), math.sqrt(float(own[2]))
+            has_yaw = mark.yaw is not None
+            place = {"x": x, "y": y, "yaw": yaw if has_yaw else None, "position_sigma": position_sigma}
+            found.append(replace(mark, **place, yaw_sigma=yaw_sigma if has_yaw else 0.0))
     return found
 
 
@@ -499,7 +494,7 @@ def _calibrated(swarm: Swarm, solution: Solution, shared: _Shared) -> Swarm:
     is_clear = np.abs(solution.parameter) > _SIGNIFICANT * solution.parameter_sigma
     is_clear &= np.array([one.name != "turn_bias" for one in SURVEY])
     found = all_changed(swarm, SURVEY, np.where(is_clear, solution.parameter, 0.0))
-    if shared.scale < _KNOWN_SCALE:
+    if shared.error.scale_sigma < _KNOWN_SCALE:
         return found
     sigma, robots = math.sqrt(len(_LOOSE) * len(found.robots)) * np.abs(shared.parameter), []
     for index, robot in enumerate(found.robots):
@@ -521,7 +516,7 @@ def _text(problem: BatchProblem, solution: Solution, before: Swarm, found: Swarm
             continue
         one, wrong = places[mark.id], float(np.mean(_is_wrong(solution)[rows]))
         yaw = "-" if one.yaw is None else f"{math.degrees(one.yaw):.1f}"
-        sigma = 1e3 * math.sqrt(one.position_sigma**2 + 0.5 * (one.shared_x**2 + one.shared_y**2))
+        sigma = 1e3 * one.position_sigma
         lines.append(
             f"{one.id:8d} {one.x:12.3f} {one.y:9.3f} {yaw:>10} {sigma:11.1f} {rows.sum():10d} {wrong:13.0%}"
         )
