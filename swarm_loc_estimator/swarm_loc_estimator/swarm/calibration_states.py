@@ -178,7 +178,7 @@ def _shared(mark: Surveyed, error: MapError) -> FloatArray:
     return by * sigma
 
 
-def shared_error(place: FloatArray, covariance: FloatArray) -> tuple[MapError, FloatArray]:
+def shared_error(place: FloatArray, covariance: FloatArray) -> tuple[MapError, FloatArray, FloatArray]:
     """What places share of their errors: scale, turn and shift of the similarity that fits these best.
 
     Args:
@@ -186,17 +186,20 @@ def shared_error(place: FloatArray, covariance: FloatArray) -> tuple[MapError, F
         covariance: (n, n) of their right-invariant errors (3 k), and of any other errors.
 
     Returns:
-        The shared error, and errors (n, 4) by one standard deviation of it. The first are those by the scale.
+        The shared error, errors (k, 3, 4) of x, y, yaw of the places by one standard deviation of it, and other
+        errors (n - 3 k, 4). The first ones are those by the scale.
     """
     # scale, turn and shift of the fit, by errors of the places
     count, centre = len(place), place.mean(axis=0)
     away, turned = place - centre, (place - centre) @ [[0.0, 1.0], [-1.0, 0.0]]
-    moves = np.zeros((count, 2, 3))  # places by errors
-    moves[:, :, :2], moves[:, 0, 2], moves[:, 1, 2] = np.eye(2), -place[:, 1], place[:, 0]
+    moves = np.tile(np.eye(3), (count, 1, 1))  # poses by errors
+    moves[:, 0, 2], moves[:, 1, 2] = -place[:, 1], place[:, 0]
     square = float((away**2).sum())
-    by_place = np.array([away / square, turned / square, *np.broadcast_to(np.eye(2)[:, None] / count, (2, count, 2))])
+    by_place = np.array(
+        [away / square, turned / square, *np.broadcast_to(np.eye(2)[:, None] / count, (2, count, 2))]
+    )
     fit = np.zeros((4, len(covariance)))
-    fit[:, : 3 * count] = np.einsum("fki,kij->fkj", by_place, moves).reshape(4, -1)
+    fit[:, : 3 * count] = np.einsum("fki,kij->fkj", by_place, moves[:, :2]).reshape(4, -1)
     # what all errors are expected to be, and the point about which turn and scale leave the least shift
     change = covariance @ fit.T
     spread = fit @ change
@@ -205,7 +208,8 @@ def shared_error(place: FloatArray, covariance: FloatArray) -> tuple[MapError, F
     x, y = (centre - off).tolist()
     shift = 0.5 * max(float(spread[2, 2] + spread[3, 3] - whole * off @ off), 0.0)
     error = MapError(x, y, math.sqrt(shift), math.sqrt(spread[1, 1]), math.sqrt(spread[0, 0]))
-    return error, np.linalg.solve(np.linalg.cholesky(spread), change.T).T
+    change = np.linalg.solve(np.linalg.cholesky(spread), change.T).T
+    return error, moves @ change[: 3 * count].reshape(count, 3, 4), change[3 * count :]
 
 
 def _error(mark: Surveyed, sigma: tuple[float, float]) -> FloatArray:

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 from core_messages import detection
 from core_messages import joined as joined_detections
-from core_run import recording_of
+from core_run import covariance_of_places, recording_of
 from core_world import Plan, World, simulate
-from scipy.linalg import block_diag
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.cli import survey as command
@@ -20,7 +19,6 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, interpolate
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.offline.batch.parameters import SURVEY
 from swarm_loc_estimator.offline.batch.problem import problem_of
 from swarm_loc_estimator.offline.batch.solver import Solver
@@ -33,7 +31,6 @@ from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY
 from swarm_loc_estimator.sensors.ranges import RangeRows
 from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
-from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.error_models import ImuModel
 from swarm_loc_estimator.swarm.swarm import (
     Anchor,
@@ -154,19 +151,6 @@ def test_the_map_of_cameras_with_another_range_curve_is_right_within_its_covaria
     assert error.ravel() @ np.linalg.solve(covariance, error.ravel()) < 4.0 * len(marks)
 
 
-def covariance_of_places(swarm: Swarm) -> FloatArray:
-    """Covariance (2 k, 2 k) of x and y of all places (k,), as the filter begins with it."""
-    state = SwarmState(ParameterTable.of(swarm.robots, swarm.surveyed, swarm.map_error))
-    moved = []
-    for one in swarm.surveyed:
-        is_shift = isinstance(one, Anchor)
-        moved.append([[1.0, 0.0, 0.0 if is_shift else -one.y], [0.0, 1.0, 0.0 if is_shift else one.x]])
-    columns = np.concatenate([state.landmark_column(k) + np.arange(3) for k in range(len(moved))])
-    by = block_diag(*moved)
-    covariance: FloatArray = by @ state.filter.block(columns) @ by.T
-    return covariance
-
-
 def test_all_places_with_a_sigma_share_an_error_in_the_filter() -> None:
     """Landmarks, anchors and cameras are moved, turned and stretched as one; what is exact stays."""
     marks = (Landmark(1, 1.0, 0.0, position_sigma=0.1), Landmark(2, 2.0, 3.0, yaw_sigma=0.2))
@@ -180,6 +164,24 @@ def test_all_places_with_a_sigma_share_an_error_in_the_filter() -> None:
     by[is_exact] = 0.0
     own = np.diag(np.where(is_exact, 1e-8, 0.01))
     assert covariance_of_places(swarm) == pytest.approx(by @ by.T + own, abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_described_places_that_share_an_error_move_as_one(seed: int) -> None:
+    """All are turned by 4 deg and 2 % too far apart, known to a millimetre beside that; a start is right."""
+    world = simulate(PLAN, seed)
+    wrong = tuple(
+        replace(one, x=1.02 * x, y=1.02 * y, yaw=(one.yaw or 0.0) + 0.07, position_sigma=1e-3, yaw_sigma=1e-3)
+        for one in world.swarm.landmarks
+        for x, y in [se2.transform_points(np.array([0.0, 0.0, 0.07]), np.array([[one.x, one.y]]))[0].tolist()]
+    )
+    off, truth = [], places_of(world.swarm)
+    for error in (MapError(), MapError(yaw_sigma=0.05, scale_sigma=0.02)):
+        swarm = replace(located_start(world), landmarks=wrong, map_error=error)
+        found = places_of(survey(recording_of(world), swarm).swarm)
+        off.append(max(np.hypot(*(found[i] - truth[i])[:2]) for i in truth))
+    assert off[1] < 0.02
+    assert off[0] > 2.0 * off[1]
 
 
 @pytest.mark.parametrize("bag", ["eight_five_robots", "eight_five_robots_w2"])

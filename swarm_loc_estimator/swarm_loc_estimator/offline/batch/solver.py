@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
@@ -21,6 +22,7 @@ from swarm_loc_estimator.filter.models import predict_any
 from swarm_loc_estimator.offline.batch.normal import ChainEquations, ChainFactor
 from swarm_loc_estimator.offline.batch.problem import BatchProblem, Drift, innovation
 from swarm_loc_estimator.offline.batch.start import Start
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera
 
 # The steps are checked by test_survey.py and make bench-commissioning, also with wrong scales of wheels.
@@ -152,6 +154,7 @@ class Solver:
         self._drift = np.zeros((knots.robot.size, drifts))
         self._drift_column = self._knot_column[:, None] + 3 + np.arange(drifts)
         self._landmark_column, next_column = _numbered(free, self._band)
+        self._shared = ParameterTable.of((), places, problem.swarm.map_error).shared
         self._parameter_column = next_column + np.arange(self._prior.size).reshape(robots, -1)
         self._size = next_column + self._prior.size
         self._weight, self._is_rigid = np.ones(self._rows.size), True
@@ -306,12 +309,22 @@ class Solver:
         normal.add(np.eye(scaled.shape[1]) / self._prior[:, :, None], self._parameter_column, scaled)
         cost = float(np.sum(scaled**2))
         cost += 0.0 if self._is_rigid else self._add_truth(normal)
+        together = []
+        of_places = dict(zip(self._landmark_column.tolist(), self._shared, strict=True))
         for column, pose, prior, sigma in self._anchors():
             # the error of the pose in map, linearized: xi = log(X X_prior^-1)
             residual = se2.log(se2.compose(pose, se2.inverse(prior)))
-            root = np.linalg.inv(np.linalg.cholesky(se2.error_covariance(prior, np.diag(sigma**2))))
-            normal.add(root[None], (column + np.arange(3))[None], (root @ residual)[None])
-            cost += float(np.sum((root @ residual) ** 2))
+            covariance = se2.error_covariance(prior, np.diag(sigma**2))
+            shared = of_places.get(column)
+            if shared is None or not shared.any():
+                cost += _add_prior(normal, column + np.arange(3), residual, covariance)
+            else:
+                together.append((column + np.arange(3), residual, covariance, shared))
+        # places that share an error are one
+        if together:
+            columns, residuals, own, by = zip(*together, strict=True)
+            whole = block_diag(*own) + np.concatenate(by) @ np.concatenate(by).T
+            cost += _add_prior(normal, np.concatenate(columns), np.concatenate(residuals), whole)
         return cost
 
     def _add_truth(self, normal: ChainEquations) -> float:
@@ -450,6 +463,15 @@ class Solver:
             self._parameter_column,
             sightings,
         )
+
+
+def _add_prior(
+    normal: ChainEquations, columns: IntArray, residual: FloatArray, covariance: FloatArray
+) -> float:
+    """Add a residual (r,) of unknowns (r,) with a covariance (r, r); its cost."""
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    normal.add(root[None], columns[None], (root @ residual)[None])
+    return float(np.sum((root @ residual) ** 2))
 
 
 def _numbered(wanted: BoolArray, first: int, size: int = 3) -> tuple[IntArray, int]:

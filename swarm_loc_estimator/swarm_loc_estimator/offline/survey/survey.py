@@ -454,16 +454,12 @@ def _shared(solution: Solution) -> _Shared:
     unknowns = np.concatenate([(bodies[:, None] + np.arange(3)).ravel(), parameters.ravel()])
     covariance = max(1.0, solution.variance_ratio) * solution.factor.covariance(unknowns)
     own = slice(3 * free.size, 3 * bodies.size)
-    none = np.zeros((column.size, 3, 4)), np.zeros(parameters.shape), covariance[own, own]
+    places, frame = np.zeros((column.size, 3, 4)), covariance[own, own]
     if not free.size or not np.ptp(place[free, :2], axis=0).any():
-        return _Shared(MapError(), *none)
-    error, change = shared_error(place[free, :2], covariance)
-    moved = np.tile(np.eye(3), (free.size, 1, 1))  # places by errors
-    moved[:, 0, 2], moved[:, 1, 2] = -place[free, 1], place[free, 0]
-    places = none[0]
-    places[free] = moved @ change[: own.start].reshape(-1, 3, 4)
-    by_scale = change[own.stop :, 0].reshape(parameters.shape)
-    return _Shared(error, places, by_scale, covariance[own, own] - change[own] @ change[own].T)
+        return _Shared(MapError(), places, np.zeros(parameters.shape), frame)
+    error, places[free], others = shared_error(place[free, :2], covariance)
+    by_scale = others[3:, 0].reshape(parameters.shape)
+    return _Shared(error, places, by_scale, frame - others[:3] @ others[:3].T)
 
 
 def _landmarks(problem: BatchProblem, solution: Solution, shared: FloatArray) -> list[Landmark]:
