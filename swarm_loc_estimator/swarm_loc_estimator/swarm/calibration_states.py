@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import error_covariance
-from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, MapError, Robot, Surveyed
+from swarm_loc_estimator.swarm.swarm import NO_MAP_ERROR, Anchor, FixedCamera, MapError, Robot, Surveyed
 
 TURN_BIAS = 0  # Bias of the turn rate while moving, or of the gyroscope [rad/s]; it changes slowly
 DISTANCE_SCALE = 1  # Relative error of the distance driven
@@ -69,7 +69,7 @@ class ParameterTable(NamedTuple):
         cls,
         robots: Sequence[Robot],
         landmarks: Sequence[Surveyed] = (),
-        map_error: MapError = MapError(),
+        map_error: MapError = NO_MAP_ERROR,
         *,
         in_blocks: bool = False,
     ) -> ParameterTable:
@@ -186,8 +186,8 @@ def shared_error(place: FloatArray, covariance: FloatArray) -> tuple[MapError, F
         covariance: (n, n) of their right-invariant errors (3 k), and of any other errors.
 
     Returns:
-        The shared error, errors (k, 3, 4) of x, y, yaw of the places by one standard deviation of it, and other
-        errors (n - 3 k, 4). The first ones are those by the scale.
+        The shared error, errors (k, 3, 4) of x, y, yaw of the places by one standard deviation of it, and
+        other errors (n - 3 k, 4). The first ones are those by the scale.
     """
     # scale, turn and shift of the fit, by errors of the places
     count, centre = len(place), place.mean(axis=0)

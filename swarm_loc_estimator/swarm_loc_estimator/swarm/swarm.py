@@ -244,6 +244,9 @@ class MapError:
     scale_sigma: float = number(0.0, "1", 0.0, 1.0, "standard deviation of their scale")
 
 
+NO_MAP_ERROR = MapError()
+
+
 @dataclass(frozen=True)
 class MarkerOwner:
     """Owner of a marker id."""
@@ -322,7 +325,7 @@ class Swarm:
     #: Expected topic, such as `robot1/odom` or `<robot>/odom` for all robots -> the topic in its place
     topics: Mapping[str, str] = field(default_factory=dict)
     localizer: Localizer | None = None  #: What tells the poses of robots from outside; None: nothing
-    map_error: MapError = MapError()  #: Error that places share
+    map_error: MapError = NO_MAP_ERROR  #: Error that places share
     origin: tuple[float, float] = (0.0, 0.0)  #: Of all places in the frame of `map` and its file [m]
 
     def __post_init__(self) -> None:

@@ -22,7 +22,7 @@ from swarm_loc_estimator.swarm.calibration_states import (
     ParameterTable,
     shared_error,
 )
-from swarm_loc_estimator.swarm.swarm import Anchor, MapError, Robot, Surveyed, Swarm
+from swarm_loc_estimator.swarm.swarm import NO_MAP_ERROR, Anchor, MapError, Robot, Surveyed, Swarm
 
 _LEAST_VARIANCE = 1e-8  # Of a place beyond the error that it shares, which may be all of it [m^2, rad^2]
 
@@ -107,7 +107,7 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
 
 
 def _shared(swarm: Swarm, state: SwarmState) -> tuple[MapError, FloatArray]:
-    """The error that places share, and variances (S, 3) of these by it; of a sparse filter, it is in all of them."""
+    """The error that places share, and variances (S, 3) of these by it; a sparse filter does not know it."""
     variance = np.zeros((len(swarm.surveyed), 3))
     is_free = [
         state.landmark_column(k) >= 0 and one.position_sigma > 0.0 for k, one in enumerate(swarm.surveyed)
@@ -116,7 +116,7 @@ def _shared(swarm: Swarm, state: SwarmState) -> tuple[MapError, FloatArray]:
     free, anchors = np.flatnonzero(is_free & ~is_shift), np.flatnonzero(is_free & is_shift)
     place = np.array([(swarm.surveyed[k].x, swarm.surveyed[k].y) for k in free]).reshape(-1, 2)
     if free.size < 2 or not np.ptp(place, axis=0).any() or not state.filter.is_dense:
-        return MapError(), variance
+        return NO_MAP_ERROR, variance
     place = se2.transform_points(state.landmark[free], place)
     columns = [state.landmark_column(k) + np.arange(3) for k in (*free.tolist(), *anchors.tolist())]
     error, places, others = shared_error(place, state.filter.block(np.concatenate(columns)))

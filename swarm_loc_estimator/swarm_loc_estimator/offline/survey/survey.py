@@ -34,7 +34,15 @@ from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.report.plots import INK, SOFT, colour_of, label_map, save, style
 from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
 from swarm_loc_estimator.swarm.calibration_states import shared_error
-from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, MapError, Swarm, UwbDevice
+from swarm_loc_estimator.swarm.swarm import (
+    NO_MAP_ERROR,
+    Anchor,
+    FixedCamera,
+    Landmark,
+    MapError,
+    Swarm,
+    UwbDevice,
+)
 
 # Checked by test_survey_cameras_and_anchors.py.
 MIN_MEASUREMENTS = 30  # Minimum number of sightings or ranges that place a camera or an anchor
@@ -456,7 +464,7 @@ def _shared(solution: Solution) -> _Shared:
     own = slice(3 * free.size, 3 * bodies.size)
     places, frame = np.zeros((column.size, 3, 4)), covariance[own, own]
     if not free.size or not np.ptp(place[free, :2], axis=0).any():
-        return _Shared(MapError(), places, np.zeros(parameters.shape), frame)
+        return _Shared(NO_MAP_ERROR, places, np.zeros(parameters.shape), frame)
     error, places[free], others = shared_error(place[free, :2], covariance)
     by_scale = others[3:, 0].reshape(parameters.shape)
     return _Shared(error, places, by_scale, frame - others[:3] @ others[:3].T)
