@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibration_world import World, record, robot
+from calibration_world import SECOND, World, record, robot
 
 from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.calibrate import main
@@ -35,6 +35,7 @@ from swarm_loc_estimator.offline.calibration.motion import (
 )
 from swarm_loc_estimator.offline.calibration.recording import (
     CalibrationError,
+    joined,
     read_recording,
     rerun,
     started_at_truth,
@@ -337,6 +338,27 @@ def test_without_ground_truth_the_models_are_found_by_landmarks_alone(seed: int)
     errors = []
     for name, path in alone.paths.items():
         true, known = interpolate(recording.truth[name], path.stamp_ns, DEFAULT_GAP_NS)
+        errors.append(np.hypot(*(path.pose[known] - true[known])[:, :2].T))
+    assert np.sqrt(np.mean(np.square(np.concatenate(errors)))) < 0.03
+
+
+@pytest.mark.parametrize("seed", [7, 8])
+def test_recordings_are_fitted_together(seed: int) -> None:
+    """Robots are elsewhere in the second, where landmarks locate them; nothing is known between the two."""
+    centred = replace(TRUE, odometry=replace(TRUE.odometry, course_offset=0.0, axle_offset=0.0))
+    robots = (robot(1, centred), robot(2, centred))
+    (first, swarm), (second, _) = (record(World(robots, one, 150.0)) for one in (seed, seed + 10))
+    both = joined([first, second])
+    assert both.odometry.robot.size == first.odometry.robot.size + second.odometry.robot.size
+    alone = fit_models(replace(both, truth={}), swarm, Options(alone=True), quiet)
+    for found in alone.swarm.robots:
+        assert found.sensor.range_curve == pytest.approx(0.5, abs=0.06)
+        assert found.sensor.bearing_scale == pytest.approx(0.97, abs=0.02)
+    end_ns, errors = first.range_ns[1], []
+    for name, path in alone.paths.items():
+        assert not ((path.stamp_ns > end_ns + SECOND) & (path.stamp_ns < end_ns + 59 * SECOND)).any()
+        true, known = interpolate(both.truth[name], path.stamp_ns, DEFAULT_GAP_NS)
+        assert known[path.stamp_ns > end_ns].mean() > 0.9
         errors.append(np.hypot(*(path.pose[known] - true[known])[:, :2].T))
     assert np.sqrt(np.mean(np.square(np.concatenate(errors)))) < 0.03
 

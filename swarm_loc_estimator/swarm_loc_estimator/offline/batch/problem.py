@@ -156,7 +156,7 @@ def problem_of(
         wanted = ~np.isin(rows.detection["id"], list(rare)) & (rows.robot < len(swarm.robots))
         seen = replace(recording, detections=select(rows, wanted), fixes=NO_FIXES, ranges=NO_RANGES)
     tracks, sightings = _tracks(recording, swarm), _measured(seen, described)
-    knots = _knots(tracks, recording, swarm, sightings if is_described else NO_MEASUREMENTS)
+    knots = _knots(tracks, recording, swarm, sightings, is_described)
     robots = np.stack([sightings.observer, sightings.target])
     sides = np.stack([knots.nearest(one, sightings.stamp_ns) for one in robots])
     started = np.array([tracks.has_started(np.maximum(one, 0), sightings.stamp_ns) for one in robots])
@@ -315,14 +315,16 @@ def _with_landmarks(recording: Recording, swarm: Swarm) -> tuple[Swarm, dict[int
     return replace(swarm, landmarks=(*swarm.landmarks, *new), anchors=(), cameras=()), rare
 
 
-def _knots(tracks: OdometryTracks, recording: Recording, swarm: Swarm, measured: Measurements) -> Knots:
-    """Instants of all robots with odometry, and of robots that need none and were measured."""
+def _knots(
+    tracks: OdometryTracks, recording: Recording, swarm: Swarm, measured: Measurements, standing: bool
+) -> Knots:
+    """Instants of all robots with odometry, and of `standing` ones that need none and were measured."""
     rows, robots, stamps = recording.odometry, [], []
     spans = {}
     for robot in np.unique(rows.robot).tolist():
         own = rows.stamp_ns[rows.robot == robot]
         spans[robot] = (int(own.min()), int(own.max()))
-    for robot in np.flatnonzero([one.stands for one in swarm.robots]).tolist():
+    for robot in np.flatnonzero([one.stands and standing for one in swarm.robots]).tolist():
         own = measured.stamp_ns[(measured.observer == robot) | (measured.target == robot)]
         if robot not in spans and own.size:
             spans[robot] = (int(own.min()), int(own.max()))
@@ -335,7 +337,19 @@ def _knots(tracks: OdometryTracks, recording: Recording, swarm: Swarm, measured:
         robots.append(np.full(at_ns.size, robot))
         stamps.append(at_ns)
     robot, stamp_ns = np.concatenate(robots), np.concatenate(stamps)
-    return Knots(robot, stamp_ns, tracks.at(robot, stamp_ns), step_ns)
+    knots = Knots(robot, stamp_ns, tracks.at(robot, stamp_ns), step_ns)
+    # none where the motion is unknown and nothing was measured
+    silent = np.zeros(robot.size, dtype=bool)
+    for index in spans:
+        own, driven = robot == index, np.sort(rows.stamp_ns[rows.robot == index])
+        after = np.searchsorted(driven, stamp_ns[own]).clip(1, max(1, driven.size - 1))
+        pause_ns = driven[after] - driven[after - 1] if driven.size > 1 else np.zeros(1)
+        silent[own] = pause_ns > 1e9 * swarm.robots[index].odometry.timeout_s
+    near = np.concatenate(
+        [knots.nearest(one, measured.stamp_ns) for one in (measured.observer, measured.target)]
+    )
+    silent[near[near >= 0]] = False
+    return Knots(robot[~silent], stamp_ns[~silent], select(knots.sample, ~silent), step_ns)
 
 
 def innovation(some: Measurements, measured: FloatArray, predicted: FloatArray) -> FloatArray:

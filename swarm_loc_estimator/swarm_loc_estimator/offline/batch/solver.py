@@ -84,12 +84,14 @@ class Solution:
         return poses
 
     def paths(self) -> dict[str, Trajectory]:
-        """Paths by the names of robots, every `_PATH_NS`."""
+        """Paths by the names of robots, every `_PATH_NS`, but where nothing is known of their motion."""
         found = {}
         for index, robot in enumerate(self.problem.swarm.robots):
             own = self.problem.knots.stamp_ns[(self.problem.knots.robot == index) & (self.column >= 0)]
             if own.size:
                 stamps = np.arange(own[0], own[-1], _PATH_NS)
+                after = np.searchsorted(own, stamps, side="right")
+                stamps = stamps[own[after] - own[after - 1] <= 2 * self.problem.knots.step_ns]
                 poses = self.at(np.full(stamps.size, index), stamps)
                 known = np.isfinite(poses[:, 0])
                 found[robot.name] = Trajectory(stamps[known], poses[known])

@@ -296,6 +296,8 @@ def _doubt(solution: Solution, members: Sequence[int]) -> FloatArray:
         own = np.flatnonzero((knots.robot == index) & (solution.column >= 0))
         end = np.searchsorted(knots.stamp_ns[own], knots.stamp_ns[own] + round(1e9 * WINDOW_S))
         begin = np.flatnonzero(end < own.size)
+        late_ns = knots.stamp_ns[own[end[begin]]] - knots.stamp_ns[own[begin]] - round(1e9 * WINDOW_S)
+        begin = begin[late_ns <= 2 * knots.step_ns]
         track = knots.sample.pose[own]
         moved = se2.between(track[begin], track[end[begin]])
         begin = begin[np.hypot(moved[:, 0], moved[:, 1]) > _MOVED_M]
