@@ -675,7 +675,7 @@ def evaluate_link(
 
 
 def _antenna(place: FloatArray, tracks: TrackArrays, robot: int, stamp_ns: int) -> list[float]:
-    """X and y of a place (3,) on a robot, by its odometry alone [m]; fixed without a robot."""
+    """x and y of a place (3,) on a robot, by its odometry alone [m]; fixed without a robot."""
     pose = np.zeros(3)
     if robot >= 0:
         look_up_pose(tracks, robot, stamp_ns, pose)

@@ -35,6 +35,7 @@ from swarm_loc_estimator.offline.calibration.motion import (
 )
 from swarm_loc_estimator.offline.calibration.recording import (
     CalibrationError,
+    Recording,
     joined,
     read_recording,
     rerun,
@@ -42,8 +43,10 @@ from swarm_loc_estimator.offline.calibration.recording import (
 )
 from swarm_loc_estimator.offline.calibration.robust import population, ridge
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE
-from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel, SensorModel
-from swarm_loc_estimator.swarm.swarm import CameraMount, Robot
+from swarm_loc_estimator.sensors.imu import TurnRateRows
+from swarm_loc_estimator.sensors.ranges import RangeRows
+from swarm_loc_estimator.swarm.error_models import ImuModel, MotionResponse, OdometryModel, SensorModel
+from swarm_loc_estimator.swarm.swarm import Anchor, CameraMount, Robot, Swarm, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -361,6 +364,75 @@ def test_recordings_are_fitted_together(seed: int) -> None:
         assert known[path.stamp_ns > end_ns].mean() > 0.9
         errors.append(np.hypot(*(path.pose[known] - true[known])[:, :2].T))
     assert np.sqrt(np.mean(np.square(np.concatenate(errors)))) < 0.03
+
+
+RADIO_BIAS, RADIO_SIGMA, GYRO_BIAS, GYRO_DENSITY = 0.3, 0.05, 0.01, 2e-3
+
+
+def with_radios_and_gyroscopes(recording: Recording, swarm: Swarm, seed: int) -> tuple[Recording, Swarm]:
+    """Ranges to four anchors, five a second, and turn rates, twenty a second, of robots that know no better."""
+    rng = np.random.default_rng([seed, 1])
+    anchors = tuple(
+        Anchor(0xA0 + k, x, y, 2.0, range_bias_sigma=0.02)
+        for k, (x, y) in enumerate([(-9.0, -8.0), (8.0, -9.0), (9.0, 9.0), (-8.0, 10.0)])
+    )
+    ranges, turns = [], []
+    for index, one in enumerate(swarm.robots):
+        path = recording.truth[one.name]
+        some = slice(None, None, round(0.2 * SECOND / np.diff(path.stamp_ns)[0]))
+        stamps, pose = path.stamp_ns[some], path.pose[some]
+        for anchor in anchors:
+            distance = np.hypot(np.hypot(pose[:, 0] - anchor.x, pose[:, 1] - anchor.y), anchor.z)
+            distance += RADIO_BIAS + RADIO_SIGMA * rng.standard_normal(distance.size)
+            ranges.append(
+                (np.full(stamps.size, index), stamps, np.full(stamps.size, anchor.address), distance)
+            )
+        stamps, turn = path.stamp_ns, np.unwrap(path.pose[:, 2])
+        rate = np.diff(turn) / (1e-9 * np.diff(stamps)) - GYRO_BIAS
+        rate += GYRO_DENSITY / np.sqrt(1e-9 * np.diff(stamps)) * rng.standard_normal(rate.size)
+        turns.append((np.full(rate.size, index), stamps[1:], rate))
+    robot_index, stamps, device, distance = (np.concatenate(column) for column in zip(*ranges, strict=True))
+    order = np.argsort(stamps, kind="stable")
+    none = np.zeros(stamps.size, dtype=np.uint64)
+    columns = (robot_index, stamps, device.astype(np.uint64), none, distance, np.zeros(stamps.size), stamps)
+    seen = RangeRows(*(column[order] for column in columns))
+    robot_index, stamps, rate = (np.concatenate(column) for column in zip(*turns, strict=True))
+    order = np.argsort(stamps, kind="stable")
+    velocity = np.column_stack([np.zeros((rate.size, 2)), rate])
+    turned = TurnRateRows(*(column[order] for column in (robot_index, stamps, velocity, rate, stamps)))
+    robots = tuple(
+        replace(one, uwb=UwbDevice(k, range_sigma=0.2), imu=ImuModel(turn_noise_density=0.02))
+        for k, one in enumerate(swarm.robots, 1)
+    )
+    swarm = replace(swarm, robots=robots, anchors=anchors)
+    return replace(recording, ranges=seen, turn_rates=turned), swarm
+
+
+@pytest.mark.parametrize("seed", [7, 8])
+def test_radios_and_gyroscopes_are_fitted_with_the_cameras(seed: int) -> None:
+    recording, swarm = record(World((robot(1, HONEST), robot(2, HONEST)), seed, 150.0))
+    recording, swarm = with_radios_and_gyroscopes(recording, swarm, seed)
+    alone = fit_models(replace(recording, truth={}), swarm, Options(alone=True), quiet)
+    for found in alone.swarm.robots:
+        assert found.uwb is not None
+        assert found.uwb.range_bias == pytest.approx(RADIO_BIAS, abs=0.05)
+        assert found.uwb.range_sigma == pytest.approx(RADIO_SIGMA, rel=0.2)
+        assert found.imu.turn_bias == pytest.approx(GYRO_BIAS, abs=1e-3)
+        assert 0.7 < found.imu.turn_noise_density / GYRO_DENSITY < 1.6
+    assert max(abs(found.range_bias) for found in alone.swarm.anchors) < 0.05
+
+
+def test_a_part_of_a_recording_is_a_part_of_all_its_inputs() -> None:
+    recording, swarm = record(World((robot(1, HONEST),), 1, 60.0))
+    recording, _ = with_radios_and_gyroscopes(recording, swarm, 1)
+    part = recording.between(21 * SECOND, 41 * SECOND)
+    for name in ("odometry", "detections", "turn_rates", "ranges"):
+        whole, some = getattr(recording, name).robot.size, getattr(part, name).robot.size
+        assert 0.28 < some / whole < 0.4
+        assert (
+            getattr(part.messages, "rows", part.messages)[name.replace("turn_rates", "imu")].robot.size
+            == some
+        )
 
 
 def test_a_wrong_description_with_a_start_is_mended_by_the_recording_alone() -> None:
