@@ -429,10 +429,7 @@ def test_a_part_of_a_recording_is_a_part_of_all_its_inputs() -> None:
     for name in ("odometry", "detections", "turn_rates", "ranges"):
         whole, some = getattr(recording, name).robot.size, getattr(part, name).robot.size
         assert 0.28 < some / whole < 0.4
-        assert (
-            getattr(part.messages, "rows", part.messages)[name.replace("turn_rates", "imu")].robot.size
-            == some
-        )
+        assert part.messages[name.replace("turn_rates", "imu")].robot.size == some
 
 
 def test_a_wrong_description_with_a_start_is_mended_by_the_recording_alone() -> None:

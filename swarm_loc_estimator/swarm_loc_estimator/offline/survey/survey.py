@@ -3,7 +3,7 @@
 Fixed cameras and UWB anchors are placed by the surveyed paths of robots. A fixed camera saw markers on robots
 whose poses are known by then, so its pose is that of the perspective from n points. An anchor was measured
 from many places, which is multilateration. Both are robust fits (Cauchy). Errors of neighbouring measurements
-are alike, so variances are those of a jackknife over spells of time, and of the frame of all paths. Nothing
+are alike, so variances are those of a jackknife over spells of time; the error of the map is apart. Nothing
 is placed that fits elsewhere as well: places on one line do not tell where about this line a camera or an
 anchor is.
 """
@@ -58,19 +58,8 @@ this share of the distance from the line, and this length."""
 _DEPTH = 0.05  # Least depth of a marker in front of a camera, of which its direction is computed [m]
 
 
-@dataclass(frozen=True)
-class Paths:
-    """Paths of the robots."""
-
-    # Poses (k, 3) in map of robots (k,) at instants (k,) [ns]; NaN: not known
-    at: Callable[[IntArray, IntArray], FloatArray]
-    # (3, 3) covariance of the right-invariant error that is common to all, beyond the error of the map
-    frame: FloatArray
-
-    def variances(self, place: FloatArray) -> FloatArray:
-        """Variances (3,) of x, y and directions at a place (2,) by the frame."""
-        moved = np.array([[1.0, 0.0, -place[1]], [0.0, 1.0, place[0]], [0.0, 0.0, 1.0]])
-        return np.asarray(np.diag(moved @ self.frame @ moved.T))
+Paths = Callable[[IntArray, IntArray], FloatArray]
+"""Poses (k, 3) in map of robots (k,) at instants (k,) [ns]; NaN: not known."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +96,7 @@ def _with_cameras(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
                 f" {stamp_ns.size} x, and {MIN_MEASUREMENTS} are needed."
             )
             continue
-        fit = _located(camera, optical, place, stamp_ns, paths)
+        fit = _located(camera, optical, place, stamp_ns)
         if fit is None:
             found.append(camera)
             remarks.append(
@@ -138,14 +127,14 @@ def _sighted(
     chosen = [owner for owner, is_kept in zip(owners, kept, strict=True) if is_kept and owner is not None]
     robot = np.array([one.robot_index for one in chosen], dtype=np.int64)
     faces = np.array([(one.marker.x, one.marker.y, one.marker.z) for one in chosen]).reshape(-1, 3)
-    pose = paths.at(robot, stamp_ns)
+    pose = paths(robot, stamp_ns)
     place = np.column_stack([se2.transform_points(pose, faces[:, :2]), faces[:, 2]])
     known = np.isfinite(pose).all(axis=1)
     return rows.detection["position"][kept][known], place[known], stamp_ns[known]
 
 
 def _located(
-    camera: FixedCamera, optical: FloatArray, place: FloatArray, stamp_ns: IntArray, paths: Paths
+    camera: FixedCamera, optical: FloatArray, place: FloatArray, stamp_ns: IntArray
 ) -> tuple[FixedCamera, float] | None:
     """A camera at the pose from which it sees markers (k, 3) of `map` at (k, 3), and the share of wrong ones.
 
@@ -180,7 +169,7 @@ def _located(
         centre = other[3:5] + ray[:2] * (height - other[5]) / ray[2]
         return np.append(centre, (turned * rotation.inv()).as_rotvec()[2])
 
-    spread = _jackknife(residual, pose, sigma, stamp_ns, shift) + paths.variances(shift(pose)[:2])
+    spread = _jackknife(residual, pose, sigma, stamp_ns, shift)
     # the pose as a description states it
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # straight down, yaw and roll are one angle
@@ -216,7 +205,7 @@ def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
     known = {one.address for one in (*radios, *swarm.anchors) if one is not None}
     usable = (rows.reference == 0) & np.array([radio is not None for radio in radios])[rows.robot]
     usable &= ~np.isin(rows.device, np.array([*known], dtype=np.uint64)) & (rows.range > 0.0)
-    pose = paths.at(rows.robot, rows.stamp_ns)
+    pose = paths(rows.robot, rows.stamp_ns)
     usable &= np.isfinite(pose).all(axis=1) & np.isfinite(rows.range)
     devices = [one or UwbDevice(0) for one in radios]
     antenna = np.array([(one.x, one.y, one.z) for one in devices])[rows.robot]
@@ -235,7 +224,7 @@ def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
         if own.sum() < MIN_MEASUREMENTS:
             remarks.append(f"{name} was measured {own.sum()} x only and is left out; drive near it.")
             continue
-        fit = _multilaterated(at[own], measured[own], rows.stamp_ns[own], paths)
+        fit = _multilaterated(at[own], measured[own], rows.stamp_ns[own])
         if fit is None:
             remarks.append(
                 f"{name} is left out, since other places fit as well: it was measured from one line or few"
@@ -252,7 +241,7 @@ def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
 
 
 def _multilaterated(
-    at: FloatArray, measured: FloatArray, stamp_ns: IntArray, paths: Paths
+    at: FloatArray, measured: FloatArray, stamp_ns: IntArray
 ) -> tuple[FloatArray, float, float] | None:
     """Place (3,) at distances (k,) from places (k, 3), not below them; its sigma, and share of wrong ones.
 
@@ -274,7 +263,6 @@ def _multilaterated(
     if not _is_unique(residual, place, sigma, at, turned, lambda other: other[:2]):
         return None
     spread = _jackknife(residual, place, sigma, stamp_ns, lambda other: other[:2])
-    spread += paths.variances(place[:2])[:2]
     height = float(np.median(at[:, 2]))
     place[2] = height + abs(place[2] - height)  # ranges in a plane do not tell above from below
     position_sigma = max(math.sqrt(0.5 * float(spread.sum())), _LEAST_SIGMA)
@@ -416,8 +404,7 @@ def survey(
     shared = _shared(solution)
     marks = tuple(_landmarks(problem, solution, shared.place))
     found = replace(_calibrated(swarm, solution, shared), landmarks=marks, map_error=shared.error)
-    paths = Paths(solution.at, shared.frame)
-    placed = place_fixed(recording, found, paths, cameras=cameras)
+    placed = place_fixed(recording, found, solution.at, cameras=cameras)
     found = replace(found, cameras=placed.cameras, anchors=placed.anchors)
     path = se2.compose(solution.knot, problem.knots.sample.pose)
     return Surveyed(found, problem, solution, path, _text(problem, solution, swarm, found, placed))
@@ -450,24 +437,19 @@ class _Shared(NamedTuple):
     error: MapError
     place: FloatArray  # (L, 3, 4) errors of landmarks by one standard deviation, first of the scale
     parameter: FloatArray  # (N, p) those of parameters by the scale
-    frame: FloatArray  # (3, 3) covariance of a knot in the middle beyond it: all paths are as uncertain
 
 
 def _shared(solution: Solution) -> _Shared:
     """The error that all landmarks share that were estimated, and what is correlated with their scale."""
     column, place = solution.landmark_column, solution.landmark
     free, parameters = np.flatnonzero(column >= 0), solution.parameter_column
-    knots = solution.column[solution.column >= 0]
-    bodies = np.append(column[free], knots[knots.size // 2])
-    unknowns = np.concatenate([(bodies[:, None] + np.arange(3)).ravel(), parameters.ravel()])
-    covariance = max(1.0, solution.variance_ratio) * solution.factor.covariance(unknowns)
-    own = slice(3 * free.size, 3 * bodies.size)
-    places, frame = np.zeros((column.size, 3, 4)), covariance[own, own]
+    places = np.zeros((column.size, 3, 4))
     if not free.size or not np.ptp(place[free, :2], axis=0).any():
-        return _Shared(NO_MAP_ERROR, places, np.zeros(parameters.shape), frame)
+        return _Shared(NO_MAP_ERROR, places, np.zeros(parameters.shape))
+    unknowns = np.concatenate([(column[free][:, None] + np.arange(3)).ravel(), parameters.ravel()])
+    covariance = max(1.0, solution.variance_ratio) * solution.factor.covariance(unknowns)
     error, places[free], others = shared_error(place[free, :2], covariance)
-    by_scale = others[3:, 0].reshape(parameters.shape)
-    return _Shared(error, places, by_scale, frame - others[:3] @ others[:3].T)
+    return _Shared(error, places, others[:, 0].reshape(parameters.shape))
 
 
 def _landmarks(problem: BatchProblem, solution: Solution, shared: FloatArray) -> list[Landmark]:
