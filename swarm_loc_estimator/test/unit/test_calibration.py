@@ -370,7 +370,7 @@ RADIO_BIAS, RADIO_SIGMA, GYRO_BIAS, GYRO_DENSITY = 0.3, 0.05, 0.01, 2e-3
 
 
 def with_radios_and_gyroscopes(recording: Recording, swarm: Swarm, seed: int) -> tuple[Recording, Swarm]:
-    """Ranges to four anchors, five a second, and turn rates, twenty a second, of robots that know no better."""
+    """Ranges to four anchors, five a second, and turn rates of robots that know no better."""
     rng = np.random.default_rng([seed, 1])
     anchors = tuple(
         Anchor(0xA0 + k, x, y, 2.0, range_bias_sigma=0.02)

@@ -69,5 +69,5 @@ def errors_of(problem: BatchProblem, paths: Mapping[str, Trajectory]) -> FloatAr
                 rows = np.flatnonzero(who == index)
                 pose, known = interpolate(paths[robot.name], sightings.stamp_ns[rows], DENSE_GAP_NS)
                 sides[side, rows[known]] = pose[known]
-    value, *_ = predict_any(sightings, *sides, np.zeros((sightings.size, 3)))
+    value = predict_any(sightings, sides[0], sides[1], np.zeros((sightings.size, 3)))[0]
     return innovation(sightings, sightings.value, value)
