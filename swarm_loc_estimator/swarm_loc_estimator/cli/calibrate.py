@@ -7,7 +7,8 @@
 Without ground truth, --self fits the recording to itself: landmarks must be where the description says, and
 robots should drive straight and turn both ways past many of them for some minutes.
 
-The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. A
+Several bags of one swarm are one recording with pauses, after which landmarks must locate the robots again.
+The swarm description is the `swarm.yaml` inside the folder of the first unless --swarm names another. A
 picture of the same name as --out shows the errors before and after.
 """
 
@@ -27,17 +28,18 @@ from swarm_loc_estimator.common.command_line import (
     swarm_beside,
     yaml_and_picture,
 )
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.offline.calibration.fit import calibrate
 from swarm_loc_estimator.offline.calibration.models import EVALUATIONS, Options
 from swarm_loc_estimator.offline.calibration.plots import draw, text_of
-from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
+from swarm_loc_estimator.offline.calibration.recording import Recording, joined, read_recording
 from swarm_loc_estimator.offline.export import read_truth
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
 
 @command(
     __doc__,
-    partial(add_bag, content=" with <robot>/ground_truth, with --truth or --self"),
+    partial(add_bag, content="; with <robot>/ground_truth, --truth or --self", several=True),
     add_remap,
     add_truth,
     argument("--out", type=yaml_and_picture, required=True, help="swarm description to write"),
@@ -63,12 +65,16 @@ def main(options: argparse.Namespace) -> int:
         evaluations=options.evaluations,
         alone=options.alone,
     )
-    swarm = load_swarm(options.swarm or swarm_beside(options.bag))
+    if options.truth and len(options.bag) > 1:
+        raise UserError("--truth is for one bag.")
+    swarm = load_swarm(options.swarm or swarm_beside(options.bag[0]))
     with ProgressLine() as progress:
         truth = read_truth(options.truth, swarm)
-        recording = read_recording(options.bag, swarm, progress, options.remap, truth)
+        recording = joined(
+            [read_recording(bag, swarm, progress, options.remap, truth) for bag in options.bag]
+        )
         done = calibrate(recording, swarm, chosen, progress)
-    save_swarm(done.swarm, options.out, f"Calibrated with {options.bag.name}. {done.warning}".rstrip())
+    save_swarm(done.swarm, options.out, f"Calibrated with {recording.name}. {done.warning}".rstrip())
     print("\n".join([text_of(done), *recording.sentences(), *_unused(recording)]))
     print(f"{options.out} written, picture: {draw(done, options.out.with_suffix('.png'))}")
     return 0

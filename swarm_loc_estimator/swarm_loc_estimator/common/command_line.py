@@ -198,9 +198,10 @@ yaml_to_write = file_to_write(".yaml", ".yml")
 yaml_and_picture = file_to_write(".yaml", ".yml", picture=".png")
 
 
-def add_bag(parser: argparse.ArgumentParser, content: str = "") -> None:
-    """Add the arguments of a command that reads a bag: the bag itself, and its swarm description."""
-    parser.add_argument("bag", type=Path, help=f"rosbag2 folder, .mcap or .db3 file{content}")
+def add_bag(parser: argparse.ArgumentParser, content: str = "", *, several: bool = False) -> None:
+    """Add the arguments of a command that reads a bag, or several: the bag, and its swarm description."""
+    nargs = "+" if several else None
+    parser.add_argument("bag", type=Path, nargs=nargs, help=f"rosbag2 folder, .mcap or .db3 file{content}")
     parser.add_argument("--swarm", type=Path, help="swarm description (default: swarm.yaml next to the bag)")
 
 

@@ -534,12 +534,12 @@ class SwarmState:
         for first, survey in zip(self._table.survey_column, self._table.survey, strict=True):
             if first >= 0:
                 self.filter.set_prior(first + np.arange(3), survey)
-        known = np.flatnonzero((self._table.survey_column >= 0) & self._table.shared.any(axis=1))
+        known = np.flatnonzero((self._table.survey_column >= 0) & self._table.shared.any(axis=(1, 2)))
         if known.size and self.filter.is_dense:
-            shared = self._table.shared[known].ravel()
+            shared = self._table.shared[known].reshape(3 * known.size, -1)
             apart = np.kron(1.0 - np.eye(known.size), np.ones((3, 3)))  # each one's own is in its survey
             columns = (self._table.survey_column[known][:, None] + np.arange(3)).ravel()
-            self.filter.add(columns, apart * np.outer(shared, shared))
+            self.filter.add(columns, apart * (shared @ shared.T))
 
     def _trust(self, robots: IntArray, confirmations: float, stamp_ns: IntArray) -> None:
         """Forget the links of robots (k,), and what was known of their errors."""

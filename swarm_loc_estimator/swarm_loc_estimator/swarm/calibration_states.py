@@ -2,9 +2,10 @@
 
 The first three parameters of a robot are errors of its motion, whose effect on the pose grows with distance
 and turn. The next three are the yaw offset, the scale error and the range offset of its camera: a range r is
-measured as (1 + scale) r + offset. The last one is the bias of its radio. A landmark with an inexact survey and a fixed camera are static bodies:
-their state is a correction of the survey, with a right-invariant error about the identity. That of an anchor
-is a displacement and the bias of its ranges.
+measured as (1 + scale) r + offset. The last one is the bias of its radio. A landmark with an inexact survey
+and a fixed camera are static bodies: their state is a correction of the survey, with a right-invariant error
+about the identity. That of an anchor is a displacement and the bias of its ranges. Errors that all places
+share correlate these states.
 Parameters with a standard deviation in the description are estimated from the start, others only after a
 contradiction, with the standard deviations below. Their filter columns follow those of all poses, in the
 order in which they were added.
@@ -12,6 +13,7 @@ order in which they were added.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -20,7 +22,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import error_covariance
-from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, Robot, Surveyed
+from swarm_loc_estimator.swarm.swarm import NO_MAP_ERROR, Anchor, FixedCamera, MapError, Robot, Surveyed
 
 TURN_BIAS = 0  # Bias of the turn rate while moving, or of the gyroscope [rad/s]; it changes slowly
 DISTANCE_SCALE = 1  # Relative error of the distance driven
@@ -56,7 +58,7 @@ class ParameterTable(NamedTuple):
     # (L,) first of the three filter columns of each landmark; -1: not estimated
     survey_column: NDArray[np.int64]
     survey: FloatArray  # (L, 3, 3) prior covariance of its error
-    shared: FloatArray  # (L, 3) its displacement by one standard deviation of what all landmarks share
+    shared: FloatArray  # (L, 3, 4) its error by one standard deviation of each error that all share
     reopened: FloatArray  # (L, 3, 3) covariance that is added after a contradiction
     drives: BoolArray  # (N,) whether the robot has odometry
     first_anchor: int  # Index of the first anchor among what was surveyed
@@ -65,7 +67,12 @@ class ParameterTable(NamedTuple):
 
     @classmethod
     def of(
-        cls, robots: Sequence[Robot], landmarks: Sequence[Surveyed] = (), *, in_blocks: bool = False
+        cls,
+        robots: Sequence[Robot],
+        landmarks: Sequence[Surveyed] = (),
+        map_error: MapError = NO_MAP_ERROR,
+        *,
+        in_blocks: bool = False,
     ) -> ParameterTable:
         """Table of the parameters that the descriptions of robots and landmarks estimate from the start."""
         sigma, time_s = np.zeros((len(robots), PARAMETERS)), np.zeros((len(robots), PARAMETERS))
@@ -87,6 +94,7 @@ class ParameterTable(NamedTuple):
         doubted[[robot.camera is None for robot in robots], DRIVES:RADIO_BIAS] = 0.0
         times = np.where(time_s > 0.0, time_s, np.inf)
         surveys = np.array([_survey(mark) for mark in landmarks]).reshape(-1, 3, 3)
+        shared = np.array([_shared(mark, map_error) for mark in landmarks]).reshape(-1, 3, 4)
         drives = np.array([not robot.stands for robot in robots], dtype=bool)
         first_camera = sum(not isinstance(mark, FixedCamera) for mark in landmarks)
         first_anchor = first_camera - sum(isinstance(mark, Anchor) for mark in landmarks)
@@ -100,8 +108,8 @@ class ParameterTable(NamedTuple):
             doubted,
             times,
             survey_column,
-            surveys,
-            np.array([_shared(mark) for mark in landmarks]).reshape(-1, 3),
+            surveys + shared @ shared.transpose(0, 2, 1),
+            shared,
             np.array(reopened).reshape(-1, 3, 3),
             drives,
             first_anchor,
@@ -156,13 +164,53 @@ def _survey(mark: Surveyed) -> FloatArray:
     """Prior covariance (3, 3) of the error of what was surveyed."""
     third = mark.range_bias_sigma if isinstance(mark, Anchor) else mark.yaw_sigma
     given = mark.position_sigma, third
-    own = _error(mark, given if mark.is_estimated else CONTRADICTED_SURVEY_SIGMA)
-    return own + np.outer(_shared(mark), _shared(mark))
+    return _error(mark, given if mark.is_estimated else CONTRADICTED_SURVEY_SIGMA)
 
 
-def _shared(mark: Surveyed) -> FloatArray:
-    """Error (3,) by one standard deviation of what all landmarks share."""
-    return np.array([mark.shared_x, mark.shared_y, 0.0]) if isinstance(mark, Landmark) else np.zeros(3)
+def _shared(mark: Surveyed, error: MapError) -> FloatArray:
+    """Errors (3, 4) of a place by one standard deviation of the shared x, y, turn and scale."""
+    if not mark.position_sigma > 0.0:
+        return np.zeros((3, 4))
+    sigma = (error.position_sigma, error.position_sigma, error.yaw_sigma, error.scale_sigma)
+    away = mark.x - error.x, mark.y - error.y
+    # of a place, the displacement; of a pose, the common motion of the whole map
+    turned = (-away[1], away[0], 0.0) if isinstance(mark, Anchor) else (error.y, -error.x, 1.0)
+    by = np.column_stack([(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), turned, (*away, 0.0)])
+    return by * sigma
+
+
+def shared_error(place: FloatArray, covariance: FloatArray) -> tuple[MapError, FloatArray, FloatArray]:
+    """What places share of their errors: scale, turn and shift of the similarity that fits these best.
+
+    Args:
+        place: (k, 2) at least two places that differ [m].
+        covariance: (n, n) of their right-invariant errors (3 k), and of any other errors.
+
+    Returns:
+        The shared error, errors (k, 3, 4) of x, y, yaw of the places by one standard deviation of it, and
+        other errors (n - 3 k, 4). The first ones are those by the scale.
+    """
+    # scale, turn and shift of the fit, by errors of the places
+    count, centre = len(place), place.mean(axis=0)
+    away, turned = place - centre, (place - centre) @ [[0.0, 1.0], [-1.0, 0.0]]
+    moves = np.tile(np.eye(3), (count, 1, 1))  # poses by errors
+    moves[:, 0, 2], moves[:, 1, 2] = -place[:, 1], place[:, 0]
+    square = float((away**2).sum())
+    by_place = np.array(
+        [away / square, turned / square, *np.broadcast_to(np.eye(2)[:, None] / count, (2, count, 2))]
+    )
+    fit = np.zeros((4, len(covariance)))
+    fit[:, : 3 * count] = np.einsum("fki,kij->fkj", by_place, moves[:, :2]).reshape(4, -1)
+    # what all errors are expected to be, and the point about which turn and scale leave the least shift
+    change = covariance @ fit.T
+    spread = fit @ change
+    whole = spread[0, 0] + spread[1, 1]
+    off = np.array([spread[0, 2] + spread[1, 3], spread[0, 3] - spread[1, 2]]) / whole
+    x, y = (centre - off).tolist()
+    shift = 0.5 * max(float(spread[2, 2] + spread[3, 3] - whole * off @ off), 0.0)
+    error = MapError(x, y, math.sqrt(shift), math.sqrt(spread[1, 1]), math.sqrt(spread[0, 0]))
+    change = np.linalg.solve(np.linalg.cholesky(spread), change.T).T
+    return error, moves @ change[: 3 * count].reshape(count, 3, 4), change[3 * count :]
 
 
 def _error(mark: Surveyed, sigma: tuple[float, float]) -> FloatArray:

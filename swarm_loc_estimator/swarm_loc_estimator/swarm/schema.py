@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from swarm_loc_estimator.common.codec import Schema, entry_specs, properties
 from swarm_loc_estimator.common.parameters import parameter_specs
 from swarm_loc_estimator.swarm.error_models import MotionResponse
-from swarm_loc_estimator.swarm.swarm import Anchor, Face, FixedCamera, Landmark, Localizer
+from swarm_loc_estimator.swarm.swarm import Anchor, Face, FixedCamera, Landmark, Localizer, MapError
 from swarm_loc_estimator.swarm.swarm_file import (
     FILE_VERSION,
     LANDMARK_DEFAULTS,
@@ -84,6 +84,7 @@ def swarm_schema() -> Schema:
             "landmarks": _section("static markers, by marker id", named={"^[0-9]+$": landmark}),
             "cameras": {**_section("fixed cameras", named={_PATTERN: camera}), "propertyNames": free_names},
             "anchors": {"type": ["array", "null"], "items": anchor, "description": "fixed radios"},
+            "map_error": _section("error that all places with a sigma share", _of_class(MapError)),
             "range_topic": {"type": ["string", "null"], "description": "topic of the ranges of two radios"},
             "topics": {"type": ["object", "null"], "additionalProperties": {"type": "string"}},
             "localizer": _section("motion capture or another localizer", _localizer()),

@@ -153,11 +153,6 @@ class Landmark:
     )
     #: Standard deviation of yaw [rad]
     yaw_sigma: float = number(0.0, "rad", 0.0, 10.0, "standard deviation of yaw; 0: exact, else estimated")
-    #: Displacement by one standard deviation of an error that all landmarks share, such as of the scale [m]
-    shared_x: float = number(
-        0.0, "m", -100.0, 100.0, "displacement by one sigma of an error that all landmarks share"
-    )
-    shared_y: float = number(0.0, "m", -100.0, 100.0, "the same of y")
 
     @property
     def is_estimated(self) -> bool:
@@ -239,6 +234,20 @@ Surveyed = Landmark | Anchor | FixedCamera  # A static body whose place may be e
 
 
 @dataclass(frozen=True)
+class MapError:
+    """Error that all places with a standard deviation share."""
+
+    x: float = number(0.0, "m", -1e8, 1e8, "in map: the point about which they are turned and stretched")
+    y: float = number(0.0, "m", -1e8, 1e8, "in map")
+    position_sigma: float = number(0.0, "m", 0.0, 100.0, "standard deviation of x and y of all of them")
+    yaw_sigma: float = number(0.0, "rad", 0.0, 10.0, "standard deviation of their turn")
+    scale_sigma: float = number(0.0, "1", 0.0, 1.0, "standard deviation of their scale")
+
+
+NO_MAP_ERROR = MapError()
+
+
+@dataclass(frozen=True)
 class MarkerOwner:
     """Owner of a marker id."""
 
@@ -316,6 +325,7 @@ class Swarm:
     #: Expected topic, such as `robot1/odom` or `<robot>/odom` for all robots -> the topic in its place
     topics: Mapping[str, str] = field(default_factory=dict)
     localizer: Localizer | None = None  #: What tells the poses of robots from outside; None: nothing
+    map_error: MapError = NO_MAP_ERROR  #: Error that places share
     origin: tuple[float, float] = (0.0, 0.0)  #: Of all places in the frame of `map` and its file [m]
 
     def __post_init__(self) -> None:

@@ -53,6 +53,7 @@ from swarm_loc_estimator.swarm.swarm import (
     FixedCamera,
     Landmark,
     Localizer,
+    MapError,
     Robot,
     StartSigma,
     Swarm,
@@ -65,8 +66,8 @@ SCHEMA_COMMENT = f"yaml-language-server: $schema={SCHEMA_FILE}"
 """First comment of a description, by which editors find the schema."""
 
 _SECTIONS = (
-    *("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors", "range_topic", "map"),
-    *("topics", "localizer"),
+    *("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors", "map_error"),
+    *("range_topic", "map", "topics", "localizer"),
 )
 LAYER = (
     *("odometry", "imu", "lidar", "random_walk", "response", "camera", "sensor", "fix", "clock", "ir"),
@@ -171,6 +172,7 @@ class _Loader(TreeChecks):
             Anchor(**self.values(tree, f"anchors[{k}]", specs, (*PLACED, "address")))
             for k, tree in enumerate(self.items([] if radios is None else radios, "anchors"))
         )
+        shared = self.values(sections.get("map_error"), "map_error", entry_specs(MapError))
         name = sections.get("map")
         if name is not None and (not isinstance(name, str) or not name):
             raise self.error("map", name, "must be the path of a map's .yaml file, from here")
@@ -197,6 +199,7 @@ class _Loader(TreeChecks):
                 sections.get("topics"), [one.name for one in robots], [one.name for one in cameras]
             ),
             localizer=self._localizer(sections.get("localizer")),
+            map_error=MapError(**shared),
         )
         states = ParameterTable.of(swarm.robots, swarm.surveyed).filter_size - 3 * len(robots)
         if states > MAX_PARAMETERS:
@@ -416,7 +419,7 @@ def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
 def _units() -> list[str]:
     """One comment per group of numbers, with the unit of each."""
     groups = {**MODELS, "uwb": UwbDevice, "faces": Face, "landmarks": Landmark}
-    groups |= {"cameras": FixedCamera, "anchors": Anchor}
+    groups |= {"cameras": FixedCamera, "anchors": Anchor, "map_error": MapError}
     lines = ["Units:"]
     for name, cls in groups.items():
         units = ", ".join(f"{key} [{spec.unit}]" for key, spec in number_specs(cls).items())
@@ -441,6 +444,7 @@ def _tree(swarm: Swarm, folder: Path) -> Layer:
         "landmarks": landmarks,
         "cameras": {one.name: to_tree(one, ("x", "y", "z")) for one in swarm.cameras},
         "anchors": [to_tree(one, PLACED) for one in swarm.anchors],
+        "map_error": to_tree(swarm.map_error),
         "range_topic": swarm.range_topic,
         "topics": dict(swarm.topics),
         "localizer": _unusual(swarm.localizer),

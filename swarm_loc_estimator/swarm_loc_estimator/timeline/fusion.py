@@ -130,7 +130,9 @@ class Fusion:
         self._sides = robots, 3 * robots + surveyed
         self._first_mount, self._first_direction = surveyed - len(swarm.cameras), 2 * robots + surveyed
         self._sees = [robot.camera is not None for robot in swarm.robots]
-        self._table = ParameterTable.of(swarm.robots, swarm.surveyed, in_blocks=self.is_sparse)
+        self._table = ParameterTable.of(
+            swarm.robots, swarm.surveyed, swarm.map_error, in_blocks=self.is_sparse
+        )
         self._pairs = _PAIRS_PER_ROBOT if any(robot.ir is not None for robot in swarm.robots) else 0
 
     def new_state(self) -> SwarmState:

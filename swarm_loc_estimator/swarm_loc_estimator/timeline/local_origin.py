@@ -57,7 +57,8 @@ def about(swarm: Swarm, origin: FloatArray) -> Swarm:
         else replace(robot, start=(robot.start[0] - x, robot.start[1] - y, robot.start[2]))
         for robot in swarm.robots
     ]
-    there = swarm.origin[0] + x, swarm.origin[1] + y
+    error, there = swarm.map_error, (swarm.origin[0] + x, swarm.origin[1] + y)
+    moved["map_error"] = replace(error, x=error.x - x, y=error.y - y)
     return replace(swarm, robots=tuple(robots), origin=there, **moved)
 
 

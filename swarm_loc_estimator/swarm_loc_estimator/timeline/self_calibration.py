@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.swarm.calibration_states import (
     CAMERA_OFFSET,
@@ -19,8 +20,11 @@ from swarm_loc_estimator.swarm.calibration_states import (
     TURN_BIAS,
     TURN_SCALE,
     ParameterTable,
+    shared_error,
 )
-from swarm_loc_estimator.swarm.swarm import Anchor, Robot, Surveyed, Swarm
+from swarm_loc_estimator.swarm.swarm import NO_MAP_ERROR, Anchor, MapError, Robot, Surveyed, Swarm
+
+_LEAST_VARIANCE = 1e-8  # Of a place beyond the error that it shares, which may be all of it [m^2, rad^2]
 
 
 def learns(swarm: Swarm) -> bool:
@@ -32,10 +36,12 @@ def learns(swarm: Swarm) -> bool:
 def learned(swarm: Swarm, state: SwarmState) -> Swarm:
     """Swarm with all estimated parameters and their standard deviations.
 
-    The bias of the turn rate is omitted, because it changes. Standard deviations of landmarks are marginal:
-    they include errors common to all landmarks.
+    The bias of the turn rate is omitted, because it changes. What places share of their errors is apart.
     """
-    surveyed: list[Any] = [_placed(mark, index, state) for index, mark in enumerate(swarm.surveyed)]
+    error, shared = _shared(swarm, state)
+    surveyed: list[Any] = [
+        _placed(mark, index, state, shared[index]) for index, mark in enumerate(swarm.surveyed)
+    ]
     marks, anchors = len(swarm.landmarks), len(swarm.landmarks) + len(swarm.anchors)
     return replace(
         swarm,
@@ -46,6 +52,7 @@ def learned(swarm: Swarm, state: SwarmState) -> Swarm:
         landmarks=tuple(surveyed[:marks]),
         cameras=tuple(surveyed[anchors:]),
         anchors=tuple(surveyed[marks:anchors]),
+        map_error=error,
     )
 
 
@@ -99,9 +106,29 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
     )
 
 
-def _calibrated(anchor: Anchor, number: int, state: SwarmState) -> Anchor:
+def _shared(swarm: Swarm, state: SwarmState) -> tuple[MapError, FloatArray]:
+    """The error that places share, and variances (S, 3) of these by it; a sparse filter does not know it."""
+    variance = np.zeros((len(swarm.surveyed), 3))
+    is_free = [
+        state.landmark_column(k) >= 0 and one.position_sigma > 0.0 for k, one in enumerate(swarm.surveyed)
+    ]
+    is_shift = np.array([isinstance(one, Anchor) for one in swarm.surveyed], dtype=bool)
+    free, anchors = np.flatnonzero(is_free & ~is_shift), np.flatnonzero(is_free & is_shift)
+    place = np.array([(swarm.surveyed[k].x, swarm.surveyed[k].y) for k in free]).reshape(-1, 2)
+    if free.size < 2 or not np.ptp(place, axis=0).any() or not state.filter.is_dense:
+        return NO_MAP_ERROR, variance
+    place = se2.transform_points(state.landmark[free], place)
+    columns = [state.landmark_column(k) + np.arange(3) for k in (*free.tolist(), *anchors.tolist())]
+    error, places, others = shared_error(place, state.filter.block(np.concatenate(columns)))
+    variance[free] = np.sum(places**2, axis=2)
+    variance[anchors] = np.sum(others**2, axis=1).reshape(-1, 3)
+    return error, variance
+
+
+def _calibrated(anchor: Anchor, number: int, state: SwarmState, shared: FloatArray) -> Anchor:
     """An anchor with its estimated place and bias; what was exact stays so."""
-    (x, y, bias), variance = state.landmark[number].tolist(), np.diag(state.landmark_covariance(number))
+    (x, y, bias) = state.landmark[number].tolist()
+    variance = np.maximum(np.diag(state.landmark_covariance(number)) - shared, _LEAST_VARIANCE)
     found: dict[str, Any] = {}
     if anchor.position_sigma > 0.0:
         sigma = math.sqrt(0.5 * (variance[0] + variance[1]))
@@ -112,20 +139,21 @@ def _calibrated(anchor: Anchor, number: int, state: SwarmState) -> Anchor:
     return replace(anchor, **found)
 
 
-def _placed(mark: Surveyed, number: int, state: SwarmState) -> Any:
+def _placed(mark: Surveyed, number: int, state: SwarmState, shared: FloatArray) -> Any:
     """A landmark, anchor or fixed camera at its estimated place, if that is estimated."""
     if state.landmark_column(number) < 0:
         return mark
     if isinstance(mark, Anchor):
-        return _calibrated(mark, number, state)
+        return _calibrated(mark, number, state, shared)
     x, y, yaw = se2.compose(state.landmark[number], [mark.x, mark.y, mark.yaw or 0.0]).tolist()
     covariance = se2.pose_covariance([x, y, yaw], state.landmark_covariance(number))
+    variance = np.maximum(np.diag(covariance) - shared, _LEAST_VARIANCE)
     moved: Any = mark
     return replace(
         moved,
         x=x,
         y=y,
         yaw=None if mark.yaw is None else yaw,
-        position_sigma=math.sqrt(0.5 * float(np.trace(covariance[:2, :2]))),
-        yaw_sigma=mark.yaw_sigma if mark.yaw is None else math.sqrt(float(covariance[2, 2])),
+        position_sigma=math.sqrt(0.5 * float(variance[0] + variance[1])),
+        yaw_sigma=mark.yaw_sigma if mark.yaw is None else math.sqrt(float(variance[2])),
     )

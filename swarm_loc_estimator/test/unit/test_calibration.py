@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from calibration_world import World, record, robot
+from calibration_world import SECOND, World, record, robot
 
 from bench.shared.bags import copy_part
 from swarm_loc_estimator.cli.calibrate import main
@@ -35,14 +35,18 @@ from swarm_loc_estimator.offline.calibration.motion import (
 )
 from swarm_loc_estimator.offline.calibration.recording import (
     CalibrationError,
+    Recording,
+    joined,
     read_recording,
     rerun,
     started_at_truth,
 )
 from swarm_loc_estimator.offline.calibration.robust import population, ridge
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE
-from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel, SensorModel
-from swarm_loc_estimator.swarm.swarm import CameraMount, Robot
+from swarm_loc_estimator.sensors.imu import TurnRateRows
+from swarm_loc_estimator.sensors.ranges import RangeRows
+from swarm_loc_estimator.swarm.error_models import ImuModel, MotionResponse, OdometryModel, SensorModel
+from swarm_loc_estimator.swarm.swarm import Anchor, CameraMount, Robot, Swarm, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -339,6 +343,93 @@ def test_without_ground_truth_the_models_are_found_by_landmarks_alone(seed: int)
         true, known = interpolate(recording.truth[name], path.stamp_ns, DEFAULT_GAP_NS)
         errors.append(np.hypot(*(path.pose[known] - true[known])[:, :2].T))
     assert np.sqrt(np.mean(np.square(np.concatenate(errors)))) < 0.03
+
+
+@pytest.mark.parametrize("seed", [7, 8])
+def test_recordings_are_fitted_together(seed: int) -> None:
+    """Robots are elsewhere in the second, where landmarks locate them; nothing is known between the two."""
+    centred = replace(TRUE, odometry=replace(TRUE.odometry, course_offset=0.0, axle_offset=0.0))
+    robots = (robot(1, centred), robot(2, centred))
+    (first, swarm), (second, _) = (record(World(robots, one, 150.0)) for one in (seed, seed + 10))
+    both = joined([first, second])
+    assert both.odometry.robot.size == first.odometry.robot.size + second.odometry.robot.size
+    alone = fit_models(replace(both, truth={}), swarm, Options(alone=True), quiet)
+    for found in alone.swarm.robots:
+        assert found.sensor.range_curve == pytest.approx(0.5, abs=0.06)
+        assert found.sensor.bearing_scale == pytest.approx(0.97, abs=0.02)
+    end_ns, errors = first.range_ns[1], []
+    for name, path in alone.paths.items():
+        assert not ((path.stamp_ns > end_ns + SECOND) & (path.stamp_ns < end_ns + 59 * SECOND)).any()
+        true, known = interpolate(both.truth[name], path.stamp_ns, DEFAULT_GAP_NS)
+        assert known[path.stamp_ns > end_ns].mean() > 0.9
+        errors.append(np.hypot(*(path.pose[known] - true[known])[:, :2].T))
+    assert np.sqrt(np.mean(np.square(np.concatenate(errors)))) < 0.03
+
+
+RADIO_BIAS, RADIO_SIGMA, GYRO_BIAS, GYRO_DENSITY = 0.3, 0.05, 0.01, 2e-3
+
+
+def with_radios_and_gyroscopes(recording: Recording, swarm: Swarm, seed: int) -> tuple[Recording, Swarm]:
+    """Ranges to four anchors, five a second, and turn rates of robots that know no better."""
+    rng = np.random.default_rng([seed, 1])
+    anchors = tuple(
+        Anchor(0xA0 + k, x, y, 2.0, range_bias_sigma=0.02)
+        for k, (x, y) in enumerate([(-9.0, -8.0), (8.0, -9.0), (9.0, 9.0), (-8.0, 10.0)])
+    )
+    ranges, turns = [], []
+    for index, one in enumerate(swarm.robots):
+        path = recording.truth[one.name]
+        some = slice(None, None, round(0.2 * SECOND / np.diff(path.stamp_ns)[0]))
+        stamps, pose = path.stamp_ns[some], path.pose[some]
+        for anchor in anchors:
+            distance = np.hypot(np.hypot(pose[:, 0] - anchor.x, pose[:, 1] - anchor.y), anchor.z)
+            distance += RADIO_BIAS + RADIO_SIGMA * rng.standard_normal(distance.size)
+            ranges.append(
+                (np.full(stamps.size, index), stamps, np.full(stamps.size, anchor.address), distance)
+            )
+        stamps, turn = path.stamp_ns, np.unwrap(path.pose[:, 2])
+        rate = np.diff(turn) / (1e-9 * np.diff(stamps)) - GYRO_BIAS
+        rate += GYRO_DENSITY / np.sqrt(1e-9 * np.diff(stamps)) * rng.standard_normal(rate.size)
+        turns.append((np.full(rate.size, index), stamps[1:], rate))
+    robot_index, stamps, device, distance = (np.concatenate(column) for column in zip(*ranges, strict=True))
+    order = np.argsort(stamps, kind="stable")
+    none = np.zeros(stamps.size, dtype=np.uint64)
+    columns = (robot_index, stamps, device.astype(np.uint64), none, distance, np.zeros(stamps.size), stamps)
+    seen = RangeRows(*(column[order] for column in columns))
+    robot_index, stamps, rate = (np.concatenate(column) for column in zip(*turns, strict=True))
+    order = np.argsort(stamps, kind="stable")
+    velocity = np.column_stack([np.zeros((rate.size, 2)), rate])
+    turned = TurnRateRows(*(column[order] for column in (robot_index, stamps, velocity, rate, stamps)))
+    robots = tuple(
+        replace(one, uwb=UwbDevice(k, range_sigma=0.2), imu=ImuModel(turn_noise_density=0.02))
+        for k, one in enumerate(swarm.robots, 1)
+    )
+    swarm = replace(swarm, robots=robots, anchors=anchors)
+    return replace(recording, ranges=seen, turn_rates=turned), swarm
+
+
+@pytest.mark.parametrize("seed", [7, 8])
+def test_radios_and_gyroscopes_are_fitted_with_the_cameras(seed: int) -> None:
+    recording, swarm = record(World((robot(1, HONEST), robot(2, HONEST)), seed, 150.0))
+    recording, swarm = with_radios_and_gyroscopes(recording, swarm, seed)
+    alone = fit_models(replace(recording, truth={}), swarm, Options(alone=True), quiet)
+    for found in alone.swarm.robots:
+        assert found.uwb is not None
+        assert found.uwb.range_bias == pytest.approx(RADIO_BIAS, abs=0.05)
+        assert found.uwb.range_sigma == pytest.approx(RADIO_SIGMA, rel=0.2)
+        assert found.imu.turn_bias == pytest.approx(GYRO_BIAS, abs=1e-3)
+        assert 0.7 < found.imu.turn_noise_density / GYRO_DENSITY < 1.6
+    assert max(abs(found.range_bias) for found in alone.swarm.anchors) < 0.05
+
+
+def test_a_part_of_a_recording_is_a_part_of_all_its_inputs() -> None:
+    recording, swarm = record(World((robot(1, HONEST),), 1, 60.0))
+    recording, _ = with_radios_and_gyroscopes(recording, swarm, 1)
+    part = recording.between(21 * SECOND, 41 * SECOND)
+    for name in ("odometry", "detections", "turn_rates", "ranges"):
+        whole, some = getattr(recording, name).robot.size, getattr(part, name).robot.size
+        assert 0.28 < some / whole < 0.4
+        assert part.messages[name.replace("turn_rates", "imu")].robot.size == some
 
 
 def test_a_wrong_description_with_a_start_is_mended_by_the_recording_alone() -> None:

@@ -23,7 +23,7 @@ from swarm_loc_estimator.cli import (
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.offline.sweep.sweep import FIGURES, KEYS, MINIMIZED, read_sweep
 from swarm_loc_estimator.swarm.new_swarm import KNOWN_ROBOTS, SENSORS
-from swarm_loc_estimator.swarm.swarm import Anchor, Face, FixedCamera, Landmark, UwbDevice
+from swarm_loc_estimator.swarm.swarm import Anchor, Face, FixedCamera, Landmark, MapError, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import MODELS, load_swarm
 
 DOC = Path(__file__).parents[2] / "doc"
@@ -43,7 +43,7 @@ def table_of(cls: type, *required: str) -> str:
     return "\n".join(lines)
 
 
-@pytest.mark.parametrize("cls", [*MODELS.values(), Face])
+@pytest.mark.parametrize("cls", [*MODELS.values(), Face, MapError])
 def test_every_number_of_a_robot_has_its_place(cls: type) -> None:
     assert table_of(cls) in SWARM_DESCRIPTION
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.offline.calibration.recording import Recording
-from swarm_loc_estimator.offline.survey.survey import Paths, Placed, place_fixed
+from swarm_loc_estimator.offline.survey.survey import Placed, place_fixed
 from swarm_loc_estimator.sensors.camera import FROM_OPTICAL, DetectionRows
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY
 from swarm_loc_estimator.sensors.ranges import RangeRows
@@ -66,7 +66,7 @@ def placed(
         ),
     )
     swarm = Swarm((Robot("a", faces=(face,), uwb=RADIO),), cameras=(camera,))
-    return place_fixed(recording, swarm, Paths(at, np.diag([1e-8, 1e-8, 1e-8])), cameras=True)
+    return place_fixed(recording, swarm, at, cameras=True)
 
 
 @pytest.mark.parametrize("where", ["line", "place"])

@@ -7,12 +7,17 @@ from collections.abc import Container, Iterable
 import numpy as np
 from core_messages import SECOND, Event, give, joined
 from core_world import World
+from scipy.linalg import block_diag
 
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.filter.measurements import Verdict
+from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.offline.calibration.recording import Recording
 from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.odometry import OdometryRows
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
+from swarm_loc_estimator.swarm.swarm import Anchor, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
 from swarm_loc_estimator.timeline.timeline import HasBudget
 
@@ -71,3 +76,16 @@ def recording_of(world: World) -> Recording:
         for index, robot in enumerate(world.swarm.robots)
     }
     return Recording("world", odometry, detections, truth)
+
+
+def covariance_of_places(swarm: Swarm) -> FloatArray:
+    """Covariance (2 k, 2 k) of x and y of all places (k,), as the filter begins with it."""
+    state = SwarmState(ParameterTable.of(swarm.robots, swarm.surveyed, swarm.map_error))
+    moved = []
+    for one in swarm.surveyed:
+        is_shift = isinstance(one, Anchor)
+        moved.append([[1.0, 0.0, 0.0 if is_shift else -one.y], [0.0, 1.0, 0.0 if is_shift else one.x]])
+    columns = np.concatenate([state.landmark_column(k) + np.arange(3) for k in range(len(moved))])
+    by = block_diag(*moved)
+    covariance: FloatArray = by @ state.filter.block(columns) @ by.T
+    return covariance

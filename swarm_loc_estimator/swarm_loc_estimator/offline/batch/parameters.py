@@ -11,9 +11,15 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import number_specs
 from swarm_loc_estimator.swarm.error_models import ImuModel, OdometryModel, SensorModel
-from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import CameraMount, Robot, Swarm, UwbDevice
 
-_SECTIONS = {"odometry": OdometryModel, "imu": ImuModel, "camera": CameraMount, "sensor": SensorModel}
+_SECTIONS = {
+    "odometry": OdometryModel,
+    "imu": ImuModel,
+    "camera": CameraMount,
+    "sensor": SensorModel,
+    "uwb": UwbDevice,
+}
 
 
 class Parameter(NamedTuple):
@@ -75,14 +81,18 @@ _POSES = (
     Parameter("camera", "yaw", 0.1),
     Parameter("sensor", "distance_scale", 0.05),
 )
+_RADIO = (
+    Parameter("uwb", "range_bias", 0.2),
+    Parameter("uwb", "range_scale", 0.02),
+)
 
 
-def calibrated_parameters(*, polar: bool, poses: bool, truth: bool) -> tuple[Parameter, ...]:
-    """What a calibration estimates of robots that see ranges and bearings, or poses, of markers.
+def calibrated_parameters(*, polar: bool, poses: bool, ranges: bool, truth: bool) -> tuple[Parameter, ...]:
+    """What a calibration estimates of robots that see markers as ranges and bearings or poses, or anchors.
 
     Where base_link is on a robot only ground truth tells; without it, it is where odometry has it.
     """
-    seen = (*(_POLAR if polar else ()), *(_POSES if poses else ()))
+    seen = (*(_POLAR if polar else ()), *(_POSES if poses else ()), *(_RADIO if ranges else ()))
     return (*_MOTION, *(_BODY if truth else ()), *_MOUNT, *seen)
 
 

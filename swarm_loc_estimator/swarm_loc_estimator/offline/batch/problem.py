@@ -20,7 +20,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, Measurements, concatenate, select
-from swarm_loc_estimator.filter.models import MODELS, POLAR, angles, is_compiled
+from swarm_loc_estimator.filter.models import MODELS, POLAR, RANGE, angles, is_compiled
 from swarm_loc_estimator.odometry.track_arrays import OdometrySample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.offline.batch.parameters import Parameter, all_changed
@@ -28,7 +28,6 @@ from swarm_loc_estimator.offline.calibration.recording import Recording
 from swarm_loc_estimator.sensors.camera import CONTENT_POSE, CONTENT_POSE_TWO
 from swarm_loc_estimator.sensors.fix import NO_FIXES
 from swarm_loc_estimator.sensors.inputs import Batch, InputConverter
-from swarm_loc_estimator.sensors.ranges import NO_RANGES
 from swarm_loc_estimator.swarm.calibration_states import CAMERA_YAW, TURN_BIAS, ParameterTable
 from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
@@ -116,6 +115,11 @@ class BatchProblem:
         """Whether sightings (m,) are range and bearing."""
         return np.asarray(self.sightings.model == POLAR)
 
+    @property
+    def is_seen(self) -> BoolArray:
+        """Whether measurements (m,) are sightings of places by a camera."""
+        return is_compiled(self.sightings.model)
+
     def poses(
         self, rows: IntArray, knot: FloatArray, place: FloatArray, track: FloatArray
     ) -> list[FloatArray]:
@@ -141,29 +145,33 @@ def problem_of(
     parameters: tuple[Parameter, ...] = (),
     truth: Mapping[str, Trajectory] | None = None,
     *,
+    ranged: bool = False,
     is_described: bool = False,
 ) -> BatchProblem:
     """Set up the problem of a recording; landmarks in the description, and poses of `truth`, are known.
 
-    Measurements are sightings by cameras of robots, of markers that belong to nobody, too. Where all
-    `is_described`, they are those of all sensors, and such markers are not used.
+    Measurements are sightings by cameras of robots, of markers that belong to nobody, too, and if `ranged`
+    the ranges to anchors. Where all `is_described`, they are those of all sensors, and such markers are not
+    used.
     """
     # knots, and measurements by robots whose tracks are known then
     described, rare, seen = swarm, dict[int, int](), recording
     if not is_described:
         described, rare = _with_landmarks(recording, swarm)
+        described = replace(described, anchors=swarm.anchors if ranged else ())
         rows = recording.detections
         wanted = ~np.isin(rows.detection["id"], list(rare)) & (rows.robot < len(swarm.robots))
-        seen = replace(recording, detections=select(rows, wanted), fixes=NO_FIXES, ranges=NO_RANGES)
+        seen = replace(recording, detections=select(rows, wanted), fixes=NO_FIXES)
     tracks, sightings = _tracks(recording, swarm), _measured(seen, described)
-    knots = _knots(tracks, recording, swarm, sightings if is_described else NO_MEASUREMENTS)
+    knots = _knots(tracks, recording, swarm, sightings, is_described)
     robots = np.stack([sightings.observer, sightings.target])
     sides = np.stack([knots.nearest(one, sightings.stamp_ns) for one in robots])
     started = np.array([tracks.has_started(np.maximum(one, 0), sightings.stamp_ns) for one in robots])
     near = np.abs(sightings.stamp_ns - knots.stamp_ns[sides]) <= 2 * knots.step_ns
     kept: BoolArray = np.asarray(((robots < 0) | (started & (sides >= 0) & near)).all(axis=0))
-    if not is_described:
-        kept &= is_compiled(sightings.model)  # not directions alone
+    if not is_described:  # not directions alone, nor what two radios of robots measure, of which both may err
+        to_anchor = (sightings.model == RANGE) & (sightings.target < 0)
+        kept &= is_compiled(sightings.model) | to_anchor
     sightings, sides = select(sightings, kept), sides[:, kept]
     # where these robots are on their tracks, and the slip since the knot, with the motion by errors of stamps
     poses, slip = _on_tracks(tracks, sightings, sightings.stamp_ns), np.zeros((2, sightings.size, 3, 3))
@@ -312,17 +320,19 @@ def _with_landmarks(recording: Recording, swarm: Swarm) -> tuple[Swarm, dict[int
         for marker_id in unknown
         if marker_id not in rare
     ]
-    return replace(swarm, landmarks=(*swarm.landmarks, *new), anchors=(), cameras=()), rare
+    return replace(swarm, landmarks=(*swarm.landmarks, *new), cameras=()), rare
 
 
-def _knots(tracks: OdometryTracks, recording: Recording, swarm: Swarm, measured: Measurements) -> Knots:
-    """Instants of all robots with odometry, and of robots that need none and were measured."""
+def _knots(
+    tracks: OdometryTracks, recording: Recording, swarm: Swarm, measured: Measurements, standing: bool
+) -> Knots:
+    """Instants of all robots with odometry, and of `standing` ones that need none and were measured."""
     rows, robots, stamps = recording.odometry, [], []
     spans = {}
     for robot in np.unique(rows.robot).tolist():
         own = rows.stamp_ns[rows.robot == robot]
         spans[robot] = (int(own.min()), int(own.max()))
-    for robot in np.flatnonzero([one.stands for one in swarm.robots]).tolist():
+    for robot in np.flatnonzero([one.stands and standing for one in swarm.robots]).tolist():
         own = measured.stamp_ns[(measured.observer == robot) | (measured.target == robot)]
         if robot not in spans and own.size:
             spans[robot] = (int(own.min()), int(own.max()))
@@ -335,7 +345,19 @@ def _knots(tracks: OdometryTracks, recording: Recording, swarm: Swarm, measured:
         robots.append(np.full(at_ns.size, robot))
         stamps.append(at_ns)
     robot, stamp_ns = np.concatenate(robots), np.concatenate(stamps)
-    return Knots(robot, stamp_ns, tracks.at(robot, stamp_ns), step_ns)
+    knots = Knots(robot, stamp_ns, tracks.at(robot, stamp_ns), step_ns)
+    # none where the motion is unknown and nothing was measured
+    silent = np.zeros(robot.size, dtype=bool)
+    for index in spans:
+        own, driven = robot == index, np.sort(rows.stamp_ns[rows.robot == index])
+        after = np.searchsorted(driven, stamp_ns[own]).clip(1, max(1, driven.size - 1))
+        pause_ns = driven[after] - driven[after - 1] if driven.size > 1 else np.zeros(1)
+        silent[own] = pause_ns > 1e9 * swarm.robots[index].odometry.timeout_s
+    near = np.concatenate(
+        [knots.nearest(one, measured.stamp_ns) for one in (measured.observer, measured.target)]
+    )
+    silent[near[near >= 0]] = False
+    return Knots(robot[~silent], stamp_ns[~silent], select(knots.sample, ~silent), step_ns)
 
 
 def innovation(some: Measurements, measured: FloatArray, predicted: FloatArray) -> FloatArray:

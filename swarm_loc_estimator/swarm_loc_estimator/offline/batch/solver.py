@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
@@ -21,6 +22,7 @@ from swarm_loc_estimator.filter.models import predict_any
 from swarm_loc_estimator.offline.batch.normal import ChainEquations, ChainFactor
 from swarm_loc_estimator.offline.batch.problem import BatchProblem, Drift, innovation
 from swarm_loc_estimator.offline.batch.start import Start
+from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera
 
 # The steps are checked by test_survey.py and make bench-commissioning, also with wrong scales of wheels.
@@ -53,7 +55,6 @@ class Solution:
     parameter: FloatArray  # (N, p) changes of parameters of the description
     parameter_sigma: FloatArray  # (N, p) their standard deviations
     landmark_covariance: FloatArray  # (S, 3, 3) of x, y, yaw
-    frame_covariance: FloatArray  # (3, 3) of a knot in the middle: what is common to all is as uncertain
     weight: FloatArray  # (m,) of the sightings, from 0 for wrong ones to 1
     used: BoolArray  # (m,) whether both sides of the sighting are connected with the origin
     variance_ratio: float  # Mean squared residual of sightings by the described noise; 1 is ideal
@@ -83,12 +84,14 @@ class Solution:
         return poses
 
     def paths(self) -> dict[str, Trajectory]:
-        """Paths by the names of robots, every `_PATH_NS`."""
+        """Paths by the names of robots, every `_PATH_NS`, but where nothing is known of their motion."""
         found = {}
         for index, robot in enumerate(self.problem.swarm.robots):
             own = self.problem.knots.stamp_ns[(self.problem.knots.robot == index) & (self.column >= 0)]
             if own.size:
                 stamps = np.arange(own[0], own[-1], _PATH_NS)
+                after = np.searchsorted(own, stamps, side="right")
+                stamps = stamps[own[after] - own[after - 1] <= 2 * self.problem.knots.step_ns]
                 poses = self.at(np.full(stamps.size, index), stamps)
                 known = np.isfinite(poses[:, 0])
                 found[robot.name] = Trajectory(stamps[known], poses[known])
@@ -153,11 +156,12 @@ class Solver:
         self._drift = np.zeros((knots.robot.size, drifts))
         self._drift_column = self._knot_column[:, None] + 3 + np.arange(drifts)
         self._landmark_column, next_column = _numbered(free, self._band)
+        self._shared = ParameterTable.of((), places, problem.swarm.map_error).shared
         self._parameter_column = next_column + np.arange(self._prior.size).reshape(robots, -1)
         self._size = next_column + self._prior.size
         self._weight, self._is_rigid = np.ones(self._rows.size), True
         self._landmarks = len(places)
-        self._origin: FloatArray | None = None
+        self._origin: tuple[int, FloatArray] | None = None  # First knot of a robot that stays at this pose
 
     def solve(self, progress: Progress) -> Solution:
         """Solve, and compute covariances."""
@@ -307,12 +311,22 @@ class Solver:
         normal.add(np.eye(scaled.shape[1]) / self._prior[:, :, None], self._parameter_column, scaled)
         cost = float(np.sum(scaled**2))
         cost += 0.0 if self._is_rigid else self._add_truth(normal)
+        together = []
+        of_places = dict(zip(self._landmark_column.tolist(), self._shared, strict=True))
         for column, pose, prior, sigma in self._anchors():
             # the error of the pose in map, linearized: xi = log(X X_prior^-1)
             residual = se2.log(se2.compose(pose, se2.inverse(prior)))
-            root = np.linalg.inv(np.linalg.cholesky(se2.error_covariance(prior, np.diag(sigma**2))))
-            normal.add(root[None], (column + np.arange(3))[None], (root @ residual)[None])
-            cost += float(np.sum((root @ residual) ** 2))
+            covariance = se2.error_covariance(prior, np.diag(sigma**2))
+            shared = of_places.get(column)
+            if shared is None or not shared.any():
+                cost += _add_prior(normal, column + np.arange(3), residual, covariance)
+            else:
+                together.append((column + np.arange(3), residual, covariance, shared))
+        # places that share an error are one
+        if together:
+            columns, residuals, own, by = zip(*together, strict=True)
+            whole = block_diag(*own) + np.concatenate(by) @ np.concatenate(by).T
+            cost += _add_prior(normal, np.concatenate(columns), np.concatenate(residuals), whole)
         return cost
 
     def _add_truth(self, normal: ChainEquations) -> float:
@@ -355,11 +369,12 @@ class Solver:
             sigma = np.array([spread.x, spread.y, spread.theta])
             found.append(self._first_pose(int(own[0]), np.array(robot.start), sigma))
         if not has_frame:
-            first = int(np.flatnonzero(self._knot_column >= 0)[0])
-            track = problem.knots.sample.pose[first]
-            origin = se2.compose(self._knot[first], track) if self._origin is None else self._origin
-            self._origin = origin
-            found.append(self._first_pose(first, origin, np.full(3, _ORIGIN_SIGMA)))
+            if self._origin is None:
+                _, first = np.unique(problem.knots.robot, return_index=True)
+                pose = se2.compose(self._knot[first], problem.knots.sample.pose[first])
+                nearest = int(np.nanargmin(np.linalg.norm(pose, axis=1)))
+                self._origin = int(first[nearest]), pose[nearest]
+            found.append(self._first_pose(*self._origin, np.full(3, _ORIGIN_SIGMA)))
         return found
 
     def _first_pose(
@@ -432,8 +447,6 @@ class Solver:
             error = factor.covariance(self._landmark_column[index] + np.arange(3))
             covariance[index] = se2.pose_covariance(self._landmark[index], error)
         sigma = np.array([np.sqrt(np.diag(factor.covariance(one))) for one in self._parameter_column])
-        placed = self._knot_column[self._knot_column >= 0]
-        frame = factor.covariance(placed[placed.size // 2] + np.arange(3))
         weight = np.zeros(self.used.size)
         weight[self._rows] = self._weight
         return Solution(
@@ -443,7 +456,6 @@ class Solver:
             self._parameter,
             sigma,
             covariance,
-            frame,
             weight,
             self.used,
             ratio,
@@ -453,6 +465,15 @@ class Solver:
             self._parameter_column,
             sightings,
         )
+
+
+def _add_prior(
+    normal: ChainEquations, columns: IntArray, residual: FloatArray, covariance: FloatArray
+) -> float:
+    """Add a residual (r,) of unknowns (r,) with a covariance (r, r); its cost."""
+    root = np.linalg.inv(np.linalg.cholesky(covariance))
+    normal.add(root[None], columns[None], (root @ residual)[None])
+    return float(np.sum((root @ residual) ** 2))
 
 
 def _numbered(wanted: BoolArray, first: int, size: int = 3) -> tuple[IntArray, int]:

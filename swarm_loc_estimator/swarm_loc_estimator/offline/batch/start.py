@@ -59,8 +59,9 @@ def start_of(problem: BatchProblem) -> Start:
     """
     swarm = problem.swarm
     maps = [_map_of(problem, robot) for robot in range(len(swarm.robots))]
-    start = Start(np.full((len(swarm.robots), 3), np.nan), np.full((len(swarm.landmarks), 3), np.nan))
-    for index in np.flatnonzero(problem.is_known).tolist():
+    start = Start(np.full((len(swarm.robots), 3), np.nan), np.full((len(swarm.surveyed), 3), np.nan))
+    start.landmark[len(swarm.landmarks) :] = 0.0  # of anchors, the shift and bias
+    for index in np.flatnonzero(problem.is_known[: len(swarm.landmarks)]).tolist():
         mark = swarm.landmarks[index]
         start.landmark[index] = (mark.x, mark.y, mark.yaw or 0.0)
     for index, robot in enumerate(swarm.robots):
@@ -88,8 +89,8 @@ def _at_first(problem: BatchProblem, robot: int, pose: FloatArray) -> FloatArray
 
 def _map_of(problem: BatchProblem, robot: int) -> FloatArray:
     """Poses (L, 3) of the landmarks that a robot has seen, in the frame of its track; NaN: not seen."""
-    sightings, places = problem.sightings, np.full((len(problem.swarm.landmarks), 3), np.nan)
-    rows = np.flatnonzero((sightings.observer == robot) & (sightings.landmark >= 0))
+    sightings, places = problem.sightings, np.full((len(problem.swarm.surveyed), 3), np.nan)
+    rows = np.flatnonzero((sightings.observer == robot) & (sightings.landmark >= 0) & problem.is_seen)
     seen = _seen_at(problem, rows, problem.tracks[0, rows])
     for index in np.unique(sightings.landmark[rows]).tolist():
         own = seen[sightings.landmark[rows] == index]

@@ -10,7 +10,7 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.filter.measurements import Measurements, select
-from swarm_loc_estimator.filter.models import POLAR, predict
+from swarm_loc_estimator.filter.models import POLAR, predict_any
 from swarm_loc_estimator.offline.batch.problem import BatchProblem, innovation
 from swarm_loc_estimator.offline.calibration.motion import DENSE_GAP_NS
 from swarm_loc_estimator.swarm.swarm import Robot
@@ -49,16 +49,17 @@ def camera_fits(
     known = np.isfinite(described[:, 0]) & np.isfinite(calibrated[:, 0])
     fits = []
     for index, robot in enumerate(after.swarm.robots):
-        rows = known & (sightings.observer == index)
+        rows = known & after.is_seen[new] & (sightings.observer == index)
         if robot.camera is not None:
             fits.append(CameraFit(robot, select(sightings, rows), described[rows], calibrated[rows]))
     return fits
 
 
 def errors_of(problem: BatchProblem, paths: Mapping[str, Trajectory]) -> FloatArray:
-    """Measured minus true (m, 3) of all sightings; NaN where a pose is not known."""
+    """Measured minus true (m, 3) of all measurements; NaN where a pose is not known."""
     sightings = problem.sightings
     marks = [(mark.x, mark.y, mark.yaw or 0.0) for mark in problem.swarm.landmarks]
+    marks += [(0.0, 0.0, 0.0)] * len(problem.swarm.anchors)  # neither shifted nor biased
     places = np.where(problem.is_known[:, None], np.array(marks).reshape(-1, 3), np.nan)
     sides = np.full((2, sightings.size, 3), np.nan)
     sides[1, sightings.landmark >= 0] = places[sightings.landmark[sightings.landmark >= 0]]
@@ -68,5 +69,5 @@ def errors_of(problem: BatchProblem, paths: Mapping[str, Trajectory]) -> FloatAr
                 rows = np.flatnonzero(who == index)
                 pose, known = interpolate(paths[robot.name], sightings.stamp_ns[rows], DENSE_GAP_NS)
                 sides[side, rows[known]] = pose[known]
-    value, _ = predict(sightings, *sides)
+    value = predict_any(sightings, sides[0], sides[1], np.zeros((sightings.size, 3)))[0]
     return innovation(sightings, sightings.value, value)

@@ -269,13 +269,13 @@ def _warning_alone(folds: Sequence[Fold], swarm: Swarm, noise: dict[str, float])
 
 
 def _scatter(fold: Fold, swarm: Swarm) -> FloatArray:
-    """Scatter of the first two components of sightings about a batch of a part, by kind of sightings."""
-    problem = problem_of(fold.recording, swarm)
+    """Scatter of sightings (two components) and of ranges about a batch of a part, by kind of sightings."""
+    problem = problem_of(fold.recording, swarm, ranged=True)
     solution = Solver(problem, started_at(problem, fold.recording.truth)).solve(unwatched)
     error = errors_of(problem, solution.paths())
-    known = np.isfinite(error[:, 0])
-    kinds = [rows for rows in (known & problem.is_polar, known & ~problem.is_polar) if rows.any()]
-    return np.array([spread(error[rows, component]) for rows in kinds for component in range(2)])
+    known, seen, polar = np.isfinite(error[:, 0]), problem.is_seen, problem.is_polar
+    kinds = [(known & polar, 2), (known & seen & ~polar, 2), (known & ~seen, 1)]
+    return np.array([spread(error[rows, k]) for rows, count in kinds if rows.any() for k in range(count)])
 
 
 def _folds(recording: Recording, swarm: Swarm, whole: FittedModels, options: Options) -> list[Fold]:

@@ -9,8 +9,9 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.trajectory import Trajectory
+from swarm_loc_estimator.filter.models import RANGE
 from swarm_loc_estimator.offline.batch.parameters import all_changed, calibrated_parameters, values_of
 from swarm_loc_estimator.offline.batch.problem import BatchProblem, problem_of
 from swarm_loc_estimator.offline.batch.solver import ParameterPrior, Solution, Solver
@@ -39,7 +40,7 @@ from swarm_loc_estimator.offline.calibration.robust import population, spread
 from swarm_loc_estimator.offline.calibration.scatter import with_scatter
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel, SensorModel
-from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Anchor, Robot, Swarm
 
 EVALUATIONS = 80  # Runs of the estimator to fit the noise
 
@@ -141,19 +142,25 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
     Raises:
         CalibrationError: Too little is known about the poses of robots.
     """
-    begin, truth = problem_of(recording, swarm), recording.truth
+    begin, truth = problem_of(recording, swarm, ranged=True), recording.truth
     if options.plain:
         return _fitted(recording, begin, begin, truth, options)
     if not truth and begin.sightings.size < MIN_SIGHTINGS:
         raise CalibrationError(
-            f"recording '{recording.name}' holds {begin.sightings.size} sightings by robots that drive;"
-            f" without ground truth {MIN_SIGHTINGS} are needed, of described landmarks or of other robots."
+            f"recording '{recording.name}' holds {begin.sightings.size} sightings and ranges by robots that"
+            f" drive; without ground truth {MIN_SIGHTINGS} are needed, of described landmarks or anchors, or"
+            " of other robots."
         )
     current = started_at_truth(swarm, recording) if truth else swarm
     online = rerun(recording, current, RUN_TICK_S)
     known = {robot.name: online.track(index) for index, robot in enumerate(swarm.robots)} | dict(truth)
-    polar = bool(begin.is_polar.any())
-    parameters = calibrated_parameters(polar=polar, poses=not begin.is_polar.all(), truth=bool(truth))
+    seen, polar = begin.is_seen, begin.is_polar
+    parameters = calibrated_parameters(
+        polar=bool(polar.any()),
+        poses=bool((seen & ~polar).any()),
+        ranges=not seen.all(),
+        truth=bool(truth),
+    )
     mean, wide = values_of(swarm, parameters), np.array([one.sigma for one in parameters])
     sigma = np.tile(wide, (len(mean), 1))
     # motion but for its delay is fitted again in each round: a table of speeds takes its place
@@ -165,7 +172,7 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
         # the batch, with parameters about those of the type
         about = np.where(is_fixed, np.nan_to_num(mean - values_of(current, parameters)), 0.0)
         prior = ParameterPrior(about, np.where(is_fixed, sigma, wide)) if number else None
-        problem = problem_of(recording, current, parameters, truth)
+        problem = problem_of(recording, current, parameters, truth, ranged=True)
         solution = Solver(problem, started_at(problem, known), prior).solve(unwatched)
         found = all_changed(current, parameters, np.round(solution.parameter, 5))
         typical, apart = _of_types(swarm, found, solution)
@@ -174,12 +181,34 @@ def fit_models(recording: Recording, swarm: Swarm, options: Options, progress: P
         # motion and noise by its paths
         known = solution.paths() | {name: one for name, one in truth.items() if _is_dense(one)}
         paths = {name: one for name, one in known.items() if not truth or name in truth}
-        models = _fitted(recording, begin, problem_of(recording, found), paths, options, solution)
+        known_by = problem_of(recording, found, ranged=True)
+        models = _fitted(recording, begin, known_by, paths, options, solution)
         current = with_noise(models.swarm, {**fixed_noise(swarm), **models.noise})
     starts = [
         replace(one, start=old.start) for one, old in zip(models.swarm.robots, swarm.robots, strict=True)
     ]
-    return replace(models, swarm=replace(models.swarm, robots=tuple(starts)))
+    found = replace(models.swarm, robots=tuple(starts), anchors=_anchors(swarm, solution))
+    return replace(models, swarm=found)
+
+
+def _anchors(swarm: Swarm, solution: Solution) -> tuple[Anchor, ...]:
+    """The anchors where the batch has them, with its biases."""
+    first, found = len(solution.landmark) - len(swarm.anchors), []
+    for number, one in enumerate(swarm.anchors, first):
+        if solution.landmark_column[number] < 0:
+            found.append(one)
+            continue
+        (x, y, bias), error = solution.landmark[number].tolist(), solution.landmark_covariance[number]
+        sigma = np.sqrt(max(1.0, solution.variance_ratio) * np.diag(error)).tolist()
+        numbers = {"range_bias": one.range_bias + bias, "range_bias_sigma": sigma[2]}
+        if one.position_sigma > 0.0:
+            numbers |= {
+                "x": one.x + x,
+                "y": one.y + y,
+                "position_sigma": math.hypot(*sigma[:2]) / math.sqrt(2.0),
+            }
+        found.append(replace(one, **numbers))
+    return tuple(found)
 
 
 def _of_types(described: Swarm, found: Swarm, solution: Solution) -> tuple[FloatArray, FloatArray]:
@@ -227,6 +256,8 @@ def _fitted(
         for index in members:
             seen = sensed.get(robots[index].name, robots[index])
             robots[index] = seen if drive is None else _with_motion(seen, index, drive)
+            if solution is not None:
+                robots[index] = _with_own_noise(robots[index], index, found, solution)
     if not motion and not any(fit.is_enough for fit in cameras):
         raise CalibrationError(
             f"recording '{recording.name}' holds too little ground truth together with odometry or sightings;"
@@ -242,6 +273,7 @@ def _with_leverage(noise: dict[str, float], solution: Solution) -> dict[str, flo
     """Noise of sightings, whose errors by a path that follows them are too small by its own variance."""
     used, residual = np.flatnonzero(solution.used), solution.sightings[0]
     is_good = solution.weight[used] > _GOOD
+    is_good &= solution.problem.is_seen[used]
     is_polar, rng = solution.problem.is_polar[used], np.random.default_rng(0)
     larger = dict(noise)
     for polar, names in _SIGHTED.items():
@@ -290,20 +322,46 @@ def _fit_drive(
 
 def _doubt(solution: Solution, members: Sequence[int]) -> FloatArray:
     """Mean variances (2,) of path and turn over a window in which a robot moves, by the batch itself."""
-    knots, rng = solution.problem.knots, np.random.default_rng(0)
-    first, last = [np.zeros(0, dtype=np.int64)], [np.zeros(0, dtype=np.int64)]
-    for index in members:
-        own = np.flatnonzero((knots.robot == index) & (solution.column >= 0))
-        end = np.searchsorted(knots.stamp_ns[own], knots.stamp_ns[own] + round(1e9 * WINDOW_S))
-        begin = np.flatnonzero(end < own.size)
-        track = knots.sample.pose[own]
-        moved = se2.between(track[begin], track[end[begin]])
-        begin = begin[np.hypot(moved[:, 0], moved[:, 1]) > _MOVED_M]
-        some = rng.choice(begin, min(_SAMPLES, begin.size), replace=False)
-        first.append(own[some])
-        last.append(own[end[some]])
-    variances = solution.moved_variances(np.concatenate(first), np.concatenate(last))
+    variances = solution.moved_variances(*np.concatenate([_moved(solution, one) for one in members], axis=1))
     return np.asarray(variances[:, [0, 2]].mean(axis=0)) if len(variances) else np.zeros(2)
+
+
+def _moved(solution: Solution, robot: int) -> IntArray:
+    """First and last knots (2, w) of some windows in which a robot moves."""
+    knots = solution.problem.knots
+    own = np.flatnonzero((knots.robot == robot) & (solution.column >= 0))
+    end = np.searchsorted(knots.stamp_ns[own], knots.stamp_ns[own] + round(1e9 * WINDOW_S))
+    begin = np.flatnonzero(end < own.size)
+    late_ns = knots.stamp_ns[own[end[begin]]] - knots.stamp_ns[own[begin]] - round(1e9 * WINDOW_S)
+    begin = begin[late_ns <= 2 * knots.step_ns]
+    track = knots.sample.pose[own]
+    moved = se2.between(track[begin], track[end[begin]])
+    begin = begin[np.hypot(moved[:, 0], moved[:, 1]) > _MOVED_M]
+    some = np.random.default_rng(robot).choice(begin, min(_SAMPLES, begin.size), replace=False)
+    return np.stack([own[some], own[end[some]]])
+
+
+def _with_own_noise(robot: Robot, index: int, found: BatchProblem, solution: Solution) -> Robot:
+    """The robot with the noise of its gyroscope and its radio: residuals, and the variance of the batch."""
+    first, last = _moved(solution, index)
+    if robot.imu.is_used and first.size:
+        knots = found.knots
+        heading = solution.at(knots.robot, knots.stamp_ns)[:, 2] - knots.sample.pose[:, 2]
+        missed = se2.wrap_angle(heading[last] - heading[first])
+        variance = np.mean(missed**2 + solution.moved_variances(first, last)[:, 2])
+        density = float(f"{math.sqrt(variance / WINDOW_S):.3g}")
+        robot = replace(robot, imu=replace(robot.imu, turn_noise_density=density))
+    used, some = np.flatnonzero(solution.used), solution.problem.sightings
+    is_own = (some.observer[used] == index) & (some.model[used] == RANGE) & (solution.weight[used] > _GOOD)
+    if is_own.sum() >= MIN_SIGHTINGS and robot.uwb is not None:
+        rows = np.random.default_rng(0).choice(np.flatnonzero(is_own), _SAMPLES, replace=False)
+        by_batch = float(np.median(solution.leverages(rows)[:, 0]))
+        noise = np.median(some.covariance[used[is_own], 0, 0]) * (
+            spread(solution.sightings[0][is_own, 0]) ** 2 + by_batch
+        )
+        sigma = float(f"{robot.uwb.range_scale * math.sqrt(noise):.3g}")
+        robot = replace(robot, uwb=replace(robot.uwb, range_sigma=sigma))
+    return robot
 
 
 def _with_motion(robot: Robot, index: int, drive: DriveFit) -> Robot:

@@ -62,7 +62,6 @@ class TrueMotion:
 
     time_s: FloatArray  # (g,) since the first odometry
     path: FloatArray  # (g,) [m], forwards
-    lateral: FloatArray  # (g,) [m], to the left
     turn: FloatArray  # (g,) heading, unwrapped [rad]
     known: npt.NDArray[np.bool_]  # (g,) whether the ground truth is dense there
 
@@ -117,9 +116,9 @@ def true_motion(truth: Trajectory, begin_ns: int, end_ns: int) -> TrueMotion:
     turn = se2.wrap_angle(np.diff(pose[:, 2]))
     middle = pose[:-1, 2] + 0.5 * turn
     dx, dy = np.diff(pose[:, :2], axis=0).T
-    path, lateral = np.cos(middle) * dx + np.sin(middle) * dy, -np.sin(middle) * dx + np.cos(middle) * dy
-    path, lateral, turn = (np.concatenate([[0.0], np.cumsum(column)]) for column in (path, lateral, turn))
-    return TrueMotion(time_s, path, lateral, turn, known)
+    path = np.cos(middle) * dx + np.sin(middle) * dy
+    path, turn = (np.concatenate([[0.0], np.cumsum(column)]) for column in (path, turn))
+    return TrueMotion(time_s, path, turn, known)
 
 
 def windows(motion: TrueMotion, length_s: float) -> tuple[IntArray, IntArray]:

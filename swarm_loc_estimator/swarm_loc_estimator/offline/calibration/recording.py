@@ -5,10 +5,12 @@ A fit runs the estimator over the same data a hundred times; the bag is read onl
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -29,6 +31,9 @@ from swarm_loc_estimator.sensors.ranges import NO_RANGES, RangeRows
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
+
+_INPUTS = ("odometry", "detections", "brightness", "fixes", "turn_rates", "ranges")
+_PAUSE_NS = 60_000_000_000  # Between recordings, in which robots may get anywhere
 
 
 class CalibrationError(UserError):
@@ -60,33 +65,43 @@ class Recording:
         return [*self.remarks, *unused]
 
     @property
+    def inputs(self) -> dict[str, Any]:
+        """All inputs by name."""
+        return {name: getattr(self, name) for name in _INPUTS}
+
+    @property
     def range_ns(self) -> tuple[int, int]:
-        """First and last arrival of odometry and detections; (0, 0) without any."""
-        arrivals = np.concatenate([self.odometry.arrival_ns, self.detections.arrival_ns])
+        """First and last arrival; (0, 0) without any."""
+        arrivals = np.concatenate([rows.arrival_ns for rows in self.inputs.values()])
         return (int(arrivals.min()), int(arrivals.max())) if arrivals.size else (0, 0)
 
     @property
     def longest_pause_ns(self) -> int:
         """The longest time between consecutive stamps or arrivals."""
-        parts = (self.odometry, self.detections)
         times = (
-            np.concatenate([part.stamp_ns for part in parts]),
-            np.concatenate([part.arrival_ns for part in parts]),
+            np.concatenate([getattr(rows, name) for rows in self.inputs.values()])
+            for name in ("stamp_ns", "arrival_ns")
         )
         return max(int(np.diff(np.sort(column)).max(initial=0)) for column in times)
 
     def between(self, from_ns: int, to_ns: int) -> Recording:
-        """The recording with only the odometry and detections that arrived in [from_ns, to_ns)."""
-        driven, seen = (
-            (rows.arrival_ns >= from_ns) & (rows.arrival_ns < to_ns)
-            for rows in (self.odometry, self.detections)
-        )
-        return replace(self, odometry=select(self.odometry, driven), detections=select(self.detections, seen))
+        """The recording with only the inputs that arrived in [from_ns, to_ns)."""
+        parts = {
+            name: select(rows, (rows.arrival_ns >= from_ns) & (rows.arrival_ns < to_ns))
+            for name, rows in self.inputs.items()
+        }
+        return replace(self, **parts)
 
     @property
     def messages(self) -> Batch:
-        """Odometry and detections as inputs of the estimator."""
-        return Batch.of(*self.range_ns, odometry=self.odometry, detections=self.detections)
+        """Odometry, turn rates, detections and ranges as inputs of the estimator."""
+        return Batch.of(
+            *self.range_ns,
+            odometry=self.odometry,
+            imu=self.turn_rates,
+            detections=self.detections,
+            ranges=self.ranges,
+        )
 
     def track(self, robot: int) -> Trajectory:
         """A robot's raw odometry in the order of its stamps, each stamp once."""
@@ -126,6 +141,29 @@ def read_recording(
         converter.drops.total,
         summary.remarks,
     )
+
+
+def joined(recordings: Sequence[Recording]) -> Recording:
+    """Recordings of one swarm, one after the other.
+
+    Nobody knows how robots moved in the pauses between them.
+    """
+    whole, *others = recordings
+    for other in others:
+        later_ns = whole.range_ns[1] + _PAUSE_NS - other.range_ns[0]
+        parts = {}
+        for name, rows in other.inputs.items():
+            late = rows._replace(stamp_ns=rows.stamp_ns + later_ns, arrival_ns=rows.arrival_ns + later_ns)
+            parts[name] = concatenate([getattr(whole, name), late])
+        truth = dict(whole.truth)
+        for name, one in other.truth.items():
+            before = truth.get(name, Trajectory(one.stamp_ns[:0], one.pose[:0]))
+            stamp_ns = np.concatenate([before.stamp_ns, one.stamp_ns + later_ns])
+            truth[name] = Trajectory(stamp_ns, np.concatenate([before.pose, one.pose]))
+        dropped = Counter(whole.dropped) + Counter(other.dropped)
+        name, remarks = f"{whole.name}, {other.name}", whole.remarks + other.remarks
+        whole = Recording(name=name, truth=truth, dropped=dropped, remarks=remarks, **parts)
+    return whole
 
 
 def started_at_truth(swarm: Swarm, recording: Recording) -> Swarm:

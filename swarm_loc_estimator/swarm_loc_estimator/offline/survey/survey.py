@@ -3,7 +3,7 @@
 Fixed cameras and UWB anchors are placed by the surveyed paths of robots. A fixed camera saw markers on robots
 whose poses are known by then, so its pose is that of the perspective from n points. An anchor was measured
 from many places, which is multilateration. Both are robust fits (Cauchy). Errors of neighbouring measurements
-are alike, so variances are those of a jackknife over spells of time, and of the frame of all paths. Nothing
+are alike, so variances are those of a jackknife over spells of time; the error of the map is apart. Nothing
 is placed that fits elsewhere as well: places on one line do not tell where about this line a camera or an
 anchor is.
 """
@@ -33,7 +33,16 @@ from swarm_loc_estimator.offline.calibration.recording import CalibrationError, 
 from swarm_loc_estimator.offline.recorded_bag import Progress, unwatched
 from swarm_loc_estimator.offline.report.plots import INK, SOFT, colour_of, label_map, save, style
 from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, FROM_OPTICAL
-from swarm_loc_estimator.swarm.swarm import Anchor, FixedCamera, Landmark, Swarm, UwbDevice
+from swarm_loc_estimator.swarm.calibration_states import shared_error
+from swarm_loc_estimator.swarm.swarm import (
+    NO_MAP_ERROR,
+    Anchor,
+    FixedCamera,
+    Landmark,
+    MapError,
+    Swarm,
+    UwbDevice,
+)
 
 # Checked by test_survey_cameras_and_anchors.py.
 MIN_MEASUREMENTS = 30  # Minimum number of sightings or ranges that place a camera or an anchor
@@ -49,18 +58,8 @@ this share of the distance from the line, and this length."""
 _DEPTH = 0.05  # Least depth of a marker in front of a camera, of which its direction is computed [m]
 
 
-@dataclass(frozen=True)
-class Paths:
-    """Paths of the robots."""
-
-    # Poses (k, 3) in map of robots (k,) at instants (k,) [ns]; NaN: not known
-    at: Callable[[IntArray, IntArray], FloatArray]
-    frame: FloatArray  # (3, 3) covariance of the right-invariant error that is common to all
-
-    def variances(self, place: FloatArray) -> FloatArray:
-        """Variances (3,) of x, y and directions at a place (2,) by the frame."""
-        moved = np.array([[1.0, 0.0, -place[1]], [0.0, 1.0, place[0]], [0.0, 0.0, 1.0]])
-        return np.asarray(np.diag(moved @ self.frame @ moved.T))
+Paths = Callable[[IntArray, IntArray], FloatArray]
+"""Poses (k, 3) in map of robots (k,) at instants (k,) [ns]; NaN: not known."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +96,7 @@ def _with_cameras(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
                 f" {stamp_ns.size} x, and {MIN_MEASUREMENTS} are needed."
             )
             continue
-        fit = _located(camera, optical, place, stamp_ns, paths)
+        fit = _located(camera, optical, place, stamp_ns)
         if fit is None:
             found.append(camera)
             remarks.append(
@@ -128,14 +127,14 @@ def _sighted(
     chosen = [owner for owner, is_kept in zip(owners, kept, strict=True) if is_kept and owner is not None]
     robot = np.array([one.robot_index for one in chosen], dtype=np.int64)
     faces = np.array([(one.marker.x, one.marker.y, one.marker.z) for one in chosen]).reshape(-1, 3)
-    pose = paths.at(robot, stamp_ns)
+    pose = paths(robot, stamp_ns)
     place = np.column_stack([se2.transform_points(pose, faces[:, :2]), faces[:, 2]])
     known = np.isfinite(pose).all(axis=1)
     return rows.detection["position"][kept][known], place[known], stamp_ns[known]
 
 
 def _located(
-    camera: FixedCamera, optical: FloatArray, place: FloatArray, stamp_ns: IntArray, paths: Paths
+    camera: FixedCamera, optical: FloatArray, place: FloatArray, stamp_ns: IntArray
 ) -> tuple[FixedCamera, float] | None:
     """A camera at the pose from which it sees markers (k, 3) of `map` at (k, 3), and the share of wrong ones.
 
@@ -170,7 +169,7 @@ def _located(
         centre = other[3:5] + ray[:2] * (height - other[5]) / ray[2]
         return np.append(centre, (turned * rotation.inv()).as_rotvec()[2])
 
-    spread = _jackknife(residual, pose, sigma, stamp_ns, shift) + paths.variances(shift(pose)[:2])
+    spread = _jackknife(residual, pose, sigma, stamp_ns, shift)
     # the pose as a description states it
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # straight down, yaw and roll are one angle
@@ -206,7 +205,7 @@ def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
     known = {one.address for one in (*radios, *swarm.anchors) if one is not None}
     usable = (rows.reference == 0) & np.array([radio is not None for radio in radios])[rows.robot]
     usable &= ~np.isin(rows.device, np.array([*known], dtype=np.uint64)) & (rows.range > 0.0)
-    pose = paths.at(rows.robot, rows.stamp_ns)
+    pose = paths(rows.robot, rows.stamp_ns)
     usable &= np.isfinite(pose).all(axis=1) & np.isfinite(rows.range)
     devices = [one or UwbDevice(0) for one in radios]
     antenna = np.array([(one.x, one.y, one.z) for one in devices])[rows.robot]
@@ -225,7 +224,7 @@ def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
         if own.sum() < MIN_MEASUREMENTS:
             remarks.append(f"{name} was measured {own.sum()} x only and is left out; drive near it.")
             continue
-        fit = _multilaterated(at[own], measured[own], rows.stamp_ns[own], paths)
+        fit = _multilaterated(at[own], measured[own], rows.stamp_ns[own])
         if fit is None:
             remarks.append(
                 f"{name} is left out, since other places fit as well: it was measured from one line or few"
@@ -242,7 +241,7 @@ def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
 
 
 def _multilaterated(
-    at: FloatArray, measured: FloatArray, stamp_ns: IntArray, paths: Paths
+    at: FloatArray, measured: FloatArray, stamp_ns: IntArray
 ) -> tuple[FloatArray, float, float] | None:
     """Place (3,) at distances (k,) from places (k, 3), not below them; its sigma, and share of wrong ones.
 
@@ -264,7 +263,6 @@ def _multilaterated(
     if not _is_unique(residual, place, sigma, at, turned, lambda other: other[:2]):
         return None
     spread = _jackknife(residual, place, sigma, stamp_ns, lambda other: other[:2])
-    spread += paths.variances(place[:2])[:2]
     height = float(np.median(at[:, 2]))
     place[2] = height + abs(place[2] - height)  # ranges in a plane do not tell above from below
     position_sigma = max(math.sqrt(0.5 * float(spread.sum())), _LEAST_SIGMA)
@@ -405,10 +403,8 @@ def survey(
     problem, solution = _solved(recording, swarm, problem, progress)
     shared = _shared(solution)
     marks = tuple(_landmarks(problem, solution, shared.place))
-    found = replace(_calibrated(swarm, solution, shared), landmarks=marks)
-    frame = max(1.0, solution.variance_ratio) * solution.frame_covariance
-    paths = Paths(solution.at, frame)
-    placed = place_fixed(recording, found, paths, cameras=cameras)
+    found = replace(_calibrated(swarm, solution, shared), landmarks=marks, map_error=shared.error)
+    placed = place_fixed(recording, found, solution.at, cameras=cameras)
     found = replace(found, cameras=placed.cameras, anchors=placed.anchors)
     path = se2.compose(solution.knot, problem.knots.sample.pose)
     return Surveyed(found, problem, solution, path, _text(problem, solution, swarm, found, placed))
@@ -436,57 +432,42 @@ def _solved(
 
 
 class _Shared(NamedTuple):
-    """What one standard deviation of the error of the map's scale changes."""
+    """Error that all landmarks share."""
 
-    scale: float  # The scale
-    place: FloatArray  # (L, 2) places of landmarks [m]
-    parameter: FloatArray  # (N, p) parameters of robots
+    error: MapError
+    place: FloatArray  # (L, 3, 4) errors of landmarks by one standard deviation, first of the scale
+    parameter: FloatArray  # (N, p) those of parameters by the scale
 
 
 def _shared(solution: Solution) -> _Shared:
-    """The error of the scale of all landmarks that were estimated, and of what is correlated with it."""
-    # the scale as a function of the unknowns
-    column, place = solution.landmark_column, solution.landmark[:, :2]
-    free = np.flatnonzero(column >= 0)
-    away = place[free] - place[free].mean(axis=0) if free.size else place[free]
-    if not (away**2).sum() > 0.0:
-        return _Shared(0.0, np.zeros(place.shape), np.zeros(solution.parameter.shape))
-    away /= (away**2).sum()
-    moved = np.zeros((free.size, 2, 3))  # of errors (3,) to places
-    moved[:, :, :2], moved[:, 0, 2], moved[:, 1, 2] = np.eye(2), -place[free, 1], place[free, 0]
-    unknowns = column[free][:, None] + np.arange(3)
-    scale = np.zeros(solution.factor.size)
-    scale[unknowns] = np.einsum("ki,kij->kj", away, moved)
-    # what all unknowns are expected to be when it is off by its standard deviation
-    change = solution.factor.solve(scale)
-    change *= math.sqrt(max(1.0, solution.variance_ratio) / float(scale @ change))
-    found = np.zeros(place.shape)
-    found[free] = np.einsum("kij,kj->ki", moved, change[unknowns])
-    return _Shared(float(scale @ change), found, change[solution.parameter_column])
+    """The error that all landmarks share that were estimated, and what is correlated with their scale."""
+    column, place = solution.landmark_column, solution.landmark
+    free, parameters = np.flatnonzero(column >= 0), solution.parameter_column
+    places = np.zeros((column.size, 3, 4))
+    if not free.size or not np.ptp(place[free, :2], axis=0).any():
+        return _Shared(NO_MAP_ERROR, places, np.zeros(parameters.shape))
+    unknowns = np.concatenate([(column[free][:, None] + np.arange(3)).ravel(), parameters.ravel()])
+    covariance = max(1.0, solution.variance_ratio) * solution.factor.covariance(unknowns)
+    error, places[free], others = shared_error(place[free, :2], covariance)
+    return _Shared(error, places, others[:, 0].reshape(parameters.shape))
 
 
 def _landmarks(problem: BatchProblem, solution: Solution, shared: FloatArray) -> list[Landmark]:
     """All landmarks that are connected, with standard deviations for those that were estimated."""
-    factor = max(1.0, solution.variance_ratio)
+    variance = np.einsum("kii->ki", max(1.0, solution.variance_ratio) * solution.landmark_covariance)
+    variance = np.maximum(variance - np.sum(shared**2, axis=2), _LEAST_SIGMA**2)
     found = []
-    for mark, pose, covariance, is_known, common in zip(
-        problem.swarm.landmarks,
-        solution.landmark.tolist(),
-        factor * solution.landmark_covariance,
-        problem.is_known,
-        shared,
-        strict=True,
+    for mark, pose, own, is_known in zip(
+        problem.swarm.landmarks, solution.landmark.tolist(), variance, problem.is_known, strict=True
     ):
         if is_known and not mark.is_estimated:
             found.append(mark)
         elif np.isfinite(pose).all():
             x, y, yaw = pose
-            own = float(covariance[0, 0] + covariance[1, 1] - common @ common)
-            position_sigma = math.sqrt(max(0.5 * own, _LEAST_SIGMA**2))
-            yaw_sigma = 0.0 if mark.yaw is None else math.sqrt(float(covariance[2, 2]))
-            place = {"x": x, "y": y, "yaw": None if mark.yaw is None else yaw}
-            place |= {"shared_x": float(common[0]), "shared_y": float(common[1])}
-            found.append(replace(mark, **place, position_sigma=position_sigma, yaw_sigma=yaw_sigma))
+            position_sigma, yaw_sigma = math.sqrt(0.5 * float(own[0] + own[1])), math.sqrt(float(own[2]))
+            has_yaw = mark.yaw is not None
+            place = {"x": x, "y": y, "yaw": yaw if has_yaw else None, "position_sigma": position_sigma}
+            found.append(replace(mark, **place, yaw_sigma=yaw_sigma if has_yaw else 0.0))
     return found
 
 
@@ -499,7 +480,7 @@ def _calibrated(swarm: Swarm, solution: Solution, shared: _Shared) -> Swarm:
     is_clear = np.abs(solution.parameter) > _SIGNIFICANT * solution.parameter_sigma
     is_clear &= np.array([one.name != "turn_bias" for one in SURVEY])
     found = all_changed(swarm, SURVEY, np.where(is_clear, solution.parameter, 0.0))
-    if shared.scale < _KNOWN_SCALE:
+    if shared.error.scale_sigma < _KNOWN_SCALE:
         return found
     sigma, robots = math.sqrt(len(_LOOSE) * len(found.robots)) * np.abs(shared.parameter), []
     for index, robot in enumerate(found.robots):
@@ -521,7 +502,7 @@ def _text(problem: BatchProblem, solution: Solution, before: Swarm, found: Swarm
             continue
         one, wrong = places[mark.id], float(np.mean(_is_wrong(solution)[rows]))
         yaw = "-" if one.yaw is None else f"{math.degrees(one.yaw):.1f}"
-        sigma = 1e3 * math.sqrt(one.position_sigma**2 + 0.5 * (one.shared_x**2 + one.shared_y**2))
+        sigma = 1e3 * one.position_sigma
         lines.append(
             f"{one.id:8d} {one.x:12.3f} {one.y:9.3f} {yaw:>10} {sigma:11.1f} {rows.sum():10d} {wrong:13.0%}"
         )
