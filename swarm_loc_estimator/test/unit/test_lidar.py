@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from mapping_world import BEAMS, LIDAR, ROOM, SWEEP_NS, LidarRobot, scan_bytes
+from test_mounts import static
 
 from swarm_loc_estimator.cli.replay_map import main
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
-from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, ODOMETRY, TRANSFORMS
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.se2 import between, compose, transform_points
 from swarm_loc_estimator.mapping.map_file import load_map
@@ -254,6 +255,36 @@ def test_odometry_that_restarts_does_not_move_the_robot_in_the_map() -> None:
     located = mapper.located(0)
     assert located is not None
     assert located.pose == pytest.approx(robot.pose(located.stamp_ns), abs=0.06)
+
+
+def test_a_bag_is_mapped_by_other_topics_and_with_the_mount_of_its_transforms(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As of a robot without a namespace, whose lidar only its URDF describes."""
+    joint = static(("base_link", "a/base_scan", (LIDAR.x, LIDAR.y, 0.2), (LIDAR.yaw, 0.0, 0.0)))
+    for name, space in (("described", "a/"), ("found", "")):
+        with BagWriter(tmp_path / name) as bag:
+            for topic, kind in (
+                ("tf_static", TRANSFORMS),
+                (f"{space}odom", ODOMETRY),
+                (f"{space}scan", LASER_SCAN),
+            ):
+                bag.add_topic(topic, kind)
+            bag.write("tf_static", 0, joint)
+            for kind, at_ns, data in messages(5_000_000_000, seed=1):
+                bag.write(f"{space}{kind.topic}", at_ns, data)
+    bare = replace(TURTLE, lidar=replace(LIDAR, x=0.0, y=0.0, yaw=0.0))
+    save_swarm(Swarm((TURTLE,)), tmp_path / "described" / "swarm.yaml")
+    save_swarm(Swarm((bare,)), tmp_path / "found" / "swarm.yaml")
+    assert main([str(tmp_path / "described"), "--out", str(tmp_path / "x")]) == 0
+    assert "tf_static" not in capsys.readouterr().out
+    remap = [part for topic in ("odom", "scan") for part in ("--remap", f"a/{topic}:=/{topic}")]
+    assert main([str(tmp_path / "found"), "--out", str(tmp_path / "y"), *remap]) == 0
+    assert "Mount of a's lidar by tf_static: x 0.050, y -0.020, yaw 1.571." in capsys.readouterr().out
+    described, found = (
+        np.loadtxt(tmp_path / one / "stops.csv", skiprows=1, delimiter=",", usecols=(2, 3, 4)) for one in "xy"
+    )
+    assert found == pytest.approx(described, abs=1e-6)
 
 
 def test_a_bag_gives_the_same_map_twice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
