@@ -9,6 +9,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
+from types import MappingProxyType
 
 import numpy as np
 
@@ -125,13 +126,13 @@ class SweepPairer(OdometryQueue):
 
     def __init__(self, lidar: LidarModel) -> None:
         super().__init__()
-        self._lidar = lidar
+        self.lidar = lidar
         self._sweeps: deque[LidarSweep] = deque()
         self._newest_ns = -math.inf
 
     def add_scan(self, scan: ScanMessage) -> None:
         """Add a scan; what cannot be used of it is counted."""
-        sweep = read_sweep(scan, self._lidar, self.drops, self.dropped_beams)
+        sweep = read_sweep(scan, self.lidar, self.drops, self.dropped_beams)
         if sweep is None:
             return
         if scan.stamp_ns <= self._newest_ns:
@@ -155,7 +156,7 @@ class SweepPairer(OdometryQueue):
 
     def _stop(self, sweep: LidarSweep, pose: FloatArray, motion: FloatArray) -> ScanStop:
         """The sweep from a pose (3,) of the robot, which had moved by `motion` (n, 3) at each beam."""
-        lidar, seen = self._lidar, sweep.seen
+        lidar, seen = self.lidar, sweep.seen
         distance = np.where(seen, sweep.distance, sweep.reach)
         x, y = sweep.ends(lidar, motion).T
         noise = (lidar.range_sigma + lidar.range_sigma_per_m * distance) / distance**2
@@ -229,6 +230,7 @@ class MapperFeed:
         robots: All robots that may join.
         mapper: The mapper.
         frequencies: Robot -> frequency of its LEDs [Hz], for robots with tracked lights.
+        begin: That of an earlier feed, of robots that have moved since.
 
     Raises:
         MapperInputError: The start of more than one robot is unknown.
@@ -236,10 +238,15 @@ class MapperFeed:
     Attributes:
         drops: Reason -> number of dropped messages.
         received: (robot, input) -> number of received messages.
+        begin: Robot -> (3,) its pose by odometry at its start.
     """
 
     def __init__(
-        self, robots: Sequence[Robot], mapper: CooperativeMapper, frequencies: Mapping[str, float]
+        self,
+        robots: Sequence[Robot],
+        mapper: CooperativeMapper,
+        frequencies: Mapping[str, float],
+        begin: Mapping[int, FloatArray] = MappingProxyType({}),
     ) -> None:
         unknown = [robot.name for robot in robots if robot.start is None and not robot.lidar.is_used]
         if len(unknown) > (len(robots) == 1):
@@ -255,7 +262,7 @@ class MapperFeed:
             SweepPairer(robot.lidar) if robot.lidar.is_used else ReadingPairer() for robot in robots
         ]
         self._number: dict[int, int] = {}
-        self._begin: dict[int, FloatArray] = {}
+        self.begin: dict[int, FloatArray] = dict(begin)
         index_of = {robot.name: k for k, robot in enumerate(robots) if not robot.lidar.is_used}
         self._light_of = [(hz, index_of[name]) for name, hz in frequencies.items() if name in index_of]
         self._readers: dict[MapperInput, Callable[[int, bytes], None]] = {
@@ -264,6 +271,13 @@ class MapperFeed:
             MapperInput.SCAN: self._read_laser,
             MapperInput.LIGHTS: self._read_lights,
         }
+
+    def describe(self, robots: Sequence[Robot]) -> None:
+        """Take the mounts of lidars, of which no sweep has been read, from another description."""
+        self._robots = robots
+        for pairer, robot in zip(self._pairers, robots, strict=True):
+            if isinstance(pairer, SweepPairer):
+                pairer.lidar = robot.lidar
 
     def add(self, robot: int, kind: MapperInput, data: bytes) -> None:
         """Process a message of a robot, by its index."""
@@ -309,7 +323,7 @@ class MapperFeed:
         if robot not in self._number:
             described = self._robots[robot]
             start, sigma = described.start, described.start_sigma
-            since: FloatArray = between(self._begin[robot], odometry)
+            since: FloatArray = between(self.begin[robot], odometry)
             pose: FloatArray = since if start is None else compose(np.array(start), since)
             known = np.array([sigma.x, sigma.y, sigma.theta])
             if start is None:  # the first one begins the map, and is looked for in no other
@@ -320,8 +334,8 @@ class MapperFeed:
     def _read_odometry(self, robot: int, data: bytes) -> None:
         message = decode_odometry(data)
         pose = np.array(message.pose)
-        if robot not in self._begin and np.isfinite(pose).all():
-            self._begin[robot] = pose
+        if robot not in self.begin and np.isfinite(pose).all():
+            self.begin[robot] = pose
         self._pairers[robot].add_odometry(message.stamp_ns, pose)
 
     def _read_laser(self, robot: int, data: bytes) -> None:
