@@ -17,7 +17,7 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import LASER, LASER_SCAN, LIGHTS, ODOMETRY, CdrError
 from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.common.se2 import between, compose
+from swarm_loc_estimator.common.se2 import between, compose, inverse, transform_points
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.messages import (
@@ -35,6 +35,7 @@ from swarm_loc_estimator.swarm.swarm import Robot
 MAX_WAITING = 500  # Maximum numbers of queued odometry messages and distances; the oldest are dropped
 MAX_GAP_NS = 500_000_000  # Maximum gap over which odometry is interpolated
 _MAX_SWEEPS = 50  # Maximum number of queued scans
+_ROBOT_MARGIN = 0.1  # Around another robot, within which beams are left out [m]
 _SIGMAS = 301  # Number of distances over which the median sigma is taken
 
 
@@ -55,6 +56,11 @@ class OdometryQueue:
     def newest_ns(self) -> float:
         """Stamp of the newest odometry; -inf before the first."""
         return self._odometry[-1][0] if self._odometry else -math.inf
+
+    @property
+    def newest(self) -> FloatArray:
+        """The newest pose (3,) by odometry."""
+        return self._odometry[-1][1]
 
     def add_odometry(self, stamp_ns: int, pose: FloatArray) -> None:
         """Add a pose (3,) by odometry."""
@@ -262,6 +268,7 @@ class MapperFeed:
             SweepPairer(robot.lidar) if robot.lidar.is_used else ReadingPairer() for robot in robots
         ]
         self._number: dict[int, int] = {}
+        self._swept: dict[int, FloatArray] = {}  # (3,) by odometry at the newest sweep
         self.begin: dict[int, FloatArray] = dict(begin)
         index_of = {robot.name: k for k, robot in enumerate(robots) if not robot.lidar.is_used}
         self._light_of = [(hz, index_of[name]) for name, hz in frequencies.items() if name in index_of]
@@ -290,9 +297,31 @@ class MapperFeed:
         pairer = self._pairers[robot]
         if isinstance(pairer, SweepPairer):
             for sweep in pairer.ready():
-                self._mapper.add_sweep(self._joined(robot, sweep.arrival), sweep)
+                number = self._joined(robot, sweep.arrival)
+                self._mapper.add_sweep(number, self._without_robots(robot, sweep))
+                self._swept[robot] = sweep.arrival
         elif (readings := pairer.ready()) is not None:
             self._mapper.add_readings(self._joined(robot, readings.odometry[0]), readings)
+
+    def _without_robots(self, robot: int, sweep: ScanStop) -> ScanStop:
+        """A sweep without the beams that end at other robots whose places are known."""
+        radius, own = self._robots[robot].lidar.robot_radius, self._place(robot, sweep.arrival)
+        others = [
+            there
+            for other in self._number
+            if other != robot and (there := self._place(other, self._pairers[other].newest)) is not None
+        ]
+        if not radius or own is None or not others:
+            return sweep
+        centres = transform_points(inverse(own), np.array(others)[:, :2])
+        away = np.hypot(*(sweep.ends[:, None] - centres[None]).transpose(2, 0, 1)).min(axis=1)
+        kept = away > radius + _ROBOT_MARGIN
+        return sweep.chosen(kept) if kept.any() else sweep
+
+    def _place(self, robot: int, odometry: FloatArray) -> FloatArray | None:
+        """Where a robot is in map (3,) at a pose by odometry; None: nobody knows."""
+        pose, swept = self._mapper.pose(self._number[robot]), self._swept.get(robot)
+        return pose if pose is None or swept is None else compose(pose, between(swept, odometry))
 
     @property
     def all_drops(self) -> Counter[str]:

@@ -257,6 +257,48 @@ def test_odometry_that_restarts_does_not_move_the_robot_in_the_map() -> None:
     assert located.pose == pytest.approx(robot.pose(located.stamp_ns), abs=0.06)
 
 
+@pytest.mark.parametrize(("start_error", "seed"), [(0.0, 1), (0.0, 2), (0.04, 3)])
+def test_other_robots_are_no_walls_of_the_map(start_error: float, seed: int) -> None:
+    """One drives past another that stands, with a pillar as wide beside it that stays in the map."""
+    there, pillar, radius, maps = np.array([0.6, 0.5]), np.array([2.8, 0.6]), 0.15, []
+    for described in (0.0, radius):
+        rng, mapper = np.random.default_rng(seed), CooperativeMapper()
+        lidar = replace(LIDAR, robot_radius=described)
+        standing = replace(TURTLE, name="b", lidar=lidar, start=(there[0] + start_error, there[1], 0.0))
+        feed = MapperFeed([replace(TURTLE, lidar=lidar), standing], mapper, {})
+        robot, still = LidarRobot(rng), LidarRobot(rng)
+        for at_ns in range(0, 12_000_000_000, ODOMETRY_NS):
+            feed.add(0, MapperInput.ODOMETRY, odometry(at_ns, robot.odometry(np.array([at_ns]))[0]))
+            feed.add(1, MapperInput.ODOMETRY, odometry(at_ns, np.zeros(3)))
+            if at_ns % SWEEP_NS == 0:
+                scan, beams = robot.scan(at_ns), np.arange(BEAMS)
+                at = compose(robot.start, robot.odometry(at_ns + SWEEP_NS // BEAMS * beams))
+                mount = compose(at, [LIDAR.x, LIDAR.y, LIDAR.yaw])
+                angle = mount[:, 2] + scan.angle_increment * beams
+                for disc in (there, pillar):
+                    x, y = (disc - mount[:, :2]).T
+                    along, across = (
+                        x * np.cos(angle) + y * np.sin(angle),
+                        y * np.cos(angle) - x * np.sin(angle),
+                    )
+                    met = (np.abs(across) < radius) & (along > 0.0)
+                    near = along[met] - np.sqrt(radius**2 - across[met] ** 2)
+                    scan.ranges[met] = np.minimum(scan.ranges[met], near)
+                feed.add(0, MapperInput.SCAN, scan_bytes(scan))
+                if at_ns == 0:
+                    feed.add(
+                        1,
+                        MapperInput.SCAN,
+                        scan_bytes(still.scan(at_ns)._replace(ranges=np.full(BEAMS, np.inf))),
+                    )
+        mapper.finish()
+        cells = mapper.occupancy().centres(mapper.occupancy().occupied)
+        maps.append([int((np.hypot(*(cells - disc).T) < radius + 0.05).sum()) for disc in (there, pillar)])
+    assert maps[0][0] > 10
+    assert maps[1][0] == 0
+    assert maps[1][1] > 0.8 * maps[0][1] > 10
+
+
 def test_a_bag_is_mapped_by_other_topics_and_with_the_mount_of_its_transforms(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
