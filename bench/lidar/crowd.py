@@ -179,7 +179,7 @@ def _scan(begin_ns: int, ranges: FloatArray) -> ScanMessage:
 
 
 def _mapped(seed: int, *, sees: bool, radius: float) -> tuple[float, float]:
-    """Map the hall by all robots; RMS error of the stops, and mean distance of walls from their places [m]."""
+    """Map the hall by all robots; RMS error of stops, and mean distance of walls from their places [m]."""
     bodies, mapper = _bodies(seed), CooperativeMapper()
     lidar = replace(LIDAR, max_range=_FAR_M, robot_radius=radius)
     robots = [
