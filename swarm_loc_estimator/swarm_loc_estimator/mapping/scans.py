@@ -364,8 +364,8 @@ class ScanStop:
 
     def chosen(self, beams: BoolArray) -> ScanStop:
         """A sweep with some of its beams (n,) only."""
-        scan = Scan(self.turn, self.inverse, np.asarray(self.bearing), np.asarray(self.weight))
-        some = Scan(*(column[beams] for column in scan))
+        bearing, weight = (np.broadcast_to(one, beams.shape)[beams] for one in (self.bearing, self.weight))
+        some = Scan(self.turn[beams], self.inverse[beams], bearing, weight)
         return ScanStop.of_sweep(int(self.stamp_ns[0]), self.arrival, some, self.sigma, self.reach)
 
     def scan(self, first: int, last: int) -> Scan:
