@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -23,16 +24,26 @@ import numpy as np
 from bench.lidar.radish import BUILDINGS, NAME, reference, write_bag
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.bags.reader import BagReader
-from swarm_loc_estimator.common.se2 import between, compose, rigid_fit, transform_points
+from swarm_loc_estimator.common.se2 import between, rigid_fit, transform_points, wrap_angle
+from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
+from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
 from swarm_loc_estimator.mapping.sweep_map import LoopTie
+from swarm_loc_estimator.offline.metrics import is_misleading
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_estimator.timeline.estimate import Status
 
 _BEGIN_S = 160.0  # Of freiburg-079, of which the odometry contradicts the scans, the begin is measured, too
 _WRONG_M, _WRONG_TURN = 1.0, math.radians(15.0)
 """Difference of a tie from the reference from which it is wrong."""
 _SAME_S = 0.01
+_ODOMETRY = OdometryModel(
+    wheel_separation=0.4, wheel_noise=1e-3, turn_noise=0.01, distance_scale_sigma=0.03, turn_scale_sigma=0.03
+)
+_TICK_S = 0.25
 _WARM = 10  # Scans before the first that count for the cost, while code is loaded
 
 
@@ -74,26 +85,42 @@ def path_rms(mapper: CooperativeMapper, building: str) -> float:
     return float(np.sqrt(np.square(off).sum(axis=1).mean()))
 
 
-def wrong_loops(mapper: CooperativeMapper, building: str, offsets: Sequence[int] = (0,)) -> int:
-    """Number of ties of loops that the reference contradicts, from each stop at some offsets from theirs."""
+def wrong_loops(mapper: CooperativeMapper, building: str) -> tuple[int, int]:
+    """Numbers of ties of loops that the reference contradicts, and of those between stops that it has."""
     path = reference(building)
-    at, _ = _at_stops(mapper, path)
-    return sum(
-        all(_contradict(mapper, path[at, 1:], tie, off) for off in offsets) for tie in mapper.sweeps.loops
-    )
+    at, known = _at_stops(mapper, path)
+    ties = [tie for tie in mapper.sweeps.loops if known[tie.begin] and known[tie.end]]
+    return sum(_contradict(path[at, 1:], tie) for tie in ties), len(ties)
 
 
-def _contradict(mapper: CooperativeMapper, truth: FloatArray, tie: LoopTie, off: int) -> bool:
-    """Whether poses (k, 3) contradict a tie, each moved on from the stop before or after.
-
-    Single poses of the references are off by a metre, as one scan of the same place shows.
-    """
-    ends = []
-    for stop in (tie.begin, tie.end):
-        by = min(max(stop + off, 0), len(truth) - 1)
-        ends.append(compose(truth[by], between(mapper.graph.states[by, :3], mapper.graph.states[stop, :3])))
-    x, y, turn = between(between(*ends), tie.pose)
+def _contradict(truth: FloatArray, tie: LoopTie) -> bool:
+    """Whether poses (k, 3) of the stops contradict a tie."""
+    x, y, turn = between(between(truth[tie.begin], truth[tie.end]), tie.pose)
     return bool(math.hypot(x, y) > _WRONG_M or abs(turn) > _WRONG_TURN)
+
+
+def localized(mapper: CooperativeMapper, building: str) -> dict[str, float]:
+    """Figures of a replay of the same log in the finished map, compared with the stops of the mapper."""
+    with TemporaryDirectory() as folder:
+        bag = Path(folder, "bag")
+        write_bag(building, bag)
+        path, _ = save_map(mapper.occupancy(), Path(folder, "map"))
+        swarm = load_swarm(bag / "swarm.yaml")
+        robot = replace(swarm.robots[0], start=(0.0, 0.0, 0.0), odometry=_ODOMETRY)
+        result = replay(bag, replace(swarm, robots=(robot,), map=path), tick_s=_TICK_S)
+    tracked = result.status[:, 0] == Status.TRACKED
+    stamps = np.array([mapper.begin_ns[stop] for stop in range(mapper.graph.count)])
+    poses, known = interpolate(Trajectory(result.stamp_ns, result.poses[:, 0]), stamps, DEFAULT_GAP_NS)
+    at = np.searchsorted(result.stamp_ns, stamps).clip(0, len(tracked) - 1)
+    known &= tracked[at] & np.isfinite(poses).all(axis=1)
+    error = poses[known] - mapper.graph.poses[known]
+    error[:, 2] = wrap_angle(error[:, 2])
+    misleading = is_misleading(error, result.covariances[at[known], 0])
+    return {
+        "localized_tracked_share": float(tracked.mean()),
+        "localized_misleading_share": float(misleading.sum() / len(stamps)),
+        "localized_rms_m": float(np.sqrt(np.square(error[:, :2]).sum(axis=1).mean())),
+    }
 
 
 def _at_stops(mapper: CooperativeMapper, path: FloatArray) -> tuple[IntArray, BoolArray]:
@@ -106,11 +133,11 @@ def _at_stops(mapper: CooperativeMapper, path: FloatArray) -> tuple[IntArray, Bo
 
 def _figures_of(building: str) -> dict[str, float]:
     mapper, cpu = mapped(building)
-    tenth = len(cpu) // 10
+    tenth, (wrong, compared) = len(cpu) // 10, wrong_loops(mapper, building)
     found = {
         "path_rms_m": path_rms(mapper, building),
-        "wrong_loops": float(wrong_loops(mapper, building)),
-        "wrong_loops_also_from_next_stops": float(wrong_loops(mapper, building, (-1, 0, 1))),
+        "wrong_loops": float(wrong),
+        "compared_loops": float(compared),
         "loops": float(mapper.counters["loops_closed"]),
         "doubts": float(len(mapper.sweeps.doubts())),
         "contradicted": float(mapper.counters["odometry_contradicted"]),
@@ -119,6 +146,7 @@ def _figures_of(building: str) -> dict[str, float]:
         "map_cells": float(mapper.occupancy().log_odds.size),
         "memory_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
     }
+    found |= localized(mapper, building)
     if building == "freiburg-079":
         found["begin_rms_m"] = path_rms(mapped(building, _BEGIN_S)[0], building)
     return found

@@ -23,9 +23,15 @@ from bench.pushbot.mapping import LIDAR_SLIPS
 from bench.shared.common import ProgressLine
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, outline, wall_distance
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
+from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, encode
+from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.mapping.map_file import save_map
+from swarm_loc_estimator.mapping.mapper import CooperativeMapper
+from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
 from swarm_loc_estimator.mapping.messages import ScanMessage
+from swarm_loc_estimator.offline.map_replay import map_figures
 from swarm_loc_estimator.offline.metrics import is_misleading
 from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.sensors.lidar import ScanRows
@@ -38,7 +44,7 @@ from swarm_loc_estimator.timeline.estimator import Estimator
 _ODOMETRY = OdometryModel(wheel_separation=0.16, distance_scale_sigma=0.05, turn_scale_sigma=0.05)
 _START = StartSigma(0.02, 0.02, math.radians(1.0))
 _COLUMNS, _ROWS, _SQUARE_M, _FREE_M = 5, 4, 1.6, 0.35
-_RADIUS, _FAR_M, _RUN_S, _SETTLED_S = 0.15, 12.0, 60.0, 5.0
+_RADIUS, _FAR_M, _RUN_S, _SETTLED_S, _MAPPED_S = 0.15, 12.0, 60.0, 5.0, 20.0
 
 
 @dataclass
@@ -158,12 +164,54 @@ def _batch(now_ns: int, odometry: list[tuple[int, int, FloatArray]], ranges: lis
     }
     begin_ns = now_ns - round(SWEEP_S * 1e9)
     if ranges:
-        scans, turn = np.empty(len(ranges), dtype=object), 2.0 * math.pi / BEAMS
+        scans = np.empty(len(ranges), dtype=object)
         for k, one in enumerate(ranges):
-            scans[k] = ScanMessage(begin_ns, 0.0, 2.0 * math.pi, turn, SWEEP_S / BEAMS, NEAREST, _FAR_M, one)
+            scans[k] = _scan(begin_ns, one)
         at_ns = np.full(len(ranges), begin_ns)
         rows["scans"] = ScanRows(np.arange(len(ranges)), at_ns, scans, np.full(len(ranges), now_ns))
     return Batch.of(begin_ns, now_ns, **rows)
+
+
+def _scan(begin_ns: int, ranges: FloatArray) -> ScanMessage:
+    """The scan of a sweep that began at a time."""
+    turn = 2.0 * math.pi / BEAMS
+    return ScanMessage(begin_ns, 0.0, 2.0 * math.pi, turn, SWEEP_S / BEAMS, NEAREST, _FAR_M, ranges)
+
+
+def _mapped(seed: int, *, sees: bool, radius: float) -> tuple[float, float]:
+    """Map the hall by all robots; RMS error of stops, and mean distance of walls from their places [m]."""
+    bodies, mapper = _bodies(seed), CooperativeMapper()
+    lidar = replace(LIDAR, max_range=_FAR_M, robot_radius=radius)
+    robots = [
+        Robot(f"r{k}", lidar=lidar, start=_start(body), start_sigma=_START) for k, body in enumerate(bodies)
+    ]
+    feed, truth = MapperFeed(robots, mapper, {}), {}
+    for step in range(round(_MAPPED_S / PERIOD_S) + 1):
+        now_ns = round(step * PERIOD_S * 1e9)
+        for k, body in enumerate(bodies):
+            truth[k, now_ns] = body.pose.copy()
+            if step % ODOMETRY_STEPS == 0:
+                frames, stamp = (f"r{k}/odom", f"r{k}/base_link"), np.array([now_ns])
+                data = encode_odometry(*frames, stamp, body.odometry[None], np.zeros((1, 3)))[0]
+                feed.add(k, MapperInput.ODOMETRY, data)
+        for k in range(len(bodies)) if step and step % SWEEP_STEPS == 0 else ():
+            begin_ns = now_ns - round(SWEEP_S * 1e9)
+            fields = _scan(begin_ns, _ranges(bodies, k, step - SWEEP_STEPS, sees=sees))._asdict()
+            header = {"stamp": fields.pop("stamp_ns"), "frame_id": fields.pop("frame_id")}
+            fields |= {"header": header, "ranges": fields["ranges"].astype(np.float32)}
+            feed.add(k, MapperInput.SCAN, encode(fields, LASER_SCAN))
+        for body in bodies:
+            body.step()
+    mapper.finish()
+    robot = {feed.number(k): k for k in range(len(bodies))}
+    errors = [
+        mapper.graph.poses[stop, :2] - truth[robot[int(mapper.graph.robot[stop])], at_ns][:2]
+        for stop, at_ns in mapper.begin_ns.items()
+        if (robot[int(mapper.graph.robot[stop])], at_ns) in truth
+    ]
+    tracks: dict[int, Trajectory] = {}
+    walls = map_figures(mapper, tracks, bodies[0].plan.walls).wall_m
+    return float(np.sqrt(np.square(errors).sum(axis=1).mean())), walls
 
 
 def measure(seeds: int, say: ProgressLine) -> dict[str, float]:
@@ -187,6 +235,19 @@ def measure(seeds: int, say: ProgressLine) -> dict[str, float]:
             figures[f"crowd.{name}.rmse_m"] = float(np.sqrt(np.mean(errors**2)))
             for key in ("tracked", "misleading", "cpu_ms"):
                 figures[f"crowd.{name}.{key}"] = float(np.mean([getattr(one, key) for one in runs]))
+    kinds_of_map = {"alone": (False, 0.0), "crowd": (True, _RADIUS), "crowd_as_walls": (True, 0.0)}
+    for name, (sees, radius) in kinds_of_map.items():
+        found = []
+        for seed in range(seeds):
+            say(f"map, {name}, seed {seed}")
+            found.append(_mapped(seed, sees=sees, radius=radius))
+        figures[f"crowd.map.{name}.rmse_m"], figures[f"crowd.map.{name}.wall_m"] = map(
+            float, np.mean(found, axis=0)
+        )
+    for key in ("rmse_m", "wall_m"):
+        figures[f"crowd.map.{key}_over_alone"] = (
+            figures[f"crowd.map.crowd.{key}"] / figures[f"crowd.map.alone.{key}"]
+        )
     rmse = {name: figures[f"crowd.{name}.rmse_m"] for name in kinds}
     figures["crowd.over_alone"] = rmse["in_map.crowd"] / rmse["in_map.alone"]
     figures["crowd.gain"] = rmse["no_map.odometry"] / rmse["no_map.sightings"]

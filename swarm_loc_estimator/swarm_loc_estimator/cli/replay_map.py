@@ -4,7 +4,8 @@
     replay_map recording --swarm swarm.yaml --walls walls.csv --led pushbot1=1000 --led pushbot2=1050
 
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The map goes
-to OUT/map.yaml and OUT/map.pgm, a picture of it to OUT/map.png, the robots' stops to OUT/stops.csv. The same
+to OUT/map.yaml and OUT/map.pgm, a picture of it to OUT/map.png, the robots' stops to OUT/stops.csv. Mounts of
+lidars that the description does not say come from the bag's static transforms. The same
 bag gives the same files, byte for byte. Loops, refused scans, odometry that scans contradict, and places
 where the map is in doubt are printed. --walls draws a floor plan below the map (x0,y0,x1,y1 [m] per line)
 and prints the errors of the map's walls; with ground truth in the bag, the errors of the stops, too.
@@ -25,6 +26,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.command_line import (
     ProgressLine,
     add_bag,
+    add_remap,
     add_set,
     argument,
     command,
@@ -51,6 +53,7 @@ class WallsError(UserError):
 @command(
     __doc__,
     add_bag,
+    add_remap,
     argument(
         "--out",
         type=folder_to_write("map.*", "stops.csv"),
@@ -68,7 +71,7 @@ def main(options: argparse.Namespace) -> int:
     walls = read_walls(options.walls) if options.walls else np.zeros((0, 4))
     frequencies = led_frequencies(options.led, swarm.index_of)
     with ProgressLine() as progress:
-        mapper, feed = replay_map(options.bag, swarm.robots, settings, frequencies, progress)
+        mapper, feed, mounts = replay_map(options.bag, swarm, settings, frequencies, progress, options.remap)
     missing = list(feed.missing())
     if not mapper.graph.count:
         print(
@@ -88,7 +91,7 @@ def main(options: argparse.Namespace) -> int:
     write_stops(mapper, name_of, options.out / "stops.csv")
     for reason, count in (feed.all_drops + feed.dropped_beams).items():
         print(f"dropped: {count} {reason}")
-    for sentence in findings(mapper, name_of):
+    for sentence in (*mounts, *findings(mapper, name_of)):
         print(sentence)
     print(figures or "nothing to compare with: no ground truth in the bag, no --walls")
     print(f"{mapper.graph.count} stops; map: {path}, {image}; picture: {picture}")

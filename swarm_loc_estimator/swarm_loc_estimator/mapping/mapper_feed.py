@@ -9,6 +9,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from enum import Enum
+from types import MappingProxyType
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import LASER, LASER_SCAN, LIGHTS, ODOMETRY, CdrError
 from swarm_loc_estimator.common.messages.poses import decode_odometry
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.common.se2 import between, compose
+from swarm_loc_estimator.common.se2 import between, compose, inverse, transform_points
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.messages import (
@@ -34,6 +35,7 @@ from swarm_loc_estimator.swarm.swarm import Robot
 MAX_WAITING = 500  # Maximum numbers of queued odometry messages and distances; the oldest are dropped
 MAX_GAP_NS = 500_000_000  # Maximum gap over which odometry is interpolated
 _MAX_SWEEPS = 50  # Maximum number of queued scans
+_ROBOT_MARGIN = 0.1  # Around another robot, within which beams are left out [m]
 _SIGMAS = 301  # Number of distances over which the median sigma is taken
 
 
@@ -54,6 +56,11 @@ class OdometryQueue:
     def newest_ns(self) -> float:
         """Stamp of the newest odometry; -inf before the first."""
         return self._odometry[-1][0] if self._odometry else -math.inf
+
+    @property
+    def newest(self) -> FloatArray:
+        """The newest pose (3,) by odometry."""
+        return self._odometry[-1][1]
 
     def add_odometry(self, stamp_ns: int, pose: FloatArray) -> None:
         """Add a pose (3,) by odometry."""
@@ -125,13 +132,13 @@ class SweepPairer(OdometryQueue):
 
     def __init__(self, lidar: LidarModel) -> None:
         super().__init__()
-        self._lidar = lidar
+        self.lidar = lidar
         self._sweeps: deque[LidarSweep] = deque()
         self._newest_ns = -math.inf
 
     def add_scan(self, scan: ScanMessage) -> None:
         """Add a scan; what cannot be used of it is counted."""
-        sweep = read_sweep(scan, self._lidar, self.drops, self.dropped_beams)
+        sweep = read_sweep(scan, self.lidar, self.drops, self.dropped_beams)
         if sweep is None:
             return
         if scan.stamp_ns <= self._newest_ns:
@@ -155,7 +162,7 @@ class SweepPairer(OdometryQueue):
 
     def _stop(self, sweep: LidarSweep, pose: FloatArray, motion: FloatArray) -> ScanStop:
         """The sweep from a pose (3,) of the robot, which had moved by `motion` (n, 3) at each beam."""
-        lidar, seen = self._lidar, sweep.seen
+        lidar, seen = self.lidar, sweep.seen
         distance = np.where(seen, sweep.distance, sweep.reach)
         x, y = sweep.ends(lidar, motion).T
         noise = (lidar.range_sigma + lidar.range_sigma_per_m * distance) / distance**2
@@ -229,6 +236,7 @@ class MapperFeed:
         robots: All robots that may join.
         mapper: The mapper.
         frequencies: Robot -> frequency of its LEDs [Hz], for robots with tracked lights.
+        begin: That of an earlier feed, of robots that have moved since.
 
     Raises:
         MapperInputError: The start of more than one robot is unknown.
@@ -236,10 +244,15 @@ class MapperFeed:
     Attributes:
         drops: Reason -> number of dropped messages.
         received: (robot, input) -> number of received messages.
+        begin: Robot -> (3,) its pose by odometry at its start.
     """
 
     def __init__(
-        self, robots: Sequence[Robot], mapper: CooperativeMapper, frequencies: Mapping[str, float]
+        self,
+        robots: Sequence[Robot],
+        mapper: CooperativeMapper,
+        frequencies: Mapping[str, float],
+        begin: Mapping[int, FloatArray] = MappingProxyType({}),
     ) -> None:
         unknown = [robot.name for robot in robots if robot.start is None and not robot.lidar.is_used]
         if len(unknown) > (len(robots) == 1):
@@ -255,7 +268,8 @@ class MapperFeed:
             SweepPairer(robot.lidar) if robot.lidar.is_used else ReadingPairer() for robot in robots
         ]
         self._number: dict[int, int] = {}
-        self._begin: dict[int, FloatArray] = {}
+        self._swept: dict[int, FloatArray] = {}  # (3,) by odometry at the newest sweep
+        self.begin: dict[int, FloatArray] = dict(begin)
         index_of = {robot.name: k for k, robot in enumerate(robots) if not robot.lidar.is_used}
         self._light_of = [(hz, index_of[name]) for name, hz in frequencies.items() if name in index_of]
         self._readers: dict[MapperInput, Callable[[int, bytes], None]] = {
@@ -264,6 +278,13 @@ class MapperFeed:
             MapperInput.SCAN: self._read_laser,
             MapperInput.LIGHTS: self._read_lights,
         }
+
+    def describe(self, robots: Sequence[Robot]) -> None:
+        """Take the mounts of lidars, of which no sweep has been read, from another description."""
+        self._robots = robots
+        for pairer, robot in zip(self._pairers, robots, strict=True):
+            if isinstance(pairer, SweepPairer):
+                pairer.lidar = robot.lidar
 
     def add(self, robot: int, kind: MapperInput, data: bytes) -> None:
         """Process a message of a robot, by its index."""
@@ -276,9 +297,31 @@ class MapperFeed:
         pairer = self._pairers[robot]
         if isinstance(pairer, SweepPairer):
             for sweep in pairer.ready():
-                self._mapper.add_sweep(self._joined(robot, sweep.arrival), sweep)
+                number = self._joined(robot, sweep.arrival)
+                self._mapper.add_sweep(number, self._without_robots(robot, sweep))
+                self._swept[robot] = sweep.arrival
         elif (readings := pairer.ready()) is not None:
             self._mapper.add_readings(self._joined(robot, readings.odometry[0]), readings)
+
+    def _without_robots(self, robot: int, sweep: ScanStop) -> ScanStop:
+        """A sweep without the beams that end at other robots whose places are known."""
+        radius, own = self._robots[robot].lidar.robot_radius, self._place(robot, sweep.arrival)
+        others = [
+            there
+            for other in self._number
+            if other != robot and (there := self._place(other, self._pairers[other].newest)) is not None
+        ]
+        if not radius or own is None or not others:
+            return sweep
+        centres = transform_points(inverse(own), np.array(others)[:, :2])
+        away = np.hypot(*(sweep.ends[:, None] - centres[None]).transpose(2, 0, 1)).min(axis=1)
+        kept = away > radius + _ROBOT_MARGIN
+        return sweep.chosen(kept) if kept.any() else sweep
+
+    def _place(self, robot: int, odometry: FloatArray) -> FloatArray | None:
+        """Where a robot is in map (3,) at a pose by odometry; None: nobody knows."""
+        pose, swept = self._mapper.pose(self._number[robot]), self._swept.get(robot)
+        return pose if pose is None or swept is None else compose(pose, between(swept, odometry))
 
     @property
     def all_drops(self) -> Counter[str]:
@@ -309,7 +352,7 @@ class MapperFeed:
         if robot not in self._number:
             described = self._robots[robot]
             start, sigma = described.start, described.start_sigma
-            since: FloatArray = between(self._begin[robot], odometry)
+            since: FloatArray = between(self.begin[robot], odometry)
             pose: FloatArray = since if start is None else compose(np.array(start), since)
             known = np.array([sigma.x, sigma.y, sigma.theta])
             if start is None:  # the first one begins the map, and is looked for in no other
@@ -320,8 +363,8 @@ class MapperFeed:
     def _read_odometry(self, robot: int, data: bytes) -> None:
         message = decode_odometry(data)
         pose = np.array(message.pose)
-        if robot not in self._begin and np.isfinite(pose).all():
-            self._begin[robot] = pose
+        if robot not in self.begin and np.isfinite(pose).all():
+            self.begin[robot] = pose
         self._pairers[robot].add_odometry(message.stamp_ns, pose)
 
     def _read_laser(self, robot: int, data: bytes) -> None:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.se2 import wrap_angle
 
@@ -354,6 +354,19 @@ class ScanStop:
         stop.stamp_ns = np.full(len(scan.turn), stamp_ns)
         stop.sigma, stop.reach = sigma, reach
         return stop
+
+    @property
+    def ends(self) -> FloatArray:
+        """(n, 2) ends of the beams of a sweep in the frame of its robot, far away if they met nothing [m]."""
+        angle = self.turn + self.bearing
+        distance = 1.0 / np.where(self.inverse > 0.0, self.inverse, 1e-9)
+        return np.stack([np.cos(angle), np.sin(angle)], axis=-1) * distance[:, None]
+
+    def chosen(self, beams: BoolArray) -> ScanStop:
+        """A sweep with some of its beams (n,) only."""
+        bearing, weight = (np.broadcast_to(one, beams.shape)[beams] for one in (self.bearing, self.weight))
+        some = Scan(self.turn[beams], self.inverse[beams], bearing, weight)
+        return ScanStop.of_sweep(int(self.stamp_ns[0]), self.arrival, some, self.sigma, self.reach)
 
     def scan(self, first: int, last: int) -> Scan:
         """The beams from `first` on and before `last`, with turns since the one before."""

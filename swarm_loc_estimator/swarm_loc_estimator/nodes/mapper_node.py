@@ -2,7 +2,8 @@
 
     ./run swarm_loc_estimator mapper_node --ros-args -p swarm_file:=swarm.yaml
 
-It subscribes to `<robot>/odom`, `<robot>/laser` and `<robot>/lights`, or `<robot>/scan`. It publishes `map`,
+It subscribes to `<robot>/odom`, `<robot>/laser` and `<robot>/lights`, or `<robot>/scan`, and for mounts of
+lidars to `/tf_static` and `<robot>/tf_static`. It publishes `map`,
 `visitation`, `<robot>/goal`, `<robot>/fix` (the estimator, which owns the transforms, fuses it) and
 `/diagnostics`.
 Services: `~/save_map`, `~/reset`. Parameters: see `doc/mapper_node.md`.
@@ -11,8 +12,10 @@ Services: `~/save_map`, `~/reset`. Parameters: see `doc/mapper_node.md`.
 from __future__ import annotations
 
 import array
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,6 +24,7 @@ from nav_msgs.msg import OccupancyGrid
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
+from tf2_msgs.msg import TFMessage
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of, listed
@@ -41,9 +45,12 @@ from swarm_loc_estimator.mapping.mapper_feed import (
 from swarm_loc_estimator.mapping.messages import led_frequencies
 from swarm_loc_estimator.nodes.mapper_precompile import precompile
 from swarm_loc_estimator.nodes.parameters import MapperParameters, chosen_robots
+from swarm_loc_estimator.sensors.mounts import TF_STATIC, Mounts
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+_TF_STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _INPUT_QOS = QoSProfile(depth=200)
 _OUTPUT_QOS = QoSProfile(depth=10)
 
@@ -60,6 +67,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         swarm = load_swarm(Path(self.params.swarm_file))
         names = chosen_robots(self.params.robots, list(swarm.index_of))
         self._robots = [swarm.robots[swarm.index_of[name]] for name in names]
+        self._mounts = Mounts(Swarm(tuple(self._robots)))
         independent = [robot.name for robot in self._robots if robot.fix.systematic_share < 1.0]
         if independent:
             raise MapperInputError(
@@ -72,6 +80,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         if not is_precompiled(precompile):
             self.get_logger().info("compiling the mapper for this machine: about half a minute")
         precompile()
+        self._unframed = {f"{one.name}/{MapperInput.SCAN.topic}" for one in self._robots if one.lidar.is_used}
         self._clear()
         self._map = self.create_publisher(OccupancyGrid, "map", _LATCHED)
         self._visitation = self.create_publisher(OccupancyGrid, "visitation", _LATCHED)
@@ -85,6 +94,11 @@ class MapperNode(ConfiguredNode[MapperParameters]):
                 topic = f"{robot.name}/{kind.topic}"
                 qos = qos_profile_sensor_data if kind is MapperInput.SCAN else _INPUT_QOS
                 self.create_subscription(message_class(kind.message_type), topic, take, qos, raw=True)
+        spaces = ["", *(f"{robot.name}/" for robot in self._robots)] if self._unframed else []
+        for topic in (f"{space}{TF_STATIC}" for space in spaces):
+            self.create_subscription(
+                TFMessage, f"/{topic}", partial(self._on_mount, topic), _TF_STATIC_QOS, raw=True
+            )
         self.create_service(Trigger, "~/save_map", self._on_save)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._jumps = self.get_clock().create_jump_callback(BACKWARDS, post_callback=self._on_jump)
@@ -92,15 +106,30 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self.start_diagnostics(self._on_diagnostics)
         self.get_logger().info(f"ready: {len(self._robots)} robots of '{self.params.swarm_file}'")
 
-    def _clear(self) -> None:
-        """Start with an empty map and robots that have not joined yet."""
+    def _clear(self, begin: Mapping[int, FloatArray] = MappingProxyType({})) -> None:
+        """Start with an empty map and robots that have not joined yet, see `MapperFeed`."""
         self._mapper = CooperativeMapper(self.params.settings)
         self._mapper.background = self._background
-        self.feed = MapperFeed(self._robots, self._mapper, self._frequencies)
+        self.feed = MapperFeed(self._robots, self._mapper, self._frequencies, begin)
         self._located: dict[int, Located] = {}
         self._published: OccupancyMap | None = None
 
+    def _on_mount(self, topic: str, data: bytes) -> None:
+        """Take mounts of lidars from static transforms and first scans; a map with others begins anew."""
+        self._mounts.add_message(topic, data)
+        robots = list(self._mounts.described().robots)
+        if robots != self._robots:
+            self._robots = robots
+            if self._mapper.graph.count:
+                self._clear(self.feed.begin)
+            self.feed.describe(robots)
+            self.get_logger().info(" ".join(self._mounts.remarks()))
+
     def _on_message(self, robot: int, kind: MapperInput, data: bytes) -> None:
+        topic = f"{self._robots[robot].name}/{kind.topic}"
+        if topic in self._unframed:
+            self._unframed.remove(topic)
+            self._on_mount(topic, data)
         self.feed.add(robot, kind, data)
         number = self.feed.number(robot)
         located = self._mapper.located(number) if number is not None else None

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -22,36 +23,46 @@ from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, inputs_of
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.offline.recorded_bag import TruthReader
-from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.offline.recorded_bag import TruthReader, mounts_of_bag, renamed_topics
+from swarm_loc_estimator.swarm.swarm import Swarm
 
 _REPORT_EVERY = 1000
 
 
+class ReplayedMap(NamedTuple):
+    """What a bag has given."""
+
+    mapper: CooperativeMapper  # After a last optimization
+    feed: MapperFeed  # With the counts of used inputs
+    mounts: list[str]  # A sentence for each mount that only transforms say
+
+
 def replay_map(
     bag: Path,
-    robots: Sequence[Robot],
+    swarm: Swarm,
     settings: MapperSettings,
     frequencies: Mapping[str, float],
     progress: Callable[[float, str], None],
-) -> tuple[CooperativeMapper, MapperFeed]:
-    """Map a bag; returns the mapper after a last optimization, and its feed with the counts of used inputs.
+    remap: Mapping[str, str] = MappingProxyType({}),
+) -> ReplayedMap:
+    """Map a bag, with mounts by its static transforms where the description says none.
 
     The bag has `<robot>/odom`, `<robot>/laser` and, if frequencies of LEDs by robot [Hz] are given,
     `<robot>/lights`; of robots with a lidar `<robot>/scan`. `progress` is called now and then with the share
-    done and what is being done.
+    done and what is being done. `remap` is as in `renamed_topics`.
 
     Raises:
-        UserError: The bag cannot be read, or the robots cannot start.
+        UserError: The bag cannot be read, a topic cannot be mapped, or the robots cannot start.
     """
-    mapper = CooperativeMapper(settings)
-    feed = MapperFeed(robots, mapper, frequencies)
     source = {
         f"{robot.name}/{kind.topic}": (k, kind)
-        for k, robot in enumerate(robots)
+        for k, robot in enumerate(swarm.robots)
         for kind in inputs_of(robot, lights=True)
     }
-    with BagReader(bag) as reader:
+    mounts = mounts_of_bag(bag, swarm, remap, source)
+    mapper = CooperativeMapper(settings)
+    feed = MapperFeed(mounts.described().robots, mapper, frequencies)
+    with BagReader(bag, renamed_topics(remap, swarm, source)) as reader:
         for number, (topic, message_type, _, data) in enumerate(reader.messages(source)):
             robot, kind = source[topic]
             if message_type == kind.message_type:
@@ -61,7 +72,7 @@ def replay_map(
             if number % _REPORT_EVERY == 0:
                 progress(reader.progress, "mapping")
     mapper.finish()
-    return mapper, feed
+    return ReplayedMap(mapper, feed, mounts.remarks())
 
 
 def truth_of(bag: Path, swarm: Swarm) -> dict[str, Trajectory]:

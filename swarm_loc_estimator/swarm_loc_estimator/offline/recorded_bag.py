@@ -303,14 +303,21 @@ def read_bag(
         return BagSummary(range_ns, tracks, ingest.received(), remarks, unusable, *shown)
 
 
-def mounts_of_bag(bag: Path, swarm: Swarm, remap: Mapping[str, str] = MappingProxyType({})) -> Mounts:
+def mounts_of_bag(
+    bag: Path,
+    swarm: Swarm,
+    remap: Mapping[str, str] = MappingProxyType({}),
+    heard: Collection[str] = (),
+) -> Mounts:
     """Mounts of sensors by the static transforms of a bag; `remap` as in `renamed_topics`.
+
+    `heard` are topics that may be mapped beside those of the estimator.
 
     Raises:
         BagError: Nothing in the bag can be read, or a topic cannot be mapped.
     """
     mounts = Mounts(swarm)
-    known = [*Ingest(swarm).handle_of, *truth_topics(swarm), *MapReader(swarm).topics]
+    known = [*Ingest(swarm).handle_of, *truth_topics(swarm), *MapReader(swarm).topics, *heard]
     with BagReader(bag, renamed_topics(remap, swarm, known)) as reader:
         types = {topic.name: topic.type for topic in reader.topics}
         static = [name for name in types if name.endswith(TF_STATIC) and same_type(types[name], TRANSFORMS)]

@@ -106,8 +106,10 @@ class InputTopic:
     device: int = 0  # Address of the other radio on the topic of a pair
 
 
-def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
+def input_topics(swarm: Swarm, *, maps: bool = False) -> tuple[InputTopic, ...]:
     """All possible input topics of a swarm: of each robot, of each fixed camera, then of the swarm.
+
+    With `maps` also those that are of use to a mapper, or in a map that is not described.
 
     Raises:
         UserError: `Swarm.topics` has a topic that is not read.
@@ -123,7 +125,7 @@ def input_topics(swarm: Swarm) -> tuple[InputTopic, ...]:
         and not kind.of_pairs
         and not (swarm.range_topic and kind.name == RangeSensor.name)
         and (kind.expected_of(robot) or not kind.only_expected)
-        and (swarm.map is not None or not kind.needs_map or robot.lidar.sees_robots)
+        and (maps or swarm.map is not None or not kind.needs_map or robot.lidar.sees_robots)
     )
     of_cameras = (
         InputTopic(swarm.topic(camera.name, kind.topic), kind, index)

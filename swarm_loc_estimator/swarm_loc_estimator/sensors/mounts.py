@@ -69,7 +69,7 @@ class Mounts:
         self._frames: dict[tuple[int, str], str] = {}  # Of a sensor of a robot
         self.topics: dict[str, InputTopic] = {
             topic.name: topic
-            for topic in input_topics(swarm)
+            for topic in input_topics(swarm, maps=True)
             if topic.kind.name in _SECTIONS and 0 <= topic.robot < len(swarm.robots)
             if getattr(swarm.robots[topic.robot], _SECTIONS[topic.kind.name][0]) is not None
         }

@@ -20,6 +20,8 @@ from rclpy.serialization import serialize_message
 from rclpy.time import Time
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Trigger
+from test_mounts import static
+from tf2_msgs.msg import TFMessage
 
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.grid import CELL
@@ -123,14 +125,29 @@ def more_scans(node: MapperNode, before: int) -> bool:
     return node.feed.received[0, MapperInput.SCAN] > before
 
 
-def test_a_lidar_is_read_by_best_effort_and_locates_a_robot_that_drives(ros: Ros, files: Path) -> None:
+@pytest.mark.parametrize("by_transforms", [False, True])
+def test_a_lidar_is_read_by_best_effort_and_locates_a_robot_that_drives(
+    ros: Ros, files: Path, by_transforms: bool
+) -> None:
+    """With its mount in the description, or in the latched transforms of its URDF."""
     robot = LidarRobot(np.random.default_rng(1))
     start = dict(zip(("x", "y", "theta"), robot.start.tolist(), strict=True))
     sigma = dict.fromkeys(start, 0.001)
-    about = f"{{start: {start}, start_sigma: {sigma}, lidar: {asdict(LIDAR)}}}".replace("'", "")
+    lidar = {
+        key: value
+        for key, value in asdict(LIDAR).items()
+        if key not in ("x", "y", "yaw") or not by_transforms
+    }
+    about = f"{{start: {start}, start_sigma: {sigma}, lidar: {lidar}}}".replace("'", "")
     text = f"fileversion: 1\ndefaults: {{fix: {{systematic_share: 1.0}}}}\nrobots: {{alpha: {about}}}\n"
     (files / "swarm.yaml").write_text(text, encoding="utf-8")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    transforms = ros.tester.create_publisher(TFMessage, "/tf_static", latched)
+    if by_transforms:
+        joint = ("base_link", "a/base_scan", (LIDAR.x, LIDAR.y, 0.2), (LIDAR.yaw, 0.0, 0.0))
+        transforms.publish(static(joint))
     node = mapper(ros, files)
+    ros.until(transforms.get_subscription_count)
     goals = ros.listen(PoseStamped, "alpha/goal")
     fixes = ros.listen(PoseWithCovarianceStamped, "alpha/fix")
     odometry = ros.tester.create_publisher(Odometry, "alpha/odom", QoSProfile(depth=200))

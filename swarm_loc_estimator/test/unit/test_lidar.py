@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 from mapping_world import BEAMS, LIDAR, ROOM, SWEEP_NS, LidarRobot, scan_bytes
+from test_mounts import static
 
 from swarm_loc_estimator.cli.replay_map import main
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.writer import BagWriter, typestore
-from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, ODOMETRY
+from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, ODOMETRY, TRANSFORMS
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry
 from swarm_loc_estimator.common.se2 import between, compose, transform_points
 from swarm_loc_estimator.mapping.map_file import load_map
@@ -254,6 +255,78 @@ def test_odometry_that_restarts_does_not_move_the_robot_in_the_map() -> None:
     located = mapper.located(0)
     assert located is not None
     assert located.pose == pytest.approx(robot.pose(located.stamp_ns), abs=0.06)
+
+
+@pytest.mark.parametrize(("start_error", "seed"), [(0.0, 1), (0.0, 2), (0.04, 3)])
+def test_other_robots_are_no_walls_of_the_map(start_error: float, seed: int) -> None:
+    """One drives past another that stands, with a pillar as wide beside it that stays in the map."""
+    there, pillar, radius, maps = np.array([0.6, 0.5]), np.array([2.8, 0.6]), 0.15, []
+    for described in (0.0, radius):
+        rng, mapper = np.random.default_rng(seed), CooperativeMapper()
+        lidar = replace(LIDAR, robot_radius=described)
+        standing = replace(TURTLE, name="b", lidar=lidar, start=(there[0] + start_error, there[1], 0.0))
+        feed = MapperFeed([replace(TURTLE, lidar=lidar), standing], mapper, {})
+        robot, still = LidarRobot(rng), LidarRobot(rng)
+        for at_ns in range(0, 12_000_000_000, ODOMETRY_NS):
+            feed.add(0, MapperInput.ODOMETRY, odometry(at_ns, robot.odometry(np.array([at_ns]))[0]))
+            feed.add(1, MapperInput.ODOMETRY, odometry(at_ns, np.zeros(3)))
+            if at_ns % SWEEP_NS == 0:
+                scan, beams = robot.scan(at_ns), np.arange(BEAMS)
+                at = compose(robot.start, robot.odometry(at_ns + SWEEP_NS // BEAMS * beams))
+                mount = compose(at, [LIDAR.x, LIDAR.y, LIDAR.yaw])
+                angle = mount[:, 2] + scan.angle_increment * beams
+                for disc in (there, pillar):
+                    x, y = (disc - mount[:, :2]).T
+                    along, across = (
+                        x * np.cos(angle) + y * np.sin(angle),
+                        y * np.cos(angle) - x * np.sin(angle),
+                    )
+                    met = (np.abs(across) < radius) & (along > 0.0)
+                    near = along[met] - np.sqrt(radius**2 - across[met] ** 2)
+                    scan.ranges[met] = np.minimum(scan.ranges[met], near)
+                feed.add(0, MapperInput.SCAN, scan_bytes(scan))
+                if at_ns == 0:
+                    feed.add(
+                        1,
+                        MapperInput.SCAN,
+                        scan_bytes(still.scan(at_ns)._replace(ranges=np.full(BEAMS, np.inf))),
+                    )
+        mapper.finish()
+        cells = mapper.occupancy().centres(mapper.occupancy().occupied)
+        maps.append([int((np.hypot(*(cells - disc).T) < radius + 0.05).sum()) for disc in (there, pillar)])
+    assert maps[0][0] > 10
+    assert maps[1][0] == 0
+    assert maps[1][1] > 0.8 * maps[0][1] > 10
+
+
+def test_a_bag_is_mapped_by_other_topics_and_with_the_mount_of_its_transforms(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As of a robot without a namespace, whose lidar only its URDF describes."""
+    joint = static(("base_link", "a/base_scan", (LIDAR.x, LIDAR.y, 0.2), (LIDAR.yaw, 0.0, 0.0)))
+    for name, space in (("described", "a/"), ("found", "")):
+        with BagWriter(tmp_path / name) as bag:
+            for topic, kind in (
+                ("tf_static", TRANSFORMS),
+                (f"{space}odom", ODOMETRY),
+                (f"{space}scan", LASER_SCAN),
+            ):
+                bag.add_topic(topic, kind)
+            bag.write("tf_static", 0, joint)
+            for kind, at_ns, data in messages(5_000_000_000, seed=1):
+                bag.write(f"{space}{kind.topic}", at_ns, data)
+    bare = replace(TURTLE, lidar=replace(LIDAR, x=0.0, y=0.0, yaw=0.0))
+    save_swarm(Swarm((TURTLE,)), tmp_path / "described" / "swarm.yaml")
+    save_swarm(Swarm((bare,)), tmp_path / "found" / "swarm.yaml")
+    assert main([str(tmp_path / "described"), "--out", str(tmp_path / "x")]) == 0
+    assert "tf_static" not in capsys.readouterr().out
+    remap = [part for topic in ("odom", "scan") for part in ("--remap", f"a/{topic}:=/{topic}")]
+    assert main([str(tmp_path / "found"), "--out", str(tmp_path / "y"), *remap]) == 0
+    assert "Mount of a's lidar by tf_static: x 0.050, y -0.020, yaw 1.571." in capsys.readouterr().out
+    described, found = (
+        np.loadtxt(tmp_path / one / "stops.csv", skiprows=1, delimiter=",", usecols=(2, 3, 4)) for one in "xy"
+    )
+    assert found == pytest.approx(described, abs=1e-6)
 
 
 def test_a_bag_gives_the_same_map_twice(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -23,7 +23,7 @@ LEDS = {"pushbot1": 1000.0, "pushbot2": 1111.111}
 def figures_of(name: str, leds: dict[str, float]) -> MapFigures:
     bag = BAGS / name
     swarm = load_swarm(bag / "swarm.yaml")
-    mapper, feed = replay_map(bag, swarm.robots, MapperSettings(), leds, lambda *_: None)
+    mapper, feed, _ = replay_map(bag, swarm, MapperSettings(), leds, lambda *_: None)
     assert set(feed.all_drops) <= {"light_of_nobody"}
     tracks = truth_of(bag, swarm)
     truth = {number: tracks[robot.name] for number, robot in enumerate(swarm.robots)}

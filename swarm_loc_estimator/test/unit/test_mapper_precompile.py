@@ -28,12 +28,12 @@ def compiled_late() -> list[str]:
     """What is compiled when robots are replayed though all is warm; in a process of its own."""
     precompile()
     before = signatures()
-    robots = load_swarm(BAG / "swarm.yaml").robots
+    swarm = load_swarm(BAG / "swarm.yaml")
     with TemporaryDirectory() as folder:
         begin = Path(folder, "begin")
         copy_part(BAG, begin, 80.0)  # the rest of the bag calls the same functions
-        mapper, feed = replay_map(begin, robots, MapperSettings(), FREQUENCIES, lambda _share, _what: None)
-    for index in range(len(robots)):
+        mapper, feed, _ = replay_map(begin, swarm, MapperSettings(), FREQUENCIES, lambda _share, _what: None)
+    for index in range(len(swarm.robots)):
         number = feed.number(index)
         goal = None if number is None else mapper.goal(number)
         if number is not None and goal is not None:
