@@ -248,7 +248,7 @@ class InitialPose(NamedTuple):
 
     def whole_covariance(self, shared: Mapping[int, FloatArray]) -> FloatArray:
         """Covariance (3, 3) of the error, from those of the other bodies by their columns."""
-        covariance = self.covariance.copy()
+        covariance: FloatArray = self.covariance.copy()
         for column, share in zip(self.columns.tolist(), self.shares, strict=True):
             covariance += share @ shared[column] @ share.T
         return covariance

@@ -242,7 +242,8 @@ def _apart(
     centre = np.array([constraints["local_x"].mean(), constraints["local_y"].mean(), 0.0])
     away = (se2.compose(others, centre) - se2.compose(one, centre))[:, :2]
     turn = np.abs(se2.wrap_angle(others[:, 2] - one[2]))
-    return np.maximum(np.hypot(*away.T) / limits[0], turn / limits[1])
+    apart: FloatArray = np.maximum(np.hypot(*away.T) / limits[0], turn / limits[1])
+    return apart
 
 
 def _refined(constraints: ConstraintArray, begin: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -288,7 +289,7 @@ def _place(turn: float, lx: float, ly: float, mx: float, my: float, out: FloatAr
 
 def _drifted(constraints: ConstraintArray, track_noise: FloatArray) -> ConstraintArray:
     """The constraints (k,) with the drift of the track added to the covariance of their points on it."""
-    out = constraints.copy()
+    out: ConstraintArray = constraints.copy()
     drift = track_noise - out["track_noise"]
     # late odometry has replaced a larger noise that was assumed without it
     late = np.linalg.eigvalsh(drift)[:, 0] < -1e-12 - 1e-9 * np.abs(np.trace(drift, axis1=1, axis2=2))

@@ -55,8 +55,6 @@ _MIN_SHARE = 1e-3  # Minimum assumed share of outliers
 _BRIGHT_SPAN = 8.0  # Range of readings that are too bright, in widths of the density of one that is not
 _NEGLIGIBLE = 10.0  # Maximum log-likelihood ratio to the best pose; less likely poses are skipped
 
-Float32Array = NDArray[np.float32]
-
 
 @dataclass(frozen=True)
 class ElementVerdicts:
@@ -127,8 +125,8 @@ def _geometries(robot_of: IntArray, same: Callable[[int, list[int]], BoolArray])
     number, seen = np.arange(robot_of.shape[1]), dict[tuple[int, ...], list[int]]()
     for k, pair in enumerate(zip(*robot_of.tolist(), strict=True)):
         firsts = seen.setdefault(pair, [])
-        near = np.flatnonzero(same(k, firsts)) if firsts else []
-        if len(near):
+        near = np.flatnonzero(same(k, firsts)).tolist() if firsts else []
+        if near:
             number[k] = firsts[near[0]]
         else:
             firsts.append(k)
@@ -155,6 +153,7 @@ def _log_ratios(
         The ratios, and (k, 2) bearing and heading [rad] of the most likely pose if all elements work.
     """
     poses, light, grid_variance = _grid(platform)
+    given: FloatArray = np.multiply.outer([1.0, *_DEAD_SHARES], light).astype(np.float32)
     log_prior = 2.0 * np.log(poses[:, 0])  # uniform over the plane
     log_blocked = np.float32(math.log(max(platform.blocked_share, _MIN_SHARE)))
     log_bright = np.float32(math.log(max(platform.bright_share, _MIN_SHARE) / _BRIGHT_SPAN))
@@ -165,8 +164,7 @@ def _log_ratios(
     level = np.rint(np.log(noise / platform.noise) / math.log(_NOISE_RATIO))
     for one in np.unique(level).tolist():
         sigma = platform.noise * _NOISE_RATIO**one
-        shares = np.array([1.0, *_DEAD_SHARES], dtype=np.float32)
-        working, *shaded = stabilized(shares[:, None, None, None] * light, sigma, relative)
+        working, *shaded = stabilized(given, sigma, relative)
         for k in np.flatnonzero(level == one).tolist():
             # log likelihoods of the readings at all poses, if all elements work
             measured = np.isfinite(readings[k]) & (readings[k] >= DARKEST * sigma)
@@ -200,7 +198,7 @@ def _grid(platform: IrPlatform) -> tuple[FloatArray, FloatArray, float]:
     angles = 2.0 * math.pi / _DIRECTIONS * np.arange(_DIRECTIONS) - math.pi
     poses = np.stack(np.meshgrid(start_table(full).ranges, angles, angles, indexing="ij"), axis=-1)
     flat = poses.reshape(-1, 3)
-    light = np.moveaxis(expected_brightness(full, flat)[:, 0], 0, 2).astype(np.float32)
+    light = np.moveaxis(expected_brightness(full, flat)[:, 0], 0, 2)
     logs = np.log(np.clip(light, platform.noise, platform.saturation)).reshape(-1, *poses.shape[:3])
     shown, variance = logs > math.log(_SHOWN * platform.noise), 0.0
     for axis in range(1, 4):
