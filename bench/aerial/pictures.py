@@ -39,8 +39,8 @@ class Look:
 
     diameter_px: float = 24.0  # Of robots in the middle of the picture
     robots: int = 12  # How many
-    # `pattern`, or plain discs: `dark`, `bright`; `board`, dark with bright parts; `lid`, a board with a bright
-    # lid; `led`, a bright spot with soft rims
+    # `pattern`, or plain discs: `dark`, `bright`; `board`, dark with bright parts; `lid`, a board with a
+    # bright lid; `led`, a bright spot with soft rims
     kind: str = "pattern"
     tilt: float = 0.0  # Of the camera [rad]
     barrel: float = 0.0  # Radial distortion k1 of the lens
@@ -268,10 +268,14 @@ class _Plan:
         size = DIAMETER / self._step
         for pose in poses[: round(look.rails * len(poses))]:
             angle = float(self._rng.uniform(-math.pi, math.pi))
-            towards, along = np.array([[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]])
+            towards, along = np.array(
+                [[math.cos(angle), math.sin(angle)], [-math.sin(angle), math.cos(angle)]]
+            )
             for share, wide, shade in ((0.5, 0.1, 0.15), (0.62, 0.15, 0.95), (0.9, 0.35, 0.7)):
                 middle = (pose[:2] - self._low) / self._step - 0.5 + (share + 0.5 * wide) * size * towards
-                corners = [middle + k * 2.0 * size * along + m * 0.5 * wide * size * towards for k, m in _CORNERS]
+                corners = [
+                    middle + k * 2.0 * size * along + m * 0.5 * wide * size * towards for k, m in _CORNERS
+                ]
                 cv2.fillConvexPoly(self.image, np.rint(corners).astype(np.int32), shade, cv2.LINE_AA)
 
     def put_robot(self, look: Look, pose: FloatArray, top: FloatArray, lift: float) -> None:
@@ -286,7 +290,9 @@ class _Plan:
         window, grid = _window(self.image, 0.5 * (base + centre), reach)
         if not window.size:
             return
-        parts = self._rng.uniform(-1.0, 1.0, (_PARTS, 2)) if look.kind in {"board", "lid"} else np.zeros((0, 2))
+        parts = (
+            self._rng.uniform(-1.0, 1.0, (_PARTS, 2)) if look.kind in {"board", "lid"} else np.zeros((0, 2))
+        )
         shares = np.linspace(-0.5, 0.5, _EXPOSURES) if look.motion > 0.0 else np.zeros(1)
         exposures = []
         for share in shares:

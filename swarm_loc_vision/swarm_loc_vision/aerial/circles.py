@@ -241,7 +241,9 @@ class Sides(NamedTuple):
         length, normal = np.ones((len(centre), RAYS)), np.tile(DIRECTIONS, (len(centre), 1, 1))
         base = (self.foot - centre) * (self.share / radius)[:, None]
         away = np.linalg.norm(base, axis=1)
-        rows = np.flatnonzero((kind != TOP) & (kind != INNER) & (away > self.share))  # otherwise the top hides the base
+        rows = np.flatnonzero(
+            (kind != TOP) & (kind != INNER) & (away > self.share)
+        )  # otherwise the top hides the base
         base, away, size = base[rows], away[rows], 1.0 - self.share
         along = base @ DIRECTIONS.T
         # where a ray meets the base's circle, and the tangent of both circles on its side
@@ -307,7 +309,7 @@ class Rims:
             start = np.clip(found, low, high)
             length, normal = self.sides.outline(centre, start, kind)
             reach = start[:, None] * length
-            edge, step, is_edge = self.edges(centre, start, reach, normal, soft, without, fine)
+            edge, step, is_edge = self.edges(centre, start, reach, normal, soft, without, fine=fine)
             away = edge - reach
             # narrower sides end anywhere between the rim of the top and those of a cylinder
             hidden = (kind[:, None] == PARTLY) & (length > 1.0)
@@ -329,6 +331,7 @@ class Rims:
         normal: FloatArray,
         soft: NDArray[np.bool_],
         without: Light | None,
+        *,
         fine: bool,
     ) -> EdgesOnRays:
         """The strongest edge on each ray near the outline at `reach` (C, R) [px], R a divisor of `RAYS`."""
@@ -352,9 +355,10 @@ class Rims:
 
 def likely(rims: Rims, centres: FloatArray, radius: float) -> FloatArray:
     """The candidates (C, 2) with enough edges around to be discs of about a radius [px]."""
-    size = np.full(len(centres), radius)
-    reach, normal = np.tile(size[:, None], RAYS // _EVERY), np.broadcast_to(DIRECTIONS[::_EVERY], (len(centres), RAYS // _EVERY, 2))
-    is_edge = rims.edges(centres, size, reach, normal, np.zeros(len(centres), np.bool_), None, False).is_edge
+    count, none = len(centres), np.zeros(len(centres), np.bool_)
+    size, normal = np.full(count, radius), np.tile(DIRECTIONS[::_EVERY], (count, 1, 1))
+    reach = np.tile(size[:, None], RAYS // _EVERY)
+    is_edge = rims.edges(centres, size, reach, normal, none, None, fine=False).is_edge
     return np.asarray(centres[is_edge.mean(axis=1) >= _LIKELY], float)
 
 

@@ -73,9 +73,11 @@ _SAME_CONTRAST = 0.45  # Least contrast of a disc over that of the others: shado
 _TOUCHING, _USUAL = 1.3, 0.65
 """Largest distance of touching discs, in diameters; least share of the usual coverage of any other disc."""
 _RAGGED = 0.1  # Quality of a disc with a ragged rim, over the square of its coverage
+_NOTHING_HIDDEN, _HIDDEN_SHARE = 0.9, 0.3
+"""Coverage below which what hides a rim may be taken for it, and error of the centre in radii over the lack."""
 _LIDS = 0.55, 0.7, 0.85  # Radii of inner circles that are tried, in radii of discs
 _LID_AWAY, _SAME_LID = 0.3, 0.1
-"""Largest distance of their centres in radii of discs, and largest difference of their radii from the others."""
+"""Largest distance of their centres in radii of discs, and largest relative difference of their radii."""
 _MOST_LIDS = 0.5  # Least share of clear discs that show an inner circle, if any does
 _LID_SIGMA = 0.1  # Error of a disc's centre by its inner circle, one standard deviation in radii
 _MAX_SQUARENESS = 0.4
@@ -302,9 +304,7 @@ def _rank(circles: Circles) -> FloatArray:
     return np.maximum(_quality(circles), _RAGGED * circles.coverage**2)
 
 
-def _with_lids(
-    rims: Rims, circles: Circles, clear: NDArray[np.bool_], size: float, least: float
-) -> Circles:
+def _with_lids(rims: Rims, circles: Circles, clear: NDArray[np.bool_], size: float, least: float) -> Circles:
     """Circles with those that show an inner circle instead of their rim.
 
     Where robots touch, little is left of their rims. What is on top of them, as a lid, has a rim of its own,
@@ -322,17 +322,18 @@ def _with_lids(
     has_lid = best.coverage > 0.0
     if has_lid[clear].mean() < _MOST_LIDS:
         return circles
-    radius = commonest(best.radius[has_lid & clear], _quality(best)[has_lid & clear])
+    usual = commonest(best.radius[has_lid & clear], _quality(best)[has_lid & clear])
     both = 0.5 * (circles.coverage + best.coverage)
-    taken = has_lid & ~clear & (np.abs(best.radius / radius - 1.0) <= _SAME_LID) & (both > circles.coverage)
+    taken = has_lid & ~clear & (np.abs(best.radius / usual - 1.0) <= _SAME_LID) & (both > circles.coverage)
     lids = best.select(taken)._replace(
         radius=np.full(int(taken.sum()), size),
         coverage=both[taken],
         contrast=np.full(int(taken.sum()), np.median(circles.contrast[clear])),
     )
-    return circles.updated(np.flatnonzero(taken), lids._replace(
-        covariance=lids.covariance + (_LID_SIGMA * size) ** 2 * np.eye(2)
-    ))
+    return circles.updated(
+        np.flatnonzero(taken),
+        lids._replace(covariance=lids.covariance + (_LID_SIGMA * size) ** 2 * np.eye(2)),
+    )
 
 
 def _whole(circles: Circles) -> NDArray[np.bool_]:
@@ -391,12 +392,13 @@ def _refined(rims: Rims, circles: Circles, light: Light) -> Circles:
     good &= np.linalg.norm(shift, axis=1) <= _MAX_SHIFT * circles.radius
     rough = circles.covariance + (_UNREFINED * circles.radius[:, None, None]) ** 2 * np.eye(2)
     spread = np.where(good[:, None, None], fine.covariance + _SHIFT_SHARE * _outer(shift), rough)
+    hidden = _HIDDEN_SHARE * np.maximum(_NOTHING_HIDDEN - circles.coverage, 0.0) * circles.radius
     parallax = rims.sides.share * (rims.sides.foot - circles.centre) * (circles.kind != SIDES)[:, None]
     return circles._replace(
         centre=np.where(good[:, None], fine.centre, circles.centre),
         radius=np.where(good, fine.radius, circles.radius),
         oval=np.where(good[:, None], fine.oval, circles.oval),
-        covariance=spread + _PARALLAX_SHARE**2 * _outer(parallax),
+        covariance=spread + hidden[:, None, None] ** 2 * np.eye(2) + _PARALLAX_SHARE**2 * _outer(parallax),
     )
 
 

@@ -72,7 +72,7 @@ def find_marks(plain: Plain, centre: FloatArray, radius: FloatArray, polarity: f
     if not len(centre):
         return Marks(*np.zeros((4, 0)))
     inside = _inside()
-    values = sampled(plain, centre[:, None] + radius[:, None, None] * inside.places)
+    values = sampled(plain, centre[:, None] + radius[:, None, None] * inside.places).astype(float)
     bare = inside.without_light(values)
     angles = np.tile(2.0 * np.pi * np.arange(_TURNS) / _TURNS, len(_SOFTNESSES))
     softnesses = np.repeat(_SOFTNESSES, _TURNS)

@@ -133,8 +133,8 @@ class Brightness:
     """A rectified image."""
 
     plain: Plain  # (rows, columns) counts, slightly smoothed
-    # (rows, columns, 3) their logarithm, in which uneven light and shadows change edges little, and the change
-    # of that to the next column and row
+    # (rows, columns, 3) their logarithm, in which uneven light and shadows change edges little, and its
+    # change to the next column and row
     log: Plain
     noise: float  # Standard deviation of the noise of the raw image [counts]
 
