@@ -65,7 +65,7 @@ def check_pictures(evidence: Evidence) -> Iterator[Finding]:
             yield Finding(name, f"has {malformed} messages that are no {heard.type}", "Rebuild its publisher")
         if not images:
             continue
-        image = images[-1]
+        image = images[-1][1]
         if not is_compressed and not {image.encoding, image.encoding.lower()} & IMAGE_ENCODINGS:
             remedy = f"Publish one of {', '.join(sorted(IMAGE_ENCODINGS))}"
             yield Finding(
@@ -77,7 +77,7 @@ def check_pictures(evidence: Evidence) -> Iterator[Finding]:
         found = evidence.topics.get(info_name, Heard(""))
         infos = decoded(found)[0] if same_type(found.type, CAMERA_INFO) else []
         yield from _of_intrinsics(
-            name, info_name, infos[-1] if infos else None, None if is_compressed else image
+            name, info_name, infos[-1][1] if infos else None, None if is_compressed else image
         )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,10 +9,9 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from rosbags.serde import SerdeError
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.bags.writer import typestore
+from swarm_loc_estimator.common.messages.cdr import RANGE, CdrError, decode
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
 from swarm_loc_estimator.filter.measurements import concatenate
 from swarm_loc_estimator.offline.recorded_bag import same_type
@@ -28,6 +26,7 @@ from swarm_loc_estimator.sensors.inputs import (
     live_topics,
 )
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
+from swarm_loc_estimator.sensors.ranges import decode_pair
 from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Contradicted, Contradiction, Status
@@ -198,13 +197,13 @@ class Evidence:
         return self.swarm.sources[index].name
 
 
-def decoded(heard: Heard) -> tuple[list[Any], int]:
-    """Messages of a topic as objects of `rosbags`, and how many are malformed."""
+def decoded(heard: Heard, most: int | None = None) -> tuple[list[tuple[int, Any]], int]:
+    """The first messages of a topic with their arrivals [ns], and how many are malformed."""
     messages, malformed = [], 0
     kind = heard.type if "/msg/" in heard.type else heard.type.replace("/", "/msg/")
-    for _, data in heard.messages:
+    for arrival_ns, data in heard.messages[:most]:
         try:
-            messages.append(typestore().deserialize_cdr(data, kind))
-        except (SerdeError, ValueError, IndexError, struct.error):
+            messages.append((arrival_ns, decode_pair(data) if kind == RANGE else decode(data, kind)))
+        except CdrError:
             malformed += 1
     return messages, malformed

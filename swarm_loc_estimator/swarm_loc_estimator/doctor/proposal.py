@@ -22,12 +22,12 @@ import numpy as np
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.health import listed
-from swarm_loc_estimator.common.messages.cdr import LASER, LASER_SCAN, RANGE, CdrError, decode, nanoseconds
+from swarm_loc_estimator.common.messages.cdr import LASER, LASER_SCAN, RANGE, nanoseconds
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.common.yaml_tree import YamlTreeError, read_tree
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag, is_looked_at, lines_of, mounts_of
-from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard
+from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, decoded
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.calibration.recording import Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, same_type
@@ -36,7 +36,6 @@ from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, NO_DETECTIONS
 from swarm_loc_estimator.sensors.inputs import TRUTH, kinds
 from swarm_loc_estimator.sensors.localizers import BODY, SOURCES, BodyPose
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY
-from swarm_loc_estimator.sensors.ranges import decode_pair
 from swarm_loc_estimator.swarm.error_models import ClockModel, FixModel, OdometryModel, RandomWalk
 from swarm_loc_estimator.swarm.ir_board import PACKAGED, IrPlatform, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.new_swarm import GYROSCOPE, KNOWN_ROBOTS, LIDAR
@@ -240,7 +239,7 @@ def likely_type(topics: Mapping[str, Heard], used: Mapping[str, Mapping[str, str
         message.header.frame_id
         for heard in topics.values()
         if same_type(heard.type, LASER_SCAN)
-        for _, message in _decoded(heard, 1)
+        for _, message in decoded(heard, 1)[0]
     }
     for name, known in KNOWN_ROBOTS.items():
         if known.lidar_frame and any(frame.endswith(known.lidar_frame) for frame in frames):
@@ -270,7 +269,7 @@ def _sensors(draft: _Draft, name: str, used: Mapping[str, str], known_type: str)
     if any(same_type(one.type, LASER) and name in topic.split("/") for topic, one in draft.topics.items()):
         fields["fix"] = FixModel(systematic_share=1.0)  # of mapper_node
     if "brightness" in used:
-        for _, message in _decoded(draft.topics[used["brightness"]], 1):
+        for _, message in decoded(draft.topics[used["brightness"]], 1)[0]:
             boards = _boards(message.n)
             if fitting := [*boards]:
                 fields["ir"] = RobotIr(int(message.receiver), boards[fitting[0]], fitting[0])
@@ -293,17 +292,6 @@ def _boards(sensors: int) -> dict[str, IrPlatform]:
     return {one: board for one, board in boards.items() if len(board.angles) == sensors}
 
 
-def _decoded(heard: Heard, most: int | None = None) -> list[tuple[int, Any]]:
-    """Messages of a topic with their arrivals [ns], without those that cannot be read."""
-    found = []
-    kind = heard.type if "/msg/" in heard.type else heard.type.replace("/", "/msg/")
-    for arrival_ns, data in heard.messages[:most]:
-        with suppress(CdrError):
-            message = decode_pair(data) if kind == RANGE else decode(data, kind)
-            found.append((arrival_ns, message))
-    return found
-
-
 def _facts(draft: _Draft) -> Iterator[str]:
     """One sentence for each kind of topic: how many, their type, rate, delay and frame."""
     groups: dict[str, dict[str, str]] = {}
@@ -317,7 +305,7 @@ def _facts(draft: _Draft) -> Iterator[str]:
         stamped = [
             (arrival_ns, message.header, robot)
             for one, robot in zip(heard, names.values(), strict=True)
-            for arrival_ns, message in _decoded(one, _MIN_ROWS)
+            for arrival_ns, message in decoded(one, _MIN_ROWS)[0]
         ]
         if not stamped:
             continue
@@ -368,7 +356,7 @@ def _bodies(draft: _Draft, source: str, names: Sequence[str], pattern: str) -> d
     for name in names:
         before, _, after = pattern.partition(BODY)
         own = name.removeprefix(before).removesuffix(after)
-        for arrival_ns, message in _decoded(draft.topics[name]):
+        for arrival_ns, message in decoded(draft.topics[name])[0]:
             for one in SOURCES[source].bodies(message):
                 is_fixed = one.frame_id in _FIXED or (source != "tf" and _ODOM not in one.frame_id)
                 if is_fixed and _ODOM not in one.name:  # robots publish other transforms and poses, too
@@ -606,7 +594,7 @@ def _range_pairs(draft: _Draft) -> dict[tuple[int, int], Ranges]:
     return {
         pair: (np.array([_time_ns(*one) for one in some]), np.array([one.range for _, one in some]))
         for pair, heard in topics.items()
-        for some in [[one for one in _decoded(heard) if np.isfinite(one[1].range)]]
+        for some in [[one for one in decoded(heard)[0] if np.isfinite(one[1].range)]]
     }
 
 

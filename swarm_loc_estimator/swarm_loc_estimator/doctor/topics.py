@@ -86,7 +86,7 @@ def check_frames(evidence: Evidence) -> Iterator[Finding]:
     for name, heard in evidence.topics.items():
         if same_type(heard.type, TRANSFORMS):
             tree = name.removesuffix("tf_static").removesuffix("tf")
-            for message in decoded(heard)[0]:
+            for _, message in decoded(heard)[0]:
                 for one in message.transforms:
                     child = one.child_frame_id.lstrip("/")
                     parents.setdefault((tree, child), set()).add(one.header.frame_id.lstrip("/"))
@@ -264,7 +264,7 @@ def _publishers(evidence: Evidence) -> Iterator[Finding]:
 
 def _of_diagnostics(topic: str, heard: Heard) -> Iterator[Finding]:
     """What other nodes report, each by its newest status; the checks here look at the estimator's inputs."""
-    newest = {status.name: status for message in decoded(heard)[0] for status in message.status}
+    newest = {status.name: status for _, message in decoded(heard)[0] for status in message.status}
     for status in newest.values():
         is_estimator = status.name.startswith("estimator") and not status.name.endswith("load")
         if status.level and not is_estimator:

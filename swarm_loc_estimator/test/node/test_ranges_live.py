@@ -37,13 +37,23 @@ def is_estimated(poses: list[SwarmPoses], before: int, now_ns: int) -> bool:
     return any(stamp_ns(one) == now_ns for one in poses[before:])
 
 
-def test_ranges_correct_a_start(ros: Ros, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "topics",
+    [
+        {"odom": "alpha/odom", "ranges": "alpha/ranges"},
+        {"odom": "lab/alpha/odometry/filtered", "ranges": "radios/first"},
+    ],
+)
+def test_ranges_correct_a_start(ros: Ros, tmp_path: Path, topics: dict[str, str]) -> None:
+    """Topics have the expected names, or those of the description."""
     path = tmp_path / "swarm.yaml"
-    path.write_text(SWARM_YAML, encoding="utf-8")
+    of_others = "topics: {<robot>/odom: lab/<robot>/odometry/filtered, alpha/ranges: /radios/first}"
+    named = "" if topics["ranges"] == "alpha/ranges" else of_others
+    path.write_text(f"{SWARM_YAML}{named}\n", encoding="utf-8")
     ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True)))
     clock = ros.tester.create_publisher(Clock, "/clock", 10)
-    odometry = ros.tester.create_publisher(Odometry, "alpha/odom", 100)
-    ranges = ros.tester.create_publisher(RangeArray, "alpha/ranges", 100)
+    odometry = ros.tester.create_publisher(Odometry, topics["odom"], 100)
+    ranges = ros.tester.create_publisher(RangeArray, topics["ranges"], 100)
     poses = ros.listen(SwarmPoses, "swarm/poses")
     heard = ros.listen(DiagnosticArray, "/diagnostics")
     ros.until(lambda: all(one.get_subscription_count() for one in (clock, odometry, ranges)))

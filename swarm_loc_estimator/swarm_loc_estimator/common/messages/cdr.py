@@ -72,6 +72,10 @@ geometry_msgs/Transform: Vector3 translation, Quaternion rotation
 geometry_msgs/TransformStamped: Header header, string child_frame_id, Transform transform
 geometry_msgs/Twist: Vector3 linear, Vector3 angular
 geometry_msgs/TwistWithCovariance: Twist twist, float64[36] covariance
+diagnostic_msgs/KeyValue: string key, string value
+diagnostic_msgs/DiagnosticStatus: byte level, string name, string message, string hardware_id,
+    KeyValue[] values
+diagnostic_msgs/DiagnosticArray: std_msgs/Header header, DiagnosticStatus[] status
 nav_msgs/MapMetaData: builtin_interfaces/Time map_load_time, float32 resolution, uint32 width,
     uint32 height, geometry_msgs/Pose origin
 nav_msgs/OccupancyGrid: Header header, MapMetaData info, int8[] data
