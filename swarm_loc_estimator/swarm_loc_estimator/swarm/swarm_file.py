@@ -161,7 +161,15 @@ class _Loader(TreeChecks):
             raise self.said(f"robots names {len(named)} robots but must name at most {MAX_ROBOTS}")
         robots = tuple(self._robot(name, tree, defaults, types) for name, tree in named)
         # what is fixed in map
-        landmarks = self._landmarks(sections.get("landmarks", {}), sections.get("defaults", {}))
+        shared = self.mapping(sections.get("defaults", {}), "defaults").get("landmark", {})
+        common, specs = self.values(shared, "defaults.landmark", LANDMARK_DEFAULTS), entry_specs(Landmark)
+        landmarks = tuple(
+            Landmark(
+                self._marker_id(number, f"landmarks.{number}"),
+                **{**common, **self.values(place, f"landmarks.{number}", specs, PLACED)},
+            )
+            for number, place in self.mapping(sections.get("landmarks", {}), "landmarks").items()
+        )
         specs = entry_specs(FixedCamera)
         cameras = tuple(
             FixedCamera(name, **self.values(tree, f"cameras.{name}", specs, ("x", "y", "z")))
@@ -351,16 +359,6 @@ class _Loader(TreeChecks):
             Face(name, self._marker_id(ids[name], f"{key}.ids.{name}"), **values)
             for name, values in places.items()
         )
-
-    def _landmarks(self, tree: Tree, defaults: Tree) -> tuple[Landmark, ...]:
-        shared_tree = self.mapping(defaults, "defaults").get("landmark", {})
-        shared = self.values(shared_tree, "defaults.landmark", LANDMARK_DEFAULTS)
-        result = []
-        for number, place in self.mapping(tree, "landmarks").items():
-            key = f"landmarks.{number}"
-            values = self.values(place, key, entry_specs(Landmark), PLACED)
-            result.append(Landmark(self._marker_id(number, key), **{**shared, **values}))
-        return tuple(result)
 
     def _marker_id(self, value: Tree, key: str) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
