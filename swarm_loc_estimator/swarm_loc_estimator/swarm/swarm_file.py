@@ -117,9 +117,6 @@ class SwarmFileError(UserError):
 def load_swarm(path: Path | str) -> Swarm:
     """Read and check a swarm description.
 
-    Args:
-        path: The file.
-
     Raises:
         SwarmFileError: One sentence with file, dotted key, value and what is allowed.
     """
@@ -397,12 +394,8 @@ _WRITTEN = (*(one for one in MODELS if one != "camera"), "response", "camera", "
 def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
     """Write a swarm description that `load_swarm` reads back equal.
 
-    Its first line names the JSON Schema if that lies next to it, so that editors complete its keys.
-
-    Args:
-        swarm: What to write.
-        path: The file; replaced when it exists, its folder created when missing.
-        comment: Comment lines for the top of the file.
+    Its first line names the JSON Schema if that lies next to it, so that editors complete its keys; lines of
+    comment follow. An existing file is replaced, a missing folder created.
 
     Raises:
         SwarmFileError: It has numbers that `load_swarm` refuses; nothing is written.
