@@ -51,3 +51,5 @@ from swarm_loc_estimator.timeline.estimate import Status as Status
 from swarm_loc_estimator.timeline.estimator import Estimator as Estimator
 from swarm_loc_estimator.timeline.estimator import Step as Step
 from swarm_loc_estimator.timeline.settings import Settings as Settings
+
+_MODULE_OF: dict[str, str]

@@ -6,14 +6,15 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import MISSING, Field, dataclass, field, fields
-from math import nan
 from pathlib import Path
 from types import MappingProxyType
 from typing import IO, Any, TypeVar
@@ -193,7 +194,7 @@ def _value(option: Field[Any], text: str) -> object:
     try:
         value = type(default)(text)
     except ValueError:
-        value = nan
+        value = math.nan
     spec = option.metadata["spec"]
     if not spec.allows(value):
         kind = "whole number" if isinstance(default, int) else "number"
@@ -322,14 +323,7 @@ def stop(children: Sequence[Child], say: Callable[[str], None]) -> None:
             if stop_signal != signal.SIGINT:
                 say(f"{child.spec.full_name}: does not end, {stop_signal.name}")
             child.process.send_signal(stop_signal)
-        _wait_for_all(running, patience_s)
-
-
-def _wait_for_all(children: Sequence[Child], patience_s: float | None) -> None:
-    """Wait until all processes have ended, or until the timeout."""
-    deadline = None if patience_s is None else time.monotonic() + patience_s
-    for child in children:
-        try:
-            child.process.wait(None if deadline is None else max(0.0, deadline - time.monotonic()))
-        except subprocess.TimeoutExpired:
-            return
+        end_s = math.inf if patience_s is None else time.monotonic() + patience_s
+        for child in running:
+            with suppress(subprocess.TimeoutExpired):
+                child.process.wait(None if patience_s is None else max(0.0, end_s - time.monotonic()))

@@ -407,8 +407,13 @@ class EstimateOutputs:
 
     def publish_identities(self, identities: Identities | None) -> None:
         """Publish the identities in the newest aerial image whenever they change, also by late data."""
-        if identities is None or (self._published is not None and _are_equal(identities, self._published)):
+        before = self._published
+        if identities is None or identities is before:
             return
+        if before is not None and before.stamp_ns == identities.stamp_ns:
+            same = np.array_equal(before.place, identities.place)
+            if same and np.array_equal(before.probability, identities.probability):
+                return
         self._published = identities
         probability = identities.probability
         self._identities.publish(
@@ -423,11 +428,3 @@ class EstimateOutputs:
         if self._sightings.get_subscription_count():
             sightings = newest_sightings(estimator.recent(), now_ns)
             self._sightings.publish(encode_sightings(self._frame, now_ns, sightings))
-
-
-def _are_equal(one: Identities, other: Identities) -> bool:
-    """Whether both have the same contents."""
-    if one is other:
-        return True
-    same = np.array_equal(one.place, other.place) and np.array_equal(one.probability, other.probability)
-    return same and one.stamp_ns == other.stamp_ns

@@ -184,16 +184,14 @@ def _own_domain() -> Iterator[None]:
     """Give this process and its children an unused ROS domain, limited to this machine."""
     reservation = domain_id()
     alone = {**_ALONE, "ROS_DOMAIN_ID": str(reservation.__enter__())}
-    before = {name: os.environ.get(name) for name in alone}
+    before = {name: os.environ[name] for name in alone if name in os.environ}
     os.environ.update(alone)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in alone.keys() - before.keys():
+            del os.environ[name]
+        os.environ.update(before)
         reservation.__exit__(None, None, None)  # it takes an exception for a domain in use
 
 

@@ -83,7 +83,11 @@ def replay(
     """
     bag = Path(bag)
     swarm = load_swarm(swarm_beside(bag)) if swarm is None else swarm
-    schedule: ListedSchedule = PeriodicSchedule(_period_ns(tick_s))
+    given: object = tick_s
+    low, high = TICKS_S
+    if not isinstance(given, int | float) or not low <= given <= high:
+        raise ScheduleError(f"tick_s = {tick_s!r} must be a number in [{low:g}, {high:g}] s.")
+    schedule: ListedSchedule = PeriodicSchedule(round(tick_s * 1e9))
     if stamp_ns is not None:
         stamps = np.asarray(stamp_ns)
         if stamps.ndim != 1 or stamps.dtype.kind not in "iu" or np.any(stamps[1:] <= stamps[:-1]):
@@ -139,14 +143,6 @@ def _compared(truth: Mapping[str, Trajectory], stamp_ns: IntArray) -> tuple[dict
 
 class ScheduleError(UserError):
     """Outputs that cannot be scheduled."""
-
-
-def _period_ns(tick_s: object) -> int:
-    """The period of outputs [ns]."""
-    low, high = TICKS_S
-    if not isinstance(tick_s, int | float) or not low <= tick_s <= high:
-        raise ScheduleError(f"tick_s = {tick_s!r} must be a number in [{low:g}, {high:g}] s.")
-    return round(tick_s * 1e9)
 
 
 MAX_DETECTIONS = 200_000
@@ -356,15 +352,12 @@ class AerialImages:
 
     def images(self) -> tuple[AerialImage, ...]:
         """All images in the order of their stamps."""
-        return tuple(
-            self._image(stamp_ns, position) for stamp_ns, position in sorted(self._positions.items())
-        )
-
-    def _image(self, stamp_ns: int, position: FloatArray) -> AerialImage:
-        robot, probability = np.full(len(position), -1), np.zeros(len(position))
-        identities = self._identities.get(stamp_ns)
-        if identities is not None:
-            found = np.flatnonzero((identities.place >= 0) & (identities.place < len(position)))
-            robot[identities.place[found]] = found
-            probability[identities.place[found]] = identities.probability[found]
-        return AerialImage(stamp_ns, position, robot, probability)
+        images = []
+        for stamp_ns, position in sorted(self._positions.items()):
+            robot, probability = np.full(len(position), -1), np.zeros(len(position))
+            if (identities := self._identities.get(stamp_ns)) is not None:
+                found = np.flatnonzero((identities.place >= 0) & (identities.place < len(position)))
+                robot[identities.place[found]] = found
+                probability[identities.place[found]] = identities.probability[found]
+            images.append(AerialImage(stamp_ns, position, robot, probability))
+        return tuple(images)

@@ -117,9 +117,6 @@ class SwarmFileError(UserError):
 def load_swarm(path: Path | str) -> Swarm:
     """Read and check a swarm description.
 
-    Args:
-        path: The file.
-
     Raises:
         SwarmFileError: One sentence with file, dotted key, value and what is allowed.
     """
@@ -161,7 +158,15 @@ class _Loader(TreeChecks):
             raise self.said(f"robots names {len(named)} robots but must name at most {MAX_ROBOTS}")
         robots = tuple(self._robot(name, tree, defaults, types) for name, tree in named)
         # what is fixed in map
-        landmarks = self._landmarks(sections.get("landmarks", {}), sections.get("defaults", {}))
+        shared = self.mapping(sections.get("defaults", {}), "defaults").get("landmark", {})
+        common, specs = self.values(shared, "defaults.landmark", LANDMARK_DEFAULTS), entry_specs(Landmark)
+        landmarks = tuple(
+            Landmark(
+                self._marker_id(number, f"landmarks.{number}"),
+                **{**common, **self.values(place, f"landmarks.{number}", specs, PLACED)},
+            )
+            for number, place in self.mapping(sections.get("landmarks", {}), "landmarks").items()
+        )
         specs = entry_specs(FixedCamera)
         cameras = tuple(
             FixedCamera(name, **self.values(tree, f"cameras.{name}", specs, ("x", "y", "z")))
@@ -352,16 +357,6 @@ class _Loader(TreeChecks):
             for name, values in places.items()
         )
 
-    def _landmarks(self, tree: Tree, defaults: Tree) -> tuple[Landmark, ...]:
-        shared_tree = self.mapping(defaults, "defaults").get("landmark", {})
-        shared = self.values(shared_tree, "defaults.landmark", LANDMARK_DEFAULTS)
-        result = []
-        for number, place in self.mapping(tree, "landmarks").items():
-            key = f"landmarks.{number}"
-            values = self.values(place, key, entry_specs(Landmark), PLACED)
-            result.append(Landmark(self._marker_id(number, key), **{**shared, **values}))
-        return tuple(result)
-
     def _marker_id(self, value: Tree, key: str) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
             raise self.error(key, value, f"must be a marker id, a whole number in [0, {MAX_ID}]")
@@ -399,12 +394,8 @@ _WRITTEN = (*(one for one in MODELS if one != "camera"), "response", "camera", "
 def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
     """Write a swarm description that `load_swarm` reads back equal.
 
-    Its first line names the JSON Schema if that lies next to it, so that editors complete its keys.
-
-    Args:
-        swarm: What to write.
-        path: The file; replaced when it exists, its folder created when missing.
-        comment: Comment lines for the top of the file.
+    Its first line names the JSON Schema if that lies next to it, so that editors complete its keys; lines of
+    comment follow. An existing file is replaced, a missing folder created.
 
     Raises:
         SwarmFileError: It has numbers that `load_swarm` refuses; nothing is written.

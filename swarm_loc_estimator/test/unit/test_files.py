@@ -21,7 +21,7 @@ from swarm_loc_estimator.cli import calibrate, calibrate_ir, new, replay, replay
 from swarm_loc_estimator.common.bags.writer import BagWriter, Stream, write_streams
 from swarm_loc_estimator.common.files import FileError, check_folder, replacing, write_whole
 from swarm_loc_estimator.common.messages.cdr import POSE_STAMPED
-from swarm_loc_estimator.common.yaml_tree import write_tree
+from swarm_loc_estimator.common.yaml_tree import YamlTreeError, read_tree, write_tree
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.offline.export import write_mcap, write_tum
@@ -287,3 +287,9 @@ def test_a_new_description_is_whole_or_not_there(tmp_path: Path, capsys: pytest.
         assert new.main([str(tmp_path / "lab" / "swarm.yaml"), "--yes"]) == 1
     assert "cannot be written: File too large" in capsys.readouterr().err
     assert [*(tmp_path / "lab").iterdir()] == []
+
+
+def test_a_folder_in_place_of_a_file_is_named_once(tmp_path: Path) -> None:
+    with pytest.raises(YamlTreeError) as refused:
+        read_tree(tmp_path)
+    assert str(refused.value) == f"{tmp_path} cannot be read: it is no regular file."

@@ -58,7 +58,7 @@ def test_type_checkers_see_the_same_names_in_the_same_modules() -> None:
         if isinstance(node, ast.ImportFrom)
         for one in node.names
     }
-    assert len(seen) == len(stub.splitlines()) > 40
+    assert len(seen) == stub.count("import") > 40
     assert seen == swarm_loc_estimator._MODULE_OF
 
 
@@ -67,7 +67,7 @@ def test_all_names_load_and_no_others() -> None:
     assert set(dir(swarm_loc_estimator)) >= NAMES
     assert len(dir(swarm_loc_estimator)) == len(set(dir(swarm_loc_estimator)))
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
-        _ = swarm_loc_estimator.nothing
+        _ = swarm_loc_estimator.nothing  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize(

@@ -297,8 +297,7 @@ def row_dtype(message_type: str, start: int | None = None, order: str = "<") -> 
 
     Args:
         message_type: Its type. A field of a message inside is named by its path; a message inside whose
-            numbers
-            are all of one type, such as a Point, is one field.
+            numbers are all of one type, such as a Point, is one field.
         start: Where it starts, in bytes after a multiple of 8; None: as all but the first of a sequence do.
         order: "<" or ">".
     """
