@@ -104,8 +104,8 @@ def lab(bag: Path, *, apart_s: float = 0.0, before_iron: bool = False) -> Mappin
     with BagWriter(bag) as writer:
         for name in NAMES:
             writer.add_topic(f"{name}/odom", ODOMETRY)
-        for body in ("robot1_cap", "robot3_cap", "robot4_cap", "robot5_cap", "chair1"):
-            writer.add_topic(f"vrpn/{body}/pose", POSE_STAMPED)
+        for one in ("robot1_cap", "robot3_cap", "robot4_cap", "robot5_cap", "chair1"):
+            writer.add_topic(f"vrpn/{one}/pose", POSE_STAMPED)
         pairs = [(a, b) for a in sorted(antennas) for b in sorted(antennas) if a < b]
         for a, b in pairs:
             writer.add_topic(f"uwb/n_{a}/n_{b}/distance", RANGE)
