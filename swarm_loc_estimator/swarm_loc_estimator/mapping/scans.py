@@ -365,9 +365,9 @@ class ScanStop:
 
     @property
     def ends(self) -> FloatArray:
-        """(n, 2) ends of the beams of a sweep in the frame of its robot, far away if they met nothing [m]."""
+        """(n, 2) ends of the beams of a sweep in the frame of its robot, at its reach without a wall [m]."""
         angle = self.turn + self.bearing
-        distance = 1.0 / np.where(self.inverse > 0.0, self.inverse, 1e-9)
+        distance = 1.0 / np.where(self.inverse > 0.0, self.inverse, 1.0 / self.reach)
         return np.stack([np.cos(angle), np.sin(angle)], axis=-1) * distance[:, None]
 
     def chosen(self, beams: BoolArray) -> ScanStop:

@@ -545,11 +545,9 @@ def _square(tie: LoopTie, states: FloatArray) -> float:
 def beams_of(stop: ScanStop) -> DrawnSweep:
     """The beams of a sweep, in the frame of its robot."""
     every = slice(None, None, -(-len(stop.turn) // MAX_BEAMS) or 1)
-    met = stop.inverse > 0.0
-    distance = 1.0 / np.where(met, stop.inverse, 1.0 / stop.reach)
-    angle = stop.bearing + stop.turn
-    ends = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * distance[:, None]
-    sigma = np.where(met, distance**2 * stop.sigma / np.sqrt(stop.weight), np.inf)
+    ends = stop.ends
+    square = np.square(ends).sum(axis=1)
+    sigma = np.where(stop.inverse > 0.0, square * stop.sigma / np.sqrt(stop.weight), np.inf)
     return DrawnSweep(ends[every].astype(np.float32), sigma[every].astype(np.float32))
 
 
