@@ -74,7 +74,7 @@ _TOUCHING, _USUAL = 1.3, 0.65
 """Largest distance of touching discs, in diameters; least share of the usual coverage of any other disc."""
 _RAGGED = 0.1  # Quality of a disc with a ragged rim, over the square of its coverage
 _NOTHING_HIDDEN, _HIDDEN_SHARE = 0.9, 0.3
-"""Coverage below which what hides a rim may be taken for it, and error of the centre in radii over the lack."""
+"""Coverage below which what hides a rim may be taken for it; error of the centre in radii, over the lack."""
 _LIDS = 0.55, 0.7, 0.85  # Radii of inner circles that are tried, in radii of discs
 _LID_AWAY, _SAME_LID = 0.3, 0.1
 """Largest distance of their centres in radii of discs, and largest relative difference of their radii."""
