@@ -669,13 +669,16 @@ def evaluate_link(
         work.jacobian[k], work.innovation[k], work.noise[k] = 0.0, 0.0, np.eye(3)
         work.distance[k], work.nis[k], work.accepted[k] = np.inf, np.nan, False
     # What its link has from these places already counts less.
-    places = [*_antenna(one.sensor, tracks, sides[0], stamp_ns), *_antenna(one.marker, tracks, sides[1], stamp_ns)]
+    places = [
+        *_antenna(one.sensor, tracks, sides[0], stamp_ns),
+        *_antenna(one.marker, tracks, sides[1], stamp_ns),
+    ]
     news = share_of_range(one.columns(), 0, belief, np.array(places), bool(work.accepted[k]))
     work.noise[k, :count, :count] /= min(news, work.share[k]) if work.share[k] == LEAST_SHARE else news
 
 
 def _antenna(place: FloatArray, tracks: TrackArrays, robot: int, stamp_ns: int) -> list[float]:
-    """x and y of a place (3,) on a robot, by its odometry alone [m]; fixed without a robot."""
+    """X and y of a place (3,) on a robot, by its odometry alone [m]; fixed without a robot."""
     pose = np.zeros(3)
     if robot >= 0:
         look_up_pose(tracks, robot, stamp_ns, pose)
@@ -710,7 +713,11 @@ def _write_radios(one: Measurements, belief: BeliefArrays, columns: IntArray, ja
 
 
 def _covariance(
-    one: Measurements, belief: BeliefArrays, joint: JointFilter, columns: IntArray, cross_covariance: FloatArray
+    one: Measurements,
+    belief: BeliefArrays,
+    joint: JointFilter,
+    columns: IntArray,
+    cross_covariance: FloatArray,
 ) -> FloatArray:
     """Covariance (c, c) of the columns (c,) of one link."""
     if joint.is_dense:

@@ -109,9 +109,10 @@ def _robot(robot: Robot, index: int, state: SwarmState) -> Robot:
 def _shared(swarm: Swarm, state: SwarmState) -> tuple[MapError, FloatArray]:
     """The error that places share, and variances (S, 3) of these by it; a sparse filter does not know it."""
     variance = np.zeros((len(swarm.surveyed), 3))
-    is_free = [
+    free_places = [
         state.landmark_column(k) >= 0 and one.position_sigma > 0.0 for k, one in enumerate(swarm.surveyed)
     ]
+    is_free = np.array(free_places, dtype=bool)
     is_shift = np.array([isinstance(one, Anchor) for one in swarm.surveyed], dtype=bool)
     free, anchors = np.flatnonzero(is_free & ~is_shift), np.flatnonzero(is_free & is_shift)
     place = np.array([(swarm.surveyed[k].x, swarm.surveyed[k].y) for k in free]).reshape(-1, 2)
