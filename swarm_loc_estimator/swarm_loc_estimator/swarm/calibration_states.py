@@ -4,7 +4,8 @@ The first three parameters of a robot are errors of its motion, whose effect on 
 and turn. The next three are the yaw offset, the scale error and the range offset of its camera: a range r is
 measured as (1 + scale) r + offset. The last one is the bias of its radio. A landmark with an inexact survey
 and a fixed camera are static bodies: their state is a correction of the survey, with a right-invariant error
-about the identity. That of an anchor is a displacement and the bias of its ranges.
+about the identity. That of an anchor is a displacement and the bias of its ranges. Errors that all places
+share correlate these states.
 Parameters with a standard deviation in the description are estimated from the start, as is the path of the
 wheels of robots with radios, others only after a contradiction, with the standard deviations below. Their
 filter columns follow those of all poses, in the order in which they were added.

@@ -88,8 +88,8 @@ MODELS: dict[str, type] = {
 }
 SECTIONS: dict[str, type] = {**MODELS, "ir": RobotIr, "uwb": UwbDevice}
 MAY_BE_NONE = ("odometry", "camera", "ir", "uwb")
-OWN = ("id", "address", "name")  # Layer of sections that only a robot has
-PLACED = ("x", "y")  # Layer that landmarks and anchors must have
+OWN = ("id", "address", "name")  # Entries of sections that only a robot has
+PLACED = ("x", "y")  # Entries that landmarks and anchors must have
 START = {name: number_specs(Landmark)[name] for name in PLACED} | {"theta": number_specs(CameraMount)["yaw"]}
 LANDMARK_DEFAULTS = {name: number_specs(Landmark)[name] for name in ("size", "position_sigma", "yaw_sigma")}
 MOUNT = ("x", "y", "z", "yaw", "pitch", "roll")  # Numbers that transforms tell where no description does
