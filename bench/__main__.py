@@ -23,6 +23,7 @@ BENCHMARKS = {
     "pushbot": "bench.pushbot",
     "pushbot_bag": "bench.pushbot.bag",
     "reading": "bench.peers.reading",
+    "robots": "bench.robots",
     "robustness": "bench.robustness",
     "scaling": "bench.peers.scaling",
     "soak": "bench.graph.soak",

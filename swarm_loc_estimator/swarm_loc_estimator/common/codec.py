@@ -75,6 +75,18 @@ def address(high: int, doc: str) -> EntrySpec:
     return EntrySpec(read, {"anyOf": [decimal, {"type": "string", "pattern": f"^{pattern}$"}]}, wanted)
 
 
+def word(doc: str) -> EntrySpec:
+    """A word of letters, digits and underscores, as in topics; may be empty."""
+    pattern = r"[A-Za-z0-9_]{0,64}"
+
+    def read(checks: TreeChecks, value: Tree, key: str) -> str:
+        if not isinstance(value, str) or not re.fullmatch(pattern, value):
+            raise checks.error(key, value, "must be up to 64 letters, digits and underscores")
+        return value
+
+    return EntrySpec(read, {"type": "string", "pattern": f"^{pattern}$", "description": doc})
+
+
 def listed(wanted: str = "", **limits: float) -> EntrySpec:
     """A list of numbers; `limits` are those of the schema."""
     items = {"type": "number", **limits}

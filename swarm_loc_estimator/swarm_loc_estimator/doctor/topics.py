@@ -163,6 +163,7 @@ def check_topics(evidence: Evidence) -> Iterator[Finding]:
             )
         elif heard is not None and counted.received and topic.kind.rows in _PERIODIC:
             yield from _rate(topic, heard, evidence.end_ns)
+    yield from _pairs(evidence)
     # topics of robots that are not described, unless a wrong name explains a missing topic
     expected = {
         topic.name for topic in evidence.inputs if topic.expected and topic.name not in evidence.topics
@@ -178,6 +179,27 @@ def check_topics(evidence: Evidence) -> Iterator[Finding]:
     for name, heard in evidence.topics.items():
         if same_type(heard.type, DIAGNOSTICS):
             yield from _of_diagnostics(name, heard)
+
+
+def _pairs(evidence: Evidence) -> Iterator[Finding]:
+    """A pattern of the ranges of two radios that fits no topic with messages."""
+    pairs = [
+        (topic, counted.received)
+        for topic, counted in zip(evidence.inputs, evidence.read[1], strict=True)
+        if topic.kind.of_pairs
+    ]
+    if pairs and not any(received for _, received in pairs):
+        topic, known = pairs[0][0], {topic.name for topic, _ in pairs}
+        others = sorted(
+            name
+            for name, heard in evidence.topics.items()
+            if same_type(heard.type, topic.kind.message_type) and name not in known
+        )
+        there = f"; {listed(others)} has this type" if others else ""
+        remedy = "Correct range_topic, and the name or address of each radio" if others else ""
+        problem = f"fits no topic with messages, such as {topic.name}{there}"
+        subject = f"range_topic '{evidence.swarm.range_topic}'"
+        yield Finding(subject, problem, remedy or "Start the drivers of the radios")
 
 
 def _lone(evidence: Evidence) -> dict[str, Heard]:

@@ -64,9 +64,9 @@ from swarm_loc_estimator.common.numerics import (
 )
 from swarm_loc_estimator.filter.measurements import Measurements
 from swarm_loc_estimator.filter.models import ANY_HEADING, has_kernel
-from swarm_loc_estimator.filter.sources import REPEATED, find_link, is_fix, robot_of
+from swarm_loc_estimator.filter.sources import RANGE_VALUE, find_link, is_fix, new_link, robot_of, source_of
 from swarm_loc_estimator.filter.state import PAIR_ROWS, BeliefArrays, Innovations, covariance_within
-from swarm_loc_estimator.odometry.track_arrays import OdometrySample
+from swarm_loc_estimator.odometry.track_arrays import OdometrySample, TrackArrays, look_up_pose
 
 _MEAN, _OBSERVER, _TARGET, _FUSED, _VARIANCE, _RANDOM, _SYSTEMATIC, _NOISE = 0, 1, 2, 3, 6, 7, 8, 9
 """The mean z; the poses of both robots on their tracks; the rows of L; the variances of their relative pose
@@ -398,6 +398,7 @@ def without_repeats(measurements: Measurements) -> list[slice]:
 
 
 # Systematic; tuned on MRCLAM set 1, where 80 % of the variances of sightings repeat.
+REPEATED = 0.5  # Share of the variance of a sighting that repeats at the same place
 _LEAST_OWN = 1e-3  # Least share of a standard deviation that the place of a source does not have, too
 LENGTH_M = 0.03  # Motion of one end, as the other sees it, after which its correlation is 1/e
 
@@ -554,7 +555,7 @@ def _weight(
 ) -> float:
     """Twice the correlation of the error of measurement k with those of its link before, as they are left.
 
-    Times the share by which it counted, since its noise was divided by that. That of ranges is in their share.
+    Times the share by which it counted, since its noise was divided by that. Ranges have it in their noise.
     """
     place, state, robot = find_link(measurements, k, belief), belief.sources, robot_of(measurements, k)
     if place < 0 or not has_kernel(measurements, k):
@@ -575,3 +576,84 @@ def _carry_excess(excess: FloatArray, left: FloatArray, added: FloatArray, weigh
     new = np.dot(np.dot(left, excess), left.T) + weight * added
     if math.isfinite(np.sum(new)):
         excess[:] = 0.5 * (new + new.T)
+
+
+# Of ranges to twelve real anchors (LIAS-CUHKSZ, libRSF) 30 to 60 % of the variance repeat while the range
+# changes by 0.15 m, and 1/e of that at 0.3 m, which takes half a metre of driving in any direction.
+RADIO_LENGTH_M = 0.5  # Motion of an antenna after which the correlation of errors is 1/e
+_LEAST_REPEATED, _MOST_REPEATED, _LEARNING, _LARGEST = 0.3, 0.9, 1.0 / 64.0, 9.0
+"""Least and largest share of their variance that repeats, and weight and limit of a squared difference."""
+_STILL_M, _NEAR_M = (
+    0.03,
+    0.15,
+)  # Antennas that have moved less have not moved, or see almost the same errors [m]
+_LEAST_NEWS = 1e-6  # Least part of the information of a range that is new
+_SPENT, _PLACES, _WHITE, _INNOVATION = 1, 2, 7, 8
+"""What else `last_look` has of two radios, see `SourceArrays`."""
+
+
+@cached_njit
+def noise_of_range(
+    measurements: Measurements,
+    k: int,
+    belief: BeliefArrays,
+    tracks: TrackArrays,
+    innovation: float,
+    accepted: bool,
+) -> float:
+    """The variance with which range k has just the information that its link does not have yet.
+
+    The errors of two radios depend on where they are. Differences of ranges that follow each other show the
+    noise of each; what the description allows beyond it repeats. With the share s of the variance that does,
+    n looks from the same places have the information n / (1 + (n - 1) s) of one. It is spent until the
+    antennas move: of errors whose correlation is 1/e at a length, two lengths are one look.
+
+    Args:
+        measurements: (m,).
+        k: Which one.
+        belief: The memory of its link is changed.
+        tracks: Odometry, which alone tells how far both antennas have moved.
+        innovation: Measured minus predicted.
+        accepted: Whether it is used.
+    """
+    robot, source = robot_of(measurements, k), source_of(measurements, k, belief)
+    described: float = measurements.covariance[k, 0, 0]
+    if robot < 0 or source < 0:
+        return described
+    place = find_link(measurements, k, belief)
+    if place < 0:
+        place = new_link(belief.sources, robot, source)
+    last = belief.sources.last_look[robot, place]
+    # How far have the antennas moved since what is known of them?
+    places, pose, moved = np.zeros(4), np.zeros(3), 0.0
+    for side in range(2):
+        end = measurements.observer[k] if side == 0 else measurements.target[k]
+        antenna = measurements.sensor[k] if side == 0 else measurements.marker[k]
+        pose.fill(0.0)
+        if end >= 0:
+            look_up_pose(tracks, end, measurements.stamp_ns[k], pose)
+        x, y, _ = composed(pose[0], pose[1], pose[2], antenna[0], antenna[1], 0.0)
+        places[2 * side], places[2 * side + 1] = x, y
+        moved += math.hypot(x - last[_PLACES + 2 * side], y - last[_PLACES + 2 * side + 1])
+    if not moved >= 0.0:
+        last[_SPENT], last[_WHITE] = 0.0, 0.5 * described
+    if not moved < _STILL_M:
+        last[_SPENT] *= math.exp(-moved / (2.0 * RADIO_LENGTH_M)) if moved >= 0.0 else 0.0
+        last[_PLACES : _PLACES + 4] = places
+    # Noise, and what repeats beside it.
+    if accepted and moved < _NEAR_M and measurements.value[k, 0] != last[RANGE_VALUE]:
+        square = 0.5 * (innovation - last[_INNOVATION]) ** 2
+        last[_WHITE] += _LEARNING * (min(square, _LARGEST * described) - last[_WHITE])
+    repeated = min(max(1.0 - last[_WHITE] / described, _LEAST_REPEATED), _MOST_REPEATED)
+    # One look more.
+    spent, news = last[_SPENT], 0.0
+    if repeated * spent < 1.0:
+        looks = spent * (1.0 - repeated) / (1.0 - repeated * spent)
+        news = (looks + 1.0) / (1.0 + looks * repeated) - spent
+    if accepted:
+        last[RANGE_VALUE], last[_INNOVATION], last[_SPENT] = (
+            measurements.value[k, 0],
+            innovation,
+            spent + news,
+        )
+    return described / max(news, _LEAST_NEWS)

@@ -227,6 +227,32 @@ def _gather(
                 information[columns[k, a], columns[k, b]] += w0 * h0 + w1 * h1 + w2 * h2
 
 
+def link_covariance(
+    joint: JointFilter, columns: IntArray, bodies: tuple[int, int], radio: int, cross_covariance: FloatArray
+) -> FloatArray:
+    """Covariance (c, c) of the columns (c,) of a link, of which 6 is the bias of the observer's radio.
+
+    Args:
+        joint: Prepared for an update, if it is sparse.
+        columns: (c,) filter columns; missing ones are arbitrary.
+        bodies: First columns of observer and target; -1: none.
+        radio: Column of that bias; -1: none.
+        cross_covariance: (3, 6) see `JointFilter.prepare_update`.
+    """
+    if joint.is_dense:
+        return joint.block(columns)
+    covariance, (o, t), of_target = np.zeros((columns.size, columns.size)), bodies, np.s_[3:6]
+    own = [0, 1, 2, 6] if radio >= 0 else [0, 1, 2]
+    if o >= 0:
+        covariance[np.ix_(own, own)] = joint.block(columns[own])
+    if t >= 0:
+        covariance[of_target, of_target] = joint.block(columns[of_target])
+        across = np.vstack([cross_covariance[:, :3], cross_covariance[:, 3]])[: len(own)] if o >= 0 else 0.0
+        covariance[own, of_target] = across
+        covariance[of_target, own] = np.transpose(across)
+    return covariance
+
+
 @cached_njit
 def update_one(
     covariance: FloatArray, columns: IntArray, jacobian: FloatArray, innovation: FloatArray, noise: FloatArray

@@ -45,10 +45,8 @@ from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SourceArray
 # Rate
 CORRELATION_NS = 100_000_000  # Errors of a link within this time are the same
 LEAST_SHARE = 1e-3
-# Of ranges to twelve real anchors (LIAS-CUHKSZ, libRSF) 30 to 60 % of the variance repeat while the range
-# changes by 0.15 m, and 1/e of that at 0.3 m.
-REPEATED = 0.5  # Share of the variance of a measurement that repeats at the same place
-RADIO_LENGTH_M = 0.5  # Motion of an antenna after which the correlation is 1/e
+RANGE_VALUE, RANGE_DEVIATION = 0, 6
+"""What `last_look` has of a link of radios: the newest range, and by how many sigmas it deviated."""
 # Health; tuned on the scenarios of bench/integrity
 EXCLUDED, _MAX_EVIDENCE = 10.0, 15.0  # Evidence from which a link is excluded, and its maximum
 _OUTLIER = 6.0
@@ -75,9 +73,6 @@ _SMALL_M, _SMALL_SHARE = 0.003, 0.005
 _REPORTED_NS = 3_000_000_000
 OCCUPIED_M = 0.02  # Two robots cannot be nearer [m]
 
-_STILL_M = 0.03  # Antennas that have moved less have not moved [m]
-_ALL_KNOWN, _LEAST_NEWS = (1.0 - 1e-6) / REPEATED, 1e-6
-"""Most information that a place of radios has, in that of one range, and the least part of a further one."""
 _SHARE_OF_HEADING, _SHARE_OF_DRIVER = 0.5, 0.1
 """Share of a position's variance by the heading from which its error lies on an arc, and that of a robot with
 odometry: its earlier headings, which the present one does not tell, have moved it, too."""
@@ -152,13 +147,13 @@ def find_link(measurements: Measurements, k: int, belief: BeliefArrays) -> int:
 
 
 @inlined_njit
-def _new_link(state: SourceArrays, robot: int, source: int) -> int:
+def new_link(state: SourceArrays, robot: int, source: int) -> int:
     """Give a new link the place of the one measured longest ago."""
     oldest = 0
     for place in range(state.source.shape[1]):
         if state.seen_ns[robot, place] < state.seen_ns[robot, oldest]:
             oldest = place
-    state.source[robot, oldest], state.seen_ns[robot, oldest] = source, NEVER_NS // 2
+    state.source[robot, oldest], state.seen_ns[robot, oldest] = source, NEVER_NS // 2 + 1
     state.finding[robot, oldest], state.evidence[robot, oldest] = AGREES, 0.0
     state.drift[robot, oldest].fill(0.0)
     state.last_look[robot, oldest].fill(math.nan)
@@ -172,54 +167,15 @@ def share_of(measurements: Measurements, k: int, belief: BeliefArrays) -> float:
     if place < 0:
         return 1.0
     since_ns = measurements.stamp_ns[k] - belief.sources.seen_ns[robot_of(measurements, k), place]
+    last = belief.sources.last_look[robot_of(measurements, k), place]
+    if measurements.value[k, 0] == last[RANGE_VALUE] and not has_kernel(measurements, k):
+        return LEAST_SHARE
     if since_ns == 0:  # two markers of one picture are two measurements, two fixes are not
         return LEAST_SHARE if is_fix(measurements, k) else 1.0
     if since_ns < 0:
         return 1.0
-    last = belief.sources.last_look[robot_of(measurements, k), place]
-    if measurements.value[k, 0] == last[0] and not has_kernel(measurements, k):
-        return LEAST_SHARE
     share: float = max(min(1.0, since_ns / CORRELATION_NS), LEAST_SHARE)
     return share
-
-
-@cached_njit
-def share_of_range(
-    measurements: Measurements, k: int, belief: BeliefArrays, places: FloatArray, accepted: bool
-) -> float:
-    """The part of the information of range k that its link does not have yet.
-
-    The errors of two radios depend on where they are. With the share s of the variance that repeats, n looks
-    from the same places have the information n / (1 + (n - 1) s) of one. It is spent until the antennas move;
-    of errors whose correlation is 1/e at a length, two lengths are one look.
-
-    Args:
-        measurements: (m,).
-        k: Which one.
-        belief: The memory of its link is changed.
-        places: (4,) x and y of both antennas, by odometry alone [m].
-        accepted: Whether it is used.
-    """
-    robot, source = robot_of(measurements, k), source_of(measurements, k, belief)
-    if robot < 0 or source < 0:
-        return 1.0
-    place = find_link(measurements, k, belief)
-    if place < 0:
-        place = _new_link(belief.sources, robot, source)
-    last = belief.sources.last_look[robot, place]
-    moved = math.hypot(places[0] - last[2], places[1] - last[3])
-    moved += math.hypot(places[2] - last[4], places[3] - last[5])
-    if not moved < _STILL_M:
-        if moved >= 0.0:
-            last[1] *= math.exp(-moved / (2.0 * RADIO_LENGTH_M))
-        else:
-            last[1] = 0.0
-        last[2:6] = places
-    looks = last[1] * (1.0 - REPEATED) / (1.0 - REPEATED * last[1])
-    share: float = (looks + 1.0) / (1.0 + looks * REPEATED) - last[1]
-    if accepted:
-        last[1] = min(last[1] + share, _ALL_KNOWN)
-    return max(share, _LEAST_NEWS)
 
 
 @inlined_njit
@@ -275,7 +231,7 @@ def assess(
         return -1
     place, is_link = find_link(measurements, k, belief), not has_kernel(measurements, k)
     if place < 0:
-        place = _new_link(state, robot, source)
+        place = new_link(state, robot, source)
     now_ns = measurements.stamp_ns[k]
     state.seen_ns[robot, place] = max(now_ns, state.seen_ns[robot, place])
     # What does it say? Outliers of fixes and radios are those that are gated; what repeats its errors drifts.
@@ -283,7 +239,7 @@ def assess(
     limit = measurements.gate[k] if is_link or is_fix(measurements, k) else _OUTLIER
     drift, weight = state.drift[robot, place], share
     if is_link:  # of one component; the other is the share of repeated values
-        state.last_look[robot, place, 6] = whitened[0]
+        state.last_look[robot, place, RANGE_DEVIATION] = whitened[0]
         if distance <= limit:  # an outlier, which may be as large as any, tells of no drift
             drift[0] += _FORGETTING * share * (whitened[0] - drift[0])
         drift[1] += _FORGETTING * ((1.0 if share == LEAST_SHARE else 0.0) - drift[1])
@@ -623,7 +579,7 @@ def count_gated(
 def _is_elsewhere_by_radios(belief: BeliefArrays, robot: int) -> bool:
     """Whether radios deny the pose of a robot: some of its ranges are too long and others too short.
 
-    Walls lengthen ranges, and the bias of its own radio changes all of them alike: these are faults of radios.
+    Walls lengthen ranges, and the bias of its own radio changes all alike: these are faults of radios.
     """
     state, newest_ns, long, short = belief.sources, NEVER_NS // 2, 0, 0
     for begin in (True, False):
@@ -635,8 +591,8 @@ def _is_elsewhere_by_radios(belief: BeliefArrays, robot: int) -> bool:
                         newest_ns = max(newest_ns, state.seen_ns[row, place])
                     elif newest_ns - state.seen_ns[row, place] < _REPORTED_NS:
                         bad = state.finding[row, place] >= DEVIATES
-                        long += 1 if bad and state.last_look[row, place, 6] > 0.0 else 0
-                        short += 1 if bad and state.last_look[row, place, 6] < 0.0 else 0
+                        long += 1 if bad and state.last_look[row, place, RANGE_DEVIATION] > 0.0 else 0
+                        short += 1 if bad and state.last_look[row, place, RANGE_DEVIATION] < 0.0 else 0
     return min(long, short) > 0
 
 

@@ -12,11 +12,9 @@ In order, each measurement passes all stages before the next one, at its exact s
 take many measurements of a period, linearized about one belief; a large swarm is cheaper so.
 
 `fuse` is compiled. Where it needs what is not, it pauses, and is resumed at the next stage. Links, whose
-models have no compiled kernel, such as ranges, are evaluated by their records. Such a measurement is gated
-with the number of gated components of its model. When accepted it confirms the poses of its robots; when
-gated it counts towards their loss, but does not refute a configured start. A contradiction is evidence
-against its link, never against one end. It takes no part in the mean of repeated measurements
-(`correlated_noise.py`), which needs positions and headings.
+models have no compiled kernel, such as ranges, are evaluated by their records, and gated with the number of
+gated components of these. What is accepted confirms the poses of its robots; what is gated refutes no start.
+A contradiction is evidence against the link, never against one end.
 """
 
 from __future__ import annotations
@@ -26,12 +24,17 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
 from swarm_loc_estimator.common.numerics import assign, assign_matrix
-from swarm_loc_estimator.filter.correlated_noise import inflate_fix, note_update, record_pair, use_mean
-from swarm_loc_estimator.filter.joint_filter import JointFilter, update_one
+from swarm_loc_estimator.filter.correlated_noise import (
+    inflate_fix,
+    noise_of_range,
+    note_update,
+    record_pair,
+    use_mean,
+)
+from swarm_loc_estimator.filter.joint_filter import JointFilter, link_covariance, update_one
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.filter.models import (
     CARTESIAN,
@@ -65,7 +68,6 @@ from swarm_loc_estimator.filter.sources import (
     is_uncertain,
     robot_of,
     share_of,
-    share_of_range,
     small_variances,
     source_of,
 )
@@ -614,9 +616,6 @@ def _turned(value_jacobian: FloatArray, row: int, matrix: FloatArray) -> tuple[f
     )
 
 
-_BODY: IntArray = np.arange(3)
-
-
 def evaluate_link(
     one: Measurements,
     k: int,
@@ -633,8 +632,8 @@ def evaluate_link(
     # Predict.
     model, stamp_ns = MODELS[int(one.model)], int(one.stamp_ns)
     predicted = model.predicted(one, work.pose[k, 0], work.pose[k, 1])
-    count, sides = predicted.value.size, (int(one.observer), int(one.target))
-    columns = _columns(one, belief)
+    count, sides, row = predicted.value.size, (int(one.observer), int(one.target)), one.columns()
+    columns = body_columns(row, 0, belief)
     work.columns[k], work.jacobian[k], work.innovation[k] = 0, 0.0, 0.0
     work.noise[k], work.pair[k] = np.eye(3), 0.0
     # Jacobian by both sides, and noise, with that of the stamp.
@@ -642,19 +641,20 @@ def evaluate_link(
     for i, jacobian in enumerate((predicted.observer_jacobian, predicted.target_jacobian)):
         if columns[i] >= 0:
             body = slice(3 * i, 3 * i + 3)
-            work.columns[k, body], work.jacobian[k, :count, body] = columns[i] + _BODY, jacobian
+            work.columns[k, body], work.jacobian[k, :count, body] = columns[i] + np.arange(3), jacobian
         if sides[i] >= 0:
             slope += jacobian @ _motion(tracks, sides[i], stamp_ns, work.pose[k, i])
     noise += one.stamp_variance * np.outer(slope, slope)
-    bias = _write_radios(one, belief, work.columns[k], work.jacobian[k])
-    if not belief.is_dense and sides[1] >= 0:
+    # Biases of radios; a sparse filter has that of the observer only, as of a camera.
+    bias, radios = _write_radios(one, belief, work.columns[k], work.jacobian[k])
+    if not belief.is_dense and radios[1] >= 0:
         noise[0, 0] += model.radios[1] ** 2 * own_within(belief, sides[1], 3 + RADIO_BIAS, 3 + RADIO_BIAS)
     jacobian = work.jacobian[k, :count]
-    covariance = _covariance(one, belief, joint, work.columns[k], work.cross_covariance[k])
+    covariance = link_covariance(joint, work.columns[k], columns, radios[0], work.cross_covariance[k])
     s = jacobian @ covariance @ jacobian.T + noise
     innovation = model.innovation(one.value, predicted.value + bias)
     gated = slice(model.gated)
-    work.share[k] = share_of(one.columns(), 0, belief)
+    work.share[k] = share_of(row, 0, belief)
     work.noise[k, :count, :count], work.innovation[k, :count] = noise, innovation
     work.whitened[k], work.elsewhere[k] = 0.0, False
     work.place[k] = one.value[0], 0.0
@@ -669,67 +669,27 @@ def evaluate_link(
         work.jacobian[k], work.innovation[k], work.noise[k] = 0.0, 0.0, np.eye(3)
         work.distance[k], work.nis[k], work.accepted[k] = np.inf, np.nan, False
     # What its link has from these places already counts less.
-    places = [*_antenna(one.sensor, tracks, sides[0], stamp_ns), *_antenna(one.marker, tracks, sides[1], stamp_ns)]
-    news = share_of_range(one.columns(), 0, belief, np.array(places), bool(work.accepted[k]))
-    work.noise[k, :count, :count] /= min(news, work.share[k]) if work.share[k] == LEAST_SHARE else news
+    variance = noise_of_range(row, 0, belief, tracks, float(innovation[0]), bool(work.accepted[k]))
+    repeats = work.share[k] if work.share[k] == LEAST_SHARE else 1.0
+    work.noise[k, :count, :count] *= variance / (repeats * float(one.covariance[0, 0]))
 
 
-def _antenna(place: FloatArray, tracks: TrackArrays, robot: int, stamp_ns: int) -> list[float]:
-    """x and y of a place (3,) on a robot, by its odometry alone [m]; fixed without a robot."""
-    pose = np.zeros(3)
-    if robot >= 0:
-        look_up_pose(tracks, robot, stamp_ns, pose)
-    return se2.transform_points(pose, place[:2]).tolist()
+def _write_radios(
+    one: Measurements, belief: BeliefArrays, columns: IntArray, jacobian: FloatArray
+) -> tuple[float, list[int]]:
+    """Write columns (c,) and Jacobian (3, c) by the biases of both robots' radios.
 
-
-def _columns(one: Measurements, belief: BeliefArrays) -> tuple[int, int]:
-    """First filter columns of observer and target of one measurement; -1: none."""
-    sides = [
-        3 * int(one.observer) if one.observer >= 0 else -1,
-        3 * int(one.target) if one.target >= 0 else -1,
-    ]
-    for side, surveyed in enumerate((one.mount, one.landmark)):
-        if surveyed >= 0:
-            sides[side] = int(belief.table.survey_column[surveyed])
-    return sides[0], sides[1]
-
-
-def _write_radios(one: Measurements, belief: BeliefArrays, columns: IntArray, jacobian: FloatArray) -> float:
-    """Write columns and Jacobian (3, c) by the biases of both robots' radios; return what these add.
-
-    A sparse filter has columns of the observer only, as of a camera.
+    Returns:
+        What they add to the value, and their columns; -1: not estimated.
     """
-    bias, weights = 0.0, MODELS[int(one.model)].radios
+    bias, found, weights = 0.0, [-1, -1], MODELS[int(one.model)].radios
     for i, (robot, weight) in enumerate(zip((int(one.observer), int(one.target)), weights, strict=True)):
         if robot >= 0 and weight != 0.0:
-            bias += weight * belief.parameter[robot, RADIO_BIAS]
-            column = belief.table.column[robot, RADIO_BIAS]
-            if column >= 0 and (i == 0 or belief.is_dense):
-                columns[6 + i], jacobian[0, 6 + i] = column, weight
-    return float(bias)
-
-
-def _covariance(
-    one: Measurements, belief: BeliefArrays, joint: JointFilter, columns: IntArray, cross_covariance: FloatArray
-) -> FloatArray:
-    """Covariance (c, c) of the columns (c,) of one link."""
-    if joint.is_dense:
-        return joint.block(columns)
-    covariance, (o, t) = np.zeros((columns.size, columns.size)), _columns(one, belief)
-    radio = belief.table.column[one.observer, RADIO_BIAS] if one.observer >= 0 else -1
-    own, of_target = [0, 1, 2, 6], np.s_[3:6]
-    if radio >= 0:
-        covariance[np.ix_(own, own)] = joint.block(np.append(o + _BODY, radio))
-    elif o >= 0:
-        covariance[:3, :3] = joint.block(o + _BODY)
-    if t >= 0:
-        covariance[of_target, of_target] = joint.block(t + _BODY)
-    if min(o, t) >= 0:
-        covariance[:3, of_target] = cross_covariance[:, :3]
-        covariance[of_target, :3] = cross_covariance[:, :3].T
-    if min(radio, t) >= 0:
-        covariance[6, of_target] = covariance[of_target, 6] = cross_covariance[:, 3]
-    return covariance
+            bias += weight * float(belief.parameter[robot, RADIO_BIAS])
+            found[i] = int(belief.table.column[robot, RADIO_BIAS])
+            if found[i] >= 0 and (i == 0 or belief.is_dense):
+                columns[6 + i], jacobian[0, 6 + i] = found[i], weight
+    return bias, found
 
 
 def _motion(tracks: TrackArrays, robot: int, stamp_ns: int, pose: FloatArray) -> FloatArray:

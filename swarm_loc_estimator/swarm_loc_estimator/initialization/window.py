@@ -20,6 +20,7 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.filter.measurements import NO_MEASUREMENTS, Measurements, concatenate, select
 from swarm_loc_estimator.filter.models import MODELS
 from swarm_loc_estimator.filter.state import InitialPose, SwarmState
+from swarm_loc_estimator.swarm.calibration_states import RADIO_BIAS
 
 
 class Window(NamedTuple):
@@ -160,6 +161,7 @@ class Problem:
         self._column[by_mark] = [state.landmark_column(mark) for mark in marks[by_mark].tolist()]
         self._drift = noise - window.noise
         self._drift[np.linalg.eigvalsh(self._drift)[:, 0] < -1e-12] = 0.0  # late odometry has replaced noise
+        self._bias, self._bias_covariance = self._radios(state, robot)
         self._link = links(window)
         self.centre = window.track.mean(axis=0)
         self._shared = {
@@ -173,6 +175,17 @@ class Problem:
         towards = se2.adjoint(state.transform[moved])
         later = np.where(np.trace(drift, axis1=1, axis2=2) > 0.0, 1.0, -1.0)[:, None, None]
         self._other_drift[self._other >= 0] = later * towards @ drift @ np.swapaxes(towards, 1, 2)
+
+    def _radios(self, state: SwarmState, robot: int) -> tuple[FloatArray, FloatArray]:
+        """What the biases of robots' radios add to the rows (m,), and their covariance (m, m)."""
+        weights = np.array([MODELS[model].radios for model in self._window.measured.model.tolist()])
+        bias, covariance = np.zeros(self._window.size), np.zeros((self._window.size, self._window.size))
+        for one in [robot, *np.unique(self._other[self._other >= 0]).tolist()]:
+            sees = self._sees if one == robot else ~self._sees
+            own = np.where(sees, weights[:, 0], weights[:, 1]) * ((self._other == one) | (one == robot))
+            bias += own * state.parameter[one, RADIO_BIAS]
+            covariance += np.outer(own, own) * state.parameter_sigma(one)[RADIO_BIAS] ** 2
+        return bias, covariance
 
     def starts(self) -> FloatArray:
         """Transforms (h, 3) to begin with: around the other sides, in all directions."""
@@ -198,13 +211,14 @@ class Problem:
             model = MODELS[int(one.model)]
             sides = (poses[k], self._other_pose[k]) if sees else (self._other_pose[k], poses[k])
             predicted = model.predicted(one, *sides)
-            residual[k] = model.innovation(one.value, predicted.value)[0]
+            residual[k] = model.innovation(one.value, predicted.value + self._bias[k])[0]
             jacobians[0 if sees else 1, k] = predicted.observer_jacobian[0]
             jacobians[1 if sees else 0, k] = predicted.target_jacobian[0]
         own, other = jacobians
         lost = ~(np.isfinite(residual) & np.isfinite(own).all(axis=1) & np.isfinite(other).all(axis=1))
         residual[lost], own[lost], other[lost] = np.inf, 0.0, 0.0
         variance = self._window.measured.covariance[:, 0, 0] + _within(other, self._other_drift)
+        variance = variance + np.diag(self._bias_covariance)
         on_track = own @ se2.adjoint(transform)
         variance = variance + np.maximum(_within(on_track, self._drift), 0.0)
         for column, covariance in self._shared.items():
@@ -273,7 +287,7 @@ class Problem:
                 self._window.measured.covariance[good, 0, 0] + _within(other, self._other_drift[good])
             )
             upper = np.triu(np.einsum("ka,lab,lb->kl", on_track, self._drift[good], on_track))
-            alone = alone + upper + np.triu(upper, 1).T
+            alone = alone + upper + np.triu(upper, 1).T + self._bias_covariance[np.ix_(good, good)]
             common = np.zeros_like(alone)
             for one, covariance in self._shared.items():
                 of_one = other * (column == one)[:, None]

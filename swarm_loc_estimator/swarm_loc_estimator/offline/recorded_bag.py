@@ -421,6 +421,11 @@ def _unusable(topics: Sequence[BagTopic], ingest: Ingest, swarm: Swarm) -> tuple
             found += " is one as ROS 2 serializes it"
         elif wrong := [topic for topic in topics if topic.name in own]:
             found = f"the bag has another type on {_listed(wrong)}"
+        elif others and kind.of_pairs:
+            found = (
+                f"the bag has this type on {_listed(others)}: correct range_topic, and the name or address"
+            )
+            found += " of each radio"
         elif others:
             found = f"the bag has this type on {_listed(others)}: map topics,"
             found += f" such as --remap '{_rule(kind.pattern, others[0].name, swarm)}'"
@@ -428,7 +433,10 @@ def _unusable(topics: Sequence[BagTopic], ingest: Ingest, swarm: Swarm) -> tuple
             found = "the bag has no topic of this type"
         else:
             continue
-        sentences.append(f"Expected {kind.message_type} on {kind.pattern}; {found}.")
+        pattern = kind.pattern
+        if kind.of_pairs:
+            pattern = f"{swarm.range_topic}, such as {next(iter(own))}"
+        sentences.append(f"Expected {kind.message_type} on {pattern}; {found}.")
     return tuple(sentences)
 
 

@@ -46,7 +46,7 @@ from swarm_loc_estimator.sensors.sensor import (
     reject_reasons,
 )
 from swarm_loc_estimator.swarm.error_models import MAX_OFFSET_S
-from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm import Radio, Swarm
 
 SENSORS: dict[str, type[Sensor]] = {
     sensor.name: sensor
@@ -143,15 +143,16 @@ def input_topics(swarm: Swarm, *, maps: bool = False) -> tuple[InputTopic, ...]:
 
 def _of_pairs(swarm: Swarm) -> Iterator[InputTopic]:
     """Topics of the ranges of two radios, in both orders; at least one of them is on a robot."""
-    radios = [(one.uwb.address, k) for k, one in enumerate(swarm.robots) if one.uwb is not None]
-    radios += [(anchor.address, THE_SWARM) for anchor in swarm.anchors]
+    radios: list[tuple[Radio, int]]
+    radios = [(one.uwb, k) for k, one in enumerate(swarm.robots) if one.uwb is not None]
+    radios += [(anchor, THE_SWARM) for anchor in swarm.anchors]
     kind = kinds()[RangeSensor.PAIRS]
     for (one, own), (other, robot) in itertools.permutations(radios if swarm.range_topic else (), 2):
-        name = swarm.range_topic.replace("{from}", str(one)).replace("{to}", str(other))
+        name = swarm.range_topic.format(**{"from": one.word, "to": other.word})
         if own != THE_SWARM:
-            yield InputTopic(name, kind, own, expected=False, device=other)
+            yield InputTopic(name, kind, own, expected=False, device=other.address)
         elif robot != THE_SWARM:
-            yield InputTopic(name, kind, robot, expected=False, device=one)
+            yield InputTopic(name, kind, robot, expected=False, device=one.address)
 
 
 def live_topics(swarm: Swarm, *, shared: bool) -> tuple[InputTopic, ...]:

@@ -184,6 +184,11 @@ class RangeSensor(Sensor):
         described = np.square(self._sigma[rows.robot, is_difference.astype(np.int64)])
         noise = np.where(rows.variance == 0.0, described, rows.variance) / np.square(scale)
         out.covariance[:, 0, 0] = np.maximum(noise, _FLOOR_M**2) + devices.variance[reference]
+        # Two robots have one link, whichever measured.
+        turned = ~is_difference & (out.target >= 0) & (out.target < out.observer)
+        for first, second in ((out.observer, out.target), (out.sensor, out.marker), out.height.T):
+            first[turned], second[turned] = second[turned], first[turned]
+        out.reading[turned] = devices.find(self._own_address)[out.target[turned]]
         return out
 
     def _usable(self, rows: RangeRows, device: IntArray, reference: IntArray) -> BoolArray:

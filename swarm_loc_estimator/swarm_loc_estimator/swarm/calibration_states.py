@@ -6,9 +6,9 @@ measured as (1 + scale) r + offset. The last one is the bias of its radio. A lan
 and a fixed camera are static bodies: their state is a correction of the survey, with a right-invariant error
 about the identity. That of an anchor is a displacement and the bias of its ranges. Errors that all places
 share correlate these states.
-Parameters with a standard deviation in the description are estimated from the start, others only after a
-contradiction, with the standard deviations below. Their filter columns follow those of all poses, in the
-order in which they were added.
+Parameters with a standard deviation in the description are estimated from the start, as is the path of the
+wheels of robots with radios, others only after a contradiction, with the standard deviations below. Their
+filter columns follow those of all poses, in the order in which they were added.
 """
 
 from __future__ import annotations
@@ -89,6 +89,9 @@ class ParameterTable(NamedTuple):
                 time_s[i, CAMERA_YAW] = robot.camera.yaw_time_s
             if robot.uwb is not None:
                 sigma[i, RADIO_BIAS] = robot.uwb.range_bias_sigma
+                # what wheels say wrong is never contradicted by ranges, which bend the path instead
+                path = robot.odometry.distance_scale_sigma or _CONTRADICTED_SIGMA[DISTANCE_SCALE]
+                sigma[i, DISTANCE_SCALE] = 0.0 if robot.stands else path
         wanted = sigma > 0.0
         doubted = np.where(wanted, sigma, _CONTRADICTED_SIGMA)
         doubted[[robot.camera is None for robot in robots], DRIVES:RADIO_BIAS] = 0.0

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from swarm_loc_estimator.common.codec import EntrySpec, address, entry, entry_specs, switch
+from swarm_loc_estimator.common.codec import EntrySpec, address, entry, entry_specs, switch, word
 from swarm_loc_estimator.common.parameters import choice, flag, number, text, texts
 from swarm_loc_estimator.swarm.error_models import (
     TURN,
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from swarm_loc_estimator.swarm.ir_board import RobotIr
 
 _ADDRESS = address(2**64 - 1, "address in messages")
+_NAME = word("in range_topic, the address by default")
 _SENSOR = EntrySpec(
     lambda checks, tree, key: SensorModel(**checks.values(tree, key, entry_specs(SensorModel))),
     {"$ref": "#/definitions/sensor"},
@@ -40,14 +41,27 @@ _SENSOR = EntrySpec(
 
 
 @dataclass(frozen=True)
-class UwbDevice:
+class Radio:
+    """What messages and topics call a radio."""
+
+    #: Number by which messages name it, unique among robots and anchors
+    address: int = field(metadata=entry(_ADDRESS))
+    #: What `Swarm.range_topic` has for it; "": its address in decimal
+    name: str = field(default="", kw_only=True, metadata=entry(_NAME))
+
+    @property
+    def word(self) -> str:
+        """What a topic of two radios has for it."""
+        return self.name or str(self.address)
+
+
+@dataclass(frozen=True)
+class UwbDevice(Radio):
     """Radio on a robot: its antenna in base_link, and the error model of what it measures.
 
     A measured range is range_scale times the true one, plus the range_bias of both devices.
     """
 
-    #: Number by which messages name it, unique among robots and anchors
-    address: int = field(metadata=entry(_ADDRESS))
     x: float = number(0.0, "m", -10.0, 10.0, "antenna forward of base_link")
     y: float = number(0.0, "m", -10.0, 10.0, "antenna left of base_link")
     z: float = number(0.0, "m", -10.0, 10.0, "antenna above the ground")
@@ -68,11 +82,9 @@ class UwbDevice:
 
 
 @dataclass(frozen=True)
-class Anchor:
+class Anchor(Radio):
     """Radio at a fixed place in `map`."""
 
-    #: Number by which messages name it, unique among robots and anchors
-    address: int = field(metadata=entry(_ADDRESS))
     x: float = number(0.0, "m", -1e8, 1e8, "in map")
     y: float = number(0.0, "m", -1e8, 1e8, "in map")
     z: float = number(0.0, "m", -1e4, 1e4, "above the ground")
@@ -319,7 +331,7 @@ class Swarm:
     cameras: tuple[FixedCamera, ...] = ()
     anchors: tuple[Anchor, ...] = ()
     map: Path | None = None
-    #: Topic of the `sensor_msgs/Range` of two radios, in which {from} and {to} stand for their addresses; "":
+    #: Topic of the `sensor_msgs/Range` of two radios, in which {from} and {to} stand for their names; "":
     #: ranges come on `<robot>/ranges`
     range_topic: str = ""
     #: Expected topic, such as `robot1/odom` or `<robot>/odom` for all robots -> the topic in its place
@@ -338,9 +350,12 @@ class Swarm:
         boards = [(f"robot '{r.name}'", r.ir.id) for r in self.robots if r.ir is not None]
         radios = [(f"robot '{r.name}'", r.uwb.address) for r in self.robots if r.uwb is not None]
         radios += [(f"anchors[{k}]", anchor.address) for k, anchor in enumerate(self.anchors)]
-        unique = (("marker id", faces + marks), ("ir.id", boards), ("uwb.address", radios))
+        devices = [*(r.uwb for r in self.robots if r.uwb is not None), *self.anchors]
+        words = [(owner, one.word) for (owner, _), one in zip(radios, devices, strict=True)]
+        unique: tuple[tuple[str, Sequence[tuple[str, int | str]]], ...]
+        unique = ("marker id", faces + marks), ("ir.id", boards), ("uwb.address", radios), ("uwb.name", words)
         for what, named in unique:
-            owners: dict[int, str] = {}
+            owners: dict[int | str, str] = {}
             for owner, one_id in named:
                 first = owners.setdefault(one_id, owner)
                 if first is not owner:

@@ -88,7 +88,7 @@ MODELS: dict[str, type] = {
 }
 SECTIONS: dict[str, type] = {**MODELS, "ir": RobotIr, "uwb": UwbDevice}
 MAY_BE_NONE = ("odometry", "camera", "ir", "uwb")
-OWN = ("id", "address")  # Entries of sections that only a robot has
+OWN = ("id", "address", "name")  # Entries of sections that only a robot has
 PLACED = ("x", "y")  # Entries that landmarks and anchors must have
 START = {name: number_specs(Landmark)[name] for name in PLACED} | {"theta": number_specs(CameraMount)["yaw"]}
 LANDMARK_DEFAULTS = {name: number_specs(Landmark)[name] for name in ("size", "position_sigma", "yaw_sigma")}
@@ -183,7 +183,7 @@ class _Loader(TreeChecks):
             and RANGE_TOPIC.fullmatch(ranges)
             and ranges.count("{from}") == ranges.count("{to}") == 1
         ):
-            rule = "must be a topic with {from} and {to} once each, for addresses"
+            rule = "must be a topic with {from} and {to} once each, for names or addresses"
             raise self.error("range_topic", ranges, rule)
         # the swarm as a whole
         swarm = self.made(
@@ -524,7 +524,8 @@ def _robot(robot: Robot, shared: Layer, folder: Path) -> Layer:
     if robot.ir is not None:
         entry["ir"] = {"id": robot.ir.id, **entry.get("ir", {})}
     if robot.uwb is not None:
-        entry["uwb"] = {"address": robot.uwb.address, **entry.get("uwb", {})}
+        named = {"name": robot.uwb.name} if robot.uwb.name else {}
+        entry["uwb"] = {"address": robot.uwb.address, **named, **entry.get("uwb", {})}
     if robot.faces:
         entry["ids"] = {face.name: face.id for face in robot.faces}
     if robot.start is not None:

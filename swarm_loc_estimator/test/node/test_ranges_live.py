@@ -12,6 +12,7 @@ from nav_msgs.msg import Odometry
 from node_world import SECOND, T0_NS, Ros, newest_status, odometry_bytes, overrides, stamp_ns, values_of
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
+from sensor_msgs.msg import Range as PairRange
 from std_msgs.msg import Header
 
 from swarm_loc_estimator.nodes.estimator_node import EstimatorNode
@@ -73,3 +74,35 @@ def test_ranges_correct_a_start(ros: Ros, tmp_path: Path, topics: dict[str, str]
     assert (alpha.x, alpha.y) == pytest.approx((0.0, 0.0), abs=0.02)
     assert values_of(newest_status(heard, "estimator: alpha"))["ranges received"] == "8"
     assert values_of(newest_status(heard, "estimator"))["dropped: uwb_unknown_address"] == "8"
+
+
+def test_ranges_on_topics_of_pairs_correct_a_start(ros: Ros, tmp_path: Path) -> None:
+    """The topics have names of radios, in both orders, as the drivers of tags and of anchors publish them."""
+    path = tmp_path / "swarm.yaml"
+    named = SWARM_YAML.replace("{address: 1,", "{address: 1, name: tag,").replace(
+        "address: 16,", "address: 16, name: west,"
+    )
+    path.write_text(f"{named}range_topic: /uwb/{{from}}/{{to}}/distance\n", encoding="utf-8")
+    ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True)))
+    clock = ros.tester.create_publisher(Clock, "/clock", 10)
+    odometry = ros.tester.create_publisher(Odometry, "alpha/odom", 100)
+    names = {16: "uwb/tag/west/distance", 17: "uwb/17/tag/distance", 18: "uwb/tag/18/distance"}
+    ranges = {a: ros.tester.create_publisher(PairRange, name, 10) for a, name in names.items()}
+    poses = ros.listen(SwarmPoses, "swarm/poses")
+    heard = ros.listen(DiagnosticArray, "/diagnostics")
+    ros.until(lambda: all(one.get_subscription_count() for one in (clock, odometry, *ranges.values())))
+    ros.until(lambda: ros.tester.count_publishers("swarm/poses"))
+    for step in range(8):
+        now_ns, before = T0_NS + step * SECOND // 2, len(poses)
+        clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+        odometry.publish(odometry_bytes("alpha", now_ns))
+        header = Header(stamp=Time(nanoseconds=now_ns).to_msg())
+        for a, (x, y) in ANCHORS.items():
+            ranges[a].publish(PairRange(header=header, range=float(np.hypot(np.hypot(x, y), 1.0))))
+        ros.until(partial(is_estimated, poses, before, now_ns))
+    ros.until(lambda: bool(heard) and stamp_ns(heard[-1]) >= now_ns)
+
+    (alpha,) = poses[-1].robots
+    assert alpha.status == SwarmPose.STATUS_TRACKED
+    assert (alpha.x, alpha.y) == pytest.approx((0.0, 0.0), abs=0.02)
+    assert values_of(newest_status(heard, "estimator: alpha"))["ranges received"] == "24"

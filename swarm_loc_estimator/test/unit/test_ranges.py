@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,15 +19,20 @@ from hypothesis import strategies as st
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.cdr import ODOMETRY, encode
 from swarm_loc_estimator.common.messages.cdr import RANGE as PAIR_TYPE
 from swarm_loc_estimator.common.messages.cdr import RANGES as MESSAGE_TYPE
-from swarm_loc_estimator.common.messages.cdr import encode
+from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.filter.measurements import Measurements, Verdict, select
+from swarm_loc_estimator.doctor.doctor import evidence_of_bag, examine, lines_of
+from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict, select
 from swarm_loc_estimator.filter.models import MODELS, RANGE, RANGE_DIFFERENCE
+from swarm_loc_estimator.offline.recorded_bag import unwatched
+from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.precompile import size_of
 from swarm_loc_estimator.sensors.inputs import Ingest
-from swarm_loc_estimator.swarm.swarm import Anchor, Robot, Swarm, UwbDevice
+from swarm_loc_estimator.swarm.swarm import Anchor, Robot, StartSigma, Swarm, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm, save_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.settings import Policy, Settings
@@ -39,8 +45,9 @@ HUGE = 2**64 - 1
 
 
 def device(index: int) -> UwbDevice:
-    """The radio of a robot: off the centre of its base."""
-    return UwbDevice(index + 1, x=0.02, y=-0.03, z=0.1, range_sigma=SIGMA, difference_sigma=1.5 * SIGMA)
+    """The radio of a robot: off the centre of its base, without a bias."""
+    noise = {"range_sigma": SIGMA, "difference_sigma": 1.5 * SIGMA, "range_bias_sigma": 0.0}
+    return UwbDevice(index + 1, x=0.02, y=-0.03, z=0.1, **noise)
 
 
 def world_of(
@@ -426,6 +433,87 @@ def test_the_biases_of_anchors_are_estimated(settings: Settings, seed: int) -> N
     assert np.sqrt(np.square(error[..., :2]).sum(axis=-1).mean()) < 0.06
 
 
+def with_radios(world: World, **changed: float) -> World:
+    """The world whose robots' radios have other numbers."""
+    robots = [replace(one, uwb=one.uwb and replace(one.uwb, **changed)) for one in world.swarm.robots]
+    return replace(world, swarm=replace(world.swarm, robots=tuple(robots)))
+
+
+@pytest.mark.parametrize("settings", [IN_ORDER, TOGETHER], ids=["order", "batch"])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_bias_of_two_radios_is_estimated(settings: Settings, seed: int) -> None:
+    """Of two robots that know their starts and nothing but the range between them."""
+    world = with_radios(world_of(seed, (), robots=2, duration_s=15.0), range_bias_sigma=0.2)
+    measured = [replace(one, range=one.range + 0.3) for one in ranges_of(world, seed, between=True)]
+    estimator, estimates = run(world, measured, settings)
+    found = [one.uwb for one in estimator.learned().robots if one.uwb is not None]
+    assert sum(one.range_bias for one in found) == pytest.approx(0.3, abs=0.05)
+    assert all(0.1 < one.range_bias_sigma < 0.2 for one in found)  # which of both has it stays unknown
+    assert (estimates[-1].status == Status.TRACKED).all()
+    assert np.hypot(*errors(world, estimates)[-1, :, :2].T).max() < 0.1
+
+
+@ALL
+def test_robots_that_stand_see_the_same_error_for_ever(settings: Settings) -> None:
+    """A thousand ranges of one place are not a thousand looks."""
+    world = world_of(3, SQUARE[:1], bias_sigma=0.0, robots=1, duration_s=50.0)
+    still = [replace(one, pose=None if one.pose is None else (0.0, 0.0, 0.0)) for one in world.events]
+    radios = with_radios(replace(world, events=tuple(still), truth=np.tile(world.truth[:1], (1001, 1, 1))))
+    start = replace(radios.swarm.robots[0], start_sigma=StartSigma(0.5, 0.5, 0.01))
+    radios = replace(radios, swarm=replace(radios.swarm, robots=(start,)))
+    rng, away = (
+        np.random.default_rng(3),
+        float(np.linalg.norm(antenna(radios, 0, 100) - antenna(radios, 0, 1))),
+    )
+    stamps = [T0 + k * SECOND // 20 for k in range(1000)]
+    measured = [
+        Measured(0, t, 100, away + 0.05 + 0.03 * rng.standard_normal(), variance=0.05**2) for t in stamps
+    ]
+    _, estimates = run(radios, measured, settings)
+    least = np.sqrt(np.linalg.eigvalsh(estimates[-1].covariances[0, :2, :2])[0])
+    assert least > 0.02
+
+
+def test_a_radio_that_jumps_is_named_and_its_robot_stays() -> None:
+    world = world_of(23, (), robots=2, duration_s=15.0)
+    jumps_ns = T0 + 5 * SECOND
+    measured = [
+        replace(one, range=one.range + (1.0 if one.stamp_ns > jumps_ns else 0.0))
+        for one in ranges_of(world, 23, between=True)
+    ]
+    estimator, estimates = run(world, measured)
+    assert (np.array([one.status for one in estimates]) != Status.WAITING).all()
+    texts = [one.text for one in estimator.contradictions(int(world.stamp_ns[-1]))]
+    assert "excluding robot_1's measurements of robot_0: inconsistent with all others" in texts or (
+        "excluding robot_0's measurements of robot_1: inconsistent with all others" in texts
+    )
+    assert np.hypot(*errors(world, estimates)[-1, :, :2].T).max() < 0.2
+
+
+def test_ranges_that_are_too_long_and_too_short_lose_a_robot_that_was_carried() -> None:
+    world = world_of(24, robots=1, duration_s=20.0)
+    carried = np.array(world.truth)
+    carried[100:, 0, 0] += 1.0
+    carried = replace(world, truth=carried)
+    estimator, estimates = run(carried, ranges_of(carried, 24))
+    assert [one.why for one in estimator.losses] == [LossReason.GATED]
+    assert estimates[-1].status[0] == Status.TRACKED
+    assert np.hypot(*errors(carried, estimates)[-1, 0, :2]) < 0.1
+
+
+def test_both_orders_of_a_pair_are_one_link() -> None:
+    swarm = replace(
+        TWO, robots=(TWO.robots[0], replace(TWO.robots[1], uwb=replace(device(1), range_scale=1.1)))
+    )
+    found, _ = converted(swarm, Measured(0, T0, 2, 1.0), Measured(1, T0, 1, 1.1))
+    assert found.received_from.tolist() == [0, 1]
+    one, other = (select(found, slice(k, k + 1))._replace(received_from=np.zeros(1, int)) for k in range(2))
+    np.testing.assert_allclose(other.value, one.value)
+    assert (one.observer, one.target) == (other.observer, other.target) == (0, 1)
+    np.testing.assert_array_equal(one.sensor, other.sensor)
+    np.testing.assert_array_equal(one.height, other.height)
+
+
 def pair_message(value: float, variance: float, *, limits: tuple[float, float] = (0.0, 0.0)) -> bytes:
     """A sensor_msgs/Range."""
     low, high = limits
@@ -466,6 +554,66 @@ def test_ranges_on_a_topic_of_two_radios_are_those_of_arrays(tmp_path: Path) -> 
     names = {topic.name for topic in ingest.topics}
     assert "a/ranges" not in names
     assert "uwb/n_16/n_16/distance" not in names
+
+
+def test_topics_of_two_radios_have_their_names(tmp_path: Path) -> None:
+    path = tmp_path / "swarm.yaml"
+    path.write_text(
+        "fileversion: 1\nrange_topic: /uwb/{from}/{to}\nrobots: {a: {uwb: {address: 1, name: from}}, b: {}}\n"
+        "anchors: [{address: 0x10, x: 0, y: 0, name: n_to}, {address: 17, x: 1, y: 0}]\n"
+    )
+    swarm = load_swarm(path)
+    save_swarm(swarm, tmp_path / "again.yaml")
+    assert load_swarm(tmp_path / "again.yaml") == swarm
+    names = {topic.name for topic in Ingest(swarm).topics if topic.kind.of_pairs}
+    assert names == {"uwb/from/n_to", "uwb/n_to/from", "uwb/from/17", "uwb/17/from"}
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "sentence"),
+    [
+        (
+            "name: b",
+            "name: a/b",
+            "anchors[0].name is 'a/b' but must be up to 64 letters, digits and underscores",
+        ),
+        ("name: b", "name: 1", "anchors[0].name is 1 but must be up to 64 letters, digits and underscores"),
+        ("name: b", "name: '1'", "uwb.name 1 belongs to both robot 'a' and anchors[0]; ids must be unique"),
+    ],
+)
+def test_a_wrong_name_of_a_radio_is_refused(old: str, new: str, sentence: str, tmp_path: Path) -> None:
+    text = "fileversion: 1\nrobots: {a: {uwb: {address: 1}}}\nanchors: [{address: 2, name: b, x: 0, y: 0}]\n"
+    path = tmp_path / "swarm.yaml"
+    path.write_text(text.replace(old, new))
+    with pytest.raises(SwarmFileError, match=re.escape(sentence)):
+        load_swarm(path)
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_pattern_that_fits_no_topic_is_named_with_the_topics_that_there_are(
+    there: bool, tmp_path: Path
+) -> None:
+    robots = tuple(Robot(name, uwb=device(k), start=(0.0, 0.0, 0.0)) for k, name in enumerate("ab"))
+    swarm = Swarm(robots, range_topic="uwb/{from}/{to}")
+    stored = "radio/n_1/n_2" if not there else "uwb/2/1"
+    with BagWriter(tmp_path / "bag") as writer:
+        for name, message_type in ((stored, PAIR_TYPE), ("a/odom", ODOMETRY)):
+            writer.add_topic(name, message_type)
+        stamps = T0 + np.arange(20) * SECOND // 20
+        still = encode_odometry("a/odom", "a/base_link", stamps, np.zeros((20, 3)), np.zeros((20, 3)))
+        for now_ns, data in zip(stamps.tolist(), still, strict=True):
+            writer.write("a/odom", now_ns, data)
+            writer.write(stored, now_ns, pair_message(1.0, 0.0))
+    said = [one for one in replay(tmp_path / "bag", swarm).remarks if "uwb/{from}/{to}" in one]
+    doctored = [
+        one
+        for one in lines_of(examine(evidence_of_bag(tmp_path / "bag", swarm, 10.0, unwatched)))
+        if "range_topic" in one
+    ]
+    assert bool(said) == bool(doctored) == (not there)
+    for one in (*said, *doctored):
+        assert "radio/n_1/n_2" in one
+        assert "orrect range_topic" in one
 
 
 @pytest.mark.parametrize(

@@ -144,7 +144,10 @@ def _result(online: ReplayResult, solution: Solution) -> ReplayResult:
 
 
 def _opened(online: ReplayResult) -> Swarm:
-    """The description, with standard deviations of landmarks that a contradiction has opened."""
+    """The description, with standard deviations of landmarks that a contradiction has opened.
+
+    The batch does not estimate biases of robots' radios: they are those found online.
+    """
     learned = online.self_calibrated or online.swarm
     position_sigma, yaw_sigma = CONTRADICTED_SURVEY_SIGMA
     marks = tuple(
@@ -153,7 +156,10 @@ def _opened(online: ReplayResult) -> Swarm:
         else mark
         for mark, now in zip(online.swarm.landmarks, learned.landmarks, strict=True)
     )
-    return replace(online.swarm, landmarks=marks)
+    robots = zip(online.swarm.robots, learned.robots, strict=True)
+    return replace(
+        online.swarm, robots=tuple(replace(one, uwb=now.uwb) for one, now in robots), landmarks=marks
+    )
 
 
 def _unsure(swarm: Swarm, learned: Swarm) -> tuple[tuple[Parameter, ...], FloatArray]:
