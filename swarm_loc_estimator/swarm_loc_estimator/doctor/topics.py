@@ -183,23 +183,17 @@ def check_topics(evidence: Evidence) -> Iterator[Finding]:
 
 def _pairs(evidence: Evidence) -> Iterator[Finding]:
     """A pattern of the ranges of two radios that fits no topic with messages."""
-    pairs = [
-        (topic, counted.received)
-        for topic, counted in zip(evidence.inputs, evidence.read[1], strict=True)
-        if topic.kind.of_pairs
-    ]
+    inputs = zip(evidence.inputs, evidence.read[1], strict=True)
+    pairs = [(topic, counted.received) for topic, counted in inputs if topic.kind.of_pairs]
     if pairs and not any(received for _, received in pairs):
-        topic, known = pairs[0][0], {topic.name for topic, _ in pairs}
-        others = sorted(
-            name
-            for name, heard in evidence.topics.items()
-            if same_type(heard.type, topic.kind.message_type) and name not in known
-        )
-        there = f"; {listed(others)} has this type" if others else ""
-        remedy = "Correct range_topic, and the name or address of each radio" if others else ""
+        topic = pairs[0][0]
+        of_type = [
+            name for name, heard in evidence.topics.items() if same_type(heard.type, topic.kind.message_type)
+        ]
+        there = f"; {listed(sorted(of_type))} has this type" if of_type else ""
+        remedy = "Correct range_topic and the names or addresses of radios, or start their drivers"
         problem = f"fits no topic with messages, such as {topic.name}{there}"
-        subject = f"range_topic '{evidence.swarm.range_topic}'"
-        yield Finding(subject, problem, remedy or "Start the drivers of the radios")
+        yield Finding(f"range_topic '{evidence.swarm.range_topic}'", problem, remedy)
 
 
 def _lone(evidence: Evidence) -> dict[str, Heard]:

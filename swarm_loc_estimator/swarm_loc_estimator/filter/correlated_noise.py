@@ -588,7 +588,7 @@ _STILL_M, _NEAR_M = (
     0.15,
 )  # Antennas that have moved less have not moved, or see almost the same errors [m]
 _LEAST_NEWS = 1e-6  # Least part of the information of a range that is new
-_SPENT, _PLACES, _WHITE, _INNOVATION = 1, 2, 7, 8
+_SPENT, _PLACES, _WHITE, _INNOVATION, _VARIANCE = 1, 2, 7, 8, 9
 """What else `last_look` has of two radios, see `SourceArrays`."""
 
 
@@ -598,6 +598,7 @@ def noise_of_range(
     k: int,
     belief: BeliefArrays,
     tracks: TrackArrays,
+    variance: float,
     innovation: float,
     accepted: bool,
 ) -> float:
@@ -606,13 +607,15 @@ def noise_of_range(
     The errors of two radios depend on where they are. Differences of ranges that follow each other show the
     noise of each; what the description allows beyond it repeats. With the share s of the variance that does,
     n looks from the same places have the information n / (1 + (n - 1) s) of one. It is spent until the
-    antennas move: of errors whose correlation is 1/e at a length, two lengths are one look.
+    antennas move: of errors whose correlation is 1/e at a length, two lengths are one look. What the noise of
+    odometry has made of it since then does not count.
 
     Args:
         measurements: (m,).
         k: Which one.
         belief: The memory of its link is changed.
         tracks: Odometry, which alone tells how far both antennas have moved.
+        variance: Of the predicted range [m^2].
         innovation: Measured minus predicted.
         accepted: Whether it is used.
     """
@@ -646,14 +649,18 @@ def noise_of_range(
         last[_WHITE] += _LEARNING * (min(square, _LARGEST * described) - last[_WHITE])
     repeated = min(max(1.0 - last[_WHITE] / described, _LEAST_REPEATED), _MOST_REPEATED)
     # One look more.
+    if variance > last[_VARIANCE]:  # False for a new link
+        last[_SPENT] *= last[_VARIANCE] / variance
     spent, news = last[_SPENT], 0.0
     if repeated * spent < 1.0:
         looks = spent * (1.0 - repeated) / (1.0 - repeated * spent)
         news = (looks + 1.0) / (1.0 + looks * repeated) - spent
+    noise = described / max(news, _LEAST_NEWS)
     if accepted:
         last[RANGE_VALUE], last[_INNOVATION], last[_SPENT] = (
             measurements.value[k, 0],
             innovation,
             spent + news,
         )
-    return described / max(news, _LEAST_NEWS)
+        last[_VARIANCE] = variance * noise / (variance + noise)
+    return noise

@@ -658,7 +658,7 @@ def evaluate_link(
     work.noise[k, :count, :count], work.innovation[k, :count] = noise, innovation
     work.whitened[k], work.elsewhere[k] = 0.0, False
     work.place[k] = one.value[0], 0.0
-    # Gate; what is not finite at these poses is gated, too.
+    # Gate, also what is not finite.
     finite = np.isfinite(s).all() and np.isfinite(innovation).all() and np.isfinite(jacobian).all()
     if finite and s[0, 0] > 0.0:  # covariances of a sparse filter are approximate
         work.distance[k] = innovation[gated] @ np.linalg.solve(s[gated, gated], innovation[gated])
@@ -669,7 +669,8 @@ def evaluate_link(
         work.jacobian[k], work.innovation[k], work.noise[k] = 0.0, 0.0, np.eye(3)
         work.distance[k], work.nis[k], work.accepted[k] = np.inf, np.nan, False
     # What its link has from these places already counts less.
-    variance = noise_of_range(row, 0, belief, tracks, float(innovation[0]), bool(work.accepted[k]))
+    own = float((s - noise)[0, 0]), float(innovation[0]), bool(work.accepted[k])
+    variance = noise_of_range(row, 0, belief, tracks, *own)
     repeats = work.share[k] if work.share[k] == LEAST_SHARE else 1.0
     work.noise[k, :count, :count] *= variance / (repeats * float(one.covariance[0, 0]))
 
