@@ -42,10 +42,10 @@ class SourceArrays(NamedTuple):
     evidence: FloatArray  # (N, K) evidence against the link
     # (N, K, 2) mean of the last whitened innovations; of a radio, the second is the share of repeated values
     drift: FloatArray
-    # (N, K, 10) x, y of the target as seen last [m], and `learned` of the robot then. Of two radios the range,
-    # what counts of their ranges from here, x, y of both antennas by odometry [m], the newest whitened
-    # innovation, the variance of what does not repeat [m^2], the innovation of the range [m], and the variance
-    # of the predicted range after it was used [m^2]
+    # (N, K, 10) x, y of the target as seen last [m], and `learned` of the robot then. Of two radios the
+    # range, what counts of their ranges from here, x, y of both antennas by odometry [m], the newest whitened
+    # innovation, the variance of what does not repeat [m^2], the innovation of the range [m], and the
+    # variance of the predicted range after it was used [m^2]
     last_look: FloatArray
     score: FloatArray  # (S,) fault score
     confirmations: FloatArray  # (N,) number of measurements that agree with the robot's initial pose

@@ -656,8 +656,7 @@ def evaluate_link(
     gated = slice(model.gated)
     work.share[k] = share_of(row, 0, belief)
     work.noise[k, :count, :count], work.innovation[k, :count] = noise, innovation
-    work.whitened[k], work.elsewhere[k] = 0.0, False
-    work.place[k] = one.value[0], 0.0
+    work.whitened[k], work.elsewhere[k], work.place[k] = 0.0, False, (one.value[0], 0.0)
     # Gate, also what is not finite.
     finite = np.isfinite(s).all() and np.isfinite(innovation).all() and np.isfinite(jacobian).all()
     if finite and s[0, 0] > 0.0:  # covariances of a sparse filter are approximate
