@@ -31,7 +31,7 @@ from swarm_loc_estimator.doctor.evidence import Evidence, Finding, Heard, decode
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.calibration.recording import Recording
 from swarm_loc_estimator.offline.recorded_bag import Progress, same_type
-from swarm_loc_estimator.offline.survey.survey import Paths, place_fixed
+from swarm_loc_estimator.offline.survey.survey import place_fixed
 from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, NO_DETECTIONS
 from swarm_loc_estimator.sensors.inputs import TRUTH, kinds
 from swarm_loc_estimator.sensors.localizers import BODY, SOURCES, BodyPose
@@ -564,8 +564,7 @@ def _radios(draft: _Draft) -> None:
     rows = draft.read(anchors=tuple(map(Anchor, others))).rows("ranges")
     if rows.robot.size and draft.tracks:
         recording = Recording("", NO_ODOMETRY, NO_DETECTIONS, {}, ranges=rows)
-        paths = Paths(draft.poses, np.zeros((3, 3)))
-        found = place_fixed(recording, draft.described(), paths, cameras=False)
+        found = place_fixed(recording, draft.described(), draft.poses, cameras=False)
         draft.swarm["anchors"] = tuple(
             replace(one, position_sigma=round(max(one.position_sigma, _ANCHOR_M), 3)) for one in found.anchors
         )

@@ -115,7 +115,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self._published: OccupancyMap | None = None
 
     def _on_mount(self, topic: str, data: bytes) -> None:
-        """Take mounts of lidars from static transforms and first scans; a map with others begins anew."""
+        """Take mounts of lidars from static transforms and first scans; with others the map starts over."""
         self._mounts.add_message(topic, data)
         robots = list(self._mounts.described().robots)
         if robots != self._robots:

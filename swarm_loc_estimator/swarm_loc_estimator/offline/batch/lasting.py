@@ -13,11 +13,11 @@ from dataclasses import replace
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.filter.correlated_noise import LENGTH_M
+from swarm_loc_estimator.filter.correlated_noise import LENGTH_M, RADIO_LENGTH_M, REPEATED
 from swarm_loc_estimator.filter.measurements import Measurements
 from swarm_loc_estimator.filter.models import POLAR, is_compiled, predict_any
 from swarm_loc_estimator.filter.prediction import GROWTH
-from swarm_loc_estimator.filter.sources import CORRELATION_NS, LEAST_SHARE, RADIO_LENGTH_M, REPEATED
+from swarm_loc_estimator.filter.sources import CORRELATION_NS, LEAST_SHARE
 from swarm_loc_estimator.offline.batch.problem import BatchProblem, Knots
 
 
