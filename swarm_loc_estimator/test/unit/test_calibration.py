@@ -394,12 +394,14 @@ def with_radios_and_gyroscopes(recording: Recording, swarm: Swarm, seed: int) ->
     robot_index, stamps, device, distance = (np.concatenate(column) for column in zip(*ranges, strict=True))
     order = np.argsort(stamps, kind="stable")
     none = np.zeros(stamps.size, dtype=np.uint64)
-    columns = (robot_index, stamps, device.astype(np.uint64), none, distance, np.zeros(stamps.size), stamps)
-    seen = RangeRows(*(column[order] for column in columns))
+    arrays = (robot_index, stamps, device.astype(np.uint64), none, distance, np.zeros(stamps.size), stamps)
+    columns: list[Any] = [one[order] for one in arrays]
+    seen = RangeRows(*columns)
     robot_index, stamps, rate = (np.concatenate(column) for column in zip(*turns, strict=True))
     order = np.argsort(stamps, kind="stable")
     velocity = np.column_stack([np.zeros((rate.size, 2)), rate])
-    turned = TurnRateRows(*(column[order] for column in (robot_index, stamps, velocity, rate, stamps)))
+    columns = [one[order] for one in (robot_index, stamps, velocity, rate, stamps)]
+    turned = TurnRateRows(*columns)
     robots = tuple(
         replace(one, uwb=UwbDevice(k, range_sigma=0.2), imu=ImuModel(turn_noise_density=0.02))
         for k, one in enumerate(swarm.robots, 1)

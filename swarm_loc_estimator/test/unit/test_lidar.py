@@ -306,12 +306,12 @@ def test_a_bag_is_mapped_by_other_topics_and_with_the_mount_of_its_transforms(
     joint = static(("base_link", "a/base_scan", (LIDAR.x, LIDAR.y, 0.2), (LIDAR.yaw, 0.0, 0.0)))
     for name, space in (("described", "a/"), ("found", "")):
         with BagWriter(tmp_path / name) as bag:
-            for topic, kind in (
+            for topic, message_type in (
                 ("tf_static", TRANSFORMS),
                 (f"{space}odom", ODOMETRY),
                 (f"{space}scan", LASER_SCAN),
             ):
-                bag.add_topic(topic, kind)
+                bag.add_topic(topic, message_type)
             bag.write("tf_static", 0, joint)
             for kind, at_ns, data in messages(5_000_000_000, seed=1):
                 bag.write(f"{space}{kind.topic}", at_ns, data)
