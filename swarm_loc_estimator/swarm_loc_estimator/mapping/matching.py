@@ -14,7 +14,7 @@ import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.mapping.scans import BINS, Beams, Lines
+from swarm_loc_estimator.mapping.scans import BINS, LINE, Beams, Lines
 
 CAUCHY = 6.0  # Square of the scale of the Cauchy loss, in variances
 MIN_MATCHED = 30  # Minimum number of matched beams of a pair of stops
@@ -26,8 +26,6 @@ _GATE_VARIANCES = 16.0  # Maximum squared residual of a matched beam, in varianc
 _RANGE_SIGMAS = 2.5  # Lines nearer to the laser's range than this are not compared [sigma]
 _IMITATED = 5.0
 """Information along lines over what errors of their normals imitate, below which it is no information."""
-
-_END_SIGMAS = 2.0  # How far from the end of a wall a beam is compared with it [sigma]
 
 OFF, UNUSABLE, FIT = 0, 1, 2  # Result for a beam: off the line; not comparable; on the line
 
@@ -42,7 +40,7 @@ class Scans(NamedTuple):
 
 @cached_njit
 def beam_residual(
-    scans: Scans, k: int, i: int, j: int, gate: float, fair: bool = False
+    scans: Scans, k: int, i: int, j: int, gate: float
 ) -> tuple[int, float, float, float, float, float, float]:
     """Compare beam i of stop k with the lines of stop j.
 
@@ -52,41 +50,30 @@ def beam_residual(
         i: Number of the beam.
         j: The stop with the lines.
         gate: A beam further off a line than this and four sigmas is not matched [m].
-        fair: Whether at the ends of walls the line is chosen by the predicted value, so that what is matched
-            does not depend on the sign of the error; scores do not need it.
 
     Returns:
         Whether it fits, residual and its variance, predicted inverse distance over the line's distance, the
         line's normal in map, and the bin of the line; all but the first are zero unless it fits.
     """
     states, lines = scans.states, scans.lines
-    measured, sigma = scans.beams.inverse[k, i], scans.beams.sigma[k]
+    measured = scans.beams.inverse[k, i]
     angle = states[k, 2] + states[k, 3] * scans.beams.turn[k, i]
     ux, uy = math.cos(angle), math.sin(angle)
     dx, dy = states[k, 0] - states[j, 0], states[k, 1] - states[j, 1]
     cos, sin = math.cos(states[j, 2]), math.sin(states[j, 2])
-    # the line where the beam ends by its measurement; at the end of a wall, also with other errors
-    m = _bin_at(dx + ux / measured, dy + uy / measured, states[j, 2])
-    is_end = fair and lines.ends[j, m]
-    for off in (-_END_SIGMAS * sigma, _END_SIGMAS * sigma):
-        if is_end and not lines.usable[j, m] and measured + off > 0.0:
-            away = 1.0 / (measured + off)
-            m = _bin_at(dx + away * ux, dy + away * uy, states[j, 2])
-    nx, ny, size, distance, predicted = 0.0, 0.0, 0.0, 0.0, 0.0
-    # there, then the line where it ends by prediction
-    for step in range(1 + is_end):
-        if step == 1:
-            m = _bin_at(dx + ux / predicted, dy + uy / predicted, states[j, 2])
-        if not lines.usable[j, m]:
-            return OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        a, b = lines.a[j, m], lines.b[j, m]
-        size = math.hypot(a, b)
-        nx, ny = (cos * a - sin * b) / size, (sin * a + cos * b) / size
-        distance = 1.0 / size - nx * dx - ny * dy
-        incidence = nx * ux + ny * uy
-        if distance < _MIN_DISTANCE or incidence < _MIN_INCIDENCE:
-            return OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        predicted = incidence / distance
+    bearing = math.atan2(dy + uy / measured, dx + ux / measured) - states[j, 2]
+    m = math.floor(bearing * BINS / (2.0 * math.pi)) % BINS
+    if not lines.usable[j, m] or lines.kind[j, m] != LINE:
+        return OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    a, b = lines.a[j, m], lines.b[j, m]
+    size = math.hypot(a, b)
+    nx, ny = (cos * a - sin * b) / size, (sin * a + cos * b) / size
+    distance = 1.0 / size - nx * dx - ny * dy
+    incidence = nx * ux + ny * uy
+    if distance < _MIN_DISTANCE or incidence < _MIN_INCIDENCE:
+        return OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    predicted = incidence / distance
+    sigma = scans.beams.sigma[k]
     if predicted < 1.0 / scans.beams.reach[k] + _RANGE_SIGMAS * sigma:
         return UNUSABLE, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     per_metre = predicted / distance
@@ -96,12 +83,6 @@ def beam_residual(
     if residual * residual > _GATE_VARIANCES * variance + (gate * per_metre) ** 2:
         return OFF, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     return FIT, residual, variance, per_metre, nx, ny, float(m)
-
-
-@cached_njit
-def _bin_at(x: float, y: float, heading: float) -> int:
-    """Bin of the direction to (x, y) [m] in map, at a heading [rad]."""
-    return math.floor((math.atan2(y, x) - heading) * BINS / (2.0 * math.pi)) % BINS
 
 
 @cached_njit
@@ -136,7 +117,7 @@ def accumulate(
     for i in range(0, scans.beams.counts[k], stride):
         if scans.beams.inverse[k, i] <= 0.0:
             continue
-        status, residual, variance, per_metre, nx, ny, m = beam_residual(scans, k, i, j, gate, True)
+        status, residual, variance, per_metre, nx, ny, m = beam_residual(scans, k, i, j, gate)
         if status != UNUSABLE:
             tried += 1
         if status != FIT:

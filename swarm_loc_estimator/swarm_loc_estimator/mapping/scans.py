@@ -95,7 +95,6 @@ _MAX_THIRD_SIGMAS = 2.2
 """Maximum distance of the mean of a third of a window from the line; beyond it the wall has a step."""
 _MIN_INCIDENCE = 0.15  # Minimum cosine between beam and normal
 _MAX_NORMAL_SIGMA = 0.08  # Maximum standard deviation of the normal of a usable line [rad]
-_END_BINS = 8  # Directions on each side of the end of a line in which beams may or may not meet it
 _RANGE_SIGMAS = 2.5  # Lines nearer to the laser's range than this are left out [sigma]
 
 
@@ -109,17 +108,15 @@ class Lines(NamedTuple):
     variance: FloatArray  # (k, BINS) of the line's inverse distance along the direction [1/m^2]
     turn: FloatArray  # (k, BINS) turn by odometry at which the direction was scanned [rad]
     normal_variance: FloatArray  # (k, BINS) of the direction of the normal [rad^2]
-    # (k, BINS) whether it is a line whose normal is accurate enough for scan matching
-    usable: NDArray[np.bool_]
-    ends: NDArray[np.bool_]  # (k, BINS) whether usable lines end next to the direction
+    usable: NDArray[np.bool_]  # (k, BINS) whether the normal is accurate enough for scan matching
 
 
 def no_lines(capacity: int) -> Lines:
     """Memory for the lines of `capacity` stops."""
     shape = (capacity, BINS)
     a, b, distance, variance, turn, normal = np.zeros((6, *shape))
-    kind, usable, ends = np.zeros(shape, dtype=np.int8), *np.zeros((2, *shape), dtype=bool)
-    return Lines(kind, a, b, distance, variance, turn, normal, usable, ends)
+    kind, usable = np.zeros(shape, dtype=np.int8), np.zeros(shape, dtype=bool)
+    return Lines(kind, a, b, distance, variance, turn, normal, usable)
 
 
 @cached_njit
@@ -151,11 +148,6 @@ def fit_lines(stop: int, ratio: float, max_range: float, beams: Beams, lines: Li
         elif seen > 0:
             lines.kind[stop, m] = POINT
             lines.distance[stop, m] = 1.0 / math.sqrt(sums[m, _YY] / seen)
-    lines.ends[stop] = False
-    for m in range(BINS):
-        if lines.usable[stop, m] != lines.usable[stop, m - 1]:
-            for near in range(m - _END_BINS, m + _END_BINS):
-                lines.ends[stop, near % BINS] = True
 
 
 @cached_njit

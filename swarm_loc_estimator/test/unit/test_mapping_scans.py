@@ -93,9 +93,7 @@ def test_beams_fit_the_lines_of_another_stop_where_both_are_true() -> None:
 def beam_at(found: Scans, change: FloatArray, beam: int) -> tuple[int, float, float, float]:
     """Fate of a beam, its line, its residual and variance, after a change of both stops (8,)."""
     states = found.states + change.reshape(2, 4)
-    fate, residual, variance, _, _, _, line = beam_residual(
-        found._replace(states=states), 0, beam, 1, 10.0, True
-    )
+    fate, residual, variance, _, _, _, line = beam_residual(found._replace(states=states), 0, beam, 1, 10.0)
     return fate, line, residual, variance
 
 
