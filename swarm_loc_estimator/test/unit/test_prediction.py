@@ -147,7 +147,7 @@ def test_a_camera_that_sways_forgets_its_yaw_and_keeps_its_variance() -> None:
         to(state, tracks, float(seconds))
     left = np.exp(-4.0 / 5.0)
     for found in (once, state):
-        np.testing.assert_allclose(found.parameter[0, CAMERA_YAW:], [0.03 * left, 0.01, 0.0], rtol=1e-9)
+        np.testing.assert_allclose(found.parameter[0, CAMERA_YAW:], [0.03 * left, 0.01, 0.0, 0.0], rtol=1e-9)
         wanted = [[1e-4 * left**2 + 4e-4 * (1.0 - left**2), 2e-5 * left], [2e-5 * left, 4e-4]]
         np.testing.assert_allclose(found.filter.covariance[3:, 3:], wanted, rtol=1e-9)
 
