@@ -123,6 +123,7 @@ def test_topics_have_other_names_for_all_robots_or_one(tmp_path: Path) -> None:
         ("localizer: {sorce: tf}", "'localizer.sorce' is not a known key; the nearest one is 'source'"),
         ("localizer: {source: ft}", "localizer.source = 'ft' must be one of pose,"),
         ("localizer: {latency_s: 3}", "localizer.latency_s = 3.0 must lie in [0, 2] s"),
+        (f"localizer: {{latency_s: -{10**400}}}", "localizer.latency_s = -inf must lie in [0, 2] s"),
     ],
 )
 def test_wrong_topics_and_localizers_are_refused(tmp_path: Path, text: str, said: str) -> None:
