@@ -359,3 +359,18 @@ def test_a_recording_without_messages_is_refused(tmp_path: Path, capsys: pytest.
         writer.add_topic("r1/odom", ODOMETRY)
     assert main(["--yes", str(tmp_path / "bag"), str(tmp_path / "swarm.yaml")]) == 1
     assert capsys.readouterr().err == "No robot was found: there is no message.\n"
+
+
+def test_what_a_cut_bag_has_lost_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = (BAGS / "pushbot_one" / "pushbot_one.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) // 2])
+    assert main(["--yes", str(tmp_path / "cut.mcap"), str(tmp_path / "swarm.yaml")]) == 0
+    assert "cut.mcap" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--use-sim-time", "--seconds=5"])
+def test_options_of_a_live_graph_are_refused_without_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    assert main(["--yes", option, str(BAGS / "pushbot_one"), str(tmp_path / "swarm.yaml")]) == 1
+    assert capsys.readouterr().err == "--seconds and --use-sim-time are for --live.\n"
