@@ -23,7 +23,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.messages.cdr import LASER, LASER_SCAN, RANGE, nanoseconds
-from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.common.yaml_tree import YamlTreeError, read_tree
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag, is_looked_at, lines_of, mounts_of
@@ -36,13 +36,7 @@ from swarm_loc_estimator.sensors.camera import CONTENT_BEARING, NO_DETECTIONS
 from swarm_loc_estimator.sensors.inputs import TRUTH, kinds
 from swarm_loc_estimator.sensors.localizers import BODY, SOURCES, BodyPose
 from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY
-from swarm_loc_estimator.swarm.error_models import (
-    MAX_OFFSET_S,
-    ClockModel,
-    FixModel,
-    OdometryModel,
-    RandomWalk,
-)
+from swarm_loc_estimator.swarm.error_models import ClockModel, FixModel, OdometryModel, RandomWalk
 from swarm_loc_estimator.swarm.ir_board import PACKAGED, IrPlatform, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.new_swarm import GYROSCOPE, KNOWN_ROBOTS, LIDAR
 from swarm_loc_estimator.swarm.swarm import (
@@ -78,7 +72,7 @@ _SPREAD_M = 0.15  # Greatest spread of the places of a marker by ground truth [m
 _MAX_PLANS = 50_000  # Assignments of radios to robots that are compared
 _NO_NOISE = 1.0  # Noise of a pair with few ranges [m]
 _CLEARER = 1.3  # Ratio of the noise of the second best one to that of the best, below which it is not sure
-_RADIO = re.compile(r"[1-9][0-9]{0,18}")  # Addresses of radios in topics
+_PAIR = re.compile(r"((?:.*\D)?)([1-9]\d{0,18})(\D+)([1-9]\d{0,18})(\D*)")  # Topics of two addresses
 _WALK = RandomWalk(position=0.01, heading=0.1)  # Of robots without odometry: 10 cm/s, 18 deg/s
 
 
@@ -211,12 +205,7 @@ def robot_topics(topics: Mapping[str, Heard]) -> dict[str, dict[str, str]]:
             if robot is not None:
                 found.setdefault(robot, {}).setdefault(kind.topic, name)
     for robot, used in found.items():
-        truth = [
-            name
-            for name, heard in topics.items()
-            if TRUTH in name and robot in map(_named, name.split("/"))
-            if any(same_type(heard.type, one.message_type) for one in SOURCES.values() if BODY in one.topic)
-        ]
+        truth = [name for name in topics if TRUTH in name and robot in map(_named, name.split("/"))]
         used.update({TRUTH: truth[0]} if truth else {})
     return dict(sorted(found.items(), key=lambda one: [int(n) if n.isdigit() else n for n in _parts(one[0])]))
 
@@ -320,6 +309,7 @@ def _facts(draft: _Draft) -> Iterator[str]:
             (arrival_ns, message.header, robot)
             for one, robot in zip(heard, names.values(), strict=True)
             for arrival_ns, message in decoded(one, _MIN_ROWS)[0]
+            if hasattr(message, "header")  # which ground truth in transforms has not
         ]
         if not stamped:
             continue
@@ -348,7 +338,8 @@ def _clocks(draft: _Draft) -> None:
             )
         elif own.any():
             late_ns[name] = float(np.median((rows.arrival_ns - rows.stamp_ns)[own]))
-    for name in [name for name, value in late_ns.items() if abs(value) > 1e9 * MAX_OFFSET_S]:
+    allows = number_specs(ClockModel)["offset_s"].allows
+    for name in [name for name, value in late_ns.items() if not allows(1e-9 * value)]:
         draft.ask(name, f"has stamps {1e-9 * late_ns.pop(name):.4g} s before they arrived", "Set its clock")
     far = {name: value for name, value in late_ns.items() if abs(value) > _HOUR_NS}
     for name in far:
@@ -593,21 +584,19 @@ def _radios(draft: _Draft) -> None:
 
 def _range_pairs(draft: _Draft) -> dict[tuple[int, int], Ranges]:
     """The ranges of topics of pairs by both addresses, in whose names the last two numbers are these."""
-    groups: dict[tuple[str, ...], dict[tuple[int, int], Heard]] = {}
+    groups: dict[str, dict[tuple[int, int], Heard]] = {}
     for name, heard in draft.topics.items():
         if same_type(heard.type, RANGE):
-            parts = _parts(name)
-            texts = (*parts[:-4], "{from}", *parts[-3:-2], "{to}", *parts[-1:])
-            known = len(parts) > 4 and RANGE_TOPIC.fullmatch("".join(texts))
-            if not known or any(not _RADIO.fullmatch(one) for one in (parts[-4], parts[-2])):
+            found = _PAIR.fullmatch(name)
+            pattern = "{0}{{from}}{2}{{to}}{4}".format(*found.groups()) if found else ""
+            if found is None or not RANGE_TOPIC.fullmatch(pattern):
                 problem = "has not two decimal numbers from 1 on for two radios"
                 draft.ask(name, problem, "Write range_topic and the radios' names, on a topic for each pair")
                 continue
-            groups.setdefault(texts, {})[int(parts[-4]), int(parts[-2])] = heard
+            groups.setdefault(pattern, {})[int(found[2]), int(found[4])] = heard
     if not groups:
         return {}
-    texts, topics = max(groups.items(), key=lambda one: len(one[1]))
-    draft.swarm["range_topic"] = "".join(texts)
+    draft.swarm["range_topic"], topics = max(groups.items(), key=lambda one: len(one[1]))
     return {
         pair: (np.array([_time_ns(*one) for one in some]), np.array([one.range for _, one in some]))
         for pair, heard in topics.items()

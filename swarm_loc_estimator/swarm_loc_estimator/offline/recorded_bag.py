@@ -121,10 +121,10 @@ class BagLocalizer:
     def remarks(self) -> tuple[str, ...]:
         """Sentences for the user."""
         drops = [f"{count} {reason}" for reason, count in sorted(self._health.drops.items())]
-        said = [f"Dropped messages of the localizer: {', '.join(drops)}."] if drops else []
-        if self._missing:
-            said.append(f"The bag holds no {self._type} of the localizer on {listed(self._missing)}.")
-        return tuple(said)
+        said = (f"Dropped messages of the localizer: {', '.join(drops)}.",) if drops else ()
+        return said + tuple(
+            f"The bag holds no {self._type} of the localizer on {one}." for one in self._missing
+        )
 
 
 class TruthReader:

@@ -160,8 +160,8 @@ def test_a_localizer_that_was_not_recorded_is_named(tmp_path: Path, output: str)
     recorded(tmp_path / "bag", "pose")
     localizer = Localizer(topic="/mocap/<body>/pose", output=output, bodies=BODIES)
     remarks = replay(tmp_path / "bag", Swarm(swarm("pose", "fix").robots, localizer=localizer)).remarks
-    names = "mocap/cf1/pose, mocap/cf2/pose"
-    assert f"The bag holds no geometry_msgs/msg/PoseStamped of the localizer on {names}." in remarks
+    for name in ("mocap/cf1/pose", "mocap/cf2/pose"):
+        assert f"The bag holds no geometry_msgs/msg/PoseStamped of the localizer on {name}." in remarks
 
 
 def test_odometry_is_no_localizer_at_the_same_time(tmp_path: Path) -> None:
