@@ -67,6 +67,8 @@ def main(options: argparse.Namespace) -> int:
     )
     if options.truth and len(options.bag) > 1:
         raise UserError("--truth is for one bag.")
+    if len({bag.resolve() for bag in options.bag}) < len(options.bag):
+        raise UserError(f"{', '.join(map(str, options.bag))}: a bag is given twice, which tells nothing new.")
     swarm = load_swarm(options.swarm or swarm_beside(options.bag[0]))
     with ProgressLine() as progress:
         truth = read_truth(options.truth, swarm)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import shlex
+import sys
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -246,6 +247,7 @@ def proposed_from(bag: Path | None, seconds: float, dialog: Dialog, *, use_sim_t
             evidence = listen(Swarm(), seconds, progress, "", is_wanted, use_sim_time=use_sim_time)
         else:
             evidence = of_heard.heard_in(bag, progress)
+    print(*evidence.remarks, sep="\n", end="\n" * bool(evidence.remarks), file=sys.stderr)
     known = _one_of(KNOWN_ROBOTS)
     folder = None if bag is None else bag if bag.is_dir() else bag.parent
     found = of_heard.proposed(evidence.topics, lambda likely: dialog.answer("type", likely, known), folder)
@@ -260,7 +262,7 @@ def proposed_from(bag: Path | None, seconds: float, dialog: Dialog, *, use_sim_t
         "files", type=Path, nargs="*", metavar="FILE", help="a bag, if any, and a .yaml to write (swarm.yaml)"
     ),
     argument("--live", action="store_true", help="describe what the running graph publishes"),
-    argument("--seconds", type=number_in(1.0, 3600.0, "s"), default=_LIVE_S, help="how long to listen to it"),
+    argument("--seconds", type=number_in(1.0, 3600.0, "s"), help=f"how long to listen to it ({_LIVE_S:g})"),
     argument("--use-sim-time", action="store_true", help="take time from /clock"),
     argument("--yes", action="store_true", help="ask nothing; take defaults where no option is given"),
     *(argument(f"--{name}", help=question) for name, question in QUESTIONS.items()),
@@ -272,6 +274,8 @@ def main(options: argparse.Namespace) -> int:
     paths = [one for one in options.files if is_description(one)] or [Path("swarm.yaml")]
     if len(bags) > (not options.live) or len(paths) > 1:
         raise UserError("new takes one bag at most, none with --live, and one .yaml file to write.")
+    if not options.live and (options.seconds or options.use_sim_time):
+        raise UserError("--seconds and --use-sim-time are for --live.")
     bag, path = bags[0] if bags else None, paths[0]
     if path.exists():
         raise UserError(f"{path} exists and is not overwritten.")
@@ -280,7 +284,7 @@ def main(options: argparse.Namespace) -> int:
     dialog = Dialog(given, asks=not options.yes)
     # from what was heard, or from answers
     if bag or options.live:
-        found = proposed_from(bag, options.seconds, dialog, use_sim_time=options.use_sim_time)
+        found = proposed_from(bag, options.seconds or _LIVE_S, dialog, use_sim_time=options.use_sim_time)
         swarm, asked = found.swarm, [f"? {one}" for one in found.asked]
         said = [f"From {bag or 'the running graph'}.", *found.facts, *asked]
         comment = "\n".join(part for line in said for part in textwrap.wrap(line, 100))

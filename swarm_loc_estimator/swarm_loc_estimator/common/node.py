@@ -26,7 +26,7 @@ from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescri
 from rclpy.clock import Clock, JumpThreshold
 from rclpy.clock_type import ClockType
 from rclpy.duration import Duration
-from rclpy.exceptions import ParameterException
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
@@ -285,7 +285,7 @@ def run_node(name: str, create: Callable[[], ConfiguredNode[Any]], *, leaves_at_
         node = create()
         stop.defer()
         return node.run(stop)
-    except (UserError, ParameterException) as error:
+    except (UserError, ParameterException, NameValidationException) as error:
         print(f"{name}: {error}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
@@ -509,7 +509,7 @@ class ManagedNode(LifecycleNodeMixin, ConfiguredNode[Parameters]):
         self.at_end(self._removal())
         try:
             step()
-        except (UserError, ParameterException) as error:
+        except (UserError, ParameterException, NameValidationException) as error:
             self._take_back(level)
             self._mistake = error
             if not self._starts_itself:

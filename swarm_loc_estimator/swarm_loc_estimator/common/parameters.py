@@ -38,7 +38,7 @@ class NumberSpec:
     def allows(self, value: float) -> bool:
         """Whether the value is finite and in range."""
         return (
-            math.isfinite(value)
+            -math.inf < value < math.inf  # also of whole numbers that no float holds
             and (self.low < value if self.above else self.low <= value)
             and value <= self.high
         )
@@ -89,7 +89,7 @@ class ParameterSpec:
             ParameterError: It has another type or is out of range.
         """
         if isinstance(self.default, float) and isinstance(value, int) and not isinstance(value, bool):
-            value = float(value)
+            value = float(str(value))  # infinite where float(value) overflows
         if isinstance(self.default, tuple) and isinstance(value, list | tuple):
             value = tuple(str(item) for item in value)
         if type(value) is not type(self.default):

@@ -23,7 +23,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.messages.cdr import LASER, LASER_SCAN, RANGE, nanoseconds
-from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.common.yaml_tree import YamlTreeError, read_tree
 from swarm_loc_estimator.doctor.doctor import evidence_of_bag, is_looked_at, lines_of, mounts_of
@@ -50,7 +50,7 @@ from swarm_loc_estimator.swarm.swarm import (
     SwarmError,
     UwbDevice,
 )
-from swarm_loc_estimator.swarm.swarm_file import NAME, RESERVED_NAMES, ROBOT
+from swarm_loc_estimator.swarm.swarm_file import NAME, RANGE_TOPIC, RESERVED_NAMES, ROBOT
 
 _BAG_S = 600.0
 _ODOM = "odom"
@@ -58,6 +58,7 @@ _NO_TRUTH = ("goal", "initialpose", "goal_pose")  # Topics with poses that are w
 _FIXED = ("map", "world")  # Frames of localizers, unless these say another one
 _HOUR_NS = 3_600_000_000_000
 _LEAST_HZ = 1.0  # Rarer poses are no ground truth
+_FAR_M = 1e8  # Places farther off are no measurements
 _MIN_ROWS = 20  # Least number of odometry messages, sightings of a marker, or ranges of a pair
 _FIRST_M, _MOVED_M = 2.0, 0.3
 """Distance from the start in which odometry is compared with ground truth, and least of it [m]."""
@@ -71,6 +72,7 @@ _SPREAD_M = 0.15  # Greatest spread of the places of a marker by ground truth [m
 _MAX_PLANS = 50_000  # Assignments of radios to robots that are compared
 _NO_NOISE = 1.0  # Noise of a pair with few ranges [m]
 _CLEARER = 1.3  # Ratio of the noise of the second best one to that of the best, below which it is not sure
+_PAIR = re.compile(r"((?:.*\D)?)([1-9]\d{0,18})(\D+)([1-9]\d{0,18})(\D*)")  # Topics of two addresses
 _WALK = RandomWalk(position=0.01, heading=0.1)  # Of robots without odometry: 10 cm/s, 18 deg/s
 
 
@@ -135,7 +137,8 @@ def proposed(
     heard = {name: one for name, one in topics.items() if one.messages}
     draft = _Draft(heard, robot_topics(heard))
     if not draft.used:
-        raise UserError(f"No robot was found: none of the topics {listed(sorted(heard))} is odometry.")
+        said = f"none of the topics {listed(sorted(heard))} is odometry" if heard else "there is no message"
+        raise UserError(f"No robot was found: {said}.")
     draft.swarm["topics"] = _renamed(draft.used)
     known_type = choose_type(likely_type(heard, draft.used))
     # robots with the sensors that they publish, their clocks, and the mounts by transforms
@@ -306,6 +309,7 @@ def _facts(draft: _Draft) -> Iterator[str]:
             (arrival_ns, message.header, robot)
             for one, robot in zip(heard, names.values(), strict=True)
             for arrival_ns, message in decoded(one, _MIN_ROWS)[0]
+            if hasattr(message, "header")  # which ground truth in transforms has not
         ]
         if not stamped:
             continue
@@ -334,6 +338,9 @@ def _clocks(draft: _Draft) -> None:
             )
         elif own.any():
             late_ns[name] = float(np.median((rows.arrival_ns - rows.stamp_ns)[own]))
+    allows = number_specs(ClockModel)["offset_s"].allows
+    for name in [name for name, value in late_ns.items() if not allows(1e-9 * value)]:
+        draft.ask(name, f"has stamps {1e-9 * late_ns.pop(name):.4g} s before they arrived", "Set its clock")
     far = {name: value for name, value in late_ns.items() if abs(value) > _HOUR_NS}
     for name in far:
         offset_s = -round(1e-9 * min(far.values()), 3)
@@ -367,7 +374,7 @@ def _bodies(draft: _Draft, source: str, names: Sequence[str], pattern: str) -> d
         by_arrival = bool(abs(np.median(stamps_ns[:, 1] - stamps_ns[:, 0])) > _HOUR_NS)
         stamp_ns, pose = stamps_ns[:, int(by_arrival)], np.array([one.pose for _, one in some])
         order = np.argsort(stamp_ns, kind="stable")
-        order = order[np.isfinite(pose[order]).all(axis=1)]
+        order = order[(np.abs(pose[order]) < _FAR_M).all(axis=1)]
         if order.size > _MIN_ROWS:
             track = Trajectory(stamp_ns[order], pose[order])
             found[body] = _Body(some[0][1].frame_id, by_arrival, track)
@@ -388,6 +395,7 @@ def _ground_truth(draft: _Draft) -> None:
             for name, heard in draft.topics.items()
             if same_type(heard.type, kind.message_type) and name not in taken and not name.endswith(_NO_TRUTH)
             if (len(heard.messages) - 1) * 1e9 > _LEAST_HZ * _spell_ns(heard)
+            if BODY not in kind.topic or "/" in name
         ]
         if not names:
             continue
@@ -447,7 +455,7 @@ def _starts(draft: _Draft) -> None:
         if name not in draft.tracks:
             draft.ask(name, "has an unknown start", "Write start, or leave it to the estimator")
             continue
-        own = select(rows, rows.robot == index)
+        own = select(rows, (rows.robot == index) & (np.abs(rows.pose) < _FAR_M).all(axis=1))
         own = select(own, np.argsort(own.stamp_ns, kind="stable"))
         true = draft.poses(own.robot, own.stamp_ns)
         odometry, true = own.pose[np.isfinite(true[:, 0])], true[np.isfinite(true[:, 0])]
@@ -576,20 +584,19 @@ def _radios(draft: _Draft) -> None:
 
 def _range_pairs(draft: _Draft) -> dict[tuple[int, int], Ranges]:
     """The ranges of topics of pairs by both addresses, in whose names the last two numbers are these."""
-    groups: dict[tuple[str, ...], dict[tuple[int, int], Heard]] = {}
+    groups: dict[str, dict[tuple[int, int], Heard]] = {}
     for name, heard in draft.topics.items():
         if same_type(heard.type, RANGE):
-            parts = _parts(name)
-            if len(parts) < 5 or any(one != str(int(one)) for one in (parts[-4], parts[-2])):
-                problem = "has not two decimal numbers for two radios"
-                draft.ask(name, problem, "Publish it on a topic for each pair, and write range_topic")
+            found = _PAIR.fullmatch(name)
+            pattern = "{0}{{from}}{2}{{to}}{4}".format(*found.groups()) if found else ""
+            if found is None or not RANGE_TOPIC.fullmatch(pattern):
+                problem = "has not two decimal numbers from 1 on for two radios"
+                draft.ask(name, problem, "Write range_topic and the radios' names, on a topic for each pair")
                 continue
-            texts = (*parts[:-4], "{from}", parts[-3], "{to}", parts[-1])
-            groups.setdefault(texts, {})[int(parts[-4]), int(parts[-2])] = heard
+            groups.setdefault(pattern, {})[int(found[2]), int(found[4])] = heard
     if not groups:
         return {}
-    texts, topics = max(groups.items(), key=lambda one: len(one[1]))
-    draft.swarm["range_topic"] = "".join(texts)
+    draft.swarm["range_topic"], topics = max(groups.items(), key=lambda one: len(one[1]))
     return {
         pair: (np.array([_time_ns(*one) for one in some]), np.array([one.range for _, one in some]))
         for pair, heard in topics.items()
@@ -606,22 +613,23 @@ def _time_ns(arrival_ns: int, message: Any) -> int:
 def _carriers(draft: _Draft, nodes: Sequence[int], pairs: Mapping[tuple[int, int], Ranges]) -> None:
     """Radios on robots: those whose ranges differ from distances by ground truth with the least noise."""
     robots = [*draft.tracks]
+    count, most = min(len(nodes), len(robots)), max(len(nodes), len(robots))
+    can_tell = count > 1 and math.perm(most, count) <= _MAX_PLANS
     errors = {
         (*pair, *two): _error(ranges, *(draft.tracks[robot] for robot in two))
-        for pair, ranges in pairs.items()
+        for pair, ranges in (pairs if can_tell else {}).items()
         for two in itertools.permutations(robots, 2)
     }
+    if not any(noise < _NO_NOISE for noise, _ in errors.values()):
+        problem = "measures ranges, but nothing shows which robot carries it"
+        draft.ask(f"radio {listed([*map(str, nodes)])}", problem, "Write uwb.address of the robots")
+        return
 
     def of_plan(plan: Plan) -> list[tuple[str, str, float, float]]:
         links = itertools.permutations(plan, 2)
         return [(r, q, *errors[a, b, r, q]) for (r, a), (q, b) in links if (a, b, r, q) in errors]
 
     # every assignment, from the least noise on
-    count, most = min(len(nodes), len(robots)), max(len(nodes), len(robots))
-    if count < 2 or math.perm(most, count) > _MAX_PLANS:
-        problem = "measures ranges, but nothing shows which robot carries it"
-        draft.ask(f"radio {listed([*map(str, nodes)])}", problem, "Write uwb.address of the robots")
-        return
     plans: list[Plan] = (
         [tuple(zip(robots, some, strict=True)) for some in itertools.permutations(nodes, count)]
         if len(nodes) >= len(robots)
@@ -638,7 +646,7 @@ def _carriers(draft: _Draft, nodes: Sequence[int], pairs: Mapping[tuple[int, int
     biases = np.linalg.lstsq(sides.reshape(-1, count), np.array([link[3] for link in links]), rcond=None)[0]
     sigma = float(np.median([link[2] for link in links])) if links else UwbDevice(1).range_sigma
     for (robot, node), bias in zip(plans[first], biases.tolist(), strict=True):
-        radio = UwbDevice(node, range_sigma=round(sigma, 3), range_bias=round(bias, 3))
+        radio = UwbDevice(node, range_sigma=max(round(sigma, 3), 0.001), range_bias=round(bias, 3))
         draft.robots[robot]["uwb"] = radio
     carried = listed([f"{robot} {node}" for robot, node in plans[first]])
     draft.facts.append(f"By ground truth, robots carry the radios {carried}, with these biases and noise.")

@@ -81,6 +81,7 @@ class BagLocalizer:
     def __init__(self, swarm: Swarm, recorded: Iterable[BagTopic]) -> None:
         self.topics: list[str] = []
         self.outputs: dict[str, BagTopic] = {}
+        self._missing: list[str] = []
         self._health = Health(lambda _: None)
         if (localizer := swarm.localizer) is None:
             return
@@ -89,6 +90,7 @@ class BagLocalizer:
         self._body_of = {topic.lstrip("/"): body for topic, body in self._robots.topics.items()}
         types = {topic.name: topic.type for topic in recorded}
         self.topics = [name for name in self._body_of if same_type(types.get(name, ""), self._type)]
+        self._missing = [name for name in self._body_of if name not in self.topics]
         kind = POSE_WITH_COVARIANCE if localizer.output == "fix" else POSE_STAMPED
         names = {robot: swarm.topic(robot, localizer.output) for robot in self._robots.robot_of.values()}
         self.outputs = {robot: BagTopic(name, kind) for robot, name in names.items()}
@@ -118,8 +120,11 @@ class BagLocalizer:
 
     def remarks(self) -> tuple[str, ...]:
         """Sentences for the user."""
-        said = [f"{count} {reason}" for reason, count in sorted(self._health.drops.items())]
-        return (f"Dropped messages of the localizer: {', '.join(said)}.",) if said else ()
+        drops = [f"{count} {reason}" for reason, count in sorted(self._health.drops.items())]
+        said = (f"Dropped messages of the localizer: {', '.join(drops)}.",) if drops else ()
+        return said + tuple(
+            f"The bag holds no {self._type} of the localizer on {one}." for one in self._missing
+        )
 
 
 class TruthReader:
@@ -275,6 +280,8 @@ def read_bag(
     known = [*ingest.handle_of, *truth_topics(swarm), *maps.topics]
     with BagReader(bag, renamed_topics(remap, swarm, known)) as reader:
         localizer = BagLocalizer(swarm, reader.topics)
+        if both := [name for name in localizer.topics if name in known]:
+            raise BagError(f"localizer.topic: {both[0]} is already a topic of another input.")
         truth = TruthReader(swarm, [*reader.topics, *localizer.outputs.values()])
         first_truth = len(ingest.topics)
         first_map = first_truth + len(truth.topics)

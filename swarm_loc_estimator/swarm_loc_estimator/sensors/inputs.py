@@ -112,10 +112,10 @@ def input_topics(swarm: Swarm, *, maps: bool = False) -> tuple[InputTopic, ...]:
     With `maps` also those that are of use to a mapper, or in a map that is not described.
 
     Raises:
-        UserError: `Swarm.topics` has a topic that is not read.
+        UserError: `Swarm.topics` has a topic that is not read, or two topics are the same.
     """
     known = {kind.topic for kind in kinds().values() if kind.of_each} | {TRUTH}
-    if unknown := [key for key in swarm.topics if key.rpartition("/")[2] not in known]:
+    if unknown := [key for key in swarm.topics if key.partition("/")[2] not in known]:
         raise UserError(f"topics has {unknown[0]}, but topics of robots are {', '.join(sorted(known))}.")
     of_robots = (
         InputTopic(swarm.topic(robot.name, kind.topic), kind, index, kind.expected_of(robot))
@@ -138,7 +138,10 @@ def input_topics(swarm: Swarm, *, maps: bool = False) -> tuple[InputTopic, ...]:
         for kind in kinds().values()
         if not kind.of_each
     )
-    return (*of_robots, *_of_pairs(swarm), *of_cameras, *of_swarm)
+    found = (*of_robots, *_of_pairs(swarm), *of_cameras, *of_swarm)
+    if twice := [name for name, count in Counter(one.name for one in found).items() if count > 1]:
+        raise UserError(f"{twice[0]} is the topic of two inputs: correct topics or range_topic.")
+    return found
 
 
 def _of_pairs(swarm: Swarm) -> Iterator[InputTopic]:

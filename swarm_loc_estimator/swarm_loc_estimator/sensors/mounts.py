@@ -36,7 +36,7 @@ _SECTIONS: Mapping[str, tuple[str, tuple[str, ...]]] = MappingProxyType(
 """Sensor -> section of the description with its mount, and the numbers of this mount."""
 _APART = MappingProxyType({"x": 0.03, "y": 0.03, "z": 0.03, "yaw": 0.09, "pitch": 0.09, "roll": 0.09})
 """Differences of a description from transforms that are named [m], [rad]."""
-_MAX_FRAMES, _MAX_CHAIN = 10_000, 50
+_MAX_FRAMES, _MAX_CHAIN, _FAR = 10_000, 50, 1e3  # Numbers of `_FAR` or more, or NaN, are no joint of a robot
 
 
 class _Joint(NamedTuple):
@@ -84,7 +84,7 @@ class Mounts:
             turn, place = one.transform.rotation, one.transform.translation
             quaternion = np.array([turn.x, turn.y, turn.z, turn.w])
             numbers = [*quaternion, place.x, place.y, place.z]
-            if np.isfinite(numbers).all() and quaternion.any() and len(joints) < _MAX_FRAMES:
+            if (np.abs(numbers) < _FAR).all() and quaternion.any() and len(joints) < _MAX_FRAMES:
                 parent, child = (name.lstrip("/") for name in (one.header.frame_id, one.child_frame_id))
                 joints.setdefault(child, _Joint(parent, _rotation(quaternion), np.array(numbers[4:])))
 

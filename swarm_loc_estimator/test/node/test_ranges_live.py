@@ -10,6 +10,7 @@ import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from nav_msgs.msg import Odometry
 from node_world import SECOND, T0_NS, Ros, newest_status, odometry_bytes, overrides, stamp_ns, values_of
+from rclpy.exceptions import InvalidTopicNameException
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import Range as PairRange
@@ -82,11 +83,11 @@ def test_ranges_on_topics_of_pairs_correct_a_start(ros: Ros, tmp_path: Path) -> 
     named = SWARM_YAML.replace("{address: 1,", "{address: 1, name: tag,").replace(
         "address: 16,", "address: 16, name: west,"
     )
-    path.write_text(f"{named}range_topic: /uwb/{{from}}/{{to}}/distance\n", encoding="utf-8")
+    path.write_text(f"{named}range_topic: /uwb/n_{{from}}/n_{{to}}/distance\n", encoding="utf-8")
     ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True)))
     clock = ros.tester.create_publisher(Clock, "/clock", 10)
     odometry = ros.tester.create_publisher(Odometry, "alpha/odom", 100)
-    names = {16: "uwb/tag/west/distance", 17: "uwb/17/tag/distance", 18: "uwb/tag/18/distance"}
+    names = {16: "uwb/n_tag/n_west/distance", 17: "uwb/n_17/n_tag/distance", 18: "uwb/n_tag/n_18/distance"}
     ranges = {a: ros.tester.create_publisher(PairRange, name, 10) for a, name in names.items()}
     poses = ros.listen(SwarmPoses, "swarm/poses")
     heard = ros.listen(DiagnosticArray, "/diagnostics")
@@ -105,4 +106,13 @@ def test_ranges_on_topics_of_pairs_correct_a_start(ros: Ros, tmp_path: Path) -> 
     (alpha,) = poses[-1].robots
     assert alpha.status == SwarmPose.STATUS_TRACKED
     assert (alpha.x, alpha.y) == pytest.approx((0.0, 0.0), abs=0.02)
-    assert values_of(newest_status(heard, "estimator: alpha"))["ranges received"] == "24"
+    assert values_of(newest_status(heard, "estimator: alpha"))["measurements used"] == "24"
+
+
+@pytest.mark.usefixtures("ros")
+def test_a_topic_that_ros_refuses_is_a_mistake_of_the_user(tmp_path: Path) -> None:
+    """Tokens of topics must not begin with a digit."""
+    path = tmp_path / "swarm.yaml"
+    path.write_text(f"{SWARM_YAML}range_topic: /uwb/{{from}}/{{to}}/distance\n", encoding="utf-8")
+    with pytest.raises(InvalidTopicNameException, match="must not start with a number"):
+        EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True))

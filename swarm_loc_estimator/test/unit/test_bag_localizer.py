@@ -17,7 +17,7 @@ from swarm_loc_estimator.offline.recorded_bag import unwatched
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.sensors.inputs import input_topics
 from swarm_loc_estimator.sensors.localizers import BODY, SOURCES
-from swarm_loc_estimator.swarm.swarm import Localizer, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Anchor, Localizer, Robot, Swarm, UwbDevice
 from swarm_loc_estimator.swarm.swarm_file import SwarmFileError, load_swarm, save_swarm
 
 BAG = Path(__file__).parents[3] / "bags" / "eight_five_robots"
@@ -123,6 +123,7 @@ def test_topics_have_other_names_for_all_robots_or_one(tmp_path: Path) -> None:
         ("localizer: {sorce: tf}", "'localizer.sorce' is not a known key; the nearest one is 'source'"),
         ("localizer: {source: ft}", "localizer.source = 'ft' must be one of pose,"),
         ("localizer: {latency_s: 3}", "localizer.latency_s = 3.0 must lie in [0, 2] s"),
+        (f"localizer: {{latency_s: -{10**400}}}", "localizer.latency_s = -inf must lie in [0, 2] s"),
     ],
 )
 def test_wrong_topics_and_localizers_are_refused(tmp_path: Path, text: str, said: str) -> None:
@@ -133,6 +134,38 @@ def test_wrong_topics_and_localizers_are_refused(tmp_path: Path, text: str, said
     assert said in str(error.value)
 
 
-def test_a_topic_that_nobody_reads_is_refused() -> None:
-    with pytest.raises(UserError, match=r"topics has r1/odm, but topics of robots are .*odom"):
-        input_topics(Swarm((Robot("r1"),), topics={"r1/odm": "x"}))
+@pytest.mark.parametrize("name", ["r1/odm", "r1/x/odom"])
+def test_a_topic_that_nobody_reads_is_refused(name: str) -> None:
+    with pytest.raises(UserError, match=rf"topics has {name}, but topics of robots are .*odom"):
+        input_topics(Swarm((Robot("r1"),), topics={name: "x"}))
+
+
+@pytest.mark.parametrize(
+    ("topics", "range_topic", "name"),
+    [
+        ({"r1/odom": "r2/odom"}, "", "r2/odom"),
+        ({"<robot>/odom": "x/<robot>", "r1/odom": "x/r2"}, "", "x/r2"),
+        ({}, "uwb/{from}{to}", "uwb/111"),
+    ],
+)
+def test_a_topic_of_two_inputs_is_refused(topics: dict[str, str], range_topic: str, name: str) -> None:
+    robots = (Robot("r1", uwb=UwbDevice(1)), Robot("r2", uwb=UwbDevice(12)))
+    anchors = (Anchor(11), Anchor(2))
+    with pytest.raises(UserError, match=rf"{name} is the topic of two inputs: correct topics or range_topic"):
+        input_topics(Swarm(robots, anchors=anchors, topics=topics, range_topic=range_topic))
+
+
+@pytest.mark.parametrize("output", ["fix", "ground_truth"])
+def test_a_localizer_that_was_not_recorded_is_named(tmp_path: Path, output: str) -> None:
+    recorded(tmp_path / "bag", "pose")
+    localizer = Localizer(topic="/mocap/<body>/pose", output=output, bodies=BODIES)
+    remarks = replay(tmp_path / "bag", Swarm(swarm("pose", "fix").robots, localizer=localizer)).remarks
+    for name in ("mocap/cf1/pose", "mocap/cf2/pose"):
+        assert f"The bag holds no geometry_msgs/msg/PoseStamped of the localizer on {name}." in remarks
+
+
+def test_odometry_is_no_localizer_at_the_same_time(tmp_path: Path) -> None:
+    recorded(tmp_path / "bag", "pose")
+    described = Swarm(swarm("pose", "fix").robots, localizer=Localizer("odometry", "/<body>/odom"))
+    with pytest.raises(UserError, match=r"localizer.topic: epuck1/odom is already a topic of another input"):
+        replay(tmp_path / "bag", described)

@@ -448,3 +448,9 @@ def test_a_wrong_description_with_a_start_is_mended_by_the_recording_alone() -> 
     assert not done.warning  # the half that begins where nobody has described is fitted, too
     before, after = (score([rerun(recording, one, TICK_S)]).position_rmse for one in (begin, done.swarm))
     assert after < 0.3 * before
+
+
+def test_a_bag_given_twice_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bag = Path(__file__).parents[3] / "bags" / "eight_one_robot_fast"
+    assert main([str(bag), f"{bag}/../{bag.name}", "--out", str(tmp_path / "swarm.yaml")]) == 1
+    assert "a bag is given twice, which tells nothing new." in capsys.readouterr().err

@@ -92,6 +92,16 @@ def test_frames_that_lead_nowhere_change_nothing() -> None:
         assert mounts_of(robot, {"scan": frame}, message).described().robots[0] == robot
 
 
+@pytest.mark.parametrize(("x", "w"), [(1e9, 1.0), (0.1, 1e200), (math.nan, 1.0), (0.1, math.inf)])
+def test_joints_that_are_none_change_nothing(x: float, w: float) -> None:
+    robot = Robot("a", lidar=LidarModel(range_sigma=0.01))
+    joint = {"translation": {"x": x}, "rotation": {"w": w, "z": w}}
+    header = {"frame_id": "base_link"}
+    one = {"header": header, "child_frame_id": "laser", "transform": joint}
+    mounts = mounts_of(robot, {"scan": "laser"}, encode({"transforms": [one]}, TRANSFORMS))
+    assert mounts.described().robots[0] == robot
+
+
 def test_cameras_and_imus_have_their_own_axes() -> None:
     """An optical frame looks along its z axis; of an IMU only what is level matters."""
     robot = Robot("a", camera=CameraMount(), imu=ImuModel(turn_noise_density=0.01))

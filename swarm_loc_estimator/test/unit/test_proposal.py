@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -12,7 +13,14 @@ from swarm_loc_estimator.cli.new import main
 from swarm_loc_estimator.cli.replay import main as replay_main
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.bags.writer import BagWriter
-from swarm_loc_estimator.common.messages.cdr import ODOMETRY, POSE_STAMPED, RANGE, TRANSFORMS, encode
+from swarm_loc_estimator.common.messages.cdr import (
+    ODOMETRY,
+    POSE_STAMPED,
+    POSE_WITH_COVARIANCE,
+    RANGE,
+    TRANSFORMS,
+    encode,
+)
 from swarm_loc_estimator.common.messages.poses import UNKNOWN_COVARIANCE, encode_odometry, encode_pose_stamped
 from swarm_loc_estimator.doctor.proposal import Proposal, heard_in, proposed
 from swarm_loc_estimator.offline.recorded_bag import unwatched
@@ -260,3 +268,109 @@ def test_a_recording_without_robots_is_refused(tmp_path: Path, capsys: pytest.Ca
     assert main(["--yes", str(tmp_path / "bag"), str(tmp_path / "swarm.yaml")]) == 1
     assert "No robot was found: none of the topics tf is odometry." in capsys.readouterr().err
     assert not (tmp_path / "swarm.yaml").exists()
+
+
+NAN, HUGE = float("nan"), 1e300
+START_NS, STEP_NS = 1_000_000_000_000, 50_000_000
+
+
+def odd(
+    bag: Path,
+    *,
+    x: float | None = None,
+    late_s: float = 0.0,
+    others: Mapping[str, tuple[str, float]] = MappingProxyType({}),
+) -> None:
+    """Two robots with odometry and ground truth, all x of r1 in its odometry being `x`, and other topics."""
+    with BagWriter(bag) as writer:
+        for name in ("r1", "r2"):
+            writer.add_topic(f"{name}/odom", ODOMETRY)
+            if f"{name}/ground_truth" not in others:
+                writer.add_topic(f"{name}/ground_truth", POSE_STAMPED)
+        for name, (kind, _) in others.items():
+            writer.add_topic(name, kind)
+        for k in range(100):
+            stamp_ns = np.array([START_NS + k * STEP_NS])
+            at_ns = int(stamp_ns[0]) + round(late_s * 1e9)
+            for side, name in enumerate(("r1", "r2")):
+                pose = np.array([[0.02 * k, 2.0 * side, 0.0]])
+                said = pose if x is None or side else np.array([[x, 0.0, 0.0]])
+                row = stamp_ns, said, np.zeros((1, 3)), *[UNKNOWN_COVARIANCE] * 2
+                writer.write(f"{name}/odom", at_ns, encode_odometry("odom", "base_link", *row)[0])
+                if f"{name}/ground_truth" not in others:
+                    data = encode_pose_stamped("map", stamp_ns, pose)[0]
+                    writer.write(f"{name}/ground_truth", at_ns, data)
+            for name, (kind, value) in others.items():
+                fields: dict[str, object] = {"header": {"stamp": int(stamp_ns[0]), "frame_id": "map"}}
+                fields |= {"range": value, "max_range": 50.0} if kind == RANGE else {}
+                writer.write(name, at_ns, encode({} if kind == TRANSFORMS else fields, kind))
+
+
+@pytest.mark.parametrize("x", [NAN, HUGE])
+def test_odometry_that_is_no_measurement_tells_no_start(tmp_path: Path, x: float) -> None:
+    odd(tmp_path / "bag", x=x)
+    assert main(["--yes", str(tmp_path / "bag"), str(tmp_path / "swarm.yaml")]) == 0
+    first, second = load_swarm(tmp_path / "swarm.yaml").robots
+    assert first.start == pytest.approx((0.0, 0.0, 0.0))
+    assert second.start == pytest.approx((0.0, 2.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [("r1/ground_truth", TRANSFORMS), ("pose", POSE_STAMPED), ("amcl_pose", POSE_WITH_COVARIANCE)],
+)
+def test_poses_on_topics_of_no_body_are_passed_over(tmp_path: Path, name: str, kind: str) -> None:
+    odd(tmp_path / "bag", others={name: (kind, 0.0)})
+    assert main(["--yes", str(tmp_path / "bag"), str(tmp_path / "swarm.yaml")]) == 0
+    assert load_swarm(tmp_path / "swarm.yaml").localizer is None
+
+
+def test_a_clock_of_1970_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    odd(tmp_path / "bag", late_s=1.76e9)
+    assert main(["--yes", str(tmp_path / "bag"), str(tmp_path / "swarm.yaml")]) == 0
+    assert "r1, r2: each has stamps 1.76e+09 s before they arrived. Set its clock." in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    "name", ["uwb/0/1", f"uwb/{10**24}/1", "uwb{}/1/2", "uwb{x}/1/2", "a.b/1/2", "uwb/1"]
+)
+def test_ranges_on_topics_of_other_patterns_are_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    odd(tmp_path / "bag", others={name: (RANGE, 2.0)})
+    assert main(["--yes", str(tmp_path / "bag"), str(tmp_path / "swarm.yaml")]) == 0
+    assert f"{name} has not two decimal numbers from 1 on for two radios." in capsys.readouterr().out
+    assert load_swarm(tmp_path / "swarm.yaml").range_topic == ""
+
+
+@pytest.mark.parametrize(("distance", "carried"), [(2.0, True), (NAN, False), (1e30, False)])
+def test_radios_are_given_to_robots_by_their_ranges_alone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], distance: float, carried: bool
+) -> None:
+    odd(tmp_path / "bag", others={"uwb/1/2": (RANGE, distance)})
+    assert main(["--yes", str(tmp_path / "bag"), str(tmp_path / "swarm.yaml")]) == 0
+    said = "radio 1, 2 measures ranges, but nothing shows which robot carries it"
+    assert (said not in capsys.readouterr().out) == carried
+    assert all((robot.uwb is not None) == carried for robot in load_swarm(tmp_path / "swarm.yaml").robots)
+
+
+def test_a_recording_without_messages_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with BagWriter(tmp_path / "bag") as writer:
+        writer.add_topic("r1/odom", ODOMETRY)
+    assert main(["--yes", str(tmp_path / "bag"), str(tmp_path / "swarm.yaml")]) == 1
+    assert capsys.readouterr().err == "No robot was found: there is no message.\n"
+
+
+def test_what_a_cut_bag_has_lost_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data = (BAGS / "pushbot_one" / "pushbot_one.mcap").read_bytes()
+    (tmp_path / "cut.mcap").write_bytes(data[: len(data) // 2])
+    assert main(["--yes", str(tmp_path / "cut.mcap"), str(tmp_path / "swarm.yaml")]) == 0
+    assert "cut.mcap" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--use-sim-time", "--seconds=5"])
+def test_options_of_a_live_graph_are_refused_without_one(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
+) -> None:
+    assert main(["--yes", option, str(BAGS / "pushbot_one"), str(tmp_path / "swarm.yaml")]) == 1
+    assert capsys.readouterr().err == "--seconds and --use-sim-time are for --live.\n"
