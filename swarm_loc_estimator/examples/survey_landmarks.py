@@ -20,8 +20,11 @@ found = survey(read_recording(bag, unknown), unknown).swarm
 
 print("   id    x [m]    y [m]   sigma [m]   from swarm.yaml [m]")
 places, away = {one.id: one for one in described.landmarks}, []
+shared = found.map_error  # what all places have in common: the frame is as good as the starts
 for mark in found.landmarks:
     known = places[mark.id]
     away.append(np.hypot(mark.x - known.x, mark.y - known.y))
-    print(f"{mark.id:5} {mark.x:8.3f} {mark.y:8.3f} {mark.position_sigma:11.4f} {away[-1]:12.4f}")
+    turned = np.hypot(shared.yaw_sigma, shared.scale_sigma) * np.hypot(mark.x - shared.x, mark.y - shared.y)
+    sigma = np.sqrt(mark.position_sigma**2 + shared.position_sigma**2 + turned**2)
+    print(f"{mark.id:5} {mark.x:8.3f} {mark.y:8.3f} {sigma:11.4f} {away[-1]:12.4f}")
 print(f"{len(away)} of {len(places)} landmarks, RMS {np.sqrt(np.mean(np.square(away))):.4f} m")
