@@ -155,13 +155,15 @@ class CommandKind(IntEnum):
 
     SET_POSE = 1  # set it to `pose` in map with `covariance`
     FORGET = 2  # deinitialize it
+    NEW_MAP = 3  # search and match all robots in another map from now on
 
 
 class Command(NamedTuple):
-    """A command of a user, executed at its stamp, after the measurements of that instant."""
+    """A command of a user, or a new map, executed at its stamp, after the measurements of that instant."""
 
     stamp_ns: int
     kind: CommandKind
     robot: int
     pose: FloatArray  # (3,) in map
     covariance: FloatArray  # (3, 3) of the pose
+    map: Any = None  # of `map_search.SearchMap`

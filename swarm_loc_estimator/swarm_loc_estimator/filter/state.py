@@ -296,6 +296,7 @@ class SwarmState:
         next_attempt_ns: (N, 2) earliest instant of the next attempt to initialize the robot with them.
         images: Memory of aerial images; None before the first.
         delays: What is known of the delays of lidars, by robot, see `sensors/lidar.py`.
+        map: The known map of lidars, of `map_search.SearchMap`; None: there is none yet.
         places: Where robots with lidars that are not located may be in the map, see `map_search.py`.
         origin: Robot whose pose was the origin when a local frame began, see `initializer.py`; IN_MAP: none.
         frame_moves: How often all poses have moved from a local frame to `map`.
@@ -330,6 +331,7 @@ class SwarmState:
         self.next_attempt_ns: NDArray[np.int64] = np.full((robots, 2), NEVER_NS)
         self.images: IdentityMemory | None = None
         self.delays: dict[int, Any] = {}  # of `lidar.DelayBelief`
+        self.map: Any = None  # of `map_search.SearchMap`
         self.places: dict[int, Any] = {}  # of `map_search.PossiblePlaces`
         self.origin, self.frame_moves, self.meetings = IN_MAP, 0, Meetings()
         self.lost_why: IntArray = np.zeros(robots, dtype=np.int64)

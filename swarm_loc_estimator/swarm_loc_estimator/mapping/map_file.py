@@ -17,14 +17,17 @@ from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.common.parameters import NumberSpec, UserError
 from swarm_loc_estimator.common.yaml_tree import read_file, read_tree, write_tree
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
+from swarm_loc_estimator.mapping.messages import GridMessage
 
 _OCCUPIED, _FREE, _UNKNOWN = 0, 254, 205
 _OCCUPIED_THRESHOLD, _FREE_THRESHOLD = 0.65, 0.196
 _MODES = ("trinary", "scale", "raw")
 _MAX_BYTES = 200_000_000
-_MAX_CELLS = 50_000_000  # Maximum number of cells: 400 MB, or 141 x 141 m with cells of 2 cm
+MAX_CELLS = 50_000_000  # Maximum number of cells: 400 MB, or 141 x 141 m with cells of 2 cm
+RESOLUTION = NumberSpec("m", 1e-4, 10.0, False, "side of a pixel")
+PLACE = NumberSpec("m", -1e8, 1e8, False, "of the lower left corner")
 _NUMBERS = {
-    "resolution": NumberSpec("m", 1e-4, 10.0, False, "side of a pixel"),
+    "resolution": RESOLUTION,
     "occupied_thresh": NumberSpec("1", 0.0, 1.0, False, "cells above are occupied"),
     "free_thresh": NumberSpec("1", 0.0, 1.0, False, "cells below are free"),
 }
@@ -36,7 +39,6 @@ _SIZE = 2 * (_SEPARATOR + rb"(\d{1,9})")
 _PNM = re.compile(rb"P(?:[14]" + _SIZE + rb"|[2356]" + _SIZE + _SEPARATOR + rb"\d+)\s")
 _PLAIN_BYTES = 16  # Maximum number of characters of a number in a plain PNM, with the space around it
 _FORMATS = ("PPM", "PNG", "BMP")  # Other decoders of Pillow start programs, or have seen less care
-_PLACE = NumberSpec("m", -1e8, 1e8, False, "of the lower left corner")
 
 
 class MapFileError(UserError):
@@ -78,7 +80,7 @@ def load_map(path: Path, cell: float | None = None) -> OccupancyMap:
     about = {"occupied_thresh": _OCCUPIED_THRESHOLD, "free_thresh": _FREE_THRESHOLD, **given}
     numbers = {name: checks.number(about[name], name, spec) or 0.0 for name, spec in _NUMBERS.items()}
     places = checks.items(about["origin"], "origin")
-    origin = [checks.number(value, "origin", _PLACE) or 0.0 for value in places]
+    origin = [checks.number(value, "origin", PLACE) or 0.0 for value in places]
     if len(origin) != 3 or abs(origin[2]) > _MAX_YAW:
         raise checks.error("origin", about["origin"], "must be x, y and a yaw of 0")
     mode, negate = about.get("mode", "trinary"), about.get("negate", 0)
@@ -104,6 +106,38 @@ def load_map(path: Path, cell: float | None = None) -> OccupancyMap:
     return OccupancyMap(corner, cell, np.ascontiguousarray(log_odds[::-1].T))
 
 
+def map_of_message(grid: GridMessage) -> OccupancyMap:
+    """The map of a message, with map_server's usual thresholds; one that is turned is resampled.
+
+    Raises:
+        MapFileError: No cell is occupied, none is free, or it has too many cells once it is turned back.
+    """
+    occupied = grid.cells > 100.0 * _OCCUPIED_THRESHOLD
+    free = (grid.cells >= 0) & (grid.cells < 100.0 * _FREE_THRESHOLD)
+    if not (occupied.any() and free.any()):
+        raise MapFileError("The map has no cell that is occupied, or none that is free.")
+    log_odds = (LOG_ODDS_CAP * (occupied.astype(np.int8) - free.astype(np.int8))).T
+    x, y, yaw = grid.origin
+    cell, corner = float(str(np.float32(grid.resolution))), np.array([x, y])  # decimals, as in a file
+    if abs(yaw) <= _MAX_YAW:
+        return OccupancyMap(corner, cell, np.ascontiguousarray(log_odds))
+    # a grid along the axes of `map` around it, whose cells have the value of the turned one at their centres
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    turn = np.array([[cos, sin], [-sin, cos]])  # rows times it are turned into `map`
+    ends = np.array([[0, 0], [1, 0], [0, 1], [1, 1]]) * log_odds.shape @ turn
+    low = np.floor(ends.min(axis=0))
+    nx, ny = (np.ceil(ends.max(axis=0)) - low).astype(np.int64).tolist()
+    if nx * ny > MAX_CELLS:
+        raise MapFileError(f"The map has {nx * ny} cells once it is turned but may have {MAX_CELLS}.")
+    turned = np.zeros((nx, ny))
+    for i in range(nx):
+        centres = np.column_stack([np.full(ny, i + 0.5), np.arange(ny) + 0.5]) + low
+        cells = np.floor(centres @ turn.T).astype(np.int64)
+        inside = ((cells >= 0) & (cells < log_odds.shape)).all(axis=1)
+        turned[i, inside] = log_odds[tuple(cells[inside].T)]
+    return OccupancyMap(corner + low * cell, cell, turned)
+
+
 def _log_odds(shade: NDArray[np.int64], mode: str, free: float, occupied: float) -> FloatArray:
     """Log odds (256,) of pixel values, from their darkness or occupancy in percent (256,)."""
     if mode == "raw":
@@ -121,10 +155,8 @@ def _log_odds(shade: NDArray[np.int64], mode: str, free: float, occupied: float)
 def _resampled(log_odds: FloatArray, scale: float, checks: TreeChecks) -> FloatArray:
     """Log odds (height, width), the last row lowest, scaled by nearest neighbour."""
     height, width = (max(1, round(size / scale)) for size in log_odds.shape)
-    if height * width > _MAX_CELLS:
-        raise checks.said(
-            f"the map has {height * width} cells of the mapper's size but may have {_MAX_CELLS}"
-        )
+    if height * width > MAX_CELLS:
+        raise checks.said(f"the map has {height * width} cells of the mapper's size but may have {MAX_CELLS}")
     rows, columns = (
         np.minimum(((np.arange(count) + 0.5) * scale).astype(np.int64), size - 1)
         for count, size in zip((height, width), log_odds.shape, strict=True)
@@ -163,13 +195,13 @@ def _read_image(path: Path) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
         _check_header(data)
         with Image.open(io.BytesIO(data), formats=_FORMATS) as opened:
             image: Any = opened
-            small_enough = 0 < image.width * image.height <= _MAX_CELLS
+            small_enough = 0 < image.width * image.height <= MAX_CELLS
             if small_enough and image.mode.startswith("I"):  # 16 bits, which `convert` would cut off
                 image = Image.fromarray((np.asarray(image) / 257.0).astype(np.uint8))
             gray: Any = image.convert("LA") if small_enough else None
     except Exception as error:  # decoders raise arbitrary exceptions for broken files
         raise MapFileError(f"The image '{path}' of a map cannot be decoded: {error}.") from error
     if gray is None:
-        raise MapFileError(f"The image '{path}' of a map has more than {_MAX_CELLS} pixels.")
+        raise MapFileError(f"The image '{path}' of a map has more than {MAX_CELLS} pixels.")
     values = np.asarray(gray, dtype=np.uint8)
     return values[..., 0], values[..., 1] == 255

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Collection
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,14 +44,21 @@ class GridMessage(NamedTuple):
 def decode_occupancy_grid(data: bytes) -> GridMessage:
     """Read a nav_msgs/OccupancyGrid; raises CdrError unless the bytes are a valid one."""
     message = decode(data, OCCUPANCY_GRID)
-    header, about, cells = message.header, message.info, message.data
-    origin = planar_pose(about.origin)
-    if not 0 < cells.size <= MAX_CELLS or cells.size != about.width * about.height:
-        raise CdrError(f"a map of {about.width} x {about.height} cells has {cells.size} of them.")
-    if not (about.resolution > 0.0 and all(map(math.isfinite, (about.resolution, *origin)))):
+    about, count = message.info, message.data.size
+    if not 0 < count <= MAX_CELLS or count != about.width * about.height:
+        raise CdrError(f"a map of {about.width} x {about.height} cells has {count} of them.")
+    found = grid_message(message)
+    if not (found.resolution > 0.0 and all(map(math.isfinite, (found.resolution, *found.origin)))):
         raise CdrError("the place of a map is not finite.")
-    cells = cells.reshape(about.height, about.width)
-    return GridMessage(nanoseconds(header.stamp), header.frame_id, about.resolution, origin, cells)
+    return found
+
+
+def grid_message(message: Any) -> GridMessage:
+    """The map of a decoded nav_msgs/OccupancyGrid, which must have as many cells as it says."""
+    header, about = message.header, message.info
+    cells = message.data.reshape(about.height, about.width)
+    stamp_ns, origin = nanoseconds(header.stamp), planar_pose(about.origin)
+    return GridMessage(stamp_ns, header.frame_id, about.resolution, origin, cells)
 
 
 class LaserMessage(NamedTuple):

@@ -17,6 +17,7 @@ from swarm_loc_estimator.filter.models import SCAN
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.inputs import Ingest, InputStatistics, InputTopic
+from swarm_loc_estimator.sensors.map_topic import MapSensor
 from swarm_loc_estimator.swarm.swarm import FixedCamera, Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Contradiction, LossReport
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
@@ -335,7 +336,7 @@ def _patience_s(topic: InputTopic, robot: Robot | None, statistics: InputStatist
     """How long an input may be silent; detectors and infrared boards have periods of their own."""
     if topic.kind.name == "odometry" and robot is not None:
         return robot.odometry.timeout_s
-    if topic.kind.of_each and not topic.expected:
+    if (topic.kind.of_each and not topic.expected) or topic.kind.rows == MapSensor.name:
         return math.inf
     return max(_PATIENCE_S, _PATIENCE_PERIODS * 1e-9 * (statistics.mean_period_ns or 0.0))
 

@@ -52,7 +52,7 @@ from swarm_loc_estimator.sensors.inputs import Ingest, live_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator
-from swarm_loc_estimator.timeline.map_scans import walls_of
+from swarm_loc_estimator.timeline.map_search import described_map
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_msgs.srv import SetRobotPose
 
@@ -102,7 +102,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         if not is_precompiled(compiled):
             self.get_logger().info("compiling the estimator for this machine: one to three minutes")
         compiled()
-        walls_of(self._swarm)  # each activation reads them again; here they are refused or compiled for
+        described_map(self._swarm)  # each activation reads them again; here they are refused or compiled for
 
     def begin(self) -> None:
         """Estimate from scratch: what was known before a pause may be wrong by now."""

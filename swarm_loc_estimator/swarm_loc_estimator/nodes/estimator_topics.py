@@ -33,6 +33,7 @@ from swarm_loc_estimator.common.node import message_class
 from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.inputs import SENSORS, Ingest, InputTopic
+from swarm_loc_estimator.sensors.map_topic import MapSensor
 from swarm_loc_estimator.sensors.mounts import TF_STATIC, Mounts
 from swarm_loc_estimator.sensors.sensor import InputKind
 from swarm_loc_estimator.swarm.swarm import StartSigma, Swarm
@@ -149,7 +150,7 @@ class PoseCommands:
 _RATE_HZ, _FAST_HZ, _IMAGE_HZ = 100, 500, 30
 """Highest rate of a topic of which all messages within the horizon wait, that of odometry and turn rates,
 which are small unless they are of many robots, and that of images: their queues take most of the memory."""
-_LEAST_DEPTH, _MOST_DEPTH = 50, 1000
+_LEAST_DEPTH, _MOST_DEPTH, _MAPS = 50, 1000, 5  # and of maps, which are large
 _MAX_PER_TAKE = 5000  # Limit of messages per tick over all topics
 _MIN_PER_TOPIC = 100
 """Least limit per topic: the messages of the usual horizon. With less, an estimator that is late
@@ -165,6 +166,8 @@ _TF = QoSProfile(depth=100)  # what tf2's own broadcaster offers
 
 def queue_depth(kind: InputKind, horizon_s: float) -> int:
     """Length of the queue of a topic, which is emptied at each tick: what can be used after a long one."""
+    if kind.rows == MapSensor.name:
+        return _MAPS
     is_small = SENSORS[kind.rows].unit is None and not kind.stands_for
     rate_hz = _FAST_HZ if is_small else _IMAGE_HZ if kind.of_cameras else _RATE_HZ
     return min(max(_LEAST_DEPTH, round(rate_hz * horizon_s)), _MOST_DEPTH)
@@ -258,11 +261,16 @@ class EstimatorInputs:
     def _subscribe(self, handle: int, reliability: ReliabilityPolicy) -> Subscription:
         topic = self._topics[handle]
         follow = partial(self._hear_best_effort, handle, "is published best effort", "lost")
+        is_latched = topic.kind.rows == MapSensor.name and reliability is ReliabilityPolicy.RELIABLE
         return self._node.create_subscription(
             message_class(topic.kind.message_type),
             topic.name,
             lambda _: None,
-            QoSProfile(depth=queue_depth(topic.kind, 1e-9 * self._horizon_ns), reliability=reliability),
+            QoSProfile(
+                depth=queue_depth(topic.kind, 1e-9 * self._horizon_ns),
+                reliability=reliability,
+                durability=DurabilityPolicy.TRANSIENT_LOCAL if is_latched else DurabilityPolicy.VOLATILE,
+            ),
             raw=True,
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=follow),
         )

@@ -41,6 +41,7 @@ from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
 from swarm_loc_estimator.offline.result import RecordedMap, Spool
 from swarm_loc_estimator.sensors.inputs import TRUTH, Batch, Ingest, kinds
 from swarm_loc_estimator.sensors.localizers import SOURCES, LocalizedRobots
+from swarm_loc_estimator.sensors.map_topic import MapSensor
 from swarm_loc_estimator.sensors.mounts import TF_STATIC, Mounts
 from swarm_loc_estimator.swarm.swarm import Swarm
 
@@ -288,11 +289,15 @@ def read_bag(
         range_ns = reader.time_range_ns
         foreign = _foreign(reader.topics, ingest)
         names = ["" if name in foreign else name for name in known] + localizer.topics
+        if (map_here := ingest.handle_of.get(MapSensor.topic)) is not None:
+            names[first_map] = ""  # it is read once, for the estimator and for display
         for recorded in reader.batches(names):
             batch = localizer.converted(recorded, [*known, *localizer.topics])
             for inputs in ingest.read(network.passed(batch.chosen(batch.topic < first_truth))):
                 take(inputs)
             truth.add(_from(batch.chosen(batch.topic < first_map), first_truth))
+            if map_here is not None:
+                batch.topic[batch.topic == map_here] = first_map
             maps.add(_from(batch, first_map))
             progress(reader.progress, "reading")
         unusable = _unusable(reader.topics, ingest, swarm)

@@ -28,6 +28,7 @@ from swarm_loc_estimator.sensors.fix import FixSensor
 from swarm_loc_estimator.sensors.imu import TurnRateSensor
 from swarm_loc_estimator.sensors.infrared import BrightnessSensor
 from swarm_loc_estimator.sensors.lidar import ScanSensor
+from swarm_loc_estimator.sensors.map_topic import MapSensor
 from swarm_loc_estimator.sensors.odometry import OdometrySensor
 from swarm_loc_estimator.sensors.ranges import RangeSensor
 from swarm_loc_estimator.sensors.sensor import (
@@ -46,7 +47,7 @@ from swarm_loc_estimator.sensors.sensor import (
     reject_reasons,
 )
 from swarm_loc_estimator.swarm.error_models import MAX_OFFSET_S
-from swarm_loc_estimator.swarm.swarm import Radio, Swarm
+from swarm_loc_estimator.swarm.swarm import MAP_BY_TOPIC, Radio, Swarm
 
 SENSORS: dict[str, type[Sensor]] = {
     sensor.name: sensor
@@ -59,6 +60,7 @@ SENSORS: dict[str, type[Sensor]] = {
         RangeSensor,
         ScanSensor,
         AerialSensor,
+        MapSensor,
     )
 }
 """All sensors by name. Simultaneous measurements are fused in this order."""
@@ -136,7 +138,7 @@ def input_topics(swarm: Swarm, *, maps: bool = False) -> tuple[InputTopic, ...]:
     of_swarm = (
         InputTopic(kind.topic, kind, THE_SWARM, not kind.stands_for and kind.is_expected_of(swarm))
         for kind in kinds().values()
-        if not kind.of_each
+        if not kind.of_each and (swarm.map == MAP_BY_TOPIC or not kind.needs_map)
     )
     found = (*of_robots, *_of_pairs(swarm), *of_cameras, *of_swarm)
     if twice := [name for name, count in Counter(one.name for one in found).items() if count > 1]:
@@ -166,7 +168,7 @@ def live_topics(swarm: Swarm, *, shared: bool) -> tuple[InputTopic, ...]:
     return tuple(
         replace(topic, expected=topic.kind.is_expected_of(swarm)) if topic.kind.is_shared else topic
         for topic in input_topics(swarm)
-        if topic.kind.rows == "aerial" or topic.kind.is_shared or _is_sent(topic, swarm, stood_for)
+        if topic.robot == THE_SWARM or _is_sent(topic, swarm, stood_for)
     )
 
 

@@ -157,7 +157,7 @@ class InputKind:
     only_expected: bool = False  #: True if robots of which it is not expected have no such topic
     of_cameras: bool = False  #: True if each fixed camera has such a topic, too
     in_map: bool = False  #: True if readings must be in the frame `map`
-    needs_map: bool = False  #: True if there are such topics only for a swarm with a map
+    needs_map: bool = False  #: True if there are such topics only with a map; of the swarm: by topic
     stands_for: str = ""  #: Name of the sensor whose topics of single robots it replaces; "" if none
     of_pairs: bool = False  #: True if each pair of radios has a topic, see `Swarm.range_topic`
 
@@ -259,7 +259,9 @@ class Sensor:
     only_expected: ClassVar[bool] = False  #: True if robots of which it is not expected have no such topic
     of_cameras: ClassVar[bool] = False  #: True if each fixed camera has such a topic, too
     in_map: ClassVar[bool] = False  #: True if messages must be in the frame `map`
-    needs_map: ClassVar[bool] = False  #: True if there are such topics only for a swarm with a map
+    needs_map: ClassVar[bool] = (
+        False  #: True if there are such topics only with a map; of the swarm: by topic
+    )
 
     optional: ClassVar[Mapping[str, Any]] = {}  #: Values of columns that `rows` may lack
     #: Columns that group readings: a group is used or dropped as a whole. None: never dropped

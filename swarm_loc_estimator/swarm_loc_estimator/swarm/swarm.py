@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final, Literal
 
 from swarm_loc_estimator.common.codec import EntrySpec, address, entry, entry_specs, switch, word
 from swarm_loc_estimator.common.parameters import choice, flag, number, text, texts
@@ -317,6 +317,10 @@ class SwarmError(ValueError):
     """An inconsistent swarm."""
 
 
+MAP_BY_TOPIC: Final = "topic"
+"""`Swarm.map` of a swarm whose map comes on the topic `map`."""
+
+
 @dataclass(frozen=True)
 class Swarm:
     """All robots, landmarks, fixed cameras and UWB anchors, and the map of walls that lidars see.
@@ -330,7 +334,7 @@ class Swarm:
     landmarks: tuple[Landmark, ...] = ()
     cameras: tuple[FixedCamera, ...] = ()
     anchors: tuple[Anchor, ...] = ()
-    map: Path | None = None
+    map: Path | Literal["topic"] | None = None  #: File of the map of walls, or `MAP_BY_TOPIC`; None: no map
     #: Topic of the `sensor_msgs/Range` of two radios, in which {from} and {to} stand for their names; "":
     #: ranges come on `<robot>/ranges`
     range_topic: str = ""

@@ -47,6 +47,7 @@ from swarm_loc_estimator.swarm.ir_board import (
     load_ir_platform,
 )
 from swarm_loc_estimator.swarm.swarm import (
+    MAP_BY_TOPIC,
     Anchor,
     CameraMount,
     Face,
@@ -180,8 +181,8 @@ class _Loader(TreeChecks):
         shared = self.values(sections.get("map_error"), "map_error", entry_specs(MapError))
         name = sections.get("map")
         if name is not None and (not isinstance(name, str) or not name):
-            raise self.error("map", name, "must be the path of a map's .yaml file, from here")
-        file = None if name is None else (self._folder / name).resolve()
+            raise self.error("map", name, "must be the path of a map's .yaml file, from here, or topic")
+        file = name if name in (None, MAP_BY_TOPIC) else (self._folder / name).resolve()
         ranges = sections.get("range_topic")
         if ranges is not None and not (
             isinstance(ranges, str)
@@ -439,7 +440,7 @@ def _tree(swarm: Swarm, folder: Path) -> Layer:
         "range_topic": swarm.range_topic,
         "topics": dict(swarm.topics),
         "localizer": _unusual(swarm.localizer),
-        "map": None if swarm.map is None else relpath(swarm.map, folder),
+        "map": relpath(swarm.map, folder) if isinstance(swarm.map, Path) else swarm.map,
     }
     return {key: value for key, value in tree.items() if value}
 

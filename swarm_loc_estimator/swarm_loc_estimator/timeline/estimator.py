@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from swarm_loc_estimator.filter.measurements import (
+    NOBODY,
     Command,
     CommandKind,
     LossReason,
@@ -22,11 +23,13 @@ from swarm_loc_estimator.filter.measurements import (
 from swarm_loc_estimator.filter.models import CARTESIAN
 from swarm_loc_estimator.filter.state import IN_MAP, NEVER_NS
 from swarm_loc_estimator.identification.memory import Identities, Outcome
+from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.fix import about_robots
 from swarm_loc_estimator.sensors.imu import TurnRateRows, TurnRateSensor
 from swarm_loc_estimator.sensors.inputs import Batch, InputConverter
 from swarm_loc_estimator.sensors.lidar import ScanSensor, SweepStore
+from swarm_loc_estimator.sensors.map_topic import MapSensor
 from swarm_loc_estimator.sensors.odometry import OdometryRows, OdometrySensor
 from swarm_loc_estimator.sensors.sensor import REJECT_REASONS, Accumulator, Guard, reject_reasons
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -51,6 +54,7 @@ from swarm_loc_estimator.timeline.local_origin import (
     local_origin,
     readings_about,
 )
+from swarm_loc_estimator.timeline.map_search import placed_map
 from swarm_loc_estimator.timeline.self_calibration import learned, learns
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.sightings import Recent
@@ -90,6 +94,7 @@ class Estimator:
                 raise TypeError(f"{name} must be a {expected.__name__}, not {value!r}")
         self.settings = settings.resolved_for(swarm)
         self.time_jumps = 0
+        self._drawn: OccupancyMap | None = None  # the newest that came in place of the described one
         self._describe(swarm)
 
     def _describe(self, swarm: Swarm) -> None:
@@ -97,6 +102,8 @@ class Estimator:
         self.swarm = swarm
         # Poses are estimated about a local origin, which the first fix tells where no description does.
         self._origin = described_origin(swarm) if is_placed(swarm) else None
+        if self._origin is None and self._drawn is not None:
+            self._origin = local_origin(self._drawn.corner[None])
         self._seen = OriginOfFixes() if self._origin is None else None
         swarm = self._local = swarm if self._origin is None else about(swarm, self._origin)
         self._limits = TrackedLimits.of(swarm, self.settings)
@@ -104,6 +111,8 @@ class Estimator:
         self._converter = InputConverter(swarm, self.settings)
         self._sweeps = cast(SweepStore, self._converter.accumulators[ScanSensor.name])
         self._fusion = Fusion(swarm, self.settings, self._tracks, self._sweeps.sweeps)
+        if self._drawn is not None and self._origin is not None:
+            self._fusion.map = placed_map(self._drawn, self._origin)
         # a measurement is shifted from its stamp by half a period at most
         self._lookback_ns = self._tracks.lookback_ns + round(0.5e9 * self.settings.fusion_period_s)
         self._timeline = Timeline(
@@ -175,6 +184,9 @@ class Estimator:
                 self._odometry.append(rows)
             elif name == TurnRateSensor.name:
                 self._turn_rates.append(rows)
+            elif name == MapSensor.name:
+                for arrival_ns, drawn in zip(rows.arrival_ns.tolist(), rows.map, strict=True):
+                    self.use_map(arrival_ns, drawn)
             else:
                 accumulator = self._gathering[name] = self._converter.accumulators[name]
                 with Guard(name, rows.robot.size, self._converter.drops.total):
@@ -220,6 +232,19 @@ class Estimator:
             self._timeline.command(command)
             self._constant.forget(robot)
         return fault
+
+    def use_map(self, stamp_ns: int, drawn: OccupancyMap) -> None:
+        """Replace the map of lidars from an instant on; located robots stay, others are searched in it.
+
+        Raises:
+            MapFileError: It has no walls, or no free space.
+        """
+        if self._origin is None:
+            self._origin = local_origin(drawn.corner[None])
+        self._seen, self._drawn = None, drawn  # from now on the map tells the origin
+        self._fusion.map = placed_map(drawn, self._origin)
+        nobody = Command(stamp_ns, CommandKind.NEW_MAP, NOBODY, np.zeros(3), np.eye(3), self._fusion.map)
+        self._timeline.command(nobody)
 
     def forget(self, robot: int, stamp_ns: int) -> None:
         """Remove a robot from the estimate until a fix initializes it."""

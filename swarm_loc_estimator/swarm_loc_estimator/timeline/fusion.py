@@ -78,7 +78,7 @@ from swarm_loc_estimator.swarm.calibration_states import ParameterTable
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.aerial_images import PictureFusion, as_fixes, relieve_seen
 from swarm_loc_estimator.timeline.map_scans import MapScans, Sweeps
-from swarm_loc_estimator.timeline.map_search import MapSearch
+from swarm_loc_estimator.timeline.map_search import MapSearch, described_map
 from swarm_loc_estimator.timeline.robots_in_scans import RobotsInScans
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_estimator.timeline.timeline import middle_of_period
@@ -105,6 +105,7 @@ class Fusion:
     Attributes:
         is_sparse: True for a large swarm: only covariances of neighbours are kept.
         starts: Initializes robots at their configured starts.
+        map: The known map of states from the beginning; None: there is none.
     """
 
     def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks, sweeps: Sweeps) -> None:
@@ -122,8 +123,7 @@ class Fusion:
         self._local = LocalFrame(swarm, tracks, self._initializer, settings.origin_after_s)
         self._pictures = PictureFusion(swarm, settings, tracks)
         self._scans = MapScans(swarm, settings, tracks, sweeps)
-        walls = self._scans.walls
-        self._search = None if walls is None else MapSearch(walls, self._scans, swarm)
+        self._search, self.map = MapSearch(self._scans, swarm), described_map(swarm)
         self._sees_robots = [robot.lidar.sees_robots for robot in swarm.robots]
         self._others = RobotsInScans(swarm, settings, self._scans) if any(self._sees_robots) else None
         robots, surveyed = len(swarm.robots), len(swarm.surveyed)
@@ -138,7 +138,9 @@ class Fusion:
     def new_state(self) -> SwarmState:
         """Create the initial state, without localized robots."""
         joint: JointFilter | None = SparseFilter(self._table) if self.is_sparse else None
-        return SwarmState(self._table, self._pairs, joint)
+        state = SwarmState(self._table, self._pairs, joint)
+        state.map = self.map
+        return state
 
     def step(
         self,
@@ -237,7 +239,7 @@ class Fusion:
         """Fuse the scan (1,) of a lidar: the robots that it sees, then its place in the map."""
         self.starts.initialize_measured(state, one)
         robot, stamp_ns = int(one.target[0]), int(one.stamp_ns[0])
-        if self._search is not None and (state.origin != IN_MAP or not state.tracked[robot]):
+        if state.map is not None and (state.origin != IN_MAP or not state.tracked[robot]):
             found, verdicts[:] = self._search.place_of(state, one.row(0))
             if found is not None:
                 self._set_pose(state, robot, stamp_ns, found.pose, found.covariance)
@@ -253,7 +255,7 @@ class Fusion:
                 own = np.zeros(sighted.size, dtype=np.uint8), np.zeros(sighted.size)
                 self._fuse(state, sighted, *own)
                 verdicts[:] = Verdict.USED if (own[0] == Verdict.USED).any() else Verdict.UNASSIGNED
-        if self._search is None or not state.tracked[robot]:
+        if state.map is None or not state.tracked[robot]:
             return
         fix, verdicts[:], confirms = self._scans.fix_of(state, one.row(0), sweep)
         if fix is not None:
@@ -448,8 +450,12 @@ class Fusion:
             state.augment_all(poses)
 
     def _execute(self, state: SwarmState, command: Command) -> None:
-        """Set the pose of a robot, or deinitialize it."""
+        """Set the pose of a robot, or deinitialize it, or change the map."""
         robot, stamp_ns = command.robot, command.stamp_ns
+        if command.kind == CommandKind.NEW_MAP:
+            state.map = command.map
+            state.places.clear()
+            return
         if command.kind == CommandKind.FORGET:
             state.deinitialize(robot, LossReason.COMMAND, stamp_ns)
             if state.origin != IN_MAP and not state.tracked.any():

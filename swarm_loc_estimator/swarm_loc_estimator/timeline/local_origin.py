@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict, deque
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ PLACING = ("fixes", "aerial")  # Sensors whose readings are in `map`
 
 def is_placed(swarm: Swarm) -> bool:
     """Whether the description says any place in `map`."""
-    return bool(swarm.surveyed) or swarm.map is not None or any(one.start for one in swarm.robots)
+    return bool(swarm.surveyed) or isinstance(swarm.map, Path) or any(one.start for one in swarm.robots)
 
 
 def local_origin(places: FloatArray) -> FloatArray:
@@ -37,7 +38,7 @@ def described_origin(swarm: Swarm) -> FloatArray:
     """
     places: list[Any] = [robot.start[:2] for robot in swarm.robots if robot.start is not None]
     places += [(one.x, one.y) for one in swarm.surveyed]
-    if not places and swarm.map is not None:
+    if not places and isinstance(swarm.map, Path):
         places = [load_map(swarm.map).corner]
     return local_origin(np.array(places)) if places else np.zeros(2)
 

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -33,7 +32,7 @@ from swarm_loc_estimator.filter.models import CARTESIAN, POSE_GATE
 from swarm_loc_estimator.filter.sources import CONFIRMED, RELIEF
 from swarm_loc_estimator.filter.state import SwarmState, robot_columns
 from swarm_loc_estimator.mapping.grid import OccupancyMap
-from swarm_loc_estimator.mapping.map_file import MapFileError, load_map
+from swarm_loc_estimator.mapping.map_file import MapFileError
 from swarm_loc_estimator.mapping.messages import LidarSweep
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
 from swarm_loc_estimator.sensors.fix import about_robots
@@ -373,38 +372,20 @@ _ORDER_WEIGHT, _ORDER_NEWS = 10.0, 4.0
 Sweeps = Mapping[tuple[int, int], LidarSweep]  # Sweeps by robot and stamp of the first beam [ns]
 
 
-def walls_of(swarm: Swarm) -> WallMap | None:
-    """Read the map of a swarm, if it has one, and compile the matching before data come.
-
-    Raises:
-        UserError: The map cannot be read, or has no walls or no free space.
-    """
-    if swarm.map is None:
-        return None
-    drawn = load_map(swarm.map)
-    walls = wall_map(replace(drawn, corner=drawn.corner - swarm.origin), swarm.map)
-    match(walls, np.zeros((0, 2)), np.zeros(2), np.zeros(0), np.zeros(3), np.eye(3))
-    return walls
-
-
 class MapScans:
-    """Matches scans to the map of a swarm.
+    """Matches scans to the known map.
 
     Args:
-        swarm: The map, and robots with lidars.
+        swarm: Robots with lidars.
         settings: Thresholds of lost robots.
         tracks: Odometry of the robots.
         sweeps: Sweeps by robot and stamp.
-
-    Raises:
-        UserError: The map cannot be read, or has no walls or no free space.
     """
 
     def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks, sweeps: Sweeps) -> None:
         self.tracks, self._sweeps = tracks, sweeps
         self._lidars = [robot.lidar for robot in swarm.robots]
         self._limits = TrackedLimits.of(swarm, settings)
-        self.walls = walls_of(swarm)
 
     def walls_of(self, walls: WallMap, robot: int) -> WallMap:
         """The map with the error that the description of a robot says."""
@@ -416,16 +397,14 @@ class MapScans:
         """Match a scan; returns its fix (1,), or None and why there is none, and if it confirms a start.
 
         Args:
-            state: Its fault scores are changed.
+            state: With a map; its fault scores are changed.
             one: Row of the scan, whose robot is located in the map.
             sweep: Its beams that may end at walls.
         """
         robot, stamp_ns = int(one.target), int(one.stamp_ns)
-        if self.walls is None:
-            return None, Verdict.NOT_LOCALIZED, False
         estimate = estimate_at(state, self.tracks.arrays, self._limits, stamp_ns)
         pose, covariance = estimate.poses[robot], estimate.covariances[robot]
-        walls = self.walls_of(self.walls, robot)
+        walls = self.walls_of(state.map.walls, robot)
         # The scan may be older than its stamp says.
         delay = state.delays.get(robot) or described_delay(self._lidars[robot].delay_s)
         best = int(delay.chance.argmax())

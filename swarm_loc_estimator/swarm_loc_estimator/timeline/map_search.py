@@ -12,6 +12,8 @@ Each scan goes on with a search by one part, so that it costs no more in a large
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -24,8 +26,10 @@ from swarm_loc_estimator.common.numerics import wrap
 from swarm_loc_estimator.common.se2 import between, compose, inverse, wrap_angle
 from swarm_loc_estimator.filter.measurements import Measurements, Verdict
 from swarm_loc_estimator.filter.state import SwarmState
+from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
+from swarm_loc_estimator.mapping.map_file import load_map
 from swarm_loc_estimator.sensors.lidar import described_delay
-from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm import MAP_BY_TOPIC, Swarm
 from swarm_loc_estimator.timeline.map_scans import (
     BLOCKED,
     FREE,
@@ -35,6 +39,7 @@ from swarm_loc_estimator.timeline.map_scans import (
     Match,
     WallMap,
     match,
+    wall_map,
 )
 
 # The constants are checked by `make bench-lidar`: three halls and a real map, 50 random starts each.
@@ -146,42 +151,63 @@ def search_map(walls: WallMap) -> SearchMap:
     return SearchMap(walls, away.astype(np.float32), near, places)
 
 
+def placed_map(drawn: OccupancyMap, origin: FloatArray, path: Path = Path(MAP_BY_TOPIC)) -> SearchMap:
+    """Prepare a map about an origin (2,); raises MapFileError if it has no walls or no free space."""
+    return search_map(wall_map(replace(drawn, corner=drawn.corner - origin), path))
+
+
+def described_map(swarm: Swarm) -> SearchMap | None:
+    """Read the map of a swarm, if it has a file, and compile what uses maps before data come.
+
+    Raises:
+        UserError: The map cannot be read, or has no walls or no free space.
+    """
+    if swarm.map is None:
+        return None
+    if isinstance(swarm.map, Path):
+        found = placed_map(load_map(swarm.map), np.array(swarm.origin), swarm.map)
+    else:
+        smallest = OccupancyMap(np.zeros(2), 1.0, np.array([[LOG_ODDS_CAP, -LOG_ODDS_CAP]]))
+        found = placed_map(smallest, np.zeros(2))
+    match(found.walls, np.zeros((0, 2)), np.zeros(2), np.zeros(0), np.zeros(3), np.eye(3))
+    ahead = np.zeros((1, 2))
+    _refined(found, ahead, _compared(found, ahead, PlaceSearch()))
+    return found if isinstance(swarm.map, Path) else None
+
+
 class MapSearch:
-    """Searches places in a map.
+    """Searches places in the known map.
 
     Args:
-        walls: The map.
         scans: What knows the beams of sweeps.
         swarm: The robots.
     """
 
-    def __init__(self, walls: WallMap, scans: MapScans, swarm: Swarm) -> None:
-        self._walls, self._scans, self._robots = walls, scans, swarm.robots
-        self._map = search_map(walls)
-        ahead = np.zeros((1, 2))  # compile before data come
-        _refined(self._map, ahead, _compared(self._map, ahead, PlaceSearch()))
+    def __init__(self, scans: MapScans, swarm: Swarm) -> None:
+        self._scans, self._robots = scans, swarm.robots
 
     def place_of(self, state: SwarmState, one: Measurements) -> tuple[FoundPlace | None, Verdict]:
         """Search the place of a robot that is not located, by its scan; returns it once it is found.
 
         Args:
-            state: What is known of places is changed.
+            state: With a map; what is known of places is changed.
             one: Row of the scan.
         """
         robot, stamp_ns, scans = int(one.target), int(one.stamp_ns), self._scans
         sweep, described = scans.sweep_of(one), self._robots[robot]
         if sweep is None or described.stands or not scans.tracks.has_started(robot, sweep.stamp_ns):
             return None, Verdict.NOT_LOCALIZED
-        before, walls = state.places.get(robot), scans.walls_of(self._walls, robot)
+        before, walls = state.places.get(robot), scans.walls_of(state.map.walls, robot)
+        known = state.map._replace(walls=walls)
         if before is not None and before.search is not None:
-            state.places[robot] = places = self._advanced(before, before.search, walls)
+            state.places[robot] = places = self._advanced(before, before.search, known)
             return None, _why_nowhere(places)
         delay = state.delays.get(robot) or described_delay(described.lidar.delay_s)
         if scans.turned(robot, sweep) > _SEARCH_TURN:
             return None, _why_nowhere(before)  # its delay and order of beams may be wrong
         sweep = sweep.backwards() if delay.backwards > 0.0 else sweep
         beams, now, _ = scans.beams(robot, stamp_ns, sweep, delay.lag_s, int(delay.chance.argmax()))
-        places, found = self._add(before, stamp_ns, SweptBeams.thinned(*beams), now, walls)
+        places, found = self._add(before, stamp_ns, SweptBeams.thinned(*beams), now, known)
         if found is not None:
             state.places.pop(robot, None)
             return found, Verdict.USED
@@ -194,7 +220,7 @@ class MapSearch:
         stamp_ns: int,
         beams: SweptBeams,
         track: FloatArray,
-        walls: WallMap,
+        known: SearchMap,
     ) -> tuple[PossiblePlaces, FoundPlace | None]:
         """Follow the places of a robot by a scan.
 
@@ -203,7 +229,7 @@ class MapSearch:
             stamp_ns: Stamp of the scan.
             beams: The scan.
             track: (3,) pose by odometry.
-            walls: The map, with the error of its walls.
+            known: The map, with the error of its walls.
 
         Returns:
             What is known then, and the place where the robot is, once it is found.
@@ -215,7 +241,7 @@ class MapSearch:
             pause_ns = min(max(_PAUSE_NS, 2 * paused_ns), _LONGEST_PAUSE_NS)
             look = Look(beams, track)
             begun = PossiblePlaces(np.zeros((0, 3)), np.zeros((0, 1)), (look,), stamp_ns, pause_ns)
-            return self._advanced(begun, PlaceSearch(), walls), None
+            return self._advanced(begun, PlaceSearch(), known), None
         away, turn = _moved(before.looks[-1].track, track)
         is_look = away >= _LOOK_M or turn >= _LOOK_TURN
         if not (is_look or before.is_sole):
@@ -224,7 +250,7 @@ class MapSearch:
         covariance = np.diag(
             [_SLIP[0] + _SLIP[2] * away, _SLIP[0] + _SLIP[2] * away, _SLIP[1] + _SLIP[2] * turn]
         )
-        found = [match(walls, *beams, compose(one, track), covariance**2) for one in before.transform]
+        found = [match(known.walls, *beams, compose(one, track), covariance**2) for one in before.transform]
         poses = np.array([one.pose for one in found])
         fits = np.column_stack([before.fits, [_fit(one) for one in found]])
         looks = (*before.looks, Look(beams, track))
@@ -244,21 +270,22 @@ class MapSearch:
         if len(kept) > 1 or not is_sure:
             return after if is_look else before, None
         if not after.is_complete:
-            return self._advanced(after, PlaceSearch(), walls), None
+            return self._advanced(after, PlaceSearch(), known), None
         if after.fits[0, 0] - after.fits[0, 1:].mean() > _DECLINE:  # the true place was not among all
             return nowhere, None
         return after, FoundPlace(best.pose, best.covariance + _START)
 
-    def _advanced(self, places: PossiblePlaces, search: PlaceSearch, walls: WallMap) -> PossiblePlaces:
+    @staticmethod
+    def _advanced(places: PossiblePlaces, search: PlaceSearch, known: SearchMap) -> PossiblePlaces:
         """Go on with a search by one part."""
-        looks, everywhere = places.looks, len(self._map.places)
+        looks, everywhere = places.looks, len(known.places)
         # compare the newest look with the map, at the first level, then at all others
         if search.compared < everywhere:
             points = _spread(looks[-1].beams.ends)
-            search = _compared(self._map, points, search) if len(points) else PlaceSearch(compared=everywhere)
+            search = _compared(known, points, search) if len(points) else PlaceSearch(compared=everywhere)
             if search.compared < everywhere:
                 return places._replace(search=search)
-            search = search._replace(poses=_refined(self._map, points, search))
+            search = search._replace(poses=_refined(known, points, search))
         # match all looks, the newest first, as long as they may explain hardly less than the known place
         least = float(places.fits.sum(axis=1).max(initial=-math.inf)) - _RULED_OUT
         now, matches, tried, transform, fits = inverse(looks[-1].track), 0, 0, [], []
@@ -266,7 +293,7 @@ class MapSearch:
             then = latest = compose(search.poses[tried], now)
             tried, own = tried + 1, np.ones(len(looks))
             for k in range(len(looks) - 1, -1, -1):
-                one = match(walls, *looks[k].beams, compose(then, looks[k].track), _SPREAD)
+                one = match(known.walls, *looks[k].beams, compose(then, looks[k].track), _SPREAD)
                 then, own[k], matches = compose(one.pose, inverse(looks[k].track)), _fit(one), matches + 1
                 latest = then if k == len(looks) - 1 else latest
                 if own.sum() < least:

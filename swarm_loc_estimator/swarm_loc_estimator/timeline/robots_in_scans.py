@@ -103,8 +103,8 @@ class RobotsInScans:
         covariances += (moved**2)[:, None, None] * np.eye(2)
         # discs, in `map`
         found = discs(ends, origin, variance, turned.angle[turned.seen], lidar.robot_radius)
-        if self._scans.walls is not None:  # pillars are no robots
-            at_walls = are_near_walls(self._scans.walls, transform_points(own, ends), _MARGIN_M)
+        if state.map is not None:  # pillars are no robots
+            at_walls = are_near_walls(state.map.walls, transform_points(own, ends), _MARGIN_M)
             found = found.without(at_walls & (found.disc >= 0))
         picture = _picture(found, origin, own, own_covariance)
         log_density = math.log(max(len(found.centre), 1) / (math.pi * turned.reach**2))

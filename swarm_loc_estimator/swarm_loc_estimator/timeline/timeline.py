@@ -23,7 +23,14 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit, inlined_njit
-from swarm_loc_estimator.filter.measurements import Command, Measurements, Verdict, concatenate, select
+from swarm_loc_estimator.filter.measurements import (
+    Command,
+    CommandKind,
+    Measurements,
+    Verdict,
+    concatenate,
+    select,
+)
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.timeline.settings import Settings
 
@@ -444,6 +451,8 @@ class Timeline:
     def _order(self, oldest_ns: int) -> None:
         """Insert new commands by their stamps."""
         for given in self._new_commands:
+            if given.kind == CommandKind.NEW_MAP:
+                given = given._replace(stamp_ns=max(given.stamp_ns, oldest_ns))  # noqa: PLW2901
             if given.stamp_ns < oldest_ns:
                 self.too_old += 1
                 continue

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import pytest
-from geometry_msgs.msg import TransformStamped
-from nav_msgs.msg import Odometry
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import Point, Pose, Quaternion, TransformStamped
+from nav_msgs.msg import MapMetaData, OccupancyGrid, Odometry
 from node_world import SECOND, T0_NS, Ros, odometry_bytes, overrides, stamp_ns
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
 from rclpy.time import Time
@@ -107,3 +109,51 @@ def test_a_mount_comes_from_static_transforms(ros: Ros, tmp_path: Path) -> None:
     turned = TransformStamped(header=Header(frame_id="alpha/base_link"), child_frame_id="alpha/base_scan")
     turned.transform.rotation.z = turned.transform.rotation.w = math.sqrt(0.5)
     stand_while_scans_come(ros, tmp_path, turned_by=BEAMS // 4, static=turned)
+
+
+def grid(*, x: float = -2.025, frame: str = "map") -> OccupancyGrid:
+    """The room as a message, with its left wall at an x."""
+    edges = {0, WIDTH - 1}
+    cells = [100 if k % WIDTH in edges or k // WIDTH in (0, HEIGHT - 1) else 0 for k in range(WIDTH * HEIGHT)]
+    corner = Pose(position=Point(x=x, y=-1.525), orientation=Quaternion(w=1.0))
+    about = MapMetaData(resolution=0.05, width=WIDTH, height=HEIGHT, origin=corner)
+    return OccupancyGrid(header=Header(frame_id=frame), info=about, data=cells)
+
+
+def test_a_map_by_topic_is_used_and_changed_at_run_time(ros: Ros, tmp_path: Path) -> None:
+    """One is published before the node starts; a later one, whose walls are elsewhere, contradicts alpha."""
+    path = tmp_path / "swarm.yaml"
+    path.write_text(SWARM_YAML.replace("floor.yaml", "topic"), encoding="utf-8")
+    latched = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+    maps = ros.tester.create_publisher(OccupancyGrid, "map", latched)
+    maps.publish(grid())
+    ros.add(EstimatorNode(parameter_overrides=overrides(swarm_file=str(path), use_sim_time=True)))
+    clock = ros.tester.create_publisher(Clock, "/clock", 10)
+    odometry = ros.tester.create_publisher(Odometry, "alpha/odom", 100)
+    scans = ros.tester.create_publisher(LaserScan, "alpha/scan", qos_profile_sensor_data)
+    poses, diagnostics = ros.listen(SwarmPoses, "swarm/poses"), ros.listen(DiagnosticArray, "/diagnostics")
+    ros.until(lambda: all(one.get_subscription_count() for one in (maps, clock, odometry, scans)))
+    ros.until(lambda: ros.tester.count_publishers("swarm/poses"))
+    steps = iter(range(1000))
+
+    def send_until(happened: Callable[[SwarmPose], bool]) -> SwarmPose:
+        """Send data until something has happened; returns alpha."""
+        for _ in range(1000):
+            now_ns, before = T0_NS + next(steps) * SECOND // 2, len(poses)
+            odometry.publish(odometry_bytes("alpha", now_ns))
+            scans.publish(scan_at(now_ns))
+            clock.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+            ros.until(partial(is_estimated, poses, before, now_ns))
+            alpha: SwarmPose = poses[-1].robots[0]
+            if happened(alpha):
+                return alpha
+        raise AssertionError(alpha)
+
+    alpha = send_until(lambda alpha: alpha.status == SwarmPose.STATUS_TRACKED)
+    assert (alpha.x, alpha.y, alpha.theta) == pytest.approx((0.0, 0.0, 0.0), abs=0.02)
+    said = "map is in frame 'odom' but must be in 'map'"
+    maps.publish(grid(frame="odom", x=-1.525))
+    alpha = send_until(lambda _: any(said in one.message for array in diagnostics for one in array.status))
+    assert alpha.status == SwarmPose.STATUS_TRACKED
+    maps.publish(grid(x=-1.525))
+    send_until(lambda alpha: alpha.status == SwarmPose.STATUS_WAITING)

@@ -225,7 +225,7 @@ class _SweepReader(TreeChecks):
 def _described(path: Path) -> tuple[Swarm, str]:
     """A swarm, and a hash of its description and map."""
     swarm = load_swarm(path)
-    return swarm, joblib.hash((swarm, None if swarm.map is None else load_map(swarm.map)))
+    return swarm, joblib.hash((swarm, load_map(swarm.map) if isinstance(swarm.map, Path) else None))
 
 
 def _storages(bag: Path) -> list[Path]:

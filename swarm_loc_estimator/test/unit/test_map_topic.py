@@ -1,0 +1,223 @@
+"""Maps of walls by topic: the same poses as by file, changes at run time, replay, refused messages."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from core_geometry import wrapped
+from mapping_world import NICHE, LidarRobot, room_map
+from test_lidar_in_map import CELL, hand_in, sent, swarm_at
+
+from swarm_loc_estimator.common.bags.writer import BagWriter
+from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, OCCUPANCY_GRID, ODOMETRY, encode
+from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
+from swarm_loc_estimator.mapping.map_file import load_map, map_of_message, save_map
+from swarm_loc_estimator.mapping.messages import decode_occupancy_grid
+from swarm_loc_estimator.offline.replay import replay
+from swarm_loc_estimator.swarm.swarm import Swarm
+from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
+from swarm_loc_estimator.timeline.estimator import Estimator, Status
+
+SECOND, MOVED = 1_000_000_000, np.array([1.0, 0.0])
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The map of the room as a file."""
+    return save_map(room_map(CELL), tmp_path_factory.mktemp("maps") / "room")[0]
+
+
+def map_bytes(drawn: OccupancyMap, yaw: float = 0.0, frame: str = "map", **others: Any) -> bytes:
+    """A map as map_server publishes it; `others` replaces fields of its metadata, and `data`."""
+    cells = np.where(drawn.occupied, 100, np.where(drawn.free, 0, -1)).astype(np.int8).T
+    x, y = drawn.corner.tolist()
+    turn = {"z": math.sin(0.5 * yaw), "w": math.cos(0.5 * yaw)}
+    about = {"resolution": drawn.cell, "width": cells.shape[1], "height": cells.shape[0]}
+    about["origin"] = {"position": {"x": x, "y": y}, "orientation": turn}
+    data = others.pop("data", cells.reshape(-1))
+    message = {"header": {"frame_id": frame}, "info": {**about, **others}, "data": data}
+    return encode(message, OCCUPANCY_GRID)
+
+
+def by_topic(start: Any = LidarRobot.start) -> Swarm:
+    """A robot whose map comes by topic; without a start if it is None."""
+    swarm = swarm_at(None, LidarRobot.start if start is None else start)
+    robot = swarm.robots[0] if start is not None else replace(swarm.robots[0], start=None)
+    return replace(swarm, robots=(robot,), map="topic")
+
+
+def without_niche() -> OccupancyMap:
+    """The room as a mere rectangle, which looks the same from its other end."""
+    whole = room_map(CELL)
+    odds, low, high = whole.log_odds.copy(), *whole.index(np.array([NICHE[:2], NICHE[2:]]))
+    odds[low[0] - 1 : high[0] + 2, low[1] + 1 :] = 0.0
+    odds[low[0] - 1 : high[0] + 2, low[1]] = LOG_ODDS_CAP
+    return replace(whole, log_odds=odds)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("has_start", [True, False])
+def test_poses_are_those_of_the_same_map_as_a_file(room: Path, seed: int, has_start: bool) -> None:
+    start = LidarRobot.start + np.random.default_rng(seed).standard_normal(3) * 0.03
+    by_message = by_topic(start if has_start else None)
+    messages = sent((3 if has_start else 9) * SECOND, seed, blocked=60)
+    file, topic = Estimator(replace(by_message, map=room)), Estimator(by_message)
+    expected = hand_in(file, messages)[-1]
+    found = hand_in(topic, [("map", 0, map_bytes(load_map(room))), *messages])[-1]
+    assert found.status[0] == Status.TRACKED
+    assert found.poses.tobytes() == expected.poses.tobytes()
+    assert found.covariances.tobytes() == expected.covariances.tobytes()
+
+
+@pytest.mark.parametrize("yaw", [0.3, -2.0, 0.5 * math.pi])
+def test_a_turned_map_is_turned_back(yaw: float) -> None:
+    """Its walls are within a cell of where they were, and all robots are within their covariance."""
+    drawn = room_map(CELL)
+    cos, sin = math.cos(-yaw), math.sin(-yaw)
+    # the same room, drawn along axes that are turned: corner and axes turn back by yaw
+    middle = drawn.corner + 0.5 * CELL * np.array(drawn.log_odds.shape)
+    size = 2 * math.ceil(math.hypot(*drawn.log_odds.shape) / 2.0) + 4
+    grid = (np.indices((size, size)).reshape(2, -1).T + 0.5 - 0.5 * size) * CELL
+    cells = drawn.index(grid @ np.array([[cos, -sin], [sin, cos]]) + middle)
+    inside = ((cells >= 0) & (cells < drawn.log_odds.shape)).all(axis=1)
+    odds = np.zeros(size * size)
+    odds[inside] = drawn.log_odds[tuple(cells[inside].T)]
+    half = 0.5 * size * CELL
+    corner = middle - np.array([cos * half + sin * half, -sin * half + cos * half])
+    turned = OccupancyMap(corner, CELL, odds.reshape(size, size))
+    back = map_of_message(decode_occupancy_grid(map_bytes(turned, yaw)))
+    walls, again = drawn.centres(drawn.occupied), back.centres(back.occupied)
+    apart = np.hypot(*(walls[:, None] - again[None]).transpose(2, 0, 1))
+    assert max(apart.min(axis=0).max(), apart.min(axis=1).max()) < 1.5 * CELL
+    estimate = hand_in(Estimator(by_topic()), [("map", 0, map_bytes(turned, yaw)), *sent(3 * SECOND, 1)])[-1]
+    assert estimate.status[0] == Status.TRACKED
+    assert np.abs(wrapped(estimate.poses[0] - LidarRobot().pose(3 * SECOND))).max() < CELL
+
+
+def test_cells_count_by_the_thresholds_of_map_server() -> None:
+    drawn = OccupancyMap(np.zeros(2), 0.5, np.zeros((8, 1)))
+    cells = np.array([-1, 0, 19, 20, 65, 66, 100, -2], dtype=np.int8)
+    found = map_of_message(decode_occupancy_grid(map_bytes(drawn, data=cells)))
+    assert found.occupied[:, 0].tolist() == [False] * 5 + [True, True, False]
+    assert found.free[:, 0].tolist() == [False, True, True, *[False] * 5]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_located_robot_stays_and_one_that_is_searched_begins_anew(seed: int) -> None:
+    """The first map has a place too many; in the second one there is only one."""
+    first, second = (("map", at, map_bytes(one)) for at, one in ((0, without_niche()), (1, room_map(CELL))))
+    messages = sent(12 * SECOND, seed)
+    late = (second[0], 5 * SECOND, second[2])
+    changed = sorted([first, *messages, late], key=lambda one: one[1])
+    searched = Estimator(by_topic(None))
+    estimates = hand_in(searched, changed)
+    assert {int(one.status[0]) for one in estimates if one.stamp_ns < 5 * SECOND} == {Status.WAITING}
+    assert estimates[-1].status[0] == Status.TRACKED
+    assert np.abs(wrapped(estimates[-1].poses[0] - LidarRobot().pose(12 * SECOND))).max() < 2.0 * CELL
+    located = hand_in(Estimator(by_topic()), changed)
+    before, after = [one for one in located if one.stamp_ns == 5 * SECOND][-2:]
+    assert before.status[0] == after.status[0] == Status.TRACKED
+    assert before.poses.tobytes() == after.poses.tobytes()
+    assert all(one.status[0] == Status.TRACKED for one in located if one.stamp_ns > 5 * SECOND)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_robot_in_a_map_that_has_moved_is_lost_and_found_in_the_new_one(seed: int) -> None:
+    drawn = room_map(CELL)
+    moved = ("map", 3 * SECOND, map_bytes(replace(drawn, corner=drawn.corner + MOVED)))
+    messages = [("map", 0, map_bytes(drawn)), *sent(16 * SECOND, seed), moved]
+    estimates = hand_in(Estimator(by_topic()), sorted(messages, key=lambda one: one[1]))
+    assert Status.WAITING in [one.status[0] for one in estimates if one.stamp_ns > 3 * SECOND]
+    assert estimates[-1].status[0] == Status.TRACKED
+    error = wrapped(estimates[-1].poses[0] - LidarRobot().pose(16 * SECOND) - [*MOVED, 0.0])
+    assert np.abs(error).max() < 2.0 * CELL
+
+
+def test_scans_that_come_late_are_matched_in_the_map_of_their_time() -> None:
+    """A map that is changed does not change what was before it."""
+    drawn, until_ns = room_map(CELL), 2 * SECOND
+    first, *others = [("map", 0, map_bytes(drawn)), *sent(until_ns, 1)]
+    moved = ("map", until_ns, map_bytes(replace(drawn, corner=drawn.corner + MOVED)))
+    late = [others[0], moved, *((topic, until_ns, data) for topic, _, data in others[1:])]
+    found = hand_in(Estimator(by_topic()), [first, *late])[-1]
+    assert found.status[0] == Status.TRACKED
+    assert found.poses == pytest.approx(hand_in(Estimator(by_topic()), [first, *others, moved])[-1].poses)
+
+
+def test_a_reset_keeps_the_newest_map_and_another_description_as_well() -> None:
+    messages = sent(3 * SECOND, 1)
+    for begin_anew in (Estimator.reset, lambda estimator: estimator.describe(estimator.swarm)):
+        estimator = Estimator(by_topic())
+        hand_in(estimator, [("map", 0, map_bytes(room_map(CELL)))])
+        begin_anew(estimator)
+        assert hand_in(estimator, messages)[-1].status[0] == Status.TRACKED
+        assert estimator.used >= 14
+
+
+def test_a_map_far_away_tells_the_local_origin() -> None:
+    """UTM coordinates: poses are as right as near the origin."""
+    drawn, far = room_map(CELL), np.array([691_003.0, 5_334_765.0])
+    messages = [("map", 0, map_bytes(replace(drawn, corner=drawn.corner + far))), *sent(9 * SECOND, 1)]
+    estimate = hand_in(Estimator(by_topic(None)), messages)[-1]
+    assert estimate.status[0] == Status.TRACKED
+    error = wrapped(estimate.poses[0] - LidarRobot().pose(9 * SECOND) - [*far, 0.0])
+    assert np.abs(error).max() < 2.0 * CELL
+
+
+FAULTS: dict[str, list[dict[str, Any]]] = {
+    "map_frame": [{"frame": "odom"}, {"frame": ""}],
+    "map_size": [{"width": 3}, {"height": 0}, {"data": np.zeros(0, dtype=np.int8)}, {"width": 2**32 - 1}],
+    "map_resolution": [{"resolution": one} for one in (0.0, math.nan, -0.05, math.inf)],
+    "map_origin": [{"origin": {"position": {"x": math.nan}, "orientation": {"w": 1.0}}}, {"origin": {}}],
+    "map_too_large": [{"data": np.zeros(51_000_000, dtype=np.int8), "width": 51_000, "height": 1000}],
+    "map_unusable": [{"data": np.zeros(1, dtype=np.int8), "width": 1, "height": 1}],
+}
+
+
+@pytest.mark.parametrize("reason", FAULTS)
+def test_a_map_that_cannot_be_used_is_dropped_and_counted(reason: str) -> None:
+    """The one before it stays."""
+    drawn = room_map(CELL)
+    bad = [("map", 0, map_bytes(drawn, **fault)) for fault in FAULTS[reason]]
+    estimator = Estimator(by_topic())
+    estimate = hand_in(estimator, [("map", 0, map_bytes(drawn)), *bad, *sent(3 * SECOND, 1)])[-1]
+    assert estimator.drops[reason] == len(bad)
+    assert estimate.status[0] == Status.TRACKED
+    assert estimator.used >= 14
+
+
+def test_a_bag_with_a_map_gives_the_same_poses_twice_byte_for_byte(room: Path, tmp_path: Path) -> None:
+    """It is shown, too; without it, the remarks say so."""
+    messages = sent(9 * SECOND, seed=2)
+    for name, maps in (("with", [("map", 0, map_bytes(load_map(room)))]), ("without", [])):
+        with BagWriter(tmp_path / name) as bag:
+            for topic, message_type in (
+                ("a/odom", ODOMETRY),
+                ("a/scan", LASER_SCAN),
+                ("map", OCCUPANCY_GRID),
+            ):
+                bag.add_topic(topic, message_type)
+            for topic, at_ns, data in [*maps, *messages]:
+                bag.write(topic, at_ns, data)
+    first, second = (replay(tmp_path / "with", by_topic(None)) for _ in range(2))
+    assert first.poses.tobytes() == second.poses.tobytes()
+    assert first.covariances.tobytes() == second.covariances.tobytes()
+    assert first.status[-1, 0] == Status.TRACKED
+    assert len(first.maps) == 1
+    file = replay(tmp_path / "with", replace(by_topic(None), map=room))
+    assert file.poses.tobytes() == first.poses.tobytes()
+    assert len(file.maps) == 1
+    without = replay(tmp_path / "without", by_topic(None))
+    assert "The bag holds no message on map." in without.remarks
+    assert (without.status[:, 0] == Status.WAITING).all()
+
+
+def test_the_description_says_that_the_map_comes_by_topic(tmp_path: Path) -> None:
+    save_swarm(by_topic(), tmp_path / "swarm.yaml")
+    assert "map: topic\n" in (tmp_path / "swarm.yaml").read_text()
+    assert load_swarm(tmp_path / "swarm.yaml") == by_topic()
