@@ -1,6 +1,4 @@
-"""New swarm descriptions from a few answers: robots of one type, markers, landmarks along the walls.
-
-Robots that a new swarm description can begin with: wheels, cameras, markers on the body, gyroscopes.
+"""New swarm descriptions from a few answers: robots of one known type, markers, landmarks along the walls.
 
 Numbers of e-pucks, PushBots and Droplets are those of drivers and simulations; others name their source.
 """
