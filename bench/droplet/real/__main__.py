@@ -27,6 +27,7 @@ from bench.shared.common import OUT, Cell, ProgressLine, table, write_figures
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.command_line import exit_with_message
 from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
 from swarm_loc_estimator.offline.calibration.infrared.board import (
     MAX_RANGE,
@@ -94,7 +95,7 @@ def measure(
     joined = BoardReadings(
         *(np.concatenate(columns) for columns in zip(*(one.clear for one in fit), strict=True))
     )
-    near = joined.select(joined.poses[:, 0] < MAX_RANGE)
+    near = select(joined, joined.poses[:, 0] < MAX_RANGE)
     said = ProgressLine(f"test on {', '.join(one.name for one in test)}")
     said("fitting")
     done = calibrate_board(load_ir_platform("droplet_2016"), near, robots)
@@ -102,7 +103,7 @@ def measure(
     for one in test:
         data = one.clear
         within = (data.poses[:, 0] > RANGES[0]) & (data.poses[:, 0] < RANGES[1])
-        data = without_dead(done.model.platform, data, robots)[1].select(within)
+        data = select(without_dead(done.model.platform, data, robots)[1], within)
         add(done, data, results)
     print()
     return done

@@ -20,6 +20,7 @@ from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.calibration.infrared.board import GAIN_SIGMA, BoardCalibration, without_dead
 from swarm_loc_estimator.offline.live_run import compare_with_replay, play_live
 from swarm_loc_estimator.offline.replay import replay
@@ -129,7 +130,7 @@ def _gains(done: BoardCalibration, place: int) -> IrGains | None:
 
 def can_be_seen(recorded: Recorded, names: list[str]) -> set[str]:
     """Receivers, and who lit its emitters several times near one of them with nobody in between."""
-    near = recorded.clear.select(recorded.clear.poses[:, 0] < REACH_M)
+    near = select(recorded.clear, recorded.clear.poses[:, 0] < REACH_M)
     often = np.bincount(near.transmitter, minlength=len(names)) >= MIN_EXCHANGES
     often[near.receiver] = True
     return {names[place] for place in np.flatnonzero(often)}

@@ -9,6 +9,7 @@ import numpy as np
 
 from bench.shared.common import ProgressLine
 from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.calibration.infrared.board import BoardReadings, BoardRecording, read_board
 from swarm_loc_estimator.offline.calibration.recording import read_recording
 from swarm_loc_estimator.offline.datasets.droplets import ImportSettings, import_recording
@@ -48,7 +49,7 @@ def read_folder(folder: Path, names: list[str], work: Path) -> list[Recorded]:
             f" {' '.join(done.remarks)}"
         )
         data = _numbered(board, swarm, names)
-        recordings.append(Recorded(path.stem, bag, swarm, data, data.select(board.clear)))
+        recordings.append(Recorded(path.stem, bag, swarm, data, select(data, board.clear)))
     return recordings
 
 

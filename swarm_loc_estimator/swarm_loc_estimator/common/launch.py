@@ -72,7 +72,6 @@ class NodeSpec:
     # Parameter -> value; they override the parameter file
     parameters: Mapping[str, ParameterValue] = field(default_factory=dict)
     parameter_file: str | None = None  # Path of a ROS parameter file, None for none
-    remappings: tuple[tuple[str, str], ...] = ()  # Pairs of names, from and to
     required: bool = True  # Whether the graph ends when this node ends
 
     @property
@@ -89,8 +88,6 @@ class NodeSpec:
             arguments += ["--params-file", self.parameter_file]
         for name, value in self.parameters.items():
             arguments += ["-p", f"{name}:={json.dumps(value)}"]
-        for source, target in self.remappings:
-            arguments += ["-r", f"{source}:={target}"]
         return arguments
 
 
@@ -225,7 +222,6 @@ def node_action(spec: NodeSpec) -> Any:
         name=spec.name,
         namespace=spec.namespace,
         parameters=[*files, dict(spec.parameters)],
-        remappings=list(spec.remappings),
         output="screen",
         on_exit=[Shutdown(reason=f"{spec.full_name} ended")] if spec.required else [],
     )

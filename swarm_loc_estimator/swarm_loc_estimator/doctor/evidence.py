@@ -13,9 +13,8 @@ import numpy as np
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import RANGE, CdrError, decode
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
-from swarm_loc_estimator.filter.measurements import concatenate
 from swarm_loc_estimator.offline.recorded_bag import same_type
-from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
+from swarm_loc_estimator.sensors.imu import TurnRateRows
 from swarm_loc_estimator.sensors.inputs import (
     SENSORS,
     Batch,
@@ -23,9 +22,10 @@ from swarm_loc_estimator.sensors.inputs import (
     InputConverter,
     InputStatistics,
     InputTopic,
+    gathered,
     live_topics,
 )
-from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
+from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.sensors.ranges import decode_pair
 from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
@@ -130,11 +130,7 @@ class Evidence:
 
     @cached_property
     def _joined(self) -> dict[str, Any]:
-        parts = self.read[0]
-        return {
-            name: concatenate([one.nothing(), *(part[name] for part in parts)])
-            for name, one in SENSORS.items()
-        }
+        return {name: gathered(self.read[0], name) for name in SENSORS}
 
     @cached_property
     def converted(self) -> tuple[list[Batch], DropCounts]:
@@ -145,15 +141,13 @@ class Evidence:
     @cached_property
     def odometry(self) -> OdometryRows:
         """All valid odometry."""
-        found = (part.rows.get("odometry", NO_ODOMETRY) for part in self.converted[0])
-        rows: OdometryRows = concatenate([NO_ODOMETRY, *found])
+        rows: OdometryRows = gathered(self.converted[0], "odometry")
         return rows
 
     @cached_property
     def turn_rates(self) -> TurnRateRows:
         """All valid turn rates of gyroscopes."""
-        found = (part.rows.get("imu", NO_TURN_RATES) for part in self.converted[0])
-        rows: TurnRateRows = concatenate([NO_TURN_RATES, *found])
+        rows: TurnRateRows = gathered(self.converted[0], "imu")
         return rows
 
     @cached_property

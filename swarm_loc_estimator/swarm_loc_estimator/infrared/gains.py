@@ -51,10 +51,6 @@ class Exchanges(NamedTuple):
     # (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad]; NaN where not known
     poses: FloatArray
 
-    def select(self, rows: NDArray[np.bool_]) -> Exchanges:
-        """The exchanges where `rows` (k,) is True."""
-        return Exchanges._make(column[rows] for column in self)
-
 
 @dataclass(frozen=True)
 class GainsFit:

@@ -195,9 +195,8 @@ class ConfiguredStarts:
         """
         initialized = False
         for side in ("observer", "target"):
-            new = np.append(state.start_pending, False)[
-                getattr(measurements, side)
-            ]  # NOBODY (-1) is the last element
+            # NOBODY (-1) is the last element
+            new = np.append(state.start_pending, False)[getattr(measurements, side)]
             robots, stamps_ns = getattr(measurements, side)[new], measurements.stamp_ns[new]
             ready = self._may_start(state, robots, stamps_ns)
             chosen_robots, first = np.unique(robots[ready], return_index=True)

@@ -289,9 +289,8 @@ class OdometryTracks:
         arrays, (robots, stamps) = self.arrays, rows[:2]
         taken = [rows]
         newest = arrays.stamp_ns[robots, np.maximum(arrays.filled[robots] - 1, 0)]
-        late = (arrays.filled[robots] > 0) & (
-            stamps <= newest
-        )  # equal stamps: the sort order decides which is kept
+        # equal stamps: the sort order decides which is kept
+        late = (arrays.filled[robots] > 0) & (stamps <= newest)
         for robot in np.unique(robots[late]):
             count = arrays.filled[robot]
             first = int(

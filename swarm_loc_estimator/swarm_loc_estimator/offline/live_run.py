@@ -399,9 +399,8 @@ def play_live(
         wall_s=played_s,
     )
     received_ns = np.array(recorder.received_ns, dtype=np.int64)
-    age_s: FloatArray = 1e-9 * (received_ns - result.stamp_ns)[received_ns > 0].astype(
-        np.float64
-    )  # 0 before the first /clock
+    # 0 before the first /clock
+    age_s: FloatArray = 1e-9 * (received_ns - result.stamp_ns)[received_ns > 0].astype(np.float64)
     return LiveRun(
         result,
         content.arrival_ns,

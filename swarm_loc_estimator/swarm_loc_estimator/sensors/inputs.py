@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -19,7 +19,7 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.detections import swarm_key
 from swarm_loc_estimator.common.messages.streams import MessageBatch
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.filter.measurements import Measurements, select
+from swarm_loc_estimator.filter.measurements import Measurements, concatenate, select
 from swarm_loc_estimator.filter.models import MODELS, MeasurementModel
 from swarm_loc_estimator.filter.models import register as register_model
 from swarm_loc_estimator.sensors.aerial import AerialSensor
@@ -249,6 +249,11 @@ class Batch:
             dropped = {} if k else self.dropped
             yield replace(self, begin_ns=begin_ns, end_ns=end_ns, rows=rows, dropped=dropped)
             begin_ns = end_ns
+
+
+def gathered(parts: Iterable[Batch], sensor: str) -> Any:
+    """All readings of a sensor in batches."""
+    return concatenate([SENSORS[sensor].nothing(), *(part[sensor] for part in parts)])
 
 
 def _stamps_ns(sensor: str, given: Mapping[str, Any]) -> IntArray:

@@ -36,7 +36,7 @@ def in_order_of_arrival(parts: Sequence[Rows]) -> Rows:
     """Concatenate tuples of columns and sort them by arrival; the sort is stable."""
     rows = concatenate(parts)
     order = np.argsort(rows[-1], kind="stable")  # the last column is the arrival
-    return type(rows)(*(column[order] for column in rows))
+    return select(rows, order)
 
 
 def fill(column: NDArray[Any], given: Any, name: str) -> None:

@@ -1,6 +1,4 @@
-"""New swarm descriptions from a few answers: robots of one type, markers, landmarks along the walls.
-
-Robots that a new swarm description can begin with: wheels, cameras, markers on the body, gyroscopes.
+"""New swarm descriptions from a few answers: robots of one known type, markers, landmarks along the walls.
 
 Numbers of e-pucks, PushBots and Droplets are those of drivers and simulations; others name their source.
 """
@@ -54,9 +52,6 @@ _SQUARE = MappingProxyType({"front": 0.0, "left": 90.0, "back": 180.0, "right": 
 """Names and directions of markers [deg]."""
 
 
-_MOCAP = Localizer()
-
-
 @dataclass(frozen=True)
 class KnownRobot:
     """One type of robot."""
@@ -71,7 +66,7 @@ class KnownRobot:
     lidar: LidarModel = LidarModel()  # Its lidar, as far as its transforms do not say
     lidar_frame: str = ""  # Frame of its scans; "": it has no lidar
     fix: FixModel = FixModel(position_sigma=0.002, heading_sigma=0.01)  # Of fixes without covariance
-    localizer: Localizer = _MOCAP  # How motion capture is usually published for it
+    localizer: Localizer = Localizer()  # How motion capture is usually published for it
     tf_per_robot: bool = False  # Whether it publishes transforms on <robot>/tf, in frames without its name
     image: str = ""  # Namespace of its images below its own
     # Executable of swarm_loc_drivers and its arguments, of {robot} and {file}; "": others drive it

@@ -306,9 +306,8 @@ class Fusion:
         if tied.any():
             some = measurements if tied.all() else select(measurements, tied)
             verdicts[tied], nis[tied] = self._update(state, some)
-            tied[tied] = (
-                verdicts[tied] != Verdict.OPEN
-            )  # robots that the prediction lost may be located again
+            # robots that the prediction lost may be located again
+            tied[tied] = verdicts[tied] != Verdict.OPEN
         untied = np.flatnonzero(~tied)
         sides = zip(measurements.observer[untied], measurements.target[untied], strict=True)
         for k, (observer, target) in zip(untied.tolist(), sides, strict=True):

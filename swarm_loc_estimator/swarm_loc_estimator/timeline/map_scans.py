@@ -431,9 +431,8 @@ class MapScans:
         if found.outcome in (OFF_MAP, FAR):
             state.sources.score[robot] += 1.0
             if state.sources.score[robot] >= (_MAX_MISSED if confirmed else _MAX_AT_START):
-                state.deinitialize(
-                    robot, LossReason.OFF_MAP, stamp_ns
-                )  # later ones may fit by chance, elsewhere
+                # later ones may fit by chance, elsewhere
+                state.deinitialize(robot, LossReason.OFF_MAP, stamp_ns)
             return None, Verdict.OFF_MAP, False
         if found.outcome == BLOCKED:
             return None, Verdict.BLOCKED, False

@@ -82,17 +82,15 @@ def sightings_frame(stamp_ns: int, sightings: Sightings) -> Frame:
     return pack("sightings", stamp_ns, sightings._asdict())
 
 
-def places_frame(
-    kind: str, stamp_ns: int, robot: Sequence[int], pose: npt.NDArray[np.float64], **extra: object
-) -> Frame:
-    """Poses (n, 3) in map of robots, -1 for an unknown robot: ground truth, goals, aerial detections."""
+def places_frame(kind: str, stamp_ns: int, robot: Sequence[int], pose: npt.NDArray[np.float64]) -> Frame:
+    """Poses (n, 3) in map of robots: ground truth or goals."""
     columns: dict[str, npt.NDArray[Any]] = {
         "robot": np.array(robot, dtype=np.int32),
         "x": pose[:, 0],
         "y": pose[:, 1],
         "theta": pose[:, 2].astype(np.float32),
     }
-    return pack(kind, stamp_ns, columns, **extra)
+    return pack(kind, stamp_ns, columns)
 
 
 def aerial_frame(

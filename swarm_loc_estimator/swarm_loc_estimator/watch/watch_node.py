@@ -365,9 +365,8 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         if estimate.names != self._names:
             self._drop("swarm/poses", "other_swarm")
             return
-        if (
-            estimate.stamp_ns < self._newest_ns
-        ):  # the clock has jumped back, and the server clears its history
+        # the clock has jumped back, and the server clears its history
+        if estimate.stamp_ns < self._newest_ns:
             for places in self._places:
                 places.clear()
         self._newest_ns = estimate.stamp_ns

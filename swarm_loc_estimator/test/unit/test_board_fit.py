@@ -9,6 +9,7 @@ import pytest
 from ir_world import random_poses
 
 from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.infrared.brightness import curve_at, expected_brightness
 from swarm_loc_estimator.offline.calibration.infrared.board import (
     BoardReadings,
@@ -98,7 +99,7 @@ def test_a_dead_sensor_is_found_and_left_out_though_the_curves_to_begin_with_are
 def test_sensors_that_nobody_faced_are_not_called_dead(seed: int) -> None:
     """All robots are ahead of the receiver; its sensors 2 and 3 look back."""
     data = recorded(600, seed)
-    ahead = data.select(np.abs(data.poses[:, 1]) < 1.2)
+    ahead = select(data, np.abs(data.poses[:, 1]) < 1.2)
     brightest = np.quantile(ahead.readings.max(axis=2), 0.95, axis=0)
     assert brightest[[2, 3]].max() < 0.2 * np.median(brightest)
     elements, _ = without_dead(fit_board(PLATFORM, ahead, ROBOTS).platform, ahead, ROBOTS)

@@ -28,7 +28,6 @@ def test_arguments_keep_types_spaces_and_order() -> None:
         namespace="epuck1",
         parameters={"file": "a b: c.yaml", "on": True, "count": 5, "gain": 5.0, "code": "012"},
         parameter_file="all.yaml",
-        remappings=(("odom", "wheel_odom"),),
     )
 
     assert node.ros_arguments() == [
@@ -45,7 +44,6 @@ def test_arguments_keep_types_spaces_and_order() -> None:
             "-p",
             'code:="012"',
         ),
-        *("-r", "odom:=wheel_odom"),
     ]
 
 

@@ -300,9 +300,8 @@ class RowBias:
 
     first_row: float = number(0.0, "px", -1000.0, 10_000.0, "row of the first knot")
     step: float = number(STEP_PX, "px", 0.0, 10.0, "from knot to knot", above=True)
-    offsets: tuple[float, ...] = field(
-        default=(), metadata=entry(EntrySpec(_read_offsets, {}))
-    )  # (K,) bias at each knot [px]; empty: unknown
+    # (K,) bias at each knot [px]; empty: unknown
+    offsets: tuple[float, ...] = field(default=(), metadata=entry(EntrySpec(_read_offsets, {})))
 
     def reaches(self, row: float) -> bool:
         """Whether a tracked row [px] lies between knots."""

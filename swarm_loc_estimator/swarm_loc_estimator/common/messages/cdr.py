@@ -493,9 +493,8 @@ class _CdrWriter:
             rows = np.ascontiguousarray(rows, dtype[0]).view(dtype)[:, 0]
         for part in (rows[:1], rows[1:]):
             dtype = row_dtype(message_type, (len(self.data) - ENCAPSULATION) % 8)
-            stored = np.zeros(
-                len(part), dtype
-            )  # equal messages give equal bytes, those between fields included
+            # equal messages give equal bytes, those between fields included
+            stored = np.zeros(len(part), dtype)
             for name, own in zip(dtype.names or (), part.dtype.names or (), strict=True):
                 stored[name] = part[own].reshape(stored[name].shape)
             self.data += stored.tobytes()

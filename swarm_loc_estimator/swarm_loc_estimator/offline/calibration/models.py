@@ -433,16 +433,14 @@ def _remarks(
     swarm: Swarm, members: Sequence[int], fits: Sequence[CameraFit], drive: DriveFit | None
 ) -> list[str]:
     """One sentence for everything that could not be fitted."""
-    poor = [fit.robot.name for fit in fits if not fit.is_enough]
+    names = ", ".join(swarm.robots[index].name for index in members)
     remarks = [
-        f"{name} has too few sightings whose truth is known: it gets the mean of its type." for name in poor
+        f"{fit.robot.name} has too few sightings whose truth is known: it gets the mean of its type."
+        for fit in fits
+        if not fit.is_enough
     ]
-    if not any(fit.is_enough for fit in fits) and any(
-        swarm.robots[index].camera is not None for index in members
-    ):
-        names = ", ".join(swarm.robots[index].name for index in members)
+    if fits and len(remarks) == len(fits):
         remarks.append(f"no camera of {names} could be calibrated: too few sightings whose truth is known.")
     if drive is None:
-        names = ", ".join(swarm.robots[index].name for index in members)
         remarks.append(f"the motion of {names} could not be calibrated: no path of theirs is known.")
     return remarks

@@ -25,8 +25,8 @@ from swarm_loc_estimator.sensors.camera import NO_DETECTIONS, DetectionRows
 from swarm_loc_estimator.sensors.fix import NO_FIXES, FixRows
 from swarm_loc_estimator.sensors.imu import NO_TURN_RATES, TurnRateRows
 from swarm_loc_estimator.sensors.infrared import NO_BRIGHTNESS, BrightnessRows
-from swarm_loc_estimator.sensors.inputs import Batch, InputConverter
-from swarm_loc_estimator.sensors.odometry import NO_ODOMETRY, OdometryRows
+from swarm_loc_estimator.sensors.inputs import Batch, InputConverter, gathered
+from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.sensors.ranges import NO_RANGES, RangeRows
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator
@@ -127,17 +127,17 @@ def read_recording(
     summary = read_bag(bag, swarm, parts.append, progress, remap)
     tracks = {**summary.truth, **truth}
     converter = InputConverter(swarm, Settings())
-    moved = [converter.convert(part).rows for part in parts]
+    moved = [converter.convert(part) for part in parts]
     detections = [part["detections"] for part in parts if part["detections"].robot.size]
     return Recording(
         bag.name,
-        concatenate([NO_ODOMETRY, *(rows.get("odometry", NO_ODOMETRY) for rows in moved)]),
+        gathered(moved, "odometry"),
         concatenate(detections or [NO_DETECTIONS]),
         {name: _each_stamp_once(track.stamp_ns, track.pose) for name, track in tracks.items()},
-        concatenate([NO_BRIGHTNESS, *(part["brightness"] for part in parts)]),
-        concatenate([NO_FIXES, *(part["fixes"] for part in parts)]),
-        concatenate([NO_TURN_RATES, *(rows.get("imu", NO_TURN_RATES) for rows in moved)]),
-        concatenate([NO_RANGES, *(part["ranges"] for part in parts)]),
+        gathered(parts, "brightness"),
+        gathered(parts, "fixes"),
+        gathered(moved, "imu"),
+        gathered(parts, "ranges"),
         converter.drops.total,
         summary.remarks,
     )

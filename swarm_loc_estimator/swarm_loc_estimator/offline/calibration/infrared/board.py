@@ -8,6 +8,7 @@ robust loss. Second differences of the log curves are regularized.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from scipy.optimize import least_squares
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import interpolate
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import Exchanges
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
@@ -68,10 +70,6 @@ class BoardReadings(NamedTuple):
     readings: FloatArray  # (k, n, n) [count], [sensor, emitter], NaN where not measured or dead
     poses: FloatArray  # (k, 3) of the transmitter seen from the receiver, range [m], bearing, heading [rad]
     stamp_ns: NDArray[np.int64]  # (k,)
-
-    def select(self, rows: NDArray[np.bool_]) -> BoardReadings:
-        """The exchanges where `rows` (k,) is True."""
-        return BoardReadings._make(column[rows] for column in self)
 
 
 @dataclass(frozen=True)
@@ -347,7 +345,8 @@ def read_board(recording: Recording, swarm: Swarm) -> BoardRecording:
             " a board cannot be calibrated without <robot>/ground_truth."
         )
     one = group.exchanges
-    data = BoardReadings(one.receiver, one.transmitter, one.readings[:, 0], one.poses, stamp_ns).select(known)
+    data = BoardReadings(one.receiver, one.transmitter, one.readings[:, 0], one.poses, stamp_ns)
+    data = select(data, known)
     clear = _clear(recording, swarm, group.robots, data, _BODIES * group.platform.radius)
     return BoardRecording(group.platform, group.robots, data, clear)
 
@@ -363,7 +362,7 @@ def calibrate_from(
     progress(0.0, "exchanges")
     board = read_board(recording, swarm)
     progress(0.1, "fitting, and validating on blocks of time")
-    to_fit = board.data.select(board.clear & (board.data.poses[:, 0] < MAX_RANGE))
+    to_fit = select(board.data, board.clear & (board.data.poses[:, 0] < MAX_RANGE))
     return board, calibrate_board(board.platform, to_fit, len(board.robots))
 
 
@@ -485,8 +484,8 @@ def calibrate_board(start: IrPlatform, data: BoardReadings, robots: int) -> Boar
     first = fit_board(start, data, robots)
     elements, alive = without_dead(first.platform, data, robots)
     validated = _cross_validated(start, alive, robots)
-    stray = min(validated, key=lambda one: validated[one][True].badness)
-    tried = validated[stray]
+    stray = min(_STRAY, key=lambda one: validated[one, True].badness)
+    tried = {known: validated[stray, known] for known in (True, False)}
     ranges = {known: one.medians[0] / max(one.solved_share, 0.01) for known, one in tried.items()}
     gains = bool(ranges[True] < ranges[False])
     model, held = fit_board(start, alive, robots) if elements.dead.any() else first, tried[gains]
@@ -552,21 +551,19 @@ def without_dead(
     return elements, data._replace(readings=elements.without(exchanges).readings[:, 0])
 
 
-def _cross_validated(start: IrPlatform, data: BoardReadings, robots: int) -> dict[float, dict[bool, HeldOut]]:
+def _cross_validated(
+    start: IrPlatform, data: BoardReadings, robots: int
+) -> dict[tuple[float, bool], HeldOut]:
     """Cross-validated errors by stray light and by whether gains are used."""
-    parts: dict[float, dict[bool, list[HeldOut]]] = {stray: {True: [], False: []} for stray in _STRAY}
+    parts: dict[tuple[float, bool], list[HeldOut]] = {one: [] for one in product(_STRAY, (True, False))}
     blocks = _blocks(data)
     for block in range(BLOCKS):
         held = blocks == block
-        model, others = fit_board(start, data.select(~held), robots), data.select(held)
-        for stray, by_gains in parts.items():
+        model, others = fit_board(start, select(data, ~held), robots), select(data, held)
+        for (stray, known), found in parts.items():
             strayed = replace(model, platform=replace(model.platform, stray_noise=stray))
-            for known, found in by_gains.items():
-                found.append(errors_of(strayed, others, known=known))
-    return {
-        stray: {known: _joined(found) for known, found in by_gains.items()}
-        for stray, by_gains in parts.items()
-    }
+            found.append(errors_of(strayed, others, known=known))
+    return {one: _joined(found) for one, found in parts.items()}
 
 
 def _blocks(data: BoardReadings) -> NDArray[np.int64]:

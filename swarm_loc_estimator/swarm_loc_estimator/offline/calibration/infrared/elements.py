@@ -36,6 +36,7 @@ from scipy.special import bdtrc, fdtrc, logsumexp
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.infrared.brightness import expected_brightness, start_table
 from swarm_loc_estimator.infrared.gains import Exchanges
 from swarm_loc_estimator.infrared.search import DARKEST
@@ -280,7 +281,7 @@ def find_reading_limits(platform: IrPlatform, robots: int, exchanges: Exchanges)
     for robot in range(robots):
         own = firsts & (exchanges.receiver == robot)
         if own.any():
-            tops, emitters = _tops(exchanges.select(own))
+            tops, emitters = _tops(select(exchanges, own))
             saturation[robot] = [_pile(tops[:, i], emitters[:, i], alarm) for i in range(platform.n)]
     noise = _noise(platform, robots, _repeats(exchanges, saturation))
     return ReadingLimits(saturation, noise[0], noise[1])

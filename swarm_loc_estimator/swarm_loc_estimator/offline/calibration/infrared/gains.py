@@ -24,6 +24,7 @@ from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import interpolate
+from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.infrared.brightness import expected_brightness
 from swarm_loc_estimator.infrared.gains import POSE_SIGMA, Exchanges, GainsError, GainsFit, estimate_gains
 from swarm_loc_estimator.infrared.likelihood import MaximumLikelihood
@@ -65,10 +66,10 @@ def helpful_gains(
         progress(f"held-out block {block + 1}")
         held = blocks == block
         try:
-            fit = estimate_gains(platform, robots, exchanges.select(~held))
+            fit = estimate_gains(platform, robots, select(exchanges, ~held))
         except GainsError:
             continue
-        logs[held] = held_out_likelihoods(platform, fit.gains, exchanges.select(held))
+        logs[held] = held_out_likelihoods(platform, fit.gains, select(exchanges, held))
     return _chosen_robots(np.stack([exchanges.receiver, exchanges.transmitter]), logs, blocks, robots)
 
 
