@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
-from mapping_world import LIDAR, LidarRobot, RoomRobot, scan_bytes
+from mapping_world import LIDAR, LidarRobot, RoomRobot, scan_bytes, static
 from nav_msgs.msg import OccupancyGrid, Odometry
 from node_world import T0_NS, Ros, odometry_bytes, overrides, stamp_ns, values_of
 from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
@@ -20,7 +20,6 @@ from rclpy.serialization import serialize_message
 from rclpy.time import Time
 from sensor_msgs.msg import LaserScan
 from std_srvs.srv import Trigger
-from test_mounts import static
 from tf2_msgs.msg import TFMessage
 
 from swarm_loc_estimator.common.parameters import UserError

@@ -10,8 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mapping_world import BEAMS, LIDAR, ROOM, SWEEP_NS, LidarRobot, scan_bytes
-from test_mounts import static
+from mapping_world import BEAMS, LIDAR, ROOM, SWEEP_NS, LidarRobot, scan_bytes, static
 
 from swarm_loc_estimator.cli.replay_map import main
 from swarm_loc_estimator.common.arrays import FloatArray

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from mapping_world import LIDAR, LidarRobot, room_map
+from mapping_world import LIDAR, LidarRobot, room_map, static
 from scipy.spatial.transform import Rotation
 from test_lidar_in_map import CELL, sent, swarm_at
 
@@ -25,20 +25,6 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_estimator.timeline.estimator import Status
 
 TURN = 0.5 * math.pi
-
-
-def static(*joints: tuple[str, str, tuple[float, ...], tuple[float, ...]]) -> bytes:
-    """A message of transforms: parent, child, place [m], and yaw, pitch, roll [rad]."""
-    transforms = []
-    for parent, child, place, angles in joints:
-        rotation = Rotation.from_euler("ZYX", angles).as_quat()
-        transform = {
-            "translation": dict(zip("xyz", place, strict=True)),
-            "rotation": dict(zip("xyzw", rotation.tolist(), strict=True)),
-        }
-        header = {"stamp": 0, "frame_id": parent}
-        transforms.append({"header": header, "child_frame_id": child, "transform": transform})
-    return encode({"transforms": transforms}, TRANSFORMS)
 
 
 def mounts_of(robot: Robot, frames: dict[str, str], *messages: bytes, topic: str = "tf_static") -> Mounts:

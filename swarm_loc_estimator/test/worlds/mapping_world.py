@@ -7,9 +7,10 @@ import math
 import numpy as np
 import scipy
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, encode
+from swarm_loc_estimator.common.messages.cdr import LASER_SCAN, TRANSFORMS, encode
 from swarm_loc_estimator.common.se2 import compose, exp, wrap_angle
 from swarm_loc_estimator.mapping.grid import OccupancyMap
 from swarm_loc_estimator.mapping.messages import ScanMessage
@@ -182,3 +183,17 @@ def room_map(cell: float) -> OccupancyMap:
         outside &= ~inside
     distance = scipy.ndimage.distance_transform_edt(outside)
     return OccupancyMap(corner, cell, np.where(~outside, -5.0, np.where(distance <= 1.0, 5.0, 0.0)))
+
+
+def static(*joints: tuple[str, str, tuple[float, ...], tuple[float, ...]]) -> bytes:
+    """A message of transforms: parent, child, place [m], and yaw, pitch, roll [rad]."""
+    transforms = []
+    for parent, child, place, angles in joints:
+        rotation = Rotation.from_euler("ZYX", angles).as_quat()
+        transform = {
+            "translation": dict(zip("xyz", place, strict=True)),
+            "rotation": dict(zip("xyzw", rotation.tolist(), strict=True)),
+        }
+        header = {"stamp": 0, "frame_id": parent}
+        transforms.append({"header": header, "child_frame_id": child, "transform": transform})
+    return encode({"transforms": transforms}, TRANSFORMS)
