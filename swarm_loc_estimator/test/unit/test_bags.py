@@ -359,6 +359,11 @@ def test_a_database_without_a_needed_column_has_no_messages_and_that_is_said(tmp
 
 
 def peak_of_reading(path: Path) -> int:
+    """Memory that reading takes [bytes]; the least of three times, since threads of other tests allocate, too."""
+    return min(one_peak_of_reading(path) for _ in range(3))
+
+
+def one_peak_of_reading(path: Path) -> int:
     with BagReader(path) as bag:
         tracemalloc.start()
         for _ in bag.messages():
