@@ -359,7 +359,7 @@ def test_a_database_without_a_needed_column_has_no_messages_and_that_is_said(tmp
 
 
 def peak_of_reading(path: Path) -> int:
-    """Memory that reading takes [bytes]; the least of three times, since threads of other tests allocate, too."""
+    """Memory that reading takes [bytes], the least of three times: threads of other tests allocate, too."""
     return min(one_peak_of_reading(path) for _ in range(3))
 
 
