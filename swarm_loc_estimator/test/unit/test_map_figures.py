@@ -70,7 +70,7 @@ def test_the_estimator_follows_the_mappers_fixes_and_finds_the_slip() -> None:
     assert np.isfinite(result.poses[-1]).all()
     assert errors.position_rmse < 0.14
     assert 0.3 < errors.nees < 3.5
-    assert result.counters["measurements used"] == result.counters["messages on <robot>/fix"] == 47
+    assert result.counters["measurements used"] == result.counters["messages on <robot>/fix"] == 48
 
 
 def test_a_map_without_anything_to_compare_with_has_no_figures() -> None:

@@ -135,7 +135,7 @@ class Marginals:
         count, before = self.groups.owner.size, self._settled[bodies]
         adjoint = translation_adjoints(places[bodies])
         moves = Moves(np.full(count, -1), np.zeros((count, 3, 3)), np.ones((count, 3)))
-        if len(self.transition):
+        if (bodies < len(self.transition)).any():
             of_robots = np.flatnonzero(bodies < len(self.transition))
             robots, own = bodies[of_robots], np.arange(3, before.shape[1])
             transition, blocks = self.transition[robots], self.groups.member[robots, 1:]
