@@ -25,6 +25,6 @@ for mark in found.landmarks:
     known = places[mark.id]
     away.append(np.hypot(mark.x - known.x, mark.y - known.y))
     turned = np.hypot(shared.yaw_sigma, shared.scale_sigma) * np.hypot(mark.x - shared.x, mark.y - shared.y)
-    sigma = np.sqrt(mark.position_sigma**2 + shared.position_sigma**2 + turned**2)
+    sigma = np.sqrt(mark.position_sigma**2 + shared.position_sigma**2 + 0.5 * turned**2)  # of x and y
     print(f"{mark.id:5} {mark.x:8.3f} {mark.y:8.3f} {sigma:11.4f} {away[-1]:12.4f}")
 print(f"{len(away)} of {len(places)} landmarks, RMS {np.sqrt(np.mean(np.square(away))):.4f} m")
