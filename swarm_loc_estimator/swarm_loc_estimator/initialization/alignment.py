@@ -200,17 +200,21 @@ def align(
     transform, covariance, weight = _refined(constraints, hypotheses[best])
     if np.count_nonzero(weight) < enough:
         return None
-    initial = _split_errors(constraints, track_noise, weight, transform, covariance)
-    shared = dict(zip(constraints["column"].tolist(), constraints["shared"], strict=True))
+    # errors that do not average out count whole: those of other robots, as if they were one, and the drift
+    drift = np.average(track_noise - constraints["track_noise"], axis=0, weights=weight)
+    whole = covariance + np.average(constraints["shared"], axis=0, weights=weight)
+    whole += se2.adjoint(transform) @ drift @ se2.adjoint(transform).T
     centre = np.array([[constraints["map_x"].mean(), constraints["map_y"].mean()]])
     (tie,) = _ties(centre)
-    x, y, heading = np.sqrt(np.diag(tie @ initial.whole_covariance(shared) @ tie.T)).tolist()
+    x, y, heading = np.sqrt(np.diag(tie @ whole @ tie.T)).tolist()
     position = max(x, y)
     if not (position < POSITION_SIGMA and heading < heading_sigma):
         return None
     rivals = hypotheses[support >= _RIVAL_SHARE * support[best]]
     limits = (_APART_M + 3.0 * position, _APART_RAD + 3.0 * heading)
-    return None if _is_ambiguous(constraints, transform, rivals, limits) else initial
+    if _is_ambiguous(constraints, transform, rivals, limits):
+        return None
+    return _split_errors(constraints, track_noise, weight, transform, covariance)
 
 
 def _is_ambiguous(
