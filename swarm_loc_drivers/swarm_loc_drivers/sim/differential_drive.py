@@ -33,7 +33,7 @@ Controller = Callable[[int, FloatArray], tuple[FloatArray, FloatArray]]
 class Drive:
     """A differential drive and its imperfections."""
 
-    wheel_separation: float  # [m]
+    wheel_separation: float | FloatArray  # [m], of all robots or of each (N,)
     wheel_noise: float  # Variance of a wheel's path per metre rolled [m]
     turn_slip: float = 0.0  # Share of every commanded turn that is lost, in [0, 1)
 
@@ -70,13 +70,15 @@ class LastingNoise:
         return mean
 
 
-def wheel_paths(speed: FloatArray, turn_rate: FloatArray, separation: float, step_s: float) -> FloatArray:
+def wheel_paths(
+    speed: FloatArray, turn_rate: FloatArray, separation: float | FloatArray, step_s: float
+) -> FloatArray:
     """Paths (..., 2) [m] of the right and left wheel in one step."""
     half_turn = 0.5 * separation * turn_rate
     return np.stack([speed + half_turn, speed - half_turn], axis=-1) * step_s
 
 
-def twist_of(wheels: FloatArray, separation: float) -> FloatArray:
+def twist_of(wheels: FloatArray, separation: float | FloatArray) -> FloatArray:
     """The twist (..., 3) of one step in the robot's own frame, from its wheels' paths (..., 2) [m]."""
     right, left = wheels[..., 0], wheels[..., 1]
     return np.stack([0.5 * (right + left), np.zeros_like(right), (right - left) / separation], axis=-1)

@@ -33,7 +33,7 @@ from swarm_loc_drivers.sim.droplet.infrared import (
 )
 from swarm_loc_drivers.sim.link_host import ConsoleFirmware
 from swarm_loc_drivers.sim.run import START_NS
-from swarm_loc_drivers.sim.worlds import WorldError, WorldParameters, start_of
+from swarm_loc_drivers.sim.worlds import LinkedWorldParameters, WorldError, start_of
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text, texts
@@ -306,7 +306,7 @@ def _check(ids: Sequence[int], platform: IrPlatform) -> None:
 
 
 @dataclass(frozen=True)
-class DropletWorldParameters(WorldParameters):
+class DropletWorldParameters(LinkedWorldParameters):
     """Parameters of `droplet_world_node`."""
 
     swarm_file: str = text(
