@@ -49,11 +49,11 @@ class RoomWorldNode(WorldNode[RoomWorldParameters]):
             self.create_subscription(Twist, topic, partial(self._on_command, k), _QOS)
         # sensors with their topics, and messages on their way
         self._sensors = sensors_of(self._world)
-        self._publishers: dict[str, Publisher] = {}
+        self._outputs: dict[str, Publisher] = {}
         for sensor in self._sensors:
             qos = qos_profile_sensor_data if isinstance(sensor, Lidar) else _QOS
             kind = message_class(sensor.message_type)
-            self._publishers |= {one: self.create_publisher(kind, one, qos) for one in sensor.topics}
+            self._outputs |= {one: self.create_publisher(kind, one, qos) for one in sensor.topics}
             if isinstance(sensor, Lidar):
                 self._static = self.create_publisher(TFMessage, "/tf_static", _STATIC_QOS)
                 self._static.publish(sensor.transforms())
@@ -69,7 +69,7 @@ class RoomWorldNode(WorldNode[RoomWorldParameters]):
                 heapq.heappush(self._on_the_way, message)
         while self._on_the_way and self._on_the_way[0][0] <= now_ns:
             topic, data = heapq.heappop(self._on_the_way)[1]
-            self._publishers[topic].publish(data)
+            self._outputs[topic].publish(data)
 
     def _on_command(self, robot: int, message: Twist) -> None:
         self._world.command(robot, message.linear.x, message.angular.z)
