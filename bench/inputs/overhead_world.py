@@ -25,12 +25,11 @@ from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Swarm
-from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, located
+from swarm_loc_vision.aerial.ground_control import AerialSettings, FloorMarker, Ground, located
 from swarm_loc_vision.aerial.locate_camera import fixed_camera
-from swarm_loc_vision.aerial.parameters import AerialSettings
-from swarm_loc_vision.markers.bodies import robot_body, up_of
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector, detection_rows
 from swarm_loc_vision.markers.families import family_named
+from swarm_loc_vision.markers.pose import robot_body, up_of
 
 ROBOTS, PERIOD_NS = 20, 100_000_000
 ARENA = (4.6, 3.4)

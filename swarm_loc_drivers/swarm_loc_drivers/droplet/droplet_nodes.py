@@ -26,8 +26,7 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
-from swarm_loc_drivers.common.ros_messages import stamp_message
+from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode, stamp_message
 from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners
 from swarm_loc_drivers.droplet.exchange import Brightness
 from swarm_loc_drivers.droplet.parameters import DropletFleetParameters, DropletParameters, DropletTraits

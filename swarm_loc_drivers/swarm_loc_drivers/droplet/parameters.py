@@ -5,11 +5,9 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from swarm_loc_drivers.droplet.exchange import PollingSettings
+from swarm_loc_drivers.droplet.exchange import MIN_TURN_S, PollingSettings, SessionSettings, TdmaSettings
 from swarm_loc_drivers.droplet.hardware import DROPLET_MODELS, ELEMENTS, FULL_POWER
 from swarm_loc_drivers.droplet.odometry import MotionNoise
-from swarm_loc_drivers.droplet.session import SessionSettings
-from swarm_loc_drivers.droplet.tdma import MIN_TURN_S, TdmaSettings
 from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text, texts
 
 _ID = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})")

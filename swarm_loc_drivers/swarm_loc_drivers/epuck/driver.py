@@ -19,12 +19,10 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.link import Link, open_link
 from swarm_loc_drivers.common.odometry import DeadReckoning, OdometryState, WheelGeometry
-from swarm_loc_drivers.common.robot_driver import RobotDriver
-from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
-from swarm_loc_drivers.epuck.hardware import as_counter, unwrapped_difference
+from swarm_loc_drivers.common.robot_driver import RobotDriver, Velocity, VelocityCommand
+from swarm_loc_drivers.epuck.hardware import CameraImage, EpuckSession, as_counter, unwrapped_difference
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.serial_session import SerialSession
-from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession
 from swarm_loc_drivers.epuck.wifi_session import WifiSession
 
 Rates = tuple[float, float]

@@ -20,8 +20,8 @@ from sensor_msgs.msg import CameraInfo, Image, Range
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
-from swarm_loc_drivers.common.ros_messages import (
+from swarm_loc_drivers.common.robot_driver_node import (
+    RobotDriverNode,
     camera_info_message,
     image_message,
     stamp_message,
@@ -34,10 +34,10 @@ from swarm_loc_drivers.epuck.hardware import (
     MIN_RANGE_M,
     PROXIMITY_BEARINGS,
     PROXIMITY_RADIUS_M,
+    CameraImage,
     range_of_raw,
 )
 from swarm_loc_drivers.epuck.parameters import EpuckParameters, camera_calibration
-from swarm_loc_drivers.epuck.session import CameraImage
 from swarm_loc_estimator.common.node import run_node
 
 _PROXIMITY_NAMES = tuple(f"ps{sensor}" for sensor in range(len(PROXIMITY_BEARINGS)))

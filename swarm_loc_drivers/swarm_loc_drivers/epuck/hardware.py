@@ -1,14 +1,17 @@
-"""Hardware of e-puck and e-puck2: motors, counters, proximity sensors, camera pixels."""
+"""Hardware of e-puck and e-puck2: motors, counters, proximity sensors, camera; measurements."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_drivers.common.odometry import WheelGeometry
+from swarm_loc_drivers.common.robot_driver import Session
 from swarm_loc_estimator.common.arrays import FloatArray
 
 STEPS_PER_TURN = 1000  # 20 steps of the motor, gear 50:1
@@ -17,6 +20,9 @@ PROXIMITY_BEARINGS = tuple(math.radians(-d) for d in (17.0, 46.0, 90.0, 151.0, -
 """Directions of ps0..ps7 in base_link [rad], positive to the left; the robot numbers them clockwise."""
 
 PROXIMITY_RADIUS_M = 0.035  # Distance of the proximity sensors from the centre of the robot
+
+WIFI_PORT = 1000
+WIFI_WIDTH, WIFI_HEIGHT = 160, 120  # Of images in the stream of the WiFi firmware [px]
 
 _COUNTER_SPAN = 1 << 16
 _AROUND_IMAGE = 11  # Two speeds before an image, its header of 3 bytes, and two speeds after it
@@ -140,3 +146,46 @@ def encode_rgb565(image: Image) -> bytes:
     red, green, blue = np.moveaxis(image.astype(np.uint16), -1, 0)
     pixels: NDArray[np.uint16] = ((red >> 3) << 11) | ((green >> 2) << 5) | (blue >> 3)
     return pixels.astype(">u2").tobytes()
+
+
+Speeds = Callable[[], tuple[int, int]]
+"""Commands for the left and the right wheel [steps/s]; called just before they are sent."""
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """Images to request."""
+
+    width: int  # [px]
+    height: int  # [px]
+    zoom: int  # Camera pixels per pixel
+    period_s: float  # Between two images over a serial port [s]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Sensor values."""
+
+    stamp_ns: int  # Acquisition [ns]
+    doubt_ns: int  # Uncertainty of the stamp in both directions [ns]
+    left_counter: int  # Steps of the left wheel, 16 bits, wrapping
+    right_counter: int  # Steps of the right wheel, 16 bits, wrapping
+    proximity: NDArray[np.int64]  # (8,) raw values of ps0..ps7
+
+
+@dataclass(frozen=True)
+class CameraImage:
+    """An image of the robot's camera."""
+
+    stamp_ns: int  # Best estimate of the exposure time [ns]
+    pixels: Image  # (height, width, 3) RGB
+
+
+class EpuckSession(Session, Protocol):
+    """A conversation with one e-puck."""
+
+    found: list[Reading | CameraImage]  # Measurements; the reader empties the list
+    is_idle: bool  # Whether no answer is pending: the next step sends a request
+
+    def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
+        """See `TalkSession.step`."""

@@ -12,9 +12,16 @@ from swarm_loc_drivers.common.calibration_file import (
 )
 from swarm_loc_drivers.common.link import Address, parse_address
 from swarm_loc_drivers.common.odometry import WheelGeometry
-from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
-from swarm_loc_drivers.epuck.hardware import EPUCK2, EPUCK_MODELS, EpuckModel, wheel_geometry
-from swarm_loc_drivers.epuck.session import CameraSettings
+from swarm_loc_drivers.epuck.hardware import (
+    EPUCK2,
+    EPUCK_MODELS,
+    WIFI_HEIGHT,
+    WIFI_PORT,
+    WIFI_WIDTH,
+    CameraSettings,
+    EpuckModel,
+    wheel_geometry,
+)
 from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 
@@ -95,7 +102,7 @@ class EpuckParameters:
     @property
     def link_address(self) -> Address:
         """The parsed address; over TCP the robot is an e-puck2 with the WiFi firmware."""
-        return parse_address(self.address, epuck_wifi.PORT)
+        return parse_address(self.address, WIFI_PORT)
 
     @property
     def epuck_model(self) -> EpuckModel:
@@ -113,7 +120,7 @@ class EpuckParameters:
         if not self.camera:
             return None
         if self.link_address.host:
-            return CameraSettings(epuck_wifi.WIDTH, epuck_wifi.HEIGHT, zoom=1, period_s=self.image_period_s)
+            return CameraSettings(WIFI_WIDTH, WIFI_HEIGHT, zoom=1, period_s=self.image_period_s)
         return CameraSettings(self.image_width, self.image_height, self.image_zoom, self.image_period_s)
 
 

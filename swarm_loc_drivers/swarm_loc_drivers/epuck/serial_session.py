@@ -19,10 +19,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_drivers.common.session import MAX_NONSENSE_S, NONSENSE, SessionError, Talk, TalkSession
-from swarm_loc_drivers.epuck.hardware import as_counter, decode_rgb565
+from swarm_loc_drivers.common.robot_driver import MAX_NONSENSE_S, NONSENSE, SessionError, Talk, TalkSession
+from swarm_loc_drivers.epuck.hardware import (
+    CameraImage,
+    CameraSettings,
+    Reading,
+    Speeds,
+    as_counter,
+    decode_rgb565,
+)
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
-from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, Reading, Speeds
 
 END = 0
 RGB565_MODE = 1

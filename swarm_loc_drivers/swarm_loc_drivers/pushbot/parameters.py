@@ -6,8 +6,7 @@ from dataclasses import dataclass, field
 
 from swarm_loc_drivers.common.link import Address, parse_address
 from swarm_loc_drivers.common.odometry import WheelGeometry
-from swarm_loc_drivers.pushbot.hardware import BAUD_RATE, TIMESTAMPS
-from swarm_loc_drivers.pushbot.protocol import Lights
+from swarm_loc_drivers.pushbot.protocol import BAUD_RATE, TIMESTAMPS, Lights
 from swarm_loc_drivers.pushbot.stop_and_go import StopAndGoSettings
 from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text, texts
 from swarm_loc_estimator.swarm.swarm import Swarm

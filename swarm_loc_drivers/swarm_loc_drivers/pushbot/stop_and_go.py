@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_drivers.common.velocity_command import STILL, Velocity
+from swarm_loc_drivers.common.robot_driver import STILL, Velocity
 from swarm_loc_estimator import SCAN_TURN, START_TURN
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import number

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.epuck import serial_session
-from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
+from swarm_loc_drivers.epuck import wifi_session as epuck_wifi
 from swarm_loc_drivers.epuck.hardware import (
     EPUCK1,
     EPUCK2,
@@ -29,7 +29,7 @@ from swarm_loc_drivers.epuck.hardware import (
     raw_of_distance,
     unwrapped_difference,
 )
-from swarm_loc_drivers.epuck.wifi_protocol import SENSORS_DTYPE, Command, StreamParser, plausible
+from swarm_loc_drivers.epuck.wifi_session import SENSORS_DTYPE, Command, StreamParser, plausible
 
 MODELS = pytest.mark.parametrize("model", [EPUCK1, EPUCK2], ids=lambda model: model.name)
 SPEED = st.integers(-1100, 1100)

@@ -14,11 +14,8 @@ from typing import Any
 
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import AnonymousDetectionArray
-from swarm_loc_vision.aerial.control_points import PoseFit
 from swarm_loc_vision.aerial.detector import AerialCamera
-from swarm_loc_vision.aerial.ground_control import Ground
-from swarm_loc_vision.aerial.ground_file import load_ground
-from swarm_loc_vision.aerial.parameters import AerialParameters
+from swarm_loc_vision.aerial.ground_control import AerialParameters, Ground, PoseFit, load_ground
 from swarm_loc_vision.common.camera_node import CameraNode
 from swarm_loc_vision.common.images import TRANSPORTS
 

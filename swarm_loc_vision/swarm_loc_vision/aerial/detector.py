@@ -29,9 +29,14 @@ from swarm_loc_vision.aerial.circles import (
     likely,
     peaks,
 )
-from swarm_loc_vision.aerial.ground_camera import GroundCamera
-from swarm_loc_vision.aerial.ground_control import NO_GROUND, Ground, GroundControl
-from swarm_loc_vision.aerial.parameters import POLARITIES, AerialSettings
+from swarm_loc_vision.aerial.ground_control import (
+    NO_GROUND,
+    POLARITIES,
+    AerialSettings,
+    Ground,
+    GroundCamera,
+    GroundControl,
+)
 from swarm_loc_vision.aerial.pattern import Marks, find_marks
 from swarm_loc_vision.aerial.rectification import (
     Brightness,
@@ -41,9 +46,8 @@ from swarm_loc_vision.aerial.rectification import (
     noise_of,
     rectification,
 )
-from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, GrayOf
 from swarm_loc_vision.common.camera import Camera
-from swarm_loc_vision.common.images import Gray, ImageError
+from swarm_loc_vision.common.images import CalibratedCamera, Gray, GrayOf, ImageError
 
 # Numbers below were chosen on drawn pictures (bench/aerial/pictures.py), not on those of seeds 101 to 104,
 # which doc/aerial_camera_node.md reports on (`make bench-aerial`).

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.aerial.ground_camera import GroundCamera
-from swarm_loc_vision.aerial.parameters import AerialSettings
+from swarm_loc_vision.aerial.ground_control import AerialSettings, GroundCamera
 from swarm_loc_vision.common.images import Gray
 
 Plain = NDArray[np.float32]

@@ -11,9 +11,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
 from swarm_loc_estimator.common.node import ManagedNode, Parameters
-from swarm_loc_vision.common.calibrated_camera import Calibration
 from swarm_loc_vision.common.camera import CameraError
-from swarm_loc_vision.common.images import TRANSPORTS, ImageError
+from swarm_loc_vision.common.images import TRANSPORTS, Calibration, ImageError
 
 IMAGE_QOS = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Where images arrive faster than they are processed, the middleware drops the oldest ones."""

@@ -25,13 +25,15 @@ from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS, nanoseconds
 from swarm_loc_estimator.common.messages.event_encoding import EventError, decode_events
 from swarm_loc_estimator.common.node import ConfiguredNode, message_class, run_node
 from swarm_loc_msgs.msg import LaserDistance, LightBearing, LightBearingArray
-from swarm_loc_vision.events.parameters import EventTrackerParameters, laser_calibration, light_sources
 from swarm_loc_vision.events.tracker import (
+    EventTrackerParameters,
     LightTracker,
     Sighting,
     WindowReport,
     direction,
     direction_jacobian,
+    laser_calibration,
+    light_sources,
 )
 from swarm_loc_vision.laser.calibration import UNKNOWN, Distance
 

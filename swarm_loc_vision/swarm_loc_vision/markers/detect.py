@@ -39,8 +39,7 @@ from swarm_loc_estimator.common.parameters import Value
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.camera import CameraError
 from swarm_loc_vision.common.images import TRANSPORTS, ImageError, Transport
-from swarm_loc_vision.markers.detector import CameraDetector
-from swarm_loc_vision.markers.parameters import DetectorParameters, detector_maker
+from swarm_loc_vision.markers.detector import CameraDetector, DetectorParameters, detector_maker
 
 CreateCamera = Callable[[str, Transport], CameraDetector]
 Progress = Callable[[float, str], None]
