@@ -11,17 +11,27 @@ from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Generator
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import Generic, Protocol, TypeVar
 
 from swarm_loc_drivers.common.link import Link, LinkError
+from swarm_loc_estimator.common.parameters import flag, number, text
 
-STANDING_CLOCK_S = 1.0
-"""A clock that stands still for so long of real time counts as dead, and the robot stops [s]."""
-
+STANDING_CLOCK_S = 1.0  # A clock that stands still for so long of real time is dead: the robot stops [s]
 MAX_VELOCITY = 1e3  # [m/s] and [rad/s]; larger velocities are dropped as errors
 
 Velocity = tuple[float, float, float]  # Forward [m/s], to the left [m/s], turning to the left [rad/s]
 STILL: Velocity = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriverParameters:
+    """Parameters that all drivers have."""
+
+    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "time without cmd_vel until the robot stops")
+    odom_frame: str = text("odom", "the pose is in <robot>/odom_frame", required=True)
+    base_frame: str = text("base_link", "the pose is that of <robot>/base_frame", required=True)
+    publish_tf: bool = flag(True, "publish the transform from odom to base_link")
 
 
 class VelocityCommand:
@@ -134,6 +144,15 @@ class TalkSession(ABC):
                 return match
             self._received = self._received[-_MAX_RECEIVED:]
         return None
+
+    def _ask(
+        self, request: bytes, answer: re.Pattern[bytes], timeout_s: float, tries: int, who: str = ""
+    ) -> Talk[re.Match[bytes]]:
+        """The answer to a request, which is sent several times; an error says `who` does not answer."""
+        for _ in range(tries):
+            if (match := (yield from self._ask_once(request, answer, timeout_s))) is not None:
+                return match
+        raise SessionError(f"the robot does not answer{who}")
 
 
 _MIN_PAUSE_S, _MAX_PAUSE_S = 0.1, 2.0

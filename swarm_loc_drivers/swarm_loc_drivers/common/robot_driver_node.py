@@ -10,7 +10,7 @@ import time
 from array import array
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from builtin_interfaces.msg import Time as TimeMessage
@@ -27,7 +27,7 @@ from tf2_msgs.msg import TFMessage
 
 from swarm_loc_drivers.common.calibration_file import CameraCalibration
 from swarm_loc_drivers.common.odometry import OdometryState
-from swarm_loc_drivers.common.robot_driver import NO_CLOCK, RobotDriver, Velocity
+from swarm_loc_drivers.common.robot_driver import NO_CLOCK, DriverParameters, RobotDriver, Velocity
 from swarm_loc_estimator.common.health import PATIENCE_S, Level, Report, level_of
 from swarm_loc_estimator.common.messages.poses import PLANE
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop
@@ -65,18 +65,6 @@ def odometry_message(state: OdometryState, odom_frame: str, base_frame: str) -> 
     return message
 
 
-def odometry_transform(odometry: Odometry) -> TransformStamped:
-    """The transform from the odometry's frame to that of the robot."""
-    pose = odometry.pose.pose
-    return TransformStamped(
-        header=odometry.header,
-        child_frame_id=odometry.child_frame_id,
-        transform=Transform(
-            translation=Vector3(x=pose.position.x, y=pose.position.y), rotation=pose.orientation
-        ),
-    )
-
-
 class OdometryOutput:
     """Publishes the odometry of one robot: the pose of `base_frame` in `odom_frame`.
 
@@ -95,7 +83,11 @@ class OdometryOutput:
         message = odometry_message(state, *self._frames)
         self._odometry.publish(message)
         if self._transforms is not None:
-            self._transforms.publish(TFMessage(transforms=[odometry_transform(message)]))
+            pose, header, child = message.pose.pose, message.header, message.child_frame_id
+            place = Vector3(x=pose.position.x, y=pose.position.y)
+            moved = Transform(translation=place, rotation=pose.orientation)
+            found = TransformStamped(header=header, child_frame_id=child, transform=moved)
+            self._transforms.publish(TFMessage(transforms=[found]))
 
 
 def transform_publisher(node: Node) -> Publisher:
@@ -136,22 +128,6 @@ _CLOCK_PATIENCE_S = 30.0
 """Silence about a simulation that is starting: its nodes may take long on a busy machine."""
 
 
-class DriverParameters(Protocol):
-    """Parameters that all drivers have."""
-
-    @property
-    def odom_frame(self) -> str:
-        """Frame of the pose, without the robot's name."""
-
-    @property
-    def base_frame(self) -> str:
-        """Frame of the robot, without its name."""
-
-    @property
-    def publish_tf(self) -> bool:
-        """Whether to publish the transform between them."""
-
-
 Parameters = TypeVar("Parameters", bound=DriverParameters)
 
 
@@ -166,8 +142,7 @@ class RobotDriverNode(ConfiguredNode[Parameters]):
     def __init__(self, *arguments: Any, **node_arguments: Any) -> None:
         super().__init__(*arguments, **node_arguments)
         robot = self.get_namespace().strip("/")
-        self._prefix = f"{robot}/" if robot else ""
-        """Prefix of the robot's frames and of its status."""
+        self._prefix = f"{robot}/" if robot else ""  # Of the robot's frames and of its status
         self._base_frame = f"{self._prefix}{self.params.base_frame}"
         self._transforms = transform_publisher(self) if self.params.publish_tf else None
 
@@ -219,19 +194,6 @@ class RobotDriverNode(ConfiguredNode[Parameters]):
     def _report(self) -> None:
         trouble, warning = self._driver.trouble, self._driver.warning
         counts = Counter(self._driver.counts)
-        self._log(trouble, counts)
-        self.health.warn_of("robot", {warning: warning} if warning else {})
-        self.health.warn_of("defect", dict(self._driver.defects))
-        now_s = time.monotonic()
-        elapsed_s, self._reported_s = now_s - self._reported_s, now_s
-        values: dict[str, object] = dict(sorted(counts.items()))
-        for name in self._rates:
-            values[f"{name} rate [1/s]"] = f"{(counts[name] - self._reported[name]) / elapsed_s:.4g}"
-        self._reported = counts
-        level, name = Level.ERROR if trouble else level_of(warning), f"{self._prefix}{self.get_name()}"
-        self.publish_reports(Report(name, trouble or warning or "connected", level, values, self._address))
-
-    def _log(self, trouble: str, counts: Counter[str]) -> None:
         # a robot that is being switched on, or a simulation that starts, does not answer at once
         first_s = _CLOCK_PATIENCE_S if trouble == NO_CLOCK else PATIENCE_S
         patience_s = 0.0 if counts["connections"] else first_s
@@ -241,6 +203,17 @@ class RobotDriverNode(ConfiguredNode[Parameters]):
         self._was_in_trouble = bool(trouble)
         errors = {f"{name}: {meaning}": counts[name] for name, meaning in self._wrong.items()}
         self.health.warn_of_drops(errors, "errors")
+        self.health.warn_of("robot", {warning: warning} if warning else {})
+        self.health.warn_of("defect", dict(self._driver.defects))
+        # the report, with rates since the last one
+        now_s = time.monotonic()
+        elapsed_s, self._reported_s = now_s - self._reported_s, now_s
+        values: dict[str, object] = dict(sorted(counts.items()))
+        for name in self._rates:
+            values[f"{name} rate [1/s]"] = f"{(counts[name] - self._reported[name]) / elapsed_s:.4g}"
+        self._reported = counts
+        level, name = Level.ERROR if trouble else level_of(warning), f"{self._prefix}{self.get_name()}"
+        self.publish_reports(Report(name, trouble or warning or "connected", level, values, self._address))
 
     def _now_ns(self) -> int:
         return int(self.get_clock().now().nanoseconds)

@@ -23,7 +23,6 @@ from swarm_loc_drivers.droplet import protocol
 from swarm_loc_drivers.droplet.exchange import (
     Brightness,
     PollingExchange,
-    PollingSettings,
     Publish,
     SessionSettings,
     TdmaExchange,
@@ -33,16 +32,17 @@ from swarm_loc_drivers.droplet.hardware import BAUD_RATE, DIRECTIONS, RADIUS_M, 
 from swarm_loc_drivers.droplet.odometry import CommandedMotion
 from swarm_loc_drivers.droplet.parameters import DropletParameters
 from swarm_loc_drivers.droplet.protocol import (
-    Broken,
+    BROKEN,
+    UNKNOWN,
     ConsoleTalk,
     Echo,
     Identity,
     MotorTrims,
     MoveStarted,
+    Noted,
     Said,
     StepLength,
     Talk,
-    Unknown,
     relay,
 )
 
@@ -74,7 +74,12 @@ class DropletSession:
         self._console = ConsoleTalk(
             settings.elements, round(settings.reply_timeout_s * 1e9), self._on_said, counts
         )
-        self._exchanging = self._exchanges(settings.exchanges, publish)
+        shared = self._interlude, publish, counts
+        self._exchanging: PollingExchange | TdmaExchange = (
+            TdmaExchange(self._console, settings.exchanges, *shared)
+            if isinstance(settings.exchanges, TdmaSettings)
+            else PollingExchange(self._console, settings.exchanges, *shared)
+        )
         self._trims: dict[int, tuple[int, int, int]] = {}
         self._lengths: dict[int, int] = {}
         self._gaits: dict[int, Gait] = {}
@@ -82,13 +87,6 @@ class DropletSession:
         self._due_ns = 0
         self._sense_ns = 0  # When the robot last said what makes sense
         self._patience_ns = round(1e9 * max(MAX_NONSENSE_S, 2.0 * settings.reply_timeout_s))
-
-    def _exchanges(
-        self, settings: PollingSettings | TdmaSettings, publish: Publish
-    ) -> PollingExchange | TdmaExchange:
-        if isinstance(settings, TdmaSettings):
-            return TdmaExchange(self._console, settings, self._interlude, publish, self._counts)
-        return PollingExchange(self._console, settings, self._interlude, publish, self._counts)
 
     @property
     def robot(self) -> int:
@@ -127,19 +125,15 @@ class DropletSession:
         yield from self._identify()
         self.connected = True
         while (yield from self._interlude()):
-            if self._exchanging.is_due(self._console.now_ns):
+            now_ns = self._console.now_ns
+            if self._exchanging.is_due(now_ns):
                 yield from self._exchanging.talk()
-            elif self._is_silent():
+            elif now_ns > self._sense_ns + _SILENCE_NS and self._exchanging.is_quiet(now_ns):
                 yield from self._console.enter(protocol.GET_ID)
             else:
-                yield self._console.now_ns + _IDLE_NS
+                yield now_ns + _IDLE_NS
         for mover in self._movers:
             yield from mover.stop(self._console)
-
-    def _is_silent(self) -> bool:
-        """Whether the robot has said nothing for long, and may be asked."""
-        now_ns = self._console.now_ns
-        return now_ns > self._sense_ns + _SILENCE_NS and self._exchanging.is_quiet(now_ns)
 
     def _identify(self) -> Talk[None]:
         """Stop the robot and read its id and its gaits."""
@@ -174,7 +168,9 @@ class DropletSession:
 
     def _on_said(self, said: Said) -> None:
         event = said.event
-        if not isinstance(event, Echo | Unknown | Broken):
+        if not isinstance(event, Echo) and not (
+            isinstance(event, Noted) and event.reason in (BROKEN, UNKNOWN)
+        ):
             self._sense_ns = self._console.now_ns
         if isinstance(event, Identity):
             self._exchanging.validator.robot = event.robot
@@ -183,20 +179,15 @@ class DropletSession:
         elif isinstance(event, StepLength):
             self._lengths[event.direction] = event.per_kilostep
         elif isinstance(event, MoveStarted):
-            self._note_move(event)
+            # a command to move, from here or by infrared
+            if event != self._mover.asked and event.direction in self._gaits:
+                self._counts["foreign_moves"] += 1
+                self._mover.motion.begin(self._console.now_ns, self._gaits[event.direction], event.steps)
         else:
             self._exchanging.observe(said)
 
-    def _note_move(self, started: MoveStarted) -> None:
-        """A command to move, from here or by infrared."""
-        if started != self._mover.asked and started.direction in self._gaits:
-            self._counts["foreign_moves"] += 1
-            self._mover.motion.begin(self._console.now_ns, self._gaits[started.direction], started.steps)
-
 
 Gaits = Mapping[int, Gait]  # Gaits of the directions in which a robot can move
-
-_STAND = None
 
 
 def nearest_motion(wanted: Velocity, gaits: Gaits) -> int | None:
@@ -207,13 +198,11 @@ def nearest_motion(wanted: Velocity, gaits: Gaits) -> int | None:
     """
 
     def distance(direction: int | None) -> float:
-        velocity = STILL if direction is _STAND else gaits[direction].velocity
+        velocity = STILL if direction is None else gaits[direction].velocity
         forward, left, turn = (want - have for want, have in zip(wanted, velocity, strict=True))
         return math.hypot(forward, left, RADIUS_M * turn)
 
-    if wanted == STILL:
-        return _STAND
-    return min([_STAND, *gaits], key=distance)
+    return None if wanted == STILL else min([None, *gaits], key=distance)
 
 
 class DropletMover:
@@ -238,15 +227,12 @@ class DropletMover:
         self._target = target
         self._doubt = relay_loss  # probability that a command was lost
         self._sent: int | None = None
-        self.asked: MoveStarted | None = None
-        """The last command to move, which the robot will print."""
+        self.asked: MoveStarted | None = None  # The last command to move, which the robot will print
 
     def is_due(self, now_ns: int, gaits: Gaits) -> bool:
         """Whether a command is due."""
         wanted = nearest_motion(self._command.velocity(), gaits)
-        if wanted != self._sent:
-            return True
-        return wanted is not None and not self.motion.moving(now_ns)
+        return wanted != self._sent or (wanted is not None and not self.motion.moving(now_ns))
 
     def send(self, console: ConsoleTalk, gaits: Gaits) -> Talk[None]:
         """Send the current motion."""
@@ -299,17 +285,12 @@ class DropletDriver(RobotDriver[DropletSession]):
         self._listeners = listeners
         self._requested = threading.Event()
         self._odometry_due_ns = 0
-        relayed = params.relayed_ids
-        self._commands = {
-            name: VelocityCommand(params.cmd_vel_timeout_s, clock, self.counts) for name in (OWN, *relayed)
-        }
-        self._movers = {name: self._mover(name, relayed.get(name)) for name in self._commands}
-
-    def _mover(self, name: str, target: int | None) -> DropletMover:
-        params = self._params
-        loss = params.relay_loss if target is not None else 0.0
-        motion = CommandedMotion(params.motion_noise)
-        return DropletMover(self._commands[name], motion, params.stride_s, target, loss)
+        self._commands: dict[str, VelocityCommand] = {}
+        self._movers: dict[str, DropletMover] = {}
+        for name, target in {OWN: None, **params.relayed_ids}.items():
+            command = self._commands[name] = VelocityCommand(params.cmd_vel_timeout_s, clock, self.counts)
+            motion, loss = CommandedMotion(params.motion_noise), params.relay_loss if name != OWN else 0.0
+            self._movers[name] = DropletMover(command, motion, params.stride_s, target, loss)
 
     def set_velocity(self, name: str, velocity: Velocity) -> None:
         """Set the velocity of a robot."""
@@ -324,13 +305,11 @@ class DropletDriver(RobotDriver[DropletSession]):
 
     def _begin(self) -> DropletSession:
         relayed = [mover for name, mover in self._movers.items() if name != OWN]
-        session = DropletSession(
-            self._params.session,
-            self._movers[OWN],
-            relayed,
-            lambda one: self._listeners.brightness(session.robot, one),
-            self.counts,
-        )
+
+        def publish(one: Brightness) -> None:
+            self._listeners.brightness(session.robot, one)
+
+        session = DropletSession(self._params.session, self._movers[OWN], relayed, publish, self.counts)
         return session
 
     def _step(self, session: DropletSession, link: Link) -> bytes:

@@ -126,7 +126,14 @@ class DropletFleetNode(ConfiguredNode[DropletFleetParameters]):
                 "turn": turn,
                 "use_sim_time": simulated,
             }
-            self._drivers.append(_driver(names[turn], own))
+            # remappings on the command line apply only to the fleet node
+            driver = DropletDriverNode(
+                namespace=names[turn],
+                parameter_overrides=[Parameter(name, value=value) for name, value in own.items()],
+                use_global_arguments=False,
+                start_parameter_services=False,
+            )
+            self._drivers.append(driver)
 
     def run(self, stop: Stop) -> int:
         """Drive all robots until asked to stop; the exit status."""
@@ -141,16 +148,6 @@ class DropletFleetNode(ConfiguredNode[DropletFleetParameters]):
         for driver in self._drivers:
             driver.destroy_node()
         super().destroy_node()
-
-
-def _driver(robot: str, parameters: dict[str, Any]) -> DropletDriverNode:
-    """Node of one robot; remappings on the command line apply only to the fleet node."""
-    return DropletDriverNode(
-        namespace=robot,
-        parameter_overrides=[Parameter(name, value=value) for name, value in parameters.items()],
-        use_global_arguments=False,
-        start_parameter_services=False,
-    )
 
 
 run_droplet_fleet = partial(run_node, "droplet_fleet_node", DropletFleetNode)

@@ -76,8 +76,7 @@ class MatrixValidator:
     def __init__(self, known: Collection[int], counts: Counter[str]) -> None:
         self._known = frozenset(known)
         self._counts = counts
-        self.robot: int | None = None
-        """Id of the robot at the cable."""
+        self.robot: int | None = None  # Id of the robot at the cable
 
     def transmitter(self, said: Said, matrix: Matrix, asked: int | None) -> int | None:
         """Id of the emitting robot; None if the matrix cannot be used.
@@ -188,7 +187,10 @@ class PollingExchange:
         for power in (Power.NEAR, Power.FAR)[-len(self._settings.powers) :]:  # far comes last, and stays
             one = yield from self._measure(partner, power)
             if one is None:
-                self._note_failure(partner)
+                # ask a robot that does not answer less and less often
+                self._counts["failed_exchanges"] += 1
+                self._failures[partner] += 1
+                self._skips[partner] = min(2 ** self._failures[partner] - 1, _MAX_SKIPPED)
                 return
             ones.append(one)
         # if the far matrix is not brighter, the command to change the power had no effect
@@ -207,12 +209,6 @@ class PollingExchange:
                 return partner
             self._skips[partner] -= 1
         return None
-
-    def _note_failure(self, partner: int) -> None:
-        """Ask a robot that does not answer less and less often."""
-        self._counts["failed_exchanges"] += 1
-        self._failures[partner] += 1
-        self._skips[partner] = min(2 ** self._failures[partner] - 1, _MAX_SKIPPED)
 
     def _measure(self, partner: int, power: Power) -> Talk[Brightness | None]:
         """A matrix of one power; None if all attempts fail or the session ends."""
@@ -286,6 +282,7 @@ class TdmaExchange:
         self._console = console
         self._settings = settings
         self._half_ns = round(0.5e9 * settings.turn_s)
+        self._turn_ns = 2 * self._half_ns
         self._interlude = interlude
         self._publish = publish
         self._counts = counts
@@ -303,11 +300,16 @@ class TdmaExchange:
         transmitter = self.validator.transmitter(said, said.event, None)
         if transmitter is None:
             return
+        # matrices of both powers of one turn are an exchange
         stamp_ns = said.stamp_ns - PRINTED_AFTER_NS
         power = Power.FAR if stamp_ns // self._half_ns % 2 else Power.NEAR
         one = brightness_of(said.event, stamp_ns, transmitter, power)
         near = self._kept.pop(transmitter, None)
-        if near is not None and power is Power.FAR and self._turn(near) == self._turn(one):
+        if (
+            near is not None
+            and power is Power.FAR
+            and near.stamp_ns // self._turn_ns == stamp_ns // self._turn_ns
+        ):
             self._counts["exchanges"] += 1
             publish_pair([near, one], self._publish)
             return
@@ -317,10 +319,6 @@ class TdmaExchange:
             self._kept[transmitter] = one
         else:
             self._publish_alone(one)
-
-    def _turn(self, one: Brightness) -> int:
-        """The number of the turn in which a matrix was measured."""
-        return one.stamp_ns // self._half_ns // 2
 
     def _publish_alone(self, one: Brightness) -> None:
         """Publish the only matrix of its exchange."""
@@ -344,19 +342,17 @@ class TdmaExchange:
 
     def _expired(self, now_ns: int) -> list[int]:
         """Robots whose far matrix is overdue."""
-        latest = (now_ns - _LATE_NS) // (2 * self._half_ns)
-        return [robot for robot, near in self._kept.items() if self._turn(near) < latest]
+        latest = (now_ns - _LATE_NS) // self._turn_ns
+        return [robot for robot, near in self._kept.items() if near.stamp_ns // self._turn_ns < latest]
 
     def talk(self) -> Talk[None]:
         """Publish unpaired matrices, and emit in this robot's turn."""
         begin_ns = self._console.now_ns
         for robot in self._expired(begin_ns):
             self._publish_alone(self._kept.pop(robot))
-        if self._is_mine(begin_ns):
-            yield from self._emit(begin_ns)
-
-    def _emit(self, begin_ns: int) -> Talk[None]:
-        """Emit once in this half of the turn."""
+        if not self._is_mine(begin_ns):
+            return
+        # emit once in this half of the turn
         half = begin_ns // self._half_ns
         self._emitted = half
         if begin_ns % self._half_ns > _LATEST * self._half_ns:

@@ -15,7 +15,6 @@ continue whenever output arrives.
 
 from __future__ import annotations
 
-import math
 import re
 from collections import Counter
 from collections.abc import Callable, Generator
@@ -41,6 +40,7 @@ MOTOR_SETTINGS = "print_motor_settings"
 _MAX_PRINTED_LINE = 512
 _MAX_DIGITS = 5
 _BACKSPACE = 8
+BROKEN, UNKNOWN = "broken_matrices", "unknown_lines"  # What lines without sense are counted as
 
 
 class CommandError(ValueError):
@@ -100,32 +100,10 @@ class MoveStarted(NamedTuple):
     steps: int
 
 
-class Relayed(NamedTuple):
-    """A line is sent to another robot; None: to all."""
-
-    target: int | None
-    line: str
-
-
 class SendAborted(NamedTuple):
     """A message was not sent because infrared is busy."""
 
     status: int
-
-
-class EmissionFailed(NamedTuple):
-    """The robot did not emit because it was busy."""
-
-    status: int
-
-
-class RangeBearing(NamedTuple):
-    """The robot's own estimate of another robot: range [m], bearing [rad] and heading [rad]."""
-
-    robot: int
-    range_m: float
-    bearing: float
-    heading: float
 
 
 class Matrix(NamedTuple):
@@ -134,12 +112,6 @@ class Matrix(NamedTuple):
     emitter: int | None  # Id of the emitting robot; None if the format lacks it
     receiver: int | None  # Id of the measuring robot; None if the format lacks it
     brightness: tuple[tuple[int, ...], ...]  # One row per emitter, one count per sensor
-
-
-class SilentSensor(NamedTuple):
-    """A sensor has repeatedly read nothing."""
-
-    sensor: int
 
 
 class MotorTrims(NamedTuple):
@@ -156,44 +128,14 @@ class StepLength(NamedTuple):
     per_kilostep: int
 
 
-class Title(NamedTuple):
-    """Title of a table."""
+class Noted(NamedTuple):
+    """Any other line: what it is counted as, or "" for an ordinary one, and its text."""
 
+    reason: str
     text: str
 
 
-class NotRecognised(NamedTuple):
-    """A command that is unknown to the firmware."""
-
-    word: str
-
-
-class Overflow(NamedTuple):
-    """A line was longer than the buffer and was dropped."""
-
-
-class Complaint(NamedTuple):
-    """Another error of the firmware."""
-
-    text: str
-
-
-class Broken(NamedTuple):
-    """An incomplete matrix."""
-
-    text: str
-
-
-class Unknown(NamedTuple):
-    """Any other line."""
-
-    text: str
-
-
-Event = (
-    Echo | Identity | MoveStarted | Relayed | SendAborted | EmissionFailed | RangeBearing | Matrix
-    | SilentSensor | MotorTrims | StepLength | Title | NotRecognised | Overflow | Complaint | Broken | Unknown
-)  # fmt: skip
+Event = Echo | Identity | MoveStarted | SendAborted | Matrix | MotorTrims | StepLength | Noted
 
 
 class Said(NamedTuple):
@@ -211,26 +153,23 @@ _HEX = "([0-9A-F]{4})"
 _NUMBER = rf" *(-?\d{{1,{_MAX_DIGITS}}})"
 
 
+def _noted(count: str) -> Callable[[re.Match[str]], Noted]:
+    return lambda match: Noted(count, match[0])
+
+
 def _integers(match: re.Match[str]) -> tuple[int, ...]:
     return tuple(int(group) for group in match.groups())
 
 
-def _relayed(match: re.Match[str]) -> Event:
-    target, line, length = match.groups()
-    return (
-        Relayed(int(target, 16) if target else None, line) if len(line) == int(length) else Unknown(match[0])
-    )
-
-
-def _range_bearing(match: re.Match[str]) -> RangeBearing:
-    robot, range_mm, bearing_deg, heading_deg = match.groups()
-    angles = math.radians(int(bearing_deg)), math.radians(int(heading_deg))
-    return RangeBearing(int(robot, 16), 1e-3 * int(range_mm), *angles)
+def _relayed(match: re.Match[str]) -> Noted:
+    """A line is sent to another robot, or to all."""
+    line, length = match.groups()
+    return Noted("" if len(line) == int(length) else UNKNOWN, match[0])
 
 
 def _motor_trims(match: re.Match[str]) -> MotorTrims:
-    direction, *trims = _integers(match)
-    return MotorTrims(direction, (trims[0], trims[1], trims[2]))
+    direction, first, second, third = _integers(match)
+    return MotorTrims(direction, (first, second, third))
 
 
 _LINES: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Event]], ...] = tuple(
@@ -238,18 +177,17 @@ _LINES: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Event]], ...] = t
     for pattern, make in (
         (r"My ID is: ([0-9A-F]{1,4})", lambda m: Identity(int(m[1], 16))),
         (r"walk direction (\d), num_steps (\d{1,5})", lambda m: MoveStarted(*_integers(m))),
-        (rf'Broadcasting command to {_HEX}: "(.*)", of length (\d{{1,2}})\.', _relayed),
-        (r'Broadcasting command()?: "(.*)", of length (\d{1,2})\.', _relayed),
+        (r'Broadcasting command(?: to [0-9A-F]{4})?: "(.*)", of length (\d{1,2})\.', _relayed),
         (r"Aborting IR send \[([0-9A-Fa-f]{2})\] while trying: .*", lambda m: SendAborted(int(m[1], 16))),
-        (r"RNB Broadcast failed \[ ([0-9A-F]{2}) \]", lambda m: EmissionFailed(int(m[1], 16))),
-        (rf"\t\(RNB\) ID: {_HEX} \| R:{_NUMBER} B:{_NUMBER} H:{_NUMBER}", _range_bearing),
-        (r"!!!\tGot \d+ consecutive nothings from sensor (\d)\.\t!!!", lambda m: SilentSensor(int(m[1]))),
+        (r"RNB Broadcast failed \[ [0-9A-F]{2} \]", _noted("failed_emissions")),
+        (rf"\t\(RNB\) ID: {_HEX} \| R:{_NUMBER} B:{_NUMBER} H:{_NUMBER}", _noted("range_bearings")),
+        (r"!!!\tGot \d+ consecutive nothings from sensor \d\.\t!!!", _noted("silent_sensors")),
         (rf"\tdir: ([0-7])\t{_NUMBER}\t{_NUMBER}\t{_NUMBER}\t", _motor_trims),
         (r"\t([0-7])\t(\d{1,5})", lambda m: StepLength(*_integers(m))),
-        (r"Motor Values|Dist \(mm\) per kilostep", lambda m: Title(m[0])),
-        (r"\tCommand \( (.*) \) not recognized\.", lambda m: NotRecognised(m[1])),
-        (r"ERROR: Serial input buffer capacity of \d+ characters exceeded\.", lambda _: Overflow()),
-        (r"(?:!!!|error|ERROR|Error).*", lambda m: Complaint(m[0])),
+        (r"Motor Values|Dist \(mm\) per kilostep", _noted("")),
+        (r"\tCommand \( .* \) not recognized\.", _noted("unknown_commands")),
+        (r"ERROR: Serial input buffer capacity of \d+ characters exceeded\.", _noted("overflows")),
+        (r"(?:!!!|error|ERROR|Error).*", _noted("firmware_errors")),
         (rf"(?:{_COMMANDS})(?: .*)?", lambda m: Echo(m[0])),
     )
 )
@@ -310,7 +248,7 @@ class ConsoleParser:
         self._rows = None
         if not missing and self._last.fullmatch(line):
             return [Said(self._rows_stamp_ns, Matrix(None, None, tuple(rows)))]
-        return [Said(self._rows_stamp_ns, Broken("{")), *self._line(line)]
+        return [Said(self._rows_stamp_ns, Noted(BROKEN, "{")), *self._line(line)]
 
     def _event(self, line: str) -> Event:
         """Parse a single line."""
@@ -322,7 +260,7 @@ class ConsoleParser:
         for pattern, make in _LINES:
             if match := pattern.fullmatch(line):
                 return make(match)
-        return Broken(line) if "{" in line or "}" in line else Unknown(line)
+        return Noted(BROKEN if "{" in line or "}" in line else UNKNOWN, line)
 
     def _square(self, cells: tuple[str, ...] | list[str]) -> tuple[tuple[int, ...], ...]:
         """Arrange cells in rows."""
@@ -336,17 +274,6 @@ Talk = Generator[int, None, Result]  # Yields the time [ns] at which to continue
 MARGIN_NS = 15_000_000  # Tolerance for the robot's clock, which counts milliseconds [ns]
 _TRIES = 8
 _ERASED_AT_ONCE = 7  # Each deleted character is answered by three; more at once would be lost
-
-_COUNTED = {
-    Broken: "broken_matrices",
-    Unknown: "unknown_lines",
-    NotRecognised: "unknown_commands",
-    Overflow: "overflows",
-    Complaint: "firmware_errors",
-    SilentSensor: "silent_sensors",
-    EmissionFailed: "failed_emissions",
-    RangeBearing: "range_bearings",
-}
 
 
 class ConsoleTalk:
@@ -364,6 +291,7 @@ class ConsoleTalk:
         self._counts = counts
         self._output = bytearray()
         self._echoes: list[str] = []
+        self._awaited = 0  # Backspaces that answer the last erasure
         self.now_ns = 0  # Time of the last step [ns]
 
     def hear(self, data: bytes, now_ns: int) -> None:
@@ -372,8 +300,8 @@ class ConsoleTalk:
         for said in self._parser.feed(data, now_ns):
             if isinstance(said.event, Echo):
                 self._echoes.append(said.event.line)
-            elif (name := _COUNTED.get(type(said.event))) is not None:
-                self._counts[name] += 1
+            elif isinstance(said.event, Noted) and said.event.reason:
+                self._counts[said.event.reason] += 1
             self._on_said(said)
 
     def take_output(self) -> bytes:
@@ -395,9 +323,9 @@ class ConsoleTalk:
             yield deadline_ns
         return True
 
-    def pause(self, duration_ns: int) -> Talk[None]:
-        """Wait."""
-        yield from self.until(lambda: False, duration_ns)
+    def pause(self, duration_ns: int) -> Talk[bool]:
+        """Wait; see `until`."""
+        return self.until(lambda: False, duration_ns)
 
     def enter(self, line: str) -> Talk[int]:
         """Type and terminate a line; the time at which the robot accepted it [ns].
@@ -425,17 +353,13 @@ class ConsoleTalk:
         """
         erased = missed = 0
         while erased < MAX_LINE:
-            if (yield from self._erase(_ERASED_AT_ONCE)):
+            self._awaited = self._parser.backspaces + BACKSPACES_PER_ERASE * _ERASED_AT_ONCE
+            self._output += _ERASED_AT_ONCE * ERASE
+            if (yield from self.until(lambda: self._parser.backspaces >= self._awaited)):
                 erased += _ERASED_AT_ONCE
             elif (missed := missed + 1) == _TRIES:
                 return False
         return True
-
-    def _erase(self, count: int) -> Talk[bool]:
-        """Delete characters; whether the robot answers."""
-        answered = self._parser.backspaces + BACKSPACES_PER_ERASE * count
-        self._output += count * ERASE
-        return (yield from self.until(lambda: self._parser.backspaces >= answered))
 
 
 def relay(console: ConsoleTalk, target: int, line: str) -> Talk[int]:

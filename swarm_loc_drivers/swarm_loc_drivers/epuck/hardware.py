@@ -78,17 +78,8 @@ class EpuckModel:
         return best if rate >= 0.0 else -best
 
 
-EPUCK1 = EpuckModel(
-    "epuck1",
-    max_command=1000,
-    timer_hz=10_000,
-    answer_buffer=3456,
-    largest_setting=3456,
-    zooms=tuple(range(1, 9)),
-)
-EPUCK2 = EpuckModel(
-    "epuck2", max_command=1100, timer_hz=50_000, answer_buffer=4139, largest_setting=4136, zooms=(1, 2, 4)
-)
+EPUCK1 = EpuckModel("epuck1", 1000, 10_000, 3456, 3456, tuple(range(1, 9)))
+EPUCK2 = EpuckModel("epuck2", 1100, 50_000, 4139, 4136, (1, 2, 4))
 EPUCK_MODELS = {model.name: model for model in (EPUCK1, EPUCK2)}
 
 
@@ -104,8 +95,7 @@ def as_counter(steps: int) -> int:
 
 def unwrapped_difference(before: int, after: int, expected: float) -> int:
     """Steps between two counters of 16 bits: the possible number closest to the expected one."""
-    surplus = as_counter(after - before - round(expected))
-    return round(expected) + surplus
+    return round(expected) + as_counter(after - before - round(expected))
 
 
 _DISTANCE_M = np.array([0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.06])

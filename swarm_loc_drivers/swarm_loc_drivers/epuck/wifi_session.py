@@ -15,7 +15,6 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.robot_driver import SessionError
 from swarm_loc_drivers.epuck.hardware import (
@@ -100,8 +99,7 @@ class Message:
 
 def plausible(payload: bytes) -> bool:
     """Whether 104 bytes can be sensor values: 12-bit converters, finite numbers."""
-    values: NDArray[np.void] = np.frombuffer(payload, SENSORS_DTYPE)
-    (record,) = values
+    record = np.frombuffer(payload, SENSORS_DTYPE)[0]
     converted = (record["proximity"], record["ambient"], record["microphones"])
     return bool(
         record["selector"] <= _SELECTOR_MAX
@@ -132,10 +130,18 @@ class StreamParser:
         messages = []
         while (length := self._verdict()) != _UNDECIDED:
             if length == _BAD:
-                self._skip_to_candidate()
+                # drop bytes up to the next possible beginning of sensor values
+                self.resyncs += self._synced
+                self._synced = False
+                candidate = self._buffer.find(SENSORS_ID, 1)
+                dropped = candidate if candidate > 0 else len(self._buffer)
+                self.skipped += dropped
+                self._drop(dropped)
             else:
                 self._synced = True
-                messages.append(self._taken(length))
+                payload, stamp_ns = bytes(self._buffer[1:length]), self._arrivals[0][1]
+                messages.append(Message(self._buffer[0], payload, stamp_ns))
+                self._drop(length)
         return messages
 
     def _verdict(self) -> int:
@@ -185,21 +191,6 @@ class StreamParser:
             candidate = self._buffer.find(SENSORS_ID, candidate + 1)
         self._searched = max(0, last)
         return False
-
-    def _skip_to_candidate(self) -> None:
-        """Drop bytes up to the next possible beginning of sensor values."""
-        self.resyncs += self._synced
-        self._synced = False
-        candidate = self._buffer.find(SENSORS_ID, 1)
-        dropped = candidate if candidate > 0 else len(self._buffer)
-        self.skipped += dropped
-        self._drop(dropped)
-
-    def _taken(self, length: int) -> Message:
-        """Remove the first message from the buffer."""
-        message = Message(self._buffer[0], bytes(self._buffer[1:length]), self._arrivals[0][1])
-        self._drop(length)
-        return message
 
     def _drop(self, count: int) -> None:
         """Remove the first bytes, and the arrivals before those of the remaining bytes."""
@@ -260,62 +251,42 @@ class WifiSession:
     def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
         """See `EpuckSession.step`."""
         newest: dict[int, Message] = {}
-        for message in self._parsed(data, now_ns):
+        skipped, resyncs = self._parser.skipped, self._parser.resyncs
+        messages = self._parser.feed(data, now_ns) if data else []
+        self._counts["messages"] += len(messages)
+        self._counts["stray_bytes"] += self._parser.skipped - skipped
+        self._counts["resyncs"] += self._parser.resyncs - resyncs
+        # of each kind the newest message that has a reliable stamp: the arrival of the one before
+        for message in messages:
             before = self._arrivals.get(message.id)
             arrival = before.next(message.stamp_ns) if before else _Arrival(message.stamp_ns)
             if before is not None and not before.is_late and not arrival.is_late:
                 newest[message.id] = replace(message, stamp_ns=before.stamp_ns)
             self._arrivals[message.id] = arrival
         is_heard = (NOTHING_ID if self.ending else SENSORS_ID) in newest
-        self._check_silence(is_heard, now_ns, steady_s)
+        # by real time and by the clock, which may stand still or jump back
+        if is_heard or self._heard is None:
+            self._heard = now_ns, steady_s
+        heard_ns, heard_s = self._heard = min(self._heard[0], now_ns), self._heard[1]
+        if min(steady_s - heard_s, (now_ns - heard_ns) * 1e-9) > self._silence_s:
+            raise SessionError(f"the robot has been silent for {self._silence_s:g} s, or made no sense")
         self.connected |= is_heard and not self.ending
         self.ended |= is_heard and self.ending
         self._keep(newest)
         return self._command(steady_s)
 
-    def _check_silence(self, is_heard: bool, now_ns: int, steady_s: float) -> None:
-        """Check that the robot sends what it shall, by real time and by the clock, which may stand still.
-
-        Raises:
-            SessionError: It has been silent for too long.
-        """
-        if is_heard or self._heard is None:
-            self._heard = now_ns, steady_s
-        heard_ns, heard_s = min(self._heard[0], now_ns), self._heard[1]  # the clock may jump back
-        self._heard = heard_ns, heard_s
-        if min(steady_s - heard_s, (now_ns - heard_ns) * 1e-9) > self._silence_s:
-            raise SessionError(f"the robot has been silent for {self._silence_s:g} s, or made no sense")
-
-    def _parsed(self, data: bytes, now_ns: int) -> list[Message]:
-        skipped, resyncs = self._parser.skipped, self._parser.resyncs
-        messages = self._parser.feed(data, now_ns) if data else []
-        self._counts["messages"] += len(messages)
-        self._counts["stray_bytes"] += self._parser.skipped - skipped
-        self._counts["resyncs"] += self._parser.resyncs - resyncs
-        return messages
-
     def _keep(self, newest: dict[int, Message]) -> None:
-        """Use the newest message of each kind."""
-        if SENSORS_ID in newest:
-            message = newest[SENSORS_ID]
-            if self._is_due(message.stamp_ns):
-                values = message.sensors
-                left, right = int(values["left_counter"]), int(values["right_counter"])
-                self.found.append(
-                    Reading(message.stamp_ns, 0, left, right, values["proximity"].astype(np.int64))
-                )
-        if IMAGE_ID in newest:
-            message = newest[IMAGE_ID]
+        """Use the newest message of each kind; the mean period of readings is that of the settings."""
+        message = newest.get(SENSORS_ID)
+        if message and not self._due_ns - self._period_ns <= (stamp_ns := message.stamp_ns) < self._due_ns:
+            on_time = 0 <= stamp_ns - self._due_ns < self._period_ns
+            self._due_ns = (self._due_ns if on_time else stamp_ns) + self._period_ns
+            values = message.sensors
+            left, right = int(values["left_counter"]), int(values["right_counter"])
+            self.found.append(Reading(stamp_ns, 0, left, right, values["proximity"].astype(np.int64)))
+        if message := newest.get(IMAGE_ID):
             pixels = decode_rgb565(message.payload, WIFI_WIDTH, WIFI_HEIGHT)
             self.found.append(CameraImage(message.stamp_ns, pixels))
-
-    def _is_due(self, stamp_ns: int) -> bool:
-        """Whether to use a reading: the mean period of used readings is that of the settings."""
-        if self._due_ns - self._period_ns <= stamp_ns < self._due_ns:
-            return False
-        on_time = 0 <= stamp_ns - self._due_ns < self._period_ns
-        self._due_ns = (self._due_ns if on_time else stamp_ns) + self._period_ns
-        return True
 
     def _command(self, steady_s: float) -> bytes:
         """The command to send, if any. A robot that is asked to stream nothing has stopped."""

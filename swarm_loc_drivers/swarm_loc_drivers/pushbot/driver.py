@@ -68,26 +68,21 @@ class EventClock:
         """
         if self._last is not None and now_ns < self._last[0]:
             self._last, self._offsets_ns = None, []  # the computer's clock was set back
-        self._add_missed_wraps(int(time_us[0]), now_ns)
+        if self._last is not None and self._span_us:
+            # a silence may be longer than the timestamps' span: add the missed wraps by the computer's clock
+            silence_us = (now_ns - self._last[0]) // _US - (int(time_us[0]) - self._last[1])
+            self._added_us += max(0, round(silence_us / self._span_us)) * self._span_us
         time_ns = (time_us + self._added_us) * _US
-        self._learn(now_ns - int(time_ns[-1]), now_ns)
-        self._last = now_ns, int(time_us[-1])
-        stamps: IntArray = time_ns + min(self._offsets_ns)
-        return np.minimum(stamps, now_ns)
-
-    def _add_missed_wraps(self, first_us: int, now_ns: int) -> None:
-        """Add the wraps of a silence that is longer than the timestamps' span, by the computer's clock."""
-        if self._last is None or not self._span_us:
-            return
-        silence_us = (now_ns - self._last[0]) // _US - (first_us - self._last[1])
-        self._added_us += max(0, round(silence_us / self._span_us)) * self._span_us
-
-    def _learn(self, offset_ns: int, now_ns: int) -> None:
+        # the smallest delay of this window and of the previous one
+        offset_ns = now_ns - int(time_ns[-1])
         if not self._offsets_ns:
             self._window_ns, self._offsets_ns = now_ns, [offset_ns]
         elif now_ns > self._window_ns + _WINDOW_NS:
             self._window_ns, self._offsets_ns = now_ns, [offset_ns, self._offsets_ns[0]]
         self._offsets_ns[0] = min(self._offsets_ns[0], offset_ns)
+        self._last = now_ns, int(time_us[-1])
+        stamps: IntArray = time_ns + min(self._offsets_ns)
+        return np.minimum(stamps, now_ns)
 
 
 class TickClock:
@@ -170,7 +165,10 @@ class PushbotSession(TalkSession):
         if not self.ending:
             generation = yield from self._set_up()
             yield from self._stream(generation)
-        yield from self._answer(self._farewell(), protocol.FORMAT, 0.0)
+        # turn everything off; the answer to the final query confirms all of it
+        off = protocol.BRAKE + protocol.EVENTS_OFF + protocol.STOP_SENSORS + protocol.MOTORS_OFF
+        dark = protocol.lights(protocol.Lights(0.0, 0.0))
+        yield from self._answer(b"\n" + off + dark + protocol.QUERY_FORMAT, protocol.FORMAT, 0.0)
 
     def _set_up(self) -> Talk[FirmwareGeneration]:
         """Identify the firmware, configure it and start the stream."""
@@ -180,32 +178,27 @@ class PushbotSession(TalkSession):
         generation = self.generation = protocol.generation_of(listing.string[: listing.end()])
         if generation is None:
             raise SessionError("the board's firmware has no wheels: it is not built for PushBots")
-        if params.event_timestamps:
-            yield from self._choose_format(generation, params.event_timestamps)
+        if timestamps := params.event_timestamps:
+            if timestamps not in generation.formats:
+                raise SessionError(
+                    f"the firmware, of the {generation.name} generation, has no timestamps"
+                    f" '{timestamps}', only {', '.join(generation.formats)}"
+                )
+            wanted = protocol.event_format(generation, timestamps) + protocol.QUERY_FORMAT
+            answer = yield from self._answer(wanted, protocol.FORMAT, 0.0)
+            if int(answer[1]) != generation.formats[timestamps]:
+                raise SessionError(
+                    f"the robot answers {answer[0]!r} to the choice of timestamps '{timestamps}'"
+                )
         self._output += protocol.lights(params.lights) + protocol.BRAKE + protocol.MOTORS_ON
         self._output += protocol.stream_ticks(generation, _tick_period_ms(params))
         if params.event_timestamps:
             self._output += protocol.EVENTS_ON
         return generation
 
-    def _choose_format(self, generation: FirmwareGeneration, timestamps: str) -> Talk[None]:
-        if timestamps not in generation.formats:
-            raise SessionError(
-                f"the firmware, of the {generation.name} generation, has no timestamps '{timestamps}', only"
-                f" {', '.join(generation.formats)}"
-            )
-        wanted = protocol.event_format(generation, timestamps) + protocol.QUERY_FORMAT
-        answer = yield from self._answer(wanted, protocol.FORMAT, 0.0)
-        if int(answer[1]) != generation.formats[timestamps]:
-            raise SessionError(f"the robot answers {answer[0]!r} to the choice of timestamps '{timestamps}'")
-
     def _answer(self, request: bytes, pattern: re.Pattern[bytes], extra_s: float) -> Talk[re.Match[bytes]]:
-        """The answer to a request, which is sent up to three times."""
-        for _ in range(_ATTEMPTS):
-            timeout_s = self._params.reply_timeout_s + extra_s
-            if (match := (yield from self._ask_once(request, pattern, timeout_s))) is not None:
-                return match
-        raise SessionError(f"the robot does not answer {request.split()[0].decode()}")
+        timeout_s, who = self._params.reply_timeout_s + extra_s, f" {request.split()[0].decode()}"
+        return self._ask(request, pattern, timeout_s, _ATTEMPTS, who)
 
     def _stream(self, generation: FirmwareGeneration) -> Talk[None]:
         """Take measurements and send velocities until the session ends."""
@@ -259,11 +252,7 @@ class PushbotSession(TalkSession):
         return stamps
 
     def _take_line(self, line: bytes, readings: TickClock, generation: FirmwareGeneration) -> None:
-        """Take wheel ticks, or count another line.
-
-        Raises:
-            SessionError: The board was reset.
-        """
+        """Take wheel ticks, or count another line."""
         ticks = protocol.wheel_ticks(line, generation)
         if ticks is not None:
             self._counts["readings"] += 1
@@ -297,11 +286,7 @@ class PushbotSession(TalkSession):
         return is_stopped and self._ticks_s >= self._turned_s + _STILL_S
 
     def _check_stop(self) -> None:
-        """Note a robot that does not stop.
-
-        Raises:
-            SessionError: It does not stop at the end either; the next session resets the board.
-        """
+        """Note a robot that does not stop; at the end the next session must reset the board."""
         if self._stands():
             self._stood_s = self._steady_s
         limit_s = _STOP_S + 2.0 * self._params.tick_period_s
@@ -311,12 +296,6 @@ class PushbotSession(TalkSession):
         self.does_not_stop = fails
         if fails and self.ending:
             raise SessionError(NO_STOP)
-
-    def _farewell(self) -> bytes:
-        """Commands that turn everything off; the answer to the final query confirms all of them."""
-        dark = protocol.lights(protocol.Lights(0.0, 0.0))
-        off = protocol.EVENTS_OFF + protocol.STOP_SENSORS + protocol.MOTORS_OFF
-        return b"\n" + protocol.BRAKE + off + dark + protocol.QUERY_FORMAT
 
 
 def _tick_period_ms(params: PushbotParameters) -> int:
@@ -369,22 +348,19 @@ class PushbotOdometry:
             elapsed_s = 0.0
         done = tick_difference(last.left, ticks.left), tick_difference(last.right, ticks.right)
         if max(map(abs, done)) > _MAX_RATE * (elapsed_s + _SLACK_S):
-            return self._distrust(ticks, elapsed_s)
+            # a single reading may have lost bytes; a second one shows that the counters have changed
+            if not self._doubtful:
+                self._counts["implausible_counters"] += 1
+                self._doubtful = True
+                return None
+            self._counts["counter_restarts"] += 1
+            self._reckoning.forget_motion(_MAX_RATE * self._metres_per_tick * elapsed_s)
+            self._last, self._doubtful = ticks, False
+            return self._reckoning.state(ticks.stamp_ns, 0.0, 0.0, 0.0)
         self._last, self._doubtful = ticks, False
         left, right = (self._metres_per_tick * one for one in done)
         self._reckoning.advance(left, right)
         return self._reckoning.state(ticks.stamp_ns, left, right, elapsed_s)
-
-    def _distrust(self, ticks: WheelTicks, elapsed_s: float) -> OdometryState | None:
-        """A single reading may have lost bytes; a second one shows that the counters have changed."""
-        if not self._doubtful:
-            self._counts["implausible_counters"] += 1
-            self._doubtful = True
-            return None
-        self._counts["counter_restarts"] += 1
-        self._reckoning.forget_motion(_MAX_RATE * self._metres_per_tick * elapsed_s)
-        self._last, self._doubtful = ticks, False
-        return self._reckoning.state(ticks.stamp_ns, 0.0, 0.0, 0.0)
 
 
 _READ_S = 0.02

@@ -116,8 +116,8 @@ def test_a_request_sets_the_speeds_and_is_framed_by_them() -> None:
 
 def test_readings_are_little_endian() -> None:
     data = bytes.fromhex("FF7F0080") + struct.pack("<8H", *range(100, 108))
-    readings = serial_session.decode_readings(data)
-    assert readings == (32767, -32768, tuple(range(100, 108)))
+    left, right, proximity = serial_session.decode_readings(data)
+    assert (left, right, proximity.tolist()) == (32767, -32768, list(range(100, 108)))
 
 
 def test_a_picture_of_another_size_or_mode_is_refused() -> None:

@@ -151,15 +151,10 @@ class GroundCamera:
     def covariances(
         self, places: FloatArray, pixel_covariance: FloatArray, height_sigma: float
     ) -> FloatArray:
-        """(N, 2, 2) covariance of places on a level plane from those of pixels, pose and height.
+        """(N, 2, 2) covariance of places (N, 3) from those of their raw pixels [px^2], pose and height [m].
 
-        With z the pixel, p the place, c the camera's pose and h the height, z = f(p, h, c) gives
-        dp = (df/dp)^-1 (dz - df/dc dc - df/dh dh).
-
-        Args:
-            places: (N, 3) in map.
-            pixel_covariance: (N, 2, 2) of their raw pixels [px^2].
-            height_sigma: Standard deviation of the height [m].
+        With z the pixel, p the place on a level plane, c the camera's pose and h the height, z = f(p, h, c)
+        gives dp = (df/dp)^-1 (dz - df/dc dc - df/dh dh).
         """
         slopes = self._slopes(places)
         inverse = np.linalg.inv(slopes[..., :2])
@@ -283,13 +278,12 @@ def _determines(values: FloatArray) -> bool:
     """Whether points span a plane even without any one of them."""
     if len(np.unique(np.round(values, 9), axis=0)) < MIN_POINTS:
         return False
-    return all(_spread(np.delete(values, k, axis=0)) > _MIN_SPREAD for k in range(min(len(values), 8)))
-
-
-def _spread(values: FloatArray) -> float:
-    """Ratio of the second to the first extent of points."""
-    sizes = np.linalg.svd(values - values.mean(axis=0), compute_uv=False)
-    return float(sizes[1] / sizes[0]) if sizes[0] > 0.0 else 0.0
+    for k in range(min(len(values), 8)):
+        others = np.delete(values, k, axis=0)
+        sizes = np.linalg.svd(others - others.mean(axis=0), compute_uv=False)
+        if not sizes[1] > _MIN_SPREAD * sizes[0]:
+            return False
+    return True
 
 
 def solve_pose(camera: Camera, points: ControlPoints, settings: AerialSettings) -> PoseFit:
@@ -303,7 +297,9 @@ def solve_pose(camera: Camera, points: ControlPoints, settings: AerialSettings) 
     """
     check_points(points)
     guess = _guess(camera, points)
-    sigma = _sigmas(camera, guess, points, settings)
+    depth = (points.places @ rotation_of(guess).T + guess[3:])[:, 2]
+    of_place = settings.control_sigma * camera.fx / np.maximum(depth, 1e-3)
+    sigma = np.asarray(np.hypot(settings.control_sigma_px, of_place))  # (N,) of the points [px]
 
     def deviations(pose: FloatArray) -> FloatArray:
         away = (projected(camera, pose, points.places) - points.pixels) / sigma[:, None]
@@ -315,7 +311,17 @@ def solve_pose(camera: Camera, points: ControlPoints, settings: AerialSettings) 
     away = deviations(pose).reshape(-1, 2)
     if not np.isfinite(pose).all() or (np.abs(away) >= _FAR).any():
         raise ControlPointError("the control points tell no pose: the camera would not see them all.")
-    ground = GroundCamera(camera, pose, _covariance(camera, pose, points, sigma, away))
+    # the covariance of the pose by least squares
+    slopes = (pose_slopes(camera, pose, points.places) / sigma[:, None, None]).reshape(-1, POSE_SIZE)
+    information = slopes.T @ slopes
+    scale = np.sqrt(np.diag(information))
+    is_open = not np.isfinite(scale).all() or (scale <= 0.0).any()
+    if is_open or np.linalg.cond(even := information / np.outer(scale, scale)) > 1e12:
+        raise ControlPointError("the control points leave the camera's pose open.")
+    freedom = away.size - POSE_SIZE
+    growth = max(1.0, float(np.sum(away**2)) / freedom) if freedom > 0 else 1.0
+    covariance = np.asarray(growth * np.linalg.inv(even) / np.outer(scale, scale))
+    ground = GroundCamera(camera, pose, covariance)
     if ground.centre[2] <= points.places[:, 2].max():
         raise ControlPointError(
             f"by its control points the camera is {ground.centre[2]:.3g} m above the floor:"
@@ -351,30 +357,6 @@ def _guess(camera: Camera, points: ControlPoints) -> FloatArray:
     if best is None:
         raise ControlPointError("the control points tell no pose of the camera.")
     return best
-
-
-def _sigmas(camera: Camera, pose: FloatArray, points: ControlPoints, settings: AerialSettings) -> FloatArray:
-    """(N,) standard deviations of the points in the image [px]."""
-    depth = (points.places @ rotation_of(pose).T + pose[3:])[:, 2]
-    of_place = settings.control_sigma * camera.fx / np.maximum(depth, 1e-3)
-    return np.asarray(np.hypot(settings.control_sigma_px, of_place))
-
-
-def _covariance(
-    camera: Camera, pose: FloatArray, points: ControlPoints, sigma: FloatArray, away: FloatArray
-) -> FloatArray:
-    """(6, 6) covariance of a pose by least squares."""
-    slopes = (pose_slopes(camera, pose, points.places) / sigma[:, None, None]).reshape(-1, POSE_SIZE)
-    information = slopes.T @ slopes
-    scale = np.sqrt(np.diag(information))
-    if not np.isfinite(scale).all() or (scale <= 0.0).any():
-        raise ControlPointError("the control points leave the camera's pose open.")
-    even = information / np.outer(scale, scale)
-    if np.linalg.cond(even) > 1e12:
-        raise ControlPointError("the control points leave the camera's pose open.")
-    freedom = away.size - POSE_SIZE
-    growth = max(1.0, float(np.sum(away**2)) / freedom) if freedom > 0 else 1.0
-    return np.asarray(growth * np.linalg.inv(even) / np.outer(scale, scale))
 
 
 def misfit(fit: PoseFit, points: ControlPoints, settings: AerialSettings) -> str:
@@ -511,32 +493,27 @@ class GroundControl:
 
     def look(self, gray: Gray) -> GroundCamera | None:
         """The camera with its pose at an image (height, width); None: see `trouble`."""
-        if self._markers is not None:
-            self._look_at(self._markers, gray)
-        self._images += 1
-        return self.fit.ground if self.fit else None
-
-    def _look_at(self, markers: FloorMarkers, gray: Gray) -> None:
-        """Solve for the pose with the markers of the first images, then detect motions of the camera."""
-        if self._images < _SETTLING:
+        markers = self._markers
+        # solve for the pose with the markers of the first images, then detect motions of the camera
+        if markers is not None and self._images < _SETTLING:
             markers.look(gray)
             if self.fit is None or self._images == _SETTLING - 1:
                 self._solve(self._ground.points.concatenate(markers.mean()))
-        elif self.fit is None or self._images % _LATER_EVERY == 0:
+        elif markers is not None and (self.fit is None or self._images % _LATER_EVERY == 0):
             seen = markers.look(gray)
-            if self.fit is None or self._has_moved(self.fit, seen):
+            has_moved = self.fit is None
+            if self.fit is not None and len(seen):  # whether most markers have moved in the image
+                away = np.linalg.norm(self.fit.ground.pixels(seen.places) - seen.pixels, axis=1)
+                sigma = np.hypot(self._settings.control_sigma_px, self.fit.rms_px)
+                has_moved = not np.median(away) <= _MOVED * sigma
+            if has_moved:
                 self.moves += self.fit is not None
                 self._images = 0
                 markers.forget()
                 markers.look(gray)
                 self._solve(self._ground.points.concatenate(markers.mean()))
-
-    def _has_moved(self, fit: PoseFit, seen: ControlPoints) -> bool:
-        """Whether most markers have moved in the image."""
-        if not len(seen):
-            return False
-        away = np.linalg.norm(fit.ground.pixels(seen.places) - seen.pixels, axis=1)
-        return not np.median(away) <= _MOVED * np.hypot(self._settings.control_sigma_px, fit.rms_px)
+        self._images += 1
+        return self.fit.ground if self.fit else None
 
     def _solve(self, points: ControlPoints) -> None:
         try:
@@ -610,7 +587,10 @@ class _Reader(TreeChecks):
     def ground(self, tree: Tree) -> Ground:
         sections = self.mapping(tree, WHOLE_FILE, ("points", "family", "markers", "camera"))
         points = self._points(self.mapping(sections.get("points"), "points"))
-        family = self._family(sections.get("family", "aruco_mip_36h12"))
+        name, known = sections.get("family", "aruco_mip_36h12"), families()
+        if not isinstance(name, str) or name not in known:
+            raise self.said(f"family is {name!r}, which is none{nearest(str(name), known)}")
+        family = known[name]
         markers = self._markers(self.mapping(sections.get("markers"), "markers"), family)
         if not markers:
             self.made("", check_points, points=points)
@@ -620,12 +600,6 @@ class _Reader(TreeChecks):
         rows = [self.values(entry, f"points.{name}", _POINT, _REQUIRED) for name, entry in tree.items()]
         values = np.array([[row.get(key) or 0.0 for key in _POINT] for row in rows], float).reshape(-1, 5)
         return ControlPoints([str(name) for name in tree], values[:, :3], values[:, 3:])
-
-    def _family(self, name: Tree) -> Family:
-        known = families()
-        if not isinstance(name, str) or name not in known:
-            raise self.said(f"family is {name!r}, which is none{nearest(str(name), known)}")
-        return known[name]
 
     def _markers(self, tree: dict[Any, Tree], family: Family) -> tuple[FloorMarker, ...]:
         markers = []

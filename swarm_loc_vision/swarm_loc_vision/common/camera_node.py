@@ -49,16 +49,11 @@ class CameraNode(ManagedNode[Parameters]):
         source, self._topic = self._input, self._input.topic
         self._detections = self.create_publisher(self._found, "detections", QoSProfile(depth=10))
         overriding = QoSOverridingOptions([QoSPolicyKind.RELIABILITY])
-        self.create_subscription(
-            CameraInfo,
-            "camera_info",
-            self._on_camera_info,
-            qos_profile_sensor_data,
-            qos_overriding_options=overriding,
-        )
-        self.create_subscription(
-            source.message_class, self._topic, self._on_message, source.qos, qos_overriding_options=overriding
-        )
+        for kind, topic, receive, qos in (
+            (CameraInfo, "camera_info", self._on_camera_info, qos_profile_sensor_data),
+            (source.message_class, self._topic, self._on_message, source.qos),
+        ):
+            self.create_subscription(kind, topic, receive, qos, qos_overriding_options=overriding)
 
     def figures(self) -> dict[str, str]:
         """Values for the diagnostics in addition to images, cost and drops."""
@@ -90,7 +85,9 @@ class CameraNode(ManagedNode[Parameters]):
 
     def report(self) -> None:
         """Publish the state of the camera."""
-        source, missing = self._source, self._missing()
+        source, missing = self._source, self.health.silence(self._topic)
+        if source.camera is None and not source.trouble:
+            missing = f"no messages received on {self.resolve_topic_name('camera_info')}"
         self.health.warn_of("missing", {"": missing} if missing else {}, PATIENCE_S)
         self.health.warn_of_drops()
         trouble = source.trouble or self.trouble() or missing
@@ -101,9 +98,3 @@ class CameraNode(ManagedNode[Parameters]):
             **drop_values(source.drops),
         }
         self.publish_reports(Report(self.status_name, trouble or "detecting", level_of(trouble), values))
-
-    def _missing(self) -> str:
-        """What is not received, a sentence; "": nothing."""
-        if self._source.camera is None and not self._source.trouble:
-            return f"no messages received on {self.resolve_topic_name('camera_info')}"
-        return self.health.silence(self._topic)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -178,23 +179,17 @@ def decoded_image(message: Any, size: Size) -> Gray:
         raise ImageError(
             "encoding", f"the image's format is '{how}', but must be one of {names}, or empty for these."
         )
-    gray = None
+    gray: NDArray[Any] | None = None
     if known.is_whole(data) and (found := known.size(data)):
         _check_size(found, size)
-        gray = _decoded(raw)
+        how_read = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+        with suppress(cv2.error):  # it would be too large
+            gray = cv2.imdecode(raw, how_read)
     if gray is None or gray.shape[::-1] != size:
         raise ImageError(
             "corrupt", f"the image's data has {raw.size} bytes, but must be a whole image in '{known.name}'."
         )
     return _highest_bits(gray)
-
-
-def _decoded(raw: NDArray[np.uint8]) -> NDArray[Any] | None:
-    """The image that OpenCV decodes; None: none, or it would be too large."""
-    try:
-        return cv2.imdecode(raw, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION)
-    except cv2.error:
-        return None
 
 
 @dataclass(frozen=True)
@@ -267,19 +262,11 @@ class Calibration:
             raise
 
     def found(self, message: Any) -> bytes:
-        """The serialized detections of a message.
-
-        Raises:
-            ImageError: The message cannot be used.
-        """
+        """The serialized detections of a message; an ImageError if it cannot be used."""
         raise NotImplementedError
 
     def known_camera(self) -> Camera:
-        """The calibration.
-
-        Raises:
-            ImageError: There is none.
-        """
+        """The calibration; without one an ImageError."""
         if self.camera is None:
             raise ImageError("no_calibration", self.trouble or "no camera_info was received yet.")
         return self.camera

@@ -193,9 +193,7 @@ class LightTracker:
         self._switches = [max(1.0, 2.0 * settings.window * source.frequency) for source in sources]
         self._density = np.zeros((len(sources), self._height + 2, self._width + 2), np.int32)
         pixels = 2 * self._width * self._height
-        self._bursts = _Bursts(
-            np.empty(pixels, np.int64), np.empty(pixels, np.int64), np.empty(pixels, np.int32)
-        )
+        self._bursts = _Bursts(*np.empty((2, pixels), np.int64), np.empty(pixels, np.int32))
         self._hits: list[_Hits] = []
         self._reset()
 
@@ -234,17 +232,8 @@ class LightTracker:
         source, x, y = np.empty((3, count), np.int32)
         hits = _Hits(source, x, y, np.empty(count, np.int64), np.empty(count, bool))
         gap_ns, gate_ns = round(1e9 * self._settings.burst_gap), round(1e9 * self._settings.period_gate)
-        found = _match(
-            events,
-            self._period_ns,
-            self._is_above,
-            gap_ns,
-            gate_ns,
-            self._width,
-            self._height,
-            self._bursts,
-            hits,
-        )
+        lights, size = (self._period_ns, self._is_above), (self._width, self._height)
+        found = _match(events, *lights, gap_ns, gate_ns, *size, self._bursts, hits)
         self._hits.append(_Hits._make(column[:found] for column in hits))
 
     def _report(self) -> list[Sighting]:
@@ -301,8 +290,13 @@ def _match(
         pixel = (int(events.is_on[k]) * height + y) * width + x
         is_new = now - bursts.event_ns[pixel] > gap_ns
         if is_new:
-            elapsed = now - bursts.begin_ns[pixel]
-            bursts.source[pixel] = _nearest_period(elapsed, 2 * y < height, period_ns, is_above, gate_ns)
+            # the light of this half of the image whose period is nearest to the time between bursts
+            elapsed, nearest = now - bursts.begin_ns[pixel], gate_ns
+            bursts.source[pixel] = -1
+            for light in range(len(period_ns)):
+                off = abs(elapsed - period_ns[light])
+                if is_above[light] == (2 * y < height) and off < nearest:
+                    nearest, bursts.source[pixel] = off, light
             bursts.begin_ns[pixel] = now
         bursts.event_ns[pixel] = now
         if bursts.source[pixel] >= 0:
@@ -310,16 +304,6 @@ def _match(
             hits.time_ns[count], hits.begins[count] = now, is_new
             count += 1
     return count
-
-
-@cached_njit
-def _nearest_period(elapsed: int, above: bool, period_ns: IntArray, is_above: BoolArray, gate_ns: int) -> int:
-    """The light of a half of the image whose period is nearest to a time between bursts; -1: none."""
-    nearest, found = gate_ns, -1
-    for k in range(len(period_ns)):
-        if is_above[k] == above and abs(elapsed - period_ns[k]) < nearest:
-            nearest, found = abs(elapsed - period_ns[k]), k
-    return found
 
 
 @cached_njit
@@ -343,21 +327,14 @@ def _locate(
     near = np.empty(len(hits.x), np.int64)
     for source in range(len(density)):
         if peak[source, 0] >= min_events:
-            count = _near(hits, source, peak[source], radius + _MAX_SHIFT_PX, near)
+            # its events around the peak
+            count, reach = 0, radius + _MAX_SHIFT_PX
+            for k in range(len(hits.x)):
+                du, dv = float(hits.x[k] - peak[source, 1]), float(hits.y[k] - peak[source, 2])
+                if hits.source[k] == source and du * du + dv * dv <= reach * reach:
+                    near[count] = k
+                    count += 1
             _centre(hits, near[:count], peak[source], radius, moments[source])
-
-
-@cached_njit
-def _near(hits: _Hits, source: int, peak: IntArray, reach: float, near: IntArray) -> int:
-    """Fill the indices of the events of a light around its peak; how many they are."""
-    count = 0
-    for k in range(len(hits.x)):
-        if hits.source[k] == source:
-            du, dv = float(hits.x[k] - peak[1]), float(hits.y[k] - peak[2])
-            if du * du + dv * dv <= reach * reach:
-                near[count] = k
-                count += 1
-    return count
 
 
 @cached_njit
@@ -402,5 +379,4 @@ def direction_jacobian(u: float, v: float, focal_px: float) -> FloatArray:
     length = ground + y * y
     root = math.sqrt(ground)
     by_xy = np.array([[1.0 / ground, 0.0], [-x * y / (root * length), root / length]])
-    jacobian: FloatArray = -by_xy / focal_px
-    return jacobian
+    return np.asarray(-by_xy / focal_px)

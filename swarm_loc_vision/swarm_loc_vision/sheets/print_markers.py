@@ -31,7 +31,7 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.command_line import argument, command, file_to_write, number_in
 from swarm_loc_estimator.common.files import check_file, replacing
 from swarm_loc_estimator.common.parameters import UserError
-from swarm_loc_estimator.swarm.swarm import Landmark, Swarm
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, save_ground
 from swarm_loc_vision.markers.families import Family, families, family_named
@@ -64,7 +64,10 @@ def sheet_figure(page: Page, family: Family, paper: str) -> Figure:
     axes.set(xlim=(0.0, width), ylim=(0.0, height))
     for piece in page.pieces:
         _draw(axes, piece, family, is_cut=page.is_cut)
-    _draw_ruler(axes)
+    # the ruler has a tick for each centimetre
+    x = EDGE_MM + np.arange(0.0, RULER_MM + 1.0, 10.0)
+    axes.hlines(EDGE_MM, x[0], x[-1], colors="black", linewidth=_LINE_PT)
+    axes.vlines(x, EDGE_MM, EDGE_MM + np.where(np.arange(len(x)) % 5, 2.0, 4.0), colors="black", lw=_LINE_PT)
     said = f"{page.title}. Print at 100 % (actual size): the ruler must be {RULER_MM} mm long."
     _write(axes, EDGE_MM, EDGE_MM + 8.0, said, width - 2.0 * EDGE_MM)
     return figure
@@ -114,13 +117,6 @@ def _draw(axes: Axes, piece: Piece, family: Family, *, is_cut: bool) -> None:
         line = Rectangle((left, bottom), width, height, fill=False, edgecolor=_FAINT, linewidth=_LINE_PT)
         axes.add_patch(line)
     _write(axes, piece.x, bottom + 0.4 * STRIP_MM, f"{sticker.id}  {sticker.label}", width - piece.margin)
-
-
-def _draw_ruler(axes: Axes) -> None:
-    """A line with a tick for each centimetre."""
-    x = EDGE_MM + np.arange(0.0, RULER_MM + 1.0, 10.0)
-    axes.hlines(EDGE_MM, x[0], x[-1], colors="black", linewidth=_LINE_PT)
-    axes.vlines(x, EDGE_MM, EDGE_MM + np.where(np.arange(len(x)) % 5, 2.0, 4.0), colors="black", lw=_LINE_PT)
 
 
 def _write(axes: Axes, x: float, y: float, said: str, width: float) -> None:
@@ -178,17 +174,15 @@ class Page:
 
 def stickers_of(swarm: Swarm) -> list[Sticker]:
     """The markers of a swarm: faces robot by robot, then landmarks with their places."""
-    faces = [
+    stickers = [
         Sticker(face.id, 1e3 * face.size, f"{robot.name} {face.name}")
         for robot in swarm.robots
         for face in robot.faces
     ]
-    return faces + [Sticker(mark.id, 1e3 * mark.size, _place(mark)) for mark in swarm.landmarks]
-
-
-def _place(mark: Landmark) -> str:
-    yaw = "" if mark.yaw is None else f", {math.degrees(mark.yaw):.3g} deg"
-    return f"landmark at {mark.x:g}, {mark.y:g}{yaw}"
+    for mark in swarm.landmarks:
+        yaw = "" if mark.yaw is None else f", {math.degrees(mark.yaw):.3g} deg"
+        stickers.append(Sticker(mark.id, 1e3 * mark.size, f"landmark at {mark.x:g}, {mark.y:g}{yaw}"))
+    return stickers
 
 
 def pages_of(stickers: Sequence[Sticker], family: Family, paper: str) -> list[Page]:
@@ -324,18 +318,16 @@ def main(options: argparse.Namespace) -> int:
             )
         pages.append(board)
     if not pages:
-        why = (
-            f"{options.swarm_file} has no markers" if options.swarm_file else "name a description, or --board"
-        )
+        file = options.swarm_file
+        why = f"{file} has no markers" if file else "name a description, or --board"
         raise SheetError(f"There is nothing to print: {why}.")
     file = options.out.with_name(f"{options.out.stem}_board.yaml")
     check_file(file)
     save_pdf(pages, family, options.paper, options.out)
     print(f"{sum(len(page.pieces) for page in pages)} markers on {len(pages)} sheets in {options.out}")
     if options.board:
-        origin = (
-            f"{pages[-1].title}. The middle of the board is the origin of map, x to the right of its text."
-        )
+        origin = "The middle of the board is the origin of map, x to the right of its text."
+        origin = f"{pages[-1].title}. {origin}"
         save_ground(Ground(markers=floor_markers(pages[-1]), family=family), file, origin)
         print(f"places of the markers of the board in {file}")
     return 0
