@@ -151,6 +151,7 @@ class _Loader(TreeChecks):
             rule = "must be a topic with {from} and {to} once each, for names or addresses"
             raise self.error("range_topic", ranges, rule)
         # the swarm as a whole
+        names = [one.name for one in robots] + [one.name for one in cameras]
         bodies = {"robots": robots, "landmarks": landmarks, "cameras": cameras, "anchors": anchors}
         swarm = self.made(
             "",
@@ -158,9 +159,7 @@ class _Loader(TreeChecks):
             **bodies,
             map=file,
             range_topic=(ranges or "").lstrip("/"),
-            topics=self._topics(
-                sections.get("topics"), [one.name for one in (*robots, *cameras)], len(robots)
-            ),
+            topics=self._topics(sections.get("topics"), names, len(robots)),
             localizer=self._localizer(sections.get("localizer")),
             map_error=MapError(**shared),
         )
