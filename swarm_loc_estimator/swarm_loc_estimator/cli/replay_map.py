@@ -5,10 +5,10 @@
 
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The map goes
 to OUT/map.yaml and OUT/map.pgm, a picture of it to OUT/map.png, the robots' stops to OUT/stops.csv. Mounts of
-lidars that the description does not say come from the bag's static transforms. The same
-bag gives the same files, byte for byte. Loops, refused scans, odometry that scans contradict, and places
-where the map is in doubt are printed. --walls draws a floor plan below the map (x0,y0,x1,y1 [m] per line)
-and prints the errors of the map's walls; with ground truth in the bag, the errors of the stops, too.
+lidars that the description does not say come from the bag's static transforms. The same bag gives the same
+files, byte for byte. Loops, refused and late scans, odometry that scans contradict, and places where the map
+is in doubt are printed. --walls draws a floor plan below the map (x0,y0,x1,y1 [m] per line) and prints the
+errors of the map's walls; with ground truth in the bag, the errors of the stops, too.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ def main(options: argparse.Namespace) -> int:
     write_stops(mapper, name_of, options.out / "stops.csv")
     for reason, count in (feed.all_drops + feed.dropped_beams).items():
         print(f"dropped: {count} {reason}")
-    for sentence in (*mounts, *findings(mapper, name_of)):
+    for sentence in (*mounts, *feed.late, *findings(mapper, name_of)):
         print(sentence)
     print(figures or "nothing to compare with: no ground truth in the bag, no --walls")
     print(f"{mapper.graph.count} stops; map: {path}, {image}; picture: {picture}")
