@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 
 from bench.integrity import faults
-from bench.integrity.fault import CLEAN, FAULT_S, SYSTEMATIC, Fault, settings_of
+from bench.integrity.faults import CLEAN, FAULT_S, SYSTEMATIC, Fault, settings_of
 from bench.integrity.sensors import SENSOR_SCENARIOS
 from swarm_loc_drivers.sim.run import SimulatedRun, Trajectories
 from swarm_loc_drivers.sim.worlds import W0, W2

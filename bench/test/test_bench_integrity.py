@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from bench.integrity.faults import seconds
-from bench.integrity.late_start import run_late_start
+from bench.integrity.live import run_late_start
 from bench.integrity.scenarios import SCENARIOS
 from bench.integrity.scoring import Blame, Named, blame_of, score
 from bench.integrity.sensors import SENSOR_SCENARIOS

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.integrity.fault import CLEAN, settings_of
-from bench.integrity.faults import simulate
+from bench.integrity.faults import CLEAN, settings_of, simulate
 from bench.robustness.protocols import Stream
 from bench.robustness.robots import PROTOCOLS, Run
 from bench.robustness.stamps import CHANGES, misleading_share, with_stamps
