@@ -12,7 +12,6 @@ eight_steering_node = Program("swarm_loc_drivers.sim.scenarios.steering_nodes", 
 epuck_driver_node = Program("swarm_loc_drivers.epuck.epuck_driver_node")
 epuck_world_node = Program("swarm_loc_drivers.sim.epuck.epuck_world_node")
 exploration_node = Program("swarm_loc_drivers.pushbot.exploration_node")
-generate_bag = Program("swarm_loc_drivers.sim.generate_bag")
 pushbot_driver_node = Program("swarm_loc_drivers.pushbot.pushbot_driver_node")
 pushbot_world_node = Program("swarm_loc_drivers.sim.pushbot.pushbot_world_node")
 room_world_node = Program("swarm_loc_drivers.sim.room.room_world_node")

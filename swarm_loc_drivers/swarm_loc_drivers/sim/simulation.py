@@ -26,7 +26,6 @@ from swarm_loc_drivers.sim.room.world import (
     room_of,
     room_starts,
 )
-from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings
 from swarm_loc_drivers.sim.scenarios.droplets import starts as droplet_starts
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, eight_floor, eight_starts, rounded
 from swarm_loc_drivers.sim.worlds import WorldError
@@ -223,7 +222,7 @@ def _aerial_files(options: SimulationOptions, folder: Path) -> tuple[Parameters,
 
 
 def _droplet_starts(options: SimulationOptions, swarm: Swarm) -> FloatArray:
-    return droplet_starts(DropletRunSettings(seed=options.seed, robots=len(swarm.robots)))
+    return droplet_starts(options.seed, len(swarm.robots))
 
 
 def _droplet_nodes(options: SimulationOptions, swarm: Swarm, links: str, whole: str) -> list[NodeSpec]:

@@ -17,19 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bench.scenarios.droplets_run import FIX_HEADING_SIGMA, FIX_SIGMA, DropletRun
+from bench.scenarios.eight_run import STEP_NS, EightSettings, ImageRun, drive_robots
+from bench.scenarios.lived_run import CAMERA_LATENESS, LivedRun, Records, SimulatedRun, arrival_ns, survivors
 from swarm_loc_drivers.common.calibration_file import CameraCalibration
 from swarm_loc_drivers.sim.differential_drive import Controller
-from swarm_loc_drivers.sim.run import (
-    CAMERA_LATENESS,
-    START_NS,
-    LivedRun,
-    Records,
-    SimulatedRun,
-    arrival_ns,
-    survivors,
-)
-from swarm_loc_drivers.sim.scenarios.droplets import FIX_HEADING_SIGMA, FIX_SIGMA, DropletRun
-from swarm_loc_drivers.sim.scenarios.eight import ARENA, STEP_NS, EightSettings, ImageRun, drive_robots
+from swarm_loc_drivers.sim.run import START_NS
+from swarm_loc_drivers.sim.scenarios.eight import ARENA
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator import CONTENT_POSE
 from swarm_loc_estimator.common import se2
