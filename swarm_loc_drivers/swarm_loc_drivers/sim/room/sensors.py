@@ -212,7 +212,7 @@ def cast(
 class Radios(SimulatedSensor):
     """Each radio ranges with one other device at a time, in turn; biases of both ends are added."""
 
-    message_type, rate_hz = RANGE, 10.0
+    message_type, rate_hz = RANGE, 5.0
 
     def _prepared(self) -> list[str]:
         world, swarm = self._world, self._world.swarm
