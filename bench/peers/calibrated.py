@@ -23,7 +23,7 @@ from swarm_loc_estimator.timeline.settings import Settings
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from swarm_loc_drivers.sim.run import Records, SimulatedRun
+    from bench.scenarios.lived_run import Records, SimulatedRun
     from swarm_loc_estimator.common.arrays import FloatArray
 
 SIZES = (100, 300, 1000)

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from swarm_loc_drivers.sim.run import SimulatedRun, in_order_of_arrival
-from swarm_loc_drivers.sim.scenarios.bags import as_detections
+from bench.scenarios.bags import as_detections
+from bench.scenarios.lived_run import SimulatedRun, in_order_of_arrival
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.filter.measurements import select
 from swarm_loc_estimator.offline.metrics import nees
@@ -22,7 +22,7 @@ from swarm_loc_estimator.timeline.estimator import Estimator
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from swarm_loc_drivers.sim.run import LivedRun
+    from bench.scenarios.lived_run import LivedRun
     from swarm_loc_estimator.common.arrays import FloatArray, IntArray
     from swarm_loc_estimator.swarm.swarm import Swarm
     from swarm_loc_estimator.timeline.estimator import Estimate

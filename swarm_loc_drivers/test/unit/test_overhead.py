@@ -8,13 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.scenarios.eight_run import EightSettings, describe
 from swarm_loc_drivers.epuck.hardware import wheel_geometry
 from swarm_loc_drivers.sim.epuck.world import OVERHEAD, EpuckWorld, EpuckWorldSettings, Exposure
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena, OverheadSettings, overhead_model
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
 from swarm_loc_drivers.sim.run import START_NS
-from swarm_loc_drivers.sim.scenarios.eight import ARENA, EightSettings, describe, eight_floor
+from swarm_loc_drivers.sim.scenarios.eight import ARENA, eight_floor
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
