@@ -38,7 +38,6 @@ _ROOM = 4 * (_MAX_ROWS + 1) * (2 * math.ceil(math.sqrt(2.0) * (REACH_PX + INNER_
 _NODES = 6
 """Points at a side whose shift is computed: start, middle and end on it, and one pixel outside of these."""
 U, V, DU, DV, LENGTH, NEAR, FAR, SHEAR = range(8)
-INNER = 4
 
 
 class SidePixels(NamedTuple):
@@ -50,8 +49,8 @@ class SidePixels(NamedTuple):
     boundaries: (
         FloatArray  # (4, cells + 1) place along a side of the boundaries of cells behind the border [px]
     )
-    count: NDArray[np.int64]  # (1,) number of pixels; M is the bound on it
-    side: NDArray[np.int64]  # (M,) index of the side; INNER is added at the inner edge of its border
+    first: NDArray[np.int64]  # (5,) the first pixel of each side, and their number; M is the bound on it
+    is_inner: NDArray[np.bool_]  # (M,) whether the pixel is at the inner edge of the border
     along: FloatArray  # (M,) distance along the side [px]
     outside: FloatArray  # (M,) distance outside of the side [px]
     place: FloatArray  # (M, 2) position from the first corner, over the size of the quadrangle
@@ -61,10 +60,10 @@ class SidePixels(NamedTuple):
 @cached_njit
 def empty_pixels(cells: int) -> SidePixels:
     """Memory for the pixels of one quadrangle with cells along a side."""
-    frames, boundaries, count = np.empty((4, 8)), np.empty((4, cells + 1)), np.zeros(1, np.int64)
+    frames, boundaries, first = np.empty((4, 8)), np.empty((4, cells + 1)), np.zeros(5, np.int64)
     along, outside, place = np.empty(_ROOM), np.empty(_ROOM), np.empty((_ROOM, 2))
-    side, value = np.empty(_ROOM, np.int64), np.empty(_ROOM)
-    return SidePixels(frames, boundaries, count, side, along, outside, place, value)
+    is_inner, value = np.empty(_ROOM, np.bool_), np.empty(_ROOM)
+    return SidePixels(frames, boundaries, first, is_inner, along, outside, place, value)
 
 
 def lens_shifts(lens: FloatArray, quads: FloatArray) -> FloatArray:
@@ -89,8 +88,9 @@ def collect(
     """
     warp, back = np.empty((6, 2)), np.empty((2, 2))
     size = 0.5 * math.hypot(quad[2, 0] - quad[0, 0], quad[2, 1] - quad[0, 1])
-    found.count[0] = 0
+    found.first[0] = 0
     for k in range(4):
+        found.first[k + 1] = found.first[k]
         frame = found.frames[k]
         _set_frame(quad, plane, k, border, frame, found.boundaries[k])
         # coefficients of 1 s s2 d ds ds2 in the shift; s 0 to 1 along the side, d outside [px]
@@ -187,7 +187,7 @@ def _collect_side(
     # walk along the rows or columns that cross it
     width, height = (image.shape[1], image.shape[0]) if is_flat else (image.shape[0], image.shape[1])
     low, high = max(math.ceil(min(begin, end)), 0), min(math.floor(max(begin, end)), width - 1)
-    stride, m = max(1, math.ceil((high - low + 1) / _MAX_ROWS)), found.count[0]
+    stride, m = max(1, math.ceil((high - low + 1) / _MAX_ROWS)), found.first[k + 1]
     for i in range(low, high + 1, stride):
         share = (i - begin) / (end - begin)
         # pixels around the outer edge, and in every other row around the inner one
@@ -207,20 +207,19 @@ def _collect_side(
                     rest_v = y - (v + a * dv - d * du + _shift(warp, 1, s, d))
                     a += back[0, 0] * rest_u + back[0, 1] * rest_v
                     d += back[1, 0] * rest_u + back[1, 1] * rest_v
-                found.side[m], found.along[m], found.outside[m] = k + INNER * inner, a, d
+                found.is_inner[m], found.along[m], found.outside[m] = inner > 0, a, d
                 found.place[m, 0] = (x - found.frames[0, U]) / size
                 found.place[m, 1] = (y - found.frames[0, V]) / size
                 found.value[m] = float(image[j, i] if is_flat else image[i, j])
                 m += 1
-    found.count[0] = m
+    found.first[k + 1] = m
 
 
 _ENDS = 8
 """The first parameters: distance of each line outside of its side at the first and the last corner [px]."""
 _DARK, _CONTRAST, _LIGHT_X, _LIGHT_Y, _BLUR_XX, _BLUR_YY, _BLUR_XY = range(_ENDS, _ENDS + 7)
 _PARAMETERS = _ENDS + 7
-_OF_SIDE = 2 + _PARAMETERS - _ENDS
-"""Parameters of a pixel: the two ends of its side, and those that all sides share."""
+_SLOPES = 7  # Derivatives of a pixel: by the two ends of its side, by what all sides share, by blur across it
 _ROUNDS = 5
 _CONVERGED = 0.2  # Maximum motion of an end at convergence, in standard deviations
 # Windows, priors and model errors: checked by errors of corners in `make bench-vision` and their NEES in
@@ -280,8 +279,8 @@ def _fit_markers(
     for n in range(len(strips)):
         for reach in (_SHARP_REACH_PX, REACH_PX):
             collect(image, quads[n], planes[n], shifts[n], border, reach, pixels)
-            contrast[n] = _fit_sides(pixels, strips[n], border, usual, work)
-            if contrast[n] > 0.0 and work.windows[:, 2:4].max() + np.abs(work.p[:_ENDS]).max() <= reach:
+            contrast[n] = _fit_sides(pixels, strips[n], border, reach, usual, work)
+            if contrast[n] > 0.0:
                 break
         if contrast[n] > 0.0:
             ends[n] = work.p[:_ENDS]
@@ -296,14 +295,18 @@ def _fit_markers(
 
 
 @cached_njit
-def _fit_sides(pixels: SidePixels, strips: Bits, border: int, usual: float, work: _Work) -> float:
-    """Fit one marker; returns the contrast, 0: no fit. `work.normal` becomes the covariance."""
+def _fit_sides(
+    pixels: SidePixels, strips: Bits, border: int, reach: float, usual: float, work: _Work
+) -> float:
+    """Fit one marker; returns the contrast, 0: no fit within reach. `work.normal` becomes the covariance."""
     p, normal, gradient = work.p, work.normal, work.gradient
     p[:] = 0.0
     p[_BLUR_XX] = p[_BLUR_YY] = _FIRST_BLUR
     noise = np.inf
     for turn in range(_ROUNDS):
         _set_windows(pixels.frames, border, work)
+        if reach < REACH_PX and work.windows[:, 2:4].max() + np.abs(p[:_ENDS]).max() > reach:
+            return 0.0
         weight, square = _set_equations(pixels, strips, border, noise, work)
         if weight < 2.0 * _PARAMETERS:
             return 0.0
@@ -355,27 +358,26 @@ def _set_gaps(pixels: SidePixels, strips: Bits, border: int, noise: float, work:
     """
     p, sums = work.p, np.zeros((4, 5))
     work.gaps[:] = 0.0
-    for i in range(pixels.count[0]):
-        k, a = pixels.side[i] - INNER, pixels.along[i]
-        if k < 0:
-            continue
+    for k in range(4):
+        frame, reach = pixels.frames[k], _inner_reach(pixels.frames[k], border, work.windows[k, 0])
         across, along, _, _, clear = work.windows[k]
-        frame = pixels.frames[k]
-        s = a / frame[LENGTH]
-        d = pixels.outside[i] - (1.0 - s) * p[2 * k] - s * p[2 * k + 1]
-        gap = frame[NEAR] + s * (frame[FAR] - frame[NEAR])
-        if a < clear or a > frame[LENGTH] - clear or abs(d + gap) > _inner_reach(frame, border, across):
-            continue
-        white = _white(a + frame[SHEAR] * (d + gap), along, strips[k], border, pixels.boundaries[k])
-        if white > _CLEARLY_WHITE:
-            level, slope, _ = _profile(d, gap, across, white)
-            light = 1.0 + p[_LIGHT_X] * pixels.place[i, 0] + p[_LIGHT_Y] * pixels.place[i, 1]
-            rest = (pixels.value[i] / light - p[_DARK]) / p[_CONTRAST] - level
-            sums[k, 0] += slope * slope
-            sums[k, 1] += slope * level
-            sums[k, 2] += level * level
-            sums[k, 3] += slope * rest
-            sums[k, 4] += level * rest
+        for i in range(pixels.first[k], pixels.first[k + 1]):
+            a = pixels.along[i]
+            s = a / frame[LENGTH]
+            d = pixels.outside[i] - (1.0 - s) * p[2 * k] - s * p[2 * k + 1]
+            gap = frame[NEAR] + s * (frame[FAR] - frame[NEAR])
+            if not pixels.is_inner[i] or a < clear or a > frame[LENGTH] - clear or abs(d + gap) > reach:
+                continue
+            white = _white(a + frame[SHEAR] * (d + gap), along, strips[k], border, pixels.boundaries[k])
+            if white > _CLEARLY_WHITE:
+                level, slope, _ = _profile(d, gap, across, white)
+                light = 1.0 + p[_LIGHT_X] * pixels.place[i, 0] + p[_LIGHT_Y] * pixels.place[i, 1]
+                rest = (pixels.value[i] / light - p[_DARK]) / p[_CONTRAST] - level
+                sums[k, 0] += slope * slope
+                sums[k, 1] += slope * level
+                sums[k, 2] += level * level
+                sums[k, 3] += slope * rest
+                sums[k, 4] += level * rest
     for k in range(4):
         determinant = sums[k, 0] * sums[k, 2] - sums[k, 1] ** 2
         if determinant > 1e-9:
@@ -414,56 +416,67 @@ def _set_equations(
     pixels: SidePixels, strips: Bits, border: int, noise: float, work: _Work
 ) -> tuple[float, float]:
     """Fill the normal equations from the pixels; returns the sum of weights and of weighted squares."""
-    p, jacobian = work.p, np.empty(_OF_SIDE)
-    of_side, towards = np.zeros((4, _OF_SIDE, _OF_SIDE)), np.zeros((4, _OF_SIDE))
-    total, square = 0.0, 0.0
-    for i in range(pixels.count[0]):
-        k, a = pixels.side[i], pixels.along[i]
-        # only pixels in the window of the outer edge, clear of the corners
-        if k >= INNER:
-            continue
-        across, along, inside, outside, clear = work.windows[k]
-        frame = pixels.frames[k]
-        s = a / frame[LENGTH]
-        d = pixels.outside[i] - (1.0 - s) * p[2 * k] - s * p[2 * k + 1]
-        if a < clear or a > frame[LENGTH] - clear or d < -inside or d > outside:
-            continue
-        # model: light (dark + contrast * profile), with the white cells behind the border
-        gap = frame[NEAR] + s * (frame[FAR] - frame[NEAR])
-        white = 0.0
-        if d + gap < _TABLE_END * across:
-            white = _white(a + frame[SHEAR] * (d + gap), along, strips[k], border, pixels.boundaries[k])
-        level, slope, widening = _profile(d, gap, across, white)
-        x, y = pixels.place[i]
-        light = 1.0 + p[_LIGHT_X] * x + p[_LIGHT_Y] * y
-        paint = p[_DARK] + p[_CONTRAST] * level
-        # its derivatives by the ends, ink, contrast, light and blur
-        by_place = light * p[_CONTRAST] * slope
-        by_variance = light * p[_CONTRAST] * widening / (2.0 * across * across)
-        jacobian[0], jacobian[1] = (s - 1.0) * by_place, -s * by_place
-        jacobian[2], jacobian[3] = light, light * level
-        jacobian[4], jacobian[5] = x * paint, y * paint
-        jacobian[6], jacobian[7] = by_variance * frame[DV] ** 2, by_variance * frame[DU] ** 2
-        jacobian[8] = -2.0 * by_variance * frame[DU] * frame[DV]
-        # add the pixel with Huber's weight to the equations of its side
-        rest = pixels.value[i] - light * paint
-        weight = min(1.0, _OUTLIER * noise / max(abs(rest), 1e-9))
-        total += weight
-        square += weight * rest * rest
-        for m in range(_OF_SIDE):
-            weighed = weight * jacobian[m]
-            towards[k, m] += weighed * rest
-            for o in range(_OF_SIDE):
-                of_side[k, m, o] += weighed * jacobian[o]
-    # put the equations of the four sides together
+    p, slopes = work.p, np.empty(_SLOPES)
     work.normal[:], work.gradient[:] = 0.0, 0.0
+    total, square = 0.0, 0.0
     for k in range(4):
-        for m in range(_OF_SIDE):
+        frame, boundaries, strip = pixels.frames[k], pixels.boundaries[k], strips[k]
+        length, near, shear = frame[LENGTH], frame[NEAR], frame[SHEAR]
+        widens = (frame[FAR] - near) / length
+        across, along, inside, outside, clear = work.windows[k]
+        products, towards = np.zeros((_SLOPES, _SLOPES)), np.zeros(_SLOPES)
+        for i in range(pixels.first[k], pixels.first[k + 1]):
+            # only pixels in the window of the outer edge, clear of the corners
+            a = pixels.along[i]
+            s = a / length
+            d = pixels.outside[i] - (1.0 - s) * p[2 * k] - s * p[2 * k + 1]
+            if pixels.is_inner[i] or a < clear or a > length - clear or d < -inside or d > outside:
+                continue
+            # model: light (dark + contrast * profile), with the white cells behind the border
+            gap, white = near + a * widens, 0.0
+            if d + gap < _TABLE_END * across:
+                white = _white(a + shear * (d + gap), along, strip, border, boundaries)
+            level, slope, widening = _profile(d, gap, across, white)
+            x, y = pixels.place[i, 0], pixels.place[i, 1]
+            light = 1.0 + p[_LIGHT_X] * x + p[_LIGHT_Y] * y
+            paint = p[_DARK] + p[_CONTRAST] * level
+            # its derivatives by the ends, ink, contrast, light, and blur across the side
+            by_place = light * p[_CONTRAST] * slope
+            slopes[0], slopes[1] = (s - 1.0) * by_place, -s * by_place
+            slopes[2], slopes[3] = light, light * level
+            slopes[4], slopes[5] = x * paint, y * paint
+            slopes[6] = light * p[_CONTRAST] * widening / (2.0 * across * across)
+            # add the pixel with Huber's weight to the equations of its side
+            rest = pixels.value[i] - light * paint
+            weight = min(1.0, _OUTLIER * noise / max(abs(rest), 1e-9))
+            total += weight
+            square += weight * rest * rest
+            for m in range(_SLOPES):
+                weighed = weight * slopes[m]
+                towards[m] += weighed * rest
+                for o in range(m, _SLOPES):
+                    products[m, o] += weighed * slopes[o]
+        # put the equations of the four sides together; blur across a side is that in three directions
+        du, dv = frame[DU], frame[DV]
+        for m in range(_SLOPES + 2):
             row = 2 * k + m if m < 2 else _ENDS + m - 2
-            work.gradient[row] += towards[k, m]
-            for o in range(_OF_SIDE):
-                work.normal[row, 2 * k + o if o < 2 else _ENDS + o - 2] += of_side[k, m, o]
+            share = _share(m, du, dv)
+            work.gradient[row] += share * towards[min(m, _SLOPES - 1)]
+            for o in range(_SLOPES + 2):
+                low, high = min(m, o, _SLOPES - 1), min(max(m, o), _SLOPES - 1)
+                column = 2 * k + o if o < 2 else _ENDS + o - 2
+                work.normal[row, column] += share * _share(o, du, dv) * products[low, high]
     return total, square
+
+
+@cached_njit
+def _share(m: int, du: float, dv: float) -> float:
+    """Derivative of the m-th slope at a side in a direction by the parameter that it is the slope of."""
+    if m == _SLOPES - 1:
+        return dv * dv
+    if m == _SLOPES:
+        return du * du
+    return -2.0 * du * dv if m == _SLOPES + 1 else 1.0
 
 
 @cached_njit

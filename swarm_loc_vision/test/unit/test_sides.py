@@ -17,7 +17,6 @@ from swarm_loc_vision.markers.decoder import Dictionary
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.lines import Corners, homographies, refine
 from swarm_loc_vision.markers.sides import (
-    INNER,
     NEW_CAMERA,
     REACH_PX,
     collect,
@@ -207,9 +206,9 @@ def test_the_lens_is_undone_at_every_pixel_next_to_a_side(k1: float, place: tupl
     pixels, image = empty_pixels(8), np.zeros((960, 1280), np.uint8)
     plane, shifts = homographies(quad[None])[0], lens_shifts(camera.lens, quad[None])[0]
     collect(image, quad, plane, shifts, 1, REACH_PX, pixels)
-    count = int(pixels.count[0])
+    count = int(pixels.first[4])
     assert count > 500
-    frame = pixels.frames[pixels.side[:count] % INNER]
+    frame = np.repeat(pixels.frames, np.diff(pixels.first), axis=0)
     along, outside = pixels.along[:count, None], pixels.outside[:count, None]
     normal = np.column_stack([frame[:, 3], -frame[:, 2]])
     raw = camera.to_raw(frame[:, :2] + along * frame[:, 2:4] + outside * normal)
