@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.aerial.ground_control import GroundCamera
 from swarm_loc_vision.aerial.pattern import MARGIN, inside_mark
 from swarm_loc_vision.common.camera import Camera
 

@@ -39,12 +39,11 @@ from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Swarm
 from swarm_loc_estimator.timeline.estimator import Status
-from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, located
+from swarm_loc_vision.aerial.ground_control import AerialSettings, FloorMarker, Ground, located
 from swarm_loc_vision.aerial.locate_camera import fixed_camera
-from swarm_loc_vision.aerial.parameters import AerialSettings
-from swarm_loc_vision.markers.bodies import robot_body, up_of
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector, detection_rows
 from swarm_loc_vision.markers.families import family_named
+from swarm_loc_vision.markers.pose import robot_body, up_of
 
 DURATION_S = 20.0
 _SETTLED_NS = 3 * 10**9  # From here on errors count

@@ -25,7 +25,6 @@ from bench.lidar.radish import BUILDINGS, NAME, reference, write_bag
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.se2 import between, rigid_fit, transform_points, wrap_angle
-from swarm_loc_estimator.common.trajectory import DEFAULT_GAP_NS, Trajectory, interpolate
 from swarm_loc_estimator.mapping.map_file import save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
@@ -100,25 +99,30 @@ def _contradict(truth: FloatArray, tie: LoopTie) -> bool:
 
 
 def localized(mapper: CooperativeMapper, building: str) -> dict[str, float]:
-    """Figures of a replay of the same log in the finished map, compared with the stops of the mapper."""
+    """Figures of a replay of the same log in the finished map, compared with the stops of the mapper.
+
+    Poses are those at the stamps of the stops, with what has come until then. Between two ticks a scan moves
+    them, so that a pose in between would have the error of one tick and the covariance of the other.
+    """
+    stops = np.array([mapper.begin_ns[stop] for stop in range(mapper.graph.count)])
+    tick_ns = round(1e9 * _TICK_S)
+    ticks = np.arange(stops.min() // tick_ns + 1, stops.max() // tick_ns) * tick_ns
     with TemporaryDirectory() as folder:
         bag = Path(folder, "bag")
         write_bag(building, bag)
         path, _ = save_map(mapper.occupancy(), Path(folder, "map"))
         swarm = load_swarm(bag / "swarm.yaml")
         robot = replace(swarm.robots[0], start=(0.0, 0.0, 0.0), odometry=_ODOMETRY)
-        result = replay(bag, replace(swarm, robots=(robot,), map=path), tick_s=_TICK_S)
+        result = replay(bag, replace(swarm, robots=(robot,), map=path), stamp_ns=np.union1d(ticks, stops))
     tracked = result.status[:, 0] == Status.TRACKED
-    stamps = np.array([mapper.begin_ns[stop] for stop in range(mapper.graph.count)])
-    poses, known = interpolate(Trajectory(result.stamp_ns, result.poses[:, 0]), stamps, DEFAULT_GAP_NS)
-    at = np.searchsorted(result.stamp_ns, stamps).clip(0, len(tracked) - 1)
-    known &= tracked[at] & np.isfinite(poses).all(axis=1)
-    error = poses[known] - mapper.graph.poses[known]
+    at = np.searchsorted(result.stamp_ns, stops)
+    known = tracked[at]
+    error = result.poses[at[known], 0] - mapper.graph.poses[known]
     error[:, 2] = wrap_angle(error[:, 2])
     misleading = is_misleading(error, result.covariances[at[known], 0])
     return {
-        "localized_tracked_share": float(tracked.mean()),
-        "localized_misleading_share": float(misleading.sum() / len(stamps)),
+        "localized_tracked_share": float(tracked[np.isin(result.stamp_ns, ticks)].mean()),
+        "localized_misleading_share": float(misleading.sum() / len(stops)),
         "localized_rms_m": float(np.sqrt(np.square(error[:, :2]).sum(axis=1).mean())),
     }
 

@@ -28,7 +28,7 @@ from bench.pushbot.exploration import (
     PushBotNoise,
 )
 from bench.shared.bags import message_header
-from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
+from swarm_loc_drivers.pushbot.protocol import SENSOR_PX
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, FloorPlanError, floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import (

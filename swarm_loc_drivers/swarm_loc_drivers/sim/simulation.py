@@ -27,7 +27,7 @@ from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, check_pa
 from swarm_loc_estimator.common.parameters import ParameterError, flag, number, text
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
-from swarm_loc_vision.aerial.ground_file import save_ground
+from swarm_loc_vision.aerial.ground_control import save_ground
 
 Parameters = dict[str, ParameterValue]
 

@@ -15,7 +15,7 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from swarm_loc_drivers.common.robot_driver import MAX_STOP_S
-from swarm_loc_drivers.common.ros_messages import stamp_message
+from swarm_loc_drivers.common.robot_driver_node import stamp_message
 from swarm_loc_drivers.sim.link_host import FirmwareHost
 from swarm_loc_drivers.sim.worlds import WorldParameters
 from swarm_loc_estimator.common.arrays import FloatArray

@@ -6,7 +6,7 @@ from node_world import Ros
 from rclpy.node import Node
 from rclpy.time import Time
 
-from swarm_loc_drivers.common.velocity_command import Velocity
+from swarm_loc_drivers.common.robot_driver import Velocity
 from swarm_loc_drivers.sim.scenarios.steering_nodes import TruthSteering
 from swarm_loc_estimator.common.arrays import FloatArray
 

@@ -7,10 +7,9 @@ from typing import Any
 import pytest
 
 from bench.shared.parameter_table import markdown_table
-from swarm_loc_drivers.droplet.exchange import PollingSettings
+from swarm_loc_drivers.droplet.exchange import PollingSettings, TdmaSettings
 from swarm_loc_drivers.droplet.hardware import AUDIO_DROPLET
 from swarm_loc_drivers.droplet.parameters import DropletFleetParameters, DropletParameters
-from swarm_loc_drivers.droplet.tdma import TdmaSettings
 from swarm_loc_drivers.sim.droplet.world import DropletWorldParameters
 from swarm_loc_estimator.common.parameters import ParameterError
 

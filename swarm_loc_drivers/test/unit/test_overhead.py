@@ -17,8 +17,7 @@ from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.aerial.detector import AerialDetector
-from swarm_loc_vision.aerial.ground_control import GroundControl
-from swarm_loc_vision.aerial.parameters import AerialSettings
+from swarm_loc_vision.aerial.ground_control import AerialSettings, GroundControl
 
 START = np.array([[0.1, 0.2, 0.3], [0.5, -0.2, 1.9], [-0.4, -0.3, -2.0]])
 RATE_HZ = 5.0

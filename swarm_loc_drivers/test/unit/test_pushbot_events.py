@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pushbot_events import Sent, event_pieces, random_events
 
 from swarm_loc_drivers.pushbot.event_parser import CONFIRMATIONS, EventParser, Parsed
-from swarm_loc_drivers.pushbot.hardware import TIMESTAMPS
+from swarm_loc_drivers.pushbot.protocol import TIMESTAMPS
 
 STAMPED = [name for name in TIMESTAMPS if name != "none"]
 LINE = b"-S28 -120 4294\n"

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.epuck.driver import EpuckDriver, EpuckListeners
-from swarm_loc_drivers.epuck.hardware import EPUCK2, EpuckModel
+from swarm_loc_drivers.epuck.hardware import EPUCK2, CameraImage, EpuckModel
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
-from swarm_loc_drivers.epuck.session import CameraImage
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
 from swarm_loc_drivers.sim.link_host import FirmwareHost

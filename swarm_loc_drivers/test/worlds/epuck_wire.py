@@ -10,12 +10,11 @@ from epuck_body import GEOMETRY, DrivenBody
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.odometry import OdometryState
-from swarm_loc_drivers.common.session import SessionError
+from swarm_loc_drivers.common.robot_driver import SessionError
 from swarm_loc_drivers.epuck.driver import WheelOdometry
-from swarm_loc_drivers.epuck.hardware import EpuckModel
+from swarm_loc_drivers.epuck.hardware import CameraImage, EpuckModel, EpuckSession, Reading
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.serial_session import SerialSession
-from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession, Reading
 from swarm_loc_drivers.epuck.wifi_session import WifiSession
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware

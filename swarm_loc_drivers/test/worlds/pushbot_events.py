@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.pushbot.hardware import TIMESTAMPS
+from swarm_loc_drivers.pushbot.protocol import TIMESTAMPS
 
 
 class Sent(NamedTuple):

@@ -181,6 +181,7 @@ class SweepMap:
         contradicted: Nodes to which odometry and scans say different motions.
         refused: Nodes of which the sweeps fit nothing.
         taken_back: Number of ties that were believed and then contradicted.
+        matched: Robot -> the newest node of which the sweep fits, and the covariance (3, 3) of its match.
     """
 
     def __init__(self, graph: PoseGraph) -> None:
@@ -189,6 +190,7 @@ class SweepMap:
         self.contradicted: list[int] = []
         self.refused: list[int] = []
         self.taken_back = 0
+        self.matched: dict[int, tuple[int, FloatArray]] = {}
         self._graph = graph
         self._chains: defaultdict[int, Chain] = defaultdict(Chain)
         self._points, self._ways = _Points(), _GraphWays()
@@ -220,6 +222,7 @@ class SweepMap:
         if found is not None and fits:
             usual = chain.score or found.score
             chain.score = usual + _MEMORY * (found.score - usual)
+            self.matched[int(self._graph.robot[node])] = node, found.covariance
             odometry = self._fuse(chain, begin, node, found, motion, sigma)
         elif len(points) >= _MIN_POINTS:
             self.refused.append(node)
@@ -385,6 +388,7 @@ class SweepMap:
             return
         if one.way < _SHORT:
             self.believe([one])
+            chain.looked += _LOOK_EVERY  # the graph knew that place
         else:
             chain.pending.append(one)
             self._test_together(chain)

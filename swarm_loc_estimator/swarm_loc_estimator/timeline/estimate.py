@@ -32,8 +32,7 @@ from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.track_arrays import TrackArrays, look_up, new_sample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.sensors.lidar import DelayBelief
-from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 
 
@@ -337,7 +336,11 @@ def contradictions(
             for robot, source in aside
         ),
         *(_suspended(names[source]) for source in suspended.tolist()),
-        *(_late(swarm.robots[robot], one) for robot, one in state.delays.items() if one.is_refuted),
+        *(
+            Contradiction(f"lidar of {names[k]}", Contradicted.LATE, one.sentence(swarm.robots[k]))
+            for k, one in state.delays.items()
+            if one.is_refuted
+        ),
         *(
             _of_robot(names[one], Contradicted.BACKWARDS)
             for one in sorted(state.delays)
@@ -369,14 +372,6 @@ _PART = {
 
 def _of_robot(name: str, kind: Contradicted) -> Contradiction:
     return Contradiction(_PART.get(kind, "") + name, kind, _TEXTS[kind].format(name))
-
-
-def _late(robot: Robot, delay: DelayBelief) -> Contradiction:
-    """Fault of a lidar whose delay is another than described."""
-    older = "older" if delay.mean_s > 0.0 else "newer"
-    text = f"the scans of {robot.name} are {abs(delay.mean_s):.2f} +- {delay.sigma_s:.2f} s {older} than"
-    text += f" described: set lidar.delay_s to {robot.lidar.delay_s - delay.mean_s:.2f}, or correct their"
-    return Contradiction(f"lidar of {robot.name}", Contradicted.LATE, f"{text} stamps")
 
 
 def _sightings(observer: str, source: str) -> Contradiction:

@@ -25,6 +25,7 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.numerics import wrap
 from swarm_loc_estimator.common.se2 import between, compose, inverse, wrap_angle
 from swarm_loc_estimator.filter.measurements import Measurements, Verdict
+from swarm_loc_estimator.filter.sources import CONFIRMED
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import load_map
@@ -32,11 +33,14 @@ from swarm_loc_estimator.sensors.lidar import described_delay
 from swarm_loc_estimator.swarm.swarm import MAP_BY_TOPIC, Swarm
 from swarm_loc_estimator.timeline.map_scans import (
     BLOCKED,
+    FITS,
     FREE,
     OFF_MAP,
+    SURE_FIT,
     WALL,
     MapScans,
     Match,
+    MatchedScan,
     WallMap,
     match,
     wall_map,
@@ -61,6 +65,11 @@ _DECLINE = 0.07
 """How much worse later scans may fit than the first, by which a place was found: wrong places fit it best."""
 _START = np.diag(np.square([0.1, 0.1, 0.05]))
 """Covariance (3, 3) added to that of a place, since the next scans, which see the same walls, replace it."""
+_AROUND = np.array([[0.2, 0.2, 0.1], [0.4, 0.4, 0.2]])
+"""Least and greatest steps in which a located robot is sought around its prediction [m, m, rad]."""
+_OFFSETS = np.stack(np.meshgrid(*[np.arange(-3.0, 4.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+_NEAR_BY, _RIVAL = 12, 25.0  # Places around it that are matched, and squared distance of different ones
+_SAME = np.diag(np.square([0.05, 0.05, 0.03]))
 _COMPARED, _MATCHES = 400_000, 50  # Numbers of poses that are compared, and that are matched, at a scan
 _GRADES = 100  # Of nearness to a wall, at the first level
 _SEARCH_TURN = 0.1  # Turn during a sweep beyond which it searches no place [rad]
@@ -213,6 +222,43 @@ class MapSearch:
             return found, Verdict.USED
         state.places[robot] = places
         return None, _why_nowhere(places)
+
+    def regained(self, state: SwarmState, scan: MatchedScan) -> FoundPlace | None:
+        """The place of a robot that is not where it was predicted; None: it is, or nobody knows.
+
+        Wheels slip, and pauses or steps too fast for their stamps leave out motions that most drivers go on
+        counting. Where the scan does not fit, it is sought around the prediction and what odometry reports.
+        """
+        is_usual = scan.found.outcome == FITS and scan.found.fitting >= SURE_FIT and scan.reported is None
+        if is_usual or state.sources.confirmations[scan.robot] < CONFIRMED:
+            return None
+        beams = SweptBeams.thinned(*scan.beams)
+        points = _spread(beams.ends)
+        sigma = np.clip(np.sqrt(np.diag(scan.covariance)), *_AROUND)
+        if scan.reported is not None:  # what is left out may be the whole turn
+            sigma = _AROUND[0]
+        centres = [one for one in (scan.predicted, scan.reported) if one is not None]
+        poses = (np.array(centres)[:, None] + _OFFSETS * sigma).reshape(-1, 3)
+        known = state.map._replace(walls=scan.walls)
+        score = _scores(known, points, poses, 0.75 * sigma[0]) if len(points) else np.zeros(len(poses))
+        order = _largest(score, len(score))
+        kept = order[_separate(poses[order], score[order], _NEAR_BY)]
+        found = [match(scan.walls, *beams, pose, np.diag(sigma**2)) for pose in poses[kept]]
+        found = sorted((one for one in found if one.outcome == FITS), key=_fit, reverse=True)
+        least = SURE_FIT if scan.reported is not None else max(SURE_FIT, scan.found.fitting + _DECLINE)
+        if not found or found[0].fitting < least:
+            return None
+        best = found[0]
+        for other in found[1:]:
+            off = between(best.pose, other.pose)
+            off[2] = wrap_angle(off[2])
+            square = off @ np.linalg.solve(best.covariance + other.covariance + _SAME, off)
+            if square > _RIVAL and other.fitting > best.fitting - _DECLINE:
+                return None
+        information = np.linalg.inv(best.covariance) + np.diag(sigma**-2)  # walls may not tell all
+        anchor = np.stack([best.pose, *scan.anchor[1:]])
+        state.delays[scan.robot] = state.delays[scan.robot]._replace(anchor=anchor, stamp_ns=-1)
+        return FoundPlace(best.pose, np.linalg.inv(information))
 
     def _add(
         self,

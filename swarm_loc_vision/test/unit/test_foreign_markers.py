@@ -20,11 +20,10 @@ from swarm_loc_estimator.common.messages.cdr import DETECTIONS, decode
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_vision.common.images import ImageError
-from swarm_loc_vision.markers.bodies import PoseSettings
 from swarm_loc_vision.markers.detector import precompile
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.foreign_markers import ForeignMarkers, ForeignParameters
-from swarm_loc_vision.markers.pose import square
+from swarm_loc_vision.markers.pose import PoseSettings, square
 
 PAGE = Path(__file__).parents[2] / "doc" / "marker_bridge_node.md"
 TAG = "apriltag_36h11"

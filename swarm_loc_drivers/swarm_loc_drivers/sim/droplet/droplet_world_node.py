@@ -15,7 +15,7 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.qos import QoSProfile
 
-from swarm_loc_drivers.common.ros_messages import stamp_message, yaw_quaternion
+from swarm_loc_drivers.common.robot_driver_node import stamp_message, yaw_quaternion
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.world import (
     STEP_NS,

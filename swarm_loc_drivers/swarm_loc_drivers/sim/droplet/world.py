@@ -18,11 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from swarm_loc_drivers.common.odometry import OdometryState
-from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
-from swarm_loc_drivers.droplet.exchange import Brightness
+from swarm_loc_drivers.common.robot_driver import Velocity, VelocityCommand
+from swarm_loc_drivers.droplet.driver import DropletMover, DropletSession
+from swarm_loc_drivers.droplet.exchange import Brightness, SessionSettings
 from swarm_loc_drivers.droplet.hardware import DIRECTIONS, ELEMENTS, WALKS, Gait, gait
 from swarm_loc_drivers.droplet.odometry import CommandedMotion, MotionNoise
-from swarm_loc_drivers.droplet.session import DropletMover, DropletSession, SessionSettings
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.infrared import (
     DropletInfrared,

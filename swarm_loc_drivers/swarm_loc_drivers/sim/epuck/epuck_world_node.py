@@ -26,7 +26,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
 from swarm_loc_drivers.common.calibration_file import CameraCalibration
-from swarm_loc_drivers.common.ros_messages import camera_info_message, image_message, stamp_message
+from swarm_loc_drivers.common.robot_driver_node import camera_info_message, image_message, stamp_message
 from swarm_loc_drivers.epuck.hardware import EPUCK_MODELS
 from swarm_loc_drivers.sim.epuck.parts import Unanswered
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware

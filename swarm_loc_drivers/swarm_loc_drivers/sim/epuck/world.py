@@ -34,8 +34,7 @@ from swarm_loc_estimator.common.parameters import ParameterError, choice, number
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_vision.aerial.ground_control import FloorMarker
-from swarm_loc_vision.aerial.ground_file import load_ground
+from swarm_loc_vision.aerial.ground_control import FloorMarker, load_ground
 from swarm_loc_vision.markers.families import families
 
 GrayImage = NDArray[np.uint8]

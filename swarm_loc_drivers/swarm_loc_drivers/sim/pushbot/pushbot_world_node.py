@@ -12,7 +12,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from swarm_loc_drivers.pushbot.hardware import GENERATIONS
+from swarm_loc_drivers.pushbot.protocol import GENERATIONS
 from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.world import (
     STEP_NS,

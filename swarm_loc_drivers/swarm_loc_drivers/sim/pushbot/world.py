@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.pushbot.hardware import GENERATIONS, SECOND_FIRMWARE
+from swarm_loc_drivers.pushbot.protocol import GENERATIONS, SECOND_FIRMWARE
 from swarm_loc_drivers.sim.differential_drive import Drive, LastingNoise, roll
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, FloorPlan, clearance, floor_plan

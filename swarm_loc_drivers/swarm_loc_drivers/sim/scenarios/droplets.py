@@ -13,11 +13,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from swarm_loc_drivers.droplet.exchange import Brightness
+from swarm_loc_drivers.droplet.exchange import Brightness, SessionSettings, TdmaSettings
 from swarm_loc_drivers.droplet.hardware import DROPLET, ELEMENTS, FULL_POWER
 from swarm_loc_drivers.droplet.odometry import MotionNoise
-from swarm_loc_drivers.droplet.session import SessionSettings
-from swarm_loc_drivers.droplet.tdma import TdmaSettings
 from swarm_loc_drivers.sim.droplet.world import (
     DROPLET_WORLDS,
     NEAR_POWER,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ellipk, ellipkinc
 
-from swarm_loc_drivers.common.velocity_command import Velocity
+from swarm_loc_drivers.common.robot_driver import Velocity
 from swarm_loc_drivers.sim.differential_drive import Controller, Drive, record_drive
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena, CameraRig
