@@ -9,8 +9,6 @@ scale's error (2 %) are not printed either; with them the method of the paper ha
 rate (`304ddb9b:bench/aerial/driving.py`).
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterator

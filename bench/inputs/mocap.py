@@ -1,9 +1,7 @@
 """Motion capture with drop-outs and delays, through the bridge and the estimator."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping, Sequence
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,14 +12,10 @@ from swarm_loc_drivers.sim.differential_drive import Drive
 from swarm_loc_drivers.sim.run import START_NS
 from swarm_loc_estimator import FixRows, Robot, Swarm
 from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.health import Health
 from swarm_loc_estimator.sensors.localizers import SOURCES, BridgeParameters, LocalizedRobots
 from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 
 ROBOTS = 5
 DURATION_S = 60.0

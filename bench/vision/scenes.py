@@ -4,8 +4,6 @@ A pixel's value is the mean over a grid of points in its square and over instant
 are where the geometry puts them, to 0.01 px. Then come the blur of the optics, light and noise.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

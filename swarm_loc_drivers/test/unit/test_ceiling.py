@@ -1,7 +1,5 @@
 """A rendered arena under a fixed camera, from the picture to the poses of robots with unknown starts."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

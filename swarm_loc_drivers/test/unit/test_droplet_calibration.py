@@ -1,7 +1,5 @@
 """Droplets calibrated from one recording are located better in another one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

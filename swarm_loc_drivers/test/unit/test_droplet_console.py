@@ -1,7 +1,5 @@
 """The Droplet's console: as its firmware prints, in pieces of any size, and with garbage between."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

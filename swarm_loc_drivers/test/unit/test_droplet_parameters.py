@@ -1,7 +1,5 @@
 """What a user sets about a Droplet's driver."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The overhead camera of a simulated world: where robots appear, and that nothing tells them apart."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

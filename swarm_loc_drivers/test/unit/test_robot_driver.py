@@ -1,7 +1,5 @@
 """A driver's link: what breaks it is reported, whatever it is."""
 
-from __future__ import annotations
-
 import os
 import pty
 import termios

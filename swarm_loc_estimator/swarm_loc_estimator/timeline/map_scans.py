@@ -434,19 +434,18 @@ class MapScans:
                 found, beams = other, reversed_beams
         state.delays[robot] = delay
         # Odometry may have left out a motion that it reports, or scans agree with it, but not with the pose.
-        sample, reported, follows = self.tracks.at(np.array([robot]), np.array([stamp_ns])), None, False
+        sample, reported = self.tracks.at(np.array([robot]), np.array([stamp_ns])), None
         anchor = np.stack([found.pose, now, sample.raw[0]])
         if not np.isnan(delay.anchor).any():
             motions = between(delay.anchor, anchor)  # in the map, as odometry is used, and as reported
             motions[:, 2] = wrap_angle(motions[:, 2])
-            seen, used, moved = motions
+            _, used, moved = motions
             path, turn = math.hypot(moved[0], moved[1]), abs(moved[2])
             slack = _LEFT_OUT + _LEFT_OUT_SHARE * np.array([path, path, turn])
-            follows = bool((np.abs(seen - used) < slack).all())
             if (np.abs(moved - used) > slack).any() or (np.diag(covariance) > _UNKNOWN_MOTION).any():
                 reported = compose(delay.anchor[0], moved)
         return MatchedScan(
-            robot, stamp_ns, walls, beams, pose, covariance, found, track, back, anchor, reported, follows
+            robot, stamp_ns, walls, beams, pose, covariance, found, track, back, anchor, reported
         )
 
     def fix_of(self, state: SwarmState, scan: MatchedScan) -> tuple[Measurements | None, Verdict, bool]:

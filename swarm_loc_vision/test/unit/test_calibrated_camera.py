@@ -1,7 +1,5 @@
 """Cameras by their camera_info: region of interest and binning, and images that do not fit them."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 

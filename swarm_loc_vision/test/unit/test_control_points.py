@@ -1,7 +1,5 @@
 """Poses of overhead cameras by control points: exact, as unsure as they are, refused where they must be."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The pages of the event tracker and of the laser's calibration have the parameters as they are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

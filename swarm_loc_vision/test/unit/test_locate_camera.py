@@ -1,7 +1,5 @@
 """The command that locates a fixed camera by control points, and by markers on the floor in pictures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

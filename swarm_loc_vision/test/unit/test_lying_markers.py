@@ -1,7 +1,5 @@
 """Markers that lie, from noisy corners to measurements; the description of a camera from control points."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What the parameters say: on the node's page, and about the detector that follows from them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Texts that select markers."""
 
-from __future__ import annotations
-
 import pytest
 
 from swarm_loc_estimator.common.parameters import ParameterError

@@ -1,7 +1,5 @@
 """Sides fitted to pixels: no bias wherever edges lie in the pixels, and as sure as they say."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

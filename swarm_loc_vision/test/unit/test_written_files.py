@@ -1,7 +1,5 @@
 """Outputs of cameras' programs: whole or not at all, and never through a link of others."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
