@@ -61,7 +61,7 @@ class UwbDevice(Radio):
     gate_probability: float = gate("ranges", 0.999)
 
 
-class Placed:
+class StaticBody:
     """A static body, whose place may be estimated."""
 
     @property
@@ -71,7 +71,7 @@ class Placed:
 
 
 @dataclass(frozen=True)
-class Anchor(Radio, Placed):
+class Anchor(Radio, StaticBody):
     """Radio at a fixed place in `map`."""
 
     x: float = number(0.0, "m", -1e8, 1e8, "in map")
@@ -119,7 +119,7 @@ class Face:
 
 
 @dataclass(frozen=True)
-class Landmark(Placed):
+class Landmark(StaticBody):
     """A static marker in `map`."""
 
     id: int  #: Marker id, unique in the swarm
@@ -178,7 +178,7 @@ class Robot:
 
 
 @dataclass(frozen=True)
-class FixedCamera(Placed):
+class FixedCamera(StaticBody):
     """A camera with a fixed pose in `map`, such as at the ceiling; its angles are those of `CameraMount`."""
 
     name: str
