@@ -8,8 +8,7 @@ import numpy as np
 
 from bench.aerial.driving import followed
 from bench.aerial.worlds import PERIOD_NS, Conditions, simulate
-from swarm_loc_estimator.identification.anchors import Scale
-from swarm_loc_estimator.identification.chain import ChainModel
+from swarm_loc_estimator.identification.chain import ChainModel, Scale
 
 if TYPE_CHECKING:
     from bench.aerial.rates import Results

@@ -10,8 +10,7 @@ import numpy as np
 
 from bench.aerial.rates import SWARMS, Results
 from bench.aerial.worlds import PERIOD_NS, Conditions, World, picture_of, simulate
-from swarm_loc_estimator.identification.anchors import Scale
-from swarm_loc_estimator.identification.chain import ChainModel, Chains
+from swarm_loc_estimator.identification.chain import ChainModel, Chains, Scale
 
 _PAPERS = ChainModel(detection_probability=0.999, absent=1e-3, entering=1e-3, false_detections=0.01)
 """All robots are on each image, and nothing else."""

@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.numerics import wrap
 from swarm_loc_estimator.common.se2 import between, compose, inverse, wrap_angle
@@ -176,22 +176,15 @@ def described_map(swarm: Swarm) -> SearchMap | None:
 
 
 class MapSearch:
-    """Searches places in the known map.
-
-    Args:
-        scans: What knows the beams of sweeps.
-        swarm: The robots.
-    """
+    """Searches places of robots in the known map; `scans` knows the beams of sweeps."""
 
     def __init__(self, scans: MapScans, swarm: Swarm) -> None:
         self._scans, self._robots = scans, swarm.robots
 
     def place_of(self, state: SwarmState, one: Measurements) -> tuple[FoundPlace | None, Verdict]:
-        """Search the place of a robot that is not located, by its scan; returns it once it is found.
+        """Search the place of a robot that is not located, by the row of its scan; returns it once found.
 
-        Args:
-            state: With a map; what is known of places is changed.
-            one: Row of the scan.
+        What the state, which has a map, knows of places is changed.
         """
         robot, stamp_ns, scans = int(one.target), int(one.stamp_ns), self._scans
         sweep, described = scans.sweep_of(one), self._robots[robot]
@@ -222,14 +215,7 @@ class MapSearch:
         track: FloatArray,
         known: SearchMap,
     ) -> tuple[PossiblePlaces, FoundPlace | None]:
-        """Follow the places of a robot by a scan.
-
-        Args:
-            before: What is known; None: nothing.
-            stamp_ns: Stamp of the scan.
-            beams: The scan.
-            track: (3,) pose by odometry.
-            known: The map, with the error of its walls.
+        """Follow the places of a robot, if any are known, by a scan at a pose (3,) by odometry.
 
         Returns:
             What is known then, and the place where the robot is, once it is found.
@@ -242,14 +228,14 @@ class MapSearch:
             look = Look(beams, track)
             begun = PossiblePlaces(np.zeros((0, 3)), np.zeros((0, 1)), (look,), stamp_ns, pause_ns)
             return self._advanced(begun, PlaceSearch(), known), None
-        away, turn = _moved(before.looks[-1].track, track)
+        x, y, turn = between(before.looks[-1].track, track)
+        away, turn = math.hypot(x, y), abs(float(wrap_angle(turn)))
         is_look = away >= _LOOK_M or turn >= _LOOK_TURN
         if not (is_look or before.is_sole):
             return before, None
         # match each place again, and rule out what explains less
-        covariance = np.diag(
-            [_SLIP[0] + _SLIP[2] * away, _SLIP[0] + _SLIP[2] * away, _SLIP[1] + _SLIP[2] * turn]
-        )
+        slip = _SLIP[0] + _SLIP[2] * away
+        covariance = np.diag([slip, slip, _SLIP[1] + _SLIP[2] * turn])
         found = [match(known.walls, *beams, compose(one, track), covariance**2) for one in before.transform]
         poses = np.array([one.pose for one in found])
         fits = np.column_stack([before.fits, [_fit(one) for one in found]])
@@ -301,11 +287,8 @@ class MapSearch:
             else:
                 transform.append(latest)
                 fits.append(own)
-        search = search._replace(
-            poses=search.poses[tried:],
-            transform=(*search.transform, *transform),
-            fits=(*search.fits, *fits),
-        )
+        transforms, every = (*search.transform, *transform), (*search.fits, *fits)
+        search = search._replace(poses=search.poses[tried:], transform=transforms, fits=every)
         return places._replace(search=search) if len(search.poses) else _searched(places, search)
 
 
@@ -314,10 +297,11 @@ def _searched(places: PossiblePlaces, search: PlaceSearch) -> PossiblePlaces:
     transform = np.concatenate([places.transform, np.reshape(search.transform, (-1, 3))])
     fits = np.concatenate([places.fits, np.reshape(search.fits, (-1, len(places.looks)))])
     poses, known = compose(transform, places.looks[-1].track), len(places.transform)
-    others = np.arange(known, len(poses))
-    if known:
-        others = others[_apart(poses[0], poses[known:])]
-    others = np.concatenate([np.arange(known), others])
+    others = np.arange(len(poses))
+    if known:  # other places than the known one
+        off = poses - poses[0]
+        is_apart = (np.hypot(off[:, 0], off[:, 1]) > _APART_M) | (np.abs(wrap_angle(off[:, 2])) > _APART)
+        others = others[is_apart | (others < known)]
     kept = others[_best(poses[others], fits[others])][:_HYPOTHESES]
     kept = kept[fits[kept].sum(axis=1) > 0.0]
     is_complete = len(places.looks) >= _LOOKS
@@ -455,15 +439,3 @@ def _best(poses: FloatArray, fits: FloatArray) -> IntArray:
     each: IntArray = order[_separate(poses[order], total[order] + 1e-9, len(order))]
     kept: IntArray = each[total[each] > total.max(initial=0.0) - _RULED_OUT]
     return kept
-
-
-def _moved(before: FloatArray, now: FloatArray) -> tuple[float, float]:
-    """Distance [m] and absolute turn [rad] from a pose (3,) to another."""
-    x, y, turn = between(before, now)
-    return math.hypot(x, y), abs(float(wrap_angle(turn)))
-
-
-def _apart(pose: FloatArray, others: FloatArray) -> BoolArray:
-    """Which poses (n, 3) are other places than a pose (3,)."""
-    off = others - pose
-    return np.asarray((np.hypot(off[:, 0], off[:, 1]) > _APART_M) | (np.abs(wrap_angle(off[:, 2])) > _APART))
