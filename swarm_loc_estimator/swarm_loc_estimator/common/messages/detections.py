@@ -71,7 +71,7 @@ def encode_detections(frame_id: str, stamp_ns: int, detections: cdr.Rows) -> byt
     return encode({"header": header, "detections": detections}, message_type)
 
 
-def blank_detections(ids: ArrayLike, content: int) -> Rows:
+def blank_detections(ids: ArrayLike, content: int) -> cdr.Rows:
     """Detections (n,) of markers by ids (n,), at the origin, without a covariance."""
     rows = np.zeros(np.shape(ids), DETECTION_DTYPE)
     rows["id"], rows["content"] = ids, content
