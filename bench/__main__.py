@@ -11,6 +11,7 @@ BENCHMARKS = {
     "droplet_real": "bench.droplet.real",
     "drivers": "bench.graph.drivers",
     "epuck": "bench.epuck",
+    "generate_bag": "bench.scenarios.generate_bag",
     "inputs": "bench.inputs",
     "integrity": "bench.integrity",
     "large_swarms": "bench.graph.large_swarms",

@@ -20,17 +20,17 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from numpy.typing import NDArray
 
-from bench.shared.bags import read_truth
-from bench.shared.common import OUT, new_plot, save_plot, table
-from swarm_loc_drivers.sim.scenarios.bags import write_droplet_bag
-from swarm_loc_drivers.sim.scenarios.droplets import (
+from bench.scenarios.bags import write_droplet_bag
+from bench.scenarios.droplets_run import (
     FIXED,
     TURN_S,
     DropletRunSettings,
     describe_droplets,
     simulate_droplets,
-    starts,
 )
+from bench.shared.bags import read_truth
+from bench.shared.common import OUT, new_plot, save_plot, table
+from swarm_loc_drivers.sim.scenarios.droplets import starts
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
 from swarm_loc_estimator.offline.calibration.recording import read_recording
@@ -135,7 +135,7 @@ def _write_swarms(seed: int, folder: Path) -> Swarm:
     """Write the swarm as the world knows it, and as the estimator does, which is returned: without starts."""
     for known, name in ((True, "world.yaml"), (False, "swarm.yaml")):
         settings = DropletRunSettings(seed, robots=ROBOTS, start_known=known)
-        swarm = describe_droplets(settings, starts(settings))
+        swarm = describe_droplets(settings, starts(settings.seed, settings.robots))
         save_swarm(swarm, folder / name)
     return swarm
 

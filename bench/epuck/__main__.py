@@ -24,11 +24,11 @@ import numpy as np
 
 from bench.epuck import rendered
 from bench.epuck.dense import DenseSettings, blind_robots, simulate_dense
+from bench.scenarios.eight_run import EightSettings, simulate_eight
+from bench.scenarios.lived_run import SimulatedRun
 from bench.shared.common import Cell, new_plot, options_of, save_plot, table, write_figures
 from bench.shared.simulated_run import errors_of, mean_nees, run_core, ticks
 from bench.vision import report as vision_report
-from swarm_loc_drivers.sim.run import SimulatedRun
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_drivers.sim.worlds import W0, W2, W2_FAST, ErrorModel
 from swarm_loc_estimator.offline.live_run import LiveError
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm

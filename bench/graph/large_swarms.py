@@ -14,11 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
+from bench.scenarios.bags import as_detections, truth_stream, write_bag, write_swarm_bag
+from bench.scenarios.lived_run import SimulatedRun
 from bench.shared.bags import SharedHead, encode_shared_detections, encode_shared_numbers
 from bench.shared.common import OUT, flat, options_of, plot_by_size, table, write_figures
 from bench.shared.grid import GridSettings, simulate_grid
-from swarm_loc_drivers.sim.run import SimulatedRun
-from swarm_loc_drivers.sim.scenarios.bags import as_detections, truth_stream, write_bag, write_swarm_bag
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.bags.writer import Stream
 from swarm_loc_estimator.common.launch import GraphOptions

@@ -10,8 +10,9 @@ from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
 
+from bench.scenarios.eight_run import EightSettings, describe
 from bench.shared.bags import read_truth
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, Lemniscate
 from swarm_loc_drivers.sim.worlds import ErrorModel
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped

@@ -12,10 +12,11 @@ from dataclasses import replace
 import numpy as np
 
 from bench.integrity.faults import CLEAN, twist_only, with_twists
+from bench.scenarios.eight_run import EightSettings, simulate_eight
+from bench.scenarios.lived_run import CAMERA_LATENESS, LivedRun, SimulatedRun, arrival_ns
 from bench.shared.common import ProgressLine, plot_curves, rms
 from bench.shared.simulated_run import errors_of, estimates_of, inputs_of, mean_nees, position_rmse, ticks
-from swarm_loc_drivers.sim.run import CAMERA_LATENESS, LivedRun, SimulatedRun, Trajectories, arrival_ns
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
+from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.offline.metrics import is_misleading
 from swarm_loc_estimator.sensors.imu import TurnRateRows

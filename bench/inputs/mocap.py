@@ -5,10 +5,11 @@ from types import SimpleNamespace
 
 import numpy as np
 
+from bench.scenarios.lived_run import CAMERA_LATENESS, LivedRun, arrival_ns, record_drive
 from bench.shared.common import ProgressLine, plot_curves, rms
 from bench.shared.simulated_run import errors_of, estimates_of, inputs_between, mean_nees, odometry_rows
-from swarm_loc_drivers.sim.differential_drive import Drive, record_drive
-from swarm_loc_drivers.sim.run import CAMERA_LATENESS, START_NS, LivedRun, arrival_ns
+from swarm_loc_drivers.sim.differential_drive import Drive
+from swarm_loc_drivers.sim.run import START_NS
 from swarm_loc_estimator import FixRows, Robot, Swarm
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray

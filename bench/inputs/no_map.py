@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 
 from bench.integrity.faults import CLEAN, seconds
+from bench.scenarios.eight_run import EightSettings, simulate_eight
+from bench.scenarios.lived_run import SimulatedRun
 from bench.shared.common import ProgressLine, plot_curves, rms
 from bench.shared.simulated_run import errors_of, estimates_of, fitted_errors, inputs_of, ticks
-from swarm_loc_drivers.sim.run import SimulatedRun
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.offline.metrics import is_misleading
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status

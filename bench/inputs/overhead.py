@@ -16,6 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.scenarios.bags import places, wander
+from bench.scenarios.eight_run import EightSettings, drive_robots
+from bench.scenarios.lived_run import CAMERA_LATENESS, LivedRun, arrival_ns
 from bench.shared.common import ProgressLine, plot_curves, rms
 from bench.shared.simulated_run import (
     errors_of,
@@ -28,9 +31,7 @@ from bench.shared.simulated_run import (
 from bench.vision.ceiling import CeilingRig
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena
-from swarm_loc_drivers.sim.run import CAMERA_LATENESS, START_NS, LivedRun, Trajectories, arrival_ns
-from swarm_loc_drivers.sim.scenarios.bags import places, wander
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, drive_robots
+from swarm_loc_drivers.sim.run import START_NS, Trajectories
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE

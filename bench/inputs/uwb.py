@@ -9,16 +9,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.scenarios.lived_run import CAMERA_LATENESS, ODOMETRY_DTYPE, LivedRun, arrival_ns
 from bench.shared.common import ProgressLine, plot_curves
 from bench.shared.simulated_run import mean_nees
-from swarm_loc_drivers.sim.run import (
-    CAMERA_LATENESS,
-    ODOMETRY_DTYPE,
-    START_NS,
-    LivedRun,
-    Trajectories,
-    arrival_ns,
-)
+from swarm_loc_drivers.sim.run import START_NS, Trajectories
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import RANGES, encode

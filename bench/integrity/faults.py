@@ -7,17 +7,17 @@ from typing import Any
 
 import numpy as np
 
-from swarm_loc_drivers.sim.run import (
+from bench.scenarios.eight_run import VIEW, EightSettings, camera_exposures, drive_eight
+from bench.scenarios.lived_run import (
     FRAME_DTYPE,
     ODOMETRY_DTYPE,
     SIGHTING_DTYPE,
     LivedRun,
     Records,
     SimulatedRun,
-    Trajectories,
 )
-from swarm_loc_drivers.sim.scenarios.eight import VIEW, EightSettings, camera_exposures, drive_eight
-from swarm_loc_drivers.sim.sightings import observe_markers
+from bench.scenarios.sightings import observe_markers
+from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_drivers.sim.worlds import W0, W2, ErrorModel
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray

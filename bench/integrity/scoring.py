@@ -11,9 +11,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.integrity.faults import Fault, seconds
+from bench.scenarios.lived_run import LivedRun
 from bench.shared.common import new_plot, rms, save_plot
 from bench.shared.simulated_run import errors_of, estimates_of, inputs_of, ticks
-from swarm_loc_drivers.sim.run import LivedRun
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.offline.metrics import is_misleading, nees
 from swarm_loc_estimator.timeline.estimate import Contradicted

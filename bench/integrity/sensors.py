@@ -21,12 +21,12 @@ from bench.inputs.uwb import Plan, simulate
 from bench.integrity import faults
 from bench.integrity.faults import CLEAN, FAULT_S, Fault, settings_of
 from bench.pushbot.mapping import PLANS
+from bench.scenarios.eight_run import drive_eight
+from bench.scenarios.lived_run import CAMERA_LATENESS, LivedRun, SimulatedRun, arrival_ns, survivors
+from bench.scenarios.sightings import schedule_exposures
 from bench.shared.common import OUT
 from bench.shared.simulated_run import detection_rows
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
-from swarm_loc_drivers.sim.run import CAMERA_LATENESS, LivedRun, SimulatedRun, arrival_ns, survivors
-from swarm_loc_drivers.sim.scenarios.eight import drive_eight
-from swarm_loc_drivers.sim.sightings import schedule_exposures
 from swarm_loc_drivers.sim.worlds import W0, ErrorModel
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray

@@ -11,10 +11,10 @@ from dataclasses import replace
 import numpy as np
 
 from bench.peers.scaling import second_half
+from bench.scenarios.lived_run import Records, SimulatedRun
 from bench.shared.common import flat, options_of, plot_by_size, table, write_figures
 from bench.shared.grid import GridSettings, simulate_grid
 from bench.shared.simulated_run import run_core, ticks
-from swarm_loc_drivers.sim.run import Records, SimulatedRun
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm

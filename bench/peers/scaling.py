@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from bench.graph import large_swarms
+from bench.scenarios.lived_run import SimulatedRun
 from bench.shared.common import flat, options_of, plot_curves, table, write_figures
 from bench.shared.grid import GridSettings, Shape, simulate_grid
 from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_core, ticks, without_delay
-from swarm_loc_drivers.sim.run import SimulatedRun
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.timeline.settings import Settings
 

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from swarm_loc_drivers.sim.run import LivedRun, SimulatedRun, in_order_of_arrival
-from swarm_loc_drivers.sim.scenarios.bags import as_detections
+from bench.scenarios.bags import as_detections
+from bench.scenarios.lived_run import LivedRun, SimulatedRun, in_order_of_arrival
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.filter.measurements import select

@@ -8,6 +8,8 @@ from exact_sightings import exact_values
 
 from bench.epuck.dense import PITCH, DenseSettings, blind_robots, simulate_dense
 from bench.peers.scaling import ShapeRuns, measure_shape, scored
+from bench.scenarios.eight_run import EightSettings, simulate_eight
+from bench.scenarios.lived_run import SimulatedRun
 from bench.shared.common import rms
 from bench.shared.grid import SENSOR, GridSettings, Shape, cells, simulate_grid
 from bench.shared.simulated_run import (
@@ -18,8 +20,6 @@ from bench.shared.simulated_run import (
     ticks,
     without_delay,
 )
-from swarm_loc_drivers.sim.run import SimulatedRun
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import IntArray
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_vision.common.sampling import homographies
 from swarm_loc_vision.markers.families import Family
+from swarm_loc_vision.markers.lines import homographies
 from swarm_loc_vision.markers.pose import square
 
 Gray = NDArray[np.uint8]

@@ -22,6 +22,7 @@ import numpy as np
 from domain_coordinator import domain_id
 from playwright.sync_api import Browser
 
+from bench.scenarios.bags import write_bag
 from bench.shared.common import (
     DEMO_BAG,
     OUT,
@@ -35,7 +36,6 @@ from bench.shared.common import (
 from bench.shared.grid import GridSettings, simulate_grid
 from bench.watch.browser import WatchedPage, chromium, running_browser
 from bench.watch.publisher import homes
-from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_estimator.common.launch import (
     Child,
     GraphOptions,

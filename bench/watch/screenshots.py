@@ -12,10 +12,10 @@ from typing import NamedTuple
 
 from playwright.sync_api import Browser
 
+from bench.scenarios.bags import write_bag
 from bench.shared.common import OUT, options_of
 from bench.shared.grid import GridSettings, simulate_grid
 from bench.watch.browser import WatchedPage, chromium, running_browser
-from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_estimator.common.command_line import swarm_beside
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.report.report import recorded

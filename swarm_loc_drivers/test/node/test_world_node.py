@@ -14,8 +14,9 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
+from bench.scenarios.eight_run import EightSettings, describe
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, Lemniscate
 from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 SECOND = 1_000_000_000

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bench.scenarios.eight_run import EightSettings, describe
 from bench.shared.parameter_table import markdown_table
 from swarm_loc_drivers.common.calibration_file import CalibrationFileError, load_calibration
 from swarm_loc_drivers.common.link import Address, parse_address
@@ -21,7 +22,7 @@ from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlanError
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorldParameters, make_pushbot_world
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, EightSteering, describe
+from swarm_loc_drivers.sim.scenarios.eight import EightSteering
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_drivers.sim.worlds import WORLDS, WorldError
 from swarm_loc_estimator.common.parameters import ParameterError, parameter_specs

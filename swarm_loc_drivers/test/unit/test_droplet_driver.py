@@ -14,6 +14,8 @@ from droplet_rig import IDEAL, IDS, LINK, NOISE, QUIET, SECOND, TRIANGLE, world_
 from hypothesis import given
 from hypothesis import strategies as st
 
+from bench.scenarios.bags import write_droplet_bag
+from bench.scenarios.droplets_run import DropletRunSettings, simulate_droplets
 from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.droplet import protocol as console
 from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners
@@ -55,8 +57,6 @@ from swarm_loc_drivers.sim.droplet.world import (
     nominal_gait,
 )
 from swarm_loc_drivers.sim.link_host import FirmwareHost
-from swarm_loc_drivers.sim.scenarios.bags import write_droplet_bag
-from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, simulate_droplets
 from swarm_loc_estimator.cli import calibrate_ir
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.scenarios.eight_run import EightSettings, describe
 from bench.vision.ceiling import CeilingRig
 from swarm_loc_drivers.epuck.hardware import wheel_geometry
 from swarm_loc_drivers.sim.epuck.world import OVERHEAD, EpuckWorld, EpuckWorldSettings, Exposure
@@ -13,7 +14,7 @@ from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena, OverheadSettings, overhead_model
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
 from swarm_loc_drivers.sim.run import START_NS, Trajectories
-from swarm_loc_drivers.sim.scenarios.eight import ARENA, EightSettings, describe, eight_floor
+from swarm_loc_drivers.sim.scenarios.eight import ARENA, eight_floor
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray

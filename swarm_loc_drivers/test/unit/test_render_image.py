@@ -12,20 +12,13 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from render_helpers import LANDMARK_SIZE, RayCaster, camera_matrix, pixels_of, small_arena
 
+from bench.scenarios.eight_run import CAMERA, VIEW, EightSettings, describe, simulate_eight, wall_markers
+from bench.scenarios.lived_run import SIGHTING_DTYPE, SimulatedRun
+from bench.scenarios.sightings import View, deliver, hidden, schedule_exposures
 from swarm_loc_drivers.sim.render import scene as scenery
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.raster import Image, project
 from swarm_loc_drivers.sim.render.renderer import MAX_INSTANTS, Renderer, RobotCamera, Scene
-from swarm_loc_drivers.sim.run import SIGHTING_DTYPE, SimulatedRun
-from swarm_loc_drivers.sim.scenarios.eight import (
-    CAMERA,
-    VIEW,
-    EightSettings,
-    describe,
-    simulate_eight,
-    wall_markers,
-)
-from swarm_loc_drivers.sim.sightings import View, deliver, hidden, schedule_exposures
 from swarm_loc_drivers.sim.worlds import W0, W2
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.sim.run import SimulatedRun
+from bench.scenarios.lived_run import SimulatedRun
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 

@@ -353,7 +353,8 @@ def contradictions(
 _TEXTS = {
     Contradicted.ODOMETRY: "the odometry of {0} jumps back and forth: it may have two sources",
     Contradicted.RESET: "the odometry of {0} jumped or was reset: its motion at that moment is unknown",
-    Contradicted.CONSTANT: "the odometry of {0} has a constant pose but a twist: integrating the twist",
+    Contradicted.CONSTANT: "the odometry of {0} has a constant pose or heading but a twist: integrating the"
+    " twist",
     Contradicted.UNMOVED: "the odometry of {0} has a constant pose and no twist, although {0} moves",
     Contradicted.GYROSCOPE: "the gyroscope of {0} does not turn with its wheels; using the turns of the"
     " wheels: check its axes (imu.roll, imu.pitch) and its driver",

@@ -33,6 +33,7 @@ from swarm_loc_estimator.sensors.lidar import described_delay
 from swarm_loc_estimator.swarm.swarm import MAP_BY_TOPIC, Swarm
 from swarm_loc_estimator.timeline.map_scans import (
     BLOCKED,
+    FAR,
     FITS,
     FREE,
     OFF_MAP,
@@ -69,6 +70,7 @@ _AROUND = np.array([[0.2, 0.2, 0.1], [0.4, 0.4, 0.2]])
 """Least and greatest steps in which a located robot is sought around its prediction [m, m, rad]."""
 _OFFSETS = np.stack(np.meshgrid(*[np.arange(-3.0, 4.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
 _NEAR_BY, _RIVAL = 12, 25.0  # Places around it that are matched, and squared distance of different ones
+_GATED = 12.0  # Squared distance of a scan from the prediction from which it is of little use to the filter
 _SAME = np.diag(np.square([0.05, 0.05, 0.03]))
 _COMPARED, _MATCHES = 400_000, 50  # Numbers of poses that are compared, and that are matched, at a scan
 _GRADES = 100  # Of nearness to a wall, at the first level
@@ -229,8 +231,10 @@ class MapSearch:
         Wheels slip, and pauses or steps too fast for their stamps leave out motions that most drivers go on
         counting. Where the scan does not fit, it is sought around the prediction and what odometry reports.
         """
-        is_usual = scan.found.outcome == FITS and scan.found.fitting >= SURE_FIT and scan.reported is None
-        if is_usual or state.sources.confirmations[scan.robot] < CONFIRMED:
+        square = _squared(scan.found.pose, scan.predicted, scan.covariance + scan.found.covariance)
+        fits = scan.found.outcome in (FITS, FAR) and scan.found.fitting >= SURE_FIT
+        is_known = scan.reported is not None or (scan.follows and fits and square > _GATED)
+        if state.sources.confirmations[scan.robot] < CONFIRMED or (fits and not is_known):
             return None
         beams = SweptBeams.thinned(*scan.beams)
         points = _spread(beams.ends)
@@ -245,14 +249,12 @@ class MapSearch:
         kept = order[_separate(poses[order], score[order], _NEAR_BY)]
         found = [match(scan.walls, *beams, pose, np.diag(sigma**2)) for pose in poses[kept]]
         found = sorted((one for one in found if one.outcome == FITS), key=_fit, reverse=True)
-        least = SURE_FIT if scan.reported is not None else max(SURE_FIT, scan.found.fitting + _DECLINE)
+        least = SURE_FIT if is_known else max(SURE_FIT, scan.found.fitting + _DECLINE)
         if not found or found[0].fitting < least:
             return None
         best = found[0]
         for other in found[1:]:
-            off = between(best.pose, other.pose)
-            off[2] = wrap_angle(off[2])
-            square = off @ np.linalg.solve(best.covariance + other.covariance + _SAME, off)
+            square = _squared(best.pose, other.pose, best.covariance + other.covariance + _SAME)
             if square > _RIVAL and other.fitting > best.fitting - _DECLINE:
                 return None
         information = np.linalg.inv(best.covariance) + np.diag(sigma**-2)  # walls may not tell all
@@ -268,18 +270,7 @@ class MapSearch:
         track: FloatArray,
         known: SearchMap,
     ) -> tuple[PossiblePlaces, FoundPlace | None]:
-        """Follow the places of a robot by a scan.
-
-        Args:
-            before: What is known; None: nothing.
-            stamp_ns: Stamp of the scan.
-            beams: The scan.
-            track: (3,) pose by odometry.
-            known: The map, with the error of its walls.
-
-        Returns:
-            What is known then, and the place where the robot is, once it is found.
-        """
+        """Follow places by a scan at a pose (3,) by odometry; the robot's place, too, once it is found."""
         if before is None or not len(before.transform):
             paused_ns = 0 if before is None else before.pause_ns
             if before is not None and stamp_ns < before.searched_ns + paused_ns:
@@ -507,6 +498,13 @@ def _moved(before: FloatArray, now: FloatArray) -> tuple[float, float]:
     """Distance [m] and absolute turn [rad] from a pose (3,) to another."""
     x, y, turn = between(before, now)
     return math.hypot(x, y), abs(float(wrap_angle(turn)))
+
+
+def _squared(pose: FloatArray, other: FloatArray, covariance: FloatArray) -> float:
+    """Squared distance of two poses (3,), in variances."""
+    off = other - pose
+    off[2] = wrap_angle(off[2])
+    return float(off @ np.linalg.solve(covariance, off))
 
 
 def _apart(pose: FloatArray, others: FloatArray) -> BoolArray:

@@ -15,7 +15,7 @@ from core_world import Plan, simulate
 from hypothesis import given
 from hypothesis import strategies as st
 from ir_world import droplet, random_poses, readings_of
-from numba.core.runtime import _nrt_python
+from numba.core.runtime import _nrt_python  # type: ignore[attr-defined]
 from numba.core.runtime.nrt import rtsys
 
 from swarm_loc_estimator.common import se2

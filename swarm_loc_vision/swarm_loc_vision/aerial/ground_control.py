@@ -299,7 +299,7 @@ def solve_pose(camera: Camera, points: ControlPoints, settings: AerialSettings) 
     guess = _guess(camera, points)
     depth = (points.places @ rotation_of(guess).T + guess[3:])[:, 2]
     of_place = settings.control_sigma * camera.fx / np.maximum(depth, 1e-3)
-    sigma = np.asarray(np.hypot(settings.control_sigma_px, of_place))  # (N,) of the points [px]
+    sigma: FloatArray = np.hypot(settings.control_sigma_px, of_place)  # (N,) of the points [px]
 
     def deviations(pose: FloatArray) -> FloatArray:
         away = (projected(camera, pose, points.places) - points.pixels) / sigma[:, None]
@@ -320,7 +320,7 @@ def solve_pose(camera: Camera, points: ControlPoints, settings: AerialSettings) 
         raise ControlPointError("the control points leave the camera's pose open.")
     freedom = away.size - POSE_SIZE
     growth = max(1.0, float(np.sum(away**2)) / freedom) if freedom > 0 else 1.0
-    covariance = np.asarray(growth * np.linalg.inv(even) / np.outer(scale, scale))
+    covariance: FloatArray = growth * np.linalg.inv(even) / np.outer(scale, scale)
     ground = GroundCamera(camera, pose, covariance)
     if ground.centre[2] <= points.places[:, 2].max():
         raise ControlPointError(

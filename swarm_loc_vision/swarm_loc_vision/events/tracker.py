@@ -193,7 +193,8 @@ class LightTracker:
         self._switches = [max(1.0, 2.0 * settings.window * source.frequency) for source in sources]
         self._density = np.zeros((len(sources), self._height + 2, self._width + 2), np.int32)
         pixels = 2 * self._width * self._height
-        self._bursts = _Bursts(*np.empty((2, pixels), np.int64), np.empty(pixels, np.int32))
+        event_ns, begin_ns = np.empty((2, pixels), np.int64)
+        self._bursts = _Bursts(event_ns, begin_ns, np.empty(pixels, np.int32))
         self._hits: list[_Hits] = []
         self._reset()
 

@@ -235,7 +235,7 @@ def fit_row_bias(rows: FloatArray, residuals: FloatArray, sigma: float) -> RowBi
     # knots from the edge up to where samples are too few
     counts = np.bincount(((rows - edge) / STEP_PX).astype(np.int64))
     sparse = np.flatnonzero(counts < _LEAST_SAMPLES)
-    knots = edge + STEP_PX * np.arange((int(sparse[0]) if len(sparse) else len(counts)) + 1)
+    knots: FloatArray = edge + STEP_PX * np.arange((int(sparse[0]) if len(sparse) else len(counts)) + 1)
     if len(knots) < 2:
         return RowBias()
     # a fit to each half must serve the other half

@@ -16,7 +16,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator import CONTENT_POSE, CONTENT_POSE_TWO
@@ -29,10 +28,9 @@ from swarm_loc_estimator.swarm.swarm import CameraMount, FixedCamera, Robot, Swa
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.camera import LENS_KIND, LENS_SIZE, STRAIGHT, Camera
 from swarm_loc_vision.common.images import TRANSPORTS, CalibratedCamera, Gray, GrayOf
-from swarm_loc_vision.common.sampling import homographies, read_cells
 from swarm_loc_vision.markers.decoder import Dictionary
-from swarm_loc_vision.markers.edges import NEW_CAMERA, refine, refine_read
 from swarm_loc_vision.markers.families import Family, Layout, draw_marker, families, family_named
+from swarm_loc_vision.markers.lines import homographies, read_cells
 from swarm_loc_vision.markers.pose import (
     SHIFT,
     Body,
@@ -43,7 +41,8 @@ from swarm_loc_vision.markers.pose import (
     robot_body,
     up_of,
 )
-from swarm_loc_vision.markers.quads import find_quads
+from swarm_loc_vision.markers.quads import apart, find_quads
+from swarm_loc_vision.markers.sides import NEW_CAMERA, refine, refine_read
 
 
 @dataclass(frozen=True)
@@ -146,7 +145,10 @@ class MarkerDetector:
                 if dictionary.layout.surrounded == swapped
                 for block in blocks
             ]
-        markers = _best(_Markers(*map(np.concatenate, zip(*found, strict=True))))
+        # of duplicates the reading with the fewest errors, then the highest contrast
+        markers = _Markers(*map(np.concatenate, zip(*found, strict=True)))
+        middle, order = markers.corners.mean(axis=1), np.lexsort((-markers.contrast, markers.errors))
+        markers = markers.select(apart(middle, _SAME * _diagonals(markers.corners), order))
         corners = self._camera.to_raw(markers.corners) if self._camera else markers.corners
         return Detections(*markers[:5], corners, *self._poses(markers), dropped)
 
@@ -201,17 +203,6 @@ class MarkerDetector:
             return None, 0
         shift = 0.0 if self._lens[LENS_KIND] == STRAIGHT else SHIFT
         return self._solver.solve(markers.id, markers.corners, markers.covariance + shift)
-
-
-def _best(markers: _Markers) -> _Markers:
-    """Remove duplicates: keeps the reading with the fewest errors, then the highest contrast."""
-    if not len(markers.id):
-        return markers
-    middle, kept = markers.corners.mean(axis=1), np.zeros(len(markers.id), np.bool_)
-    near = KDTree(middle).query_ball_point(middle, _SAME * _diagonals(markers.corners))
-    for i in np.lexsort((-markers.contrast, markers.errors)):
-        kept[i] = not kept[near[i]].any()
-    return markers.select(kept)
 
 
 def _diagonals(quads: FloatArray) -> FloatArray:

@@ -41,12 +41,10 @@ class DropletWorldNode(WorldNode[DropletWorldParameters]):
         params = self.params
         swarm, self._world = make_droplet_world(params)
         names = [robot.name for robot in swarm.robots]
-        self.begin(
-            names,
-            STEP_NS,
-            lambda robot: DropletFirmware(SimulatedDroplet(self._world, robot)),
-            clock_steps=_CLOCK_STEPS,
+        self.serve(
+            names, lambda robot: DropletFirmware(SimulatedDroplet(self._world, robot)), params.link_folder
         )
+        self.begin(names, STEP_NS, clock_steps=_CLOCK_STEPS)
         fixed = tuple(swarm.index_of[name] for name in params.fixed)
         self._tracker = Tracker(
             fixed, params.fix_rate, params.fix_sigma, params.fix_heading_sigma, params.seed

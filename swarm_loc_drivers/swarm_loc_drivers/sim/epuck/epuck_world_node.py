@@ -97,12 +97,8 @@ class EpuckWorldNode(WorldNode[EpuckWorldParameters]):
                 SerialFirmware(body, EPUCK_MODELS[params.model]) if params.link_folder else WifiFirmware(body)
             )
 
-        self.begin(
-            self._names,
-            STEP_NS,
-            firmware_of,
-            first_port=params.first_port,
-        )
+        self.serve(self._names, firmware_of, params.link_folder, first_port=params.first_port)
+        self.begin(self._names, STEP_NS)
         # cameras, on the robots and above
         calibration = params.camera.calibration
         self._cameras = [CameraOutput(self, name, calibration) for name in self._names]

@@ -24,8 +24,8 @@ from swarm_loc_drivers.sim.scenarios.eight import ARENA, CAMERA_RATE_HZ, FAMILY
 from swarm_loc_drivers.sim.worlds import (
     WORLDS,
     ErrorModel,
+    LinkedWorldParameters,
     WorldError,
-    WorldParameters,
     hidden_geometry,
     start_of,
 )
@@ -245,7 +245,7 @@ def check_swarm(swarm: Swarm) -> None:
 
 
 @dataclass(frozen=True)
-class EpuckWorldParameters(WorldParameters):
+class EpuckWorldParameters(LinkedWorldParameters):
     """Parameters of `epuck_world_node`; the cameras' are those of `CameraModel` and `OverheadSettings`."""
 
     world: str = choice("w2", tuple(WORLDS), "which errors robots and cameras have; see sim/worlds.py")

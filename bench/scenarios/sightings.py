@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.sim.run import (
+from bench.scenarios.lived_run import (
     CAMERA_LATENESS,
     FRAME_DTYPE,
     SIGHTING_DTYPE,
     Records,
-    Trajectories,
     arrival_ns,
     in_order_of_arrival,
     survivors,
 )
+from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_drivers.sim.worlds import ErrorModel, HiddenGeometry, hidden_geometry
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray

@@ -1,10 +1,10 @@
 """Simulate a swarm and write its measurements as a bag, with the swarm description.
 
-    generate_bag eight bags/eight_five_robots --seed 3 --duration 54 --world w0
-    generate_bag pictures bags/eight_pictures --seed 1 --duration 9 --robots 2
-    generate_bag droplets bags/droplets_twenty --seed 1 --duration 60
-    generate_bag aerial bags/aerial_five --seed 1
-    generate_bag droplets /tmp/same_boards --seed 2 --boards 1
+    ./run -- python -m bench generate_bag eight bags/eight_five_robots --seed 3 --duration 54 --world w0
+    ./run -- python -m bench generate_bag pictures bags/eight_pictures --seed 1 --duration 9 --robots 2
+    ./run -- python -m bench generate_bag droplets bags/droplets_twenty --seed 1 --duration 60
+    ./run -- python -m bench generate_bag aerial bags/aerial_five --seed 1
+    ./run -- python -m bench generate_bag droplets /tmp/same_boards --seed 2 --boards 1
 
 The bag contains <robot>/odom, <robot>/detections and <robot>/ground_truth, and its folder `swarm.yaml`.
 In place of detections,
@@ -20,17 +20,17 @@ import argparse
 import sys
 from typing import TYPE_CHECKING
 
-from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
-from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.scenarios.bags import (
+from bench.scenarios.bags import (
     simulate_wandering,
     write_aerial_bag,
     write_bag,
     write_droplet_bag,
     write_image_bag,
 )
-from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, simulate_droplets
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight, simulate_eight_images
+from bench.scenarios.droplets_run import DropletRunSettings, simulate_droplets
+from bench.scenarios.eight_run import EightSettings, simulate_eight, simulate_eight_images
+from swarm_loc_drivers.sim.droplet.world import DROPLET_WORLDS
+from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.command_line import bag_to_write, command_parser, exit_with_message, number_in
 

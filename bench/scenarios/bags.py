@@ -17,19 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from bench.scenarios.droplets_run import FIX_HEADING_SIGMA, FIX_SIGMA, DropletRun
+from bench.scenarios.eight_run import STEP_NS, EightSettings, ImageRun, drive_robots
+from bench.scenarios.lived_run import CAMERA_LATENESS, LivedRun, Records, SimulatedRun, arrival_ns, survivors
 from swarm_loc_drivers.common.calibration_file import CameraCalibration
 from swarm_loc_drivers.sim.differential_drive import Controller
-from swarm_loc_drivers.sim.run import (
-    CAMERA_LATENESS,
-    START_NS,
-    LivedRun,
-    Records,
-    SimulatedRun,
-    arrival_ns,
-    survivors,
-)
-from swarm_loc_drivers.sim.scenarios.droplets import FIX_HEADING_SIGMA, FIX_SIGMA, DropletRun
-from swarm_loc_drivers.sim.scenarios.eight import ARENA, STEP_NS, EightSettings, ImageRun, drive_robots
+from swarm_loc_drivers.sim.run import START_NS
+from swarm_loc_drivers.sim.scenarios.eight import ARENA
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator import CONTENT_POSE
 from swarm_loc_estimator.common import se2
@@ -46,7 +40,7 @@ from swarm_loc_estimator.common.messages.cdr import (
 )
 from swarm_loc_estimator.common.messages.detections import (
     ANONYMOUS_DTYPE,
-    DETECTION_DTYPE,
+    blank_detections,
     encode_brightness,
     encode_detections,
 )
@@ -145,7 +139,6 @@ def _overhead_image(rng: np.random.Generator, poses: FloatArray) -> np.typing.ND
     return image
 
 
-FAMILY = 0  # MarkerDetection.FAMILY_ARTOOLKIT_BCH
 TRUTH_PERIOD_NS = 100_000_000
 SATURATION = 240  # As the drivers report it: full scale less the largest ambient light [count]
 LOSS = 0.05  # Share of brightness matrices and fixes that never arrive
@@ -270,16 +263,9 @@ def as_detections(run: SimulatedRun) -> Records:
     observer = np.repeat(run.frames["robot"], run.frames["count"])
     height = np.array([markers[int(marker)].marker.z for marker in run.sightings["marker_id"]])
     forward, left, heading = run.sightings["value"].T
-    detections = np.zeros(len(run.sightings), DETECTION_DTYPE)
-    detections["id"] = run.sightings["marker_id"]
-    detections["family"], detections["content"] = FAMILY, CONTENT_POSE
-    detections["id_margin"] = np.nan
-    detections["corners_px"] = np.nan
+    detections = blank_detections(run.sightings["marker_id"], CONTENT_POSE)
     detections["position"] = np.column_stack([-left, camera_height[observer] - height, forward])
     detections["orientation"] = marker_orientation(heading)
-    detections["covariance"][:, 0, 0] = -1.0
-    detections["alternative_orientation"][:, 3] = 1.0
-    detections["alternative_ratio"] = np.nan
     return detections
 
 
