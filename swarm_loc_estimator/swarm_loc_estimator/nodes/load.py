@@ -128,7 +128,7 @@ def _units(sensor: type[Sensor], rows: Any) -> _Units:
     return _Units(robot, stamp_ns, of_row.reshape(-1), exchanges)
 
 
-# Checked by test_shedding.py and test_fusion_pace.py, and on live swarms by make bench-large_swarms.
+# Checked by test_fusion_period.py, and on live swarms by make bench-large_swarms.
 MIN_SHARE = 0.01  # However busy the node is: without any measurements, robots would be lost for good
 _WINDOW_S = 0.5  # Least time over which the load is measured, since fusing comes in bursts
 _BUSY = 0.9  # Load above which a node may not keep up
