@@ -1,7 +1,5 @@
 """Run a benchmark by its name: python -m bench NAME [ARGUMENTS], which `make bench-NAME` calls."""
 
-from __future__ import annotations
-
 import runpy
 import sys
 
@@ -13,11 +11,11 @@ BENCHMARKS = {
     "droplet_real": "bench.droplet.real",
     "drivers": "bench.graph.drivers",
     "epuck": "bench.epuck",
+    "generate_bag": "bench.scenarios.generate_bag",
     "inputs": "bench.inputs",
     "integrity": "bench.integrity",
     "large_swarms": "bench.graph.large_swarms",
     "lidar": "bench.lidar",
-    "live": "bench.graph.live",
     "mrclam": "bench.mrclam",
     "selfcal": "bench.selfcal",
     "pushbot": "bench.pushbot",
@@ -26,7 +24,6 @@ BENCHMARKS = {
     "robots": "bench.robots",
     "robustness": "bench.robustness",
     "scaling": "bench.peers.scaling",
-    "soak": "bench.graph.soak",
     "sweep": "bench.sweep",
     "vision": "bench.vision",
     "watch": "bench.watch",

@@ -20,11 +20,11 @@ from functools import cache
 
 import numpy as np
 
+from bench.scenarios.eight_run import VIEW, EightSettings, camera_exposures, drive_eight
+from bench.scenarios.lived_run import SimulatedRun
+from bench.scenarios.sightings import observe_markers
 from bench.shared.common import Cell, ProgressLine, new_plot, save_plot, table, write_figures
 from bench.shared.simulated_run import detection_rows, fitted_errors, odometry_rows, position_rmse, ticks
-from swarm_loc_drivers.sim.run import SimulatedRun
-from swarm_loc_drivers.sim.scenarios.eight import VIEW, EightSettings, camera_exposures, drive_eight
-from swarm_loc_drivers.sim.sightings import observe_markers
 from swarm_loc_drivers.sim.worlds import W0, W2, ErrorModel, hidden_geometry
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.offline.calibration.recording import Recording, rerun

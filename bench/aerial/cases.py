@@ -5,8 +5,6 @@ camera and control points. Those without a file of their own with the truth show
 places.
 """
 
-from __future__ import annotations
-
 import re
 import time
 from dataclasses import replace
@@ -19,10 +17,8 @@ from numpy.typing import NDArray
 
 from bench.aerial.detector import Score, score_places
 from bench.shared.common import Cell, rms, table
-from swarm_loc_vision.aerial.control_points import solve_pose
 from swarm_loc_vision.aerial.detector import AerialDetector
-from swarm_loc_vision.aerial.ground_file import load_ground
-from swarm_loc_vision.aerial.parameters import AerialSettings
+from swarm_loc_vision.aerial.ground_control import AerialSettings, load_ground, solve_pose
 
 FOLDER = Path(__file__).parents[3] / "shared" / "cases"
 _DIAMETER = 0.08

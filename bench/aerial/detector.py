@@ -17,9 +17,8 @@ from bench.aerial.pictures import DIAMETER, Look, Picture, control_pixels, draw_
 from bench.shared.common import Cell, ProgressLine, table
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.aerial.control_points import ControlPoints, solve_pose
 from swarm_loc_vision.aerial.detector import AerialDetections, AerialDetector
-from swarm_loc_vision.aerial.parameters import AerialSettings
+from swarm_loc_vision.aerial.ground_control import AerialSettings, ControlPoints, solve_pose
 
 SEEDS = 5
 _MATCHED = 0.3  # Of a diameter: a detection so near is of that robot

@@ -4,8 +4,6 @@ A floor plan is painted with discs, texture, lines and things that are no robots
 over it; a camera of any tilt and lens looks at it, pixel by pixel as means of several samples.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -14,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.aerial.ground_control import GroundCamera
 from swarm_loc_vision.aerial.pattern import MARGIN, inside_mark
 from swarm_loc_vision.common.camera import Camera
 

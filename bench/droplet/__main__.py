@@ -11,7 +11,6 @@ end a swarm of 20 is localized through infrared, see bench/droplet/swarm.py.
 
 from __future__ import annotations
 
-import argparse
 import sys
 import time
 from collections.abc import Sequence
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 
 from bench.droplet import swarm as droplet_swarm
 from bench.droplet.cramer_rao import information
-from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
+from bench.shared.common import Cell, options_of, plot_curves, table, write_figures
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.infrared.brightness import expected_brightness
@@ -109,7 +108,19 @@ def accuracy(poses_each: int) -> dict[str, float]:
     # table and plot
     head = ["R cm", "ml cm", "deg", "deg", "NEES", "worst cm", "rms/CRB", "", ""]
     print("\rmean errors of range, bearing, heading\n" + table(head, rows))
-    draw({name: np.array(curve) for name, curve in curves.items()})
+    units = ("range [cm]", "bearing [deg]", "heading [deg]")
+    shown = {
+        label: np.array(curves[key]) for key, label in (("ml", "likelihood"), ("bound", "Cramer-Rao bound"))
+    }
+    plot_curves(
+        "droplet",
+        *(
+            ("distance [cm]", f"rms error of {unit}", CENTIMETRES, {k: v[:, place] for k, v in shown.items()})
+            for place, unit in enumerate(units)
+        ),
+        style=".-",
+        yscale="log",
+    )
     # all ranges together
     rng = np.random.default_rng(7)
     poses = random_poses(rng, 3 * poses_each, 6, 28)
@@ -204,36 +215,15 @@ def best_time(estimator: MaximumLikelihood, calls: Sequence[FloatArray]) -> floa
     return 1e6 * min(runs) / sum(len(readings) for readings in calls)
 
 
-def draw(curves: dict[str, FloatArray]) -> None:
-    """Errors by range beside the bound."""
-    figure, axes = new_plot(4, width=4.2, height=3.8)
-    names = {"ml": ("likelihood", "C0"), "bound": ("Cramer-Rao bound", "0.4")}
-    for place, unit in zip(range(3), ("range [cm]", "bearing [deg]", "heading [deg]"), strict=True):
-        for name, (label, colour) in names.items():
-            style = "--" if name == "bound" else "-"
-            axes[place].plot(
-                CENTIMETRES, curves[name][:, place], style, color=colour, label=label, marker="."
-            )
-        axes[place].set(xlabel="distance [cm]", ylabel=f"rms error of {unit}", yscale="log")
-    axes[0].legend()
-    ratios = curves["ml"] / curves["bound"]
-    for place, label in enumerate(("range", "bearing", "heading")):
-        axes[3].plot(CENTIMETRES, ratios[:, place], marker=".", label=label)
-    axes[3].axhline(1.0, color="0.4", linestyle="--")
-    axes[3].set(xlabel="distance [cm]", ylabel="likelihood's rms error / bound", ylim=(0.8, 1.3))
-    axes[3].legend()
-    print(f"plot: {save_plot(figure, 'droplet')}")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument(
-        "--poses", type=int, default=POSES, help="per range; of mismatch a twelfth per couple"
+    options = options_of(
+        __doc__,
+        arguments,
+        poses=(POSES, "per range; of mismatch a twelfth per couple"),
+        live=(LIVE, "runs of the swarm over the whole graph"),
+        replays=(REPLAYS, "bags of the swarm"),
     )
-    parser.add_argument("--live", type=int, default=LIVE, help="runs of the swarm over the whole graph")
-    parser.add_argument("--replays", type=int, default=REPLAYS, help="bags of the swarm")
-    options = parser.parse_args(arguments)
     figures = accuracy(options.poses)
     figures |= mismatch(options.poses // COUPLES)
     figures |= times()

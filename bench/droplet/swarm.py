@@ -10,32 +10,27 @@ without ground truth (`calibrate_ir`) in another minute of the same robots. Erro
 time on when the swarm has found itself.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from geometry_msgs.msg import PoseStamped
-from matplotlib.axes import Axes
-from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
-from bench.shared.bags import read_truth
-from bench.shared.common import OUT, Cell, new_plot, save_plot, table
-from swarm_loc_drivers.sim.scenarios.bags import write_droplet_bag
-from swarm_loc_drivers.sim.scenarios.droplets import (
+from bench.scenarios.bags import write_droplet_bag
+from bench.scenarios.droplets_run import (
     FIXED,
     TURN_S,
     DropletRunSettings,
     describe_droplets,
     simulate_droplets,
-    starts,
 )
-from swarm_loc_estimator.common.arrays import FloatArray
+from bench.shared.bags import read_truth
+from bench.shared.common import OUT, new_plot, save_plot, table
+from swarm_loc_drivers.sim.scenarios.droplets import starts
 from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
 from swarm_loc_estimator.offline.calibration.recording import read_recording
@@ -140,7 +135,7 @@ def _write_swarms(seed: int, folder: Path) -> Swarm:
     """Write the swarm as the world knows it, and as the estimator does, which is returned: without starts."""
     for known, name in ((True, "world.yaml"), (False, "swarm.yaml")):
         settings = DropletRunSettings(seed, robots=ROBOTS, start_known=known)
-        swarm = describe_droplets(settings, starts(settings))
+        swarm = describe_droplets(settings, starts(settings.seed, settings.robots))
         save_swarm(swarm, folder / name)
     return swarm
 
@@ -191,20 +186,11 @@ def measure(live: Sequence[int], replays: Sequence[int]) -> dict[str, float]:
             print(f"\rreplay {seed}, calibrated", end="", flush=True)
     print()
     outcomes = [outcome_of(result) for result in results]
-    report(outcomes)
+    names = [field.name for field in fields(Outcome)]
+    print(table(names, [[getattr(one, name) for name in names] for one in outcomes]))
     print(f"plot: {draw(results[0])}")
     plain = len(live) + len(replays)
     return figures_of(outcomes[: len(live)], outcomes[len(live) : plain], outcomes[plain:])
-
-
-def report(outcomes: Sequence[Outcome]) -> None:
-    """Print the table."""
-    head = ["run", "position cm", "heading deg", "NEES", "worst cm", "all located s", "located"]
-    rows: list[list[Cell]] = [
-        [one.name, one.position_cm, one.heading_deg, one.nees, one.worst_cm, one.located_s, one.located]
-        for one in outcomes
-    ]
-    print(table(head, rows))
 
 
 def figures_of(
@@ -224,31 +210,11 @@ def figures_of(
 
 
 def draw(result: ReplayResult) -> Path:
-    """Where the robots ended and were believed to be, and errors over time."""
-    figure, (place, course) = new_plot(2, width=5.4, height=4.4)
-    for index, (name, track) in enumerate(result.truth.items()):
-        true, believed = track.pose[-1], result.poses[-1, index]
-        place.plot(*(100.0 * track.pose[:, :2].T), color="0.8", linewidth=1.0)
-        x, y = (100.0 * true[:2]).tolist()
-        place.add_patch(Ellipse((x, y), 4.4, 4.4, fill=False, color="0.5"))
-        place.annotate(name.removeprefix("droplet"), (x, y), fontsize=7, ha="center", va="center")
-        if np.isfinite(believed).all():
-            _draw_pose(place, believed, result.covariances[-1, index])
-        errors = result.errors[name]
-        since_s = (errors.stamp_ns - result.stamp_ns[0]) * 1e-9
-        course.plot(since_s, 100.0 * errors.position, color="C0", linewidth=0.8, alpha=0.6)
-    place.set(xlabel="x [cm]", ylabel="y [cm]", title="robots, believed poses, 3 sigma", aspect="equal")
+    """Errors of all robots over time."""
+    errors = result.errors.values()
+    since_s = [(one.stamp_ns - result.stamp_ns[0]) * 1e-9 for one in errors]
+    figure, (course,) = new_plot(1, width=5.4)
+    for at_s, one in zip(since_s, errors, strict=True):
+        course.plot(at_s, 100.0 * one.position, color="C0", linewidth=0.8, alpha=0.6)
     course.set(xlabel="time [s]", ylabel="position error [cm]", yscale="log", title=result.title)
-    course.axvline(SETTLED_S, color="0.5", linewidth=1.0, linestyle=":")
     return save_plot(figure, "droplet_swarm")
-
-
-def _draw_pose(axes: Axes, pose: FloatArray, covariance: FloatArray) -> None:
-    """A believed pose and its uncertainty."""
-    values, vectors = np.linalg.eigh(covariance[:2, :2])
-    width, height = 600.0 * np.sqrt(np.maximum(values, 0.0))
-    angle = float(np.degrees(np.arctan2(vectors[1, 0], vectors[0, 0])))
-    x, y = (100.0 * pose[:2]).tolist()
-    axes.add_patch(Ellipse((x, y), width, height, angle=angle, color="C1", alpha=0.5))
-    dx, dy = 2.2 * np.cos(pose[2]), 2.2 * np.sin(pose[2])
-    axes.plot([x, x + dx], [y, y + dy], color="C3", linewidth=1.2)

@@ -9,38 +9,30 @@ experiment: unknown yaw and scale of every camera, a badly surveyed map, late st
 "paper" is the paper's own filter (closest stored state, printed sigmas, no gate), and "selfcal" estimates
 yaw, scale, slip and the map along with the poses. Errors are those of poses ten times a second as they come
 out, while sightings are still 150-300 ms late. "rendered" is W2 with five robots through everything there is:
-rendered pictures, the marker detector, emulated firmware, drivers, the whole graph over DDS, with "selfcal"
-live and beside it the same data through the paper's filter. At the end the marker detector sees the same
-pictures as others.
+rendered pictures, the marker detector, emulated firmware, drivers, the whole graph over DDS, with "selfcal".
+At the end the marker detector sees the same pictures as others.
 """
 
-from __future__ import annotations
-
-import argparse
 import math
 import sys
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from multiprocessing import get_context
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.epuck import rendered
 from bench.epuck.dense import DenseSettings, blind_robots, simulate_dense
-from bench.epuck.rendered_report import rendered_worlds
-from bench.epuck.rendered_report import report as report_rendered
-from bench.shared.common import Cell, new_plot, save_plot, table, write_figures
+from bench.scenarios.eight_run import EightSettings, simulate_eight
+from bench.scenarios.lived_run import SimulatedRun
+from bench.shared.common import Cell, new_plot, options_of, save_plot, table, write_figures
 from bench.shared.simulated_run import errors_of, mean_nees, run_core, ticks
 from bench.vision import report as vision_report
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_drivers.sim.worlds import W0, W2, W2_FAST, ErrorModel
 from swarm_loc_estimator.offline.live_run import LiveError
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
-
-if TYPE_CHECKING:
-    from swarm_loc_drivers.sim.run import SimulatedRun
 
 SLOW, FAST = 0.06, 0.08
 W0_SEEDS, DENSE_SEEDS, WORLDS, FAST_WORLDS = 6, 3, 24, 8
@@ -241,52 +233,36 @@ def report(results: dict[str, list[Outcome]]) -> dict[str, float]:
 
 def draw(results: dict[str, list[Outcome]]) -> None:
     """Plot the errors of every world by case."""
-    figure, (position, heading) = new_plot(2, width=6.4, height=4.4)
+    figure, axes = new_plot(2, width=6.4, height=4.4)
     names = list(results)
-    rng = np.random.default_rng(0)
-    for axes, values, unit in (
-        (position, [[one.position_cm for one in results[name]] for name in names], "position error [cm]"),
-        (heading, [[one.heading_deg for one in results[name]] for name in names], "heading error [deg]"),
-    ):
-        for k, ones in enumerate(values):
-            axes.plot(ones, k + rng.uniform(-0.15, 0.15, len(ones)), ".", color="C0", alpha=0.6)
-            axes.plot(np.mean(ones), k, "D", color="C1")
-        axes.set(xlabel=f"mean {unit}, one dot per world, diamond: all", xlim=(0.0, None))
-        axes.set_yticks(range(len(names)), names if axes is position else [""] * len(names))
-        axes.invert_yaxis()
-    for k, name in enumerate(names):
-        for axes, value in zip((position, heading), PAPER.get(name, ()), strict=False):
-            axes.plot(value, k, "|", color="C3", markersize=18, markeredgewidth=2)
-    position.plot([], [], "|", color="C3", markersize=12, label="the paper's robots")
-    position.legend()
+    for k, (axis, key) in enumerate(zip(axes, ("position_cm", "heading_deg"), strict=True)):
+        for row, name in enumerate(names):
+            values = [getattr(one, key) for one in results[name]]
+            axis.plot(values, np.full(len(values), row), ".", color="C0", alpha=0.6)
+            axis.plot(np.mean(values), row, "D", color="C1")
+            if name in PAPER:
+                axis.plot(PAPER[name][k], row, "|", color="C3", markersize=18, markeredgewidth=2)
+        axis.set(
+            xlabel=f"mean {key}: one dot per world, diamond: all, bar: the paper's robots", xlim=(0, None)
+        )
+        axis.set_yticks(range(len(names)), names if not k else [""] * len(names))
+        axis.invert_yaxis()
     print(f"plot: {save_plot(figure, 'epuck')}")
-
-
-def measure_rendered(count: int) -> dict[str, float]:
-    """The figures of `count` worlds through the whole graph.
-
-    Raises:
-        LiveError: A node has ended, or the graph has stopped.
-    """
-    if not count:
-        return {}
-    paper, settings = FILTERS["paper"]
-    worlds = rendered_worlds(range(1, count + 1), RENDERED_S, self_calibrating, paper, settings)
-    return report_rendered(worlds, SETTLING_S)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument(
-        "--worlds", type=int, default=WORLDS, help="how many of W2, and at most of the others"
+    options = options_of(
+        __doc__,
+        arguments,
+        worlds=(WORLDS, "how many of W2, and at most of the others"),
+        rendered=(RENDERED_SEEDS, "how many worlds through the whole graph"),
     )
-    parser.add_argument(
-        "--rendered", type=int, default=RENDERED_SEEDS, help="how many worlds through the whole graph"
-    )
-    options = parser.parse_args(arguments)
+    figures: dict[str, float] = {}
     try:
-        figures = measure_rendered(options.rendered)
+        if options.rendered:
+            swarm = self_calibrating(rendered.swarm_of_world())
+            figures = rendered.measure(range(1, options.rendered + 1), RENDERED_S, SETTLING_S, swarm)
     except LiveError as error:
         print(f"\n{error}", file=sys.stderr)
         return 1

@@ -4,24 +4,15 @@ A block of robots drives a small eight in the e-puck paper's arena, all in step.
 landmark, as in a swarm so dense that neighbours stand in every line of sight.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.sim.run import SimulatedRun
-from swarm_loc_drivers.sim.scenarios.eight import (
-    STEP_NS,
-    VIEW,
-    EightSettings,
-    Lemniscate,
-    camera_exposures,
-    drive_robots,
-    follow,
-)
-from swarm_loc_drivers.sim.sightings import observe_markers
+from bench.scenarios.eight_run import STEP_NS, VIEW, EightSettings, camera_exposures, drive_robots
+from bench.scenarios.lived_run import SimulatedRun
+from bench.scenarios.sightings import observe_markers
+from swarm_loc_drivers.sim.scenarios.eight import Lemniscate, follow
 from swarm_loc_drivers.sim.worlds import W0, ErrorModel
 from swarm_loc_estimator.common.arrays import FloatArray
 

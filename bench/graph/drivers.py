@@ -9,9 +9,6 @@ pause until the counts of drivers and estimator no longer change, answer for a w
 "Discovery" is the time from the last driver's first answer to the first message of the last robot.
 """
 
-from __future__ import annotations
-
-import argparse
 import os
 import re
 import subprocess
@@ -26,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 
-from bench.shared.common import OUT, plot_by_size, table, write_figures
+from bench.shared.common import OUT, Cell, flat, options_of, plot_by_size, table, write_figures
 from swarm_loc_drivers.epuck.hardware import EPUCK2
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.world import EpuckWorldParameters, SimulatedEpuck, make_world
@@ -234,32 +231,28 @@ def _server() -> Iterator[None]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--robots", type=int, nargs="+", default=SIZES, help="numbers of drivers")
-    parser.add_argument("--discovery", nargs="+", default=[MULTICAST, SERVER], choices=[MULTICAST, SERVER])
-    parser.add_argument("--duration", type=float, default=DURATION_S, help="of a measurement [s]")
-    options = parser.parse_args(arguments)
+    ways = (MULTICAST, SERVER)
+    options = options_of(
+        __doc__,
+        arguments,
+        robots=(SIZES, "numbers of drivers"),
+        discovery=(ways, "how drivers are found", ways),
+        duration=(DURATION_S, "of a measurement [s]"),
+    )
     results: dict[str, dict[int, dict[str, float]]] = {}
     for discovery in options.discovery:
         for robots in options.robots:
             figures = measure(robots, discovery, options.duration)
             results.setdefault(discovery, {})[robots] = figures
             print(robots, discovery, figures, flush=True)
-    rows = [
-        [str(robots), discovery, *(f"{value:.3g}" for value in figures.values())]
-        for discovery, found in results.items()
-        for robots, figures in found.items()
+    rows: list[list[Cell]] = [
+        [n, way, *figures.values()] for way, found in results.items() for n, figures in found.items()
     ]
     print(table(["robots", "discovery", *_UNITS.values()], rows))
     shown = {name: _UNITS[name] for name in ("start_up_s", "discovery_s", "estimator_core")}
     print(f"plot: {plot_by_size('drivers', results, shown, 'driver processes', 'discovery')}")
-    all_figures = {
-        f"{discovery}{robots}.{name}": value
-        for discovery, found in results.items()
-        for robots, figures in found.items()
-        for name, value in figures.items()
-    }
-    print(f"figures: {write_figures('drivers', all_figures)}")
+    named = {f"{way}{n}": figures for way, found in results.items() for n, figures in found.items()}
+    print(f"figures: {write_figures('drivers', flat(named))}")
 
 
 if __name__ == "__main__":

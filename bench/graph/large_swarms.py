@@ -8,21 +8,22 @@ of each robot, once with topics that all share (`shared_topics`). The age of a p
 reception; the data behind it is older.
 """
 
-from __future__ import annotations
-
-import argparse
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from bench.graph.shared_bag import write_shared_bag
-from bench.shared.common import OUT, plot_by_size, table, write_figures
+from bench.scenarios.bags import as_detections, truth_stream, write_bag, write_swarm_bag
+from bench.scenarios.lived_run import SimulatedRun
+from bench.shared.bags import SharedHead, encode_shared_detections, encode_shared_numbers
+from bench.shared.common import OUT, flat, options_of, plot_by_size, table, write_figures
 from bench.shared.grid import GridSettings, simulate_grid
-from swarm_loc_drivers.sim.run import SimulatedRun
-from swarm_loc_drivers.sim.scenarios.bags import write_bag
+from swarm_loc_estimator.common.arrays import IntArray
+from swarm_loc_estimator.common.bags.writer import Stream
 from swarm_loc_estimator.common.launch import GraphOptions
+from swarm_loc_estimator.common.messages.cdr import SWARM_DETECTIONS, SWARM_ODOMETRY
+from swarm_loc_estimator.common.messages.detections import swarm_key
 from swarm_loc_estimator.nodes.load import SHED_REASONS
 from swarm_loc_estimator.offline.live_run import play_live
 
@@ -64,14 +65,9 @@ def measure(sizes: Sequence[int], layouts: Sequence[str], duration_s: float, see
     ]
     if rows:
         print(table(["robots", "topics", *_UNITS.values()], rows))
-        draw(results)
-    named = {
-        f"{_FIGURES_OF[layout]}{n}.{name}": value
-        for layout, found in results.items()
-        for n, one in found.items()
-        for name, value in one.items()
-    }
-    return {name: value for name, value in named.items() if np.isfinite(value)}
+        shown = {name: _UNITS[name] for name in ("start_up_s", "estimator_core", "memory_mb", "pose_age_ms")}
+        print(f"plot: {plot_by_size('large_swarms', results, shown, 'robots', 'topics')}")
+    return flat({f"{_FIGURES_OF[layout]}{n}": results[layout][n] for layout in layouts for n in sizes})
 
 
 def run(recording: SimulatedRun, *, shared: bool) -> dict[str, float]:
@@ -101,23 +97,63 @@ def run(recording: SimulatedRun, *, shared: bool) -> dict[str, float]:
     return {name: float(value) for name, value in zip(_UNITS, figures, strict=True)}
 
 
-def draw(results: dict[str, dict[int, dict[str, float]]]) -> None:
-    """Plot figures over the size of the swarm."""
-    shown = {name: _UNITS[name] for name in ("start_up_s", "estimator_core", "memory_mb", "pose_age_ms")}
-    print(f"plot: {plot_by_size('large_swarms', results, shown, 'robots', 'topics')}")
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--robots", type=int, nargs="+", default=SIZES, help="swarm sizes")
-    parser.add_argument("--topics", nargs="+", default=LAYOUTS, choices=LAYOUTS, help="layouts")
-    parser.add_argument("--duration", type=float, default=DURATION_S, help="of a recording [s]")
-    parser.add_argument("--seed", type=int, default=1, help="of the simulation")
-    options = parser.parse_args(arguments)
+    options = options_of(
+        __doc__,
+        arguments,
+        robots=(SIZES, "swarm sizes"),
+        topics=(LAYOUTS, "layouts", LAYOUTS),
+        duration=(DURATION_S, "of a recording [s]"),
+        seed=(1, "of the simulation"),
+    )
     figures = measure(options.robots, options.topics, options.duration, options.seed)
     print(f"figures: {write_figures('large_swarms', figures)}")
 
 
 if __name__ == "__main__":
     main()
+
+
+PERIOD_NS = 10_000_000  # All that arrives within this goes out together, at its end
+
+
+def write_shared_bag(run: SimulatedRun, folder: Path, comment: str) -> int:
+    """Write `swarm/odom`, `swarm/detections`, and `<robot>/ground_truth` of all robots.
+
+    The folder, the comment, the result and the errors are those of `bag.write_bag`.
+    """
+    robots = run.swarm.robots
+    truth = [truth_stream(run, index) for index in range(len(robots))]
+    key = swarm_key(robot.name for robot in robots)
+    return write_swarm_bag([_odometry(run, key), _detections(run, key), *truth], run.swarm, folder, comment)
+
+
+def _odometry(run: SimulatedRun, key: int) -> Stream:
+    rows, sent_ns, data = run.odometry, [], []
+    for at_ns, some in _together(rows["arrival_ns"]):
+        head = SharedHead(at_ns, "odom", key, rows["robot"][some], rows["stamp_ns"][some])
+        data.append(encode_shared_numbers(head, rows["pose"][some]))
+        sent_ns.append(at_ns)
+    return Stream("swarm/odom", SWARM_ODOMETRY, np.array(sent_ns, dtype=np.int64), data)
+
+
+def _detections(run: SimulatedRun, key: int) -> Stream:
+    detections, frames = as_detections(run), run.frames
+    columns = (np.repeat(frames[name], frames["count"]) for name in ("robot", "stamp_ns", "arrival_ns"))
+    robot, stamp_ns, arrival_ns = columns
+    sent_ns, data = [], []
+    for at_ns, some in _together(arrival_ns):
+        head = SharedHead(at_ns, "", key, robot[some], stamp_ns[some])
+        data.append(encode_shared_detections(head, detections[some]))
+        sent_ns.append(at_ns)
+    return Stream("swarm/detections", SWARM_DETECTIONS, np.array(sent_ns, dtype=np.int64), data)
+
+
+def _together(arrival_ns: IntArray) -> Iterator[tuple[int, IntArray]]:
+    """When a message goes out, and which readings (n,) it carries, in order of arrival."""
+    order = np.argsort(arrival_ns, kind="stable")
+    period = -(-arrival_ns[order] // PERIOD_NS)
+    starts = np.flatnonzero(np.diff(period, prepend=-1))
+    for begin, end in zip(starts, [*starts[1:], order.size], strict=True):
+        yield int(period[begin]) * PERIOD_NS, order[begin:end]

@@ -1,7 +1,5 @@
 """Record a live graph of simulated robots on the eight: their messages and true poses."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -11,12 +9,12 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped
 from nav_msgs.msg import Odometry
 from numpy.typing import NDArray
-from sensor_msgs.msg import Image
 
+from bench.scenarios.eight_run import EightSettings, describe
 from bench.shared.bags import read_truth
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, Lemniscate
 from swarm_loc_drivers.sim.worlds import ErrorModel
-from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY, POSE_STAMPED, nanoseconds
+from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY, POSE_STAMPED
 from swarm_loc_estimator.common.messages.poses import decode_pose_stamped
 from swarm_loc_estimator.common.trajectory import Trajectory
 from swarm_loc_estimator.offline.live_run import START_PATIENCE_S, LiveError, LiveGraph
@@ -50,10 +48,8 @@ class Listener:
 
     graph: LiveGraph  # The graph; its recorder subscribes
     names: Sequence[str]  # Of the robots
-    looked_at: str = ""  # The robot whose images are recorded
     # Robot and topic -> times of arrival by the graph's clock [ns], and messages
     kept: dict[tuple[str, str], tuple[list[int], list[bytes]]] = field(default_factory=dict)
-    pictures: dict[tuple[str, int], Image] = field(default_factory=dict)  # Robot and stamp -> image
 
     def __post_init__(self) -> None:
         recorder = self.graph.recorder
@@ -66,15 +62,6 @@ class Listener:
     def _keep(self, arrivals: list[int], messages: list[bytes], data: bytes) -> None:
         arrivals.append(self.graph.recorder.get_clock().now().nanoseconds)
         messages.append(data)
-
-    def listen_to_camera(self, name: str) -> None:
-        """Record a robot's images from now on; they are large."""
-
-        def keep(message: Image) -> None:
-            self.pictures[name, nanoseconds(message.header.stamp)] = message
-
-        self.graph.recorder.create_subscription(Image, f"{name}/image_raw", keep, 1)
-        self.looked_at = name
 
     @property
     def now_ns(self) -> int:

@@ -6,19 +6,15 @@ A part is a module with a function `measure(seeds, say)`, which returns figures 
     make bench-inputs ARGS="--parts uwb mocap --seeds 2"
 """
 
-from __future__ import annotations
-
-import argparse
 from collections.abc import Callable, Mapping, Sequence
 
-from bench.inputs import apriltag_msgs, families, imu, lidar_map, mocap, no_map, overhead, uwb
-from bench.shared.common import ProgressLine, table, write_figures
+from bench.inputs import families, imu, lidar_map, mocap, no_map, overhead, uwb
+from bench.shared.common import ProgressLine, options_of, table, write_figures
 
 PARTS: Mapping[str, Callable[[Sequence[int], ProgressLine], Mapping[str, float]]] = {
     "overhead": overhead.measure,
     "mocap": mocap.measure,
     "uwb": uwb.measure,
-    "apriltag_msgs": apriltag_msgs.measure,
     "families": families.measure,
     "imu": imu.measure,
     "no_map": no_map.measure,
@@ -29,12 +25,8 @@ PARTS: Mapping[str, Callable[[Sequence[int], ProgressLine], Mapping[str, float]]
 
 def main() -> None:
     """Run the parts, print the table, write the figures."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, default=5, help="runs of each part")
-    parser.add_argument("--parts", nargs="+", choices=[*PARTS], default=[*PARTS])
-    arguments = parser.parse_args()
+    parts = tuple(PARTS)
+    arguments = options_of(__doc__, seeds=(5, "runs of each part"), parts=(parts, "what to measure", parts))
     seeds = range(1, arguments.seeds + 1)
     figures: dict[str, float] = {}
     for part in arguments.parts:

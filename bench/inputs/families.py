@@ -1,28 +1,31 @@
 """Families of markers: ids read at 30 px, and ids read where there are none, compared with OpenCV."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping, Sequence
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.aerial.cases import FOLDER, gray_picture
-from bench.shared.common import ProgressLine, new_plot, save_plot
+from bench.shared.common import ProgressLine
 from bench.vision.comparison import match
 from bench.vision.negatives import black_square, random_family
 from bench.vision.peers import Found, Peer, as_found, opencv_name, stock
-from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, facing, project, random_scene, render
+from bench.vision.scenes import (
+    CAMERA,
+    HEIGHT,
+    WIDTH,
+    Gray,
+    Look,
+    Truth,
+    facing,
+    project,
+    random_scene,
+    render,
+)
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import CODE_OTHER, Family, families
 from swarm_loc_vision.markers.pose import square
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping, Sequence
-
-    from numpy.typing import NDArray
-
-    from bench.vision.scenes import Gray
 
 SIDE_PX = 30.0
 _OWN_MARKERS = {"opencv": "aruco_6x6", "apriltag": "apriltag_36h11", "charuco": "aruco_4x4"}
@@ -53,7 +56,6 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
             for kind, pictures in (("false_ids", without), ("foreign_ids", others)):
                 number = sum(len(read(image).ids) for image in pictures)
                 figures[f"families.{name}.{who}{kind}"] = float(number)
-    _plot(figures)
     return figures
 
 
@@ -121,22 +123,3 @@ def _of_makers(seeds: Sequence[int]) -> Iterator[tuple[str, Gray]]:
     rng = np.random.default_rng(7)
     for _ in range(_RANDOM_IMAGES * len(seeds)):
         yield _RANDOM.name, random_scene(rng, _RANDOM, 20, Look())[0]
-
-
-def _plot(figures: Mapping[str, float]) -> None:
-    """Draw shares of ids read and numbers of false ids of each family."""
-    names = [key.split(".")[1] for key in figures if key.endswith(".read_share")]
-    titles = {
-        "read_share": "share of ids read at 30 px",
-        "false_ids": "ids in pictures without markers",
-        "foreign_ids": "ids in pictures of other markers",
-    }
-    figure, plots = new_plot(3, width=4.4)
-    for axes, (kind, title) in zip(plots, titles.items(), strict=True):
-        for shift, prefix, who in ((-0.2, "", "our detector"), (0.2, "opencv_", "OpenCV")):
-            values = [figures.get(f"families.{name}.{prefix}{kind}", np.nan) for name in names]
-            axes.barh(np.arange(len(names)) + shift, values, 0.4, label=who)
-        axes.set(xlabel=title, yticks=np.arange(len(names)), yticklabels=names if axes is plots[0] else [])
-        axes.invert_yaxis()
-    plots[1].legend()
-    save_plot(figure, "inputs-families")

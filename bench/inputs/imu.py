@@ -5,24 +5,22 @@ of the other benchmarks. All cameras are covered for the second minute. Twists a
 the usual slip and all sightings.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from bench.inputs.gyro import simulate_gyroscopes
-from bench.integrity.fault import CLEAN
-from bench.integrity.faults import twist_only, with_twists
-from bench.shared.common import ProgressLine, new_plot, rms, save_plot
+from bench.integrity.faults import CLEAN, twist_only, with_twists
+from bench.scenarios.eight_run import EightSettings, simulate_eight
+from bench.scenarios.lived_run import CAMERA_LATENESS, LivedRun, SimulatedRun, arrival_ns
+from bench.shared.common import ProgressLine, plot_curves, rms
 from bench.shared.simulated_run import errors_of, estimates_of, inputs_of, mean_nees, position_rmse, ticks
-from swarm_loc_drivers.sim.run import SimulatedRun
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
-from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_drivers.sim.run import Trajectories
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.offline.metrics import is_misleading
 from swarm_loc_estimator.sensors.imu import TurnRateRows
+from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
 from swarm_loc_estimator.swarm.error_models import ImuModel
 
 IMU = ImuModel(turn_noise_density=3e-4, turn_scale_sigma=0.005, turn_bias_sigma=0.01)
@@ -65,7 +63,14 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
     pose, twist = (position_rmse(np.stack([error for error, _ in found[name]])) for name in ("pose", "twist"))
     figures["twist_only.position_ratio_to_pose"] = twist / pose
     figures["twist_only.nees"] = float(np.mean([mean_nees(*one) for one in found["twist"]]))
-    _plot(found)
+    shown = {}
+    for name in ("without", "with"):
+        error = np.concatenate([one[..., 2] for one, _ in found[name]], axis=1)
+        sigma = np.sqrt(np.concatenate([one[..., 2, 2] for _, one in found[name]], axis=1))
+        shown[f"{name} gyroscopes, RMS error"] = np.degrees(np.sqrt(np.mean(error**2, axis=1)))
+        shown[f"{name} gyroscopes, reported sigma"] = np.degrees(np.sqrt(np.mean(sigma**2, axis=1)))
+    time_s = 1.0 + 0.1 * np.arange(len(error))
+    plot_curves("inputs-imu", ("time [s]", "heading error [deg]", time_s, shown), yscale="log")
     return figures
 
 
@@ -96,21 +101,40 @@ def _estimate(run: SimulatedRun, **rates: TurnRateRows) -> tuple[FloatArray, Flo
     return error, np.array([one.covariances for one in estimates])
 
 
-def _plot(found: Mapping[str, Sequence[tuple[FloatArray, FloatArray]]]) -> None:
-    figure, (axis,) = new_plot(1, width=7.0)
-    for name, colour in (("without", "tab:orange"), ("with", "tab:blue")):
-        error = np.degrees(np.abs(np.concatenate([one[..., 2] for one, _ in found[name]], axis=1)))
-        sigma = np.degrees(np.sqrt(np.concatenate([one[..., 2, 2] for _, one in found[name]], axis=1)))
-        time_s = 1.0 + 0.1 * np.arange(len(error))
-        axis.plot(time_s, error, color=colour, linewidth=0.4, alpha=0.4)
-        axis.plot(time_s, _quadratic_mean(error), color=colour, label=f"{name} gyroscopes, RMS error")
-        axis.plot(time_s, _quadratic_mean(sigma), color=colour, linestyle=":", label="... reported sigma")
-    axis.axvline(BLIND_S, color="0.5", linewidth=0.8)
-    axis.set(xlabel="time [s]", ylabel="heading error [deg]", yscale="log", ylim=(0.05, 60.0))
-    axis.set_title("no sightings in the second minute", loc="left")
-    axis.legend(fontsize=8)
-    save_plot(figure, "inputs-imu")
+RATE_HZ = 50.0  # Rate of the messages of an IMU
 
 
-def _quadratic_mean(rows: FloatArray) -> FloatArray:
-    return np.asarray(np.sqrt(np.mean(np.square(rows), axis=1)))
+def simulate_gyroscopes(rng: np.random.Generator, run: LivedRun, imu: ImuModel) -> TurnRateRows:
+    """Readings of an IMU on each robot, with bias and scale drawn from their sigmas, in order of arrival.
+
+    Args:
+        rng: Draws errors and delays.
+        run: Gives the true motion.
+        imu: Error model of all robots.
+    """
+    stamp_ns = np.arange(run.start_ns, run.end_ns, round(1e9 / RATE_HZ))
+    parts = [_readings(rng, run.truth, robot, stamp_ns, imu) for robot in range(len(run.swarm.robots))]
+    robots = np.repeat(np.arange(len(parts)), stamp_ns.size)
+    stamps, rate = np.tile(stamp_ns, len(parts)), np.concatenate(parts)
+    arrivals = arrival_ns(rng, stamps, CAMERA_LATENESS)
+    velocity = np.column_stack([np.zeros((rate.size, 2)), rate])
+    return in_order_of_arrival([TurnRateRows(robots, stamps, velocity, np.full(rate.size, np.nan), arrivals)])
+
+
+def _readings(
+    rng: np.random.Generator, truth: Trajectories, robot: int, stamp_ns: IntArray, imu: ImuModel
+) -> FloatArray:
+    """Turn rates (k,) that the IMU of one robot measures, each the mean over its period."""
+    period_s = 1.0 / RATE_HZ
+    heading = truth.at(robot, stamp_ns)[:, 2]
+    turn = np.gradient(np.unwrap(heading), period_s)
+    # a Gauss-Markov bias, in its stationary distribution
+    kept = math.exp(-period_s / imu.turn_bias_time_s)
+    bias, step = np.empty(stamp_ns.size), imu.turn_bias_sigma * math.sqrt(1.0 - kept**2)
+    bias[0] = imu.turn_bias_sigma * rng.standard_normal()
+    for k, noise in enumerate(step * rng.standard_normal(stamp_ns.size - 1)):
+        bias[k + 1] = kept * bias[k] + noise
+    white = imu.turn_noise_density * math.sqrt(RATE_HZ) * rng.standard_normal(stamp_ns.size)
+    scale = imu.turn_scale * (1.0 + imu.turn_scale_sigma * rng.standard_normal())
+    measured: FloatArray = (turn - bias - imu.turn_bias) / scale + white
+    return measured

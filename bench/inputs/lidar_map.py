@@ -7,8 +7,6 @@ beams ends at people who are not in the map and walk around. "wrong_start" is of
 the truth, so they contain those of the map.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Mapping, Sequence
@@ -33,10 +31,11 @@ from bench.pushbot.lidar import (
     scan_message,
 )
 from bench.pushbot.mapping import LIDAR_SLIPS, PLANS
+from bench.scenarios.lived_run import ODOMETRY_DTYPE, LivedRun
 from bench.shared.common import ProgressLine
 from bench.shared.simulated_run import errors_of, inputs_between, odometry_rows
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, floor_plan
-from swarm_loc_drivers.sim.run import ODOMETRY_DTYPE, LivedRun, Trajectories
+from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import save_map

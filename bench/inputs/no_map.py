@@ -5,19 +5,16 @@ only; errors are those after a rigid fit at each instant, compared with a run in
 the second part, robots of two groups do not see each other for half a minute, and landmarks come after 40 s.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
-from bench.integrity.fault import CLEAN
-from bench.integrity.faults import seconds
-from bench.shared.common import ProgressLine, new_plot, rms, save_plot
+from bench.integrity.faults import CLEAN, seconds
+from bench.scenarios.eight_run import EightSettings, simulate_eight
+from bench.scenarios.lived_run import SimulatedRun
+from bench.shared.common import ProgressLine, plot_curves, rms
 from bench.shared.simulated_run import errors_of, estimates_of, fitted_errors, inputs_of, ticks
-from swarm_loc_drivers.sim.run import SimulatedRun
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.offline.metrics import is_misleading
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
@@ -47,7 +44,17 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> Mapping[str, float]:
         moves.append(count)
     fitted = {name: np.concatenate(errors) for name, errors in relative.items()}
     relative_cm = {name: 100.0 * rms(one[np.isfinite(one)]) for name, one in fitted.items()}
-    _plot(relative, moved)
+    shown = {
+        name: 100.0 * np.sqrt(np.nanmean(np.concatenate(errors, axis=1) ** 2, axis=1))
+        for name, errors in relative.items()
+    }
+    away = 100.0 * np.concatenate([np.hypot(*error[..., :2].T).T for error, _ in moved], axis=1)
+    plot_curves(
+        "inputs-no_map",
+        ("time [s]", "RMS after a rigid fit [cm]", SETTLED_S + 0.1 * np.arange(len(shown["no map"])), shown),
+        ("time [s]", "error in map [cm]", 1.0 + 0.1 * np.arange(len(away)), {"": away}),
+        yscale="log",
+    )
     return {
         "no_map.relative_cm": relative_cm["no map"],
         "no_map.known_frame_relative_cm": relative_cm["one start known"],
@@ -117,23 +124,3 @@ def _estimates(run: SimulatedRun) -> Iterator[tuple[Estimate, Estimator]]:
     """Estimates at all ticks from the first second on, and the estimator at that moment."""
     tick_ns = ticks(run)[9:]
     return estimates_of(run.swarm, inputs_of(run, tick_ns), tick_ns)
-
-
-def _plot(
-    relative: Mapping[str, Sequence[FloatArray]], moved: Sequence[tuple[FloatArray, BoolArray]]
-) -> None:
-    figure, (left, right) = new_plot(2, width=5.2)
-    for (name, errors), colour in zip(relative.items(), ("tab:blue", "tab:orange"), strict=True):
-        time_s = SETTLED_S + 0.1 * np.arange(len(errors[0]))
-        rows = np.concatenate(errors, axis=1)
-        left.plot(time_s, 100.0 * np.sqrt(np.nanmean(rows**2, axis=1)), color=colour, label=name)
-    left.set(xlabel="time [s]", ylabel="RMS after a rigid fit [cm]", ylim=(0.0, None))
-    left.legend()
-    for error, misleading in moved:
-        time_s, distance = 1.0 + 0.1 * np.arange(len(error)), 100.0 * np.hypot(*error[..., :2].T).T
-        right.semilogy(time_s, distance, color="0.6", linewidth=0.5)
-        ticks, robots = np.nonzero(misleading)
-        right.semilogy(time_s[ticks], distance[ticks, robots], "r.", markersize=3)
-    right.axvline(LANDMARKS_S, color="tab:green", linewidth=0.8)
-    right.set(xlabel="time [s]", ylabel="error in map [cm]", title="landmarks come after 40 s")
-    save_plot(figure, "inputs-no_map")

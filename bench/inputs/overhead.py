@@ -2,24 +2,24 @@
 
 Bounds: position 0.3 cm and heading 0.5 degrees (root mean square), no jump by more than 0.3 cm when one
 camera takes over from another, and all detectors and the estimator on one core. Images arrive 150 to 300 ms
-late, and what the wheels slip meanwhile nobody can know. `bound` is the error of a pose that was exact in the
-newest image that has arrived; `at_once` is a swarm whose images and odometry are not late.
+late.
 """
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib.axes import Axes
 from numpy.typing import NDArray
 
-from bench.inputs.overhead_world import ARENA, MODEL, PERIOD_NS, ROBOTS, OverheadRun, simulate_overhead
-from bench.shared.common import ProgressLine, new_plot, rms, save_plot
+from bench.scenarios.bags import places, wander
+from bench.scenarios.eight_run import EightSettings, drive_robots
+from bench.scenarios.lived_run import CAMERA_LATENESS, LivedRun, arrival_ns
+from bench.shared.common import ProgressLine, plot_curves, rms
 from bench.shared.simulated_run import (
     errors_of,
     estimates_of,
@@ -28,13 +28,23 @@ from bench.shared.simulated_run import (
     position_rmse,
     ticks,
 )
-from swarm_loc_drivers.sim.run import START_NS
+from bench.vision.ceiling import CeilingRig
+from swarm_loc_drivers.sim.render.lens import CameraModel
+from swarm_loc_drivers.sim.render.rigs import Arena
+from swarm_loc_drivers.sim.run import START_NS, Trajectories
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
+from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.offline.metrics import nees
-from swarm_loc_estimator.sensors.sensor import in_order_of_arrival
+from swarm_loc_estimator.sensors.camera import DetectionRows
+from swarm_loc_estimator.swarm.error_models import SensorModel
+from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Swarm
 from swarm_loc_estimator.timeline.estimator import Status
+from swarm_loc_vision.aerial.ground_control import AerialSettings, FloorMarker, Ground, located
+from swarm_loc_vision.aerial.locate_camera import fixed_camera
+from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector, detection_rows
+from swarm_loc_vision.markers.families import family_named
+from swarm_loc_vision.markers.pose import robot_body, up_of
 
 DURATION_S = 20.0
 _SETTLED_NS = 3 * 10**9  # From here on errors count
@@ -64,26 +74,27 @@ class Tracked(NamedTuple):
 
 def measure(seeds: Sequence[int], say: ProgressLine) -> dict[str, float]:
     """Run all seeds; draw the last one; return the figures."""
-    runs, prompt, shares, bounds = [], [], [], []
+    runs, shares = [], []
+    track(simulate_overhead(seeds[0], 2.0, say))  # compiles or loads what is timed next
     for seed in seeds:
         run = simulate_overhead(seed, DURATION_S, say)
-        prompt.append(track(_at_once(run)))  # compiles or loads what is timed next
         found = track(run)
         runs.append(found)
         shares.append((run.cpu_s / run.images * 4e9 / PERIOD_NS, found.cpu_s / run.duration_s))
-        bounds.append(_bound(run, found))
-        say(f"seed {seed}: {_rms(found)[0]:.3f} cm, dropped {dict(found.drops)}")
+        say(f"seed {seed}: dropped {dict(found.drops)}")
     print()
-    _draw(run, found)
+    distance, heading = 100.0 * np.hypot(*found.errors[..., :2].T).T, np.degrees(np.abs(found.errors[..., 2]))
+    seconds = (found.stamp_ns - START_NS) * 1e-9
+    curves = (("position error [cm]", distance), ("heading error [deg]", heading))
+    plot_curves("inputs-overhead", *(("time [s]", label, seconds, {"": rows}) for label, rows in curves))
     jumps = np.concatenate([one.jumps[one.counts & one.hands_over] for one in runs])
     steady = np.concatenate([one.jumps[one.counts & ~one.hands_over] for one in runs])
     detectors, estimator = np.mean(shares, axis=0)
     begun = [one.stamp_ns > START_NS + 10**9 for one in runs]
-    of = {"": map(_rms, runs), "at_once.": map(_rms, prompt), "bound.": bounds}
-    wrong = {name: np.sqrt(np.mean(np.square(list(values)), axis=0)) for name, values in of.items()}
+    errors = np.concatenate([one.errors[one.counts] for one in runs])
     return {
-        **{f"overhead.{name}position_cm": float(values[0]) for name, values in wrong.items()},
-        **{f"overhead.{name}heading_deg": float(values[1]) for name, values in wrong.items()},
+        "overhead.position_cm": 100.0 * position_rmse(errors),
+        "overhead.heading_deg": math.degrees(rms(se2.wrap_angle(errors[:, 2]))),
         "overhead.handover_jump_cm": 100.0 * float(jumps.max()),
         "overhead.handover_jump_rms_cm": 100.0 * rms(jumps),
         "overhead.other_jump_cm": 100.0 * float(steady.max()),
@@ -94,33 +105,6 @@ def measure(seeds: Sequence[int], say: ProgressLine) -> dict[str, float]:
         "overhead.detectors_share": float(detectors),
         "overhead.core_share": float(detectors + estimator),
     }
-
-
-def _at_once(run: OverheadRun) -> OverheadRun:
-    """The run with arrivals at the stamps."""
-    odometry, seen = run.odometry.copy(), run.detections
-    odometry["arrival_ns"] = odometry["stamp_ns"]
-    seen = in_order_of_arrival([seen._replace(arrival_ns=seen.stamp_ns)])
-    order = np.argsort(odometry["arrival_ns"], kind="stable")
-    return replace(run, odometry=odometry[order], detections=seen)
-
-
-def _bound(run: OverheadRun, found: Tracked) -> FloatArray:
-    """Position [cm] and heading [deg], rms, of true poses in the newest arrived images, moved by odometry."""
-    seen, odometry, errors = run.detections, run.odometry, []
-    for robot in range(ROBOTS):
-        mine = seen.detection["id"] == robot
-        arrived_ns, newest_ns = seen.arrival_ns[mine], np.maximum.accumulate(seen.stamp_ns[mine])
-        last = np.searchsorted(arrived_ns, found.stamp_ns, side="right") - 1
-        own = odometry[odometry["robot"] == robot]
-        own = own[np.argsort(own["stamp_ns"], kind="stable")]
-        path = Trajectory(own["stamp_ns"].astype(np.int64), own["pose"])
-        some = found.counts[:, robot] & (last >= 0) & (found.stamp_ns <= own["stamp_ns"][-1])
-        now_ns, then_ns = found.stamp_ns[some], newest_ns[last[some]]
-        (then, is_known), (now, _) = (interpolate(path, ns, PERIOD_NS) for ns in (then_ns, now_ns))
-        moved = se2.compose(run.truth.at(robot, then_ns), se2.between(then, now))
-        errors.append((moved - run.truth.at(robot, now_ns))[is_known])
-    return _rms_of(np.concatenate(errors))
 
 
 def track(run: OverheadRun) -> Tracked:
@@ -170,57 +154,127 @@ def _hand_overs(run: OverheadRun, ticks_ns: IntArray) -> NDArray[np.bool_]:
     return found
 
 
-def _rms(found: Tracked) -> FloatArray:
-    """Position [cm] and heading [deg], rms."""
-    return _rms_of(found.errors[found.counts])
+ROBOTS, PERIOD_NS = 20, 100_000_000
+ARENA = (4.6, 3.4)
+FAMILY = family_named("aruco_mip_36h12")
+MODEL = CameraModel(k1=-0.08, exposure_s=0.004)
+TOP = Face("top", 0, 0.0, 0.0, 0.105, 0.0, size=0.05, lies=True)
+PLACES = [(x, y) for x in (-1.1, 1.1) for y in (-0.8, 0.8)]  # Where the cameras are meant to hang
+_HEIGHT = 2.5
+_ASIDE, _TILT = 0.03, math.radians(1.5)
+_FLOOR = [(x, y) for x in (-2.1, -1.1, 0.0, 1.1, 2.1) for y in (-1.5, 0.0, 1.5)]
+"""Markers on the floor; those in the middle are seen by all cameras around, whose poses then agree there."""
+_FIRST_FLOOR_ID, _SURVEY_SIGMA = 200, 0.001
+_SHARED_BY_CORNERS = 2.0
+"""The four corners of a marker share the error of its place, which counts as one of each."""
+_CALIBRATION_IMAGES = 10
+_LOSS = 0.02
+_UNUSED_ID = 1000
+_RESIDUAL = SensorModel(residual_position_sigma=0.0003, residual_heading_sigma=0.002)
 
 
-def _rms_of(errors: FloatArray) -> FloatArray:
-    """Position [cm] and heading [deg], rms, of errors (k, 3)."""
-    return np.array([100.0 * position_rmse(errors), math.degrees(rms(se2.wrap_angle(errors[:, 2])))])
+@dataclass(frozen=True)
+class OverheadRun(LivedRun):
+    """A run under ceiling cameras."""
+
+    hidden: tuple[FixedCamera, ...]  # Where the cameras truly hang
+    detections: DetectionRows  # In order of arrival
+    images: int  # Number of images
+    cpu_s: float  # Time that the detectors took [s]
+    picture: NDArray[np.uint8]  # An image
 
 
-def _draw(run: OverheadRun, found: Tracked) -> None:
-    """The arena with true and estimated paths, and errors over time."""
-    # the arena
-    figure, (arena, errors) = new_plot(2, width=6.4, height=4.8)
-    truth = run.truth.all_at(found.stamp_ns)
-    for robot in range(ROBOTS):
-        arena.plot(*truth[:, robot, :2].T, color="0.75", linewidth=3.0, label=None if robot else "true")
-        arena.plot(*found.poses[:, robot, :2].T, linewidth=0.8, label=None if robot else "estimated")
-    for camera in run.swarm.cameras:
-        _outline(arena, camera.x, camera.y, camera.z)
-    arena.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="four ceiling cameras")
-    arena.set(xlim=(-0.55 * ARENA[0], 0.55 * ARENA[0]), ylim=(-0.55 * ARENA[1], 0.55 * ARENA[1]))
-    arena.legend(loc="lower right")
-    # errors over time, and jumps where another camera takes over
-    seconds = (found.stamp_ns - START_NS) * 1e-9
-    distance = 100.0 * np.linalg.norm(found.errors[..., :2], axis=2)
-    heading = np.degrees(np.abs(found.errors[..., 2]))
-    errors.plot(seconds, distance, color="0.8", linewidth=0.6)
-    located = np.isfinite(distance).any(axis=1)
-    seconds, distance, heading = seconds[located], distance[located], heading[located]
-    errors.plot(seconds, np.sqrt(np.nanmean(distance**2, axis=1)), color="C0", label="position, rms [cm]")
-    errors.plot(seconds, np.sqrt(np.nanmean(heading**2, axis=1)), color="C1", label="heading, rms [deg]")
-    jumped = found.hands_over & found.counts
-    at, _ = np.nonzero(jumped)
-    errors.plot(
-        (found.stamp_ns[at] - START_NS) * 1e-9,
-        100.0 * found.jumps[jumped],
-        ".",
-        color="C3",
-        markersize=3,
-        label="hand-over jump [cm]",
+def simulate_overhead(seed: int, duration_s: float, say: Callable[[str], None]) -> OverheadRun:
+    """Drive, render and detect."""
+    # robots that drive around, with a marker on top
+    rng = np.random.default_rng(seed)
+    settings = EightSettings(seed, duration_s, ROBOTS, start_known=False)
+    start = places(rng, ROBOTS, ARENA)
+    driven, truth, odometry = drive_robots(rng, settings, start, wander(rng, ROBOTS, ARENA), _UNUSED_ID)
+    robots = tuple(
+        replace(robot, camera=None, faces=(replace(TOP, id=k),)) for k, robot in enumerate(driven.robots)
     )
-    errors.axhline(0.3, color="C3", linestyle=":", linewidth=1.0)
-    errors.set(xlabel="time [s]", ylim=(0.0, 1.5), title="errors")
-    errors.legend(loc="upper right")
-    print(save_plot(figure, "inputs-overhead"))
+    # cameras where they hang, and where locate_camera finds them
+    hidden = tuple(_hung(f"ceiling{k + 1}", x, y, rng) for k, (x, y) in enumerate(PLACES))
+    floor = [FloorMarker(_FIRST_FLOOR_ID + k, x, y, size=0.12) for k, (x, y) in enumerate(_FLOOR)]
+    arena, begin_ns = Arena(ARENA, FAMILY), START_NS + PERIOD_NS
+    cameras = _located(hidden, CeilingRig((), hidden, arena, MODEL, floor, seed), floor, truth, rng)
+    rig = CeilingRig(robots, hidden, arena, MODEL, floor, seed)
+    swarm = Swarm(robots, (), cameras)
+    parts, stamps, cpu_s, images = [], [], 0.0, 0
+    picture = rig.take(0, begin_ns, truth, rng)
+    detectors = [_detector(swarm, camera) for camera in swarm.cameras]
+    for detector in detectors[:1]:
+        detector.detect(picture)  # compiled or loaded
+    # images and what is detected in them
+    phases = rng.integers(0, PERIOD_NS, len(cameras))
+    end_ns = int(truth.stamp_ns[-1])
+    for tick_ns in range(begin_ns, end_ns - 2 * PERIOD_NS, PERIOD_NS):
+        say(f"seed {seed}, {(tick_ns - START_NS) * 1e-9:.0f} of {duration_s:.0f} s")
+        for k, detector in enumerate(detectors):
+            stamp_ns = tick_ns + int(phases[k])
+            image = rig.take(k, stamp_ns, truth, rng)
+            begun_s = time.process_time()
+            found = detection_rows(detector.detect(image), DetectorSettings().ambiguity)
+            cpu_s += time.process_time() - begun_s
+            images += 1
+            if rng.random() >= _LOSS:
+                parts.append(found)
+                stamps.append((ROBOTS + k, stamp_ns))
+    # detections in order of arrival
+    source, stamp_ns_of = np.array(stamps).T
+    arrivals_ns = arrival_ns(rng, stamp_ns_of, CAMERA_LATENESS)
+    order = [k for k in np.argsort(arrivals_ns, kind="stable").tolist() if arrivals_ns[k] <= end_ns]
+    counts = [len(parts[k]) for k in order]
+    rows = np.concatenate([parts[k] for k in order], dtype=DETECTION_DTYPE)
+    robot, stamp, arrival = (np.repeat(one[order], counts) for one in (source, stamp_ns_of, arrivals_ns))
+    seen = DetectionRows(robot, stamp, rows, arrival)
+    return OverheadRun(swarm, truth, odometry, hidden, seen, images, cpu_s, picture)
 
 
-def _outline(arena: Axes, x: float, y: float, height: float) -> None:
-    """About what a camera sees of the floor."""
-    half_x = height * math.tan(0.5 * MODEL.field_of_view)
-    half_y = half_x * MODEL.height / MODEL.width
-    corners = [(x + a * half_x, y + b * half_y) for a, b in ((1, 1), (1, -1), (-1, -1), (-1, 1), (1, 1))]
-    arena.plot(*zip(*corners, strict=True), "--", color="0.4", linewidth=0.8)
+def _located(
+    hidden: Sequence[FixedCamera],
+    rig: CeilingRig,
+    floor: Sequence[FloorMarker],
+    truth: Trajectories,
+    rng: np.random.Generator,
+) -> tuple[FixedCamera, ...]:
+    """The cameras as described, from images of the empty arena."""
+    ground = Ground(markers=tuple(_measured(one, rng) for one in floor), family=FAMILY)
+    empty, cameras = Trajectories(truth.stamp_ns, truth.poses[:, :0]), []
+    for k, camera in enumerate(hidden):
+        stamps_ns = [START_NS + image * PERIOD_NS for image in range(1, _CALIBRATION_IMAGES + 1)]
+        pictures = [rig.take(k, stamp_ns, empty, rng) for stamp_ns in stamps_ns]
+        fit = located(ground, MODEL.camera, pictures, _CONTROL)
+        cameras.append(replace(fixed_camera(camera.name, fit.ground, TOP.z), sensor=_RESIDUAL))
+    return tuple(cameras)
+
+
+_CONTROL = AerialSettings(control_sigma_px=0.1, control_sigma=_SHARED_BY_CORNERS * _SURVEY_SIGMA)
+
+
+def _hung(name: str, x: float, y: float, rng: np.random.Generator) -> FixedCamera:
+    """A camera near the place that it was meant for, and nearly straight down."""
+    dx, dy, dz = (_ASIDE * rng.standard_normal(3)).tolist()
+    pitch, roll = (_TILT * rng.standard_normal(2)).tolist()
+    return FixedCamera(name, x + dx, y + dy, _HEIGHT + dz, 0.5 * math.pi, 0.5 * math.pi + pitch, roll)
+
+
+def _measured(marker: FloorMarker, rng: np.random.Generator) -> FloorMarker:
+    """A marker on the floor where it was measured to lie."""
+    dx, dy = (_SURVEY_SIGMA * rng.standard_normal(2)).tolist()
+    return replace(marker, x=marker.x + dx, y=marker.y + dy)
+
+
+def _detector(swarm: Swarm, camera: FixedCamera) -> MarkerDetector:
+    """The detector of a camera, as `marker_detector_node` creates it."""
+    faces = [face for robot in swarm.robots for face in robot.faces]
+    return MarkerDetector(
+        DetectorSettings(),
+        {FAMILY: np.array(sorted(face.id for face in faces))},
+        MODEL.camera,
+        lengths={face.id: face.size for face in faces},
+        up=up_of(camera),
+        lying=[face.id for face in faces],
+        bodies=[robot_body(robot) for robot in swarm.robots],
+    )

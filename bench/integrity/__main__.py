@@ -11,21 +11,16 @@ it never is, "accused" the number of innocent sources that are named. "others" i
 the fault does not concern over that of the run without it, while it lasts, and "after" in the 30 s after it.
 """
 
-from __future__ import annotations
-
-import argparse
 import math
 import shutil
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 
-from bench.integrity.late_start import LATE_START, run_late_start
-from bench.integrity.live import LIVE_SCENARIOS, run_live
+from bench.integrity.live import LATE_START, LIVE_SCENARIOS, run_late_start, run_live
 from bench.integrity.scenarios import SCENARIOS
-from bench.integrity.scoring import Score, score
-from bench.shared.common import OUT, Cell, ProgressLine, new_plot, rms, save_plot, table, write_figures
+from bench.integrity.scoring import Score, plot_errors, score
+from bench.shared.common import OUT, Cell, ProgressLine, options_of, rms, table, write_figures
 
 _NAMES = (*SCENARIOS, LATE_START, *LIVE_SCENARIOS)
 _PLOTS_PER_FILE = 5
@@ -42,15 +37,14 @@ _COLUMNS = ("scenario", "misleading", "worst seed", "tracked", "RMSE [cm]", "NEE
 
 def main() -> None:
     """Print the table, write the figures, plot the errors."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=5, help="runs of each scenario")
-    parser.add_argument("--scenarios", nargs="+", choices=_NAMES, default=list(_NAMES))
-    arguments = parser.parse_args()
-    scores = {name: _runs(name, arguments.seeds) for name in arguments.scenarios}
+    chosen = options_of(__doc__, seeds=(5, "runs of each scenario"), scenarios=(_NAMES, "which", _NAMES))
+    scores = {name: _runs(name, chosen.seeds) for name in chosen.scenarios}
     print(table(_COLUMNS, [_row(name, runs) for name, runs in scores.items()]))
     figures = {key: value for name, runs in scores.items() for key, value in _figures(name, runs).items()}
     print(write_figures("integrity", figures))
-    print(*_plots(scores), sep="\n")
+    for first in range(0, len(scores), _PLOTS_PER_FILE):
+        some = {name: scores[name] for name in [*scores][first : first + _PLOTS_PER_FILE]}
+        print(plot_errors(some, f"integrity-{first // _PLOTS_PER_FILE + 1}"))
 
 
 def _runs(name: str, seeds: int) -> list[Score]:
@@ -113,22 +107,6 @@ def _row(name: str, runs: Sequence[Score]) -> list[Cell]:
     )
     optional = [figures.get(f"{name}.{key}") for key in _OPTIONAL]
     return [name, share, worst, f"{tracked:.4f}", position, nees, *optional]
-
-
-def _plots(scores: Mapping[str, Sequence[Score]]) -> list[Path]:
-    """Plot errors of all robots over time, an axis per scenario, with misleading ones marked."""
-    names, files = list(scores), []
-    for first in range(0, len(names), _PLOTS_PER_FILE):
-        some = names[first : first + _PLOTS_PER_FILE]
-        figure, axes = new_plot(len(some), width=3.4)
-        for axis, name in zip(axes, some, strict=True):
-            for one in scores[name]:
-                axis.semilogy(one.time_s, 100.0 * one.error_m, color="0.6", linewidth=0.5)
-                ticks, robots = np.nonzero(one.misleading)
-                axis.semilogy(one.time_s[ticks], 100.0 * one.error_m[ticks, robots], "r.", markersize=3)
-            axis.set(title=name, xlabel="time [s]", ylabel="error [cm]", ylim=(0.01, 300.0))
-        files.append(save_plot(figure, f"integrity-{first // _PLOTS_PER_FILE + 1}"))
-    return files
 
 
 if __name__ == "__main__":

@@ -1,27 +1,60 @@
-"""Faults injected into simulated runs: wrong odometry, false sightings, geometry other than described."""
-
-from __future__ import annotations
+"""Faults injected into simulated runs, and what all scenarios share."""
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
-from swarm_loc_drivers.sim.run import (
+from bench.scenarios.eight_run import VIEW, EightSettings, camera_exposures, drive_eight
+from bench.scenarios.lived_run import (
     FRAME_DTYPE,
     ODOMETRY_DTYPE,
     SIGHTING_DTYPE,
     LivedRun,
     Records,
     SimulatedRun,
-    Trajectories,
 )
-from swarm_loc_drivers.sim.scenarios.eight import VIEW, EightSettings, camera_exposures, drive_eight
-from swarm_loc_drivers.sim.sightings import observe_markers
+from bench.scenarios.sightings import observe_markers
+from swarm_loc_drivers.sim.run import Trajectories
+from swarm_loc_drivers.sim.worlds import W0, W2, ErrorModel
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import Swarm
+
+DURATION_S = 60.0
+FAULT_S = (15.0, 45.0)
+
+DETECTOR = SensorModel(forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06)  # Noise as described
+CLEAN = replace(W0, forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06, described=DETECTOR)
+SYSTEMATIC = replace(W2, forward_sigma=0.005, left_sigma=0.002, heading_sigma=0.06, described=DETECTOR)
+"""Systematic errors of w2 that the description does not contain."""
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A run with a fault."""
+
+    run: LivedRun  # The run
+    # End of the fault, after which the estimate should recover; None: it does not end
+    ends_s: float | None = None
+    # Begin and end of the time in which no data that has arrived shows the fault
+    hidden_s: tuple[float, float] | None = None
+    about: str = ""  # Name of the faulty robot or landmark, if it depends on the seed
+    # Readings by sensor besides odometry and sightings of the run, or in place of these
+    readings: Mapping[str, Any] = field(default_factory=dict)
+    healthy: Mapping[str, Any] = field(default_factory=dict)  # The same without the fault
+    begins_s: float = 0.0  # Begin of the fault
+    guilty: frozenset[str] = frozenset()  # Names that a contradiction may be about
+    concerned: frozenset[int] = frozenset()  # Robots that the fault concerns, if not all of them
+
+
+def settings_of(seed: int, errors: ErrorModel, duration_s: float = DURATION_S) -> EightSettings:
+    """Five robots, for a minute unless told otherwise."""
+    return EightSettings(seed=seed, duration_s=duration_s, errors=errors)
+
 
 SwarmChange = Callable[[Swarm], Swarm]
 TruthChange = Callable[[Trajectories], Trajectories]

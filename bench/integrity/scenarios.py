@@ -3,8 +3,6 @@
 Those of other sensors than odometry and cameras on robots are in `sensors.py`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache
@@ -12,9 +10,10 @@ from functools import lru_cache
 import numpy as np
 
 from bench.integrity import faults
-from bench.integrity.fault import CLEAN, FAULT_S, SYSTEMATIC, Fault, settings_of
+from bench.integrity.faults import CLEAN, FAULT_S, SYSTEMATIC, Fault, settings_of
 from bench.integrity.sensors import SENSOR_SCENARIOS
-from swarm_loc_drivers.sim.run import SimulatedRun, Trajectories
+from bench.scenarios.lived_run import SimulatedRun
+from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_drivers.sim.worlds import W0, W2
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray

@@ -5,15 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from bench.integrity.fault import Fault
-from bench.integrity.faults import seconds
-from bench.shared.common import rms
+from bench.integrity.faults import Fault, seconds
+from bench.scenarios.lived_run import LivedRun
+from bench.shared.common import new_plot, rms, save_plot
 from bench.shared.simulated_run import errors_of, estimates_of, inputs_of, ticks
-from swarm_loc_drivers.sim.run import LivedRun
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray
 from swarm_loc_estimator.offline.metrics import is_misleading, nees
 from swarm_loc_estimator.timeline.estimate import Contradicted
@@ -163,3 +163,15 @@ def _recovery_s(time_s: FloatArray, right: BoolArray, ends_s: float | None) -> f
     steady = [np.convolve(one[begin:], np.ones(needed), "valid") >= needed for one in right.T]
     since_s = time_s[begin:] - ends_s
     return max(float(since_s[np.argmax(one)]) if one.any() else float(time_s[-1]) for one in steady)
+
+
+def plot_errors(scores: Mapping[str, Sequence[Score]], file: str) -> Path:
+    """Plot errors of all robots over time as out/FILE.png, a plot per name, with misleading ones marked."""
+    figure, axes = new_plot(len(scores), width=3.6)
+    for axis, (name, runs) in zip(axes, scores.items(), strict=True):
+        for one in runs:
+            axis.semilogy(one.time_s, 100.0 * one.error_m, color="0.6", linewidth=0.5)
+            ticks, robots = np.nonzero(one.misleading)
+            axis.semilogy(one.time_s[ticks], 100.0 * one.error_m[ticks, robots], "r.", markersize=3)
+        axis.set(title=name, xlabel="time [s]", ylabel="error [cm]", ylim=(0.01, 300.0))
+    return save_plot(figure, file)

@@ -5,27 +5,20 @@ its camera is turned, and the landmarks stand beside where the survey has them. 
 Errors of the second half of a run count, of the poses told as tracked.
 """
 
-from __future__ import annotations
-
-import argparse
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.peers.shapes import second_half
-from bench.shared.common import new_plot, save_plot, table, write_figures
+from bench.peers.scaling import second_half
+from bench.scenarios.lived_run import Records, SimulatedRun
+from bench.shared.common import flat, options_of, plot_by_size, table, write_figures
 from bench.shared.grid import GridSettings, simulate_grid
 from bench.shared.simulated_run import run_core, ticks
 from swarm_loc_estimator.common import se2
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.settings import Settings
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from swarm_loc_drivers.sim.run import Records, SimulatedRun
-    from swarm_loc_estimator.common.arrays import FloatArray
 
 SIZES = (100, 300, 1000)
 ROBOT_SECONDS = 12_000.0  # A run of N robots is N-th of this long, and 40 s at most
@@ -100,36 +93,20 @@ def measure(robots: int, seed: int) -> dict[str, float]:
     return second_half(run, Settings())
 
 
-def draw(results: dict[tuple[int, int], dict[str, float]]) -> None:
-    """CPU time and consistency against swarm size."""
-    figure, (speed, quality) = new_plot(2)
-    for seed in sorted({seed for _, seed in results}):
-        sizes = [robots for robots, of in results if of == seed]
-        for axes, name in ((speed, "cpu_s_per_s"), (quality, "nees")):
-            axes.plot(sizes, [results[robots, seed][name] for robots in sizes], "o-", label=f"seed {seed}")
-    speed.axhline(1.0, color="0.5", linestyle=":", label="real time")
-    speed.set(xscale="log", yscale="log", xlabel="calibrated robots", ylabel="CPU seconds per second")
-    quality.axhline(3.0, color="0.5", linestyle=":", label="ideal")
-    quality.set(xscale="log", xlabel="calibrated robots", ylabel="NEES", ylim=(0.0, 6.0))
-    for axes in (speed, quality):
-        axes.legend()
-    print(f"plot: {save_plot(figure, 'calibrated')}")
-
-
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--robots", type=int, nargs="+", default=SIZES, help="swarm sizes")
-    parser.add_argument("--seeds", type=int, nargs="+", default=(1, 2), help="of the simulation")
-    options = parser.parse_args(arguments)
+    options = options_of(
+        __doc__, arguments, robots=(SIZES, "swarm sizes"), seeds=((1, 2), "of the simulation")
+    )
     warm_up = simulate_calibrated(GridSettings(robots=300, duration_s=2.0))
     run_core(warm_up, ticks(warm_up), Settings())  # compiles what is not compiled yet, or loads it
-    results = {(n, seed): measure(n, seed) for n in options.robots for seed in options.seeds}
-    names = list(next(iter(results.values())))
-    print(table(["robots", "seed", *names], [[*run, *one.values()] for run, one in results.items()]))
-    draw(results)
-    flat = {f"n{n}.seed{s}.{name}": v for (n, s), one in results.items() for name, v in one.items()}
-    print(f"figures: {write_figures('calibrated', flat)}")
+    results = {f"seed{seed}": {n: measure(n, seed) for n in options.robots} for seed in options.seeds}
+    rows = [[seed, n, *one.values()] for seed, found in results.items() for n, one in found.items()]
+    print(table(["seed", "robots", *next(iter(results["seed" + str(options.seeds[0])].values()))], rows))
+    shown = {"cpu_s_per_s": "CPU seconds per second", "nees": "NEES"}
+    print(f"plot: {plot_by_size('calibrated', results, shown, 'calibrated robots', '')}")
+    sized = {f"n{n}": {seed: found[n] for seed, found in results.items()} for n in options.robots}
+    print(f"figures: {write_figures('calibrated', flat(sized))}")
 
 
 if __name__ == "__main__":

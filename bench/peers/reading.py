@@ -6,14 +6,12 @@ decoded to arrays of numbers: stamps and poses, or ids, positions and covariance
 bytes, which rosbags' type store turns into objects. All readers of a recording are measured in one run.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.reader import make_reader
@@ -21,19 +19,14 @@ from rosbags.rosbag2 import Reader, StoragePlugin, Writer
 
 from bench.mrclam.sets import import_set
 from bench.shared.bags import copy_part
-from bench.shared.common import OUT, new_plot, save_plot, table, write_figures
+from bench.shared.common import DEMO_BAG, OUT, flat, new_plot, save_plot, table, write_figures
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.bags.writer import typestore
 from swarm_loc_estimator.common.messages.cdr import DETECTIONS, ODOMETRY, nanoseconds
 from swarm_loc_estimator.common.messages.poses import decode_odometry, yaw_of
 from swarm_loc_estimator.common.messages.streams import DetectionReader, PoseReader
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from swarm_loc_estimator.common.arrays import FloatArray
-
-DEMO = Path(__file__).resolve().parents[2] / "bags" / "eight_five_robots"
 MRCLAM_S = 300.0  # How much of a set is read [s]; costs per message do not change with the length
 REPEATS = 3
 
@@ -185,46 +178,27 @@ def _alike(one: Figures, other: Figures) -> bool:
 def report(results: dict[str, dict[str, dict[str, Figures]]], folder: Path = OUT) -> None:
     """Print the table, draw the plot and write the figures, by recording, storage and reader."""
     rows: list[list[str | float | int]] = []
-    flat: dict[str, float] = {}
+    figures: dict[str, dict[str, float]] = {}
     for recording, storages in results.items():
         for storage, readers in storages.items():
             for name, one in readers.items():
                 read_us, decode_us = (1e6 * s / one.messages for s in (one.read_s, one.decode_s))
                 share = readers["this"].decode_s / one.decode_s
-                rows.append(
-                    [recording, storage, name, one.messages, read_us, decode_us, 1e6 / decode_us, share]
-                )
-                key = f"{recording}.{storage}.{name}"
-                flat |= {f"{key}.read_us": read_us, f"{key}.decode_us": decode_us}
-                flat |= {f"{key}.this_to_it": share}
-    columns = [
-        "recording",
-        "storage",
-        "reader",
-        "messages",
-        "read us",
-        "decoded us",
-        "messages/s",
-        "this / it",
-    ]
-    print(table(columns, rows))
-    draw(results, folder)
-    print(f"figures: {write_figures('reading', flat, folder / 'bench')}")
-
-
-def draw(results: dict[str, dict[str, dict[str, Figures]]], folder: Path) -> None:
-    """CPU time per message, read alone and decoded."""
-    figure, axes = new_plot(len(results))
-    for axis, (recording, storages) in zip(axes, results.items(), strict=True):
-        readers = [(storage, *pair) for storage, found in storages.items() for pair in found.items()]
-        places = np.arange(len(readers))
-        for shift, field, label in ((-0.2, "read_s", "read"), (0.2, "decode_s", "read and decoded")):
-            times = [1e6 * getattr(one, field) / one.messages for _, _, one in readers]
-            axis.barh(places + shift, times, 0.4, label=label)
-        axis.set_yticks(places, [f"{name}, {storage}" for storage, name, _ in readers])
-        axis.set(xscale="log", xlabel="CPU time per message [us]", title=recording)
-    axes[-1].legend()
+                rows.append([f"{recording}.{storage}.{name}", one.messages, read_us, decode_us, share])
+                figures[f"{recording}.{storage}.{name}"] = {
+                    "read_us": read_us,
+                    "decode_us": decode_us,
+                    "this_to_it": share,
+                }
+    print(table(["reader", "messages", "read us", "decoded us", "this / it"], rows))
+    figure, (axis,) = new_plot(1, width=7.0)
+    for shift, key in ((-0.2, "read_us"), (0.2, "decode_us")):
+        axis.barh(np.arange(len(figures)) + shift, [one[key] for one in figures.values()], 0.4, label=key)
+    axis.set_yticks(range(len(figures)), [*figures])
+    axis.set(xscale="log", xlabel="CPU time per message [us]")
+    axis.legend()
     print(f"plot: {save_plot(figure, 'reading', folder)}")
+    print(f"figures: {write_figures('reading', flat(figures), folder / 'bench')}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -235,13 +209,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     results = {}
     with tempfile.TemporaryDirectory() as work:
-        source, times = DEMO, options.times
+        source, times = DEMO_BAG, options.times
         if options.folder:
             whole, source, times = Path(work, "whole"), Path(work, "first"), 1
             import_set(options.folder, whole)
             copy_part(whole, source, MRCLAM_S)
         results["odometry"] = measure(source, ODOMETRY, times)
-    results["detections"] = measure(DEMO, DETECTIONS, options.times)
+    results["detections"] = measure(DEMO_BAG, DETECTIONS, options.times)
     report(results)
 
 

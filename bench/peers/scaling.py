@@ -1,34 +1,89 @@
-"""How far one core carries: simulated swarms of growing size, beside filterpy and gtsam on the same data.
+"""How far one core carries: simulated swarms of growing size, and large ones of several shapes.
 
-The swarm is a grid with about three neighbours in view of each robot (`bench.shared.grid`):
-odometry at 20 Hz, cameras at 7.5 Hz, 150-300 ms late; for one figure (`prompt_cpu_s_per_s`) nothing is late.
-Everybody gives all poses ten times a second; each uses measurements as often as suits it, the estimator as
-its default settings say. Measured is CPU time of this process per simulated second, without reading
-messages; the optimum is gtsam's batch solution of all data that have arrived by the same moment. Swarms of
-several shapes are compared with the exact filter (`shapes.py`). At the end some are played into the live
-graph in real time (`make bench-large_swarms`).
+The swarm is a grid with about three neighbours in view of each robot (`bench.shared.grid`): odometry at
+20 Hz, cameras at 7.5 Hz, 150-300 ms late; for one figure (`prompt_cpu_s_per_s`) nothing is late. Poses come
+ten times a second, with default settings. Measured is CPU time of this process per simulated second, without
+reading messages. The data of shapes go through the exact dense filter, too, whatever the size; errors of the
+second half of such a run count, of the poses with status TRACKED. At the end some swarms are played into the
+live graph in real time (`make bench-large_swarms`).
 """
 
-from __future__ import annotations
-
-import argparse
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bench.graph import large_swarms
-from bench.peers import filterpy_ekf, gtsam_batch, gtsam_lag
-from bench.peers.shapes import ShapeRuns, measure_shape, scored, show
-from bench.shared.common import new_plot, save_plot, table, write_figures
+from bench.scenarios.lived_run import SimulatedRun
+from bench.shared.common import flat, options_of, plot_curves, table, write_figures
 from bench.shared.grid import GridSettings, Shape, simulate_grid
-from bench.shared.simulated_run import errors_of, position_rmse, run_core, ticks, without_delay
+from bench.shared.simulated_run import errors_of, mean_nees, position_rmse, run_core, ticks, without_delay
+from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.timeline.settings import Settings
 
-if TYPE_CHECKING:
-    from collections.abc import Sequence
+_NEVER = 1_000_000
 
-    from swarm_loc_drivers.sim.run import SimulatedRun
+
+@dataclass(frozen=True)
+class ShapeRuns:
+    """What to run."""
+
+    duration_s: float  # Of a run [s]
+    exact_s: float  # The exact filter has so much of it at most [s], and is compared there
+    seeds: tuple[int, ...]  # One run each
+
+
+def measure_shape(shape: Shape, robots: int, runs: ShapeRuns) -> dict[str, float]:
+    """CPU time, ratio of RMSE to the exact filter's, NEES: means over the seeds."""
+    figures = [
+        _measure(GridSettings(robots, seed, runs.duration_s, shape), runs.exact_s) for seed in runs.seeds
+    ]
+    return {name: float(np.mean([one[name] for one in figures])) for name in figures[0]}
+
+
+def _measure(grid: GridSettings, exact_s: float) -> dict[str, float]:
+    run = simulate_grid(grid)
+    own = beside = second_half(run, Settings())
+    if exact_s < grid.duration_s:
+        run = simulate_grid(replace(grid, duration_s=exact_s))
+        beside = second_half(run, Settings())
+    exact = second_half(run, Settings(sparse_from=_NEVER))
+    ratio = beside["position_rmse_mm"] / exact["position_rmse_mm"]
+    reference = {f"exact_{name}": exact[name] for name in ("nees", "tracked_share", "cpu_s_per_s")}
+    return own | {"position_rmse_ratio_to_exact": ratio} | reference
+
+
+def second_half(run: SimulatedRun, settings: Settings) -> dict[str, float]:
+    """CPU time of a run, and the figures of its second half."""
+    at_ns = ticks(run)
+    core = run_core(run, at_ns, settings)
+    counted = np.arange(at_ns.size) >= at_ns.size // 2
+    errors = errors_of(core.poses, run, at_ns)
+    cost = {"cpu_s_per_s": core.cpu_s / run.duration_s}
+    return cost | scored(errors[counted], core.covariances[counted])
+
+
+def scored(errors: FloatArray, covariances: FloatArray) -> dict[str, float]:
+    """The share of poses that are tracked, and how exact these are.
+
+    Args:
+        errors: (K, N, 3) x, y [m], theta [rad]; not finite where a pose is not told as tracked.
+        covariances: (K, N, 3, 3) of them.
+    """
+    tracked = np.isfinite(errors).all(axis=-1)
+    return {
+        "tracked_share": float(np.mean(tracked)),
+        "position_rmse_mm": 1e3 * position_rmse(errors[tracked]),
+        "nees": mean_nees(errors[tracked], covariances[tracked]),
+    }
+
+
+def show(results: dict[tuple[Shape, int], dict[str, float]]) -> dict[str, float]:
+    """Print a table; return the figures by name."""
+    names = list(next(iter(results.values()))) if results else []
+    print(table(["shape", "robots", *names], [[s.value, n, *f.values()] for (s, n), f in results.items()]))
+    return {f"{s.value}.n{n}.{name}": value for (s, n), f in results.items() for name, value in f.items()}
+
 
 SIZES = (5, 20, 50, 100, 200, 300, 500, 1000)
 SHAPE_SIZES = (300, 1000)
@@ -36,10 +91,7 @@ SHAPE_DURATION_S = 120.0
 EXACT_S = 10.0
 """Of the largest swarms the exact filter has only so much: its cost per second grows with their cube."""
 LARGEST_FOR_EXACT = 300
-LARGEST_FOR_BATCH = 50
 DURATION_S = 20.0
-PEER_ROBOT_SECONDS = 1500.0
-"""Peers get the first part of a large swarm's run: their cost per second does not change with its length."""
 WARM_UP_S = 2.0
 SETTLING_S = 3.0  # Errors count from here on
 
@@ -59,95 +111,46 @@ def measure(robots: int, duration_s: float, seed: int, settings: Settings) -> di
         "prompt_cpu_s_per_s": prompt.cpu_s / run.duration_s,
         "heading_rmse_deg": float(np.degrees(np.sqrt(np.nanmean(errors[..., 2] ** 2)))),
     }
-    figures |= scored(errors, core.covariances[settled])
-    part = first_part(run, min(duration_s, max(2.0, PEER_ROBOT_SECONDS / robots)))
-    for name, peer in (("filterpy", filterpy_ekf), ("gtsam", gtsam_lag)):
-        figures[f"{name}_cpu_s_per_s"] = peer.solve(part, ticks(part)).cpu_s / part.duration_s
-        figures[f"{name}_cpu_ratio"] = figures[f"{name}_cpu_s_per_s"] / figures["cpu_s_per_s"]
-    if robots <= LARGEST_FOR_BATCH:
-        chosen = np.flatnonzero(settled)[:: max(1, int(settled.sum()) * robots // 240)]
-        best = gtsam_batch.solve(run, tick_ns[chosen])
-        optimum = position_rmse(errors_of(best.poses, run, tick_ns[chosen]))
-        reached = position_rmse(errors_of(core.poses[chosen], run, tick_ns[chosen]))
-        figures["position_rmse_ratio_to_batch"] = reached / optimum
-    return figures
-
-
-def first_part(run: SimulatedRun, duration_s: float) -> SimulatedRun:
-    """The run as if it had ended after `duration_s`."""
-    end_ns = run.start_ns + round(duration_s * 1e9)
-    kept = run.truth.stamp_ns <= end_ns
-    truth = replace(run.truth, stamp_ns=run.truth.stamp_ns[kept], poses=run.truth.poses[kept])
-    odometry = run.odometry[run.odometry["arrival_ns"] <= end_ns]
-    frames = run.frames[run.frames["arrival_ns"] <= end_ns]
-    return replace(
-        run, truth=truth, odometry=odometry, frames=frames, sightings=run.sightings[: frames["count"].sum()]
-    )
-
-
-def draw(results: dict[int, dict[str, float]]) -> None:
-    """CPU time and consistency against swarm size."""
-    figure, (speed, quality) = new_plot(2)
-    sizes = list(results)
-    names = (("", "this estimator"), ("filterpy_", "filterpy EKF"), ("gtsam_", "gtsam fixed-lag smoother"))
-    for prefix, label in names:
-        speed.plot(sizes, [results[n][f"{prefix}cpu_s_per_s"] for n in sizes], "o-", label=label)
-    speed.axhline(1.0, color="0.5", linestyle=":", label="real time")
-    speed.set(xscale="log", yscale="log", xlabel="robots", ylabel="CPU seconds per second")
-    speed.legend()
-    quality.plot(sizes, [results[n]["nees"] / 3.0 for n in sizes], "o-", label="NEES / 3")
-    with_batch = [n for n in sizes if "position_rmse_ratio_to_batch" in results[n]]
-    ratios = [results[n]["position_rmse_ratio_to_batch"] for n in with_batch]
-    quality.plot(with_batch, ratios, "s-", label="position RMSE / batch optimum")
-    quality.axhline(1.0, color="0.5", linestyle=":")
-    quality.set(xscale="log", xlabel="robots", ylim=(0.5, 1.5))
-    quality.legend()
-    print(f"plot: {save_plot(figure, 'scaling')}")
+    return figures | scored(errors, core.covariances[settled])
 
 
 def report(results: dict[int, dict[str, float]], shapes: dict[str, float], live: dict[str, float]) -> None:
-    """Print the tables, draw the plot and write the figures."""
-    keys = {
-        "cpu_s_per_s": "CPU s/s",
-        "prompt_cpu_s_per_s": "without delay s/s",
-        "filterpy_cpu_s_per_s": "filterpy s/s",
-        "gtsam_cpu_s_per_s": "gtsam s/s",
-        "gtsam_cpu_ratio": "gtsam / own",
-        "position_rmse_mm": "RMSE mm",
-        "heading_rmse_deg": "RMSE deg",
-        "position_rmse_ratio_to_batch": "RMSE / batch",
-        "nees": "NEES",
-        "tracked_share": "tracked",
-    }
-    rows = [[robots, *(figures.get(key) for key in keys)] for robots, figures in results.items()]
-    print(table(["robots", *keys.values()], rows))
+    """Print the table, draw the plot and write the figures."""
     if results:
-        draw(results)
-    flat = {
-        f"n{robots}.{key}": value for robots, figures in results.items() for key, value in figures.items()
-    }
-    flat |= shapes | live
-    print(f"figures: {write_figures('scaling', flat)}")
+        names = list(next(iter(results.values())))
+        print(table(["robots", *names], [[robots, *one.values()] for robots, one in results.items()]))
+        sizes, shown = list(results), ("cpu_s_per_s", "nees")
+        cpu, nees = ([one[name] for one in results.values()] for name in shown)
+        plot_curves(
+            "scaling",
+            ("robots", "CPU seconds per second", sizes, {"": cpu, "real time": np.ones(len(sizes))}),
+            ("robots", "NEES", sizes, {"": nees, "ideal": np.full(len(sizes), 3.0)}),
+            style="o-",
+            xscale="log",
+        )
+    sized = {f"n{robots}": figures for robots, figures in results.items()}
+    print(f"figures: {write_figures('scaling', flat(sized) | shapes | live)}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--robots", type=int, nargs="*", default=SIZES, help="swarm sizes")
-    parser.add_argument("--duration", type=float, default=DURATION_S, help="simulated time [s]")
-    parser.add_argument("--seed", type=int, default=1, help="of the simulation")
-    names = [shape.value for shape in Shape]
-    parser.add_argument("--shapes", nargs="*", choices=names, default=names, help="shapes of swarms")
-    parser.add_argument("--shape-robots", type=int, nargs="+", default=SHAPE_SIZES, help="their sizes")
-    parser.add_argument("--shape-duration", type=float, default=SHAPE_DURATION_S, help="simulated time [s]")
-    parser.add_argument("--shape-seeds", type=int, nargs="+", default=(1, 2, 3), help="of the simulation")
-    parser.add_argument("--no-live", action="store_true", help="leave the live graph out")
-    options = parser.parse_args(arguments)
-    settings = Settings()
+    names = tuple(shape.value for shape in Shape)
+    options = options_of(
+        __doc__,
+        arguments,
+        robots=(SIZES, "swarm sizes"),
+        duration=(DURATION_S, "simulated time [s]"),
+        seed=(1, "of the simulation"),
+        shapes=(names, "shapes of swarms", names),
+        shape_robots=(SHAPE_SIZES, "their sizes"),
+        shape_duration=(SHAPE_DURATION_S, "simulated time [s]"),
+        shape_seeds=((1, 2, 3), "of the simulation"),
+        no_live=(False, "leave the live graph out"),
+    )
     results = {}
     for robots in options.robots:
         print(f"{robots} robots ...", flush=True)
-        results[robots] = measure(robots, options.duration, options.seed, settings)
+        results[robots] = measure(robots, options.duration, options.seed, Settings())
     shaped = {}
     for name in options.shapes:
         for robots in options.shape_robots:

@@ -27,8 +27,9 @@ from bench.pushbot.exploration import (
     Exploration,
     PushBotNoise,
 )
+from bench.scenarios.bags import write_swarm_bag
 from bench.shared.bags import message_header
-from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
+from swarm_loc_drivers.pushbot.protocol import SENSOR_PX
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
 from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, FloorPlanError, floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import (
@@ -40,7 +41,6 @@ from swarm_loc_drivers.sim.pushbot.optics import (
     lights_of,
 )
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
-from swarm_loc_drivers.sim.scenarios.bags import write_swarm_bag
 from swarm_loc_estimator import (
     CooperativeMapper,
     Goal,

@@ -10,9 +10,9 @@ import numpy as np
 from bench.pushbot.event_feed import StandingBody
 from bench.pushbot.event_flow import RATE, EventFlow, Measured
 from bench.shared.common import Cell, new_plot, save_plot, table
-from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE, TIMESTAMPS
+from swarm_loc_drivers.pushbot.driver import PushbotSession
 from swarm_loc_drivers.pushbot.parameters import PushbotParameters
-from swarm_loc_drivers.pushbot.session import PushbotSession
+from swarm_loc_drivers.pushbot.protocol import SECOND_FIRMWARE, TIMESTAMPS
 from swarm_loc_drivers.sim.pushbot.firmware import EventRing, PushbotFirmware
 
 ROBOTS = (1, 2, 10)

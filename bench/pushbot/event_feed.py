@@ -10,7 +10,7 @@ import time
 
 import numpy as np
 
-from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE
+from swarm_loc_drivers.pushbot.protocol import SECOND_FIRMWARE
 from swarm_loc_drivers.sim.link_host import FirmwareHost
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking
 from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware

@@ -12,8 +12,7 @@ from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraEvents, C
 from swarm_loc_drivers.sim.pushbot.optics import spot_brightness
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.event_encoding import Events
-from swarm_loc_vision.events.parameters import LightSource, TrackerSettings
-from swarm_loc_vision.events.tracker import LightTracker
+from swarm_loc_vision.events.tracker import LightSource, LightTracker, TrackerSettings
 
 NOISES = (0.0, 1.0, 5.0, 15.0, 30.0)  # Noise events of a pixel [1/s]; the bar is at 15
 BAR_NOISE = 15.0

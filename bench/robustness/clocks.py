@@ -15,11 +15,11 @@ from itertools import pairwise
 import numpy as np
 
 from bench.graph.listener import Say
-from bench.graph.soak import BAG
 from bench.robustness import pauses
 from bench.robustness.load import BREAK_NS, Run, started
 from bench.robustness.pauses import PAUSES_S, misleading_share, stopped
 from bench.robustness.source import SourceSettings
+from bench.shared.common import DEMO_BAG as BAG
 from bench.shared.common import OUT
 from swarm_loc_estimator.common.launch import GraphOptions, graph_nodes
 from swarm_loc_estimator.offline.live_run import (

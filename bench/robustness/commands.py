@@ -64,7 +64,14 @@ class Command(NamedTuple):
     def line(self, given: Path, out: Path, full_bytes: int = -1) -> list[str]:
         """The command line; where no file may grow beyond `full_bytes`, -1 for any."""
         words = [word.format(given=given, out=out) for word in self.arguments.split()]
-        return [sys.executable, "-c", _START, *self.program.split(), str(full_bytes), *words]
+        return [
+            sys.executable,
+            "-c",
+            f"import sys; sys.path.append({str(BAGS.parent)!r})\n{_START}",
+            *self.program.split(),
+            str(full_bytes),
+            *words,
+        ]
 
 
 _ESTIMATOR, _VISION, _DRIVERS = (f"swarm_loc_{name}" for name in ("estimator", "vision", "drivers"))
@@ -90,10 +97,10 @@ COMMANDS = (
     Command(f"{_ESTIMATOR} import_droplets", "{given}/droplets.txt {out}/bag", "", "bag"),
     Command(f"{_VISION} print_markers", "--board 3x4 --out {out}/a.pdf", "a_board.yaml"),
     Command(f"{_VISION} detect", "{given}/eight_pictures --output {out}/bag", "", "bag"),
-    Command(f"{_DRIVERS} generate_bag", "eight {out}/bag --duration 4 --robots 1", "", "bag"),
-    Command(f"{_DRIVERS} generate_bag", "pictures {out}/bag --duration 2 --robots 1", "", "bag"),
-    Command(f"{_DRIVERS} generate_bag", "droplets {out}/bag --duration 4 --robots 3", "", "bag"),
-    Command(f"{_DRIVERS} generate_bag", "aerial {out}/bag --duration 4 --robots 2", "", "bag"),
+    Command("bench.scenarios generate_bag", "eight {out}/bag --duration 4 --robots 1", "", "bag"),
+    Command("bench.scenarios generate_bag", "pictures {out}/bag --duration 2 --robots 1", "", "bag"),
+    Command("bench.scenarios generate_bag", "droplets {out}/bag --duration 4 --robots 3", "", "bag"),
+    Command("bench.scenarios generate_bag", "aerial {out}/bag --duration 4 --robots 2", "", "bag"),
 )
 
 

@@ -21,7 +21,7 @@ import numpy as np
 from geometry_msgs.msg import PoseStamped, PoseWithCovarianceStamped
 
 from bench.graph.listener import Say
-from bench.graph.soak import BAG
+from bench.shared.common import DEMO_BAG as BAG
 from bench.shared.common import OUT
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
 from swarm_loc_estimator.common.launch import NodeSpec

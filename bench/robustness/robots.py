@@ -23,8 +23,8 @@ from swarm_loc_drivers.epuck.driver import EpuckDriver, EpuckListeners
 from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.pushbot.driver import PushbotDriver, PushbotListeners
-from swarm_loc_drivers.pushbot.hardware import MAX_TICK_RATE, SECOND_FIRMWARE
 from swarm_loc_drivers.pushbot.parameters import PushbotParameters
+from swarm_loc_drivers.pushbot.protocol import MAX_TICK_RATE, SECOND_FIRMWARE
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware

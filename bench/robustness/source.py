@@ -23,6 +23,9 @@ from rclpy.qos import QoSProfile
 from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 
+from bench.scenarios.bags import as_detections
+from bench.scenarios.lived_run import ODOMETRY_DTYPE, SimulatedRun
+from bench.scenarios.sightings import schedule_exposures
 from bench.shared.grid import (
     HOME_RADIUS,
     ODOMETRY,
@@ -33,9 +36,7 @@ from bench.shared.grid import (
     observe_neighbours,
 )
 from swarm_loc_drivers.sim.differential_drive import twist_of, wheel_paths
-from swarm_loc_drivers.sim.run import ODOMETRY_DTYPE, SimulatedRun, Trajectories
-from swarm_loc_drivers.sim.scenarios.bags import as_detections
-from swarm_loc_drivers.sim.sightings import schedule_exposures
+from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.detections import encode_detections

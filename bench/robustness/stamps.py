@@ -7,11 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from bench.integrity.fault import CLEAN, settings_of
-from bench.integrity.faults import simulate
+from bench.integrity.faults import CLEAN, settings_of, simulate
+from bench.scenarios.lived_run import SimulatedRun
 from bench.shared.common import ProgressLine
 from bench.shared.simulated_run import errors_of, estimates_of, inputs_of
-from swarm_loc_drivers.sim.run import SimulatedRun
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.offline.metrics import is_misleading
 from swarm_loc_estimator.timeline.estimator import Status

@@ -1,8 +1,7 @@
 """Bags for benchmarks and tests: their parts, ground truth received live, messages of many robots."""
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +23,15 @@ from swarm_loc_estimator.offline.recorded_bag import TruthReader
 from swarm_loc_estimator.swarm.swarm import Swarm
 
 
-def copy_part(bag: Path, folder: Path, end_s: float, begin_s: float = 0.0) -> int:
+def copy_part(
+    bag: Path,
+    folder: Path,
+    end_s: float = math.inf,
+    begin_s: float = 0.0,
+    *,
+    rename: Callable[[str, str], tuple[str, str]] = lambda name, kind: (name, kind),
+    change: Callable[[str, int, bytes], tuple[int, bytes]] = lambda _, log_ns, data: (log_ns, data),
+) -> int:
     """Copy some seconds of a bag to a new one.
 
     Args:
@@ -32,6 +39,8 @@ def copy_part(bag: Path, folder: Path, end_s: float, begin_s: float = 0.0) -> in
         folder: The new bag, created; must not exist.
         end_s: End of the part, by log time since the first message [s].
         begin_s: Its begin [s].
+        rename: Name and type of a topic -> those in the new bag.
+        change: Topic, log time [ns] and bytes of a message -> log time and bytes in the new bag.
 
     Returns:
         Number of messages.
@@ -41,16 +50,18 @@ def copy_part(bag: Path, folder: Path, end_s: float, begin_s: float = 0.0) -> in
     """
     count = 0
     with BagReader(bag) as reader, BagWriter(folder) as writer:
-        begin_ns, end_ns = (reader.time_range_ns[0] + round(1e9 * at_s) for at_s in (begin_s, end_s))
+        first_ns = reader.time_range_ns[0]
+        begin_ns, end_ns = (
+            first_ns + (round(1e9 * at) if math.isfinite(at) else at) for at in (begin_s, end_s)
+        )
         for topic in reader.topics:
-            writer.add_topic(topic.name, topic.type)
-        for name, _, log_ns, data in reader.messages():
+            writer.add_topic(*rename(topic.name, topic.type))
+        for name, kind, log_ns, data in reader.messages():
             if log_ns > end_ns:
                 break
-            if log_ns < begin_ns:
-                continue
-            writer.write(name, log_ns, bytes(data))
-            count += 1
+            if log_ns >= begin_ns:
+                writer.write(rename(name, kind)[0], *change(name, log_ns, bytes(data)))
+                count += 1
     return count
 
 

@@ -1,28 +1,23 @@
 """What all benchmarks share: the folder of results, tables, figures and the style of plots."""
 
-from __future__ import annotations
-
+import argparse
 import json
 import math
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from numpy.typing import ArrayLike
-
-    from swarm_loc_estimator.common.arrays import FloatArray, IntArray
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 OUT = Path(__file__).resolve().parents[2] / "out"  # Folder of results
+DEMO_BAG = OUT.parent / "bags" / "eight_five_robots"
 
 _STYLE = {
     "figure.constrained_layout.use": True,
@@ -37,6 +32,39 @@ _STYLE = {
 }
 
 Cell = str | float | int | None
+Curves = Mapping[str, "ArrayLike | tuple[ArrayLike, ArrayLike]"]
+"""Label -> values over a common abscissa, or values with an abscissa of their own; none of "" has a label."""
+
+
+def options_of(doc: str | None, arguments: Sequence[str] | None = None, **options: Any) -> argparse.Namespace:
+    """Options of a command line by name: default, help, and choices if any.
+
+    A default that is a tuple takes several values, False is a switch; types are those of the defaults.
+    """
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
+    for name, (default, text, *choices) in options.items():
+        flag = f"--{name.replace('_', '-')}"
+        if default is False:
+            parser.add_argument(flag, action="store_true", help=text)
+            continue
+        many = (
+            {"nargs": "*", "type": type(default[0])}
+            if isinstance(default, tuple)
+            else {"type": type(default)}
+        )
+        parser.add_argument(flag, default=default, help=text, choices=choices[0] if choices else None, **many)
+    return parser.parse_args(arguments)
+
+
+def flat(results: Mapping[Any, Any], prefix: str = "") -> dict[str, float]:
+    """Nested results as one mapping, names joined by points; what is not finite is left out."""
+    out: dict[str, float] = {}
+    for name, value in results.items():
+        if isinstance(value, Mapping):
+            out |= flat(value, f"{prefix}{name}.")
+        elif math.isfinite(value):
+            out[f"{prefix}{name}"] = value
+    return out
 
 
 def table(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
@@ -50,11 +78,6 @@ def table(columns: Sequence[str], rows: Sequence[Sequence[Cell]]) -> str:
 def rms(values: ArrayLike) -> float:
     """Root mean square of numbers."""
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def equal_parts(values: FloatArray, count: int) -> list[IntArray]:
-    """Indices of values by size, in so many parts of about as many each."""
-    return np.array_split(np.argsort(values, kind="stable"), count)
 
 
 def write_figures(name: str, figures: Mapping[str, float], folder: Path = OUT / "bench") -> Path:
@@ -87,6 +110,35 @@ def save_plot(figure: Figure, name: str, folder: Path = OUT) -> Path:
     path = folder / f"{name}.png"
     figure.savefig(path)
     plt.close(figure)
+    return path
+
+
+def plot_curves(
+    name: str,
+    *plots: tuple[str, str, ArrayLike, Curves],
+    style: str = "-",
+    folder: Path = OUT,
+    **settings: Any,
+) -> Path:
+    """Plot curves side by side as out/NAME.png; returns the file.
+
+    Args:
+        name: Of the file.
+        plots: Labels of abscissa and ordinate, abscissa (n,), and curves (n,) or (n, k) by name.
+        style: Of all curves.
+        folder: Of the file.
+        settings: Of all axes, such as `yscale`.
+    """
+    figure, axes = new_plot(len(plots))
+    for axis, (xlabel, ylabel, x, curves) in zip(axes, plots, strict=True):
+        for label, values in curves.items():
+            at, shown = values if isinstance(values, tuple) else (x, values)
+            axis.plot(at, shown, style, label=label or None)
+        axis.set(xlabel=xlabel, ylabel=ylabel, **settings)
+        if any(curves):
+            axis.legend(fontsize=8)
+    path = save_plot(figure, name, folder)
+    print(f"plot: {path}")
     return path
 
 

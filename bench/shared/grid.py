@@ -5,8 +5,6 @@ the landmarks that stand around the grid, one pitch outside. Odometry comes at 2
 each robot at its own phase.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import Enum
@@ -15,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from swarm_loc_drivers.sim.differential_drive import Controller, Drive, record_drive
-from swarm_loc_drivers.sim.run import SIGHTING_DTYPE, Records, SimulatedRun, Trajectories
-from swarm_loc_drivers.sim.sightings import Exposures, View, deliver, schedule_exposures
+from bench.scenarios.lived_run import SIGHTING_DTYPE, Records, SimulatedRun, record_drive
+from bench.scenarios.sightings import Exposures, View, deliver, schedule_exposures
+from swarm_loc_drivers.sim.differential_drive import Controller, Drive
+from swarm_loc_drivers.sim.run import Trajectories
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.error_models import OdometryModel, SensorModel

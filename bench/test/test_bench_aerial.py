@@ -1,13 +1,10 @@
 """The benchmark's worlds, rates and figures are sound."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from bench.aerial import calibration, driving
-from bench.aerial.rates import Rate, Results
-from bench.aerial.worlds import Conditions, simulate
+from bench.aerial import chains as statistics
+from bench.aerial.chains import Conditions, Rate, Results, simulate
 from swarm_loc_estimator.identification.chain import ChainModel
 
 SEED = 77
@@ -34,7 +31,7 @@ def test_the_interval_of_a_rate_holds_it_and_narrows() -> None:
 
 def test_chains_find_most_robots_and_sure_answers_are_right() -> None:
     results = Results()
-    reliability = calibration.measure(results, 15, SEED)
+    reliability = statistics.measure_calibration(results, 15, SEED)
     assert results.rates["calibration.right_share_at_99"].share >= 0.95
     assert reliability.binned()[2].sum() == reliability.right.size
     rng, right = np.random.default_rng(SEED), 0
@@ -42,6 +39,6 @@ def test_chains_find_most_robots_and_sure_answers_are_right() -> None:
         conditions = Conditions(10, 4)
         world = simulate(conditions, rng)
         for robot in range(5):
-            *_, chains = driving.followed(world, robot, conditions, ChainModel())
+            *_, chains = statistics.followed(world, robot, conditions, ChainModel())
             right += int(np.argmax(chains.probabilities)) == world.place_of(robot, 3)
     assert right >= 17

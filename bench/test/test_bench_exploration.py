@@ -1,7 +1,5 @@
 """PushBots in floor plans: motion and readings, a short exploration, and its bag through the mapper."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any
@@ -22,8 +20,7 @@ from swarm_loc_estimator.common.messages.event_encoding import decode_events
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.scans import LightSightings
-from swarm_loc_vision.events.parameters import LightSource, TrackerSettings
-from swarm_loc_vision.events.tracker import LightTracker
+from swarm_loc_vision.events.tracker import LightSource, LightTracker, TrackerSettings
 from swarm_loc_vision.laser.calibration import load_laser
 
 ROOM = FloorPlan("room", outline([(0, 0, 4, 3)], [(2, 1, 2.5, 2)]), np.array([[1.0, 1.5], [3.5, 1.5]]))

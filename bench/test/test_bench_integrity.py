@@ -1,7 +1,5 @@
 """Faults are reported, and no robot is TRACKED with a wrong pose; with seeds that no figure comes from."""
 
-from __future__ import annotations
-
 import pickle
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench.integrity.faults import seconds
-from bench.integrity.late_start import run_late_start
+from bench.integrity.live import run_late_start
 from bench.integrity.scenarios import SCENARIOS
 from bench.integrity.scoring import Blame, Named, blame_of, score
 from bench.integrity.sensors import SENSOR_SCENARIOS

@@ -1,7 +1,5 @@
 """Drivers of all protocols under corrupted bytes: no thread ends, no error is hidden, no nonsense is life."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -9,8 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.integrity.fault import CLEAN, settings_of
-from bench.integrity.faults import simulate
+from bench.integrity.faults import CLEAN, settings_of, simulate
 from bench.robustness.protocols import Stream
 from bench.robustness.robots import PROTOCOLS, Run
 from bench.robustness.stamps import CHANGES, misleading_share, with_stamps

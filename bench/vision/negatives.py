@@ -1,7 +1,5 @@
 """False-positive rates: squares that are no markers, and how many of them are read as an id."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import cv2
@@ -10,8 +8,7 @@ import numpy as np
 from bench.vision.peers import FAMILY, own_detector
 from bench.vision.scenes import Gray, Look, random_scene
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
-from swarm_loc_vision.markers.families import CODE_OTHER, Family, families, family_named
-from swarm_loc_vision.markers.layouts import Layout
+from swarm_loc_vision.markers.families import CODE_OTHER, Family, Layout, families, family_named
 
 _INK, _PAPER, _MARGIN_PX = 25.0, 225.0, 20
 _FEW_IDS = np.arange(16)

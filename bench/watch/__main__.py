@@ -5,13 +5,10 @@
 
 Latency is from the stamp of a pose, when it is published, through DDS, `watch_node`, the WebSocket and
 Chromium (without a window and without a GPU) to the task after the page was painted. The poses come from a
-stand-in for the estimator, `bench.watch.publisher`, at 20 Hz; and, as `robots5_estimated`, from the real one,
-which gets what five robots have sent as if they sent it now. Its load is measured on bags that are played.
+stand-in for the estimator, `bench.watch.publisher`, at 20 Hz. The estimator's load is measured on bags that
+are played.
 """
 
-from __future__ import annotations
-
-import argparse
 import os
 import sys
 import tempfile
@@ -20,17 +17,25 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from domain_coordinator import domain_id
 from playwright.sync_api import Browser
 
-from bench.shared.common import OUT, ProgressLine, new_plot, save_plot, table, write_figures
+from bench.scenarios.bags import write_bag
+from bench.shared.common import (
+    DEMO_BAG,
+    OUT,
+    ProgressLine,
+    flat,
+    options_of,
+    plot_curves,
+    table,
+    write_figures,
+)
 from bench.shared.grid import GridSettings, simulate_grid
 from bench.watch.browser import WatchedPage, chromium, running_browser
 from bench.watch.publisher import homes
-from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_estimator.common.launch import (
     Child,
     GraphOptions,
@@ -49,45 +54,24 @@ from swarm_loc_estimator.watch.server import free_port
 SIZES = (5, 300, 1000)
 BARS_MS = {5: 100.0, 300: 150.0, 1000: 250.0}
 LOADED = (5, 300)
-DEMO_BAG = OUT.parent / "bags" / "eight_five_robots"
 _PATIENCE_MS = 60_000
 _SETTLED = 20  # So many poses are painted before any counts
 
 Samples = dict[str, list[float]]
 
 
-class Source(NamedTuple):
-    """Where poses come from."""
-
-    swarm_file: Path  # Whose
-    commands: Sequence[Sequence[str]]  # Programs that publish them
-
-
-def stand_in(robots: int, work: Path) -> Source:
-    """A swarm of one size without an estimator."""
+def measure(browser: Browser, robots: int, work: Path, seconds: float) -> tuple[dict[str, float], Samples]:
+    """Figures of a page with robots without an estimator, and latencies and times of painting [ms]."""
     swarm_file = work / f"swarm{robots}.yaml"
     save_swarm(swarm_of(robots), swarm_file, "Robots of a benchmark.")
-    return Source(swarm_file, [[sys.executable, "-m", "bench.watch.publisher", str(swarm_file)]])
-
-
-def real() -> Source:
-    """Five robots with the estimator."""
-    swarm_file = DEMO_BAG / "swarm.yaml"
-    parameters: dict[str, ParameterValue] = {"swarm_file": str(swarm_file)}
-    estimator = NodeSpec("swarm_loc_estimator", "estimator_node", "estimator", parameters=parameters)
-    robots = [sys.executable, "-m", "bench.watch.restamped", str(DEMO_BAG)]
-    return Source(swarm_file, [node_command(estimator), robots])
-
-
-def measure(browser: Browser, source: Source, seconds: float) -> tuple[dict[str, float], Samples]:
-    """Figures of a page, and latencies and times of painting [ms]."""
+    publisher = [sys.executable, "-m", "bench.watch.publisher", str(swarm_file)]
     with ExitStack() as stack:
         stack.enter_context(own_domain())
         port = free_port()
         log = stack.enter_context((OUT / "watch.log").open("wb"))
-        parameters: dict[str, ParameterValue] = {"swarm_file": str(source.swarm_file), "port": port}
+        parameters: dict[str, ParameterValue] = {"swarm_file": str(swarm_file), "port": port}
         node = NodeSpec("swarm_loc_estimator", "watch_node", "watch", parameters=parameters)
-        children = [Child(node, start(command, log)) for command in (node_command(node), *source.commands)]
+        children = [Child(node, start(command, log)) for command in (node_command(node), publisher)]
         stack.callback(stop, children, lambda _: None)
         page = open_page(browser, port, children[0])
         page.until(f"watch.metrics.latency.length > {_SETTLED}", round(1e3 * START_PATIENCE_S))
@@ -179,27 +163,15 @@ def bag_of(robots: int, work: Path) -> Path:
     return bag
 
 
-def draw(samples: dict[int, Samples]) -> None:
-    """How many poses are how old when painted, and what painting takes."""
-    figure, axes = new_plot(2)
-    for axis, name, label in zip(
-        axes, ("latency", "frame"), ("stamp to painted [ms]", "painting [ms]"), strict=True
-    ):
-        for robots, of_size in samples.items():
-            values = np.sort(of_size[name])
-            axis.plot(values, np.arange(1, values.size + 1) / values.size, label=f"{robots} robots")
-        axis.set(xlabel=label, ylabel="share", ylim=(0.0, 1.02))
-        axis.legend(loc="lower right")
-    print(f"plot: {save_plot(figure, 'watch')}")
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the benchmark; its exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=15.0, help="how long each page is watched")
-    parser.add_argument("--sizes", type=int, nargs="+", default=SIZES, help="numbers of robots")
-    parser.add_argument("--no-load", action="store_true", help="leave the estimator's load out")
-    options = parser.parse_args(arguments)
+    options = options_of(
+        __doc__,
+        arguments,
+        seconds=(15.0, "how long each page is watched"),
+        sizes=(SIZES, "numbers of robots"),
+        no_load=(False, "leave the estimator's load out"),
+    )
     executable = chromium()
     if executable is None:
         print("There is no Chromium here: apt-get install chromium.", file=sys.stderr)
@@ -210,10 +182,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as work, running_browser(executable) as browser:
         for robots in options.sizes:
             progress(f"page with {robots} robots")
-            source = stand_in(robots, Path(work))
-            results[robots], samples[robots] = measure(browser, source, options.seconds)
-        progress("page with 5 robots and the estimator")
-        estimated, _ = measure(browser, real(), options.seconds)
+            results[robots], samples[robots] = measure(browser, robots, Path(work), options.seconds)
         for robots in () if options.no_load else LOADED:
             progress(f"estimator of {robots} robots")
             bag, figures = bag_of(robots, Path(work)), results.setdefault(robots, {})
@@ -222,16 +191,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # table and figures
     print()
     names = list(dict.fromkeys(name for figures in results.values() for name in figures))
-    columns = [*results.values(), estimated]
-    rows = [[name, *(figures.get(name) for figures in columns)] for name in names]
-    bars = ["bar: latency_ms", *(BARS_MS.get(robots) for robots in results), BARS_MS[5]]
-    heads = [*(f"{robots} robots" for robots in results), "5, estimated"]
-    print(table(["figure", *heads], [*rows, bars]))
-    draw(samples)
-    flat = {f"robots{n}.{name}": value for n, figures in results.items() for name, value in figures.items()}
-    flat |= {f"robots5_estimated.{name}": value for name, value in estimated.items()}
-    flat["machine_load"] = os.getloadavg()[0]
-    print(f"figures: {write_figures('watch', flat)}; load of the machine {flat['machine_load']:.1f}")
+    rows = [[name, *(figures.get(name) for figures in results.values())] for name in names]
+    bars = ["bar: latency_ms", *(BARS_MS.get(robots) for robots in results)]
+    print(table(["figure", *(f"{robots} robots" for robots in results)], [*rows, bars]))
+    for name, label in (("latency", "stamp to painted [ms]"), ("frame", "painting [ms]")):
+        curves = {}
+        for robots, of_size in samples.items():
+            values = np.sort(of_size[name])
+            curves[f"{robots} robots"] = (values, np.arange(1, values.size + 1) / values.size)
+        plot_curves(f"watch-{name}", (label, "share", (), curves))
+    sized = flat({f"robots{n}": figures for n, figures in results.items()})
+    print(f"figures: {write_figures('watch', sized | {'machine_load': os.getloadavg()[0]})}")
     return 0
 
 

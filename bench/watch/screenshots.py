@@ -1,12 +1,9 @@
 """Photograph the page for the documentation: ./run -- python -m bench.watch.screenshots [--only NAME].
 
 Five e-pucks and twenty Droplets as the bags of this repository hold them, three hundred simulated robots,
-each replayed by the estimator, and three PushBots that make a map; shown in Chromium as by `report.html`.
+each replayed by the estimator; shown in Chromium as by `report.html`.
 """
 
-from __future__ import annotations
-
-import argparse
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -15,12 +12,10 @@ from typing import NamedTuple
 
 from playwright.sync_api import Browser
 
-from bench.pushbot.runs import RunSettings
-from bench.shared.common import OUT
+from bench.scenarios.bags import write_bag
+from bench.shared.common import OUT, options_of
 from bench.shared.grid import GridSettings, simulate_grid
 from bench.watch.browser import WatchedPage, chromium, running_browser
-from bench.watch.mapping_run import mapping_run
-from swarm_loc_drivers.sim.scenarios.bags import write_bag
 from swarm_loc_estimator.common.command_line import swarm_beside
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.report.report import recorded
@@ -32,14 +27,13 @@ FOLDER = ROOT / "swarm_loc_estimator" / "doc" / "watch"
 SIZE = (1200, 760)
 ROBOTS = 300
 _GRID_S = 8.0
-MAPPED = RunSettings("office", slip=0.02, seed=1, minutes=6.0, robots=3)
 
 
 class Picture(NamedTuple):
     """What to photograph."""
 
     name: str  # Of the file
-    bag: Path | None  # What was recorded; None: the run of the mapper
+    bag: Path  # What was recorded
     share: float  # At which part of the run
     theme: str  # light or dark
     selected: int  # The robot whose numbers are shown, -1 for none
@@ -48,7 +42,8 @@ class Picture(NamedTuple):
 def photograph(browser: Browser, picture: Picture, work: Path, out: Path) -> Path:
     """Replay a bag and take its picture; returns the file."""
     file = work / f"{picture.name}.html"
-    file.write_text(page(_recording(picture.bag)), encoding="utf-8")
+    result = replay(picture.bag, load_swarm(swarm_beside(picture.bag)), keep_sightings=True)
+    file.write_text(page(recorded(result)), encoding="utf-8")
     shown = WatchedPage(browser, file.as_uri(), SIZE)
     shown.until("watch.playing && watch.fitted")
     shown.evaluate(f"{{ watch.setTheme('{picture.theme}'); watch.panel.select({picture.selected}) }}")
@@ -62,19 +57,11 @@ def photograph(browser: Browser, picture: Picture, work: Path, out: Path) -> Pat
     return path
 
 
-def _recording(bag: Path | None) -> str:
-    """What the page plays."""
-    if bag is None:
-        return mapping_run(MAPPED)
-    return recorded(replay(bag, load_swarm(swarm_beside(bag)), keep_sightings=True))
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Take all pictures; the exit status."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--out", type=Path, default=FOLDER, help="folder for the pictures")
-    parser.add_argument("--only", help="the one picture to take")
-    options = parser.parse_args(arguments)
+    options = options_of(
+        __doc__, arguments, out=(FOLDER, "folder for the pictures"), only=("", "the one picture to take")
+    )
     executable = chromium()
     if executable is None:
         print("There is no Chromium here: apt-get install chromium.", file=sys.stderr)
@@ -82,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options.out.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as folder, running_browser(executable) as browser:
         grid = Path(folder) / "grid"
-        if options.only in (None, "robots300"):
+        if options.only in ("", "robots300"):
             write_bag(
                 simulate_grid(GridSettings(robots=ROBOTS, duration_s=_GRID_S)), grid, f"{ROBOTS} robots."
             )
@@ -90,9 +77,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             Picture("epucks", ROOT / "bags" / "eight_five_robots", 0.6, "light", 1),
             Picture("droplets", ROOT / "bags" / "droplets_twenty", 0.7, "dark", -1),
             Picture("robots300", grid, 0.9, "light", -1),
-            Picture("mapper", None, 1.0, "light", -1),
         ):
-            if options.only not in (None, picture.name):
+            if options.only not in ("", picture.name):
                 continue
             print(photograph(browser, picture, Path(folder), options.out), flush=True)
     return 0

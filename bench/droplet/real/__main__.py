@@ -10,8 +10,6 @@ apart with no other robot within 44 mm of the line between them. Headings of the
 fit found of each robot's fiducial. At the end whole recordings go through the estimator, see `graph`.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile
@@ -21,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.droplet.real import firmware, graph
-from bench.droplet.real.recordings import Recorded, read_folder
+from bench.droplet.real import graph
+from bench.droplet.real.graph import Recorded, read_folder
 from bench.shared.common import OUT, Cell, ProgressLine, table, write_figures
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.command_line import exit_with_message
@@ -41,7 +39,7 @@ from swarm_loc_estimator.offline.calibration.infrared.board import (
 from swarm_loc_estimator.swarm.ir_board import load_ir_platform
 
 DEFAULT_FOLDER = OUT.parent.parent / "shared" / "data" / "droplet_2016"
-METHODS = ("firmware", "stock", "board")
+METHODS = ("stock", "board")
 RANGES = (0.05, 0.2)
 _CHI_SQUARE_99 = 11.345
 _UNITS = np.array([100.0, np.degrees(1.0), np.degrees(1.0)])
@@ -116,8 +114,6 @@ def add(done: BoardCalibration, data: BoardReadings, results: dict[str, Results]
     paper = load_ir_platform("droplet")
     stock = replace(paper, amplitudes=paper.amplitudes[:1])
     estimators = {"stock": MaximumLikelihood(stock), "board": MaximumLikelihood(model.platform)}
-    found = firmware.solve(data.readings, np.array(model.platform.angles))
-    gather(results["firmware"], found, truth, None)
     readings = data.readings[:, None]
     for name, estimator in estimators.items():
         gains = pair_gains(model, data, known=done.with_gains) if name == "board" else None
@@ -125,16 +121,15 @@ def add(done: BoardCalibration, data: BoardReadings, results: dict[str, Results]
         gather(results[name], solutions.poses, truth, solutions.covariances)
 
 
-def gather(result: Results, found: FloatArray, truth: FloatArray, covariances: FloatArray | None) -> None:
+def gather(result: Results, found: FloatArray, truth: FloatArray, covariances: FloatArray) -> None:
     """Add poses (k, 3), NaN where there is none."""
     solved = np.isfinite(found).all(axis=1)
     errors = found[solved] - truth[solved]
     errors[:, 1:] = wrap_angle(errors[:, 1:])
     result.errors.append(errors)
     result.asked += len(found)
-    if covariances is not None:
-        half = np.linalg.solve(covariances[solved], errors[..., None])[..., 0]
-        result.nees.append(np.sum(errors * half, axis=1))
+    half = np.linalg.solve(covariances[solved], errors[..., None])[..., 0]
+    result.nees.append(np.sum(errors * half, axis=1))
 
 
 def report(results: dict[str, Results]) -> dict[str, float]:

@@ -13,15 +13,24 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.droplet.real.recordings import Recorded
-from bench.integrity.scoring import Estimated, Score, scored
-from bench.shared.common import OUT, Cell, ProgressLine, new_plot, save_plot, table
+from bench.integrity.scoring import Estimated, Score, plot_errors, scored
+from bench.shared.common import OUT, Cell, ProgressLine, table
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.launch import GraphOptions
+from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import Trajectory, interpolate
 from swarm_loc_estimator.filter.measurements import select
-from swarm_loc_estimator.offline.calibration.infrared.board import GAIN_SIGMA, BoardCalibration, without_dead
+from swarm_loc_estimator.offline.calibration.infrared.board import (
+    GAIN_SIGMA,
+    BoardCalibration,
+    BoardReadings,
+    BoardRecording,
+    read_board,
+    without_dead,
+)
+from swarm_loc_estimator.offline.calibration.recording import read_recording
+from swarm_loc_estimator.offline.datasets.droplets import ImportSettings, import_recording
 from swarm_loc_estimator.offline.live_run import compare_with_replay, play_live
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.offline.result import ReplayResult
@@ -41,7 +50,6 @@ class Outcome:
     """A recording through the estimator."""
 
     score: Score  # As `bench.integrity` has it, of the instants with truth
-    estimated: Estimated  # What it is of
     located_share: float  # Share of the robots that can be seen that were located at all
     tracked_share: float  # Share of all robots' instants that were told as tracked, with truth or without
     position_cm: FloatArray  # (K,) errors of the poses told as tracked whose truth is known
@@ -92,7 +100,7 @@ def report(outcomes: dict[str, Outcome], agreement: dict[str, float]) -> None:
     head = ["graph", "located", "tracked", "cm", "90 % cm", "heading known", "deg", "NEES", "misleading"]
     print(table(head, rows))
     print(table(["live beside replay", ""], [[name, value] for name, value in agreement.items()]))
-    print(f"plot: {draw(outcomes)}")
+    print(f"plot: {plot_errors({name: [one.score] for name, one in outcomes.items()}, 'droplet_real')}")
 
 
 def described(recorded: Recorded, done: BoardCalibration, names: list[str]) -> Path:
@@ -157,7 +165,6 @@ def outcome_of(result: ReplayResult, yaw: dict[str, float], seen: set[str]) -> O
     told, known = error[tracked], result.heading_known[tracked]
     return Outcome(
         scored(estimated),
-        estimated,
         float(np.mean(located)),
         float(np.mean(result.status == Status.TRACKED)),
         100.0 * np.hypot(told[:, 0], told[:, 1]),
@@ -190,13 +197,50 @@ def lived(
     }
 
 
-def draw(outcomes: dict[str, Outcome]) -> Path:
-    """Errors of all robots over time, misleading ones marked, a plot per run."""
-    figure, axes = new_plot(len(outcomes), width=4.2)
-    for axis, (name, one) in zip(axes, outcomes.items(), strict=True):
-        score = one.score
-        axis.semilogy(score.time_s, 100.0 * score.error_m, color="0.6", linewidth=0.6)
-        ticks, robots = np.nonzero(score.misleading)
-        axis.semilogy(score.time_s[ticks], 100.0 * score.error_m[ticks, robots], "r.", markersize=2)
-        axis.set(title=name, xlabel="time [s]", ylabel="position error [cm]", ylim=(0.01, 50.0))
-    return save_plot(figure, "droplet_real")
+@dataclass(frozen=True)
+class Recorded:
+    """A recording whose robots are numbered across all recordings."""
+
+    name: str  # Of the file, without its ending
+    bag: Path  # What it was imported to
+    swarm: Swarm  # As the importer describes it
+    data: BoardReadings  # All exchanges whose poses are known
+    clear: BoardReadings  # Those of them with nobody in between
+
+
+def read_folder(folder: Path, names: list[str], work: Path) -> list[Recorded]:
+    """All recordings of a folder as bags in `work`; robots that are new are added to the names.
+
+    Raises:
+        UserError: There is none.
+    """
+    paths = sorted(folder.glob("*.txt"))
+    if not paths:
+        raise UserError(f"'{folder}' holds no recording (*.txt).")
+    work.mkdir()
+    recordings = []
+    for path in paths:
+        progress, bag = ProgressLine(path.name), work / path.stem
+        done = import_recording(path, bag, ImportSettings(), lambda _, what, p=progress: p(what))  # type: ignore[misc]
+        swarm = load_swarm(bag / "swarm.yaml")
+        board = read_board(read_recording(bag, swarm), swarm)
+        print(
+            f"\r{path.name}: {done.exchanges} exchanges, {done.with_truth} with truth;"
+            f" {' '.join(done.remarks)}"
+        )
+        data = _numbered(board, swarm, names)
+        recordings.append(Recorded(path.stem, bag, swarm, data, select(data, board.clear)))
+    return recordings
+
+
+def _numbered(board: BoardRecording, swarm: Swarm, names: list[str]) -> BoardReadings:
+    """All exchanges, by the places of robots in `names`, to which new ones are added."""
+    of_robot = []
+    for index in board.robots:
+        name = swarm.robots[index].name
+        if name not in names:
+            names.append(name)
+        of_robot.append(names.index(name))
+    numbers = np.array(of_robot)
+    data = board.data
+    return data._replace(receiver=numbers[data.receiver], transmitter=numbers[data.transmitter])

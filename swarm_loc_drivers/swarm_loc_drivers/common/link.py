@@ -130,9 +130,6 @@ def _reason(error: Exception) -> str:
     return str(error.args[-1])
 
 
-_CHUNK = 1 << 16
-
-
 class TcpLink:
     """A TCP connection; the robot is the server. Connecting, and a write, have a timeout [s].
 
@@ -153,7 +150,7 @@ class TcpLink:
         """See `Link.read`."""
         try:
             self._socket.settimeout(timeout_s)
-            data = self._socket.recv(_CHUNK)
+            data = self._socket.recv(1 << 16)
         except (TimeoutError, BlockingIOError):
             return b""
         except OSError as error:

@@ -1,19 +1,159 @@
-"""Thread of a driver: connects to one robot, reconnects after failures, stops the robot at the end."""
+"""Session, velocity command and driver of one robot: a thread that connects, and stops it at the end."""
 
 from __future__ import annotations
 
 import math
+import re
 import threading
 import time
 import traceback
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from contextlib import suppress
-from typing import Generic, TypeVar
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 from swarm_loc_drivers.common.link import Link, LinkError
-from swarm_loc_drivers.common.session import Session, SessionError
+from swarm_loc_estimator.common.parameters import flag, number, text
+
+STANDING_CLOCK_S = 1.0  # A clock that stands still for so long of real time is dead: the robot stops [s]
+MAX_VELOCITY = 1e3  # [m/s] and [rad/s]; larger velocities are dropped as errors
+
+Velocity = tuple[float, float, float]  # Forward [m/s], to the left [m/s], turning to the left [rad/s]
+STILL: Velocity = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DriverParameters:
+    """Parameters that all drivers have."""
+
+    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "time without cmd_vel until the robot stops")
+    odom_frame: str = text("odom", "the pose is in <robot>/odom_frame", required=True)
+    base_frame: str = text("base_link", "the pose is that of <robot>/base_frame", required=True)
+    publish_tf: bool = flag(True, "publish the transform from odom to base_link")
+
+
+class VelocityCommand:
+    """Holds the newest velocity; zero after a timeout [s].
+
+    The clock [ns] may be simulated, and 0 means no time; `steady_s` is real time. Counts `bad_cmd_vel` and
+    `stale_cmd_vel`.
+    """
+
+    def __init__(
+        self,
+        timeout_s: float,
+        clock: Callable[[], int],
+        counts: Counter[str],
+        steady_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._timeout_ns = round(timeout_s * 1e9)
+        self._clock = clock
+        self._counts = counts
+        self._steady_s = steady_s
+        self._latest: tuple[int, Velocity] | None = None
+        self._expired: tuple[int, Velocity] | None = None  # by `velocity`; `_latest` by `set`
+        self._clock_ran = (0, steady_s())
+
+    def set(self, velocity: Velocity) -> None:
+        """Take a velocity; one that is not finite or too large is dropped."""
+        if not all(abs(component) <= MAX_VELOCITY for component in velocity):
+            self._counts["bad_cmd_vel"] += 1
+            return
+        self._latest = (self._clock(), velocity)
+
+    def velocity(self) -> Velocity:
+        """The velocity to drive now."""
+        latest, now_ns = self._latest, self._clock()
+        if now_ns != self._clock_ran[0]:
+            self._clock_ran = (now_ns, self._steady_s())
+        if latest is None or latest is self._expired:
+            return STILL
+        age_ns = now_ns - latest[0]
+        if 0 <= age_ns <= self._timeout_ns and self._steady_s() <= self._clock_ran[1] + STANDING_CLOCK_S:
+            return latest[1]
+        if latest[1] != STILL:
+            self._counts["stale_cmd_vel"] += 1
+        self._expired = latest
+        return STILL
+
+
+MAX_NONSENSE_S = 2.5  # A robot whose answers make no sense for so long is no longer connected [s]
+NONSENSE = "what the robot sends makes no sense"
+_MAX_RECEIVED = 1 << 16  # Bytes kept while an answer is awaited: a camera may still be streaming
+
+Result = TypeVar("Result")
+Talk = Generator[None, None, Result]  # Part of a conversation; it continues at every step
+
+
+class SessionError(Exception):
+    """The robot does not answer as it must; the link is closed and opened again."""
+
+
+class Session(Protocol):
+    """A conversation with one robot."""
+
+    ending: bool  # Set it to stop the robot and end the conversation
+    connected: bool  # Whether the robot has answered; `step` fails soon after answers make no sense
+    ended: bool  # Whether the conversation has ended; the robot stands
+
+
+class TalkSession(ABC):
+    """A `Session` that is written as one generator, and counts what happens."""
+
+    def __init__(self, counts: Counter[str]) -> None:
+        self.ending = self.connected = self.ended = False
+        self._counts = counts
+        self._received = self._output = b""
+        self._now_ns, self._steady_s = 0, 0.0
+        self._talk = self._run()
+
+    @abstractmethod
+    def _run(self) -> Talk[None]:
+        """Talk to the robot: append to `_output`, yield, and read `_received`."""
+
+    def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
+        """Continue the conversation with the bytes received since the last step; returns bytes to send.
+
+        The time [ns] may be simulated, stand still or jump back; 0 means no time. `steady_s` is real time.
+
+        Raises:
+            SessionError: The robot does not answer as it must.
+        """
+        self._received += data
+        self._now_ns, self._steady_s = now_ns, steady_s
+        try:
+            next(self._talk)
+        except StopIteration:
+            self.ended = True
+        output, self._output = self._output, b""
+        return output
+
+    def _ask_once(
+        self, request: bytes, answer: re.Pattern[bytes], timeout_s: float
+    ) -> Talk[re.Match[bytes] | None]:
+        """Send a request and wait for its answer; None after the timeout."""
+        self._received = b""
+        self._output += request
+        deadline_s = self._steady_s + timeout_s
+        while self._steady_s < deadline_s:
+            yield
+            if match := answer.search(self._received):
+                self._received = self._received[match.end() :]
+                return match
+            self._received = self._received[-_MAX_RECEIVED:]
+        return None
+
+    def _ask(
+        self, request: bytes, answer: re.Pattern[bytes], timeout_s: float, tries: int, who: str = ""
+    ) -> Talk[re.Match[bytes]]:
+        """The answer to a request, which is sent several times; an error says `who` does not answer."""
+        for _ in range(tries):
+            if (match := (yield from self._ask_once(request, answer, timeout_s))) is not None:
+                return match
+        raise SessionError(f"the robot does not answer{who}")
+
 
 _MIN_PAUSE_S, _MAX_PAUSE_S = 0.1, 2.0
 NO_CLOCK = "waiting for simulated time: nothing on /clock yet"

@@ -1,40 +1,131 @@
-"""A node around the driver of one robot: it starts the driver, and stops the robot at the end."""
+"""A node around the driver of one robot: it starts the driver, and stops the robot at the end.
+
+Odometry, images and calibrations as ROS messages.
+"""
 
 from __future__ import annotations
 
+import math
 import time
+from array import array
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
-from geometry_msgs.msg import Twist
+import numpy as np
+from builtin_interfaces.msg import Time as TimeMessage
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Twist, Vector3
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.time import Time
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
 
-from swarm_loc_drivers.common.robot_driver import NO_CLOCK, RobotDriver
-from swarm_loc_drivers.common.ros_messages import OdometryOutput, transform_publisher
-from swarm_loc_drivers.common.velocity_command import Velocity
+from swarm_loc_drivers.common.calibration_file import CameraCalibration
+from swarm_loc_drivers.common.odometry import OdometryState
+from swarm_loc_drivers.common.robot_driver import NO_CLOCK, DriverParameters, RobotDriver, Velocity
 from swarm_loc_estimator.common.health import PATIENCE_S, Level, Report, level_of
+from swarm_loc_estimator.common.messages.poses import PLANE
 from swarm_loc_estimator.common.node import ConfiguredNode, Stop
+
+ODOMETRY_QOS = QoSProfile(depth=10)
+_TF_QOS = QoSProfile(depth=100)
+
+_FIXED_VARIANCE = 1e-9  # Variance of z, roll and pitch, and least variance of all other components
+
+
+def stamp_message(stamp_ns: int) -> TimeMessage:
+    """Convert a time [ns] to a message."""
+    return Time(nanoseconds=stamp_ns).to_msg()
+
+
+def yaw_quaternion(yaw: float) -> Quaternion:
+    """Quaternion of a rotation about z [rad]."""
+    return Quaternion(z=math.sin(0.5 * yaw), w=math.cos(0.5 * yaw))
+
+
+def odometry_message(state: OdometryState, odom_frame: str, base_frame: str) -> Odometry:
+    """The state as nav_msgs/Odometry, its covariances over x, y, z, and rotation about X, Y, Z."""
+    message = Odometry(
+        header=Header(stamp=stamp_message(state.stamp_ns), frame_id=odom_frame), child_frame_id=base_frame
+    )
+    position, twist = message.pose.pose.position, message.twist.twist
+    position.x, position.y, yaw = (float(value) for value in state.pose)
+    message.pose.pose.orientation = yaw_quaternion(yaw)
+    twist.linear.x, twist.linear.y, twist.angular.z = (float(value) for value in state.twist)
+    covariance, twist_covariance = np.eye(6) * _FIXED_VARIANCE, np.eye(6) * _FIXED_VARIANCE
+    covariance[PLANE] += state.covariance
+    twist_covariance[PLANE] += state.twist_covariance
+    message.pose.covariance = covariance.ravel()
+    message.twist.covariance = twist_covariance.ravel()
+    return message
+
+
+class OdometryOutput:
+    """Publishes the odometry of one robot: the pose of `base_frame` in `odom_frame`.
+
+    `transforms` is the publisher of /tf; None publishes no transform.
+    """
+
+    def __init__(
+        self, node: Node, topic: str, odom_frame: str, base_frame: str, transforms: Publisher | None
+    ) -> None:
+        self._odometry = node.create_publisher(Odometry, topic, ODOMETRY_QOS)
+        self._frames = odom_frame, base_frame
+        self._transforms = transforms
+
+    def publish(self, state: OdometryState) -> None:
+        """Publish a state."""
+        message = odometry_message(state, *self._frames)
+        self._odometry.publish(message)
+        if self._transforms is not None:
+            pose, header, child = message.pose.pose, message.header, message.child_frame_id
+            place = Vector3(x=pose.position.x, y=pose.position.y)
+            moved = Transform(translation=place, rotation=pose.orientation)
+            found = TransformStamped(header=header, child_frame_id=child, transform=moved)
+            self._transforms.publish(TFMessage(transforms=[found]))
+
+
+def transform_publisher(node: Node) -> Publisher:
+    """The publisher of /tf, an absolute name because tf2 listens only there."""
+    return node.create_publisher(TFMessage, "/tf", _TF_QOS)
+
+
+def image_message(pixels: NDArray[np.uint8], stamp_ns: int, frame_id: str) -> Image:
+    """Pixels (height, width) of grey or (height, width, 3) of RGB as sensor_msgs/Image."""
+    height, width = pixels.shape[:2]
+    message = Image(
+        header=Header(stamp=stamp_message(stamp_ns), frame_id=frame_id),
+        height=height,
+        width=width,
+        encoding="mono8" if pixels.ndim == 2 else "rgb8",
+        step=pixels[0].nbytes,
+    )
+    message.data = array("B", pixels.tobytes())  # setting a list would check every byte
+    return message
+
+
+def camera_info_message(calibration: CameraCalibration, header: Header) -> CameraInfo:
+    """The calibration as sensor_msgs/CameraInfo, for an image with this header."""
+    return CameraInfo(
+        header=header,
+        height=calibration.height,
+        width=calibration.width,
+        distortion_model=calibration.model,
+        d=list(calibration.distortion),
+        k=list(calibration.matrix),
+        r=list(calibration.rectification),
+        p=list(calibration.projection),
+    )
+
 
 _COMMAND_QOS = QoSProfile(depth=1)
 _CLOCK_PATIENCE_S = 30.0
 """Silence about a simulation that is starting: its nodes may take long on a busy machine."""
-
-
-class DriverParameters(Protocol):
-    """Parameters that all drivers have."""
-
-    @property
-    def odom_frame(self) -> str:
-        """Frame of the pose, without the robot's name."""
-
-    @property
-    def base_frame(self) -> str:
-        """Frame of the robot, without its name."""
-
-    @property
-    def publish_tf(self) -> bool:
-        """Whether to publish the transform between them."""
 
 
 Parameters = TypeVar("Parameters", bound=DriverParameters)
@@ -51,8 +142,7 @@ class RobotDriverNode(ConfiguredNode[Parameters]):
     def __init__(self, *arguments: Any, **node_arguments: Any) -> None:
         super().__init__(*arguments, **node_arguments)
         robot = self.get_namespace().strip("/")
-        self._prefix = f"{robot}/" if robot else ""
-        """Prefix of the robot's frames and of its status."""
+        self._prefix = f"{robot}/" if robot else ""  # Of the robot's frames and of its status
         self._base_frame = f"{self._prefix}{self.params.base_frame}"
         self._transforms = transform_publisher(self) if self.params.publish_tf else None
 
@@ -104,19 +194,6 @@ class RobotDriverNode(ConfiguredNode[Parameters]):
     def _report(self) -> None:
         trouble, warning = self._driver.trouble, self._driver.warning
         counts = Counter(self._driver.counts)
-        self._log(trouble, counts)
-        self.health.warn_of("robot", {warning: warning} if warning else {})
-        self.health.warn_of("defect", dict(self._driver.defects))
-        now_s = time.monotonic()
-        elapsed_s, self._reported_s = now_s - self._reported_s, now_s
-        values: dict[str, object] = dict(sorted(counts.items()))
-        for name in self._rates:
-            values[f"{name} rate [1/s]"] = f"{(counts[name] - self._reported[name]) / elapsed_s:.4g}"
-        self._reported = counts
-        level, name = Level.ERROR if trouble else level_of(warning), f"{self._prefix}{self.get_name()}"
-        self.publish_reports(Report(name, trouble or warning or "connected", level, values, self._address))
-
-    def _log(self, trouble: str, counts: Counter[str]) -> None:
         # a robot that is being switched on, or a simulation that starts, does not answer at once
         first_s = _CLOCK_PATIENCE_S if trouble == NO_CLOCK else PATIENCE_S
         patience_s = 0.0 if counts["connections"] else first_s
@@ -126,6 +203,17 @@ class RobotDriverNode(ConfiguredNode[Parameters]):
         self._was_in_trouble = bool(trouble)
         errors = {f"{name}: {meaning}": counts[name] for name, meaning in self._wrong.items()}
         self.health.warn_of_drops(errors, "errors")
+        self.health.warn_of("robot", {warning: warning} if warning else {})
+        self.health.warn_of("defect", dict(self._driver.defects))
+        # the report, with rates since the last one
+        now_s = time.monotonic()
+        elapsed_s, self._reported_s = now_s - self._reported_s, now_s
+        values: dict[str, object] = dict(sorted(counts.items()))
+        for name in self._rates:
+            values[f"{name} rate [1/s]"] = f"{(counts[name] - self._reported[name]) / elapsed_s:.4g}"
+        self._reported = counts
+        level, name = Level.ERROR if trouble else level_of(warning), f"{self._prefix}{self.get_name()}"
+        self.publish_reports(Report(name, trouble or warning or "connected", level, values, self._address))
 
     def _now_ns(self) -> int:
         return int(self.get_clock().now().nanoseconds)

@@ -26,8 +26,7 @@ from rclpy.qos import QoSProfile
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
-from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
-from swarm_loc_drivers.common.ros_messages import stamp_message
+from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode, stamp_message
 from swarm_loc_drivers.droplet.driver import OWN, DropletDriver, DropletListeners
 from swarm_loc_drivers.droplet.exchange import Brightness
 from swarm_loc_drivers.droplet.parameters import DropletFleetParameters, DropletParameters, DropletTraits
@@ -127,7 +126,14 @@ class DropletFleetNode(ConfiguredNode[DropletFleetParameters]):
                 "turn": turn,
                 "use_sim_time": simulated,
             }
-            self._drivers.append(_driver(names[turn], own))
+            # remappings on the command line apply only to the fleet node
+            driver = DropletDriverNode(
+                namespace=names[turn],
+                parameter_overrides=[Parameter(name, value=value) for name, value in own.items()],
+                use_global_arguments=False,
+                start_parameter_services=False,
+            )
+            self._drivers.append(driver)
 
     def run(self, stop: Stop) -> int:
         """Drive all robots until asked to stop; the exit status."""
@@ -142,16 +148,6 @@ class DropletFleetNode(ConfiguredNode[DropletFleetParameters]):
         for driver in self._drivers:
             driver.destroy_node()
         super().destroy_node()
-
-
-def _driver(robot: str, parameters: dict[str, Any]) -> DropletDriverNode:
-    """Node of one robot; remappings on the command line apply only to the fleet node."""
-    return DropletDriverNode(
-        namespace=robot,
-        parameter_overrides=[Parameter(name, value=value) for name, value in parameters.items()],
-        use_global_arguments=False,
-        start_parameter_services=False,
-    )
 
 
 run_droplet_fleet = partial(run_node, "droplet_fleet_node", DropletFleetNode)

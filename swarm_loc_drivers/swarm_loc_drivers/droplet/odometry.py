@@ -138,8 +138,8 @@ class CommandedMotion:
     def _body_noise(self, gait: Gait, steps: float) -> FloatArray:
         """Variances (3,) of steps: along, across, heading."""
         path, turn = steps * math.hypot(gait.forward, gait.left), steps * abs(gait.turn)
-        walk = self._noise.walk_noise * path
-        return np.array([walk, walk, self._noise.veer_noise * path + self._noise.turn_noise * turn])
+        walk, heading = self._noise.walk_noise * path, self._noise.veer_noise * path
+        return np.array([walk, walk, heading + self._noise.turn_noise * turn])
 
     def _way(self, gait: Gait, steps: float) -> FloatArray:
         """Motion (3,) of steps in the odometry's frame; the turn is not wrapped."""

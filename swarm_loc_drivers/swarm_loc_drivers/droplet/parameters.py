@@ -5,26 +5,24 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-from swarm_loc_drivers.droplet.exchange import PollingSettings
+from swarm_loc_drivers.common.robot_driver import DriverParameters
+from swarm_loc_drivers.droplet.exchange import MIN_TURN_S, PollingSettings, SessionSettings, TdmaSettings
 from swarm_loc_drivers.droplet.hardware import DROPLET_MODELS, ELEMENTS, FULL_POWER
 from swarm_loc_drivers.droplet.odometry import MotionNoise
-from swarm_loc_drivers.droplet.session import SessionSettings
-from swarm_loc_drivers.droplet.tdma import MIN_TURN_S, TdmaSettings
-from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text, texts
+from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text, texts
 
 _ID = re.compile(r"(?:0[xX])?([0-9A-Fa-f]{1,4})")
 _RELAYED = re.compile(r"([A-Za-z]\w*)=(.*)")
 
 
 @dataclass(frozen=True)
-class DropletTraits:
+class DropletTraits(DriverParameters):
     """Parameters that all Droplets of a table share."""
 
     model: str = choice(
         "droplet", tuple(DROPLET_MODELS), "an audio_droplet moves only ahead, back and in turns"
     )
     reply_timeout_s: float = number(0.3, "s", 0.01, 10.0, "how long an echo or an answer may take")
-    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "time without cmd_vel until the robot stops")
     stride_s: float = number(
         2.0, "s", 0.2, 60.0, "duration of a commanded motion, which continues for so long if the driver dies"
     )
@@ -36,9 +34,6 @@ class DropletTraits:
     near_power: int = number(40, "1", 0, FULL_POWER - 1, "power in near exchanges; 0: only far ones")
     saturation: int = number(240, "count", 1, 4095, "readings saturate here: full scale less ambient light")
     turn_s: float = number(1.0, "s", MIN_TURN_S, 60.0, "how long a turn to emit lasts")
-    odom_frame: str = text("odom", "the pose is in <robot>/odom_frame", required=True)
-    base_frame: str = text("base_link", "the pose is that of <robot>/base_frame", required=True)
-    publish_tf: bool = flag(True, "publish the transform from odom to base_link")
 
 
 @dataclass(frozen=True)
@@ -78,7 +73,25 @@ class DropletParameters(DropletTraits):
     @property
     def session(self) -> SessionSettings:
         """Settings of the session."""
-        return SessionSettings(DROPLET_MODELS[self.model], ELEMENTS, self.reply_timeout_s, self._exchanges())
+        partners: list[int] = []
+        for one in self.partners:
+            robot = _id("partners", one)
+            if robot in partners:
+                raise ParameterError(f"parameter partners has '{one}', but each id may stand once.")
+            partners.append(robot)
+        far, near = self.far_power, self.near_power
+        if near >= far:
+            raise ParameterError(f"parameter near_power = {near} must be below far_power = {far}.")
+        powers, known = (far, near) if near else (far,), tuple(partners)
+        exchanges: PollingSettings | TdmaSettings
+        if self.turns:
+            if self.turn >= self.turns:
+                raise ParameterError(f"parameter turn = {self.turn} must be below turns = {self.turns}.")
+            exchanges = TdmaSettings(self.turn, self.turns, self.turn_s, powers, known)
+        else:
+            period_s = 1.0 / self.exchange_rate if self.exchange_rate else 0.0
+            exchanges = PollingSettings(known, period_s, self.retries, powers, self.least_brightness)
+        return SessionSettings(DROPLET_MODELS[self.model], ELEMENTS, self.reply_timeout_s, exchanges)
 
     @property
     def motion_noise(self) -> MotionNoise:
@@ -100,29 +113,6 @@ class DropletParameters(DropletTraits):
                 )
             found[name] = robot
         return found
-
-    def _exchanges(self) -> PollingSettings | TdmaSettings:
-        partners = self._partner_ids()
-        far, near = self.far_power, self.near_power
-        if near >= far:
-            raise ParameterError(f"parameter near_power = {near} must be below far_power = {far}.")
-        powers = (far, near) if near else (far,)
-        if not self.turns:
-            period_s = 1.0 / self.exchange_rate if self.exchange_rate else 0.0
-            return PollingSettings(partners, period_s, self.retries, powers, self.least_brightness)
-        if self.turn >= self.turns:
-            raise ParameterError(f"parameter turn = {self.turn} must be below turns = {self.turns}.")
-        return TdmaSettings(self.turn, self.turns, self.turn_s, powers, partners)
-
-    def _partner_ids(self) -> tuple[int, ...]:
-        """Ids of the robots to ask."""
-        found: list[int] = []
-        for one in self.partners:
-            robot = _id("partners", one)
-            if robot in found:
-                raise ParameterError(f"parameter partners has '{one}', but each id may stand once.")
-            found.append(robot)
-        return tuple(found)
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,24 @@ The console echoes every character and answers the end of a line with CR LF. CR 
 exactly one of them may be sent. All other output is text for people, and echoes may interrupt it. Matrices
 have one row per emitter and one column per sensor. Formats are those of the firmware of 2014, 2016 and 2018
 (correlllab/cu-droplet).
+
+A Droplet ignores its console for a sixth of a second during an infrared exchange, and a line that has lost
+characters may be another command. So a line is terminated only after its complete echo; otherwise it is
+deleted and typed again.
+
+Actions that take time are generators: they yield the time [ns] at which to continue at the latest, and
+continue whenever output arrives.
 """
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Callable
-from typing import NamedTuple
+from collections import Counter
+from collections.abc import Callable, Generator
+from typing import NamedTuple, TypeVar
 
-from swarm_loc_drivers.droplet.hardware import ELEMENTS, FULL_POWER
+from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.droplet.hardware import ELEMENTS, FULL_POWER, HANDLING_NS, message_ns
 
 TERMINATOR = b"\r"
 ERASE = b"\b"
@@ -32,6 +40,7 @@ MOTOR_SETTINGS = "print_motor_settings"
 _MAX_PRINTED_LINE = 512
 _MAX_DIGITS = 5
 _BACKSPACE = 8
+BROKEN, UNKNOWN = "broken_matrices", "unknown_lines"  # What lines without sense are counted as
 
 
 class CommandError(ValueError):
@@ -91,32 +100,10 @@ class MoveStarted(NamedTuple):
     steps: int
 
 
-class Relayed(NamedTuple):
-    """A line is sent to another robot; None: to all."""
-
-    target: int | None
-    line: str
-
-
 class SendAborted(NamedTuple):
     """A message was not sent because infrared is busy."""
 
     status: int
-
-
-class EmissionFailed(NamedTuple):
-    """The robot did not emit because it was busy."""
-
-    status: int
-
-
-class RangeBearing(NamedTuple):
-    """The robot's own estimate of another robot: range [m], bearing [rad] and heading [rad]."""
-
-    robot: int
-    range_m: float
-    bearing: float
-    heading: float
 
 
 class Matrix(NamedTuple):
@@ -125,12 +112,6 @@ class Matrix(NamedTuple):
     emitter: int | None  # Id of the emitting robot; None if the format lacks it
     receiver: int | None  # Id of the measuring robot; None if the format lacks it
     brightness: tuple[tuple[int, ...], ...]  # One row per emitter, one count per sensor
-
-
-class SilentSensor(NamedTuple):
-    """A sensor has repeatedly read nothing."""
-
-    sensor: int
 
 
 class MotorTrims(NamedTuple):
@@ -147,44 +128,14 @@ class StepLength(NamedTuple):
     per_kilostep: int
 
 
-class Title(NamedTuple):
-    """Title of a table."""
+class Noted(NamedTuple):
+    """Any other line: what it is counted as, or "" for an ordinary one, and its text."""
 
+    reason: str
     text: str
 
 
-class NotRecognised(NamedTuple):
-    """A command that is unknown to the firmware."""
-
-    word: str
-
-
-class Overflow(NamedTuple):
-    """A line was longer than the buffer and was dropped."""
-
-
-class Complaint(NamedTuple):
-    """Another error of the firmware."""
-
-    text: str
-
-
-class Broken(NamedTuple):
-    """An incomplete matrix."""
-
-    text: str
-
-
-class Unknown(NamedTuple):
-    """Any other line."""
-
-    text: str
-
-
-Event = (
-    Echo | Identity | MoveStarted | Relayed | SendAborted | EmissionFailed | RangeBearing | Matrix
-    | SilentSensor | MotorTrims | StepLength | Title | NotRecognised | Overflow | Complaint | Broken | Unknown
-)  # fmt: skip
+Event = Echo | Identity | MoveStarted | SendAborted | Matrix | MotorTrims | StepLength | Noted
 
 
 class Said(NamedTuple):
@@ -202,26 +153,23 @@ _HEX = "([0-9A-F]{4})"
 _NUMBER = rf" *(-?\d{{1,{_MAX_DIGITS}}})"
 
 
+def _noted(count: str) -> Callable[[re.Match[str]], Noted]:
+    return lambda match: Noted(count, match[0])
+
+
 def _integers(match: re.Match[str]) -> tuple[int, ...]:
     return tuple(int(group) for group in match.groups())
 
 
-def _relayed(match: re.Match[str]) -> Event:
-    target, line, length = match.groups()
-    return (
-        Relayed(int(target, 16) if target else None, line) if len(line) == int(length) else Unknown(match[0])
-    )
-
-
-def _range_bearing(match: re.Match[str]) -> RangeBearing:
-    robot, range_mm, bearing_deg, heading_deg = match.groups()
-    angles = math.radians(int(bearing_deg)), math.radians(int(heading_deg))
-    return RangeBearing(int(robot, 16), 1e-3 * int(range_mm), *angles)
+def _relayed(match: re.Match[str]) -> Noted:
+    """A line is sent to another robot, or to all."""
+    line, length = match.groups()
+    return Noted("" if len(line) == int(length) else UNKNOWN, match[0])
 
 
 def _motor_trims(match: re.Match[str]) -> MotorTrims:
-    direction, *trims = _integers(match)
-    return MotorTrims(direction, (trims[0], trims[1], trims[2]))
+    direction, first, second, third = _integers(match)
+    return MotorTrims(direction, (first, second, third))
 
 
 _LINES: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Event]], ...] = tuple(
@@ -229,18 +177,17 @@ _LINES: tuple[tuple[re.Pattern[str], Callable[[re.Match[str]], Event]], ...] = t
     for pattern, make in (
         (r"My ID is: ([0-9A-F]{1,4})", lambda m: Identity(int(m[1], 16))),
         (r"walk direction (\d), num_steps (\d{1,5})", lambda m: MoveStarted(*_integers(m))),
-        (rf'Broadcasting command to {_HEX}: "(.*)", of length (\d{{1,2}})\.', _relayed),
-        (r'Broadcasting command()?: "(.*)", of length (\d{1,2})\.', _relayed),
+        (r'Broadcasting command(?: to [0-9A-F]{4})?: "(.*)", of length (\d{1,2})\.', _relayed),
         (r"Aborting IR send \[([0-9A-Fa-f]{2})\] while trying: .*", lambda m: SendAborted(int(m[1], 16))),
-        (r"RNB Broadcast failed \[ ([0-9A-F]{2}) \]", lambda m: EmissionFailed(int(m[1], 16))),
-        (rf"\t\(RNB\) ID: {_HEX} \| R:{_NUMBER} B:{_NUMBER} H:{_NUMBER}", _range_bearing),
-        (r"!!!\tGot \d+ consecutive nothings from sensor (\d)\.\t!!!", lambda m: SilentSensor(int(m[1]))),
+        (r"RNB Broadcast failed \[ [0-9A-F]{2} \]", _noted("failed_emissions")),
+        (rf"\t\(RNB\) ID: {_HEX} \| R:{_NUMBER} B:{_NUMBER} H:{_NUMBER}", _noted("range_bearings")),
+        (r"!!!\tGot \d+ consecutive nothings from sensor \d\.\t!!!", _noted("silent_sensors")),
         (rf"\tdir: ([0-7])\t{_NUMBER}\t{_NUMBER}\t{_NUMBER}\t", _motor_trims),
         (r"\t([0-7])\t(\d{1,5})", lambda m: StepLength(*_integers(m))),
-        (r"Motor Values|Dist \(mm\) per kilostep", lambda m: Title(m[0])),
-        (r"\tCommand \( (.*) \) not recognized\.", lambda m: NotRecognised(m[1])),
-        (r"ERROR: Serial input buffer capacity of \d+ characters exceeded\.", lambda _: Overflow()),
-        (r"(?:!!!|error|ERROR|Error).*", lambda m: Complaint(m[0])),
+        (r"Motor Values|Dist \(mm\) per kilostep", _noted("")),
+        (r"\tCommand \( .* \) not recognized\.", _noted("unknown_commands")),
+        (r"ERROR: Serial input buffer capacity of \d+ characters exceeded\.", _noted("overflows")),
+        (r"(?:!!!|error|ERROR|Error).*", _noted("firmware_errors")),
         (rf"(?:{_COMMANDS})(?: .*)?", lambda m: Echo(m[0])),
     )
 )
@@ -301,7 +248,7 @@ class ConsoleParser:
         self._rows = None
         if not missing and self._last.fullmatch(line):
             return [Said(self._rows_stamp_ns, Matrix(None, None, tuple(rows)))]
-        return [Said(self._rows_stamp_ns, Broken("{")), *self._line(line)]
+        return [Said(self._rows_stamp_ns, Noted(BROKEN, "{")), *self._line(line)]
 
     def _event(self, line: str) -> Event:
         """Parse a single line."""
@@ -313,9 +260,115 @@ class ConsoleParser:
         for pattern, make in _LINES:
             if match := pattern.fullmatch(line):
                 return make(match)
-        return Broken(line) if "{" in line or "}" in line else Unknown(line)
+        return Noted(BROKEN if "{" in line or "}" in line else UNKNOWN, line)
 
     def _square(self, cells: tuple[str, ...] | list[str]) -> tuple[tuple[int, ...], ...]:
         """Arrange cells in rows."""
         numbers = [int(cell) for cell in cells]
         return tuple(tuple(numbers[k : k + self._elements]) for k in range(0, len(numbers), self._elements))
+
+
+Result = TypeVar("Result")
+Talk = Generator[int, None, Result]  # Yields the time [ns] at which to continue at the latest
+
+MARGIN_NS = 15_000_000  # Tolerance for the robot's clock, which counts milliseconds [ns]
+_TRIES = 8
+_ERASED_AT_ONCE = 7  # Each deleted character is answered by three; more at once would be lost
+
+
+class ConsoleTalk:
+    """The computer's end of the console of a robot with some number of emitters, and of sensors.
+
+    `on_said` receives every printed line. Counts `lines`, `bad_echoes`, and unrequested lines by kind.
+    """
+
+    def __init__(
+        self, elements: int, echo_timeout_ns: int, on_said: Callable[[Said], None], counts: Counter[str]
+    ) -> None:
+        self._parser = ConsoleParser(elements)
+        self._timeout_ns = echo_timeout_ns
+        self._on_said = on_said
+        self._counts = counts
+        self._output = bytearray()
+        self._echoes: list[str] = []
+        self._awaited = 0  # Backspaces that answer the last erasure
+        self.now_ns = 0  # Time of the last step [ns]
+
+    def hear(self, data: bytes, now_ns: int) -> None:
+        """Take output of the console."""
+        self.now_ns = now_ns
+        for said in self._parser.feed(data, now_ns):
+            if isinstance(said.event, Echo):
+                self._echoes.append(said.event.line)
+            elif isinstance(said.event, Noted) and said.event.reason:
+                self._counts[said.event.reason] += 1
+            self._on_said(said)
+
+    def take_output(self) -> bytes:
+        """Bytes to send now."""
+        output = bytes(self._output)
+        self._output.clear()
+        return output
+
+    def until(self, condition: Callable[[], bool], timeout_ns: int | None = None) -> Talk[bool]:
+        """Wait for a condition; whether it holds before the timeout (default: that of an echo).
+
+        A jump back in time ends the wait, since the elapsed time is unknown.
+        """
+        begin_ns = self.now_ns
+        deadline_ns = begin_ns + (self._timeout_ns if timeout_ns is None else timeout_ns)
+        while not condition():
+            if not begin_ns <= self.now_ns < deadline_ns:
+                return False
+            yield deadline_ns
+        return True
+
+    def pause(self, duration_ns: int) -> Talk[bool]:
+        """Wait; see `until`."""
+        return self.until(lambda: False, duration_ns)
+
+    def enter(self, line: str) -> Talk[int]:
+        """Type and terminate a line; the time at which the robot accepted it [ns].
+
+        Raises:
+            SessionError: The robot does not echo the line in several attempts.
+        """
+        for _ in range(_TRIES):
+            self._output += typed(line)
+            if (yield from self.until(lambda: self._parser.partial == line)):
+                self._echoes.clear()
+                self._output += TERMINATOR
+                if (yield from self.until(lambda: line in self._echoes)):
+                    self._counts["lines"] += 1
+                    return self.now_ns
+            self._counts["bad_echoes"] += 1
+            if not (yield from self.forget_line()):
+                break
+        raise SessionError(f"the robot does not echo '{line}'")
+
+    def forget_line(self) -> Talk[bool]:
+        """Delete the unfinished line, no faster than the robot can answer; whether it answered.
+
+        The visible line does not show its true length, since other output may interrupt an echo.
+        """
+        erased = missed = 0
+        while erased < MAX_LINE:
+            self._awaited = self._parser.backspaces + BACKSPACES_PER_ERASE * _ERASED_AT_ONCE
+            self._output += _ERASED_AT_ONCE * ERASE
+            if (yield from self.until(lambda: self._parser.backspaces >= self._awaited)):
+                erased += _ERASED_AT_ONCE
+            elif (missed := missed + 1) == _TRIES:
+                return False
+        return True
+
+
+def relay(console: ConsoleTalk, target: int, line: str) -> Talk[int]:
+    """Send a line to another robot, without confirmation; the time at which it executes the line [ns].
+
+    Raises:
+        SessionError: The robot at the cable does not echo the line.
+    """
+    sent_ns = yield from console.enter(for_robot(target, line))
+    due_ns = sent_ns + message_ns(len(line)) + HANDLING_NS
+    yield from console.pause(due_ns + MARGIN_NS - console.now_ns)
+    return due_ns

@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.link import Link, open_link
 from swarm_loc_drivers.common.odometry import DeadReckoning, OdometryState, WheelGeometry
-from swarm_loc_drivers.common.robot_driver import RobotDriver
-from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
-from swarm_loc_drivers.epuck.hardware import as_counter, unwrapped_difference
+from swarm_loc_drivers.common.robot_driver import RobotDriver, Velocity, VelocityCommand
+from swarm_loc_drivers.epuck.hardware import CameraImage, EpuckSession, as_counter, unwrapped_difference
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.serial_session import SerialSession
-from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession
 from swarm_loc_drivers.epuck.wifi_session import WifiSession
+from swarm_loc_estimator.common.arrays import FloatArray
 
 Rates = tuple[float, float]
 
@@ -68,16 +67,15 @@ class WheelOdometry:
     def note_rates(self, now_ns: int, left: float, right: float) -> None:
         """The wheels turn at these commanded rates [steps/s] from now on."""
         self._rates = (left, right)
-        self._note(_RateLimits(now_ns, self._rates, self._rates))
+        self._limit_rates(now_ns, self._rates, self._rates)
 
     def doubt_rates(self, now_ns: int, max_rate: float) -> None:
         """The rates are unknown, up to `max_rate` [steps/s], until the next command."""
-        self._note(_RateLimits(now_ns, (-max_rate, -max_rate), (max_rate, max_rate)))
+        self._limit_rates(now_ns, (-max_rate, -max_rate), (max_rate, max_rate))
 
-    def _note(self, limits: _RateLimits) -> None:
-        newest = self._limits_since[-1]
-        if (limits.slowest, limits.fastest) != (newest.slowest, newest.fastest):
-            self._limits_since.append(limits)
+    def _limit_rates(self, now_ns: int, slowest: Rates, fastest: Rates) -> None:
+        if (slowest, fastest) != self._limits_since[-1][1:]:
+            self._limits_since.append(_RateLimits(now_ns, slowest, fastest))
 
     def update(self, stamp_ns: int, left: int, right: int, *, doubt_ns: int = 0) -> OdometryState | None:
         """Take counters of 16 bits, read at `stamp_ns` with an uncertainty of `doubt_ns`.
@@ -104,20 +102,23 @@ class WheelOdometry:
         # steps that the commands can explain, also if the right counter runs backwards
         steps = self._steps(left, right, elapsed_s)
         mirrored = self._steps(left, right, elapsed_s, right_sign=-1)
-        paths = 0.0, 0.0
-        if self._possible(steps, longest_s):
-            paths = self._advance(*steps)
-        elif self._doubtful and self._possible(mirrored, longest_s):
+        is_known = self._possible(steps, longest_s)
+        if not is_known and self._doubtful and self._possible(mirrored, longest_s):
             self._counts["reversed_counters"] += 1
             self._right_sign, right = -self._right_sign, as_counter(-right)
-            paths = self._advance(*mirrored)
-        elif self._doubtful or has_jumped:
-            self._counts["counter_restarts"] += 1
-            self._forget_motion(longest_s)
-        else:  # a single reading may have lost bytes
+            is_known, steps = True, mirrored
+        elif not is_known and not self._doubtful and not has_jumped:  # a single reading may have lost bytes
             self._counts["implausible_counters"] += 1
             self._doubtful = True
             return None
+        # move, or as fast as commanded in an unknown way
+        metres = self._geometry.metres_per_step
+        paths = (metres * steps[0], metres * steps[1]) if is_known else (0.0, 0.0)
+        if is_known:
+            self._reckoning.advance(*paths)
+        else:
+            self._counts["counter_restarts"] += 1
+            self._reckoning.forget_motion(float(np.abs(self._limits()).max()) * metres * longest_s)
         self._restart(stamp_ns, doubt_ns, left, right)
         return self._reckoning.state(stamp_ns, *paths, elapsed_s)
 
@@ -144,33 +145,16 @@ class WheelOdometry:
         begin_ns, end_ns = self._gap_ns
         return begin_ns if 0 <= stamp_ns - end_ns <= _DELAY_NS else stamp_ns
 
-    def _limits(self) -> tuple[Rates, Rates]:
-        """Slowest and fastest rates since the last reading; zero is always possible."""
-        slowest = [(0.0, 0.0), *(one.slowest for one in self._limits_since)]
-        fastest = [(0.0, 0.0), *(one.fastest for one in self._limits_since)]
-        return (
-            (min(left for left, _ in slowest), min(right for _, right in slowest)),
-            (max(left for left, _ in fastest), max(right for _, right in fastest)),
-        )
+    def _limits(self) -> FloatArray:
+        """(2, 2) slowest and fastest rates since the last reading; zero is always possible."""
+        rates = np.array([((0.0, 0.0), (0.0, 0.0)), *(one[1:] for one in self._limits_since)])
+        return np.stack([rates[:, 0].min(axis=0), rates[:, 1].max(axis=0)])
 
     def _possible(self, steps: tuple[int, int], longest_s: float) -> bool:
         """Whether the commands allow these steps within `longest_s`."""
-        ranges = zip(steps, *self._limits(), strict=True)
-        return all(
-            slowest * longest_s - _ROUNDING_STEPS <= done <= fastest * longest_s + _ROUNDING_STEPS
-            for done, slowest, fastest in ranges
-        )
-
-    def _advance(self, left_steps: int, right_steps: int) -> tuple[float, float]:
-        """Move by steps of the wheels; returns their paths [m]."""
-        left, right = (steps * self._geometry.metres_per_step for steps in (left_steps, right_steps))
-        self._reckoning.advance(left, right)
-        return left, right
-
-    def _forget_motion(self, longest_s: float) -> None:
-        """The motion is unknown, at most as fast as commanded."""
-        rate = max(abs(rate) for limit in self._limits() for rate in limit)
-        self._reckoning.forget_motion(rate * self._geometry.metres_per_step * longest_s)
+        slowest, fastest = self._limits() * longest_s
+        low, high = slowest - _ROUNDING_STEPS <= steps, steps <= fastest + _ROUNDING_STEPS
+        return bool(low.all() and high.all())
 
 
 _MAX_IDLE_S = 0.5

@@ -20,8 +20,8 @@ from sensor_msgs.msg import CameraInfo, Image, Range
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
-from swarm_loc_drivers.common.ros_messages import (
+from swarm_loc_drivers.common.robot_driver_node import (
+    RobotDriverNode,
     camera_info_message,
     image_message,
     stamp_message,
@@ -34,13 +34,12 @@ from swarm_loc_drivers.epuck.hardware import (
     MIN_RANGE_M,
     PROXIMITY_BEARINGS,
     PROXIMITY_RADIUS_M,
+    CameraImage,
     range_of_raw,
 )
 from swarm_loc_drivers.epuck.parameters import EpuckParameters, camera_calibration
-from swarm_loc_drivers.epuck.session import CameraImage
 from swarm_loc_estimator.common.node import run_node
 
-_PROXIMITY_NAMES = tuple(f"ps{sensor}" for sensor in range(len(PROXIMITY_BEARINGS)))
 _TF_STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _RATES = ("readings", "images")
 _WRONG = {
@@ -67,30 +66,39 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
         odometry = self._odometry_output("odom", self._prefix)
         listeners = EpuckListeners(odometry.publish, self._publish_proximity, self._publish_image)
         self._driver = EpuckDriver(params, listeners, self._now_ns)
-        self._advertise()
-        self._start_reports(str(params.link_address), _RATES, _WRONG)
-        self._follow("cmd_vel", self._driver.set_velocity)
-        self.create_timer(1.0 / params.reading_rate, self._driver.tick)
-
-    def _advertise(self) -> None:
         # one topic each: eight messages at once would overflow a sensor-data queue
+        names = [f"ps{sensor}" for sensor in range(len(PROXIMITY_BEARINGS))]
         self._proximity = [
-            self.create_publisher(Range, f"proximity/{name}", qos_profile_sensor_data)
-            for name in _PROXIMITY_NAMES
+            self.create_publisher(Range, f"proximity/{name}", qos_profile_sensor_data) for name in names
         ]
+        self._frames = [f"{self._prefix}{name}" for name in names]  # x points out of the sensor
         if self._calibration is not None:
             self._image = self.create_publisher(Image, "image_raw", qos_profile_sensor_data)
             self._camera_info = self.create_publisher(CameraInfo, "camera_info", qos_profile_sensor_data)
         # an absolute name, because tf2 listens only there
         self._tf_static = self.create_publisher(TFMessage, "/tf_static", _TF_STATIC_QOS)
-        sensors = _proximity_transforms(self._now_ns(), self._base_frame, self._prefix)
-        self._tf_static.publish(TFMessage(transforms=sensors))
+        header = Header(stamp=stamp_message(self._now_ns()), frame_id=self._base_frame)
+        transforms = []
+        for frame, bearing in zip(self._frames, PROXIMITY_BEARINGS, strict=True):
+            x, y = PROXIMITY_RADIUS_M * math.cos(bearing), PROXIMITY_RADIUS_M * math.sin(bearing)
+            transform = Transform(translation=Vector3(x=x, y=y), rotation=yaw_quaternion(bearing))
+            transforms.append(TransformStamped(header=header, child_frame_id=frame, transform=transform))
+        self._tf_static.publish(TFMessage(transforms=transforms))
+        self._start_reports(str(params.link_address), _RATES, _WRONG)
+        self._follow("cmd_vel", self._driver.set_velocity)
+        self.create_timer(1.0 / params.reading_rate, self._driver.tick)
 
     def _publish_proximity(self, stamp_ns: int, raw: NDArray[np.int64]) -> None:
-        if any(publisher.get_subscription_count() for publisher in self._proximity):
-            messages = _range_messages(stamp_ns, raw, self._prefix)
-            for publisher, message in zip(self._proximity, messages, strict=True):
-                publisher.publish(message)
+        """Publish raw proximity values (8,) as ranges."""
+        if not any(publisher.get_subscription_count() for publisher in self._proximity):
+            return
+        stamp = stamp_message(stamp_ns)
+        kind = {"radiation_type": Range.INFRARED, "field_of_view": FIELD_OF_VIEW}
+        limits = {"min_range": MIN_RANGE_M, "max_range": MAX_RANGE_M}
+        ranges = range_of_raw(raw).tolist()
+        for publisher, frame, distance in zip(self._proximity, self._frames, ranges, strict=True):
+            header = Header(stamp=stamp, frame_id=frame)
+            publisher.publish(Range(header=header, range=distance, **kind, **limits))
 
     def _publish_image(self, taken: CameraImage) -> None:
         if self._calibration is None:
@@ -98,37 +106,6 @@ class EpuckDriverNode(RobotDriverNode[EpuckParameters]):
         image = image_message(taken.pixels, taken.stamp_ns, self._camera_frame)
         self._image.publish(image)
         self._camera_info.publish(camera_info_message(self._calibration, image.header))
-
-
-def _proximity_frames(prefix: str) -> list[str]:
-    """Frames of the sensors; x points out of the sensor."""
-    return [f"{prefix}{name}" for name in _PROXIMITY_NAMES]
-
-
-def _proximity_transforms(stamp_ns: int, base_frame: str, prefix: str) -> list[TransformStamped]:
-    header = Header(stamp=stamp_message(stamp_ns), frame_id=base_frame)
-    transforms = []
-    for frame, bearing in zip(_proximity_frames(prefix), PROXIMITY_BEARINGS, strict=True):
-        place = Vector3(x=PROXIMITY_RADIUS_M * math.cos(bearing), y=PROXIMITY_RADIUS_M * math.sin(bearing))
-        transform = Transform(translation=place, rotation=yaw_quaternion(bearing))
-        transforms.append(TransformStamped(header=header, child_frame_id=frame, transform=transform))
-    return transforms
-
-
-def _range_messages(stamp_ns: int, raw: NDArray[np.int64], prefix: str) -> list[Range]:
-    """Raw proximity values (8,) as ranges, ps0 first."""
-    stamp = stamp_message(stamp_ns)
-    return [
-        Range(
-            header=Header(stamp=stamp, frame_id=frame),
-            radiation_type=Range.INFRARED,
-            field_of_view=FIELD_OF_VIEW,
-            min_range=MIN_RANGE_M,
-            max_range=MAX_RANGE_M,
-            range=distance,
-        )
-        for frame, distance in zip(_proximity_frames(prefix), range_of_raw(raw).tolist(), strict=True)
-    ]
 
 
 main = partial(run_node, "epuck_driver_node", EpuckDriverNode)

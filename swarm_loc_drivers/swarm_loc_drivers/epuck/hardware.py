@@ -1,14 +1,17 @@
-"""Hardware of e-puck and e-puck2: motors, counters, proximity sensors, camera pixels."""
+"""Hardware of e-puck and e-puck2: motors, counters, proximity sensors, camera; measurements."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_drivers.common.odometry import WheelGeometry
+from swarm_loc_drivers.common.robot_driver import Session
 from swarm_loc_estimator.common.arrays import FloatArray
 
 STEPS_PER_TURN = 1000  # 20 steps of the motor, gear 50:1
@@ -17,6 +20,9 @@ PROXIMITY_BEARINGS = tuple(math.radians(-d) for d in (17.0, 46.0, 90.0, 151.0, -
 """Directions of ps0..ps7 in base_link [rad], positive to the left; the robot numbers them clockwise."""
 
 PROXIMITY_RADIUS_M = 0.035  # Distance of the proximity sensors from the centre of the robot
+
+WIFI_PORT = 1000
+WIFI_WIDTH, WIFI_HEIGHT = 160, 120  # Of images in the stream of the WiFi firmware [px]
 
 _COUNTER_SPAN = 1 << 16
 _AROUND_IMAGE = 11  # Two speeds before an image, its header of 3 bytes, and two speeds after it
@@ -72,17 +78,8 @@ class EpuckModel:
         return best if rate >= 0.0 else -best
 
 
-EPUCK1 = EpuckModel(
-    "epuck1",
-    max_command=1000,
-    timer_hz=10_000,
-    answer_buffer=3456,
-    largest_setting=3456,
-    zooms=tuple(range(1, 9)),
-)
-EPUCK2 = EpuckModel(
-    "epuck2", max_command=1100, timer_hz=50_000, answer_buffer=4139, largest_setting=4136, zooms=(1, 2, 4)
-)
+EPUCK1 = EpuckModel("epuck1", 1000, 10_000, 3456, 3456, tuple(range(1, 9)))
+EPUCK2 = EpuckModel("epuck2", 1100, 50_000, 4139, 4136, (1, 2, 4))
 EPUCK_MODELS = {model.name: model for model in (EPUCK1, EPUCK2)}
 
 
@@ -98,8 +95,7 @@ def as_counter(steps: int) -> int:
 
 def unwrapped_difference(before: int, after: int, expected: float) -> int:
     """Steps between two counters of 16 bits: the possible number closest to the expected one."""
-    surplus = as_counter(after - before - round(expected))
-    return round(expected) + surplus
+    return round(expected) + as_counter(after - before - round(expected))
 
 
 _DISTANCE_M = np.array([0.0, 0.005, 0.01, 0.015, 0.02, 0.03, 0.04, 0.05, 0.06])
@@ -140,3 +136,46 @@ def encode_rgb565(image: Image) -> bytes:
     red, green, blue = np.moveaxis(image.astype(np.uint16), -1, 0)
     pixels: NDArray[np.uint16] = ((red >> 3) << 11) | ((green >> 2) << 5) | (blue >> 3)
     return pixels.astype(">u2").tobytes()
+
+
+Speeds = Callable[[], tuple[int, int]]
+"""Commands for the left and the right wheel [steps/s]; called just before they are sent."""
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """Images to request."""
+
+    width: int  # [px]
+    height: int  # [px]
+    zoom: int  # Camera pixels per pixel
+    period_s: float  # Between two images over a serial port [s]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Sensor values."""
+
+    stamp_ns: int  # Acquisition [ns]
+    doubt_ns: int  # Uncertainty of the stamp in both directions [ns]
+    left_counter: int  # Steps of the left wheel, 16 bits, wrapping
+    right_counter: int  # Steps of the right wheel, 16 bits, wrapping
+    proximity: NDArray[np.int64]  # (8,) raw values of ps0..ps7
+
+
+@dataclass(frozen=True)
+class CameraImage:
+    """An image of the robot's camera."""
+
+    stamp_ns: int  # Best estimate of the exposure time [ns]
+    pixels: Image  # (height, width, 3) RGB
+
+
+class EpuckSession(Session, Protocol):
+    """A conversation with one e-puck."""
+
+    found: list[Reading | CameraImage]  # Measurements; the reader empties the list
+    is_idle: bool  # Whether no answer is pending: the next step sends a request
+
+    def step(self, data: bytes, now_ns: int, steady_s: float) -> bytes:
+        """See `TalkSession.step`."""

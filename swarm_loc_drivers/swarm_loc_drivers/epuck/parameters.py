@@ -12,9 +12,17 @@ from swarm_loc_drivers.common.calibration_file import (
 )
 from swarm_loc_drivers.common.link import Address, parse_address
 from swarm_loc_drivers.common.odometry import WheelGeometry
-from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
-from swarm_loc_drivers.epuck.hardware import EPUCK2, EPUCK_MODELS, EpuckModel, wheel_geometry
-from swarm_loc_drivers.epuck.session import CameraSettings
+from swarm_loc_drivers.common.robot_driver import DriverParameters
+from swarm_loc_drivers.epuck.hardware import (
+    EPUCK2,
+    EPUCK_MODELS,
+    WIFI_HEIGHT,
+    WIFI_PORT,
+    WIFI_WIDTH,
+    CameraSettings,
+    EpuckModel,
+    wheel_geometry,
+)
 from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 
@@ -22,7 +30,7 @@ _ODOMETRY = OdometryModel()
 
 
 @dataclass(frozen=True)
-class EpuckParameters:
+class EpuckParameters(DriverParameters):
     """Parameters of `epuck_driver_node`.
 
     Raises:
@@ -47,7 +55,6 @@ class EpuckParameters:
     reply_timeout_s: float = number(
         0.5, "s", 0.01, 10.0, "how long an answer may take; a stream may be silent 1.5 s longer"
     )
-    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "time without cmd_vel until the robot stops")
     wheel_diameter: float = number(0.041, "m", 0.001, 1.0, "diameter of the wheels")
     wheel_separation: float = number(
         _ODOMETRY.wheel_separation, "m", 0.001, 10.0, "distance between the two wheels"
@@ -55,9 +62,6 @@ class EpuckParameters:
     wheel_noise: float = number(
         _ODOMETRY.wheel_noise, "m", 0.0, 1.0, "variance of each wheel's path per metre it rolls [m^2/m]"
     )
-    odom_frame: str = text("odom", "the pose is in <robot>/odom_frame", required=True)
-    base_frame: str = text("base_link", "the pose is that of <robot>/base_frame", required=True)
-    publish_tf: bool = flag(True, "publish the transform from odom to base_link")
     camera: bool = flag(False, "publish images; needs camera_info_file")
     camera_info_file: str = text("", "calibration of the camera, as camera_calibration writes it")
     image_width: int = number(
@@ -76,26 +80,23 @@ class EpuckParameters:
                 " only epuck2 has WiFi."
             )
         if self.camera and not self.link_address.host:
-            self._check_images(self.epuck_model)
-
-    def _check_images(self, model: EpuckModel) -> None:
-        """Check the images over a serial port: the robot would silently refuse those beyond its buffer."""
-        size = 2 * self.image_width * self.image_height
-        if size > model.largest_image:
-            raise ParameterError(
-                f"parameters image_width = {self.image_width} and image_height = {self.image_height} make"
-                f" images of {size} bytes, but an {model.name} can send at most {model.largest_image}."
-            )
-        if self.image_zoom not in model.zooms:
-            raise ParameterError(
-                f"parameter image_zoom = {self.image_zoom} must be one of"
-                f" {', '.join(map(str, model.zooms))} for an {model.name}."
-            )
+            # over a serial port the robot would silently refuse images beyond its buffer
+            model, size = self.epuck_model, 2 * self.image_width * self.image_height
+            if size > model.largest_image:
+                raise ParameterError(
+                    f"parameters image_width = {self.image_width} and image_height = {self.image_height} make"
+                    f" images of {size} bytes, but an {model.name} can send at most {model.largest_image}."
+                )
+            if self.image_zoom not in model.zooms:
+                raise ParameterError(
+                    f"parameter image_zoom = {self.image_zoom} must be one of"
+                    f" {', '.join(map(str, model.zooms))} for an {model.name}."
+                )
 
     @property
     def link_address(self) -> Address:
         """The parsed address; over TCP the robot is an e-puck2 with the WiFi firmware."""
-        return parse_address(self.address, epuck_wifi.PORT)
+        return parse_address(self.address, WIFI_PORT)
 
     @property
     def epuck_model(self) -> EpuckModel:
@@ -113,7 +114,7 @@ class EpuckParameters:
         if not self.camera:
             return None
         if self.link_address.host:
-            return CameraSettings(epuck_wifi.WIDTH, epuck_wifi.HEIGHT, zoom=1, period_s=self.image_period_s)
+            return CameraSettings(WIFI_WIDTH, WIFI_HEIGHT, zoom=1, period_s=self.image_period_s)
         return CameraSettings(self.image_width, self.image_height, self.image_zoom, self.image_period_s)
 
 

@@ -15,14 +15,20 @@ import struct
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from swarm_loc_drivers.common.session import MAX_NONSENSE_S, NONSENSE, SessionError, Talk, TalkSession
-from swarm_loc_drivers.epuck.hardware import as_counter, decode_rgb565
+from swarm_loc_drivers.common.robot_driver import MAX_NONSENSE_S, NONSENSE, SessionError, Talk, TalkSession
+from swarm_loc_drivers.epuck.hardware import (
+    CameraImage,
+    CameraSettings,
+    Reading,
+    Speeds,
+    as_counter,
+    decode_rgb565,
+)
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
-from swarm_loc_drivers.epuck.session import CameraImage, CameraSettings, Reading, Speeds
 
 END = 0
 RGB565_MODE = 1
@@ -57,14 +63,6 @@ def code(letter: str) -> int:
     return 256 - ord(letter)
 
 
-class Readings(NamedTuple):
-    """Periodic readings."""
-
-    left_counter: int  # Steps of the left wheel, 16 bits, wrapping
-    right_counter: int  # Steps of the right wheel, 16 bits, wrapping
-    proximity: tuple[int, ...]  # Raw values of ps0..ps7
-
-
 @dataclass(frozen=True)
 class Request:
     """A chain of binary commands and the frame of its reply."""
@@ -94,10 +92,10 @@ def _request(left: int, right: int, letters: str, size: int) -> Request:
     return Request(queries, _SPEEDS.pack(left, right), size)
 
 
-def decode_readings(body: bytes) -> Readings:
-    """Decode a reply to `readings_request`."""
+def decode_readings(body: bytes) -> tuple[int, int, NDArray[np.int64]]:
+    """Counters of the left and the right wheel, 16 bits, and raw values (8,) of ps0..ps7."""
     left, right, *proximity = _READINGS.unpack(body)
-    return Readings(left, right, tuple(proximity))
+    return left, right, np.array(proximity, np.int64)
 
 
 def decode_image(body: bytes, width: int, height: int) -> bytes | None:
@@ -184,24 +182,21 @@ class SerialSession(TalkSession):
             self.is_idle = False
             if self.ending:
                 break
-            yield from self._exchange(camera)
+            # send the wheel speeds and take the measurements
+            speeds = self._speeds()
+            is_answered = yield from self._read(speeds)
+            if is_answered and camera is not None:
+                is_answered = yield from self._take_image(speeds, camera)
+            if not is_answered:
+                self._doubt()
+                self._may_have_moved = True
+                self._counts["missed_replies"] += 1
+                yield from self._resync()
         yield from self._resync()
 
     def _speeds(self) -> tuple[int, int]:
         """Commands of the wheels now; zero before the connection and at the end."""
         return self._wanted_speeds() if self.connected and not self.ending else (0, 0)
-
-    def _exchange(self, camera: CameraSettings | None) -> Talk[None]:
-        """Send the wheel speeds and take the measurements."""
-        speeds = self._speeds()
-        is_answered = yield from self._read(speeds)
-        if is_answered and camera is not None and self._image_is_due(camera):
-            is_answered = yield from self._take_image(speeds, camera)
-        if not is_answered:
-            self._doubt()
-            self._may_have_moved = True
-            self._counts["missed_replies"] += 1
-            yield from self._resync()
 
     def _read(self, speeds: tuple[int, int]) -> Talk[bool]:
         """Read counters and proximity; the stamp is the middle between request and reply.
@@ -209,15 +204,14 @@ class SerialSession(TalkSession):
         A reply that is far later than the one before is not used: this process was stopped meanwhile.
         """
         asked_ns = self._now_ns
-        body = yield from self._ask(readings_request(*speeds, is_new=speeds != self._sent))
+        body = yield from self._request(readings_request(*speeds, is_new=speeds != self._sent))
         if body is None:
             return False
         way_ns = max(0, self._now_ns - asked_ns) // 2
         is_late = way_ns > (most_ns := 2 * self._way_ns + _JITTER_NS)
         self._way_ns = min(way_ns, most_ns)
         left, right, proximity = decode_readings(body)
-        stamp_ns, sensors = asked_ns + self._way_ns, np.array(proximity, dtype=np.int64)
-        reading = Reading(stamp_ns, self._way_ns, left, right, sensors)
+        reading = Reading(asked_ns + self._way_ns, self._way_ns, left, right, proximity)
         if not is_late:
             self.found.append(reading)
         self._may_have_moved |= any(self._sent) or any(speeds)
@@ -233,17 +227,13 @@ class SerialSession(TalkSession):
         left, right = after.left_counter - before.left_counter, after.right_counter - before.right_counter
         return max(abs(as_counter(left)), abs(as_counter(right))) <= most + _ROUNDING_STEPS
 
-    def _image_is_due(self, camera: CameraSettings) -> bool:
-        period_ns = round(camera.period_s * _NS)
-        if self._image_due_ns - period_ns <= self._now_ns < self._image_due_ns:
-            return False
-        self._image_due_ns = self._now_ns + period_ns
-        return True
-
     def _take_image(self, speeds: tuple[int, int], camera: CameraSettings) -> Talk[bool]:
-        """Read an image, which the robot takes when the request arrives."""
-        asked_ns = self._now_ns
-        body = yield from self._ask(image_request(*speeds, camera.width, camera.height))
+        """Read an image if one is due, which the robot takes when the request arrives; whether it answers."""
+        period_ns, asked_ns = round(camera.period_s * _NS), self._now_ns
+        if self._image_due_ns - period_ns <= asked_ns < self._image_due_ns:
+            return True
+        self._image_due_ns = asked_ns + period_ns
+        body = yield from self._request(image_request(*speeds, camera.width, camera.height))
         if body is None:
             return False
         pixels = decode_image(body, camera.width, camera.height)
@@ -254,7 +244,7 @@ class SerialSession(TalkSession):
             self.found.append(CameraImage(asked_ns + self._way_ns, image))
         return True
 
-    def _ask(self, request: Request) -> Talk[bytes | None]:
+    def _request(self, request: Request) -> Talk[bytes | None]:
         """The body of the reply; None if it is late or incomplete."""
         self._counts["stray_bytes"] += len(self._received)
         self._received = b""
@@ -280,8 +270,10 @@ class SerialSession(TalkSession):
     def _set_camera(self, camera: CameraSettings) -> Talk[None]:
         """Set the size of images, and check that the robot has accepted it."""
         setting = f"J,{RGB565_MODE},{camera.width},{camera.height},{camera.zoom}\r".encode()
-        yield from self._answer(setting, ASCII_CAMERA_SET)  # the answer even when it refuses
-        answer = yield from self._answer(ASCII_CAMERA_QUERY, ASCII_CAMERA_REPLY)
+        timeouts_s = (self._timeout_s(len(line)) for line in (setting, ASCII_CAMERA_QUERY))
+        yield from self._ask(setting, ASCII_CAMERA_SET, next(timeouts_s), _TRIES)  # even when it refuses
+        answer = yield from self._ask(ASCII_CAMERA_QUERY, ASCII_CAMERA_REPLY, next(timeouts_s), _TRIES)
+        self._received = b""
         wanted = (RGB565_MODE, camera.width, camera.height, camera.zoom)
         taken = tuple(int(number) for number in answer.groups()[:4])
         if taken != wanted:
@@ -300,12 +292,4 @@ class SerialSession(TalkSession):
             if (yield from self._ask_once(line, answer, self._timeout_s(len(line)))) is not None:
                 self._received = b""
                 return
-        raise SessionError("the robot does not answer")
-
-    def _answer(self, line: bytes, answer: re.Pattern[bytes]) -> Talk[re.Match[bytes]]:
-        """The answer to an ASCII line, which is sent several times."""
-        for _ in range(_TRIES):
-            if (match := (yield from self._ask_once(line, answer, self._timeout_s(len(line))))) is not None:
-                self._received = b""
-                return match
         raise SessionError("the robot does not answer")

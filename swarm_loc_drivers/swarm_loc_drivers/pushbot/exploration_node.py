@@ -68,8 +68,14 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
         super().destroy_node()
 
     def _on_odometry(self, index: int, message: Odometry) -> None:
-        robot = self._robots[index]
-        robot.drives = robot.drives or self._can_begin(self._names[index])
+        robot, name = self._robots[index], self._names[index]
+        # all nodes that produce and use a robot's distances must run, so that none is lost
+        awaited = [f"{name}/laser", f"{name}/goal", f"{name}/fix"]
+        awaited += ["swarm/poses"] if self.params.wait_for_poses else []
+        robot.drives = robot.drives or (
+            min(self.count_subscribers(f"{name}/{topic}") for topic in ("laser", "odom")) > 1
+            and all(self.count_publishers(topic) for topic in awaited)
+        )
         stamp_ns, pose = nanoseconds(message.header.stamp), _planar(message.pose.pose)
         if not robot.drives:
             return
@@ -78,13 +84,6 @@ class ExplorationNode(ConfiguredNode[ExplorationParameters]):
             return
         forward, _, rate = robot.motion.command(stamp_ns, pose)
         self._commands[index].publish(Twist(linear=Vector3(x=forward), angular=Vector3(z=rate)))
-
-    def _can_begin(self, name: str) -> bool:
-        """Whether all nodes that produce and use a robot's distances run, so that none is lost."""
-        awaited = [f"{name}/laser", f"{name}/goal", f"{name}/fix"]
-        awaited += ["swarm/poses"] if self.params.wait_for_poses else []
-        heard = self.count_subscribers(f"{name}/laser") > 1 and self.count_subscribers(f"{name}/odom") > 1
-        return heard and all(self.count_publishers(topic) for topic in awaited)
 
     def _on_laser(self, index: int, message: LaserDistance) -> None:
         self._robots[index].motion.take_distance(message.distance)

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 from swarm_loc_drivers.common.link import Address, parse_address
 from swarm_loc_drivers.common.odometry import WheelGeometry
-from swarm_loc_drivers.pushbot.hardware import BAUD_RATE, TIMESTAMPS
-from swarm_loc_drivers.pushbot.protocol import Lights
+from swarm_loc_drivers.common.robot_driver import DriverParameters
+from swarm_loc_drivers.pushbot.protocol import BAUD_RATE, TIMESTAMPS, Lights
 from swarm_loc_drivers.pushbot.stop_and_go import StopAndGoSettings
 from swarm_loc_estimator.common.parameters import ParameterError, choice, flag, number, text, texts
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -17,7 +17,7 @@ _MIN_FREQUENCY = 10.0  # Lowest blink frequency that the tracker detects [Hz]; 0
 
 
 @dataclass(frozen=True)
-class PushbotParameters:
+class PushbotParameters(DriverParameters):
     """Parameters of `pushbot_driver_node`.
 
     Raises:
@@ -36,15 +36,11 @@ class PushbotParameters:
     reply_timeout_s: float = number(
         0.5, "s", 0.05, 10.0, "how long an answer, or the next wheel ticks, may take"
     )
-    cmd_vel_timeout_s: float = number(0.5, "s", 0.02, 10.0, "time without cmd_vel until the robot stops")
     metres_per_tick: float = number(1e-4, "m", 1e-6, 1e-2, "path of a wheel per tick")
     wheel_separation: float = number(0.085, "m", 0.01, 1.0, "distance between the two wheels")
     wheel_noise: float = number(
         2e-4, "m", 0.0, 1.0, "variance of each wheel's path per metre it rolls [m^2/m]"
     )
-    odom_frame: str = text("odom", "the pose is in <robot>/odom_frame", required=True)
-    base_frame: str = text("base_link", "the pose is that of <robot>/base_frame", required=True)
-    publish_tf: bool = flag(True, "publish the transform from odom to base_link")
 
     def __post_init__(self) -> None:
         parse_address(self.address, TCP_PORT)

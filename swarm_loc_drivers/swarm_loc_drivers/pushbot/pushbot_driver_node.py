@@ -15,13 +15,11 @@ from typing import Any
 from rclpy.qos import QoSProfile, ReliabilityPolicy
 from std_msgs.msg import Header
 
-from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode
-from swarm_loc_drivers.common.ros_messages import stamp_message
+from swarm_loc_drivers.common.robot_driver_node import RobotDriverNode, stamp_message
 from swarm_loc_drivers.pushbot.driver import PushbotDriver, PushbotListeners
-from swarm_loc_drivers.pushbot.event_packets import EventPacket
-from swarm_loc_drivers.pushbot.event_parser import precompile
-from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
+from swarm_loc_drivers.pushbot.event_parser import EventPacket, precompile
 from swarm_loc_drivers.pushbot.parameters import PushbotParameters
+from swarm_loc_drivers.pushbot.protocol import SENSOR_PX
 from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS
 from swarm_loc_estimator.common.messages.event_encoding import ENCODING
 from swarm_loc_estimator.common.node import message_class, run_node

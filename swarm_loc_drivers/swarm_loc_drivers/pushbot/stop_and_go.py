@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from swarm_loc_drivers.common.velocity_command import STILL, Velocity
+from swarm_loc_drivers.common.robot_driver import STILL, Velocity
 from swarm_loc_estimator import SCAN_TURN, START_TURN
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import number
@@ -114,12 +114,21 @@ class StopAndGo:
         Returns:
             Whether the goal is accepted: it must be newer than the last one and within this odometry.
         """
-        there = self._odometry_at(goal.stamp_ns)
-        if there is None or goal.stamp_ns <= self._goal_ns:
+        is_new, track = goal.stamp_ns > self._goal_ns, self._track
+        if not is_new or not track or not track[0][0] <= goal.stamp_ns <= track[-1][0]:
             return False
+        since_ns = np.array([row[0] - goal.stamp_ns for row in track], dtype=float)
+        poses = np.array([row[1:] for row in track])
+        there = np.array([np.interp(0.0, since_ns, column) for column in poses.T])
         self.goals += 1
         self._goal_ns = goal.stamp_ns
-        self._learn_ratio(float(goal.pose[2]), float(there[2]))
+        # estimate the wheel slip from the headings of two fixes and the odometry between them
+        heading, by_odometry = float(goal.pose[2]), float(there[2])
+        if self._fixed is not None and abs(turned := by_odometry - self._fixed[1]) > _MIN_RATIO_TURN:
+            wrong = float(wrap_angle(heading - self._fixed[0] - self.ratio * turned))
+            self.ratio = min(max(self.ratio + wrong / turned, _LOW_RATIO), _HIGH_RATIO)
+        self._fixed = (heading, by_odometry)
+        # turn to the goal, drive there, and scan
         way = goal.position - goal.pose[:2]
         length = math.hypot(way[0], way[1])
         self._moves.clear()
@@ -173,38 +182,18 @@ class StopAndGo:
         self._track.append((stamp_ns, x, y, theta))
         return np.array([x, y, theta])
 
-    def _odometry_at(self, stamp_ns: int) -> FloatArray | None:
-        """Pose (3,) by odometry at a time [ns]; None outside the record."""
-        if not self._track or not self._track[0][0] <= stamp_ns <= self._track[-1][0]:
-            return None
-        since_ns = np.array([row[0] - stamp_ns for row in self._track], dtype=float)
-        poses = np.array([row[1:] for row in self._track])
-        return np.array([np.interp(0.0, since_ns, column) for column in poses.T])
-
-    def _learn_ratio(self, heading: float, by_odometry: float) -> None:
-        """Estimate the wheel slip from the headings of two fixes [rad] and the odometry between them."""
-        if self._fixed is not None and abs(turned := by_odometry - self._fixed[1]) > _MIN_RATIO_TURN:
-            wrong = float(wrap_angle(heading - self._fixed[0] - self.ratio * turned))
-            self.ratio = min(max(self.ratio + wrong / turned, _LOW_RATIO), _HIGH_RATIO)
-        self._fixed = (heading, by_odometry)
-
     def _towards(self, move: _Turn | _Look | _Drive, now: FloatArray, begin: FloatArray) -> Velocity | None:
         """Velocity of a move at a pose (3,) by odometry; None when the move is done."""
         if isinstance(move, _Drive):
-            return self._ahead(move, now, begin)
+            left = move.length - math.dist(now[:2], begin[:2])
+            if left >= _ARRIVED and not self._is_near:
+                speed = min(max(_GAIN * left, _MIN_SPEED), self._settings.speed)
+                return speed, 0.0, _COURSE_GAIN * float(begin[2] - now[2])
+            self.halts += left >= _ARRIVED
+            return None
         heading = move.heading if isinstance(move, _Turn) else begin[2] + move.angle
         left = heading - now[2]
         is_beyond = (heading - begin[2]) * left <= 0.0
         if abs(left) < _TURNED or is_beyond:
             return None
         return 0.0, 0.0, math.copysign(min(max(_GAIN * abs(left), _MIN_RATE), move.rate), left)
-
-    def _ahead(self, move: _Drive, now: FloatArray, begin: FloatArray) -> Velocity | None:
-        left = move.length - math.dist(now[:2], begin[:2])
-        if left < _ARRIVED:
-            return None
-        if self._is_near:
-            self.halts += 1
-            return None
-        speed = min(max(_GAIN * left, _MIN_SPEED), self._settings.speed)
-        return speed, 0.0, _COURSE_GAIN * float(begin[2] - now[2])

@@ -10,18 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from swarm_loc_drivers.sim.run import (
-    ODOMETRY_DTYPE,
-    ODOMETRY_LATENESS,
-    START_NS,
-    Lateness,
-    Records,
-    Trajectories,
-    arrival_ns,
-    in_order_of_arrival,
-)
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 
@@ -33,17 +22,9 @@ Controller = Callable[[int, FloatArray], tuple[FloatArray, FloatArray]]
 class Drive:
     """A differential drive and its imperfections."""
 
-    wheel_separation: float  # [m]
+    wheel_separation: float | FloatArray  # [m], of all robots or of each (N,)
     wheel_noise: float  # Variance of a wheel's path per metre rolled [m]
     turn_slip: float = 0.0  # Share of every commanded turn that is lost, in [0, 1)
-
-
-@dataclass(frozen=True)
-class Driven:
-    """True and reported tracks of a drive."""
-
-    truth: FloatArray  # (T + 1, N, 3) true poses in map
-    reported: FloatArray  # (T + 1, N, 3) poses by odometry, each robot's own frame, starting at zero
 
 
 class LastingNoise:
@@ -70,13 +51,15 @@ class LastingNoise:
         return mean
 
 
-def wheel_paths(speed: FloatArray, turn_rate: FloatArray, separation: float, step_s: float) -> FloatArray:
+def wheel_paths(
+    speed: FloatArray, turn_rate: FloatArray, separation: float | FloatArray, step_s: float
+) -> FloatArray:
     """Paths (..., 2) [m] of the right and left wheel in one step."""
     half_turn = 0.5 * separation * turn_rate
     return np.stack([speed + half_turn, speed - half_turn], axis=-1) * step_s
 
 
-def twist_of(wheels: FloatArray, separation: float) -> FloatArray:
+def twist_of(wheels: FloatArray, separation: float | FloatArray) -> FloatArray:
     """The twist (..., 3) of one step in the robot's own frame, from its wheels' paths (..., 2) [m]."""
     right, left = wheels[..., 0], wheels[..., 1]
     return np.stack([0.5 * (right + left), np.zeros_like(right), (right - left) / separation], axis=-1)
@@ -105,46 +88,6 @@ def roll(
     return se2.compose(poses, se2.exp(twist_of(rolled, model.wheel_separation)))
 
 
-def drive(
-    rng: np.random.Generator,
-    start: FloatArray,
-    control: Controller,
-    model: Drive,
-    *,
-    step_s: float,
-    steps: int,
-) -> Driven:
-    """Drive N robots from `start` (N, 3) for `steps` steps of `step_s`, commanded by `control`."""
-    truth = np.empty((steps + 1, *start.shape))
-    truth[0] = start
-    speeds, turn_rates = np.empty((2, steps, len(start)))
-    noise = rng.standard_normal((steps, len(start), 2)) * np.sqrt(model.wheel_noise)
-    for k in range(steps):
-        speeds[k], turn_rates[k] = control(k, truth[k])
-        truth[k + 1] = roll(truth[k], speeds[k], turn_rates[k], model, step_s, noise[k])
-    commanded = wheel_paths(speeds, turn_rates, model.wheel_separation, step_s)
-    return Driven(truth, integrate(twist_of(commanded, model.wheel_separation)))
-
-
-def record_drive(
-    rng: np.random.Generator,
-    start: FloatArray,
-    control: Controller,
-    model: Drive,
-    *,
-    step_ns: int,
-    duration_s: float,
-    odometry_rate_hz: float,
-) -> tuple[Trajectories, Records]:
-    """Drive N robots from `start` (N, 3) at START_NS: their true tracks, and odometry of ODOMETRY_DTYPE."""
-    steps = round(duration_s * 1e9 / step_ns)
-    stamp_ns = START_NS + step_ns * np.arange(steps + 1, dtype=np.int64)
-    driven = drive(rng, start, control, model, step_s=step_ns * 1e-9, steps=steps)
-    every = round(1e9 / odometry_rate_hz / step_ns)
-    odometry = report_odometry(rng, stamp_ns, driven.reported, every, ODOMETRY_LATENESS)
-    return Trajectories(stamp_ns, driven.truth), odometry
-
-
 def integrate(twists: FloatArray) -> FloatArray:
     """Odometry (T + 1, N, 3) from zero, by the mean heading of each step, e-puck paper eq. (1)."""
     heading = np.concatenate([np.zeros((1, *twists.shape[1:-1])), np.cumsum(twists[..., 2], axis=0)])
@@ -152,30 +95,3 @@ def integrate(twists: FloatArray) -> FloatArray:
     steps = twists[..., :1] * np.stack([np.cos(middle), np.sin(middle)], axis=-1)
     position = np.concatenate([np.zeros((1, *steps.shape[1:])), np.cumsum(steps, axis=0)])
     return np.concatenate([position, se2.wrap_angle(heading)[..., None]], axis=-1)
-
-
-def report_odometry(
-    rng: np.random.Generator, stamp_ns: NDArray[np.int64], reported: FloatArray, every: int, late: Lateness
-) -> Records:
-    """The odometry messages of N robots, each at its own phase of the common clock.
-
-    Args:
-        rng: Source of phases and delays.
-        stamp_ns: (T,).
-        reported: (T, N, 3) in each robot's odom frame.
-        every: Steps between two messages of a robot.
-        late: Delay on the way.
-
-    Returns:
-        (M,) of ODOMETRY_DTYPE in order of arrival. Every robot's first message is at the first stamp.
-    """
-    robots = reported.shape[1]
-    phase = rng.integers(1, every + 1, robots)
-    step = np.arange(len(stamp_ns))[:, None]
-    chosen, robot = np.nonzero((step == 0) | ((step - phase) % every == 0))
-    messages = np.zeros(len(chosen), ODOMETRY_DTYPE)
-    messages["robot"] = robot
-    messages["stamp_ns"] = stamp_ns[chosen]
-    messages["pose"] = reported[chosen, robot]
-    messages["arrival_ns"] = arrival_ns(rng, messages["stamp_ns"], late)
-    return in_order_of_arrival(messages, int(stamp_ns[-1]))

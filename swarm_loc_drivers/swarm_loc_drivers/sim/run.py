@@ -7,14 +7,12 @@ Ground truth is separate and only for evaluation.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.swarm.swarm import Swarm
 
 
 @dataclass(frozen=True)
@@ -62,90 +60,4 @@ def _interpolate(
     return se2.compose(before, se2.exp(share[..., None] * se2.log(se2.between(before, after))))
 
 
-ODOMETRY_DTYPE = np.dtype(
-    [("robot", "<i4"), ("stamp_ns", "<i8"), ("arrival_ns", "<i8"), ("pose", "<f8", (3,))]
-)
-"""One odometry message: pose x [m], y [m], theta [rad] in the robot's odom frame, which starts at zero."""
-
-FRAME_DTYPE = np.dtype(
-    [("robot", "<i4"), ("stamp_ns", "<i8"), ("arrival_ns", "<i8"), ("first", "<i8"), ("count", "<i4")]
-)
-"""One camera image that arrived: its sightings are `sightings[first : first + count]`; count may be 0."""
-
-SIGHTING_DTYPE = np.dtype([("marker_id", "<u4"), ("value", "<f8", (3,))])
-"""One marker: forward [m] and left [m] of the camera, its normal from the optical axis [rad]."""
-
 START_NS = 1_000 * 10**9  # Start time of simulated runs
-
-Records = NDArray[Any]  # A structured array of one of the types above
-
-
-@dataclass(frozen=True)
-class LivedRun:
-    """Data common to all simulated swarms."""
-
-    swarm: Swarm  # The description available to a user, without the hidden errors of the world
-    truth: Trajectories  # True poses of the robots in map
-    odometry: Records  # (M,) of ODOMETRY_DTYPE in order of arrival
-
-    @property
-    def start_ns(self) -> int:
-        """Start of the simulation."""
-        return int(self.truth.stamp_ns[0])
-
-    @property
-    def end_ns(self) -> int:
-        """End of the simulation; nothing arrives later."""
-        return int(self.truth.stamp_ns[-1])
-
-    @property
-    def duration_s(self) -> float:
-        """Simulated time [s]."""
-        return (self.end_ns - self.start_ns) * 1e-9
-
-
-@dataclass(frozen=True)
-class SimulatedRun(LivedRun):
-    """A simulated swarm with cameras from start to end."""
-
-    frames: Records  # (F,) of FRAME_DTYPE in order of arrival; lost images are not there
-    sightings: Records  # (S,) of SIGHTING_DTYPE, grouped by frame
-
-    def masked(self, kept: NDArray[np.bool_]) -> SimulatedRun:
-        """The run with some of its sightings (S,) only; frames stay, empty ones too."""
-        frames = self.frames.copy()
-        frame = np.repeat(np.arange(len(frames)), frames["count"])
-        frames["count"] = np.bincount(frame[kept], minlength=len(frames))
-        frames["first"] = np.cumsum(frames["count"]) - frames["count"]
-        return replace(self, frames=frames, sightings=self.sightings[kept])
-
-
-def in_order_of_arrival(records: Records, end_ns: int) -> Records:
-    """The records that arrive until `end_ns`, sorted by arrival."""
-    ordered = records[np.argsort(records["arrival_ns"], kind="stable")]
-    return ordered[ordered["arrival_ns"] <= end_ns]
-
-
-@dataclass(frozen=True)
-class Lateness:
-    """Delay between measurement and arrival, uniform between two bounds."""
-
-    low_s: float  # Shortest delay [s]
-    high_s: float  # Longest delay [s]
-
-
-CAMERA_LATENESS = Lateness(0.150, 0.300)
-"""Exposure, marker detection and wireless link of the e-puck paper, section V-B."""
-
-ODOMETRY_LATENESS = Lateness(0.002, 0.020)  # A few bytes on the same wireless link
-
-
-def arrival_ns(rng: np.random.Generator, stamp_ns: NDArray[np.int64], late: Lateness) -> NDArray[np.int64]:
-    """Arrival times (M,) of messages with stamps (M,); independent delays may change their order."""
-    delay_s = rng.uniform(late.low_s, late.high_s, len(stamp_ns))
-    return stamp_ns + np.rint(delay_s * 1e9).astype(np.int64)
-
-
-def survivors(rng: np.random.Generator, count: int, loss: float) -> NDArray[np.bool_]:
-    """Which of `count` messages arrive (count,), when each is lost with probability `loss`."""
-    return rng.random(count) >= loss

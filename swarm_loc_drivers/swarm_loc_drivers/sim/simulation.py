@@ -18,7 +18,14 @@ from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import MAX_ROBOTS, laser_hz, led_hz
 from swarm_loc_drivers.sim.pushbot.wall_drive import calibrate_lasers
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
-from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings
+from swarm_loc_drivers.sim.room.sensors import sensors_of
+from swarm_loc_drivers.sim.room.world import (
+    ROOM_WORLDS,
+    RoomWorld,
+    draw_missing_map,
+    room_of,
+    room_starts,
+)
 from swarm_loc_drivers.sim.scenarios.droplets import starts as droplet_starts
 from swarm_loc_drivers.sim.scenarios.eight import ARENA, eight_floor, eight_starts, rounded
 from swarm_loc_drivers.sim.worlds import WorldError
@@ -27,12 +34,13 @@ from swarm_loc_estimator.common.launch import NodeSpec, ParameterValue, check_pa
 from swarm_loc_estimator.common.parameters import ParameterError, flag, number, text
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
-from swarm_loc_vision.aerial.ground_file import save_ground
+from swarm_loc_vision.aerial.ground_control import save_ground
 
 Parameters = dict[str, ParameterValue]
 
 _ESTIMATOR, _VISION, _DRIVERS = "swarm_loc_estimator", "swarm_loc_vision", "swarm_loc_drivers"
 _TIME: Parameters = {"use_sim_time": True}
+_HALL = "corridor"  # Of PushBots
 _ANSWER_WITHIN_S = 0.15  # Images of real robots take so long to become detections, too
 _AERIAL_RATE_HZ = 3.0
 _AERIAL_CAMERA: Parameters = {
@@ -58,7 +66,9 @@ class SimulationOptions:
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
     )
     plan: str = text(
-        "corridor", f"the hall of PushBots: {', '.join(FLOOR_PLANS)}, or the path of a floor plan"
+        "",
+        f"the walls: {', '.join(FLOOR_PLANS)}, or the path of a floor plan (default: corridor for PushBots,"
+        " else the map of the description)",
     )
     aerial: bool = flag(False, "locate e-pucks only by an overhead camera, which cannot tell them apart")
     parameter_file: str | None = text(None, "ROS parameter file for all nodes")
@@ -69,8 +79,8 @@ class RobotType:
     """How one kind of robot is simulated."""
 
     name: str  # The type of the robots in a swarm description
-    # Options, number of robots -> poses (N, 3) of those that the description gives no start
-    starts: Callable[[SimulationOptions, int], FloatArray]
+    # Options, swarm -> poses (N, 3) of those that the description gives no start
+    starts: Callable[[SimulationOptions, Swarm], FloatArray]
     check: Callable[[Swarm], None]  # Raises a `UserError` for a swarm that its world cannot hold
     # Options, swarm, folder for serial ports and files, file of the swarm with all starts -> nodes in the
     # order in which they start
@@ -81,7 +91,7 @@ class RobotType:
 
 
 def robot_type_of(swarm: Swarm) -> RobotType:
-    """The kind of a swarm's robots; e-pucks may have a type of any other name.
+    """The kind of a swarm's robots; those of any other type are e-pucks, or in a room if none has a camera.
 
     Raises:
         WorldError: The robots are of several kinds.
@@ -93,7 +103,7 @@ def robot_type_of(swarm: Swarm) -> RobotType:
             raise WorldError(
                 f"robot '{robot}' is no {first.name}, and others are: one world has one kind of robots."
             )
-    return first
+    return first if first is not EPUCK or any(robot.camera for robot in swarm.robots) else ROOM
 
 
 def simulated_swarm(options: SimulationOptions) -> Swarm:
@@ -102,7 +112,7 @@ def simulated_swarm(options: SimulationOptions) -> Swarm:
     Raises:
         UserError: A file cannot be used, or the swarm cannot be simulated.
     """
-    floor_plan(options.plan)
+    floor_plan(options.plan or _HALL)
     check_parameter_file(options.parameter_file)
     swarm = load_swarm(Path(options.swarm_file))
     kind = robot_type_of(swarm)
@@ -141,7 +151,7 @@ def placed(options: SimulationOptions, swarm: Swarm) -> Swarm:
     described = [robot.start for robot in swarm.robots if robot.start is not None]
     if len(described) == len(swarm.robots):
         return swarm
-    starts = robot_type_of(swarm).starts(options, len(swarm.robots))
+    starts = robot_type_of(swarm).starts(options, swarm)
     taken = np.array(described).reshape(-1, 3)[:, :2]
     away = np.linalg.norm(starts[:, None, :2] - taken, axis=-1).min(axis=1, initial=np.inf)
     free = iter(starts[np.sort(np.argsort(-away, kind="stable")[: len(starts) - len(described)])])
@@ -158,8 +168,9 @@ def _world(swarm_file: str, options: SimulationOptions, links: str, **own: Param
     return {**shared, "link_folder": links, **own}
 
 
-def _epuck_starts(_: SimulationOptions, robots: int) -> FloatArray:
+def _epuck_starts(_: SimulationOptions, swarm: Swarm) -> FloatArray:
     """Places of an odd number of robots: of an even number, opposite ones would meet at the crossing."""
+    robots = len(swarm.robots)
     return eight_starts(robots + 1 - robots % 2)[:robots]
 
 
@@ -210,8 +221,8 @@ def _aerial_files(options: SimulationOptions, folder: Path) -> tuple[Parameters,
     return {"swarm_file": str(swarm_file)}, {"control_points_file": str(floor_file)}
 
 
-def _droplet_starts(options: SimulationOptions, robots: int) -> FloatArray:
-    return droplet_starts(DropletRunSettings(seed=options.seed, robots=robots))
+def _droplet_starts(options: SimulationOptions, swarm: Swarm) -> FloatArray:
+    return droplet_starts(options.seed, len(swarm.robots))
 
 
 def _droplet_nodes(options: SimulationOptions, swarm: Swarm, links: str, whole: str) -> list[NodeSpec]:
@@ -230,12 +241,12 @@ def _droplet_nodes(options: SimulationOptions, swarm: Swarm, links: str, whole: 
     ]
 
 
-def _pushbot_starts(options: SimulationOptions, robots: int) -> FloatArray:
-    starts = floor_plan(options.plan).starts
+def _pushbot_starts(options: SimulationOptions, swarm: Swarm) -> FloatArray:
+    robots = len(swarm.robots)
+    plan = floor_plan(options.plan or _HALL)
+    starts = plan.starts
     if len(starts) < robots:
-        raise WorldError(
-            f"the floor plan '{options.plan}' has starts for {len(starts)} robots, not {robots}."
-        )
+        raise WorldError(f"the floor plan '{plan.name}' has starts for {len(starts)} robots, not {robots}.")
     return np.column_stack([starts[:robots], np.zeros(robots)])
 
 
@@ -246,7 +257,7 @@ def _pushbot_nodes(options: SimulationOptions, swarm: Swarm, links: str, whole: 
     described: Parameters = {"swarm_file": whole}
     leds = [f"{robot}={led_hz(index)}" for index, robot in enumerate(robots)] if len(robots) > 1 else []
     mapper: Parameters = {**described, **({"led_frequencies": leds} if leds else {}), **_TIME}
-    world = _world(whole, options, links, plan=options.plan)
+    world = _world(whole, options, links, plan=options.plan or _HALL)
     exploration: Parameters = {**described, "wait_for_poses": True, **_TIME}
     file = options.parameter_file
     nodes = [
@@ -281,6 +292,33 @@ def _check_pushbots(swarm: Swarm) -> None:
         )
 
 
+def _room_starts(options: SimulationOptions, swarm: Swarm) -> FloatArray:
+    return room_starts(swarm, room_of(swarm, options.plan), options.seed)
+
+
+def _check_room(swarm: Swarm) -> None:
+    """Check that all sensors can be simulated; raises a UserError otherwise."""
+    sensors_of(RoomWorld(swarm, room_of(swarm, ""), 1, 0.0))
+
+
+def _room_nodes(options: SimulationOptions, swarm: Swarm, links: str, whole: str) -> list[NodeSpec]:
+    """Draws the map that the description names, if it is missing."""
+    draw_missing_map(swarm, room_of(swarm, options.plan))
+    described: Parameters = {"swarm_file": options.swarm_file, **_TIME}
+    world, file = (
+        _world(whole, options, links, world=options.world, plan=options.plan),
+        options.parameter_file,
+    )
+    nodes = [
+        NodeSpec(_ESTIMATOR, "estimator_node", "estimator", "", described, file),
+        NodeSpec(_DRIVERS, "room_world_node", "room_world", "", world, file),
+    ]
+    if swarm.localizer is not None:
+        nodes.append(NodeSpec(_ESTIMATOR, "localizer_bridge", "localizer_bridge", "", described, file))
+    return nodes
+
+
+ROOM = RobotType("room", _room_starts, _check_room, _room_nodes, tuple(ROOM_WORLDS))
 EPUCK = RobotType("epuck", _epuck_starts, check_swarm, _epuck_nodes, ("w2", "w0", "w2fast"), has_markers=True)
 ROBOT_TYPES = {
     one.name: one
@@ -291,4 +329,4 @@ ROBOT_TYPES = {
     )
 }
 """The kinds of robots that can be simulated, by the type in a swarm description."""
-WORLD_NAMES = [world for kind in ROBOT_TYPES.values() for world in kind.worlds]
+WORLD_NAMES = [world for kind in ROBOT_TYPES.values() for world in kind.worlds]  # those of rooms among them

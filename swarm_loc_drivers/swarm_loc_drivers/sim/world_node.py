@@ -15,7 +15,7 @@ from rclpy.qos import QoSProfile
 from rosgraph_msgs.msg import Clock
 
 from swarm_loc_drivers.common.robot_driver import MAX_STOP_S
-from swarm_loc_drivers.common.ros_messages import stamp_message
+from swarm_loc_drivers.common.robot_driver_node import stamp_message
 from swarm_loc_drivers.sim.link_host import FirmwareHost
 from swarm_loc_drivers.sim.worlds import WorldParameters
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -45,26 +45,24 @@ class WorldNode(ConfiguredNode[Parameters]):
         self._steps = 0
         self._asked_s, self._used_s = math.inf, 0.0
 
-    def begin(
+    def serve(
         self,
         names: Sequence[str],
-        step_ns: int,
         firmware_of: Callable[[int], Any],
+        link_folder: str,
         *,
         first_port: int = 0,
         waits: bool = False,
-        clock_steps: int = 1,
     ) -> None:
-        """Put all robots on their links and start publishing, the time every `clock_steps` steps.
+        """Put all robots on their links.
 
-        `firmware_of` makes the firmware of a robot by its index: a `ConsoleFirmware` with a link folder, else
-        a `StreamFirmware`. Serial ports have flow control if these wait. TCP ports follow the first one; 0:
-        any.
+        `firmware_of` makes the firmware of a robot by its index: a `ConsoleFirmware` with a folder of links,
+        else a `StreamFirmware`. Serial ports have flow control if these wait. TCP ports follow the first
+        one; 0: any.
 
         Raises:
             ParameterError: A link cannot be made.
         """
-        link_folder = self.params.link_folder
         for robot, name in enumerate(names):
             firmware = firmware_of(robot)
             try:
@@ -79,6 +77,9 @@ class WorldNode(ConfiguredNode[Parameters]):
                     f"parameter {place} cannot be used for {name}: {error.strerror}."
                 ) from error
             self.get_logger().info(f"{name} answers at {address}")
+
+    def begin(self, names: Sequence[str], step_ns: int, *, clock_steps: int = 1) -> None:
+        """Start publishing the true poses of robots and, every `clock_steps` steps, the time."""
         self._step_s, self._clock_steps = step_ns * 1e-9, clock_steps
         self._truth_steps = max(1, round(1.0 / (self.params.truth_rate * self._step_s)))
         self._clock_publisher = self.create_publisher(Clock, "/clock", _CLOCK_QOS)

@@ -105,6 +105,12 @@ class WorldParameters:
         1.0, "1", 0.01, 100.0, "simulated seconds per second, as far as the machine keeps up"
     )
     truth_rate: float = number(20.0, "1/s", 0.1, 200.0, "published true poses of each robot")
+
+
+@dataclass(frozen=True)
+class LinkedWorldParameters(WorldParameters):
+    """Parameters of worlds whose robots answer their drivers."""
+
     link_folder: str = text("", "where each robot's serial port appears under its name; empty: TCP")
 
 

@@ -1,7 +1,5 @@
 """`simulate` with Droplets over DDS: infrared alone locates those that nobody has seen."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,7 +8,8 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 from node_world import stamp_ns
 
-from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, describe_droplets, starts
+from bench.scenarios.droplets_run import DropletRunSettings, describe_droplets
+from swarm_loc_drivers.sim.scenarios.droplets import starts
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of, simulated_swarm
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.offline.live_run import LiveGraph
@@ -24,7 +23,7 @@ SETTINGS = DropletRunSettings(seed=SEED, robots=ROBOTS, start_known=True)
 @pytest.mark.timeout(400)
 def test_droplets_that_nobody_sees_are_located_by_infrared(tmp_path: Path) -> None:
     """A tracker sees the first and the last of four, no start is known, and the second one wanders."""
-    there = starts(SETTINGS)
+    there = starts(SETTINGS.seed, SETTINGS.robots)
     known, unknown = tmp_path / "swarm.yaml", tmp_path / "without_starts.yaml"
     save_swarm(describe_droplets(SETTINGS, there), known)
     save_swarm(describe_droplets(replace(SETTINGS, start_known=False), there), unknown)

@@ -1,7 +1,5 @@
 """The whole chain of Droplets over DDS: steering, drivers, consoles, one world, its clock and its tracker."""
 
-from __future__ import annotations
-
 import signal
 import threading
 from contextlib import ExitStack
@@ -14,8 +12,9 @@ from nav_msgs.msg import Odometry
 from node_world import Program, Ros, overrides, stamp_ns
 from rosgraph_msgs.msg import Clock
 
+from bench.scenarios.droplets_run import DropletRunSettings, describe_droplets
 from swarm_loc_drivers.droplet.droplet_nodes import DropletFleetNode
-from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, describe_droplets, starts
+from swarm_loc_drivers.sim.scenarios.droplets import starts
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_msgs.msg import BrightnessMatrix
@@ -28,7 +27,7 @@ SETTINGS = DropletRunSettings(robots=ROBOTS, start_known=True)
 @pytest.fixture
 def swarm_file(tmp_path: Path) -> Path:
     path = tmp_path / "swarm.yaml"
-    swarm = describe_droplets(SETTINGS, starts(SETTINGS))
+    swarm = describe_droplets(SETTINGS, starts(SETTINGS.seed, SETTINGS.robots))
     save_swarm(swarm, path)
     return path
 
@@ -86,7 +85,7 @@ def test_droplets_wander_and_measure_each_other(ros: Ros, swarm_file: Path, tmp_
     assert (np.diff(times) > 0).all()
     assert {one.receiver for one in matrices} == {0x1001}
     assert all(stamp_ns(one) > 0 for one in matrices)
-    there = starts(SETTINGS)[2]
+    there = starts(SETTINGS.seed, SETTINGS.robots)[2]
     for fix in fixes:
         place, turn = fix.pose.pose.position, fix.pose.pose.orientation
         pose = [place.x, place.y, 2.0 * np.arctan2(turn.z, turn.w)]

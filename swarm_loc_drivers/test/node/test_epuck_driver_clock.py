@@ -1,7 +1,5 @@
 """The driver node in this process, on a clock that the test sets: simulated time, pictures."""
 
-from __future__ import annotations
-
 import math
 import struct
 import time
@@ -22,7 +20,7 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
-from swarm_loc_drivers.common import robot_driver, velocity_command
+from swarm_loc_drivers.common import robot_driver
 from swarm_loc_drivers.epuck import wifi_session
 from swarm_loc_drivers.epuck.epuck_driver_node import EpuckDriverNode
 from swarm_loc_drivers.epuck.hardware import EPUCK2
@@ -104,7 +102,7 @@ class World:
 @pytest.fixture
 def world(ros: Ros, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
     # real time does not count here
-    monkeypatch.setattr(velocity_command, "STANDING_CLOCK_S", math.inf)
+    monkeypatch.setattr(robot_driver, "STANDING_CLOCK_S", math.inf)
     monkeypatch.setattr(wifi_session, "_REPEAT_S", math.inf)
     monkeypatch.setattr(robot_driver, "MAX_STOP_S", 0.1)  # who could answer is gone when the node ends
     with ExitStack() as stack:

@@ -1,7 +1,5 @@
 """PushBots over DDS: world, driver and tracker as processes, their bytes on TCP and on a serial port."""
 
-from __future__ import annotations
-
 import math
 import signal
 from collections.abc import Iterator
@@ -20,8 +18,8 @@ from rclpy.qos import qos_profile_sensor_data
 from test_world_node import free_ports
 
 from bench.shared.parameter_table import markdown_table
+from swarm_loc_drivers.pushbot.driver import NO_STOP
 from swarm_loc_drivers.pushbot.pushbot_driver_node import PushbotDriverNode
-from swarm_loc_drivers.pushbot.session import NO_STOP
 from swarm_loc_drivers.sim.pushbot.floor_plan import floor_plan
 from swarm_loc_drivers.sim.pushbot.optics import FOCAL_PX
 from swarm_loc_drivers.sim.pushbot.world import PushbotWorld, PushbotWorldParameters

@@ -1,14 +1,12 @@
 """Robots are steered from when all of them have sent odometry."""
 
-from __future__ import annotations
-
 from geometry_msgs.msg import PoseStamped, Twist
 from nav_msgs.msg import Odometry
 from node_world import Ros
 from rclpy.node import Node
 from rclpy.time import Time
 
-from swarm_loc_drivers.common.velocity_command import Velocity
+from swarm_loc_drivers.common.robot_driver import Velocity
 from swarm_loc_drivers.sim.scenarios.steering_nodes import TruthSteering
 from swarm_loc_estimator.common.arrays import FloatArray
 

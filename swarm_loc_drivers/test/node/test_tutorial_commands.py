@@ -1,7 +1,5 @@
 """The commands of tutorials, word by word, with simulated robots."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import signal
@@ -82,6 +80,10 @@ def test_a_new_swarm_is_simulated_and_located(
         ("E-pucks under a camera", SwarmPose.STATUS_TRACKED),
         ("Droplets", SwarmPose.STATUS_TRACKED),
         ("PushBots that map", SwarmPose.STATUS_UNCONFIRMED),
+        ("TurtleBots in a map", SwarmPose.STATUS_TRACKED),
+        ("Tags under ceiling cameras", SwarmPose.STATUS_TRACKED),
+        ("Radios", SwarmPose.STATUS_TRACKED),
+        ("Motion capture", SwarmPose.STATUS_TRACKED),
     ],
 )
 def test_robots_of_a_tutorial_are_located(

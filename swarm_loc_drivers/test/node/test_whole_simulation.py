@@ -1,7 +1,5 @@
 """Everything at once over DDS: images, firmware, drivers, detectors and estimator give true poses."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +7,8 @@ import pytest
 from geometry_msgs.msg import PoseStamped
 from node_world import stamp_ns
 
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
+from bench.scenarios.eight_run import EightSettings, describe
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, Lemniscate
 from swarm_loc_drivers.sim.simulation import SimulationOptions, graph_of
 from swarm_loc_estimator.common.messages.poses import EstimateMessage
 from swarm_loc_estimator.offline.live_run import LiveGraph

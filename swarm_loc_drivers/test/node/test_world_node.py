@@ -1,7 +1,5 @@
 """The whole chain over DDS: steering, drivers, emulated firmware, one world, its clock and its cameras."""
 
-from __future__ import annotations
-
 import signal
 import socket
 from contextlib import ExitStack
@@ -16,8 +14,9 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import CameraInfo, Image
 
+from bench.scenarios.eight_run import EightSettings, describe
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, EightSettings, Lemniscate, describe
+from swarm_loc_drivers.sim.scenarios.eight import HALF_WIDTH, Lemniscate
 from swarm_loc_estimator.swarm.swarm_file import save_swarm
 
 SECOND = 1_000_000_000

@@ -1,7 +1,5 @@
 """A rendered arena under a fixed camera, from the picture to the poses of robots with unknown starts."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -17,12 +15,11 @@ from swarm_loc_estimator.sensors.camera import DetectionRows
 from swarm_loc_estimator.sensors.inputs import Batch
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Robot, Swarm
 from swarm_loc_estimator.timeline.estimator import Estimator, Status
-from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, located
+from swarm_loc_vision.aerial.ground_control import AerialSettings, FloorMarker, Ground, located
 from swarm_loc_vision.aerial.locate_camera import fixed_camera
-from swarm_loc_vision.aerial.parameters import AerialSettings
-from swarm_loc_vision.markers.bodies import robot_body
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector, detection_rows
 from swarm_loc_vision.markers.families import family_named
+from swarm_loc_vision.markers.pose import robot_body
 
 FAMILY = family_named("aruco_mip_36h12")
 MODEL = CameraModel(width=640, height=480, field_of_view=math.radians(60.0), k1=-0.05, exposure_s=0.004)

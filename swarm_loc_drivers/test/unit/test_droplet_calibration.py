@@ -1,15 +1,13 @@
 """Droplets calibrated from one recording are located better in another one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.sim.scenarios.bags import write_droplet_bag
-from swarm_loc_drivers.sim.scenarios.droplets import DropletRunSettings, simulate_droplets
+from bench.scenarios.bags import write_droplet_bag
+from bench.scenarios.droplets_run import DropletRunSettings, simulate_droplets
 from swarm_loc_estimator.cli import calibrate_ir
 from swarm_loc_estimator.offline.replay import replay
 from swarm_loc_estimator.swarm.swarm import Swarm

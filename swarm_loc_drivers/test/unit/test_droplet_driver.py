@@ -1,7 +1,5 @@
 """The Droplet's driver in its thread, over real pseudo-terminals, also bad ones."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack

@@ -1,7 +1,5 @@
 """The simulated infrared: what sensors read, who hears whom, and what gets lost."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From velocities to a Droplet's few motions, and from commands to poses and how sure they are."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import replace
@@ -12,11 +10,11 @@ from droplet_rig import IDEAL, IDS, NOISE, SECOND, START_NS, TRIANGLE, Lab, aski
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm_loc_drivers.common.velocity_command import VelocityCommand
-from swarm_loc_drivers.droplet.console_session import ConsoleTalk, Talk
+from swarm_loc_drivers.common.robot_driver import VelocityCommand
+from swarm_loc_drivers.droplet.driver import DropletMover, nearest_motion
 from swarm_loc_drivers.droplet.hardware import AUDIO_DROPLET, DIRECTIONS, ELEMENTS, Gait
 from swarm_loc_drivers.droplet.odometry import CommandedMotion, MotionNoise
-from swarm_loc_drivers.droplet.session import DropletMover, nearest_motion
+from swarm_loc_drivers.droplet.protocol import ConsoleTalk, Talk
 from swarm_loc_drivers.sim.droplet.world import STEP_NS, nominal_gait
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray

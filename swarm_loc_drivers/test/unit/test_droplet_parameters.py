@@ -1,7 +1,5 @@
 """What a user sets about a Droplet's driver."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -9,10 +7,9 @@ from typing import Any
 import pytest
 
 from bench.shared.parameter_table import markdown_table
-from swarm_loc_drivers.droplet.exchange import PollingSettings
+from swarm_loc_drivers.droplet.exchange import PollingSettings, TdmaSettings
 from swarm_loc_drivers.droplet.hardware import AUDIO_DROPLET
 from swarm_loc_drivers.droplet.parameters import DropletFleetParameters, DropletParameters
-from swarm_loc_drivers.droplet.tdma import TdmaSettings
 from swarm_loc_drivers.sim.droplet.world import DropletWorldParameters
 from swarm_loc_estimator.common.parameters import ParameterError
 

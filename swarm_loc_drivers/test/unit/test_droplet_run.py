@@ -1,20 +1,13 @@
 """A simulated swarm of Droplets: where they go, what they measure, and what a bag of it holds."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.sim.generate_bag import main
-from swarm_loc_drivers.sim.scenarios.droplets import (
-    PITCH,
-    DropletRun,
-    DropletRunSettings,
-    simulate_droplets,
-    starts,
-)
+from bench.scenarios.droplets_run import DropletRun, DropletRunSettings, simulate_droplets
+from bench.scenarios.generate_bag import main
+from swarm_loc_drivers.sim.scenarios.droplets import PITCH, starts
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.poses import decode_fix

@@ -1,7 +1,5 @@
 """Conversations with emulated Droplets in simulated time: exchanges, turns, losses, and what is not right."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -25,7 +23,7 @@ from droplet_rig import (
 )
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.common.session import SessionError
+from swarm_loc_drivers.common.robot_driver import SessionError
 from swarm_loc_drivers.droplet.exchange import Brightness, Power
 from swarm_loc_drivers.droplet.hardware import FULL_POWER
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, Print

@@ -1,7 +1,5 @@
 """The driver against emulated robots over real pseudo-terminals and sockets, also bad ones."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Iterator

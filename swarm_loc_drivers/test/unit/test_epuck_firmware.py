@@ -1,7 +1,5 @@
 """The emulated firmware answers bytes as the robots' documentation and sources say."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np
@@ -11,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_drivers.epuck import serial_session
-from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
+from swarm_loc_drivers.epuck import wifi_session as epuck_wifi
 from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2, EpuckModel, decode_rgb565
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import DELAY_NS, FAILED_EXCHANGE_NS, IMAGE_NS, WifiFirmware

@@ -1,7 +1,5 @@
 """From velocities to wheels and from steps to poses."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 
@@ -13,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.odometry import OdometryState
-from swarm_loc_drivers.common.velocity_command import STANDING_CLOCK_S, STILL, Velocity, VelocityCommand
+from swarm_loc_drivers.common.robot_driver import STANDING_CLOCK_S, STILL, Velocity, VelocityCommand
 from swarm_loc_drivers.epuck.driver import WheelOdometry
 from swarm_loc_drivers.epuck.hardware import EPUCK1, EPUCK2, as_counter
 from swarm_loc_estimator.common import se2

@@ -1,7 +1,5 @@
 """What a user sets about the driver, and the calibration that he gives it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -71,11 +69,7 @@ def test_a_calibration_is_read(path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        (
-            "image_width: 40",
-            "image_width: 41",
-            "is for images of 41 x 30 px, but the camera's have 40 x 30 px.",
-        ),
+        ("age_width: 40", "age_width: 41", "is for images of 41 x 30 px, but the camera's have 40 x 30 px."),
         ("image_height: 30\n", "", "has no image_height."),
         ("plumb_bob", "fisheye", "distortion_model is 'fisheye' but must be one of plumb_bob,"),
         ("45.5", "0.0", "camera_matrix has the focal lengths 0 and 45 px, but they must be above 0 px."),

@@ -1,7 +1,5 @@
 """The e-pucks' bytes: as documented, in pieces of any size, and with garbage between them."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 import math
@@ -15,7 +13,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.epuck import serial_session
-from swarm_loc_drivers.epuck import wifi_protocol as epuck_wifi
+from swarm_loc_drivers.epuck import wifi_session as epuck_wifi
 from swarm_loc_drivers.epuck.hardware import (
     EPUCK1,
     EPUCK2,
@@ -29,7 +27,7 @@ from swarm_loc_drivers.epuck.hardware import (
     raw_of_distance,
     unwrapped_difference,
 )
-from swarm_loc_drivers.epuck.wifi_protocol import SENSORS_DTYPE, Command, StreamParser, plausible
+from swarm_loc_drivers.epuck.wifi_session import SENSORS_DTYPE, Command, StreamParser, plausible
 
 MODELS = pytest.mark.parametrize("model", [EPUCK1, EPUCK2], ids=lambda model: model.name)
 SPEED = st.integers(-1100, 1100)
@@ -116,8 +114,8 @@ def test_a_request_sets_the_speeds_and_is_framed_by_them() -> None:
 
 def test_readings_are_little_endian() -> None:
     data = bytes.fromhex("FF7F0080") + struct.pack("<8H", *range(100, 108))
-    readings = serial_session.decode_readings(data)
-    assert readings == (32767, -32768, tuple(range(100, 108)))
+    left, right, proximity = serial_session.decode_readings(data)
+    assert (left, right, proximity.tolist()) == (32767, -32768, list(range(100, 108)))
 
 
 def test_a_picture_of_another_size_or_mode_is_refused() -> None:

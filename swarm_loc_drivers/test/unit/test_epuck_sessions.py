@@ -1,7 +1,5 @@
 """Conversations with e-pucks, bytes in and bytes out, by a clock that only the test moves."""
 
-from __future__ import annotations
-
 import math
 import struct
 from dataclasses import replace
@@ -15,11 +13,10 @@ from epuck_rig import SQUARE, params_of
 from epuck_wire import MS, SECOND, Wire
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.common.session import SessionError
-from swarm_loc_drivers.epuck import serial_session, wifi_protocol
-from swarm_loc_drivers.epuck.hardware import EPUCK1
+from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.epuck import serial_session, wifi_session
+from swarm_loc_drivers.epuck.hardware import EPUCK1, CameraImage, Reading
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
-from swarm_loc_drivers.epuck.session import CameraImage, Reading
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import DELAY_NS, WifiFirmware
 
@@ -269,10 +266,10 @@ def test_a_message_that_looks_right_by_chance_is_no_sign_of_life(seed: int) -> N
     wire.run(0.5)
     assert wire.session.connected
     rng = np.random.default_rng(seed)
-    message = bytes([wifi_protocol.SENSORS_ID]) + bytes(wifi_protocol.SENSORS_DTYPE.itemsize)
+    message = bytes([wifi_session.SENSORS_ID]) + bytes(wifi_session.SENSORS_DTYPE.itemsize)
     chance_ns = wire.now_ns + int(rng.integers(500, 1900)) * MS
     wire.firmware.stream = lambda: (
-        message + bytes([wifi_protocol.NOTHING_ID]) if wire.now_ns == chance_ns else rng.bytes(20)
+        message + bytes([wifi_session.NOTHING_ID]) if wire.now_ns == chance_ns else rng.bytes(20)
     )
     count = wire.counts["messages"]
     with pytest.raises(SessionError, match="made no sense"):

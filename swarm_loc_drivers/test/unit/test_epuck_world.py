@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.scenarios.eight_run import EightSettings, describe
 from swarm_loc_drivers.epuck.hardware import raw_of_distance, wheel_geometry
 from swarm_loc_drivers.sim.epuck.world import (
     STEP_NS,
@@ -16,7 +17,7 @@ from swarm_loc_drivers.sim.epuck.world import (
 )
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena
-from swarm_loc_drivers.sim.scenarios.eight import ARENA, EightSettings, describe
+from swarm_loc_drivers.sim.scenarios.eight import ARENA
 from swarm_loc_drivers.sim.worlds import W0, W2, ErrorModel, WorldError
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import Swarm

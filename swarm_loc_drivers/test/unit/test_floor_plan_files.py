@@ -1,7 +1,5 @@
 """Floor plans from files: walls, maps as images, and what is wrong with a file in one sentence."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

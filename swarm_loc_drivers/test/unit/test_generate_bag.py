@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.sim.generate_bag import main
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
+from bench.scenarios.eight_run import EightSettings, simulate_eight
+from bench.scenarios.generate_bag import main
 from swarm_loc_estimator.common.bags.reader import BagReader
 from swarm_loc_estimator.common.messages.detections import decode_detections
 from swarm_loc_estimator.common.messages.poses import decode_odometry, decode_pose_stamped

@@ -1,7 +1,5 @@
 """Floor plans: rays and clearances in them, and the built-in halls."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 from render_helpers import pixels_of
 
-from swarm_loc_drivers.sim.generate_bag import main
+from bench.scenarios.bags import CAMERA_INFO, COMPRESSED_IMAGE
+from bench.scenarios.eight_run import CAMERA, EightSettings, simulate_eight_images
+from bench.scenarios.generate_bag import main
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.renderer import RobotCamera
-from swarm_loc_drivers.sim.scenarios.bags import CAMERA_INFO, COMPRESSED_IMAGE
-from swarm_loc_drivers.sim.scenarios.eight import CAMERA, FAMILY, EightSettings, simulate_eight_images
+from swarm_loc_drivers.sim.scenarios.eight import FAMILY
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.bags.reader import BagReader

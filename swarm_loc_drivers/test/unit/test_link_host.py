@@ -1,7 +1,5 @@
 """Whether links of emulated robots are in use."""
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Swarms that `new` describes: numbers are those of drivers, commands exist, simulated robots are located."""
 
-from __future__ import annotations
-
 import re
 from configparser import ConfigParser
 from pathlib import Path
@@ -9,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.scenarios import eight_run as eight
+from bench.scenarios.bags import write_bag
+from bench.scenarios.lived_run import SimulatedRun
+from bench.scenarios.sightings import observe_markers
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.pushbot.parameters import PushbotParameters
-from swarm_loc_drivers.sim.run import SimulatedRun
-from swarm_loc_drivers.sim.scenarios import eight
-from swarm_loc_drivers.sim.scenarios.bags import write_bag
-from swarm_loc_drivers.sim.sightings import observe_markers
 from swarm_loc_drivers.sim.worlds import ErrorModel
 from swarm_loc_estimator.cli.new import main, start_lines
 from swarm_loc_estimator.offline.replay import replay

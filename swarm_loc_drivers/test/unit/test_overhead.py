@@ -1,26 +1,24 @@
 """The overhead camera of a simulated world: where robots appear, and that nothing tells them apart."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from bench.scenarios.eight_run import EightSettings, describe
 from swarm_loc_drivers.epuck.hardware import wheel_geometry
 from swarm_loc_drivers.sim.epuck.world import OVERHEAD, EpuckWorld, EpuckWorldSettings, Exposure
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.rigs import Arena, OverheadSettings, overhead_model
 from swarm_loc_drivers.sim.render.scene import TOP_HEIGHT, TOP_RADIUS
 from swarm_loc_drivers.sim.run import START_NS
-from swarm_loc_drivers.sim.scenarios.eight import ARENA, EightSettings, describe, eight_floor
+from swarm_loc_drivers.sim.scenarios.eight import ARENA, eight_floor
 from swarm_loc_drivers.sim.worlds import W0
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_vision.aerial.detector import AerialDetector
-from swarm_loc_vision.aerial.ground_control import GroundControl
-from swarm_loc_vision.aerial.parameters import AerialSettings
+from swarm_loc_vision.aerial.ground_control import AerialSettings, GroundControl
 
 START = np.array([[0.1, 0.2, 0.3], [0.5, -0.2, 1.9], [-0.4, -0.3, -2.0]])
 RATE_HZ = 5.0

@@ -1,7 +1,5 @@
 """Stamps of events, packets, and odometry of PushBots."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import numpy as np
@@ -10,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm_loc_drivers.common.odometry import WheelGeometry
-from swarm_loc_drivers.pushbot.driver import PushbotOdometry
-from swarm_loc_drivers.pushbot.event_packets import MAX_EVENTS, EventPackets
-from swarm_loc_drivers.pushbot.hardware import tick_difference, wheel_velocities
-from swarm_loc_drivers.pushbot.session import EventClock, TickClock, WheelTicks
+from swarm_loc_drivers.pushbot.driver import EventClock, PushbotOdometry, TickClock, WheelTicks
+from swarm_loc_drivers.pushbot.event_parser import MAX_EVENTS, EventPackets
+from swarm_loc_drivers.pushbot.protocol import tick_difference, wheel_velocities
 from swarm_loc_estimator.common.arrays import IntArray
 from swarm_loc_estimator.common.messages.event_encoding import ENCODING, decode_events
 

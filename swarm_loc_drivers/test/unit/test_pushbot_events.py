@@ -1,7 +1,5 @@
 """The parser of events and of lines between them: how bytes are cut does not matter, lost ones do little."""
 
-from __future__ import annotations
-
 from collections import Counter
 from itertools import pairwise
 
@@ -12,7 +10,7 @@ from hypothesis import strategies as st
 from pushbot_events import Sent, event_pieces, random_events
 
 from swarm_loc_drivers.pushbot.event_parser import CONFIRMATIONS, EventParser, Parsed
-from swarm_loc_drivers.pushbot.hardware import TIMESTAMPS
+from swarm_loc_drivers.pushbot.protocol import TIMESTAMPS
 
 STAMPED = [name for name in TIMESTAMPS if name != "none"]
 LINE = b"-S28 -120 4294\n"

@@ -1,11 +1,16 @@
 """Command lines of an emulated PushBot against what firmware 0.7.1 says and does."""
 
-from __future__ import annotations
-
 import pytest
 
-from swarm_loc_drivers.pushbot.hardware import FIRST_FIRMWARE, SECOND_FIRMWARE, FirmwareGeneration
-from swarm_loc_drivers.pushbot.protocol import BRAKE, Lights, is_refusal, lights
+from swarm_loc_drivers.pushbot.protocol import (
+    BRAKE,
+    FIRST_FIRMWARE,
+    SECOND_FIRMWARE,
+    FirmwareGeneration,
+    Lights,
+    is_refusal,
+    lights,
+)
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking
 from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 

@@ -1,7 +1,5 @@
 """Parameters of the PushBots' nodes, their pages, and what is simulated of a swarm of them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,15 +1,12 @@
 """Conversations with emulated PushBots: handshake, streams, stalls, and wheels that must not run away."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from pushbot_rig import PushbotWire, pushbot_params
 
 from swarm_loc_drivers.pushbot import protocol as commands
-from swarm_loc_drivers.pushbot.driver import PushbotDriver, PushbotListeners
-from swarm_loc_drivers.pushbot.hardware import FIRST_FIRMWARE, SECOND_FIRMWARE, FirmwareGeneration
-from swarm_loc_drivers.pushbot.session import NO_STOP
+from swarm_loc_drivers.pushbot.driver import NO_STOP, PushbotDriver, PushbotListeners
+from swarm_loc_drivers.pushbot.protocol import FIRST_FIRMWARE, SECOND_FIRMWARE, FirmwareGeneration
 from swarm_loc_estimator.common.messages.event_encoding import ENCODING, decode_events
 
 FORMATS = [(one, name) for one in (FIRST_FIRMWARE, SECOND_FIRMWARE) for name in ("", *one.formats)]

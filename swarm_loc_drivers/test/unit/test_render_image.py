@@ -10,11 +10,11 @@ from hypothesis import assume, example, given, settings
 from hypothesis import strategies as st
 from render_helpers import LANDMARK_SIZE, RayCaster, camera_matrix, pixels_of, small_arena
 
+from bench.scenarios.eight_run import CAMERA
 from swarm_loc_drivers.sim.render import scene as scenery
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.raster import Image
 from swarm_loc_drivers.sim.render.renderer import Renderer, RobotCamera, Scene
-from swarm_loc_drivers.sim.scenarios.eight import CAMERA
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import CameraMount
 

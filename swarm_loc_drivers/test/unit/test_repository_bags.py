@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from repository_bags import assert_same_messages, options_of, words_of
 
-from swarm_loc_drivers.sim.generate_bag import main
+from bench.scenarios.generate_bag import main
 
 SIMULATED = [
     "droplets_twenty",

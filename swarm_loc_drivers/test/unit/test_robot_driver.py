@@ -1,7 +1,5 @@
 """A driver's link: what breaks it is reported, whatever it is."""
 
-from __future__ import annotations
-
 import os
 import pty
 import termios
@@ -12,8 +10,7 @@ from typing import Any
 import pytest
 
 from swarm_loc_drivers.common.link import LinkError, SerialLink
-from swarm_loc_drivers.common.robot_driver import NO_CLOCK, RobotDriver
-from swarm_loc_drivers.common.session import SessionError
+from swarm_loc_drivers.common.robot_driver import NO_CLOCK, RobotDriver, SessionError
 
 
 @pytest.mark.parametrize("call", ["tcsetattr", "tcflush"])

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from exact_sightings import exact_values
 
-from swarm_loc_drivers.sim.run import SIGHTING_DTYPE, SimulatedRun
-from swarm_loc_drivers.sim.scenarios.eight import VIEW, EightSettings, describe, simulate_eight, wall_markers
-from swarm_loc_drivers.sim.sightings import View, deliver, hidden, schedule_exposures
+from bench.scenarios.eight_run import VIEW, EightSettings, describe, simulate_eight, wall_markers
+from bench.scenarios.lived_run import SIGHTING_DTYPE, SimulatedRun
+from bench.scenarios.sightings import View, deliver, hidden, schedule_exposures
 from swarm_loc_drivers.sim.worlds import W0, W2
 from swarm_loc_estimator.common import se2
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from swarm_loc_drivers.sim.scenarios.bags import as_detections
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, simulate_eight
+from bench.scenarios.bags import as_detections
+from bench.scenarios.eight_run import EightSettings, simulate_eight
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.sensors.camera import DetectionRows, SightingConverter
 from swarm_loc_estimator.sensors.sensor import DropCounts

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from bench.scenarios.lived_run import drive
 from swarm_loc_drivers.sim.differential_drive import (
     Controller,
     Drive,
     LastingNoise,
-    drive,
     integrate,
     twist_of,
     wheel_paths,

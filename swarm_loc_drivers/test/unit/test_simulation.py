@@ -1,7 +1,5 @@
 """The list of a simulation's nodes, its command line, and how its world waits for those who see it."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +24,7 @@ from swarm_loc_estimator.common.launch import parsed_options
 from swarm_loc_estimator.common.parameters import ParameterError, parameter_specs
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
-from swarm_loc_vision.aerial.parameters import AerialParameters
+from swarm_loc_vision.aerial.ground_control import AerialParameters
 
 BAGS = Path(__file__).parents[3] / "bags"
 SECOND = 1_000_000_000

@@ -1,13 +1,11 @@
 """A robot between the goals of a mapper: looks around, goes there though its wheels slip, and stops."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 
-from swarm_loc_drivers.common.velocity_command import STILL
+from swarm_loc_drivers.common.robot_driver import STILL
 from swarm_loc_drivers.pushbot.stop_and_go import MapGoal, StopAndGo, StopAndGoSettings
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.se2 import wrap_angle

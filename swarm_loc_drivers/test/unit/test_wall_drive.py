@@ -1,7 +1,5 @@
 """A laser that was calibrated by one simulated drive at a wall reads another drive as well as it says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.scenarios.eight_run import EightSettings, describe
 from bench.shared.parameter_table import markdown_table
 from swarm_loc_drivers.sim.epuck.world import EpuckWorldParameters, make_world
 from swarm_loc_drivers.sim.render.lens import CameraModel
-from swarm_loc_drivers.sim.scenarios.eight import EightSettings, EightSteering, describe
+from swarm_loc_drivers.sim.scenarios.eight import EightSteering
 from swarm_loc_drivers.sim.worlds import WORLDS
 from swarm_loc_estimator.common.parameters import ParameterError, parameter_specs
 from swarm_loc_estimator.swarm.swarm_file import save_swarm

@@ -8,22 +8,19 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.droplet.exchange import Brightness, PollingSettings
+from bench.scenarios.droplets_run import Cable, run
+from swarm_loc_drivers.droplet.exchange import Brightness, PollingSettings, SessionSettings, TdmaSettings
 from swarm_loc_drivers.droplet.hardware import DROPLET, ELEMENTS, FULL_POWER
 from swarm_loc_drivers.droplet.odometry import MotionNoise
-from swarm_loc_drivers.droplet.session import SessionSettings
-from swarm_loc_drivers.droplet.tdma import TdmaSettings
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware, _braces
 from swarm_loc_drivers.sim.droplet.infrared import InfraredSettings
 from swarm_loc_drivers.sim.droplet.world import (
     NEAR_POWER,
     STEP_NS,
-    Cable,
     DropletErrors,
     DropletWorld,
     DropletWorldSettings,
     SimulatedDroplet,
-    run,
 )
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.ir_board import load_ir_platform

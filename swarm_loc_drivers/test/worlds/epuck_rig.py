@@ -1,7 +1,5 @@
 """What the driver's tests share: emulated robots in threads, a driver, and what it reports."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time
@@ -17,9 +15,8 @@ from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.odometry import OdometryState
 from swarm_loc_drivers.epuck.driver import EpuckDriver, EpuckListeners
-from swarm_loc_drivers.epuck.hardware import EPUCK2, EpuckModel
+from swarm_loc_drivers.epuck.hardware import EPUCK2, CameraImage, EpuckModel
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
-from swarm_loc_drivers.epuck.session import CameraImage
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware
 from swarm_loc_drivers.sim.link_host import FirmwareHost

@@ -1,7 +1,5 @@
 """A conversation with an emulated e-puck on one clock, a millisecond at a time: no links, no threads."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -12,12 +10,11 @@ from epuck_body import GEOMETRY, DrivenBody
 from numpy.typing import NDArray
 
 from swarm_loc_drivers.common.odometry import OdometryState
-from swarm_loc_drivers.common.session import SessionError
+from swarm_loc_drivers.common.robot_driver import SessionError
 from swarm_loc_drivers.epuck.driver import WheelOdometry
-from swarm_loc_drivers.epuck.hardware import EpuckModel
+from swarm_loc_drivers.epuck.hardware import CameraImage, EpuckModel, EpuckSession, Reading
 from swarm_loc_drivers.epuck.parameters import EpuckParameters
 from swarm_loc_drivers.epuck.serial_session import SerialSession
-from swarm_loc_drivers.epuck.session import CameraImage, EpuckSession, Reading
 from swarm_loc_drivers.epuck.wifi_session import WifiSession
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
 from swarm_loc_drivers.sim.epuck.wifi_firmware import WifiFirmware

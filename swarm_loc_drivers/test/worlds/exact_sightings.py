@@ -1,11 +1,9 @@
 """What simulated cameras would have reported without noise."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.sim.run import SimulatedRun
+from bench.scenarios.lived_run import SimulatedRun
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 

@@ -1,13 +1,11 @@
 """Events of PushBots for tests, and their bytes, encoded apart from the emulator."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.pushbot.hardware import TIMESTAMPS
+from swarm_loc_drivers.pushbot.protocol import TIMESTAMPS
 
 
 class Sent(NamedTuple):

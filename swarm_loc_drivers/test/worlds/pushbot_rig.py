@@ -1,7 +1,5 @@
 """A session and an emulated PushBot in one world, without threads and without a clock."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from typing import Any
@@ -9,12 +7,11 @@ from typing import Any
 import numpy as np
 
 from swarm_loc_drivers.common.odometry import OdometryState, WheelGeometry
-from swarm_loc_drivers.common.session import SessionError
-from swarm_loc_drivers.pushbot.driver import PushbotOdometry
-from swarm_loc_drivers.pushbot.event_packets import EventPacket
-from swarm_loc_drivers.pushbot.hardware import SECOND_FIRMWARE, FirmwareGeneration
+from swarm_loc_drivers.common.robot_driver import SessionError
+from swarm_loc_drivers.pushbot.driver import PushbotOdometry, PushbotSession, WheelTicks
+from swarm_loc_drivers.pushbot.event_parser import EventPacket
 from swarm_loc_drivers.pushbot.parameters import PushbotParameters
-from swarm_loc_drivers.pushbot.session import PushbotSession, WheelTicks
+from swarm_loc_drivers.pushbot.protocol import SECOND_FIRMWARE, FirmwareGeneration
 from swarm_loc_drivers.sim.pushbot.event_camera import CameraNoise
 from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.floor_plan import FloorPlan, outline

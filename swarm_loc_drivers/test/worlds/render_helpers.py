@@ -1,7 +1,5 @@
 """A small scene, and what an image of it must show, worked out by casting rays: slow and independent."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -9,11 +7,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.scenarios.eight_run import faces, wall_markers
 from swarm_loc_drivers.sim.render import scene as scenery
 from swarm_loc_drivers.sim.render.lens import CameraModel
 from swarm_loc_drivers.sim.render.raster import Patches
 from swarm_loc_drivers.sim.render.renderer import RobotCamera, Scene
-from swarm_loc_drivers.sim.scenarios.eight import ARENA, faces, wall_markers
+from swarm_loc_drivers.sim.scenarios.eight import ARENA
 from swarm_loc_estimator.common.arrays import FloatArray
 
 LANDMARK_SIZE = wall_markers()[0].size

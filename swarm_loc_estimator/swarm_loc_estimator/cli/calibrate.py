@@ -17,17 +17,8 @@ from __future__ import annotations
 import argparse
 from functools import partial
 
-from swarm_loc_estimator.common.command_line import (
-    ProgressLine,
-    add_bag,
-    add_remap,
-    add_truth,
-    argument,
-    command,
-    number_in,
-    swarm_beside,
-    yaml_and_picture,
-)
+from swarm_loc_estimator.common import command_line as cli
+from swarm_loc_estimator.common.command_line import argument, command
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.offline.calibration.fit import calibrate
 from swarm_loc_estimator.offline.calibration.models import EVALUATIONS, Options
@@ -36,26 +27,19 @@ from swarm_loc_estimator.offline.calibration.recording import Recording, joined,
 from swarm_loc_estimator.offline.export import read_truth
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
+_RUNS = f"runs of the estimator to fit the noise (default {EVALUATIONS})"
+
 
 @command(
     __doc__,
-    partial(add_bag, content="; with <robot>/ground_truth, --truth or --self", several=True),
-    add_remap,
-    add_truth,
-    argument("--out", type=yaml_and_picture, required=True, help="swarm description to write"),
+    partial(cli.add_bag, content="; with <robot>/ground_truth, --truth or --self", several=True),
+    cli.add_remap,
+    cli.add_truth,
+    argument("--out", type=cli.yaml_and_picture, required=True, help="swarm description to write"),
     argument("--self", dest="alone", action="store_true", help="use no ground truth"),
     argument("--plain", action="store_true", help="fit only noise, calibrate nothing"),
-    argument(
-        "--no-response",
-        action="store_true",
-        help="one share of speed and one of turn rate instead of a table",
-    ),
-    argument(
-        "--evaluations",
-        type=number_in(1, 10_000),
-        default=EVALUATIONS,
-        help=f"runs of the estimator to fit the noise (default {EVALUATIONS})",
-    ),
+    argument("--no-response", action="store_true", help="one share of speed and one of turns, no table"),
+    argument("--evaluations", type=cli.number_in(1, 10_000), default=EVALUATIONS, help=_RUNS),
 )
 def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
@@ -69,8 +53,8 @@ def main(options: argparse.Namespace) -> int:
         raise UserError("--truth is for one bag.")
     if len({bag.resolve() for bag in options.bag}) < len(options.bag):
         raise UserError(f"{', '.join(map(str, options.bag))}: a bag is given twice, which tells nothing new.")
-    swarm = load_swarm(options.swarm or swarm_beside(options.bag[0]))
-    with ProgressLine() as progress:
+    swarm = load_swarm(options.swarm or cli.swarm_beside(options.bag[0]))
+    with cli.ProgressLine() as progress:
         truth = read_truth(options.truth, swarm)
         recording = joined(
             [read_recording(bag, swarm, progress, options.remap, truth) for bag in options.bag]

@@ -15,15 +15,8 @@ from __future__ import annotations
 import argparse
 from functools import partial
 
-from swarm_loc_estimator.common.command_line import (
-    ProgressLine,
-    add_bag,
-    add_remap,
-    argument,
-    command,
-    swarm_beside,
-    yaml_and_picture,
-)
+from swarm_loc_estimator.common import command_line as cli
+from swarm_loc_estimator.common.command_line import argument, command
 from swarm_loc_estimator.offline.calibration.infrared.board import calibrate_from, with_board
 from swarm_loc_estimator.offline.calibration.infrared.gains import calibrate_infrared
 from swarm_loc_estimator.offline.calibration.plots import board_text, draw_board, draw_gains, gains_text
@@ -32,30 +25,23 @@ from swarm_loc_estimator.swarm.ir_board import save_ir_platform
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 
+_OUT = "out/calibrated_ir.yaml"
+
 
 @command(
     __doc__,
-    partial(add_bag, content=" with <robot>/brightness"),
-    add_remap,
-    argument(
-        "--out",
-        type=yaml_and_picture,
-        default="out/calibrated_ir.yaml",
-        help="swarm description to write (default out/calibrated_ir.yaml)",
-    ),
-    argument(
-        "--board",
-        type=yaml_and_picture,
-        help="find what the board itself is, by ground truth, and write it to this file",
-    ),
+    partial(cli.add_bag, content=" with <robot>/brightness"),
+    cli.add_remap,
+    argument("--out", type=cli.yaml_and_picture, default=_OUT, help=f"description to write (default {_OUT})"),
+    argument("--board", type=cli.yaml_and_picture, help="where to write the board, found by ground truth"),
     argument("--without-truth", action="store_true", help="do as if there were no ground truth"),
 )
 def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    swarm = load_swarm(options.swarm or swarm_beside(options.bag))
+    swarm = load_swarm(options.swarm or cli.swarm_beside(options.bag))
     if options.board is not None:
         return _board(options, swarm)
-    with ProgressLine() as progress:
+    with cli.ProgressLine() as progress:
         recording = read_recording(options.bag, swarm, progress, options.remap)
         done = calibrate_infrared(recording, swarm, progress, with_truth=not options.without_truth)
     save_swarm(done.swarm, options.out, f"Infrared gains calibrated with {options.bag.name}.")
@@ -66,7 +52,7 @@ def main(options: argparse.Namespace) -> int:
 
 def _board(options: argparse.Namespace, swarm: Swarm) -> int:
     """Fit the parameters of the board, and write it and a swarm description that uses it."""
-    with ProgressLine() as progress:
+    with cli.ProgressLine() as progress:
         recording = read_recording(options.bag, swarm, progress, options.remap)
         board, done = calibrate_from(recording, swarm, progress)
     said = f"Infrared board calibrated with {options.bag.name}."

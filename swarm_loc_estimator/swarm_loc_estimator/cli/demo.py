@@ -18,14 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
+from swarm_loc_estimator.common import command_line as cli
 from swarm_loc_estimator.common import se2
-from swarm_loc_estimator.common.command_line import (
-    argument,
-    command,
-    folder_to_write,
-    number_in,
-    swarm_beside,
-)
+from swarm_loc_estimator.common.command_line import argument, command
 from swarm_loc_estimator.common.launch import GraphOptions
 from swarm_loc_estimator.common.trajectory import interpolate
 from swarm_loc_estimator.nodes.playback import clock_step_ns
@@ -46,6 +41,7 @@ from swarm_loc_estimator.watch.server import free_port
 
 BAG = Path("bags/eight_five_robots")
 RATE = 3.0
+_REPORT = cli.folder_to_write(*REPORT_FILES, "*.log")
 
 # Limits of the bag of the demo, where the errors are 3 mm, 1.2 degrees and NEES 3.
 _POSITION_M = 0.010
@@ -61,19 +57,12 @@ _REDRAW_UNWATCHED_S = 5.0
 @command(
     __doc__,
     argument("bag", nargs="?", type=Path, default=BAG, help=f"what to play (default: {BAG})"),
-    argument(
-        "--rate", type=number_in(0.1, 100.0), default=RATE, help=f"speed of the bag (default: {RATE:g})"
-    ),
-    argument(
-        "--out",
-        type=folder_to_write(*REPORT_FILES, "*.log"),
-        default="out/demo",
-        help="folder for the report",
-    ),
+    argument("--rate", type=cli.number_in(0.1, 100.0), default=RATE, help=f"speed (default: {RATE:g})"),
+    argument("--out", type=_REPORT, default="out/demo", help="folder for the report"),
 )
 def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    swarm_file = swarm_beside(options.bag)
+    swarm_file = cli.swarm_beside(options.bag)
     progress = _Progress(load_swarm(swarm_file))
     print(f"Playing {options.bag} at {options.rate:g} x into the live graph", flush=True)
     port = free_port()

@@ -22,9 +22,7 @@ _LIVE_S, _BAG_S = 20.0, 120.0
 
 @command(
     __doc__,
-    partial(
-        add_live_or_bag, seconds=f"how long to look (default: {_LIVE_S:g} s live, {_BAG_S:g} s of a bag)"
-    ),
+    partial(add_live_or_bag, seconds=f"how long (default: {_LIVE_S:g} s live, {_BAG_S:g} s of a bag)"),
 )
 def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""

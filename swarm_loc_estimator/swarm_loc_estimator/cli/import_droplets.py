@@ -21,18 +21,15 @@ from swarm_loc_estimator.offline.datasets.droplets import (
     name_of,
 )
 
+_SCALE = "of the camera's image (default: robots of 44 mm that touch are 42 pixels apart)"
+
 
 @command(
     __doc__,
     argument("recording", type=Path, help="text file, one exchange a line"),
     argument("bag", type=bag_to_write, help="bag folder to create"),
     argument("--platform", default="droplet_2016", help="board of the robots (default droplet_2016)"),
-    argument(
-        "--metres-per-pixel",
-        type=number_in(1e-6, 1.0, "m"),
-        default=METRES_PER_PIXEL,
-        help="of the camera's image (default: robots of 44 mm that touch are 42 pixels apart)",
-    ),
+    argument("--metres-per-pixel", type=number_in(1e-6, 1.0, "m"), default=METRES_PER_PIXEL, help=_SCALE),
 )
 def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""

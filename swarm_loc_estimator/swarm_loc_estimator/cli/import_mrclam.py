@@ -11,28 +11,19 @@ from __future__ import annotations
 import argparse
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from swarm_loc_estimator.common.command_line import ProgressLine, argument, bag_to_write, command
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.offline.datasets.mrclam import Delay, convert, read_dataset
 
-if TYPE_CHECKING:
-    pass
+_DELAY = "detections arrive evenly between LO and HI milliseconds late (default: at once)"
 
 
 @command(
     __doc__,
     argument("folder", type=Path, help="folder with Robot*_Odometry.dat and the other files"),
     argument("bag", type=bag_to_write, help="bag folder to create"),
-    argument(
-        "--delay-ms",
-        nargs=3,
-        type=int,
-        default=(0, 0, 0),
-        metavar=("LO", "HI", "SEED"),
-        help="detections arrive evenly between LO and HI milliseconds late (default: at once)",
-    ),
+    argument("--delay-ms", nargs=3, type=int, default=(0, 0, 0), metavar=("LO", "HI", "SEED"), help=_DELAY),
 )
 def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""

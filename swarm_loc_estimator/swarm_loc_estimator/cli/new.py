@@ -164,7 +164,7 @@ def start_lines(plan: SwarmPlan, file: str) -> list[str]:
         source = "" if "mocap" in sensors else " -p source:=pose  # of vrpn_mocap; its page has others"
         lines.append(f"./run swarm_loc_estimator localizer_bridge --ros-args -p swarm_file:={file}{source}")
     if "uwb" in sensors:
-        lines.append("# another node must publish uwb/FROM/TO/distance of each pair: sensor_msgs/Range")
+        lines.append("# another node must publish uwb/n_FROM/n_TO/distance of each pair: sensor_msgs/Range")
     if "mapper" in sensors:
         tracker = f"-r __ns:=/{robot} -p calibration:={robot}.yaml"
         lines += [

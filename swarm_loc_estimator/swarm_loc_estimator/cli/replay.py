@@ -26,21 +26,8 @@ from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_estimator.common.command_line import (
-    ProgressLine,
-    add_bag,
-    add_remap,
-    add_set,
-    add_truth,
-    argument,
-    command,
-    file_to_write,
-    folder_to_write,
-    number_in,
-    parameters_of,
-    swarm_beside,
-    yaml_to_write,
-)
+from swarm_loc_estimator.common import command_line as cli
+from swarm_loc_estimator.common.command_line import argument, command
 from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.offline.batch.smooth import smooth
 from swarm_loc_estimator.offline.export import read_truth, write_mcap, write_tum
@@ -51,6 +38,7 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm, save_swarm
 from swarm_loc_estimator.timeline.self_calibration import swapped_signs
 from swarm_loc_estimator.timeline.settings import Settings
 
+_REPORT = cli.folder_to_write(*REPORT_FILES, "poses.csv", "smoothed.csv")
 _NOTHING_TO_LEARN = (
     "--learned: the swarm description has no sigma of a camera, of odometry or of a landmark, and nothing"
     " contradicted it, so there is nothing to learn; give for instance camera.yaw_sigma."
@@ -62,38 +50,23 @@ _COLUMNS = ("stamp_ns", "robot", "x_m", "y_m", "theta_rad", *_COVARIANCE)
 
 @command(
     __doc__,
-    add_bag,
-    add_remap,
-    add_truth,
-    argument(
-        "--out",
-        type=folder_to_write(*REPORT_FILES, "poses.csv", "smoothed.csv"),
-        default="out/replay",
-        help="folder for the report",
-    ),
+    cli.add_bag,
+    cli.add_remap,
+    cli.add_truth,
+    argument("--out", type=_REPORT, default="out/replay", help="folder for the report"),
     argument("--smooth", action="store_true", help="estimate all poses again, from the whole recording"),
-    argument("--learned", type=yaml_to_write, metavar="FILE", help="where to write what was learned"),
-    argument(
-        "--mcap",
-        type=file_to_write(".mcap"),
-        metavar="FILE",
-        help="where to write poses, /tf and markers for viewers",
-    ),
-    argument(
-        "--tum",
-        type=folder_to_write("*.tum"),
-        metavar="FOLDER",
-        help="where to write trajectories and ground truth for evo",
-    ),
-    argument("--tick", type=number_in(*TICKS_S, "s"), default=TICK_S, help="seconds between outputs"),
-    partial(add_set, what="parameter of the estimator"),
+    argument("--learned", type=cli.yaml_to_write, metavar="FILE", help="where to write what was learned"),
+    argument("--mcap", type=cli.file_to_write(".mcap"), metavar="FILE", help="poses and markers for viewers"),
+    argument("--tum", type=cli.folder_to_write("*.tum"), metavar="FOLDER", help="trajectories for evo"),
+    argument("--tick", type=cli.number_in(*TICKS_S, "s"), default=TICK_S, help="seconds between outputs"),
+    partial(cli.add_set, what="parameter of the estimator"),
 )
 def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
     # replay, and write all files
-    settings = parameters_of(Settings, options.set)
-    swarm = load_swarm(options.swarm or swarm_beside(options.bag))
-    with ProgressLine() as progress:
+    settings = cli.parameters_of(Settings, options.set)
+    swarm = load_swarm(options.swarm or cli.swarm_beside(options.bag))
+    with cli.ProgressLine() as progress:
         result = replay(
             options.bag,
             swarm,

@@ -5,10 +5,10 @@
 
 The swarm description is the `swarm.yaml` inside the bag's folder unless --swarm names another. The map goes
 to OUT/map.yaml and OUT/map.pgm, a picture of it to OUT/map.png, the robots' stops to OUT/stops.csv. Mounts of
-lidars that the description does not say come from the bag's static transforms. The same
-bag gives the same files, byte for byte. Loops, refused scans, odometry that scans contradict, and places
-where the map is in doubt are printed. --walls draws a floor plan below the map (x0,y0,x1,y1 [m] per line)
-and prints the errors of the map's walls; with ground truth in the bag, the errors of the stops, too.
+lidars that the description does not say come from the bag's static transforms. The same bag gives the same
+files, byte for byte. Loops, refused and late scans, odometry that scans contradict, and places where the map
+is in doubt are printed. --walls draws a floor plan below the map (x0,y0,x1,y1 [m] per line) and prints the
+errors of the map's walls; with ground truth in the bag, the errors of the stops, too.
 """
 
 from __future__ import annotations
@@ -22,18 +22,9 @@ from pathlib import Path
 
 import numpy as np
 
+from swarm_loc_estimator.common import command_line as cli
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.command_line import (
-    ProgressLine,
-    add_bag,
-    add_remap,
-    add_set,
-    argument,
-    command,
-    folder_to_write,
-    parameters_of,
-    swarm_beside,
-)
+from swarm_loc_estimator.common.command_line import argument, command
 from swarm_loc_estimator.common.files import replacing
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.mapping.map_file import save_map
@@ -43,6 +34,7 @@ from swarm_loc_estimator.mapping.settings import MapperSettings
 from swarm_loc_estimator.offline.map_replay import draw_map, map_figures, replay_map, truth_of
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 
+_MAP = cli.folder_to_write("map.*", "stops.csv")
 _CONTRADICTED = 0.02  # Share of contradicted stops from which odometry is named
 
 
@@ -52,25 +44,20 @@ class WallsError(UserError):
 
 @command(
     __doc__,
-    add_bag,
-    add_remap,
-    argument(
-        "--out",
-        type=folder_to_write("map.*", "stops.csv"),
-        default="out/map",
-        help="folder for map and picture",
-    ),
+    cli.add_bag,
+    cli.add_remap,
+    argument("--out", type=_MAP, default="out/map", help="folder for map and picture"),
     argument("--walls", type=Path, help="floor plan to draw below the map: x0,y0,x1,y1 a line"),
     argument("--led", action="append", default=[], metavar="ROBOT=HZ", help="frequency of LEDs"),
-    partial(add_set, what="a number of the mapper; may be given several times"),
+    partial(cli.add_set, what="a number of the mapper; may be given several times"),
 )
 def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    settings = parameters_of(MapperSettings, options.set)
-    swarm = load_swarm(options.swarm or swarm_beside(options.bag))
+    settings = cli.parameters_of(MapperSettings, options.set)
+    swarm = load_swarm(options.swarm or cli.swarm_beside(options.bag))
     walls = read_walls(options.walls) if options.walls else np.zeros((0, 4))
     frequencies = led_frequencies(options.led, swarm.index_of)
-    with ProgressLine() as progress:
+    with cli.ProgressLine() as progress:
         mapper, feed, mounts = replay_map(options.bag, swarm, settings, frequencies, progress, options.remap)
     missing = list(feed.missing())
     if not mapper.graph.count:
@@ -91,7 +78,7 @@ def main(options: argparse.Namespace) -> int:
     write_stops(mapper, name_of, options.out / "stops.csv")
     for reason, count in (feed.all_drops + feed.dropped_beams).items():
         print(f"dropped: {count} {reason}")
-    for sentence in (*mounts, *findings(mapper, name_of)):
+    for sentence in (*mounts, *feed.late, *findings(mapper, name_of)):
         print(sentence)
     print(figures or "nothing to compare with: no ground truth in the bag, no --walls")
     print(f"{mapper.graph.count} stops; map: {path}, {image}; picture: {picture}")

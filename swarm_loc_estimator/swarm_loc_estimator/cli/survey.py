@@ -18,15 +18,8 @@ from dataclasses import replace
 from functools import partial
 from importlib import import_module
 
-from swarm_loc_estimator.common.command_line import (
-    ProgressLine,
-    add_live_or_bag,
-    argument,
-    command,
-    described,
-    is_live,
-    yaml_and_picture,
-)
+from swarm_loc_estimator.common import command_line as cli
+from swarm_loc_estimator.common.command_line import argument, command
 from swarm_loc_estimator.common.parameters import UserError
 from swarm_loc_estimator.doctor.evidence import Evidence
 from swarm_loc_estimator.offline.calibration.recording import Recording, read_recording
@@ -42,24 +35,19 @@ _SURVEYED = ("unknown_id", "uwb_unknown_address")  # Reasons for which the estim
 
 @command(
     __doc__,
-    partial(
-        add_live_or_bag,
-        seconds=f"how long to listen to a live graph (default: {_LIVE_S:g} s, or until Ctrl-C)",
-    ),
-    argument("--out", type=yaml_and_picture, required=True, help="swarm description to write"),
-    argument(
-        "--all", action="store_true", help="survey landmarks, anchors and cameras that are described, too"
-    ),
+    partial(cli.add_live_or_bag, seconds=f"how long to listen (default: {_LIVE_S:g} s, or until Ctrl-C)"),
+    argument("--out", type=cli.yaml_and_picture, required=True, help="swarm description to write"),
+    argument("--all", action="store_true", help="survey landmarks, anchors and cameras described, too"),
 )
 def main(options: argparse.Namespace) -> int:
     """Run the command; returns its exit status."""
-    live = is_live(options)
+    live = cli.is_live(options)
     if not live and (options.seconds or options.namespace):
         raise UserError("--seconds and --namespace are for a live graph; a bag is surveyed as a whole.")
-    swarm = load_swarm(described(options))
+    swarm = load_swarm(cli.described(options))
     if options.all:
         swarm = replace(swarm, landmarks=(), anchors=())
-    with ProgressLine() as progress:
+    with cli.ProgressLine() as progress:
         if live:
             listen = import_module("swarm_loc_estimator.doctor.listener").listen
             where, seconds = (options.namespace, _is_used), options.seconds or _LIVE_S

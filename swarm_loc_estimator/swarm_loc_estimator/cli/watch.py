@@ -12,13 +12,8 @@ import argparse
 from pathlib import Path
 
 from swarm_loc_estimator.cli.graph import check_graph
-from swarm_loc_estimator.common.command_line import (
-    argument,
-    command,
-    described,
-    is_description,
-    number_in,
-)
+from swarm_loc_estimator.common import command_line as cli
+from swarm_loc_estimator.common.command_line import argument, command
 from swarm_loc_estimator.common.launch import GraphOptions, NodeSpec, ParameterValue, graph_nodes, run_graph
 from swarm_loc_estimator.nodes.parameters import WatchParameters
 from swarm_loc_estimator.watch.server import Access
@@ -31,13 +26,9 @@ _DEFAULT = WatchParameters()
     argument("source", metavar="SWARM_FILE|BAG", type=Path, help="swarm description, or a bag"),
     argument("--swarm", type=Path, help="swarm description (default: swarm.yaml beside the bag)"),
     argument("--address", default=_DEFAULT.address, help="what to listen on (default: 127.0.0.1)"),
-    argument("--port", type=number_in(0, 65535), default=_DEFAULT.port, help="where (default: 8420; 0: any)"),
-    argument(
-        "--token",
-        default="",
-        help="token that browsers must send as ?token=, 8 characters or more, 5 different",
-    ),
-    argument("--rate", type=number_in(0.01, 1000.0), default=1.0, help="speed of the bag (default: 1)"),
+    argument("--port", type=cli.number_in(0, 65535), default=_DEFAULT.port, help="default: 8420; 0: any"),
+    argument("--token", default="", help="token of browsers, as ?token=, 8 characters or more, 5 different"),
+    argument("--rate", type=cli.number_in(0.01, 1000.0), default=1.0, help="speed of the bag (default: 1)"),
     argument("--loop", action="store_true", help="play the bag again and again"),
     argument("--teleop", action="store_true", help="let pages drive robots by <robot>/cmd_vel"),
     argument("--use-sim-time", action="store_true", help="take time from /clock without a bag"),
@@ -54,8 +45,8 @@ def watch_nodes(options: argparse.Namespace) -> list[NodeSpec]:
     Raises:
         UserError: A file cannot be used.
     """
-    is_bag = not is_description(options.source)
-    swarm_file = described(options)
+    is_bag = not cli.is_description(options.source)
+    swarm_file = cli.described(options)
     graph = GraphOptions(
         str(swarm_file),
         bag=str(options.source) if is_bag else None,

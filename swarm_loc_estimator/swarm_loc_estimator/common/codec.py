@@ -74,16 +74,15 @@ def address(high: int, doc: str) -> EntrySpec:
     return EntrySpec(read, {"anyOf": [decimal, {"type": "string", "pattern": f"^{pattern}$"}]}, wanted)
 
 
-def word(doc: str) -> EntrySpec:
-    """A word of letters, digits and underscores, as in topics; may be empty."""
-    pattern = r"[A-Za-z0-9_]{0,64}"
+def matching(pattern: str, rule: str, schema: Schema, wanted: str = "") -> EntrySpec:
+    """A text that matches a pattern."""
 
     def read(checks: TreeChecks, value: Tree, key: str) -> str:
-        if not isinstance(value, str) or not re.fullmatch(pattern, value):
-            raise checks.error(key, value, "must be up to 64 letters, digits and underscores")
+        if not isinstance(value, str) or not re.fullmatch(pattern, value, re.DOTALL):
+            raise checks.error(key, value, f"must be {rule}")
         return value
 
-    return EntrySpec(read, {"type": "string", "pattern": f"^{pattern}$", "description": doc})
+    return EntrySpec(read, {"type": "string", **schema}, wanted)
 
 
 def listed(wanted: str = "", **limits: float) -> EntrySpec:
@@ -95,22 +94,20 @@ def listed(wanted: str = "", **limits: float) -> EntrySpec:
 def properties(specs: Mapping[str, Spec], cls: type | None = None) -> Schema:
     """The schema of entries by name, with the defaults that they have in a dataclass."""
     defaults = {one.name: one.default for one in fields(cls)} if cls else {}
-    schema = {
-        name: _number_schema(s) if isinstance(s, NumberSpec) else {**s.schema} for name, s in specs.items()
-    }
-    for name, one in schema.items():
+    schema: Schema = {}
+    for name, spec in specs.items():
+        if isinstance(spec, EntrySpec):
+            schema[name] = {**spec.schema}
+        else:
+            schema[name] = {
+                "type": ["number", "null"] if spec.optional else "number",
+                "exclusiveMinimum" if spec.above else "minimum": spec.low,
+                "maximum": spec.high,
+                "description": f"{spec.doc}{'' if spec.unit == '1' else f' [{spec.unit}]'}",
+            }
         if isinstance(defaults.get(name, MISSING), int | float | None):
-            one["default"] = defaults[name]
+            schema[name]["default"] = defaults[name]
     return schema
-
-
-def _number_schema(spec: NumberSpec) -> Schema:
-    return {
-        "type": ["number", "null"] if spec.optional else "number",
-        "exclusiveMinimum" if spec.above else "minimum": spec.low,
-        "maximum": spec.high,
-        "description": f"{spec.doc}{'' if spec.unit == '1' else f' [{spec.unit}]'}",
-    }
 
 
 def to_tree(holder: Any, keep: Collection[str] = (), without: Collection[str] = ()) -> dict[str, Tree]:

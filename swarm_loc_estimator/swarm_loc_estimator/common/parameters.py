@@ -60,6 +60,23 @@ def number(value: float | None, unit: str, low: float, high: float, doc: str, *,
     return field(default=value, metadata={"spec": NumberSpec(unit, low, high, above, doc, value is None)})
 
 
+def positive(value: float, unit: str, high: float, doc: str) -> Any:
+    """A `number` in (0, high]."""
+    return number(value, unit, 0.0, high, doc, above=True)
+
+
+def estimated(value: float, unit: str, high: float, of: str) -> Any:
+    """A `number` in [0, high]: a standard deviation, from which the error is estimated unless it is zero."""
+    relative = "relative " if unit == "1" else ""
+    doc = f"{relative}standard deviation of {of}; 0: exact, else estimated"
+    return number(value, unit, 0.0, high, doc)
+
+
+def gate(of: str, value: float = 0.9999) -> Any:
+    """A `number`: the gate probability of measurements by their name."""
+    return number(value, "1", 0.5, 1.0, f"share of good {of} that must pass the gate; 1 passes all")
+
+
 def number_specs(cls: type) -> dict[str, NumberSpec]:
     """The numbers of a dataclass: field name -> what it may be, in the order of definition."""
     specs = {one.name: one.metadata.get("spec") for one in fields(cls)}

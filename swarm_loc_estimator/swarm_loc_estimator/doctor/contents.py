@@ -12,9 +12,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from itertools import combinations
+from itertools import combinations, product
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -32,20 +32,11 @@ from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.swarm.swarm import CameraMount, Robot
 from swarm_loc_estimator.timeline.estimate import GYROSCOPE_OF, Contradicted, Contradiction, Status
 
-CAMERA_INFO, IMAGE, COMPRESSED_IMAGE = (
-    f"sensor_msgs/msg/{name}" for name in ("CameraInfo", "Image", "CompressedImage")
-)
-_EIGHT_BITS = (
-    *("mono8", "8UC1", "rgb8", "bgr8", "8UC3", "rgba8", "bgra8", "8UC4"),
-    *("bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"),
-)
-IMAGE_ENCODINGS = frozenset(
-    [
-        *_EIGHT_BITS,
-        *(name.replace("8", "16") for name in _EIGHT_BITS),
-        *("yuv422", "uyvy", "yuv422_yuy2", "yuyv", "nv12", "nv21", "nv24"),
-    ]
-)
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_GREY = "mono8 8UC1 rgb8 bgr8 8UC3 rgba8 bgra8 8UC4 bayer_rggb8 bayer_bggr8 bayer_gbrg8 bayer_grbg8"
+_YUV = "yuv422 uyvy yuv422_yuy2 yuyv nv12 nv21 nv24"
+IMAGE_ENCODINGS = frozenset(f"{_GREY} {_GREY.replace('8', '16')} {_YUV}".split())
 """Encodings that the detectors of swarm_loc_vision read."""
 
 
@@ -54,11 +45,8 @@ def check_pictures(evidence: Evidence) -> Iterator[Finding]:
     cameras = tuple(f"{robot.name}/" for robot in evidence.swarm.robots if robot.camera is not None)
     for name, heard in evidence.topics.items():
         is_compressed = same_type(heard.type, COMPRESSED_IMAGE)
-        if not is_compressed and not same_type(heard.type, IMAGE):
-            continue
-        if not name.startswith(cameras) or not name.removesuffix("/compressed").endswith("image_raw"):
-            continue
-        if "depth" in name:
+        is_raw = name.removesuffix("/compressed").endswith("image_raw") and "depth" not in name
+        if not (is_compressed or same_type(heard.type, IMAGE)) or not (is_raw and name.startswith(cameras)):
             continue
         images, malformed = decoded(heard)
         if malformed:
@@ -67,30 +55,23 @@ def check_pictures(evidence: Evidence) -> Iterator[Finding]:
             continue
         image = images[-1][1]
         if not is_compressed and not {image.encoding, image.encoding.lower()} & IMAGE_ENCODINGS:
-            remedy = f"Publish one of {', '.join(sorted(IMAGE_ENCODINGS))}"
-            yield Finding(
-                name, f"has the encoding '{image.encoding}', which the detectors cannot read", remedy
-            )
+            problem = f"has the encoding '{image.encoding}', which the detectors cannot read"
+            yield Finding(name, problem, f"Publish one of {', '.join(sorted(IMAGE_ENCODINGS))}")
         # image_raw/compressed is a transport of image_raw, which has a camera_info, too
         namespace = name.removesuffix("/compressed").rpartition("/")[0]
         info_name = f"{namespace}/camera_info".lstrip("/")
         found = evidence.topics.get(info_name, Heard(""))
         infos = decoded(found)[0] if same_type(found.type, CAMERA_INFO) else []
-        yield from _of_intrinsics(
-            name, info_name, infos[-1][1] if infos else None, None if is_compressed else image
-        )
-
-
-def _of_intrinsics(name: str, info_name: str, info: Any, image: Any) -> Iterator[Finding]:
-    """What is wrong with the newest CameraInfo of an image, which may be None."""
-    calibrate = "Calibrate the camera (camera_calibration) and let its driver load the file"
-    if info is None:
-        yield Finding(name, f"has no intrinsics: no message on {info_name}", calibrate)
-    elif not info.k[0] > 0.0 or not info.k[4] > 0.0:
-        yield Finding(info_name, "has intrinsics of zeros: the camera is not calibrated", calibrate)
-    elif image is not None and (info.width, info.height) != (image.width, image.height):
-        problem = f"is of {info.width} x {info.height} pixels but images have {image.width} x {image.height}"
-        yield Finding(info_name, problem, "Calibrate at the resolution that the driver publishes")
+        info = infos[-1][1] if infos else None
+        calibrate = "Calibrate the camera (camera_calibration) and let its driver load the file"
+        if info is None:
+            yield Finding(name, f"has no intrinsics: no message on {info_name}", calibrate)
+        elif not info.k[0] > 0.0 or not info.k[4] > 0.0:
+            yield Finding(info_name, "has intrinsics of zeros: the camera is not calibrated", calibrate)
+        elif not is_compressed and (info.width, info.height) != (image.width, image.height):
+            sizes = f"{info.width} x {info.height} pixels but images have {image.width} x {image.height}"
+            remedy = "Calibrate at the resolution that the driver publishes"
+            yield Finding(info_name, f"is of {sizes}", remedy)
 
 
 # Limits of the doctor are checked by test_doctor.py with the set-ups of wrong_setups.py.
@@ -133,9 +114,36 @@ _REASONS = MappingProxyType(
 
 def check_contents(evidence: Evidence) -> Iterator[Finding]:
     """Readings can be used."""
-    yield from _unknown_markers(evidence)
-    yield from _same_odometry(evidence)
-    yield from _too_fast(evidence)
+    # markers that nobody describes
+    detected = evidence.rows("detections").detection["id"]
+    ids, counts = np.unique(detected, return_counts=True)
+    is_unknown = ~np.isin(ids, [*evidence.swarm.owner_of]) & (counts >= _MIN_SIGHTINGS)
+    ids, counts = ids[is_unknown], counts[is_unknown]
+    if ids.size:
+        most = np.argsort(-counts, kind="stable")
+        which = listed([f"{ids[k]} ({counts[k]} times)" for k in most])
+        remedy = "Describe them under landmarks, or ids of a robot; survey finds the places of landmarks"
+        yield Finding(f"marker {which}", "was seen, but is in no description", remedy)
+    # two robots with the same odometry: one driver for two names
+    rows = evidence.rows("odometry")
+    poses = {robot: rows.pose[rows.robot == robot] for robot in np.unique(rows.robot).tolist()}
+    long = {robot: pose for robot, pose in poses.items() if len(pose) > _MIN_ROWS}
+    moving = {robot: pose for robot, pose in long.items() if np.ptp(pose[:, :2], axis=0).max() > 0.01}
+    for one, other in combinations(moving, 2):
+        count = min(len(moving[one]), len(moving[other]))
+        if np.array_equal(moving[one][:count], moving[other][:count]):
+            names = f"{evidence.source_name(one)} and {evidence.source_name(other)}"
+            yield Finding(names, "have the same odometry", "Start a driver of its own for each robot")
+    # odometry whose usual speed is impossible, as in other units
+    rows = evidence.odometry
+    for index, robot in enumerate(evidence.swarm.robots):
+        pose, stamp_ns = rows.pose[rows.robot == index], rows.stamp_ns[rows.robot == index]
+        passed_s = 1e-9 * np.diff(stamp_ns)
+        speed = np.hypot(*np.diff(pose[:, :2], axis=0).T)[passed_s > 0.0] / passed_s[passed_s > 0.0]
+        if speed.size > _MIN_ROWS and np.median(speed) > robot.odometry.max_speed:
+            problem = f"moves at {np.median(speed):.2g} m/s by its odometry, beyond max_speed"
+            yield Finding(robot.name, problem, "Publish odometry in metres, or raise max_speed")
+    # readings that the estimator drops
     readings = _readings(evidence)
     for index, source in enumerate(evidence.swarm.sources):
         for reason, count in evidence.converted[1].of_robot[index].items():
@@ -151,11 +159,9 @@ def check_estimate(evidence: Evidence) -> Iterator[Finding]:
     estimated = evidence.estimated
     measures = [name not in ("odometry", "imu") for name in SENSORS]
     measured = _readings(evidence)[measures].sum(axis=0)
-    seen = evidence.rows("detections").detection["id"]
+    seen, is_overlooked = evidence.rows("detections").detection["id"], evidence.rows("aerial").stamp_ns.size
     for index, robot in enumerate(evidence.swarm.robots):
-        is_seen = (
-            np.isin([face.id for face in robot.faces], seen).any() or evidence.rows("aerial").stamp_ns.size
-        )
+        is_seen = is_overlooked or np.isin([face.id for face in robot.faces], seen).any()
         is_helpless = robot.start is None and not measured[index] and not is_seen
         if estimated.status[index] == Status.WAITING and is_helpless:
             problem = "cannot be located: it has no start, measures nothing, and nobody sees it"
@@ -194,9 +200,8 @@ def _other_starts(evidence: Evidence) -> Iterator[Finding]:
             continue
         if not evidence.is_at_start(index):
             continue
-        stamps_ns = np.array(
-            [rows.stamp_ns[own].min(), min(estimated.begin_ns[index], rows.stamp_ns[own].max())]
-        )
+        begin_ns, end_ns = rows.stamp_ns[own].min(), rows.stamp_ns[own].max()
+        stamps_ns = np.array([begin_ns, min(estimated.begin_ns[index], end_ns)])
         first, then = tracks.at(np.array([index, index]), stamps_ns).pose
         began = se2.compose(estimated.begin_pose[index], se2.between(then, first))
         away = math.hypot(*(began[:2] - np.array(robot.start[:2])))
@@ -240,47 +245,6 @@ _CONTRADICTED = MappingProxyType(
     }
 )
 """What is contradicted, and what to do about it."""
-
-
-def _unknown_markers(evidence: Evidence) -> Iterator[Finding]:
-    """Markers that nobody describes."""
-    detected = evidence.rows("detections").detection["id"]
-    ids, counts = np.unique(detected, return_counts=True)
-    unknown = {
-        int(i): int(n)
-        for i, n in zip(ids, counts, strict=True)
-        if int(i) not in evidence.swarm.owner_of and n >= _MIN_SIGHTINGS
-    }
-    if unknown:
-        most = sorted(unknown, key=lambda marker: -unknown[marker])
-        which = listed([f"{marker} ({unknown[marker]} times)" for marker in most])
-        remedy = "Describe them under landmarks, or ids of a robot; survey finds the places of landmarks"
-        yield Finding(f"marker {which}", "was seen, but is in no description", remedy)
-
-
-def _too_fast(evidence: Evidence) -> Iterator[Finding]:
-    """Odometry whose usual speed is impossible, as in other units."""
-    rows = evidence.odometry
-    for index, robot in enumerate(evidence.swarm.robots):
-        pose, stamp_ns = rows.pose[rows.robot == index], rows.stamp_ns[rows.robot == index]
-        passed_s = 1e-9 * np.diff(stamp_ns)
-        speed = np.hypot(*np.diff(pose[:, :2], axis=0).T)[passed_s > 0.0] / passed_s[passed_s > 0.0]
-        if speed.size > _MIN_ROWS and np.median(speed) > robot.odometry.max_speed:
-            problem = f"moves at {np.median(speed):.2g} m/s by its odometry, beyond max_speed"
-            yield Finding(robot.name, problem, "Publish odometry in metres, or raise max_speed")
-
-
-def _same_odometry(evidence: Evidence) -> Iterator[Finding]:
-    """Two robots with the same odometry: one driver for two names."""
-    rows = evidence.rows("odometry")
-    poses = {robot: rows.pose[rows.robot == robot] for robot in np.unique(rows.robot).tolist()}
-    long = {robot: pose for robot, pose in poses.items() if len(pose) > _MIN_ROWS}
-    moving = {robot: pose for robot, pose in long.items() if np.ptp(pose[:, :2], axis=0).max() > 0.01}
-    for one, other in combinations(moving, 2):
-        count = min(len(moving[one]), len(moving[other]))
-        if np.array_equal(moving[one][:count], moving[other][:count]):
-            names = f"{evidence.source_name(one)} and {evidence.source_name(other)}"
-            yield Finding(names, "have the same odometry", "Start a driver of its own for each robot")
 
 
 _WINDOW_NS = 6_000_000_000  # Odometry is trusted this long
@@ -337,13 +301,8 @@ def _check_headings(robot: Robot, own: OdometryRows) -> Iterator[Finding]:
     second = (own.stamp_ns[1:] - own.stamp_ns[:1]) // 1_000_000_000  # in which headings and twists may lag
     seconds, second = np.unique(second, return_inverse=True)
     passed_s = 1e-9 * np.diff(own.stamp_ns)
-    turned, wanted = (
-        np.bincount(second, weights, minlength=seconds.size)
-        for weights in (
-            se2.wrap_angle(np.diff(own.pose[:, 2])),
-            np.nan_to_num(own.twist[1:, 2]) * passed_s,
-        )
-    )
+    turns = se2.wrap_angle(np.diff(own.pose[:, 2])), np.nan_to_num(own.twist[1:, 2]) * passed_s
+    turned, wanted = (np.bincount(second, weights, minlength=seconds.size) for weights in turns)
     shares = [
         float(turned[half] @ wanted[half] / (wanted[half] @ wanted[half]))
         for half in np.array_split(np.arange(seconds.size), 2)
@@ -409,16 +368,11 @@ def _sightings(evidence: Evidence, index: int, robot: Robot) -> _Sightings:
     rows = evidence.rows("detections")
     ids = [mark.id for mark in evidence.swarm.landmarks]
     mine = (rows.robot == index) & np.isin(rows.detection["id"], ids)
-    mine &= (rows.detection["content"] != CONTENT_BEARING) & np.isfinite(rows.detection["position"]).all(
-        axis=1
-    )
-    stamp_ns = rows.stamp_ns[mine] + round(1e9 * robot.sensor.time_offset_s)
-    return _Sightings(
-        rows.detection["position"][mine],
-        rows.detection["id"][mine].astype(np.int64),
-        stamp_ns,
-        (stamp_ns - stamp_ns.min(initial=np.iinfo(np.int64).max)) // _WINDOW_NS,
-    )
+    mine &= rows.detection["content"] != CONTENT_BEARING
+    mine &= np.isfinite(rows.detection["position"]).all(axis=1)
+    seen, stamp_ns = rows.detection[mine], rows.stamp_ns[mine] + round(1e9 * robot.sensor.time_offset_s)
+    window = (stamp_ns - stamp_ns.min(initial=np.iinfo(np.int64).max)) // _WINDOW_NS
+    return _Sightings(seen["position"], seen["id"].astype(np.int64), stamp_ns, window)
 
 
 def _of_robot(robot: Robot, camera: CameraMount, own: OdometryRows, seen: _Sightings) -> Iterator[Finding]:
@@ -433,9 +387,11 @@ def _of_robot(robot: Robot, camera: CameraMount, own: OdometryRows, seen: _Sight
             yield Finding(robot.name, problem, "Check its encoders, and that its driver reads them")
         return
     # signs: a changed track fits better
-    worst = {
-        what: max(_residuals(robot, own, half, undo) for half in seen.halves) for what, undo in _WRONG.items()
-    }
+    worst = dict.fromkeys(_WRONG, 0.0)  # of both halves, the residual over that of the true track
+    for what, half in product(_WRONG, seen.halves):
+        true, other = (_fitted(robot, own, half, one, by_ranges=False) for one in (unchanged, _WRONG[what]))
+        ratio = math.inf if true is None or other is None else other.residual / true.residual
+        worst[what] = max(worst[what], ratio)
     best = min(worst, key=lambda what: worst[what])
     if worst[best] < _CLEARER:
         remedy = "Correct the driver: x forward, y left, angles counter-clockwise (REP 103)"
@@ -450,11 +406,8 @@ def _of_robot(robot: Robot, camera: CameraMount, own: OdometryRows, seen: _Sight
     if _is_clear(factor.real, sigma.real, _SCALE):
         scale = math.exp(factor[0].real)
         problem = f"sees landmarks {1.0 / scale:.2f} times as far as its odometry says"
-        remedy = (
-            f"Measure the markers, whose size may be {scale:.2f} times what the detector assumes,"
-            " and the robot's wheels"
-        )
-        yield Finding(robot.name, problem, remedy)
+        markers = f"the markers, whose size may be {scale:.2f} times what the detector assumes"
+        yield Finding(robot.name, problem, f"Measure {markers}, and the robot's wheels")
     if _is_clear(factor.imag, sigma.imag, _YAW):
         yaw = float(factor[0].imag)
         problem = f"has a camera that is turned by {math.degrees(yaw):+.0f} deg from its description"
@@ -468,15 +421,8 @@ def unchanged(pose: FloatArray) -> FloatArray:
 
 def _is_clear(values: FloatArray, sigma: float, least: float) -> bool:
     """Whether errors of the whole and of both halves exceed the least one to the same side."""
-    return (
-        bool(np.all(values[0] * values > least * np.abs(values[0]))) and abs(values[0]) > _SIGNIFICANT * sigma
-    )
-
-
-def _residuals(robot: Robot, own: OdometryRows, seen: _Sightings, undo: Change) -> float:
-    """Residual with odometry whose poses are changed, over that of the true one; infinite: not known."""
-    true, other = (_fitted(robot, own, seen, one, by_ranges=False) for one in (unchanged, undo))
-    return math.inf if true is None or other is None else other.residual / true.residual
+    is_same = bool(np.all(values[0] * values > least * np.abs(values[0])))
+    return is_same and abs(values[0]) > _SIGNIFICANT * sigma
 
 
 def _centred(values: FloatArray, group: IntArray, weight: FloatArray) -> FloatArray:
@@ -529,9 +475,8 @@ def _fitted(
         weight = 1.0 / (1.0 + (error / (3.0 * residual)) ** 2)
     # without one window after the other (jackknife): errors of a window, as of headings, last
     count = len(products)
-    factor, others = (
-        -np.log(one[..., 0] + _TINY + 1j * one[..., 1]) for one in (best, _solved(whole - products))
-    )
+    solutions = best, _solved(whole - products)
+    factor, others = (-np.log(one[..., 0] + _TINY + 1j * one[..., 1]) for one in solutions)
     away = (others - factor) * math.sqrt((count - 1) / count)
     sigma = complex(np.linalg.norm(away.real), np.linalg.norm(away.imag))
     return _Alignment(complex(factor), sigma, residual)

@@ -28,7 +28,7 @@ from swarm_loc_estimator.sensors.inputs import (
 from swarm_loc_estimator.sensors.odometry import OdometryRows
 from swarm_loc_estimator.sensors.ranges import decode_pair
 from swarm_loc_estimator.sensors.sensor import DropCounts
-from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimate import Contradicted, Contradiction, Status
 from swarm_loc_estimator.timeline.estimator import Estimator
 from swarm_loc_estimator.timeline.settings import Settings
@@ -126,10 +126,10 @@ class Evidence:
 
     def rows(self, sensor: str) -> Any:
         """All readings of a sensor, see `sensors/inputs.py`."""
-        return self._joined[sensor]
+        return self._gathered[sensor]
 
     @cached_property
-    def _joined(self) -> dict[str, Any]:
+    def _gathered(self) -> dict[str, Any]:
         return {name: gathered(self.read[0], name) for name in SENSORS}
 
     @cached_property
@@ -153,16 +153,19 @@ class Evidence:
     @cached_property
     def estimated(self) -> Estimated:
         """What the estimator makes of all readings."""
-        swarm = replace(self.swarm, robots=tuple(map(self._without_old_start, range(len(self.swarm.robots)))))
-        estimator, robots = Estimator(swarm, SETTINGS), len(swarm.robots)
+        # without starts that robots had left before they were heard
+        described = [
+            robot if self.is_at_start(index) else replace(robot, start=None)
+            for index, robot in enumerate(self.swarm.robots)
+        ]
+        estimator, robots = Estimator(replace(self.swarm, robots=tuple(described)), SETTINGS), len(described)
         ticks, lasting = Counter[tuple[str, Contradicted]](), dict[tuple[str, Contradicted], Contradiction]()
         begin_ns, begin_pose = np.full(robots, -1), np.full((robots, 3), np.nan)
         status, count = np.full(robots, int(Status.WAITING)), 0
         for part in self.converted[0]:
             stamps_ns = np.arange(part.begin_ns + _TICK_NS, part.end_ns, _TICK_NS)
-            for now_ns, arrived in zip(
-                [*stamps_ns.tolist(), part.end_ns], part.until_each(stamps_ns), strict=True
-            ):
+            ends_ns = [*stamps_ns.tolist(), part.end_ns]
+            for now_ns, arrived in zip(ends_ns, part.until_each(stamps_ns), strict=True):
                 count += 1
                 estimator.receive(arrived)
                 estimate = estimator.tick(now_ns)
@@ -180,11 +183,6 @@ class Evidence:
         """Whether a robot was heard from its start on: its odometry began at zero."""
         first = self.odometry.pose[self.odometry.robot == index][:1]
         return bool((np.abs(first) < _AT_ZERO).all())
-
-    def _without_old_start(self, index: int) -> Robot:
-        """The robot without its start, if it had left it before it was heard."""
-        robot = self.swarm.robots[index]
-        return robot if self.is_at_start(index) else replace(robot, start=None)
 
     def source_name(self, index: int) -> str:
         """Name of a robot or a fixed camera."""

@@ -21,7 +21,8 @@ from swarm_loc_estimator.doctor.evidence import Evidence, Heard, Message, Publis
 from swarm_loc_estimator.offline.recorded_bag import Progress
 from swarm_loc_estimator.swarm.swarm import Swarm
 
-_DEPTH = 1000
+_FLEETING = QoSProfile(depth=1000, reliability=ReliabilityPolicy.BEST_EFFORT)  # Hears every publisher
+_LATCHED = QoSProfile(depth=1000, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _LOOK_S = 0.5  # Time between two looks at the topics of the graph [s]
 _OWN = ("parameter_events", "rosout")
 
@@ -65,18 +66,19 @@ class Listener(Node):
         executor.remove_node(self)
         # messages before the first /clock have no time of arrival; without any /clock, that is the finding
         is_timed = any(one.arrival_ns for kept in self._messages.values() for one in kept)
-        heard = {
-            name: [one for one in kept if one.arrival_ns or not is_timed]
-            for name, kept in self._messages.items()
-        }
-        return Evidence(
-            self._swarm,
-            {
-                name: Heard(kind, heard.get(name, []), self.publishers_of(self._full[name]))
-                for name, kind in self._types.items()
-            },
-            is_live=True,
-        )
+        topics = {}
+        for name, kind in self._types.items():
+            messages = [one for one in self._messages.get(name, []) if one.arrival_ns or not is_timed]
+            publishers = [
+                Publisher(
+                    f"{one.node_namespace.rstrip('/')}/{one.node_name}",
+                    one.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT,
+                    one.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+                )
+                for one in self.get_publishers_info_by_topic(self._full[name])
+            ]
+            topics[name] = Heard(kind, messages, tuple(publishers))
+        return Evidence(self._swarm, topics, is_live=True)
 
     def _follow_topics(self) -> None:
         """Subscribe to topics that are new."""
@@ -92,29 +94,12 @@ class Listener(Node):
                 kind = message_class(types[0])
             except MessageTypeError:
                 continue  # the topic is known by its name and type
-            self.create_subscription(kind, full, partial(self._on_message, name), _qos(name), raw=True)
+            qos = _LATCHED if name.endswith("tf_static") else _FLEETING
+            self.create_subscription(kind, full, partial(self._on_message, name), qos, raw=True)
 
     def _on_message(self, name: str, data: bytes) -> None:
         arrival_ns = int(self.get_clock().now().nanoseconds)
         keep(self._messages.setdefault(name, []), self._types[name], Message(arrival_ns, data))
-
-    def publishers_of(self, name: str) -> tuple[Publisher, ...]:
-        """The publishers of a topic."""
-        return tuple(
-            Publisher(
-                f"{one.node_namespace.rstrip('/')}/{one.node_name}",
-                one.qos_profile.reliability != ReliabilityPolicy.BEST_EFFORT,
-                one.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
-            )
-            for one in self.get_publishers_info_by_topic(name)
-        )
-
-
-def _qos(name: str) -> QoSProfile:
-    """Best effort, which hears every publisher; latched messages where they are usual."""
-    if name.endswith("tf_static"):
-        return QoSProfile(depth=_DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-    return QoSProfile(depth=_DEPTH, reliability=ReliabilityPolicy.BEST_EFFORT)
 
 
 def listen(

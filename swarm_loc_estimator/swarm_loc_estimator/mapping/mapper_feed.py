@@ -29,6 +29,7 @@ from swarm_loc_estimator.mapping.messages import (
     read_sweep,
 )
 from swarm_loc_estimator.mapping.scans import UNSEEN, LightSightings, Readings, Scan, ScanStop
+from swarm_loc_estimator.sensors.lidar import described_delay, learned_delay
 from swarm_loc_estimator.swarm.error_models import LidarModel
 from swarm_loc_estimator.swarm.swarm import Robot
 
@@ -74,9 +75,9 @@ class OdometryQueue:
     def poses_at(self, stamp_ns: IntArray) -> tuple[FloatArray, BoolArray]:
         """Poses (n, 3) by odometry at times (n,) up to the newest stamp, and whether they are known.
 
-        No later call may ask for a time before the first of these.
+        No later call may ask for a time before the earliest of these.
         """
-        while len(self._odometry) > 1 and self._odometry[1][0] <= stamp_ns[0]:
+        while len(self._odometry) > 1 and self._odometry[1][0] <= stamp_ns.min():
             self._odometry.popleft()
         stamps, poses = zip(*self._odometry, strict=True)
         return interpolate(Trajectory(np.array(stamps), np.array(poses)), stamp_ns, MAX_GAP_NS)
@@ -124,15 +125,21 @@ class ReadingPairer(OdometryQueue):
 
 
 class SweepPairer(OdometryQueue):
-    """Takes a robot's motion during each sweep of its lidar out of it.
+    """Takes a robot's motion during each sweep of its lidar out of it, and learns how old sweeps are.
 
     Args:
         lidar: Mount and noise of the lidar.
+
+    Attributes:
+        delay: What is known of the times of its beams.
     """
 
     def __init__(self, lidar: LidarModel) -> None:
         super().__init__()
         self.lidar = lidar
+        self.delay = described_delay(lidar.delay_s)
+        self._track: FloatArray | None = None  # (L, 3) by odometry in the middle of the newest sweep, at lags
+        self._seen: tuple[int, FloatArray] | None = None  # Node of `delay.seen`, and this pose from it
         self._sweeps: deque[LidarSweep] = deque()
         self._newest_ns = -math.inf
 
@@ -151,14 +158,32 @@ class SweepPairer(OdometryQueue):
         self._sweeps.append(sweep)
 
     def ready(self) -> Iterator[ScanStop]:
-        """The sweeps with known odometry, in order."""
-        while self._sweeps and self._sweeps[0].beam_ns[-1] <= self.newest_ns:
-            sweep = self._sweeps.popleft()
-            poses, known = self.poses_at(np.concatenate([[sweep.stamp_ns], sweep.beam_ns]))
-            if known.all():
-                yield self._stop(sweep, poses[0], between(poses[0], poses[1:]))
+        """The sweeps with known odometry, in order, at the likeliest lag."""
+        while self._sweeps:
+            sweep, lag_ns = self._sweeps[0], np.round(1e9 * self.delay.lag_s).astype(np.int64)
+            beams = slice(1, 1 + sweep.beam_ns.size)
+            beam_ns = sweep.beam_ns - lag_ns[self.delay.chance.argmax()]
+            middle_ns = sweep.stamp_ns + sweep.duration_ns // 2
+            at_ns = np.concatenate([[sweep.stamp_ns], beam_ns, middle_ns - lag_ns])
+            if at_ns.max() > self.newest_ns:
+                return
+            self._sweeps.popleft()
+            poses, known = self.poses_at(at_ns)
+            if known[: beams.stop].all():
+                self._track = poses[beams.stop :] if known.all() else None
+                yield self._stop(sweep, poses[0], between(poses[0], poses[beams]))
             else:
                 self.drops["scan_without_odometry"] += 1
+
+    def learn(self, sweep: ScanStop, node: int, poses: FloatArray, covariance: FloatArray) -> None:
+        """Learn the delay by the node of the newest sweep, of all nodes (n, 3), and its covariance (3, 3)."""
+        if self._track is None:
+            return
+        back = between(sweep.arrival, self._track[self.delay.chance.argmax()])
+        if self._seen is not None:  # the graph may have moved since
+            self.delay = self.delay._replace(seen=compose(poses[self._seen[0]], self._seen[1]))
+        seen, self._seen = compose(poses[node], back), (node, back)
+        self.delay = learned_delay(self.delay, int(sweep.stamp_ns[0]), seen, covariance, self._track)
 
     def _stop(self, sweep: LidarSweep, pose: FloatArray, motion: FloatArray) -> ScanStop:
         """The sweep from a pose (3,) of the robot, which had moved by `motion` (n, 3) at each beam."""
@@ -284,7 +309,7 @@ class MapperFeed:
         self._robots = robots
         for pairer, robot in zip(self._pairers, robots, strict=True):
             if isinstance(pairer, SweepPairer):
-                pairer.lidar = robot.lidar
+                pairer.lidar, pairer.delay = robot.lidar, described_delay(robot.lidar.delay_s)
 
     def add(self, robot: int, kind: MapperInput, data: bytes) -> None:
         """Process a message of a robot, by its index."""
@@ -300,6 +325,9 @@ class MapperFeed:
                 number = self._joined(robot, sweep.arrival)
                 self._mapper.add_sweep(number, self._without_robots(robot, sweep))
                 self._swept[robot] = sweep.arrival
+                node, covariance = self._mapper.sweeps.matched.get(number, (-1, np.eye(3)))
+                if self._mapper.begin_ns.get(node) == sweep.stamp_ns[0]:
+                    pairer.learn(sweep, node, self._mapper.graph.poses, covariance)
         elif (readings := pairer.ready()) is not None:
             self._mapper.add_readings(self._joined(robot, readings.odometry[0]), readings)
 
@@ -330,6 +358,13 @@ class MapperFeed:
         for pairer in self._pairers:
             total.update(pairer.drops)
         return total
+
+    @property
+    def late(self) -> list[str]:
+        """A sentence for each lidar whose scans are older, or newer, than described."""
+        pairs = zip(self._robots, self._pairers, strict=True)
+        lidars = [(robot, one.delay) for robot, one in pairs if isinstance(one, SweepPairer)]
+        return [delay.sentence(robot) for robot, delay in lidars if delay.is_refuted]
 
     @property
     def dropped_beams(self) -> Counter[str]:

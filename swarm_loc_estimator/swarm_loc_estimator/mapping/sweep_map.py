@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse import csr_matrix
@@ -28,7 +28,7 @@ from swarm_loc_estimator.mapping.correlation import (
     thin,
 )
 from swarm_loc_estimator.mapping.grid import DrawnSweep
-from swarm_loc_estimator.mapping.pose_graph import PoseGraph
+from swarm_loc_estimator.mapping.pose_graph import PairRows, PoseGraph, doubled
 from swarm_loc_estimator.mapping.scans import MAX_BEAMS, ScanStop
 
 # The constants were chosen on freiburg-101, acapulco and intel, `_LOOK_EVERY` by the cost in freiburg-079.
@@ -122,9 +122,9 @@ class _Points:
     def set(self, node: int, points: FloatArray) -> None:
         """Set the points (n, 2) of a node."""
         while node >= len(self.counts):
-            self._first, self.counts, self.middle = map(_doubled, (self._first, self.counts, self.middle))
+            self._first, self.counts, self.middle = map(doubled, (self._first, self.counts, self.middle))
         while self._used + len(points) > len(self._points):
-            self._points = _doubled(self._points)
+            self._points = doubled(self._points)
         self._points[self._used : self._used + len(points)] = points
         self._first[node], self.counts[node] = self._used, len(points)
         self._used += len(points)
@@ -140,33 +140,23 @@ class _GraphWays:
     """Ways through the graph: edges of which the length says how much two stops may be off."""
 
     def __init__(self) -> None:
-        self._edges = np.zeros((64, 3))
-        self._used = 0
+        self._edges = PairRows(1)
 
     def add(self, begin: int, end: int, length: float) -> None:
         """Add an edge with a length [m]."""
-        if self._used == len(self._edges):
-            self._edges = _doubled(self._edges)
-        self._edges[self._used] = begin, end, length + 1e-3
-        self._used += 1
+        self._edges.add(begin, end, length + 1e-3)
 
     def cut(self, *stops: int) -> None:
         """Remove all edges of one stop, or those of two."""
-        edges = self._edges[: self._used]
-        edges[np.isin(edges[:, :2], stops).sum(axis=1) == len(stops), 2] = np.inf
+        begin, end, _ = self._edges.columns
+        self._edges.remove(np.isin(begin, stops).astype(int) + np.isin(end, stops) == len(stops))
 
     def lengths(self, node: int, count: int, limit: float = np.inf) -> FloatArray:
         """Lengths (count,) of the shortest ways from a stop, up to a limit [m]."""
-        edges = self._edges[: self._used]
-        edges = edges[np.isfinite(edges[:, 2])]
-        index = (edges[:, 0].astype(np.int32), edges[:, 1].astype(np.int32))
-        graph = csr_matrix((edges[:, 2], index), shape=(count, count))
+        begin, end, length = self._edges.columns
+        graph = csr_matrix((length[:, 0], (begin, end)), shape=(count, count))
         lengths: FloatArray = dijkstra(graph, directed=False, indices=node, limit=limit)
         return lengths
-
-
-def _doubled(array: Any) -> Any:
-    return np.concatenate([array, np.zeros_like(array)])
 
 
 class SweepMap:
@@ -181,6 +171,7 @@ class SweepMap:
         contradicted: Nodes to which odometry and scans say different motions.
         refused: Nodes of which the sweeps fit nothing.
         taken_back: Number of ties that were believed and then contradicted.
+        matched: Robot -> the newest node of which the sweep fits, and the covariance (3, 3) of its match.
     """
 
     def __init__(self, graph: PoseGraph) -> None:
@@ -189,6 +180,7 @@ class SweepMap:
         self.contradicted: list[int] = []
         self.refused: list[int] = []
         self.taken_back = 0
+        self.matched: dict[int, tuple[int, FloatArray]] = {}
         self._graph = graph
         self._chains: defaultdict[int, Chain] = defaultdict(Chain)
         self._points, self._ways = _Points(), _GraphWays()
@@ -220,6 +212,7 @@ class SweepMap:
         if found is not None and fits:
             usual = chain.score or found.score
             chain.score = usual + _MEMORY * (found.score - usual)
+            self.matched[int(self._graph.robot[node])] = node, found.covariance
             odometry = self._fuse(chain, begin, node, found, motion, sigma)
         elif len(points) >= _MIN_POINTS:
             self.refused.append(node)
@@ -385,6 +378,7 @@ class SweepMap:
             return
         if one.way < _SHORT:
             self.believe([one])
+            chain.looked += _LOOK_EVERY  # the graph knew that place
         else:
             chain.pending.append(one)
             self._test_together(chain)

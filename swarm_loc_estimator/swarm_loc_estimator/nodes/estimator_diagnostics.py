@@ -18,7 +18,7 @@ from swarm_loc_estimator.identification.memory import Identities
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.inputs import Ingest, InputStatistics, InputTopic
 from swarm_loc_estimator.sensors.map_topic import MapSensor
-from swarm_loc_estimator.swarm.swarm import FixedCamera, Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 from swarm_loc_estimator.timeline.estimate import Contradiction, LossReport
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
 
@@ -139,7 +139,8 @@ class Diagnostics:
         """One sentence about the missing topics, grouped by cause; "" without any."""
         by_cause: dict[str, list[str]] = {}
         for topic in self.missing():
-            by_cause.setdefault(self._why_missing(topic), []).append(topic.name)
+            why = self._graph.why_missing(topic.name, topic.kind.message_type)
+            by_cause.setdefault(why, []).append(topic.name)
         causes = by_cause.items()
         return "; ".join(f"no messages received on {listed(names)}{cause}" for cause, names in causes)
 
@@ -164,25 +165,38 @@ class Diagnostics:
         """
         elapsed_s = (now_ns - self._reported_ns) * 1e-9 if self._reported_ns is not None else 0.0
         self._reported_ns = now_ns
-        used, nis = _used_per_source(recent, len(self._sources))
+        # how many measurements of each source were used, and their mean NIS (NaN for none)
+        measurements, verdicts, nis = recent
+        mine = (verdicts == Verdict.USED) & (measurements.received_from >= 0) & np.isfinite(nis)
+        observers, count = measurements.received_from[mine], len(self._sources)
+        used = np.bincount(observers, minlength=count)
+        total = np.bincount(observers, nis[mine], minlength=count)
+        mean_nis = np.divide(total, used, out=np.full(count, np.nan), where=used > 0)
+        # robots and fixed cameras
         of_one = [topic.name for _, topic in self._of_swarm if not topic.kind.stands_for]
         common = self._duplicates_on([*self._sole, *of_one])
         self.duplicate_publishers = common.copy()
         reports, clocks_apart = [], self._ingest.clocks_apart()
         for index, source in enumerate(self._sources):
-            loss = losses[index] if index < len(losses) else None
-            known = [loss.text(now_ns)] if loss is not None else []
-            known += self._drop_troubles(index, drops_of[index]) if drops_of else []
-            known += _unused_scans(index, recent)
-            if index in clocks_apart:
-                known.append(clocks_apart[index].problem)
-            report = self._source_report(index, source, estimate, now_ns, elapsed_s, known)
-            report.values |= drop_values(drops_of[index]) if drops_of else {}
-            report.values["measurements used"] = str(used[index])
-            report.values["NIS mean"] = _figure(nis[index])
-            reports.append(report)
-        troubles = [*common, *filter(None, [self.missing_text()])]
-        values = drop_values(drops)
+            robot = source if isinstance(source, Robot) else None
+            inputs, loss = self._inputs_of[index], losses[index] if index < len(losses) else None
+            troubles = self._duplicates_on([topic.name for _, topic in inputs])
+            self.duplicate_publishers += troubles
+            troubles += [loss.text(now_ns)] if loss is not None else []
+            troubles += self._drop_troubles(index, drops_of[index]) if drops_of else []
+            troubles += _unused_scans(index, recent)
+            troubles += [clocks_apart[index].problem] if index in clocks_apart else []
+            values: dict[str, object] = {}
+            for handle, topic in inputs:
+                troubles += self._input_troubles(handle, topic, robot, now_ns)
+                if topic.expected or self._ingest.statistics[handle].received:
+                    values.update(self._input_values(handle, topic, now_ns, elapsed_s))
+            words = "seeing" if robot is None else _state(index, estimate, troubles, values)
+            values |= drop_values(drops_of[index]) if drops_of else {}
+            values |= {"measurements used": str(used[index]), "NIS mean": _figure(mean_nis[index])}
+            reports.append(Report(source.name, "; ".join(troubles) or words, level_of(troubles), values))
+        # the swarm
+        troubles, values = [*common, *filter(None, [self.missing_text()])], drop_values(drops)
         for handle, topic in self._of_swarm:
             troubles += self._input_troubles(handle, topic, None, now_ns)
             if self._ingest.statistics[handle].received:
@@ -193,9 +207,6 @@ class Diagnostics:
         words += f", {turned} of unknown heading" if turned else ""
         reports.append(Report("estimator", "; ".join(troubles) or words, level_of(troubles), values))
         return reports
-
-    def _why_missing(self, topic: InputTopic) -> str:
-        return self._graph.why_missing(topic.name, topic.kind.message_type)
 
     def _duplicates_on(self, topics: Sequence[str]) -> list[str]:
         """One sentence for each of the topics that several nodes publish."""
@@ -210,52 +221,12 @@ class Diagnostics:
         some = [(reason, count) for reason, count in grown.items() if count]
         return [f"dropped {count} of its data: they {_CAUSES[reason]}" for reason, count in some]
 
-    def _source_report(
-        self,
-        index: int,
-        source: Robot | FixedCamera,
-        estimate: Estimate,
-        now_ns: int,
-        elapsed_s: float,
-        known: Sequence[str],
-    ) -> Report:
-        """State and inputs of one robot, or inputs of a fixed camera, with troubles known before."""
-        robot = source if isinstance(source, Robot) else None
-        duplicates = self._duplicates_on([topic.name for _, topic in self._inputs_of[index]])
-        self.duplicate_publishers += duplicates
-        troubles = [*duplicates, *known]
-        values: dict[str, object] = {}
-        for handle, topic in self._inputs_of[index]:
-            troubles += self._input_troubles(handle, topic, robot, now_ns)
-            if topic.expected or self._ingest.statistics[handle].received:
-                values.update(self._input_values(handle, topic, now_ns, elapsed_s))
-        if robot is None:
-            return Report(source.name, "; ".join(troubles) or "seeing", level_of(troubles), values)
-        status = Status(int(estimate.status[index]))
-        if status is Status.WAITING and not troubles:
-            troubles.append("waiting for a sighting or a fix that locates it")
-        if status is Status.STALE and not troubles:
-            troubles.append("its odometry is silent")
-        sigma = np.sqrt(np.diagonal(estimate.covariances[index]))
-        if status is Status.UNCERTAIN:
-            size = f"{_figure(max(sigma[:2]))} m, with a heading of {_figure(sigma[2])} rad"
-            troubles.append(f"its position is uncertain: its standard deviation is {size}")
-        heading_known = bool(estimate.heading_known[index])
-        words = status.name.lower()
-        if status is not Status.WAITING and not heading_known:
-            words += ", heading unknown"
-        values["status"], values["heading known"] = status.name.lower(), str(heading_known).lower()
-        values["fix age [s]"] = _figure(estimate.fix_age_s[index])
-        values["sigma x [m]"], values["sigma y [m]"] = _figure(sigma[0]), _figure(sigma[1])
-        values["sigma theta [rad]"] = _figure(sigma[2])
-        return Report(robot.name, "; ".join(troubles) or words, level_of(troubles), values)
-
     def _input_troubles(self, handle: int, topic: InputTopic, robot: Robot | None, now_ns: int) -> list[str]:
         """Problems of an input, in words."""
         statistics = self._ingest.statistics[handle]
         if not statistics.received:
-            missing = f"no messages received on {topic.name}{self._why_missing(topic)}"
-            return [missing] if topic.expected else []
+            why = self._graph.why_missing(topic.name, topic.kind.message_type)
+            return [f"no messages received on {topic.name}{why}"] if topic.expected else []
         if statistics.last_arrival_ns is None:
             return [f"no message on {topic.name} is a {topic.kind.message_type}"]
         troubles, found = [], self._ingest.frame_id(handle)
@@ -268,28 +239,26 @@ class Diagnostics:
         one = self._parameters
         odom_frame = one.odom_frame if robot is None else one.odom_frame_of(robot.name)
         if topic.kind.rows == "odometry" and found != odom_frame:
-            troubles.append(
-                f"{topic.name} is in frame '{found}' but transforms are published for '{odom_frame}'"
-            )
+            published = f"transforms are published for '{odom_frame}'"
+            troubles.append(f"{topic.name} is in frame '{found}' but {published}")
         return troubles
 
     def _input_values(
         self, handle: int, topic: InputTopic, now_ns: int, elapsed_s: float
     ) -> dict[str, object]:
         """Figures of an input over the interval; begins its next one."""
-        statistics, name = self._ingest.statistics[handle], topic.kind.topic
+        statistics = self._ingest.statistics[handle]
+        name = topic.name if topic.kind.of_pairs else topic.kind.topic
         arrived = statistics.received - self._received[handle]
         self._received[handle] = statistics.received
-        arrival_ns, count = statistics.last_arrival_ns, statistics.late_count
+        arrival_ns, count, most_ns = statistics.last_arrival_ns, statistics.late_count, statistics.late_max_ns
         values: dict[str, object] = {
             f"{name} received": str(statistics.received),
             f"{name} malformed": str(statistics.malformed),
             f"{name} rate [1/s]": _figure(arrived / elapsed_s if elapsed_s > 0.0 else None),
             f"{name} age [s]": _figure(None if arrival_ns is None else (now_ns - arrival_ns) * 1e-9),
             f"{name} lateness mean [s]": _figure(statistics.late_sum_ns * 1e-9 / count if count else None),
-            f"{name} lateness max [s]": _figure(
-                None if statistics.late_max_ns is None else statistics.late_max_ns * 1e-9
-            ),
+            f"{name} lateness max [s]": _figure(None if most_ns is None else most_ns * 1e-9),
         }
         statistics.restart()
         return values
@@ -306,22 +275,18 @@ def load_report(cost: TickCost, elapsed_s: float, period_s: float, fusion_period
     }
     if load < _FULL_LOAD:
         return Report("load", f"ticks take {100.0 * load:.0f} % of the time", values=values)
-    advice = (
-        f"a tick takes {1e3 * cost.sum_s / cost.count:.0f} ms, more than its share: raise fusion_period_s"
-        f" (now {fusion_period_s:g} s) or tick_period_s (now {period_s:g} s)"
-    )
-    return Report("load", advice, level=Level.WARN, values=values)
+    advice = f"raise fusion_period_s (now {fusion_period_s:g} s) or tick_period_s (now {period_s:g} s)"
+    said = f"a tick takes {1e3 * cost.sum_s / cost.count:.0f} ms, more than its share: {advice}"
+    return Report("load", said, level=Level.WARN, values=values)
 
 
 def shedding_report(cost: TickCost) -> Report:
     """Report of the share of measurements dropped under overload."""
     share = cost.shed / cost.sightings if cost.sightings else 0.0
-    values: dict[str, object] = {"sightings left out [1]": _figure(share)}
-    if not cost.shed:
-        return Report("shedding", "nothing is left out for lack of time", values=values)
-    dropped = f"{cost.shed} of {cost.sightings} measurements"
-    sentence = f"overload: dropped {dropped} ({100.0 * share:.0f} %), uniformly over robots"
-    return Report("shedding", sentence, Level.WARN, values)
+    dropped = f"dropped {cost.shed} of {cost.sightings} measurements ({100.0 * share:.0f} %)"
+    said = f"overload: {dropped}, uniformly over robots"
+    said = said if cost.shed else "nothing is left out for lack of time"
+    return Report("shedding", said, level_of(cost.shed), {"sightings left out [1]": _figure(share)})
 
 
 def merged(reports: Sequence[Report], name: str) -> Report:
@@ -341,15 +306,23 @@ def _patience_s(topic: InputTopic, robot: Robot | None, statistics: InputStatist
     return max(_PATIENCE_S, _PATIENCE_PERIODS * 1e-9 * (statistics.mean_period_ns or 0.0))
 
 
-def _used_per_source(recent: Recent, sources: int) -> tuple[list[int], list[float]]:
-    """How many measurements of each robot or fixed camera were used, and their mean NIS (NaN for none)."""
-    measurements, verdicts, nis = recent
-    mine = (verdicts == Verdict.USED) & (measurements.received_from >= 0) & np.isfinite(nis)
-    observers = measurements.received_from[mine]
-    count = np.bincount(observers, minlength=sources)
-    total = np.bincount(observers, nis[mine], minlength=sources)
-    mean = np.divide(total, count, out=np.full(sources, np.nan), where=count > 0)
-    return count.tolist(), mean.tolist()
+def _state(index: int, estimate: Estimate, troubles: list[str], values: dict[str, object]) -> str:
+    """The state of a robot in words, which is added to troubles and values."""
+    status, sigma = Status(int(estimate.status[index])), np.sqrt(np.diagonal(estimate.covariances[index]))
+    if status is Status.WAITING and not troubles:
+        troubles.append("waiting for a sighting or a fix that locates it")
+    if status is Status.STALE and not troubles:
+        troubles.append("its odometry is silent")
+    if status is Status.UNCERTAIN:
+        size = f"{_figure(max(sigma[:2]))} m, with a heading of {_figure(sigma[2])} rad"
+        troubles.append(f"its position is uncertain: its standard deviation is {size}")
+    heading_known = bool(estimate.heading_known[index])
+    values["status"], values["heading known"] = status.name.lower(), str(heading_known).lower()
+    values["fix age [s]"] = _figure(estimate.fix_age_s[index])
+    values["sigma x [m]"], values["sigma y [m]"] = _figure(sigma[0]), _figure(sigma[1])
+    values["sigma theta [rad]"] = _figure(sigma[2])
+    unknown = status is not Status.WAITING and not heading_known
+    return f"{status.name.lower()}{', heading unknown' if unknown else ''}"
 
 
 def _unused_scans(robot: int, recent: Recent) -> list[str]:

@@ -28,23 +28,8 @@ from swarm_loc_estimator.common.health import PATIENCE_S, Level, Report
 from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.messages.streams import MessageBatch
 from swarm_loc_estimator.common.node import BACKWARDS, ManagedNode, Ticks, run_node
-from swarm_loc_estimator.nodes.estimator_diagnostics import (
-    Diagnostics,
-    TickCost,
-    add_contradictions,
-    add_identities,
-    load_report,
-    merged,
-    shedding_report,
-)
-from swarm_loc_estimator.nodes.estimator_topics import (
-    NO_CLOCK,
-    EstimateOutputs,
-    EstimatorInputs,
-    PoseCommands,
-    StaticTransforms,
-    newest_time_ns,
-)
+from swarm_loc_estimator.nodes import estimator_diagnostics as diagnostics
+from swarm_loc_estimator.nodes import estimator_topics as topics
 from swarm_loc_estimator.nodes.load import SHED_REASONS, FusionPace, Shedding, Thinning
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.precompile import precompile, size_of
@@ -56,22 +41,10 @@ from swarm_loc_estimator.timeline.map_search import described_map
 from swarm_loc_estimator.timeline.settings import Settings
 from swarm_loc_msgs.srv import SetRobotPose
 
-_ORDINARY_DROPS = frozenset(
-    {
-        "aerial_ambiguous",
-        "aerial_unassigned",
-        "duplicate",
-        "gated",
-        "ir_saturated",
-        "ir_too_weak",
-        "ir_undetermined",
-        "odometry_duplicate",
-        "reset",
-        "too_old",
-        "not_localized",
-        *SHED_REASONS,
-    }
-)
+_ORDINARY_DROPS = SHED_REASONS | {
+    *("aerial_ambiguous", "aerial_unassigned", "duplicate", "gated", "ir_saturated", "ir_too_weak"),
+    *("ir_undetermined", "odometry_duplicate", "reset", "too_old", "not_localized"),
+}
 """Drops that are ordinary and not logged: late, duplicate or outlying data and infrared out of range.
 Drops under overload have a warning of their own."""
 
@@ -119,18 +92,25 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         is_large = len(self._swarm.robots) >= self._estimator.settings.sparse_from
         self._thinning = Thinning(len(self._swarm.robots), round(period_s * 1e9) if is_large else 0)
         self._measurements: Counter[str] = Counter()  # Read so far, by sensor
-        self._cost = TickCost()
+        self._cost = diagnostics.TickCost()
         sole = ["swarm/poses", *(["/clock"] if self.get_clock().ros_time_is_active else [])]
-        self._diagnostics = Diagnostics(self._swarm, self._ingest, self.params, self, sole)
-        self._outputs = EstimateOutputs(self, self._swarm, self.params)
+        self._diagnostics = diagnostics.Diagnostics(self._swarm, self._ingest, self.params, self, sole)
+        self._outputs = topics.EstimateOutputs(self, self._swarm, self.params)
         self._reported_s = time.monotonic()
         self._lost = 0
-        self._static_transforms = StaticTransforms(self, self._swarm, self._ingest, self.params)
+        self._static_transforms = topics.StaticTransforms(self, self._swarm, self._ingest, self.params)
         horizon_s = self.params.settings.horizon_s
-        self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop, horizon_s)
+        self._inputs = topics.EstimatorInputs(self, self._ingest.topics, self._estimator.drop, horizon_s)
         frame = self.params.map_frame
-        self._commands = PoseCommands(self, self._swarm, self._estimator, frame, by_topics=not shared)
-        self._start_ticks()
+        self._commands = topics.PoseCommands(self, self._swarm, self._estimator, frame, by_topics=not shared)
+        self.at_end(Ticks(self, self.params.tick_period_s, self._on_tick).stop)
+        # messages received before a backward jump must not be stamped after it
+        before_jumps = partial(self._receive, self._time_ns)
+        self.at_end(self.get_clock().create_jump_callback(BACKWARDS, pre_callback=before_jumps).unregister)
+        known = f"{len(self._swarm.robots)} robots and {len(self._swarm.landmarks)} landmarks"
+        self.get_logger().info(f"ready: {known} of '{self.params.swarm_file}'")
+        if hint := self._estimator.hint:
+            self.get_logger().warning(hint)
 
     @property
     def status_name(self) -> str:
@@ -142,25 +122,17 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         """Subscriptions that an executor handles; the raw ones, the inputs, are taken by ticks."""
         return (one for one in super().subscriptions if not one.raw)
 
-    def _start_ticks(self) -> None:
-        self.at_end(Ticks(self, self.params.tick_period_s, self._on_tick).stop)
-        # messages received before a backward jump must not be stamped after it
-        before_jumps = partial(self._receive, self._time_ns)
-        self.at_end(self.get_clock().create_jump_callback(BACKWARDS, pre_callback=before_jumps).unregister)
-        self.get_logger().info(
-            f"ready: {len(self._swarm.robots)} robots and {len(self._swarm.landmarks)} landmarks"
-            f" of '{self.params.swarm_file}'"
-        )
-        if hint := self._estimator.hint:
-            self.get_logger().warning(hint)
-
     def _on_tick(self) -> None:
         begin_s = time.perf_counter()
         if not (self.is_active and self._time_ns()):
             return
         self._shedding.begin_tick(begin_s, self._pace.waited_s(self._time_ns()))
-        self._receive(partial(newest_time_ns, self))
-        self._follow_mounts()
+        self._receive(partial(topics.newest_time_ns, self))
+        # restart with mounts of sensors that static transforms tell
+        news = self._static_transforms.mounts()
+        if news is not None and news[0] != self._estimator.swarm:
+            self._estimator.describe(news[0])
+            self.get_logger().info(" ".join(news[1]))
         self._inputs.looked_ns = now_ns = self._time_ns()
         self._estimate, fusing_s = self._estimate_at(now_ns, begin_s)
         if self._estimator.time_jumps != self._jumps:
@@ -210,13 +182,6 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             self._cost.note_sightings(missed, missed)
             self._estimator.drop(f"shed_{sensor}", missed)
 
-    def _follow_mounts(self) -> None:
-        """Restart with mounts of sensors that static transforms tell."""
-        news = self._static_transforms.mounts()
-        if news is not None and news[0] != self._estimator.swarm:
-            self._estimator.describe(news[0])
-            self.get_logger().info(" ".join(news[1]))
-
     def _follow_frame(self) -> None:
         """Publish in the frame that the poses are in: `map_frame`, or that of the origin of a local frame."""
         if self._estimator.origin == self._origin:
@@ -239,9 +204,9 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         begin_s = time.perf_counter()
         now_s = time.monotonic()
         elapsed_s, self._reported_s = now_s - self._reported_s, now_s
-        cost, self._cost = self._cost, TickCost()
+        cost, self._cost = self._cost, diagnostics.TickCost()
         if not self._time_ns():
-            missing, reports = NO_CLOCK, [Report("estimator", NO_CLOCK, Level.WARN)]
+            missing, reports = topics.NO_CLOCK, [Report("estimator", topics.NO_CLOCK, Level.WARN)]
         else:
             missing, reports = self._diagnostics.missing_text(), self._make_reports(cost, elapsed_s)
         self.health.warn_of("missing", {self._time_ns() > 0: missing} if missing else {}, PATIENCE_S)
@@ -252,20 +217,19 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self.publish_reports(*reports, stamp=stamp)
         self._shedding.note(time.perf_counter() - begin_s)
 
-    def _make_reports(self, cost: TickCost, elapsed_s: float) -> list[Report]:
+    def _make_reports(self, cost: diagnostics.TickCost, elapsed_s: float) -> list[Report]:
         """One report per robot and one for the estimator; warnings are logged."""
         # Load, and what was left out or dropped.
-        load = load_report(
-            cost, elapsed_s, self.params.tick_period_s, self._estimator.settings.fusion_period_s
-        )
-        causes = [load, shedding_report(cost)]
+        periods_s = self.params.tick_period_s, self._estimator.settings.fusion_period_s
+        load = diagnostics.load_report(cost, elapsed_s, *periods_s)
+        causes = [load, diagnostics.shedding_report(cost)]
         for report in causes:
             if report.warning:
                 self.health.warn(report.name, report.message)
         drops = self._estimator.drops
         self.health.warn_of_drops({k: n for k, n in drops.items() if k not in _ORDINARY_DROPS})
         if self._estimate is None:
-            return [merged(causes, "estimator")]
+            return [diagnostics.merged(causes, "estimator")]
         # Robots, with faults and identities.
         now_ns = self._time_ns()
         own = [self._estimator.drops_of(source) for source in range(len(self._swarm.sources))]
@@ -273,8 +237,8 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         recent = self._estimator.recent()
         reports = self._diagnostics.reports(now_ns, self._estimate, recent, drops, own, losses)
         contradictions = self._estimator.contradictions(now_ns)
-        add_contradictions(reports, contradictions)
-        add_identities(reports, self._estimator.identities)
+        diagnostics.add_contradictions(reports, contradictions)
+        diagnostics.add_identities(reports, self._estimator.identities)
         # The estimator as a whole.
         *robots, whole = reports
         frames = {"frame": self._frame, "frame moves": self._estimator.frame_moves}
@@ -285,11 +249,10 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             text = f"overload: {lost} messages were lost in queues"
             causes.append(Report("overload", text, Level.WARN))
         causes += [Report("transforms", text, Level.WARN) for text in foreign]
-        self.health.warn_of(
-            "publishers", {text: text for text in [*self._diagnostics.duplicate_publishers, *foreign]}
-        )
+        publishers = [*self._diagnostics.duplicate_publishers, *foreign]
+        self.health.warn_of("publishers", {text: text for text in publishers})
         self.health.warn_of("contradictions", {(one.about, one.kind): one.text for one in contradictions})
-        return [*robots, merged([whole, *causes], "estimator")]
+        return [*robots, diagnostics.merged([whole, *causes], "estimator")]
 
     def _on_reset(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         if not self.is_active:

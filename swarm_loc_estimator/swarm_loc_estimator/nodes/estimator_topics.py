@@ -18,7 +18,6 @@ from rclpy.subscription import Subscription
 from rosgraph_msgs.msg import Clock
 from tf2_msgs.msg import TFMessage
 
-from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.detections import encode_identities
 from swarm_loc_estimator.common.messages.poses import (
@@ -26,7 +25,7 @@ from swarm_loc_estimator.common.messages.poses import (
     SwarmPosesEncoder,
     TransformsEncoder,
     encode_poses,
-    yaw_of,
+    planar_pose,
 )
 from swarm_loc_estimator.common.messages.streams import SerializedMessage
 from swarm_loc_estimator.common.node import message_class
@@ -36,7 +35,7 @@ from swarm_loc_estimator.sensors.inputs import SENSORS, Ingest, InputTopic
 from swarm_loc_estimator.sensors.map_topic import MapSensor
 from swarm_loc_estimator.sensors.mounts import TF_STATIC, Mounts
 from swarm_loc_estimator.sensors.sensor import InputKind
-from swarm_loc_estimator.swarm.swarm import StartSigma, Swarm
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.estimator import Estimate, Estimator, Status
 from swarm_loc_estimator.timeline.sightings import encode_sightings, newest_sightings
 from swarm_loc_msgs.msg import RobotIdentities, SwarmPoses, SwarmSightings
@@ -57,24 +56,6 @@ class SetPoseError(ValueError):
     """A pose that cannot be set."""
 
 
-def planar_pose(pose: PoseWithCovariance, start_sigma: StartSigma) -> tuple[FloatArray, FloatArray]:
-    """The pose (3,) in map, x [m], y [m], theta [rad], and its covariance (3, 3).
-
-    A covariance of zeros is replaced by `start_sigma`.
-
-    Raises:
-        SetPoseError: A number is not finite, or the quaternion is invalid.
-    """
-    position, q = pose.pose.position, pose.pose.orientation
-    planar = np.array([position.x, position.y, yaw_of(q.x, q.y, q.z, q.w)])
-    covariance = np.array(pose.covariance, dtype=float).reshape(6, 6)[PLANE]
-    if not (np.isfinite(planar).all() and np.isfinite(covariance).all()):
-        raise SetPoseError("pose and covariance must be finite numbers, and the quaternion not zero.")
-    if not covariance.any():
-        covariance = np.diag([start_sigma.x**2, start_sigma.y**2, start_sigma.theta**2])
-    return planar, 0.5 * (covariance + covariance.T)
-
-
 class PoseCommands:
     """Sets the pose of a robot, or deinitializes it until the next fix, at the user's request.
 
@@ -89,10 +70,8 @@ class PoseCommands:
         self._estimator = estimator
         self._map_frame = map_frame
         for index, robot in enumerate(swarm.robots if by_topics else ()):
-            on_pose = partial(self._on_initial_pose, index)
-            node.create_subscription(
-                PoseWithCovarianceStamped, f"{robot.name}/initialpose", on_pose, QoSProfile(depth=10)
-            )
+            topic, on_pose = f"{robot.name}/initialpose", partial(self._on_initial_pose, index)
+            node.create_subscription(PoseWithCovarianceStamped, topic, on_pose, _RELIABLE)
 
     def on_request(
         self, request: SetRobotPose.Request, response: SetRobotPose.Response
@@ -118,26 +97,31 @@ class PoseCommands:
     def _on_initial_pose(self, robot: int, message: PoseWithCovarianceStamped) -> None:
         name, frame = self._swarm.robots[robot].name, message.header.frame_id
         try:
-            self._check_message(frame, message.pose)
-            self._node.get_logger().info(f"by {name}/initialpose: {self._set_pose(robot, message.pose)}")
+            done = self._set_pose(robot, message.pose, frame)
+            self._node.get_logger().info(f"by {name}/initialpose: {done}")
         except SetPoseError as error:
             self._node.get_logger().warning(f"by {name}/initialpose nothing was changed: {error}")
 
-    def _check_message(self, frame: str, pose: PoseWithCovariance) -> None:
-        if not np.any(pose.covariance):
+    def _set_pose(self, robot: int, wanted: PoseWithCovariance, frame: str | None = None) -> str:
+        """Set a pose in a frame; without one, in `map_frame`, where zeros stand for the start's sigmas."""
+        if frame is not None and not np.any(wanted.covariance):
             self._estimator.drop("bad_covariance")
             raise SetPoseError("the covariance is zero.")
-        if frame != self._map_frame:
+        if frame not in (None, self._map_frame):
             raise SetPoseError(f"the pose is in frame '{frame}' but must be in '{self._map_frame}'.")
-
-    def _set_pose(self, robot: int, wanted: PoseWithCovariance) -> str:
-        pose, covariance = planar_pose(wanted, self._swarm.robots[robot].start_sigma)
-        fault = self._estimator.set_pose(robot, self._now_ns(), pose, covariance)
+        described = self._swarm.robots[robot]
+        pose, covariance = np.array(planar_pose(wanted.pose)), np.array(wanted.covariance, dtype=float)
+        covariance = covariance.reshape(6, 6)[PLANE]
+        if not (np.isfinite(pose).all() and np.isfinite(covariance).all()):
+            raise SetPoseError("pose and covariance must be finite numbers, and the quaternion not zero.")
+        if not covariance.any():
+            sigma = described.start_sigma
+            covariance = np.diag([sigma.x**2, sigma.y**2, sigma.theta**2])
+        fault = self._estimator.set_pose(robot, self._now_ns(), pose, 0.5 * (covariance + covariance.T))
         if fault:
             raise SetPoseError(REFUSALS[fault])
         x, y, theta = pose
-        name = self._swarm.robots[robot].name
-        return f"Robot '{name}' is at x {x:.3f} m, y {y:.3f} m, theta {theta:.3f} rad."
+        return f"Robot '{described.name}' is at x {x:.3f} m, y {y:.3f} m, theta {theta:.3f} rad."
 
     def _now_ns(self) -> int:
         """The node's time; raises SetPoseError before the first /clock."""
@@ -233,10 +217,7 @@ class EstimatorInputs:
         # time must not seem to go back to where it was looked at before
         begin_ns = now_ns if is_simulated else self.looked_ns
         self.looked_ns = now_ns
-        return [
-            SerializedMessage(handle, data, min(max(at_ns, begin_ns), now_ns))
-            for at_ns, handle, data in taken
-        ]
+        return [SerializedMessage(k, data, min(max(at_ns, begin_ns), now_ns)) for at_ns, k, data in taken]
 
     def _count_gaps(self, handle: int, numbers: Sequence[int | None]) -> int:
         """Number of messages missing in the sequences of a topic's publishers, which messages do not name.
@@ -395,12 +376,9 @@ class EstimateOutputs:
     def publish(self, estimate: Estimate) -> None:
         """Publish all poses; robots that are not localized are only in `swarm/poses`, with status waiting."""
         e = estimate
-        located = e.status != Status.WAITING
-        self._swarm_poses.publish(
-            self._swarm_poses_encoder.encode(
-                e.stamp_ns, e.poses, e.covariances, e.fix_age_s, e.status, e.heading_known
-            )
-        )
+        located, states = e.status != Status.WAITING, (e.fix_age_s, e.status, e.heading_known)
+        message = self._swarm_poses_encoder.encode(e.stamp_ns, e.poses, e.covariances, *states)
+        self._swarm_poses.publish(message)
         stamp_ns = e.stamp_ns + self._tolerance_ns
         for publisher, encoder, robots in self._transforms:
             if located[robots].any():
@@ -415,18 +393,16 @@ class EstimateOutputs:
 
     def publish_identities(self, identities: Identities | None) -> None:
         """Publish the identities in the newest aerial image whenever they change, also by late data."""
-        before = self._published
-        if identities is None or identities is before:
+        before, now = self._published, identities
+        if now is None or now is before:
             return
-        if before is not None and before.stamp_ns == identities.stamp_ns:
-            same = np.array_equal(before.place, identities.place)
-            if same and np.array_equal(before.probability, identities.probability):
+        if before is not None and before.stamp_ns == now.stamp_ns:
+            same = np.array_equal(before.place, now.place)
+            if same and np.array_equal(before.probability, now.probability):
                 return
-        self._published = identities
-        probability = identities.probability
-        self._identities.publish(
-            encode_identities(self._frame, identities.stamp_ns, self._names, identities.place, probability)
-        )
+        self._published = now
+        message = encode_identities(self._frame, now.stamp_ns, self._names, now.place, now.probability)
+        self._identities.publish(message)
 
     def publish_sightings(self, estimator: Estimator, now_ns: int) -> None:
         """Publish the robots' measurements and their outcomes, a few times per second if subscribed to."""

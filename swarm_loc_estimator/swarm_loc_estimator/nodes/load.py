@@ -64,31 +64,27 @@ class Thinning:
     def thin(self, messages: Batch, share: float) -> Thinned:
         """Keep a share of all measurements, in (0, 1]."""
         units = [_units(sensor, messages[sensor.name]) for sensor in self._sensors]
-        sources = [
-            k * self._sources_of_kind + one.robot % self._sources_of_kind for k, one in enumerate(units)
-        ]
-        if self._period_ns:
-            used = self._in_periods(np.concatenate([one.stamp_ns for one in units]), share)
+        count = self._sources_of_kind
+        if self._period_ns:  # by the periods of stamps
+            stamps_ns = np.concatenate([one.stamp_ns for one in units])
+            number = (end_of_period(stamps_ns, self._period_ns) // self._period_ns).astype(np.uint64)
+            used = ((number * _GOLDEN).astype(np.float64) / _WHOLE < share) | (share >= 1.0)
         else:
+            sources = [k * count + one.robot % count for k, one in enumerate(units)]
             used = self._used(np.concatenate(sources), share)
-        rows = dict(messages.rows)
-        shed: dict[str, int] = {}
-        for sensor, one, mine in zip(
-            self._sensors, units, np.split(used, np.cumsum([s.size for s in sources[:-1]])), strict=True
-        ):
-            self._decide_as_before(one.exchange, mine)
+        rows, shed = dict(messages.rows), dict[str, int]()
+        ends = np.cumsum([one.robot.size for one in units])
+        for sensor, one, mine in zip(self._sensors, units, np.split(used, ends[:-1]), strict=True):
+            for k, exchange in enumerate(one.exchange):  # one that continues is used or not as before
+                mine[k] = self._exchanges.get(exchange, mine[k])
+            if one.exchange:
+                self._exchanges = dict(zip(one.exchange, mine.tolist(), strict=True))
             if not mine.all():
                 rows[sensor.name] = select(messages[sensor.name], mine[one.of_row])
                 shed[f"shed_{sensor.name}"] = int(np.sum(~mine))
         left = replace(messages, rows=rows, dropped={**messages.dropped, **shed})
         measurements = {sensor.name: one.robot.size for sensor, one in zip(self._sensors, units, strict=True)}
         return Thinned(left, measurements, sum(shed.values()))
-
-    def _in_periods(self, stamp_ns: IntArray, share: float) -> NDArray[np.bool_]:
-        """Select measurements (u,) by the periods of their stamps (u,) [ns]."""
-        number = (end_of_period(stamp_ns, self._period_ns) // self._period_ns).astype(np.uint64)
-        fraction = (number * _GOLDEN).astype(np.float64) / _WHOLE
-        return np.asarray((fraction < share) | (share >= 1.0))
 
     def _used(self, source: IntArray, share: float) -> NDArray[np.bool_]:
         """Select measurements (u,) by their sources (u,)."""
@@ -104,14 +100,6 @@ class Thinning:
         share_of = np.minimum(1.0, water_level(count, share * source.size) / np.maximum(count, 1))
         fraction = (number * _GOLDEN + source.astype(np.uint64) * _SILVER).astype(np.float64) / _WHOLE
         return np.asarray(fraction < share_of[source])
-
-    def _decide_as_before(self, exchanges: Sequence[tuple[int, ...]], used: NDArray[np.bool_]) -> None:
-        """Repeat the decisions of the previous call for exchanges that continue."""
-        if not exchanges:
-            return
-        for k, exchange in enumerate(exchanges):
-            used[k] = self._exchanges.get(exchange, used[k])
-        self._exchanges = dict(zip(exchanges, used.tolist(), strict=True))
 
 
 def water_level(count: IntArray, total: float) -> float:
@@ -173,11 +161,7 @@ class Shedding:
         self._ticked_s: float | None = None
         self._fusing_load = fusion_load
         self._may_cut = True
-        self._begin_window(0.0)
-
-    def _begin_window(self, wall_s: float) -> None:
-        self._begin_s = wall_s
-        self._handled_s = self._busy_s = self._fusing_s = 0.0
+        self._begin_s = self._handled_s = self._busy_s = self._fusing_s = 0.0
 
     def begin_tick(self, wall_s: float, waited_s: float) -> None:
         """Begin a tick at a steady time [s]; data have waited for at most `waited_s` to be fused."""
@@ -185,7 +169,7 @@ class Shedding:
             self._ticked_s = self._begin_s = wall_s
         if wall_s - self._begin_s >= _WINDOW_S:
             self._adapt(wall_s - self._begin_s, waited_s)
-            self._begin_window(wall_s)
+            self._begin_s, self._handled_s, self._busy_s, self._fusing_s = wall_s, 0.0, 0.0, 0.0
         self._handled_s += wall_s - self._ticked_s  # it handles what was received since the previous one
         self._ticked_s = wall_s
 

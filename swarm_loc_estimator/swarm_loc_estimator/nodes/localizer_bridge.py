@@ -40,7 +40,7 @@ class LocalizerBridge(ConfiguredNode[BridgeParameters]):
         parameters = self.params = replace(self.params, **{**unset, "swarm_file": self.params.swarm_file})
         self._source = SOURCES[parameters.source]
         self._robots = LocalizedRobots(parameters, list(swarm.index_of), self.health)
-        self._counts, self._trouble = (0, 0), ""
+        self._used, self._dropped, self._trouble = 0, 0, ""
         kind: Any = PoseWithCovarianceStamped if parameters.output == "fix" else PoseStamped
         self._outputs = {
             robot: self.create_publisher(kind, f"{robot}/{parameters.output}", _OUTPUT_QOS)
@@ -60,8 +60,18 @@ class LocalizerBridge(ConfiguredNode[BridgeParameters]):
             self._outputs[robot].publish(data)
 
     def _on_diagnostics(self) -> None:
-        robots, missing = self._robots, self._missing()
-        self._follow_poses()
+        robots, silence = self._robots, self.health.silence
+        # whether every pose since the last report was dropped; without any pose, nothing changes
+        used, dropped = robots.used, self.health.drops.total()
+        if used > self._used:
+            self._trouble = ""
+        elif dropped > self._dropped:
+            self._trouble = f"no pose can be used: {listed(sorted(self.health.drops))}"
+        self._used, self._dropped = used, dropped
+        # topics, and bodies on them, of which nothing was received yet or recently
+        silent = [topic for topic in robots.topics if silence(topic)]
+        missing = [f"{one}{self.why_missing(one, self._source.message_type)}" for one in silent]
+        missing = missing or [label for label in robots.label_of.values() if silence(label)]
         if missing:
             self._note_topics_of_strangers()
         said = {name: f"body '{name}' is of no robot: name it in bodies" for name in robots.strangers}
@@ -78,27 +88,10 @@ class LocalizerBridge(ConfiguredNode[BridgeParameters]):
         message = message or self._trouble
         self.publish_reports(Report(self.status_name, message or "bridging", level_of(message), values))
 
-    def _follow_poses(self) -> None:
-        """Note whether every pose since the last report was dropped; without any pose, nothing changes."""
-        drops, (was_used, was_dropped) = self.health.drops, self._counts
-        used, dropped = self._counts = self._robots.used, drops.total()
-        if used > was_used:
-            self._trouble = ""
-        elif dropped > was_dropped:
-            self._trouble = f"no pose can be used: {listed(sorted(drops))}"
-
-    def _missing(self) -> list[str]:
-        """Topics, and bodies on them, of which nothing was received yet or recently."""
-        silent = [topic for topic in self._robots.topics if self.health.silence(topic)]
-        if not silent:
-            return [label for label in self._robots.label_of.values() if self.health.silence(label)]
-        return [f"{one}{self.why_missing(one, self._source.message_type)}" for one in silent]
-
     def _note_topics_of_strangers(self) -> None:
         """Note bodies with topics of their own that nobody describes."""
-        before, own, after = self.resolve_topic_name(self._robots.topic.replace(BODY, "BODY")).partition(
-            "BODY"
-        )
+        name_of_body = self.resolve_topic_name(self._robots.topic.replace(BODY, "BODY"))
+        before, own, after = name_of_body.partition("BODY")
         pattern = re.compile(f"{re.escape(before)}([^/]+){re.escape(after)}")
         for name, types in self.get_topic_names_and_types() if own else ():
             match = pattern.fullmatch(name)

@@ -32,16 +32,11 @@ from swarm_loc_estimator.common.jit import is_precompiled
 from swarm_loc_estimator.common.messages.poses import encode_fix, encode_pose_stamped
 from swarm_loc_estimator.common.node import BACKWARDS, ConfiguredNode, message_class, run_node
 from swarm_loc_estimator.common.parameters import UserError
+from swarm_loc_estimator.mapping import mapper_feed
 from swarm_loc_estimator.mapping.grid import CELL, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import load_map, save_map
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper, Located
-from swarm_loc_estimator.mapping.mapper_feed import (
-    MapperFeed,
-    MapperInput,
-    MapperInputError,
-    fix_covariance,
-    inputs_of,
-)
+from swarm_loc_estimator.mapping.mapper_feed import MapperFeed, MapperInput
 from swarm_loc_estimator.mapping.messages import led_frequencies
 from swarm_loc_estimator.nodes.mapper_precompile import precompile
 from swarm_loc_estimator.nodes.parameters import MapperParameters, chosen_robots
@@ -52,15 +47,10 @@ from swarm_loc_estimator.swarm.swarm_file import load_swarm
 _LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _TF_STATIC_QOS = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _INPUT_QOS = QoSProfile(depth=200)
-_OUTPUT_QOS = QoSProfile(depth=10)
 
 
 class MapperNode(ConfiguredNode[MapperParameters]):
-    """Converts the inputs, calls the mapper and publishes its map, goals and fixes.
-
-    Attributes:
-        feed: Converts the inputs and counts what was dropped.
-    """
+    """Converts the inputs, calls the mapper and publishes its map, goals and fixes."""
 
     def __init__(self, **node_arguments: Any) -> None:
         super().__init__("mapper", MapperParameters, **node_arguments)
@@ -70,10 +60,9 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self._mounts = Mounts(Swarm(tuple(self._robots)))
         independent = [robot.name for robot in self._robots if robot.fix.systematic_share < 1.0]
         if independent:
-            raise MapperInputError(
-                f"robot '{independent[0]}' maps: its type in '{self.params.swarm_file}' needs"
-                " 'fix: {systematic_share: 1.0}', since an error of the map is in all of its fixes."
-            )
+            need = f"its type in '{self.params.swarm_file}' needs 'fix: {{systematic_share: 1.0}}'"
+            why = "an error of the map is in all of its fixes"
+            raise mapper_feed.MapperInputError(f"robot '{independent[0]}' maps: {need}, since {why}.")
         self._frequencies = led_frequencies(self.params.led_frequencies, names)
         path = self.params.load_map
         self._background: OccupancyMap | None = load_map(Path(path), CELL) if path else None
@@ -84,21 +73,19 @@ class MapperNode(ConfiguredNode[MapperParameters]):
         self._clear()
         self._map = self.create_publisher(OccupancyGrid, "map", _LATCHED)
         self._visitation = self.create_publisher(OccupancyGrid, "visitation", _LATCHED)
-        self._goals = [self.create_publisher(PoseStamped, f"{name}/goal", _LATCHED) for name in names]
-        self._fixes = [
-            self.create_publisher(PoseWithCovarianceStamped, f"{name}/fix", _OUTPUT_QOS) for name in names
-        ]
+        goal, fix = (PoseStamped, _LATCHED), (PoseWithCovarianceStamped, QoSProfile(depth=10))
+        self._goals = [self.create_publisher(goal[0], f"{name}/goal", goal[1]) for name in names]
+        self._fixes = [self.create_publisher(fix[0], f"{name}/fix", fix[1]) for name in names]
         for index, robot in enumerate(self._robots):
-            for kind in inputs_of(robot, lights=bool(self._frequencies)):
+            for kind in mapper_feed.inputs_of(robot, lights=bool(self._frequencies)):
                 take = partial(self._on_message, index, kind)
                 topic = f"{robot.name}/{kind.topic}"
                 qos = qos_profile_sensor_data if kind is MapperInput.SCAN else _INPUT_QOS
                 self.create_subscription(message_class(kind.message_type), topic, take, qos, raw=True)
         spaces = ["", *(f"{robot.name}/" for robot in self._robots)] if self._unframed else []
         for topic in (f"{space}{TF_STATIC}" for space in spaces):
-            self.create_subscription(
-                TFMessage, f"/{topic}", partial(self._on_mount, topic), _TF_STATIC_QOS, raw=True
-            )
+            take = partial(self._on_mount, topic)
+            self.create_subscription(TFMessage, f"/{topic}", take, _TF_STATIC_QOS, raw=True)
         self.create_service(Trigger, "~/save_map", self._on_save)
         self.create_service(Trigger, "~/reset", self._on_reset)
         self._jumps = self.get_clock().create_jump_callback(BACKWARDS, post_callback=self._on_jump)
@@ -137,7 +124,7 @@ class MapperNode(ConfiguredNode[MapperParameters]):
             return
         self._located[robot] = located
         frame, goal = self.params.map_frame, self._mapper.goal(number)
-        covariance = fix_covariance(self._mapper.covariance(number))
+        covariance = mapper_feed.fix_covariance(self._mapper.covariance(number))
         self._fixes[robot].publish(encode_fix(frame, located.stamp_ns, located.pose, covariance))
         if goal is not None:
             # with the heading of the straight line from the present position

@@ -16,9 +16,7 @@ class EstimatorParameters:
 
     autostart: bool = autostart()
     swarm_file: str = text("", "path of the swarm description", required=True)
-    tick_period_s: float = number(
-        0.05, "s", 0.005, 1.0, "period of the node's clock in which data is used and poses are published"
-    )
+    tick_period_s: float = number(0.05, "s", 0.005, 1.0, "period in which data is used and poses published")
     fusion_load: float = number(
         0.1, "1", 0.01, 1.0, "share of a core that fusing may take; a large swarm fuses at fewer ticks then"
     )
@@ -27,13 +25,8 @@ class EstimatorParameters:
         "odom", "transforms go from map_frame to <robot>/odom_frame, the frame of its odometry", required=True
     )
     publish_tf: bool = flag(True, "publish these transforms")
-    tf_per_robot: bool = flag(
-        False,
-        "publish them on <robot>/tf, to odom_frame without <robot>/, as Nav2 with several robots expects",
-    )
-    transform_tolerance_s: float = number(
-        0.0, "s", 0.0, 10.0, "time by which transforms are post-dated, as by AMCL"
-    )
+    tf_per_robot: bool = flag(False, "publish them on <robot>/tf, to odom_frame without <robot>/, for Nav2")
+    transform_tolerance_s: float = number(0.0, "s", 0.0, 10.0, "post-dating of transforms, as by AMCL")
     publish_robot_poses: bool = flag(True, "publish <robot>/pose, too, unless shared_topics")
     shared_topics: bool = flag(
         False, "listen to swarm/odom, swarm/detections and swarm/fixes in place of topics of each robot"
@@ -51,9 +44,7 @@ class MapperParameters:
 
     swarm_file: str = text("", "path of the swarm description", required=True)
     robots: tuple[str, ...] = texts("robots that map; empty: all of the description")
-    led_frequencies: tuple[str, ...] = texts(
-        "of the robots' LEDs, such as pushbot1=1000 [Hz]; empty: lights are not used"
-    )
+    led_frequencies: tuple[str, ...] = texts("of LEDs, such as pushbot1=1000 [Hz]; empty: no lights are used")
     map_frame: str = text("map", "frame of the map, the fixes and the goals", required=True)
     map_period_s: float = number(2.0, "s", 0.1, 60.0, "period in which a changed map is published")
     load_map: str = text("", "path of the YAML of an earlier map, the background of the new one; empty: none")
@@ -94,23 +85,15 @@ class WatchParameters:
 
     swarm_file: str = text("", "path of the swarm description", required=True)
     title: str = text("", "heading of the page; empty: the name of the swarm description's folder")
-    address: str = text(
-        "127.0.0.1", "what to listen on; any but a loopback address needs a token", required=True
-    )
+    address: str = text("127.0.0.1", "what to listen on; others than loopback need a token", required=True)
     port: int = number(8420, "1", 0, 65535, "where to listen; 0: any port that is free")
-    token: str = text(
-        "", "token that browsers must send as ?token=, 8 characters or more, 5 different; empty: none"
-    )
+    token: str = text("", "token of browsers, as ?token=, 8 characters or more, 5 different; empty: none")
     rate: float = number(20.0, "Hz", 0.5, 60.0, "how often a page gets new poses, at most")
-    commands: bool = flag(
-        True, "whether pages may reset the estimator and set poses, each time after a question"
-    )
+    commands: bool = flag(True, "whether pages may reset the estimator and set poses, after a question")
     teleop: bool = flag(False, "whether pages may drive robots by <robot>/cmd_vel, too")
     teleop_speed: float = number(0.05, "m/s", 0.001, 10.0, "speed ahead while a key is held")
     teleop_turn_rate: float = number(0.8, "rad/s", 0.01, 20.0, "turn rate while a key is held")
-    estimator: str = text(
-        "estimator", "name of the estimator's node, whose services obey commands", required=True
-    )
+    estimator: str = text("estimator", "name of the estimator's node, which obeys commands", required=True)
 
 
 @dataclass(frozen=True)

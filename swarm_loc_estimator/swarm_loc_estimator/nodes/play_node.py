@@ -20,7 +20,7 @@ from rclpy.experimental.events_executor import EventsExecutor
 from rclpy.publisher import Publisher
 from rclpy.qos import DurabilityPolicy, LivelinessPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.time import Time
-from rosbags.interfaces import Qos, QosDurability, QosLiveliness, QosReliability, QosTime
+from rosbags.interfaces import Qos, QosDurability, QosLiveliness, QosReliability
 from rosgraph_msgs.msg import Clock as ClockMessage
 
 from swarm_loc_estimator.common.bags.reader import BagReader, BagTopic, RawMessage
@@ -45,14 +45,6 @@ RELIABLE = QoSProfile(depth=DEPTH)  # Reliable, which matches reliable and best-
 LATCHED = QoSProfile(depth=DEPTH, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _LATCHED_TOPICS = frozenset({"tf_static", "robot_description", "map"})
 
-_RELIABILITY = {
-    QosReliability.RELIABLE: ReliabilityPolicy.RELIABLE,
-    QosReliability.BEST_EFFORT: ReliabilityPolicy.BEST_EFFORT,
-}
-_LIVELINESS = {
-    QosLiveliness.AUTOMATIC: LivelinessPolicy.AUTOMATIC,
-    QosLiveliness.MANUAL_BY_TOPIC: LivelinessPolicy.MANUAL_BY_TOPIC,
-}
 _LONGEST_NS = 2**63 - 1
 
 
@@ -65,17 +57,21 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
         first_ns, last_ns = self._reader.time_range_ns
         self._begin_ns = first_ns + round(self.params.start_offset_s * 1e9)
         if self._begin_ns > last_ns:
-            raise ParameterError(
-                f"parameter start_offset_s = {self.params.start_offset_s:g} must lie within the bag,"
-                f" which lasts {1e-9 * (last_ns - first_ns):g} s."
-            )
+            rule = f"must lie within the bag, which lasts {1e-9 * (last_ns - first_ns):g} s"
+            raise ParameterError(f"parameter start_offset_s = {self.params.start_offset_s:g} {rule}.")
         self._publisher_of: dict[str, Publisher] = {}
         # first of all: others learn of publishers in this order, and of thousands the last one after long
-        self._clock_publisher = (
-            self.create_publisher(ClockMessage, "/clock", RELIABLE) if self.params.clock else None
-        )
+        clock = partial(self.create_publisher, ClockMessage, "/clock", RELIABLE)
+        self._clock_publisher = clock() if self.params.clock else None
         for topic in self._chosen_topics():
-            self._add_publisher(topic)
+            try:
+                publishes = message_class(topic.type)
+            except MessageTypeError:
+                why = f"there is no type {topic.type} here"
+                self.get_logger().warning(f"{topic.name} is not played: {why}")
+                continue
+            qos = playing_qos(topic.name, self._reader.offered_qos.get(topic.name, ()))
+            self._publisher_of[topic.name] = self.create_publisher(publishes, topic.name, qos)
         self._own_executor = EventsExecutor()
         self._own_executor.add_node(self)
         self.so_far = PlayedSoFar()
@@ -110,20 +106,9 @@ class PlayNode(ConfiguredNode[PlayerParameters]):
         wanted = [name.lstrip("/") for name in self.params.topics]
         for name in wanted:
             if name not in topics:
-                raise ParameterError(
-                    f"parameter topics names '{name}', but '{self.params.bag}' has: {listed([*topics])}."
-                )
+                there = f"'{self.params.bag}' has: {listed([*topics])}"
+                raise ParameterError(f"parameter topics names '{name}', but {there}.")
         return [topics[name] for name in wanted or topics]
-
-    def _add_publisher(self, topic: BagTopic) -> None:
-        """Create the publisher of a topic, if its type is installed."""
-        try:
-            publishes = message_class(topic.type)
-        except MessageTypeError:
-            self.get_logger().warning(f"{topic.name} is not played: there is no type {topic.type} here")
-            return
-        qos = playing_qos(topic.name, self._reader.offered_qos.get(topic.name, ()))
-        self._publisher_of[topic.name] = self.create_publisher(publishes, topic.name, qos)
 
     def publish(self, message: RawMessage) -> None:
         """Publish a message of the bag."""
@@ -200,20 +185,21 @@ def playing_qos(topic: str, recorded: Sequence[Qos]) -> QoSProfile:
 def _profile(recorded: Qos) -> QoSProfile:
     """A recorded profile; unspecified policies are replaced by the defaults of this player."""
     latched = recorded.durability is QosDurability.TRANSIENT_LOCAL
+    is_lossy = recorded.reliability is QosReliability.BEST_EFFORT
+    by_hand = recorded.liveliness is QosLiveliness.MANUAL_BY_TOPIC
+    durations = {
+        name: Duration(nanoseconds=min(time.sec * 1_000_000_000 + time.nsec, _LONGEST_NS))
+        for name in ("deadline", "lifespan", "liveliness_lease_duration")
+        for time in [getattr(recorded, name)]
+    }
     return QoSProfile(
         # of a latched topic, late subscribers get as much as they used to
         depth=recorded.depth if latched and 0 < recorded.depth < DEPTH else DEPTH,
-        reliability=_RELIABILITY.get(recorded.reliability, RELIABLE.reliability),
+        reliability=ReliabilityPolicy.BEST_EFFORT if is_lossy else ReliabilityPolicy.RELIABLE,
         durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
-        liveliness=_LIVELINESS.get(recorded.liveliness, LivelinessPolicy.AUTOMATIC),
-        deadline=_duration(recorded.deadline),
-        lifespan=_duration(recorded.lifespan),
-        liveliness_lease_duration=_duration(recorded.liveliness_lease_duration),
+        liveliness=LivelinessPolicy.MANUAL_BY_TOPIC if by_hand else LivelinessPolicy.AUTOMATIC,
+        **durations,
     )
-
-
-def _duration(time: QosTime) -> Duration:
-    return Duration(nanoseconds=min(time.sec * 1_000_000_000 + time.nsec, _LONGEST_NS))
 
 
 main = partial(run_node, "play", PlayNode)

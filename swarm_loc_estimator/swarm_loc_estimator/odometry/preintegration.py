@@ -119,17 +119,13 @@ def _outside(value: float, one: float, other: float) -> float:
 def update_unmoved(tracks: TrackArrays, robot: int, row: int, oldest_ns: int) -> bool:
     """Note whether a row's pose has changed; return whether the twist is integrated from now on.
 
-    A pose that has been constant since the first row while the twist says that the robot has moved is not
-    filled by its driver. Rows not older than `oldest_ns` are then integrated by their twists until the pose
-    changes for the first time.
+    A pose that has been constant since the first row while the twist says that the robot has moved, or a
+    heading while it says that it has turned, is not filled by its driver. Rows not older than `oldest_ns` are
+    then integrated by their twists until the heading changes for the first time.
     """
     before, after = tracks.raw[robot, row - 1], tracks.raw[robot, row]
     moved = tracks.unmoved[robot, row]
     stamp_ns, before_ns = tracks.stamp_ns[robot, row], tracks.stamp_ns[robot, row - 1]
-    if after[0] != before[0] or after[1] != before[1] or after[2] != before[2]:
-        tracks.twist_until_ns[robot] = min(tracks.twist_until_ns[robot], before_ns)
-        moved[0] = moved[1] = moved[2] = math.nan
-        return False
     duration_s = (stamp_ns - before_ns) * 1e-9
     left = math.exp(-duration_s / _UNMOVED_S)
     if duration_s > tracks.model[robot].timeout_s:
@@ -139,13 +135,23 @@ def update_unmoved(tracks: TrackArrays, robot: int, row: int, oldest_ns: int) ->
         moved[i] = left * tracks.unmoved[robot, row - 1, i] + (
             mean * duration_s if math.isfinite(mean) else 0.0
         )
+    if after[0] != before[0] or after[1] != before[1] or after[2] != before[2]:
+        if not math.isnan(moved[0]):
+            moved[2] = 0.0  # from now on only the heading may be constant
+            tracks.twist_until_ns[robot] = min(tracks.twist_until_ns[robot], before_ns)
+        moved[0] = moved[1] = math.nan
+    if after[2] != before[2]:
+        moved[2] = math.nan
+        tracks.twist_until_ns[robot] = min(tracks.twist_until_ns[robot], before_ns)
     has_moved = math.hypot(moved[0], moved[1]) > _UNMOVED_M or abs(moved[2]) > _UNMOVED_RAD  # False for NaN
-    if row < _UNMOVED_ROWS or not has_moved or stamp_ns > tracks.twist_from_ns[robot]:
+    is_integrated = tracks.twist_from_ns[robot] < stamp_ns <= tracks.twist_until_ns[robot]
+    if row < _UNMOVED_ROWS or not has_moved or is_integrated:
         return False
+    tracks.twist_until_ns[robot] = LATEST_NS
     begin_ns = tracks.begin_ns[robot]
     if oldest_ns > BEFORE_ALL_NS:
         begin_ns = max(begin_ns, oldest_ns + tracks.delay_ns[robot])
-    tracks.twist_from_ns[robot] = begin_ns
+    tracks.twist_from_ns[robot] = min(tracks.twist_from_ns[robot], begin_ns)
     return True
 
 
@@ -459,7 +465,8 @@ def _integrate_step(tracks: TrackArrays, robot: int, row: int) -> int:
         add_in_track_frame((x, y, middle), (0.0, 0.0, covered, 0.0), covariance)
     if by_twist and before_ns <= tracks.twist_from_ns[robot]:  # the motion before is lost
         lost = tracks.unmoved[robot, row - 1]
-        path, turned = lost[0] ** 2 + lost[1] ** 2, lost[2] ** 2
+        path = 0.0 if math.isnan(lost[0]) else lost[0] ** 2 + lost[1] ** 2
+        turned = 0.0 if math.isnan(lost[2]) else lost[2] ** 2
         add_in_track_frame((start[0], start[1], start[2]), (path, path, turned, 0.0), covariance)
     return fault
 

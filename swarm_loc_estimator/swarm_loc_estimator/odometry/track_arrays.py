@@ -205,8 +205,8 @@ class TrackArrays(NamedTuple):
     # (N, capacity, 2) evidence that twists agree with displacements and turns, see `fault_of_step`
     agreed: IntArray
     fastest: FloatArray  # (N, capacity, 2) largest speed [m/s] and turn rate [rad/s] of the twists so far
-    # (N, capacity, 3) displacement [m] and turn [rad] by the twists while the pose is constant; NaN after the
-    # pose has changed
+    # (N, capacity, 3) displacement [m] and turn [rad] by the twists while the pose and the heading are
+    # constant; NaN after these have changed
     unmoved: FloatArray
     # (N, capacity) end of the known motion: the row's instant, or earlier after repeated faults
     known_ns: IntArray

@@ -98,7 +98,7 @@ class OdometryTracks:
         return np.asarray(self._walk[robots].any(axis=-1))
 
     def integrates_twist(self) -> BoolArray:
-        """Whether the twist of each robot (N,) is integrated, because its pose is constant."""
+        """Whether the twist of each robot (N,) is integrated: its pose or its heading is constant."""
         arrays = self.arrays
         newest_ns = arrays.stamp_ns[np.arange(self._robots), np.maximum(arrays.filled - 1, 0)]
         return (arrays.twist_from_ns < newest_ns) & (newest_ns <= arrays.twist_until_ns)

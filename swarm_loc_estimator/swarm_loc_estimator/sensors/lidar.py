@@ -33,10 +33,13 @@ _RIGHT, _CHANGES_PER_S = 0.9, 0.003  # Chance that the described delay is right,
 _NEW, _SLIP = 0.3, 0.05  # Share of a match's variance that the next one does not have; error of odometry
 _BENT = 0.25  # Error of the heading, as a share of the turn in a sweep that was straightened without it
 _DOF = 4.0  # Errors have Student's distribution: wheels slip
-_GAP_NS = 1_000_000_000  # Scans farther apart are not compared
+_GAP_NS = 4_000_000_000  # Scans farther apart are not compared
+_WILD, _NOISE_SHARE = 400.0, 0.1
+"""Squares from which odometry is wrong at any lag and tells nothing, and weight of one in its usual noise."""
 _BACKWARDS, _SURE_ORDER = -2.0, 4.0
 """Log odds that the header says the order of the beams wrongly, at first and from which on it is known."""
 _NEAR_S, _REFUTED = 0.06, 0.05  # A delay is refuted if it, and those so near, have less chance than this
+_NOWHERE = np.full((3, 3), np.nan)
 
 
 class ScanRows(NamedTuple):
@@ -137,6 +140,9 @@ class DelayBelief(NamedTuple):
     covariance: FloatArray  # (3, 3) of this pose, by its own axes
     track: FloatArray  # (L, 3) this pose by odometry, at each lag
     backwards: float = _BACKWARDS  # Log odds that beams are measured in the other order than described
+    noise: float = 1.0  # Mean of recent squares: how much worse odometry is than assumed
+    #: (3, 3) at its stamp: the pose in `map`, by odometry as it is used, and as it was reported
+    anchor: FloatArray = _NOWHERE
 
     @property
     def is_backwards(self) -> bool:
@@ -157,6 +163,13 @@ class DelayBelief(NamedTuple):
     def is_refuted(self) -> bool:
         """Whether the described delay is wrong."""
         return bool(self.chance[np.abs(self.lag_s) <= _NEAR_S].sum() < _REFUTED)
+
+    def sentence(self, robot: Robot) -> str:
+        """How old the scans of a robot are, and what to describe."""
+        older = "older" if self.mean_s > 0.0 else "newer"
+        text = f"the scans of {robot.name} are {abs(self.mean_s):.2f} +- {self.sigma_s:.2f} s {older} than"
+        text += f" described: set lidar.delay_s to {robot.lidar.delay_s - self.mean_s:.2f}, or correct their"
+        return f"{text} stamps"
 
 
 def described_delay(delay_s: float) -> DelayBelief:
@@ -181,12 +194,15 @@ def learned_delay(
     turn, cos, sin = np.eye(3), math.cos(seen[2]), math.sin(seen[2])
     turn[:2, :2] = [[cos, sin], [-sin, cos]]
     own, chance, since_ns = turn @ covariance @ turn.T, before.chance, stamp_ns - before.stamp_ns
+    noisiness = before.noise
     if 0 < since_ns < _GAP_NS:
         # (L, L, 3) errors of the motion from a lag of the scan before to one of this scan
         error = between(track, compose(before.track, between(before.seen, seen))[:, None])
         slip = _SLIP * (chance @ between(before.track, track))
         noise = _NEW * (own + before.covariance) + np.diag(slip**2)
         squares = (error @ np.linalg.inv(noise) * error).sum(axis=-1)
+        usual = min(float(chance @ np.diag(squares)) / 3.0, _WILD)
+        noisiness = max(1.0, noisiness + _NOISE_SHARE * (usual - noisiness))
         # a sweep that turned otherwise than at the likeliest lag was straightened wrongly
         turned = np.gradient(np.unwrap(track[:, 2])) * (1e-9 * since_ns / _STEP_S)
         bent = 1.0 + (_BENT * (turned - turned[chance.argmax()])) ** 2 / noise[2, 2]
@@ -194,10 +210,12 @@ def learned_delay(
         change = 1.0 - math.exp(-1e-9 * since_ns * _CHANGES_PER_S)
         transition = (1.0 - change) * np.eye(_COUNT) + change * _delay_prior(before.lag_s)
         chance = chance @ (
-            transition * (1.0 + squares / (bent * _DOF)) ** (-0.5 * (_DOF + 3.0)) / np.sqrt(bent)
+            transition * (1.0 + squares / (noisiness * bent * _DOF)) ** (-0.5 * (_DOF + 3.0)) / np.sqrt(bent)
         )
-        chance /= chance.sum()
-    return DelayBelief(before.lag_s, chance, stamp_ns, seen, own, track, before.backwards)
+        chance = chance / chance.sum() if squares.min() < _WILD else before.chance
+    return before._replace(
+        chance=chance, stamp_ns=stamp_ns, seen=seen, covariance=own, track=track, noise=noisiness
+    )
 
 
 def at_odometry(belief: DelayBelief, now: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -15,6 +15,7 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.health import listed
@@ -82,7 +83,9 @@ class Mounts:
             numbers = [*quaternion, place.x, place.y, place.z]
             if (np.abs(numbers) < _FAR).all() and quaternion.any() and len(joints) < _MAX_FRAMES:
                 parent, child = (name.lstrip("/") for name in (one.header.frame_id, one.child_frame_id))
-                joints.setdefault(child, _Joint(parent, _rotation(quaternion), np.array(numbers[4:])))
+                joints.setdefault(
+                    child, _Joint(parent, Rotation.from_quat(quaternion).as_matrix(), np.array(numbers[4:]))
+                )
 
     def add_frame(self, topic: InputTopic, frame: str) -> None:
         """Add the frame of a sensor's messages."""
@@ -172,15 +175,3 @@ def _says(robot: Robot, section: str, key: str) -> bool:
     model: Any = getattr(robot, section)
     default = type(model).__dataclass_fields__[key].default
     return f"{section}.{key}" in robot.said or getattr(model, key) != default
-
-
-def _rotation(quaternion: FloatArray) -> FloatArray:
-    """Rotation (3, 3) of a quaternion x, y, z, w of any length."""
-    x, y, z, w = quaternion / np.linalg.norm(quaternion)
-    return np.array(
-        [
-            [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - z * w), 2.0 * (x * z + y * w)],
-            [2.0 * (x * y + z * w), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - x * w)],
-            [2.0 * (x * z - y * w), 2.0 * (y * z + x * w), 1.0 - 2.0 * (x * x + y * y)],
-        ]
-    )

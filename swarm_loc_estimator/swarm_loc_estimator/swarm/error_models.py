@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, field
 
 from swarm_loc_estimator.common.codec import EntrySpec, TreeChecks, entry, listed
-from swarm_loc_estimator.common.parameters import number
+from swarm_loc_estimator.common.parameters import estimated, gate, number, positive
 
 
 class MotionResponseError(ValueError):
@@ -82,13 +82,9 @@ class OdometryModel:
     wheel_separation: float = number(0.053, "m", 0.001, 10.0, "distance between the two wheels")
     wheel_noise: float = number(2e-4, "m", 0.0, 1.0, "variance of a wheel's path per metre it rolls [m^2/m]")
     distance_noise: float = number(0.0, "m", 0.0, 1.0, "added variance of the path per metre driven [m^2/m]")
-    distance_turn_noise: float = number(
-        0.0, "m^2/rad", 0.0, 1.0, "additional variance of the path per radian turned"
-    )
+    distance_turn_noise: float = number(0.0, "m^2/rad", 0.0, 1.0, "added variance of path per radian turned")
     lateral_noise: float = number(0.0, "m", 0.0, 1.0, "variance across the path per metre driven [m^2/m]")
-    turn_noise: float = number(
-        0.0, "rad", 0.0, 10.0, "additional variance of the turn per radian turned [rad^2/rad]"
-    )
+    turn_noise: float = number(0.0, "rad", 0.0, 10.0, "added variance of turn per radian turned [rad^2/rad]")
     turn_change_noise: float = number(
         0.0, "rad s", 0.0, 10.0, "additional variance of the turn per change of turn rate [rad^2/(rad/s)]"
     )
@@ -96,17 +92,11 @@ class OdometryModel:
     lateral_drift: float = number(0.0, "m^2/s", 0.0, 1.0, "variance across the path per second while moving")
     turn_drift: float = number(0.0, "rad^2/s", 0.0, 10.0, "variance of the turn per second while moving")
     distance_scale: float = number(1.0, "1", 0.1, 10.0, "true path per reported path")
-    distance_scale_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "relative standard deviation of distance_scale; 0: exact, else estimated"
-    )
+    distance_scale_sigma: float = estimated(0.0, "1", 1.0, "distance_scale")
     turn_scale: float = number(1.0, "1", 0.1, 10.0, "true turn per reported turn")
-    turn_scale_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "relative standard deviation of turn_scale; 0: exact, else estimated"
-    )
+    turn_scale_sigma: float = estimated(0.0, "1", 1.0, "turn_scale")
     turn_bias: float = number(0.0, "rad/s", -1.0, 1.0, "true minus scaled turn rate while moving")
-    turn_bias_sigma: float = number(
-        0.0, "rad/s", 0.0, 10.0, "standard deviation of the variable part of turn_bias, estimated; 0: none"
-    )
+    turn_bias_sigma: float = estimated(0.0, "rad/s", 10.0, "the variable part of turn_bias")
     turn_bias_time_s: float = number(60.0, "s", 0.1, 1e6, "time constant of that part (Gauss-Markov)")
     course_offset: float = number(0.0, "rad", -math.pi, math.pi, "course relative to base_link's x axis")
     axle_offset: float = number(0.0, "m", -1.0, 1.0, "base_link ahead of the wheels' axle")
@@ -116,9 +106,7 @@ class OdometryModel:
     max_speed: float = number(1.0, "m/s", 0.001, 100.0, "steps that imply more are dropped")
     max_turn_rate: float = number(10.0, "rad/s", 0.01, 1000.0, "steps that imply more are dropped")
     speed_change: float = number(0.1, "m/s/s^0.5", 0.0, 100.0, "random walk of speed past the newest message")
-    turn_rate_change: float = number(
-        2.0, "rad/s/s^0.5", 0.0, 1000.0, "random walk of the turn rate past the newest message"
-    )
+    turn_rate_change: float = number(2.0, "rad/s/s^0.5", 0.0, 1000.0, "the same of the turn rate")
 
 
 @dataclass(frozen=True)
@@ -129,30 +117,16 @@ class ImuModel:
     along with the pose where their sigma is not zero; those of the wheels' turns are then not estimated.
     """
 
-    turn_noise_density: float = number(
-        0.0, "rad/s/Hz^0.5", 0.0, 1.0, "white noise of the turn rate; 0: the robot has no IMU"
-    )
+    turn_noise_density: float = number(0.0, "rad/s/Hz^0.5", 0.0, 1.0, "white noise of turn rates; 0: no IMU")
     turn_scale: float = number(1.0, "1", 0.1, 10.0, "true turn per measured turn")
-    turn_scale_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "relative standard deviation of turn_scale; 0: exact, else estimated"
-    )
+    turn_scale_sigma: float = estimated(0.0, "1", 1.0, "turn_scale")
     turn_bias: float = number(0.0, "rad/s", -1.0, 1.0, "true minus scaled turn rate")
-    turn_bias_sigma: float = number(
-        0.0, "rad/s", 0.0, 10.0, "standard deviation of the variable part of turn_bias, estimated; 0: none"
-    )
+    turn_bias_sigma: float = estimated(0.0, "rad/s", 10.0, "the variable part of turn_bias")
     turn_bias_time_s: float = number(600.0, "s", 0.1, 1e6, "time constant of that part (Gauss-Markov)")
-    roll: float = number(
-        0.0,
-        "rad",
-        -math.pi,
-        math.pi,
-        "mount: the IMU turned about base_link's x axis, before pitch; 3.1416: upside down",
-    )
-    pitch: float = number(0.0, "rad", -math.pi, math.pi, "mount: turned about base_link's y axis")
+    roll: float = number(0.0, "rad", -math.pi, math.pi, "mount: turned about the x axis; 3.1416: upside down")
+    pitch: float = number(0.0, "rad", -math.pi, math.pi, "mount: then turned about the y axis")
     delay_s: float = number(0.0, "s", -2.0, 2.0, "the turn happens this much after its stamp")
-    timeout_s: float = number(
-        0.25, "s", 0.001, 10.0, "time between two messages from which the turn of the wheels is used"
-    )
+    timeout_s: float = number(0.25, "s", 0.001, 10.0, "gap between messages that the wheels' turns fill")
 
     @property
     def is_used(self) -> bool:
@@ -175,20 +149,8 @@ class LidarModel:
     max_range: float = number(
         12.0, "m", 0.2, 50.0, "where range_max is greater or missing: space is free up to here", above=True
     )
-    map_sigma: float = number(
-        0.02,
-        "m",
-        0.0,
-        1.0,
-        "error of the walls of the map for localization, in addition to that of its cells",
-    )
-    robot_radius: float = number(
-        0.0,
-        "m",
-        0.0,
-        5.0,
-        "of the bodies of other robots where it sees them, which are no walls but sightings; 0: it sees none",
-    )
+    map_sigma: float = number(0.02, "m", 0.0, 1.0, "error of the map's walls, added to that of its cells")
+    robot_radius: float = number(0.0, "m", 0.0, 5.0, "of bodies of other robots that it sees; 0: sees none")
 
     @property
     def is_used(self) -> bool:
@@ -221,13 +183,7 @@ MAX_OFFSET_S = 1e9  # Greatest offset of a clock [s]
 class ClockModel:
     """Clock of a robot, by which its odometry, detections, turn rates, ranges and brightness are stamped."""
 
-    offset_s: float = number(
-        0.0,
-        "s",
-        -MAX_OFFSET_S,
-        MAX_OFFSET_S,
-        "its time minus the time of the estimator; taken off its stamps",
-    )
+    offset_s: float = number(0.0, "s", -MAX_OFFSET_S, MAX_OFFSET_S, "its time minus that of the estimator")
 
 
 @dataclass(frozen=True)
@@ -241,44 +197,30 @@ class SensorModel:
     bearing = bearing_scale * b + bearing_curve * b^2 + bearing_offset, taken `time_offset_s` after the stamp.
     """
 
-    forward_sigma: float = number(
-        0.02, "m", 0.0, 10.0, "noise along the optical axis, sightings with heading", above=True
-    )
-    left_sigma: float = number(
-        0.01, "m", 0.0, 10.0, "noise across the optical axis, sightings with heading", above=True
-    )
-    heading_sigma: float = number(0.1, "rad", 0.0, 10.0, "noise of the marker's heading", above=True)
+    forward_sigma: float = positive(0.02, "m", 10.0, "noise along the optical axis, sightings with heading")
+    left_sigma: float = positive(0.01, "m", 10.0, "noise across the optical axis, sightings with heading")
+    heading_sigma: float = positive(0.1, "rad", 10.0, "noise of the marker's heading")
     residual_position_sigma: float = number(
         0.0, "m", 0.0, 10.0, "additional error forward and left, such as of calibration"
     )
     residual_heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "additional error of the marker's heading")
-    range_sigma: float = number(0.15, "m", 0.0, 10.0, "noise of range, sightings without heading", above=True)
+    range_sigma: float = positive(0.15, "m", 10.0, "noise of range, sightings without heading")
     range_sigma_per_m: float = number(0.0, "1", 0.0, 10.0, "growth of range noise with distance [m per m]")
-    bearing_sigma: float = number(
-        0.05, "rad", 0.0, 10.0, "noise of the bearing, sightings without heading", above=True
-    )
+    bearing_sigma: float = positive(0.05, "rad", 10.0, "noise of the bearing, sightings without heading")
     distance_scale: float = number(1.0, "1", 0.1, 10.0, "measured per true distance")
-    distance_scale_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "relative standard deviation of distance_scale; 0: exact, else estimated"
-    )
+    distance_scale_sigma: float = estimated(0.0, "1", 1.0, "distance_scale")
     range_log_scale: float = number(0.0, "1", -2.0, 2.0, "a of the range curve")
     range_skew: float = number(0.0, "1/rad", -10.0, 10.0, "c of the range curve")
-    range_curve: float = number(
-        0.0, "1/rad^2", -10.0, 10.0, "q of the range curve; 0.5 when depth is logged as range"
-    )
+    range_curve: float = number(0.0, "1/rad^2", -10.0, 10.0, "q of the range curve; 0.5: ranges are depths")
     range_offset: float = number(0.0, "m", -5.0, 5.0, "added to the scaled range")
-    range_offset_sigma: float = number(
-        0.0, "m", 0.0, 5.0, "standard deviation of range_offset; 0: exact, else estimated"
-    )
+    range_offset_sigma: float = estimated(0.0, "m", 5.0, "range_offset")
     robot_range_offset: float = number(0.0, "m", -5.0, 5.0, "also added to the range of a robot's marker")
     bearing_curve: float = number(0.0, "1/rad", -10.0, 10.0, "quadratic term of the bearing")
     bearing_offset: float = number(0.0, "rad", -TURN, TURN, "added to the scaled bearing")
     bearing_scale: float = number(1.0, "1", 0.1, 10.0, "true bearing per logged bearing")
     time_offset_s: float = number(0.0, "s", -2.0, 2.0, "exposure time minus stamp of the image")
     time_sigma_s: float = number(0.0, "s", 0.0, 2.0, "noise of an image's stamp, common to its detections")
-    gate_probability: float = number(
-        0.9999, "1", 0.5, 1.0, "share of good sightings that must pass the gate; 1 passes all"
-    )
+    gate_probability: float = gate("sightings")
 
 
 @dataclass(frozen=True)
@@ -290,6 +232,4 @@ class FixModel:
     )
     position_sigma: float = number(0.0, "m", 0.0, 1e3, "of x and y, for fixes without covariance; 0: dropped")
     heading_sigma: float = number(0.0, "rad", 0.0, 10.0, "of the heading, for such fixes; 0: it is not used")
-    gate_probability: float = number(
-        0.9999, "1", 0.5, 1.0, "share of good fixes that must pass the gate; 1 passes all"
-    )
+    gate_probability: float = gate("fixes")

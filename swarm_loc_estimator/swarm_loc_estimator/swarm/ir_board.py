@@ -1,13 +1,10 @@
-"""Infrared boards: arrangement, curves and errors of the elements, and their files.
+"""Infrared boards: arrangement, curves and errors of the elements, and their files, as in config/ir/*.yaml.
 
 Sensor and emitter of the same number are side by side on a circle about the origin of base_link, both facing
 outwards. There are at least three of each.
-
 The curves S of sensors and E of emitters over an angle are data, either pieces of sums of powers, as the
 Droplet paper prints (19) and (20), or a table. Both are sampled once into piecewise cubics with exact joints,
 which are fast to evaluate and have the exact one-sided slopes at a kink.
-
-config/ir/*.yaml of this package show the format of a board's file.
 """
 
 from __future__ import annotations
@@ -22,21 +19,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 import scipy
 
+from swarm_loc_estimator.common import codec
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_estimator.common.codec import (
-    WHOLE_FILE,
-    EntrySpec,
-    Tree,
-    TreeChecks,
-    address,
-    entry,
-    entry_specs,
-    listed,
-    properties,
-    shown,
-    to_tree,
-)
-from swarm_loc_estimator.common.parameters import NumberSpec, UserError, number, number_specs
+from swarm_loc_estimator.common.codec import EntrySpec, Tree, TreeChecks, entry, entry_specs, listed
+from swarm_loc_estimator.common.parameters import NumberSpec, UserError, gate, number, number_specs, positive
 from swarm_loc_estimator.common.yaml_tree import read_tree, write_tree
 
 if TYPE_CHECKING:
@@ -100,9 +86,8 @@ class PowerCurve:
         for left, right in itertools.pairwise(self.pieces):
             before, after = (float(_powers(p.terms, np.array(left.below))[0]) for p in (left, right))
             if abs(before - after) > _JOINT * highest:
-                raise IrPlatformError(
-                    f"pieces do not meet at {left.below:g} rad, where they are {before:.4g} and {after:.4g}."
-                )
+                values = f"where they are {before:.4g} and {after:.4g}"
+                raise IrPlatformError(f"pieces do not meet at {left.below:g} rad, {values}.")
 
     def table(self) -> CurveTable:
         """The curve in the form used by compiled code."""
@@ -129,10 +114,8 @@ class TabulatedCurve:
 
     def __post_init__(self) -> None:
         if len(self.angles) < 2 or len(self.angles) != len(self.values):
-            raise IrPlatformError(
-                f"table has {len(self.angles)} angles and {len(self.values)} values but must have as many of"
-                " both, at least two."
-            )
+            sizes = f"{len(self.angles)} angles and {len(self.values)} values"
+            raise IrPlatformError(f"table has {sizes} but must have as many of both, at least two.")
         ascends = all(a < b for a, b in itertools.pairwise(self.angles))
         if not ascends or self.angles[0] < -math.pi or self.angles[-1] > math.pi:
             raise IrPlatformError(f"angles are {list(self.angles)} but must ascend within [-pi, pi] rad.")
@@ -159,23 +142,20 @@ def _read_curve(checks: TreeChecks, tree: Tree, key: str) -> AngleCurve:
         return checks.made(f"{key}.", TabulatedCurve, **checks.values(tree, key, table, table))
     checks.mapping(tree, key, ("pieces",))
     pieces = checks.items(keys["pieces"], f"{key}.pieces") or [None]
-    last = len(pieces) - 1
-    read = [_read_piece(checks, one, f"{key}.pieces[{k}]", is_last=k == last) for k, one in enumerate(pieces)]
+    read = []
+    for k, one in enumerate(pieces):
+        here, is_last = f"{key}.pieces[{k}]", k == len(pieces) - 1
+        known = ("terms",) if is_last else ("below", "terms")  # the last one ends at pi
+        piece, terms = checks.mapping(one, here, known, known), []
+        for number_of_term, item in enumerate(checks.items(piece["terms"], f"{here}.terms")):
+            place = f"{here}.terms[{number_of_term}]"
+            term = checks.list_of_numbers(item, place)
+            if len(term) != 2:
+                raise checks.error(place, item, "must be [coefficient, exponent]")
+            terms.append((term[0], term[1]))
+        below = math.pi if is_last else checks.number(piece["below"], f"{here}.below", _BELOW)
+        read.append(PowerPiece(below or 0.0, tuple(terms)))
     return checks.made(f"{key}.", PowerCurve, pieces=tuple(read))
-
-
-def _read_piece(checks: TreeChecks, tree: Tree, key: str, *, is_last: bool) -> PowerPiece:
-    """One sum of powers; the last one ends at pi."""
-    known = ("terms",) if is_last else ("below", "terms")
-    keys = checks.mapping(tree, key, known, known)
-    terms = []
-    for k, item in enumerate(checks.items(keys["terms"], f"{key}.terms")):
-        term = checks.list_of_numbers(item, f"{key}.terms[{k}]")
-        if len(term) != 2:
-            raise checks.error(f"{key}.terms[{k}]", item, "must be [coefficient, exponent]")
-        terms.append((term[0], term[1]))
-    below = math.pi if is_last else checks.number(keys["below"], f"{key}.below", _BELOW)
-    return PowerPiece(below or 0.0, tuple(terms))
 
 
 _CURVE = EntrySpec(_read_curve, {})
@@ -192,18 +172,17 @@ class Amplitude:
         IrPlatformError: The pole is not nearer than `nearest`.
     """
 
-    scale: float = number(1.4, "count m^exponent", 0.0, 1e9, "brightness at a distance of 1 m", above=True)
+    scale: float = positive(1.4, "count m^exponent", 1e9, "brightness at a distance of 1 m")
     offset: float = number(0.0, "m", -1.0, 1.0, "added to the distance")
-    exponent: float = number(2.0, "1", 0.0, 10.0, "how fast brightness falls", above=True)
+    exponent: float = positive(2.0, "1", 10.0, "how fast brightness falls")
     background: float = number(0.0, "count", -1e6, 1e6, "added to every reading before S and E")
     nearest: float = number(0.0, "m", 0.0, 1.0, "closest distance of the law, nearer it is linear")
 
     def __post_init__(self) -> None:
         check_numbers(self)
         if self.nearest + self.offset <= 0.0:
-            raise IrPlatformError(
-                f"nearest is {self.nearest:g} m but must be beyond the pole at {-self.offset:g} m."
-            )
+            rule = f"must be beyond the pole at {-self.offset:g} m"
+            raise IrPlatformError(f"nearest is {self.nearest:g} m but {rule}.")
 
 
 def _powers(terms: tuple[tuple[float, float], ...], size: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -241,6 +220,7 @@ def _check(table: CurveTable) -> None:
 POWERS = ("far", "near")
 """Powers of the emitters in the order of BrightnessMatrix's POWER_* constants; the second is optional."""
 MAX_ELEMENTS = 32
+GAIN_LISTS = ("sensor", "emitter")
 GAIN_RANGE = (0.05, 20.0)
 _GAINS = listed(minimum=GAIN_RANGE[0], maximum=GAIN_RANGE[1])
 _TOGETHER = 1e-3  # Minimum angle between two elements [rad]
@@ -285,31 +265,17 @@ class IrPlatform:
     sensor: AngleCurve = field(metadata=entry(_CURVE))  # S, sensor reading over the angle of incidence
     emitter: AngleCurve = field(metadata=entry(_CURVE))  # E, light over the angle to the emitter's axis
     amplitudes: tuple[Amplitude, ...]  # A for each power of the emitters, in the order of `POWERS`
-    radius: float = number(0.022, "m", 0.0, 10.0, "from the centre to the elements", above=True)
-    saturation: float = number(255.0, "count", 0.0, 1e9, "readings from here on are lower bounds", above=True)
+    radius: float = positive(0.022, "m", 10.0, "from the centre to the elements")
+    saturation: float = positive(255.0, "count", 1e9, "readings from here on are lower bounds")
     dark_level: float = number(0.0, "count", -1e6, 1e6, "mean reading without light")
-    noise: float = number(1.0, "count", 0.0, 1e6, "standard deviation of every reading", above=True)
+    noise: float = positive(1.0, "count", 1e6, "standard deviation of every reading")
     relative_noise: float = number(0.0, "1", 0.0, 1.0, "additional noise, relative to the reading")
-    stray_noise: float = number(
-        0.0,
-        "1",
-        0.0,
-        1.0,
-        "additional noise, relative to the brightest reading: light reflected by bodies and floor",
-    )
-    curve_sigma: float = number(
-        0.0, "1", 0.0, 1.0, "relative systematic error of the curves, one standard deviation"
-    )
+    stray_noise: float = number(0.0, "1", 0.0, 1.0, "noise of reflections, relative to the brightest reading")
+    curve_sigma: float = number(0.0, "1", 0.0, 1.0, "relative systematic error of the curves, one sigma")
     blocked_share: float = number(0.02, "1", 0.0, 0.5, "share of readings darkened by an obstacle; 0: none")
-    bright_share: float = number(
-        0.0, "1", 0.0, 0.5, "share of readings with light that is not in the model; 0: none"
-    )
-    covariance_scale: float = number(
-        1.0, "1", 1.0, 1e3, "factor on covariances, for errors with longer tails than the noise"
-    )
-    element_sigma: float = number(
-        0.1, "1", 0.0, 1.0, "relative standard deviation of the gains of elements; 0: equal elements"
-    )
+    bright_share: float = number(0.0, "1", 0.0, 0.5, "share of readings with foreign light; 0: none")
+    covariance_scale: float = number(1.0, "1", 1.0, 1e3, "factor on covariances, for errors with long tails")
+    element_sigma: float = number(0.1, "1", 0.0, 1.0, "relative standard deviation of gains; 0: all equal")
 
     def __post_init__(self) -> None:
         check_numbers(self)
@@ -321,9 +287,8 @@ class IrPlatform:
         if np.min(np.diff(ahead, append=ahead[0] + 2.0 * math.pi)) < _TOGETHER:
             raise IrPlatformError(f"angles is {list(self.angles)} but no two elements may coincide.")
         if self.dark_level >= self.saturation:
-            raise IrPlatformError(
-                f"dark_level is {self.dark_level:g} count but must be below saturation, {self.saturation:g}."
-            )
+            rule = f"must be below saturation, {self.saturation:g}"
+            raise IrPlatformError(f"dark_level is {self.dark_level:g} count but {rule}.")
         if not 1 <= len(self.amplitudes) <= len(POWERS):
             raise IrPlatformError(f"amplitudes has {len(self.amplitudes)} powers but must have one or two.")
 
@@ -346,26 +311,15 @@ class IrPlatform:
     def model(self) -> IrModel:
         """The platform for compiled code."""
         angles = np.array(self.angles)
-        laws = [[getattr(law, name) for name in number_specs(Amplitude)] for law in self.amplitudes]
-        errors = ReadingErrors(
-            self.noise,
-            self.relative,
-            (self.curve_sigma / self.relative) ** 2 if self.relative else 0.0,
-            -math.log(self.blocked_share) if self.blocked_share else math.inf,
-            -math.log(self.bright_share) if self.bright_share else math.inf,
-        )
+        units = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+        laws = np.array([[getattr(law, name) for name in number_specs(Amplitude)] for law in self.amplitudes])
+        systematic = (self.curve_sigma / self.relative) ** 2 if self.relative else 0.0
+        shares = (self.blocked_share, self.bright_share)
+        costs = (-math.log(share) if share else math.inf for share in shares)
+        errors = ReadingErrors(self.noise, self.relative, systematic, *costs)
         return IrModel(
-            self.radius,
-            angles,
-            np.stack([np.cos(angles), np.sin(angles)], axis=-1),
-            self.sensor.table(),
-            self.emitter.table(),
-            np.array(laws),
-            self.saturation,
-            self.noise,
-            errors,
-            self.stray_noise,
-            self.covariance_scale,
+            *(self.radius, angles, units, self.sensor.table(), self.emitter.table(), laws),
+            *(self.saturation, self.noise, errors, self.stray_noise, self.covariance_scale),
         )
 
     def unknown_gains(self, count: int) -> PairGains:
@@ -392,22 +346,17 @@ class IrGains:
     dead_emitters: tuple[int, ...] = ()  # Numbers of emitters to ignore
 
     def __post_init__(self) -> None:
-        if len(self.sensor) != len(self.emitter):
-            raise IrPlatformError(
-                f"gains have {len(self.sensor)} sensors and {len(self.emitter)} emitters"
-                " but must have as many of both."
-            )
-        low, high = GAIN_RANGE
-        for name in ("sensor", "emitter"):
+        count, (low, high) = len(self.sensor), GAIN_RANGE
+        if count != len(self.emitter):
+            sizes = f"{count} sensors and {len(self.emitter)} emitters"
+            raise IrPlatformError(f"gains have {sizes} but must have as many of both.")
+        for name in GAIN_LISTS:
             if wild := [value for value in getattr(self, name) if not low <= value <= high]:
-                raise IrPlatformError(
-                    f"gains.{name} has {wild[0]:g} but factors must lie in [{low:g}, {high:g}]."
-                )
+                rule = f"factors must lie in [{low:g}, {high:g}]"
+                raise IrPlatformError(f"gains.{name} has {wild[0]:g} but {rule}.")
         for name in ("dead_sensors", "dead_emitters"):
-            if wrong := [k for k in getattr(self, name) if not 0 <= k < len(self.sensor)]:
-                raise IrPlatformError(
-                    f"{name} has {wrong[0]} but elements are numbered 0 to {len(self.sensor) - 1}."
-                )
+            if wrong := [k for k in getattr(self, name) if not 0 <= k < count]:
+                raise IrPlatformError(f"{name} has {wrong[0]} but elements are numbered 0 to {count - 1}.")
         check_numbers(self, "gains.")
 
     @classmethod
@@ -442,16 +391,17 @@ def _without(factors: FloatArray, dead: list[tuple[int, ...]]) -> FloatArray:
     return factors
 
 
-def _read_elements(checks: TreeChecks, value: Tree, key: str) -> tuple[int, ...]:
-    numbers = checks.list_of_numbers(value, key)
-    if any(number != int(number) or number < 0 for number in numbers):
-        raise checks.error(key, value, "must be a list of numbers of elements, from 0 on")
-    return tuple(int(number) for number in numbers)
-
-
 def _elements(doc: str) -> EntrySpec:
+    """Numbers of elements."""
+
+    def read(checks: TreeChecks, value: Tree, key: str) -> tuple[int, ...]:
+        numbers = checks.list_of_numbers(value, key)
+        if any(number != int(number) or number < 0 for number in numbers):
+            raise checks.error(key, value, "must be a list of numbers of elements, from 0 on")
+        return tuple(int(number) for number in numbers)
+
     items = {"type": "integer", "minimum": 0}
-    return EntrySpec(_read_elements, {"type": "array", "items": items, "description": doc})
+    return EntrySpec(read, {"type": "array", "items": items, "description": doc})
 
 
 def _read_gains(checks: TreeChecks, tree: Tree, key: str) -> IrGains | None:
@@ -462,22 +412,16 @@ def _read_gains(checks: TreeChecks, tree: Tree, key: str) -> IrGains | None:
     return checks.made(key.removesuffix("gains"), IrGains, **values)
 
 
-def _read_source(checks: TreeChecks, value: Tree, key: str) -> str:
-    if not isinstance(value, str):
-        raise checks.error(key, value, f"must be {_PLATFORM}")
-    return value
-
-
 FOLDER = Path(__file__).parents[1] / "config" / "ir"
 PACKAGED = tuple(sorted(path.stem for path in FOLDER.glob("*.yaml")))  # Names of platforms
-GAIN_LISTS = ("sensor", "emitter")
 _PLATFORM = "the name of a packaged one or the path of a file"
-_PLATFORM_SCHEMA = {"type": "string", "description": f"one of {', '.join(PACKAGED)}, or the path of a file"}
+_SAID = {"description": f"one of {', '.join(PACKAGED)}, or the path of a file"}
+_SOURCE = codec.matching(".*", _PLATFORM, _SAID, _PLATFORM)
 _GAINS_SCHEMA = {
     "description": "factors of the elements",
     "type": ["object", "null"],
     "additionalProperties": False,
-    "properties": properties(entry_specs(IrGains), IrGains),
+    "properties": codec.properties(entry_specs(IrGains), IrGains),
     "required": list(GAIN_LISTS),
 }
 
@@ -487,9 +431,9 @@ class RobotIr:
     """The infrared board of one robot."""
 
     #: Id in its exchanges, 1 to 65535, unique in the swarm
-    id: int = field(metadata=entry(address(2**16 - 1, "id in exchanges")))
+    id: int = field(metadata=entry(codec.address(2**16 - 1, "id in exchanges")))
     #: Model of the board
-    platform: IrPlatform = field(metadata=entry(EntrySpec(_read_source, _PLATFORM_SCHEMA, _PLATFORM)))
+    platform: IrPlatform = field(metadata=entry(_SOURCE))
     source: str  #: Name of a packaged platform, or absolute path of its file
     #: Calibrated gains of its elements; None: never calibrated
     gains: IrGains | None = field(default=None, metadata=entry(EntrySpec(_read_gains, _GAINS_SCHEMA)))
@@ -497,9 +441,7 @@ class RobotIr:
     dead_sensors: tuple[int, ...] = field(default=(), metadata=entry(_elements("sensors to ignore")))
     #: Numbers of emitters to ignore
     dead_emitters: tuple[int, ...] = field(default=(), metadata=entry(_elements("emitters to ignore")))
-    gate_probability: float = number(
-        0.9999, "1", 0.5, 1.0, "share of good measurements that must pass the gate; 1 passes all"
-    )
+    gate_probability: float = gate("measurements")
 
     @property
     def believed_gains(self) -> IrGains:
@@ -526,23 +468,18 @@ def load_ir_platform(name: str) -> IrPlatform:
     if not name.endswith((".yaml", ".yml")):
         path = FOLDER / f"{name}.yaml"
         if name not in PACKAGED:
-            raise IrPlatformFileError(
-                f"{shown(name)} is no packaged infrared platform ({', '.join(PACKAGED)})"
-                " and no path of a .yaml file."
-            )
+            packaged = f"packaged infrared platform ({', '.join(PACKAGED)})"
+            raise IrPlatformFileError(f"{codec.shown(name)} is no {packaged} and no path of a .yaml file.")
     checks, specs = TreeChecks(path, IrPlatformFileError), entry_specs(IrPlatform)
     tree = read_tree(path, IrPlatformFileError)
-    keys = checks.mapping(tree, WHOLE_FILE, (*_KEYS, *specs), (*_KEYS, "angles", *GAIN_LISTS))
+    keys = checks.mapping(tree, codec.WHOLE_FILE, (*_KEYS, *specs), (*_KEYS, "angles", *GAIN_LISTS))
     checks.version(keys["fileversion"], FILE_VERSION)
-    values = checks.values(keys, WHOLE_FILE, specs, others=_KEYS)
-    powers = checks.mapping(keys["powers"], "powers", POWERS, POWERS[:1])
+    values = checks.values(keys, codec.WHOLE_FILE, specs, others=_KEYS)
+    powers, specs = checks.mapping(keys["powers"], "powers", POWERS, POWERS[:1]), entry_specs(Amplitude)
     values["amplitudes"] = tuple(
-        checks.made(
-            f"powers.{power}.",
-            Amplitude,
-            **checks.values(powers[power], f"powers.{power}", entry_specs(Amplitude), ("scale",)),
-        )
+        checks.made(f"{key}.", Amplitude, **checks.values(powers[power], key, specs, ("scale",)))
         for power in POWERS[: len(powers)]
+        for key in [f"powers.{power}"]
     )
     return checks.made("", IrPlatform, **values)
 
@@ -553,23 +490,15 @@ def save_ir_platform(platform: IrPlatform, path: Path, comment: str = "") -> Non
     An existing file is replaced, a missing folder created.
     """
     laws = dict(zip(platform.powers, platform.amplitudes, strict=True))
-    numbers = entry_specs(IrPlatform)
-    tree = {
-        "fileversion": FILE_VERSION,
-        "angles": list(platform.angles),
-        "sensor": _curve_tree(platform.sensor),
-        "emitter": _curve_tree(platform.emitter),
-        "powers": {name: to_tree(law, keep=entry_specs(Amplitude)) for name, law in laws.items()},
-        **to_tree(platform, keep=numbers, without=("angles", *GAIN_LISTS)),
-    }
+    tree: dict[str, Tree] = {"fileversion": FILE_VERSION, "angles": list(platform.angles)}
+    for name in GAIN_LISTS:
+        curve: AngleCurve = getattr(platform, name)
+        if isinstance(curve, TabulatedCurve):
+            tree[name] = codec.to_tree(curve)
+        else:
+            below = [{"below": piece.below} for piece in curve.pieces[:-1]]
+            terms = [{"terms": [list(term) for term in piece.terms]} for piece in curve.pieces]
+            tree[name] = {"pieces": [{**a, **b} for a, b in zip([*below, {}], terms, strict=True)]}
+    tree["powers"] = {name: codec.to_tree(law, keep=entry_specs(Amplitude)) for name, law in laws.items()}
+    tree |= codec.to_tree(platform, keep=entry_specs(IrPlatform), without=("angles", *GAIN_LISTS))
     write_tree(tree, path, comment.splitlines())
-
-
-def _curve_tree(curve: TabulatedCurve | PowerCurve) -> dict[str, object]:
-    if isinstance(curve, TabulatedCurve):
-        return to_tree(curve)
-    pieces: list[dict[str, object]] = [
-        {"below": piece.below, "terms": [list(term) for term in piece.terms]} for piece in curve.pieces
-    ]
-    del pieces[-1]["below"]
-    return {"pieces": pieces}

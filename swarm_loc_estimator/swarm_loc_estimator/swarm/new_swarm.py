@@ -336,7 +336,7 @@ def planned_swarm(plan: SwarmPlan) -> Swarm:
         tuple(replace(one, x=one.x * x) for one in _CEILING) if "ceiling" in sensors else (),
         tuple(Anchor(plan.robots + k, *corner, z=2.0) for k, corner in enumerate(corners, 1)),
         Path(plan.map).absolute() if "map" in sensors else None,
-        "uwb/{from}/{to}/distance" if "uwb" in sensors else "",
+        "uwb/n_{from}/n_{to}/distance" if "uwb" in sensors else "",
         localizer=known.localizer if "mocap" in sensors else None,
     )
 

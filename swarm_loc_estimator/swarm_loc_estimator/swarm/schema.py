@@ -7,25 +7,11 @@ from collections.abc import Iterable
 
 from swarm_loc_estimator.common.codec import Schema, entry_specs, properties
 from swarm_loc_estimator.common.parameters import parameter_specs
+from swarm_loc_estimator.swarm import swarm_file as file
 from swarm_loc_estimator.swarm.error_models import MotionResponse
 from swarm_loc_estimator.swarm.swarm import Anchor, Face, FixedCamera, Landmark, Localizer, MapError
-from swarm_loc_estimator.swarm.swarm_file import (
-    FILE_VERSION,
-    LANDMARK_DEFAULTS,
-    LAYER,
-    MAX_ID,
-    MAX_NAME,
-    MAX_ROBOTS,
-    MODELS,
-    NAME,
-    OWN,
-    PLACED,
-    RESERVED_NAMES,
-    SECTIONS,
-    START,
-)
 
-_PATTERN = f"^{NAME.pattern}$"  # Of names
+_PATTERN = f"^{file.NAME.pattern}$"  # Of names
 _SAID = {"ir": "infrared board; null: none", "uwb": "radio; null: none"}
 
 
@@ -40,24 +26,24 @@ def swarm_schema() -> Schema:
     Those are that marker ids are unique, that types and faces exist, and the sizes of tables.
     """
     # a robot
-    of_robot = {name: {"$ref": f"#/definitions/{name}"} for name in LAYER}
-    marker_id = {"type": "integer", "minimum": 0, "maximum": MAX_ID, "description": "marker id"}
+    of_robot = {name: {"$ref": f"#/definitions/{name}"} for name in file.LAYER}
+    marker_id = {"type": "integer", "minimum": 0, "maximum": file.MAX_ID, "description": "marker id"}
     robot = {
         "type": {"type": ["string", "null"], "description": "one of types"},
         **of_robot,
-        **{name: _section(said, _of_class(SECTIONS[name])) for name, said in _SAID.items()},
+        **{name: _section(said, _of_class(file.SECTIONS[name])) for name, said in _SAID.items()},
         "ids": _section("marker id of each face", named={_PATTERN: marker_id}),
-        "start": _section("start pose in map; null: unknown", properties(START), required=START),
+        "start": _section("start pose in map; null: unknown", properties(file.START), required=file.START),
     }
     # what is fixed in map
-    landmark = _section("marker with a fixed pose", _of_class(Landmark), required=PLACED)
-    shared = _section("what landmarks have where they say nothing else", properties(LANDMARK_DEFAULTS))
+    landmark = _section("marker with a fixed pose", _of_class(Landmark), required=file.PLACED)
+    shared = _section("what landmarks have where they say nothing else", properties(file.LANDMARK_DEFAULTS))
     camera = _section("camera with a fixed pose", _of_class(FixedCamera), required=("x", "y", "z"))
-    anchor = _section("radio at a fixed place", _of_class(Anchor), required=("address", *PLACED))
+    anchor = _section("radio at a fixed place", _of_class(Anchor), required=("address", *file.PLACED))
     landmark["type"] = camera["type"] = anchor["type"] = "object"
     # the whole file
-    names = {"maxLength": MAX_NAME}
-    free_names = {**names, "not": {"enum": sorted(RESERVED_NAMES)}}
+    names = {"maxLength": file.MAX_NAME}
+    free_names = {**names, "not": {"enum": sorted(file.RESERVED_NAMES)}}
     return {
         "$schema": "http://json-schema.org/draft-07/schema#",
         "title": "Description of a robot swarm",
@@ -65,7 +51,7 @@ def swarm_schema() -> Schema:
         "additionalProperties": False,
         "required": ["fileversion", "robots"],
         "properties": {
-            "fileversion": {"const": FILE_VERSION, "description": "version of this format"},
+            "fileversion": {"const": file.FILE_VERSION, "description": "version of this format"},
             "defaults": _section(
                 "what robots have where neither they nor their types say anything else",
                 {**of_robot, "landmark": shared},
@@ -78,7 +64,7 @@ def swarm_schema() -> Schema:
                 **_section("the robots", named={_PATTERN: _section("a robot", robot)}),
                 "type": "object",
                 "minProperties": 1,
-                "maxProperties": MAX_ROBOTS,
+                "maxProperties": file.MAX_ROBOTS,
                 "propertyNames": free_names,
             },
             "landmarks": _section("static markers, by marker id", named={"^[0-9]+$": landmark}),
@@ -97,7 +83,7 @@ def swarm_schema() -> Schema:
 def _definitions() -> Schema:
     """What defaults, types and robots may say alike."""
     found = {}
-    for name, cls in MODELS.items():
+    for name, cls in file.MODELS.items():
         first = (cls.__doc__ or "").partition("\n")[0].rstrip(".")
         none = "; null: none" if name in ("odometry", "camera") else ""
         found[name] = _section(f"{first}{none}", _of_class(cls))
@@ -106,8 +92,8 @@ def _definitions() -> Schema:
     return {
         **found,
         "response": _section("ratios of true to reported motion", response, required=response),
-        "faces": {**faces, "propertyNames": {"maxLength": MAX_NAME}},
-        **{name: _section(said, _of_class(SECTIONS[name], OWN)) for name, said in _SAID.items()},
+        "faces": {**faces, "propertyNames": {"maxLength": file.MAX_NAME}},
+        **{name: _section(said, _of_class(file.SECTIONS[name], file.OWN)) for name, said in _SAID.items()},
     }
 
 

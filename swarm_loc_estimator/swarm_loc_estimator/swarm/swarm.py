@@ -1,9 +1,4 @@
-"""Swarm description: robots with their sensors and error models, and landmarks.
-
-All classes are immutable; units are SI and radians. Each number has its default, unit and allowed range in
-one table for the reader of `swarm.yaml`, the documentation and the calibration; a new parameter is one line
-in one of these classes.
-"""
+"""Swarm description: robots with their sensors and error models, and landmarks; units are SI and radians."""
 
 from __future__ import annotations
 
@@ -15,25 +10,27 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, Literal
 
-from swarm_loc_estimator.common.codec import EntrySpec, address, entry, entry_specs, switch, word
-from swarm_loc_estimator.common.parameters import choice, flag, number, text, texts
+from swarm_loc_estimator.common.codec import EntrySpec, address, entry, entry_specs, matching, switch
+from swarm_loc_estimator.common.parameters import choice, estimated, flag, gate, number, positive, text, texts
 from swarm_loc_estimator.swarm.error_models import (
     TURN,
     ClockModel,
     FixModel,
     ImuModel,
     LidarModel,
+    MotionResponse,
     OdometryModel,
     RandomWalk,
     SensorModel,
 )
 
 if TYPE_CHECKING:
-    from swarm_loc_estimator.swarm.error_models import MotionResponse
     from swarm_loc_estimator.swarm.ir_board import RobotIr
 
 _ADDRESS = address(2**64 - 1, "address in messages")
-_NAME = word("in range_topic, the address by default")
+_WORD = r"[A-Za-z0-9_]{0,64}"
+_SAID = {"pattern": f"^{_WORD}$", "description": "in range_topic, the address by default"}
+_NAME = matching(_WORD, "up to 64 letters, digits and underscores", _SAID)
 _SENSOR = EntrySpec(
     lambda checks, tree, key: SensorModel(**checks.values(tree, key, entry_specs(SensorModel))),
     {"$ref": "#/definitions/sensor"},
@@ -65,41 +62,33 @@ class UwbDevice(Radio):
     x: float = number(0.0, "m", -10.0, 10.0, "antenna forward of base_link")
     y: float = number(0.0, "m", -10.0, 10.0, "antenna left of base_link")
     z: float = number(0.0, "m", -10.0, 10.0, "antenna above the ground")
-    range_sigma: float = number(0.1, "m", 0.0, 10.0, "noise of a range without variance", above=True)
-    difference_sigma: float = number(
-        0.15, "m", 0.0, 10.0, "noise of a range difference without variance", above=True
-    )
+    range_sigma: float = positive(0.1, "m", 10.0, "noise of a range without variance")
+    difference_sigma: float = positive(0.15, "m", 10.0, "noise of a range difference without variance")
     range_bias: float = number(0.0, "m", -10.0, 10.0, "added to each range from or to this device")
-    range_bias_sigma: float = number(
-        0.2, "m", 0.0, 10.0, "standard deviation of range_bias; 0: exact, else estimated with the poses"
-    )
-    range_scale: float = number(
-        1.0, "1", 0.5, 2.0, "measured over true distance, of ranges that this device measures"
-    )
-    gate_probability: float = number(
-        0.999, "1", 0.5, 1.0, "share of good ranges that must pass the gate; 1 passes all"
-    )
+    range_bias_sigma: float = estimated(0.2, "m", 10.0, "range_bias")
+    range_scale: float = number(1.0, "1", 0.5, 2.0, "measured over true distance, of ranges that it measures")
+    gate_probability: float = gate("ranges", 0.999)
+
+
+class Placed:
+    """A static body, whose place may be estimated."""
+
+    @property
+    def is_estimated(self) -> bool:
+        """Whether its place, yaw or bias is estimated: any standard deviation is positive."""
+        return any(value > 0.0 for name, value in vars(self).items() if name.endswith("_sigma"))
 
 
 @dataclass(frozen=True)
-class Anchor(Radio):
+class Anchor(Radio, Placed):
     """Radio at a fixed place in `map`."""
 
     x: float = number(0.0, "m", -1e8, 1e8, "in map")
     y: float = number(0.0, "m", -1e8, 1e8, "in map")
     z: float = number(0.0, "m", -1e4, 1e4, "above the ground")
-    position_sigma: float = number(
-        0.0, "m", 0.0, 100.0, "standard deviation of x and y; 0: exact, else estimated with the poses"
-    )
+    position_sigma: float = estimated(0.0, "m", 100.0, "x and y")
     range_bias: float = number(0.0, "m", -10.0, 10.0, "added to each range to this anchor")
-    range_bias_sigma: float = number(
-        0.2, "m", 0.0, 10.0, "standard deviation of range_bias; 0: exact, else estimated with the poses"
-    )
-
-    @property
-    def is_estimated(self) -> bool:
-        """Whether its place or bias is estimated: any standard deviation is positive."""
-        return self.position_sigma > 0.0 or self.range_bias_sigma > 0.0
+    range_bias_sigma: float = estimated(0.2, "m", 10.0, "range_bias")
 
 
 Pose2 = tuple[float, float, float]  # x [m], y [m], heading [rad]
@@ -116,12 +105,8 @@ class CameraMount:
     y: float = number(0.0, "m", -10.0, 10.0, "left of base_link")
     z: float = number(0.0, "m", -10.0, 10.0, "above base_link")
     yaw: float = number(0.0, "rad", -TURN, TURN, "turned to the left")
-    yaw_sigma: float = number(
-        0.0, "rad", 0.0, 1.0, "standard deviation of yaw; 0: exact, else estimated with the pose"
-    )
-    yaw_time_s: float = number(
-        0.0, "s", 0.0, 1e6, "time constant with which an estimated yaw varies (Gauss-Markov); 0: constant"
-    )
+    yaw_sigma: float = estimated(0.0, "rad", 1.0, "yaw")
+    yaw_time_s: float = number(0.0, "s", 0.0, 1e6, "time constant of yaw (Gauss-Markov); 0: constant")
     pitch: float = number(0.0, "rad", -TURN, TURN, "turned down")
     roll: float = number(0.0, "rad", -TURN, TURN, "turned about the optical axis")
 
@@ -140,15 +125,13 @@ class Face:
     #: Side of the marker, black border included [m]
     size: float = number(0.036, "m", 0.001, 10.0, "side of the marker, black border included")
     #: Standard deviation of x and y, each [m]
-    position_sigma: float = number(
-        0.0, "m", 0.0, 10.0, "standard deviation of x and y; added to the noise of its sightings"
-    )
+    position_sigma: float = number(0.0, "m", 0.0, 10.0, "standard deviation of x and y, added to sightings")
     #: Whether it lies flat and looks up; its yaw is then the direction of its x axis, to the right
     lies: bool = field(default=False, metadata=entry(switch("lies flat and looks up")))
 
 
 @dataclass(frozen=True)
-class Landmark:
+class Landmark(Placed):
     """A static marker in `map`."""
 
     id: int  #: Marker id, unique in the swarm
@@ -160,25 +143,18 @@ class Landmark:
     #: Side of the marker, black border included [m]
     size: float = number(0.05, "m", 0.001, 10.0, "side of the marker, black border included")
     #: Standard deviation of x and y, each [m]
-    position_sigma: float = number(
-        0.0, "m", 0.0, 100.0, "standard deviation of x and y; 0: exact, else estimated with the poses"
-    )
+    position_sigma: float = estimated(0.0, "m", 100.0, "x and y")
     #: Standard deviation of yaw [rad]
-    yaw_sigma: float = number(0.0, "rad", 0.0, 10.0, "standard deviation of yaw; 0: exact, else estimated")
-
-    @property
-    def is_estimated(self) -> bool:
-        """Whether its pose is estimated: any standard deviation is positive."""
-        return self.position_sigma > 0.0 or self.yaw_sigma > 0.0
+    yaw_sigma: float = estimated(0.0, "rad", 10.0, "yaw")
 
 
 @dataclass(frozen=True)
 class StartSigma:
     """Standard deviations of the start pose."""
 
-    x: float = number(0.01, "m", 0.0, 1e3, "along map x", above=True)
-    y: float = number(0.01, "m", 0.0, 1e3, "along map y", above=True)
-    theta: float = number(0.02, "rad", 0.0, 10.0, "heading", above=True)
+    x: float = positive(0.01, "m", 1e3, "along map x")
+    y: float = positive(0.01, "m", 1e3, "along map y")
+    theta: float = positive(0.02, "rad", 10.0, "heading")
 
 
 @dataclass(frozen=True)
@@ -218,7 +194,7 @@ class Robot:
 
 
 @dataclass(frozen=True)
-class FixedCamera:
+class FixedCamera(Placed):
     """A camera with a fixed pose in `map`, such as at the ceiling; its angles are those of `CameraMount`."""
 
     name: str
@@ -228,18 +204,9 @@ class FixedCamera:
     yaw: float = number(0.0, "rad", -TURN, TURN, "turned to the left")
     pitch: float = number(math.pi / 2, "rad", -TURN, TURN, "turned down; by default straight down")
     roll: float = number(0.0, "rad", -TURN, TURN, "turned about the optical axis")
-    position_sigma: float = number(
-        0.001, "m", 0.0, 10.0, "standard deviation of x and y, estimated with the poses", above=True
-    )
-    yaw_sigma: float = number(
-        0.002, "rad", 0.0, 1.0, "standard deviation of yaw, estimated with the poses", above=True
-    )
+    position_sigma: float = positive(0.001, "m", 10.0, "standard deviation of x and y, always estimated")
+    yaw_sigma: float = positive(0.002, "rad", 1.0, "standard deviation of yaw, always estimated")
     sensor: SensorModel = field(default=SensorModel(), metadata=entry(_SENSOR))
-
-    @property
-    def is_estimated(self) -> bool:
-        """Whether its pose is estimated: always, since its standard deviation is never zero."""
-        return True
 
 
 Surveyed = Landmark | Anchor | FixedCamera  # A static body whose place may be estimated
@@ -277,40 +244,21 @@ class Localizer:
     """Motion capture, AMCL or another localizer, and which of its bodies are robots."""
 
     source: str = choice("pose", LOCALIZERS, "kind of messages, see the table of sources")
-    topic: str = text(
-        "",
-        "topic of the messages, with <body> in place of the body's name; empty: that of the table of sources",
-    )
-    output: str = choice(
-        "fix",
-        ("fix", "ground_truth"),
-        "<robot>/fix for the estimator, or <robot>/ground_truth to evaluate it",
-    )
+    topic: str = text("", "topic, with <body> for the body's name; empty: that of the table of sources")
+    output: str = choice("fix", ("fix", "ground_truth"), "<robot>/fix, or <robot>/ground_truth to evaluate")
     bodies: tuple[str, ...] = texts(
-        "tracked bodies, such as cf1=epuck1, or epuck2 for a body with the robot's name;"
-        " empty: each robot has a body of its own name"
+        "tracked bodies, such as cf1=epuck1, or epuck2 of the robot's name; empty: one of each robot's name"
     )
     offsets: tuple[str, ...] = texts(
-        "poses of bodies in base_link, such as epuck1=0.01,0,1.5708 [m, m, rad];"
-        " the body of a robot not named here is at base_link"
+        "poses of bodies in base_link, such as epuck1=0.01,0,1.5708 [m, m, rad]; others are at base_link"
     )
     source_frame: str = text("", "frame that the poses must be in; empty: map_frame or world")
     map_frame: str = text("map", "frame of the published poses", required=True)
-    latency_s: float = number(
-        0.0, "s", 0.0, 2.0, "time from the exposure to the stamp of a message, subtracted from the stamp"
-    )
-    stamp_on_arrival: bool = flag(
-        False, "take the time of arrival in place of stamps, for a source with another clock or none"
-    )
-    position_sigma: float = number(
-        0.001, "m", 0.0, 10.0, "noise of x and of y, for poses without covariance", above=True
-    )
-    heading_sigma: float = number(
-        0.005, "rad", 0.0, 3.0, "noise of the heading, for poses without covariance", above=True
-    )
-    max_tilt: float = number(
-        0.35, "rad", 0.0, 3.1416, "largest angle between the z axes of a body and of the frame"
-    )
+    latency_s: float = number(0.0, "s", 0.0, 2.0, "time from exposure to stamp, subtracted from the stamp")
+    stamp_on_arrival: bool = flag(False, "stamp by arrival, for a source with another clock or none")
+    position_sigma: float = positive(0.001, "m", 10.0, "noise of x and of y, for poses without covariance")
+    heading_sigma: float = positive(0.005, "rad", 3.0, "noise of the heading, for poses without covariance")
+    max_tilt: float = number(0.35, "rad", 0.0, 3.1416, "largest angle between z axes of body and frame")
 
 
 class SwarmError(ValueError):
@@ -360,16 +308,13 @@ class Swarm:
         unique = ("marker id", faces + marks), ("ir.id", boards), ("uwb.address", radios), ("uwb.name", words)
         for what, named in unique:
             owners: dict[int | str, str] = {}
-            for owner, one_id in named:
-                first = owners.setdefault(one_id, owner)
+            for owner, key in named:
+                first = owners.setdefault(key, owner)
                 if first is not owner:
-                    raise SwarmError(
-                        f"{what} {one_id} belongs to both {first} and {owner}; ids must be unique."
-                    )
+                    raise SwarmError(f"{what} {key} belongs to both {first} and {owner}; ids must be unique.")
         if walking := [r.name for r in self.robots if r.random_walk.moves and not r.stands]:
-            raise SwarmError(
-                f"robot '{walking[0]}' has a random_walk, which must be 0 where odometry is not null."
-            )
+            rule = "which must be 0 where odometry is not null"
+            raise SwarmError(f"robot '{walking[0]}' has a random_walk, {rule}.")
         if turned := [r.name for r in self.robots if r.imu.is_used and r.stands]:
             raise SwarmError(f"robot '{turned[0]}' has no odometry, so its imu.turn_noise_density must be 0.")
 
@@ -396,10 +341,5 @@ class Swarm:
     @cached_property
     def owner_of(self) -> Mapping[int, MarkerOwner]:
         """Owner by marker id."""
-        owners = {
-            face.id: MarkerOwner(index, -1, face)
-            for index, robot in enumerate(self.robots)
-            for face in robot.faces
-        }
-        owners.update({mark.id: MarkerOwner(-1, index, mark) for index, mark in enumerate(self.landmarks)})
-        return owners
+        faces = {f.id: MarkerOwner(k, -1, f) for k, robot in enumerate(self.robots) for f in robot.faces}
+        return faces | {mark.id: MarkerOwner(-1, k, mark) for k, mark in enumerate(self.landmarks)}

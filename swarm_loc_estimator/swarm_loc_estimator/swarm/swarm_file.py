@@ -14,38 +14,12 @@ from os.path import relpath
 from pathlib import Path
 from typing import Any
 
-from swarm_loc_estimator.common.codec import (
-    WHOLE_FILE,
-    Tree,
-    TreeChecks,
-    entry_specs,
-    nearest,
-    to_tree,
-)
-from swarm_loc_estimator.common.parameters import (
-    ParameterError,
-    UserError,
-    number_specs,
-    parameter_specs,
-)
+from swarm_loc_estimator.common.codec import WHOLE_FILE, Tree, TreeChecks, entry_specs, nearest, to_tree
+from swarm_loc_estimator.common.parameters import ParameterError, UserError, number_specs, parameter_specs
 from swarm_loc_estimator.common.yaml_tree import read_tree, write_tree
 from swarm_loc_estimator.swarm.calibration_states import ParameterTable
-from swarm_loc_estimator.swarm.error_models import (
-    ClockModel,
-    FixModel,
-    ImuModel,
-    LidarModel,
-    MotionResponse,
-    OdometryModel,
-    RandomWalk,
-    SensorModel,
-)
-from swarm_loc_estimator.swarm.ir_board import (
-    IrPlatform,
-    IrPlatformFileError,
-    RobotIr,
-    load_ir_platform,
-)
+from swarm_loc_estimator.swarm.error_models import MotionResponse, OdometryModel
+from swarm_loc_estimator.swarm.ir_board import IrPlatform, IrPlatformFileError, RobotIr, load_ir_platform
 from swarm_loc_estimator.swarm.swarm import (
     MAP_BY_TOPIC,
     Anchor,
@@ -56,7 +30,6 @@ from swarm_loc_estimator.swarm.swarm import (
     Localizer,
     MapError,
     Robot,
-    StartSigma,
     Swarm,
     UwbDevice,
 )
@@ -70,23 +43,13 @@ _SECTIONS = (
     *("fileversion", "defaults", "types", "robots", "landmarks", "cameras", "anchors", "map_error"),
     *("range_topic", "map", "topics", "localizer"),
 )
+_MODELS = ("odometry", "imu", "lidar", "random_walk", "camera", "sensor", "fix", "clock", "start_sigma")
 LAYER = (
     *("odometry", "imu", "lidar", "random_walk", "response", "camera", "sensor", "fix", "clock", "ir"),
     *("uwb", "faces", "start_sigma"),
 )
-_DEFAULTS = (*LAYER, "landmark")
 _ROBOT = ("type", *LAYER, "ids", "start")
-MODELS: dict[str, type] = {
-    "odometry": OdometryModel,
-    "imu": ImuModel,
-    "lidar": LidarModel,
-    "random_walk": RandomWalk,
-    "camera": CameraMount,
-    "sensor": SensorModel,
-    "fix": FixModel,
-    "clock": ClockModel,
-    "start_sigma": StartSigma,
-}
+MODELS: dict[str, type] = {name: type(getattr(Robot, name)) for name in _MODELS}
 SECTIONS: dict[str, type] = {**MODELS, "ir": RobotIr, "uwb": UwbDevice}
 MAY_BE_NONE = ("odometry", "camera", "ir", "uwb")
 OWN = ("id", "address", "name")  # Entries of sections that only a robot has
@@ -147,7 +110,7 @@ class _Loader(TreeChecks):
         sections = self.mapping(tree, WHOLE_FILE, _SECTIONS)
         self.version(sections.get("fileversion"), FILE_VERSION)
         # what robots have in common, then the robots
-        defaults = self._layer(sections.get("defaults", {}), "defaults", _DEFAULTS)
+        defaults = self._layer(sections.get("defaults", {}), "defaults", (*LAYER, "landmark"))
         types = {
             name: self._layer(tree, f"types.{name}", LAYER)
             for name, tree in self._named(sections.get("types", {}), "types")
@@ -161,12 +124,11 @@ class _Loader(TreeChecks):
         # what is fixed in map
         shared = self.mapping(sections.get("defaults", {}), "defaults").get("landmark", {})
         common, specs = self.values(shared, "defaults.landmark", LANDMARK_DEFAULTS), entry_specs(Landmark)
+        places = self.mapping(sections.get("landmarks", {}), "landmarks")
         landmarks = tuple(
-            Landmark(
-                self._marker_id(number, f"landmarks.{number}"),
-                **{**common, **self.values(place, f"landmarks.{number}", specs, PLACED)},
-            )
-            for number, place in self.mapping(sections.get("landmarks", {}), "landmarks").items()
+            Landmark(self._marker_id(number, key), **{**common, **self.values(place, key, specs, PLACED)})
+            for number, place in places.items()
+            for key in [f"landmarks.{number}"]
         )
         specs = entry_specs(FixedCamera)
         cameras = tuple(
@@ -184,35 +146,27 @@ class _Loader(TreeChecks):
             raise self.error("map", name, "must be the path of a map's .yaml file, from here, or topic")
         file = name if name in (None, MAP_BY_TOPIC) else (self._folder / name).resolve()
         ranges = sections.get("range_topic")
-        if ranges is not None and not (
-            isinstance(ranges, str)
-            and RANGE_TOPIC.fullmatch(ranges)
-            and ranges.count("{from}") == ranges.count("{to}") == 1
-        ):
+        is_pattern = isinstance(ranges, str) and RANGE_TOPIC.fullmatch(ranges)
+        if ranges is not None and not (is_pattern and ranges.count("{from}") == ranges.count("{to}") == 1):
             rule = "must be a topic with {from} and {to} once each, for names or addresses"
             raise self.error("range_topic", ranges, rule)
         # the swarm as a whole
+        names = [one.name for one in robots] + [one.name for one in cameras]
+        bodies = {"robots": robots, "landmarks": landmarks, "cameras": cameras, "anchors": anchors}
         swarm = self.made(
             "",
             Swarm,
-            robots=robots,
-            landmarks=landmarks,
-            cameras=cameras,
-            anchors=anchors,
+            **bodies,
             map=file,
             range_topic=(ranges or "").lstrip("/"),
-            topics=self._topics(
-                sections.get("topics"), [one.name for one in robots], [one.name for one in cameras]
-            ),
+            topics=self._topics(sections.get("topics"), names, len(robots)),
             localizer=self._localizer(sections.get("localizer")),
             map_error=MapError(**shared),
         )
         states = ParameterTable.of(swarm.robots, swarm.surveyed).filter_size - 3 * len(robots)
         if states > MAX_PARAMETERS:
-            raise self.said(
-                f"what has a sigma makes {states} states beside the poses"
-                f" but must make at most {MAX_PARAMETERS}"
-            )
+            rule = f"must make at most {MAX_PARAMETERS}"
+            raise self.said(f"what has a sigma makes {states} states beside the poses but {rule}")
         return swarm
 
     def _robot(self, name: str, tree: Tree, defaults: Layer, types: Mapping[str, Layer]) -> Robot:
@@ -265,8 +219,10 @@ class _Loader(TreeChecks):
         }
         if "platform" in (layer.get("ir") or {}):
             layer["ir"]["platform"] = self._platform(layer["ir"]["platform"], f"{key}.ir.platform")
-        if "response" in mapping:
-            layer["response"] = self._response(mapping["response"], f"{key}.response")
+        if "response" in mapping:  # null or a whole one: those of layers are not merged
+            specs, tree = entry_specs(MotionResponse), mapping["response"]
+            values = {} if tree is None else self.values(tree, f"{key}.response", specs, required=specs)
+            layer["response"] = self.made(f"{key}.", MotionResponse, **values) if values else None
         faces = self._named(mapping.get("faces", {}), f"{key}.faces")
         layer["faces"] = {
             name: None if face is None else self.values(face, f"{key}.faces.{name}", entry_specs(Face))
@@ -274,16 +230,16 @@ class _Loader(TreeChecks):
         }
         return layer
 
-    def _topics(self, tree: Tree, robots: Collection[str], cameras: Collection[str]) -> dict[str, str]:
+    def _topics(self, tree: Tree, sources: Collection[str], robots: int) -> dict[str, str]:
         """Parse the topics in place of expected ones."""
         topics: dict[str, str] = {}
         for own, topic in self.mapping(tree, "topics").items():
             key, (source, _, name) = f"topics.{own}", str(own).partition("/")
-            if source not in (ROBOT, *robots, *cameras) or not name:
+            if source not in (ROBOT, *sources) or not name:
                 raise self.said(f"{key} must begin with {ROBOT} or the name of a robot or camera, and /")
             if not isinstance(topic, str) or not TOPIC.fullmatch(topic):
                 raise self.error(key, topic, f"must be a topic, in which {ROBOT} stands for each robot")
-            if topic in topics.values() or (len(robots) > 1 and source == ROBOT and ROBOT not in topic):
+            if topic in topics.values() or (robots > 1 and source == ROBOT and ROBOT not in topic):
                 raise self.error(key, topic, "must be the topic of only one robot")
             topics[own] = topic
         return topics
@@ -299,15 +255,6 @@ class _Loader(TreeChecks):
             raise self.said(f"localizer.{said}") from error
         return Localizer(**values) if tree is not None else None
 
-    def _response(self, tree: Tree, key: str) -> MotionResponse | None:
-        """Parse a motion response or null; layers are not merged."""
-        if tree is None:
-            return None
-        specs = entry_specs(MotionResponse)
-        return self.made(
-            key.removesuffix("response"), MotionResponse, **self.values(tree, key, specs, required=specs)
-        )
-
     def _board(self, values: Layer | None, key: str) -> RobotIr | None:
         """The infrared board of a robot from the merged values of its layers."""
         if not values:
@@ -317,15 +264,12 @@ class _Loader(TreeChecks):
         source = values["platform"]
         platform, gains = self._platforms[source], values.get("gains")
         if gains is not None and len(gains.sensor) != platform.n:
-            raise self.said(
-                f"{key}.gains has {len(gains.sensor)} sensors and emitters"
-                f" but must have the {platform.n} of its platform"
-            )
+            rule = f"must have the {platform.n} of its platform"
+            raise self.said(f"{key}.gains has {len(gains.sensor)} sensors and emitters but {rule}")
         for name in ("dead_sensors", "dead_emitters"):
             if wrong := [k for k in values.get(name, ()) if k >= platform.n]:
-                raise self.said(
-                    f"{key}.{name} has {wrong[0]} but elements are numbered 0 to {platform.n - 1}"
-                )
+                rule = f"elements are numbered 0 to {platform.n - 1}"
+                raise self.said(f"{key}.{name} has {wrong[0]} but {rule}")
         return RobotIr(**{**values, "platform": platform, "source": source})
 
     def _platform(self, name: str, key: str) -> str:
@@ -350,13 +294,10 @@ class _Loader(TreeChecks):
         ids = self.mapping(ids_tree, f"{key}.ids", places)
         missing = [name for name in places if name not in ids]
         if missing:
-            raise self.said(
-                f"{key}.ids has no id for face '{missing[0]}'; give one or set faces.{missing[0]} to null"
-            )
-        return tuple(
-            Face(name, self._marker_id(ids[name], f"{key}.ids.{name}"), **values)
-            for name, values in places.items()
-        )
+            advice = f"give one or set faces.{missing[0]} to null"
+            raise self.said(f"{key}.ids has no id for face '{missing[0]}'; {advice}")
+        numbers = {name: self._marker_id(ids[name], f"{key}.ids.{name}") for name in places}
+        return tuple(Face(name, numbers[name], **values) for name, values in places.items())
 
     def _marker_id(self, value: Tree, key: str) -> int:
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_ID:
@@ -405,18 +346,14 @@ def save_swarm(swarm: Swarm, path: Path | str, comment: str = "") -> None:
     tree = _tree(swarm, path.parent)
     parse_swarm(tree, path)
     schema = [SCHEMA_COMMENT] if (path.parent / SCHEMA_FILE).is_file() else []
-    write_tree(tree, path, [*schema, *comment.splitlines(), *_units()])
-
-
-def _units() -> list[str]:
-    """One comment per group of numbers, with the unit of each."""
+    # one comment per group of numbers, with the unit of each
     groups = {**MODELS, "uwb": UwbDevice, "faces": Face, "landmarks": Landmark}
     groups |= {"cameras": FixedCamera, "anchors": Anchor, "map_error": MapError}
-    lines = ["Units:"]
+    units = ["Units:"]
     for name, cls in groups.items():
-        units = ", ".join(f"{key} [{spec.unit}]" for key, spec in number_specs(cls).items())
-        lines += textwrap.wrap(f"{name}: {units}", 100, initial_indent="  ", subsequent_indent="      ")
-    return lines
+        said = ", ".join(f"{key} [{spec.unit}]" for key, spec in number_specs(cls).items())
+        units += textwrap.wrap(f"{name}: {said}", 100, initial_indent="  ", subsequent_indent="      ")
+    write_tree(tree, path, [*schema, *comment.splitlines(), *units])
 
 
 def _tree(swarm: Swarm, folder: Path) -> Layer:
@@ -425,44 +362,40 @@ def _tree(swarm: Swarm, folder: Path) -> Layer:
         if robot.type and robot.type not in types:
             alike = [_layer(other, folder) for other in swarm.robots if other.type == robot.type]
             types[robot.type] = _shared(alike)
-    robots = {robot.name: _robot(robot, types.get(robot.type, {}), folder) for robot in swarm.robots}
+    # landmarks without what all of them have, and what is not as usual of a localizer
     landmarks = {mark.id: to_tree(mark, PLACED) for mark in swarm.landmarks}
-    defaults = _taken_out(LANDMARK_DEFAULTS, list(landmarks.values()))
+    shared = _common([*landmarks.values()])
+    defaults = {name: value for name, value in shared.items() if name in LANDMARK_DEFAULTS}
+    usual, localizer = vars(Localizer()), vars(swarm.localizer) if swarm.localizer else {}
     tree = {
         "fileversion": FILE_VERSION,
         "defaults": {"landmark": defaults} if defaults else {},
         "types": types,
-        "robots": robots,
-        "landmarks": landmarks,
+        "robots": {robot.name: _robot(robot, types.get(robot.type, {}), folder) for robot in swarm.robots},
+        "landmarks": {number: _without(defaults, mark) for number, mark in landmarks.items()},
         "cameras": {one.name: to_tree(one, ("x", "y", "z")) for one in swarm.cameras},
         "anchors": [to_tree(one, PLACED) for one in swarm.anchors],
         "map_error": to_tree(swarm.map_error),
         "range_topic": swarm.range_topic,
         "topics": dict(swarm.topics),
-        "localizer": _unusual(swarm.localizer),
+        "localizer": {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in localizer.items()
+            if value != usual[name] or name == "source"
+        },
         "map": relpath(swarm.map, folder) if isinstance(swarm.map, Path) else swarm.map,
     }
     return {key: value for key, value in tree.items() if value}
 
 
-def _unusual(localizer: Localizer | None) -> Layer:
-    """What is not as usual of a localizer."""
-    usual = vars(Localizer())
-    return {
-        name: list(value) if isinstance(value, tuple) else value
-        for name, value in (vars(localizer) if localizer else {}).items()
-        if value != usual[name] or name == "source"
-    }
+def _common(entries: list[Layer]) -> Layer:
+    """The values that all entries have."""
+    first = entries[0] if entries else {}
+    return {name: value for name, value in first.items() if all(one.get(name) == value for one in entries)}
 
 
-def _taken_out(names: Iterable[str], entries: list[Layer]) -> Layer:
-    """Those of the named values that all entries share, taken out of them."""
-    shared = {name: entries[0][name] for name in names if entries and name in entries[0]}
-    shared = {name: value for name, value in shared.items() if all(e.get(name) == value for e in entries)}
-    for entry in entries:
-        for name in shared:
-            del entry[name]
-    return shared
+def _without(shared: Layer, entry: Layer) -> Layer:
+    return {name: value for name, value in entry.items() if name not in shared}
 
 
 def _layer(robot: Robot, folder: Path) -> Layer:
@@ -489,16 +422,12 @@ def _layer(robot: Robot, folder: Path) -> Layer:
 def _shared(layers: list[Layer]) -> Layer:
     """What all robots of a type have in common; cameras and faces as a whole, the rest number by number."""
     shared: Layer = {}
-    for section, first in layers[0].items():
-        if section in _WHOLE or any(layer[section] is None for layer in layers):
-            if all(layer[section] == first for layer in layers):
-                shared[section] = first
-        else:
-            shared[section] = {
-                name: value
-                for name, value in first.items()
-                if all(layer[section].get(name) == value for layer in layers)
-            }
+    for section in layers[0]:
+        values = [layer[section] for layer in layers]
+        if section not in _WHOLE and None not in values:
+            shared[section] = _common(values)
+        elif all(value == values[0] for value in values):
+            shared[section] = values[0]
     return {section: value for section, value in shared.items() if value != {}}
 
 
@@ -508,9 +437,8 @@ def _robot(robot: Robot, shared: Layer, folder: Path) -> Layer:
     for section, value in _layer(robot, folder).items():
         rest = value
         if section in shared:
-            same = value == shared[section]
-            whole = section in _WHOLE
-            rest = {} if same or whole else {k: v for k, v in value.items() if k not in shared[section]}
+            is_whole = section in _WHOLE or value == shared[section]
+            rest = {} if is_whole else _without(shared[section], value)
         if rest != {}:
             entry[section] = rest
     if robot.ir is not None:
@@ -521,5 +449,5 @@ def _robot(robot: Robot, shared: Layer, folder: Path) -> Layer:
     if robot.faces:
         entry["ids"] = {face.name: face.id for face in robot.faces}
     if robot.start is not None:
-        entry["start"] = dict(zip(("x", "y", "theta"), robot.start, strict=True))
+        entry["start"] = dict(zip(START, robot.start, strict=True))
     return entry

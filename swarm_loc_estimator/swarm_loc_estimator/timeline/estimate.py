@@ -25,8 +25,7 @@ from swarm_loc_estimator.filter.state import NEVER_NS, BeliefArrays, SwarmState
 from swarm_loc_estimator.odometry.preintegration import Preintegrated
 from swarm_loc_estimator.odometry.track_arrays import TrackArrays, look_up, new_sample
 from swarm_loc_estimator.odometry.tracks import OdometryTracks
-from swarm_loc_estimator.sensors.lidar import DelayBelief
-from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.timeline.settings import Settings
 
 
@@ -289,7 +288,11 @@ def contradictions(
             for robot, source in aside
         ),
         *(_suspended(names[source]) for source in suspended.tolist()),
-        *(_late(swarm.robots[robot], one) for robot, one in state.delays.items() if one.is_refuted),
+        *(
+            Contradiction(f"lidar of {names[k]}", Contradicted.LATE, one.sentence(swarm.robots[k]))
+            for k, one in state.delays.items()
+            if one.is_refuted
+        ),
         *(
             _of_robot(names[one], Contradicted.BACKWARDS)
             for one in sorted(state.delays)
@@ -302,7 +305,8 @@ def contradictions(
 _TEXTS = {
     Contradicted.ODOMETRY: "the odometry of {0} jumps back and forth: it may have two sources",
     Contradicted.RESET: "the odometry of {0} jumped or was reset: its motion at that moment is unknown",
-    Contradicted.CONSTANT: "the odometry of {0} has a constant pose but a twist: integrating the twist",
+    Contradicted.CONSTANT: "the odometry of {0} has a constant pose or heading but a twist: integrating the"
+    " twist",
     Contradicted.UNMOVED: "the odometry of {0} has a constant pose and no twist, although {0} moves",
     Contradicted.GYROSCOPE: "the gyroscope of {0} does not turn with its wheels; using the turns of the"
     " wheels: check its axes (imu.roll, imu.pitch) and its driver",
@@ -321,14 +325,6 @@ _PART = {
 
 def _of_robot(name: str, kind: Contradicted) -> Contradiction:
     return Contradiction(_PART.get(kind, "") + name, kind, _TEXTS[kind].format(name))
-
-
-def _late(robot: Robot, delay: DelayBelief) -> Contradiction:
-    """Fault of a lidar whose delay is another than described."""
-    older = "older" if delay.mean_s > 0.0 else "newer"
-    text = f"the scans of {robot.name} are {abs(delay.mean_s):.2f} +- {delay.sigma_s:.2f} s {older} than"
-    text += f" described: set lidar.delay_s to {robot.lidar.delay_s - delay.mean_s:.2f}, or correct their"
-    return Contradiction(f"lidar of {robot.name}", Contradicted.LATE, f"{text} stamps")
 
 
 def _sightings(observer: str, source: str) -> Contradiction:

@@ -196,7 +196,13 @@ class Fusion:
                 verdicts[:] = Verdict.USED if (own[0] == Verdict.USED).any() else Verdict.UNASSIGNED
         if state.map is None or not state.tracked[robot]:
             return
-        fix, verdicts[:], confirms = self._scans.fix_of(state, one.row(0), sweep)
+        scan = self._scans.matched(state, one.row(0), sweep)
+        found = self._search.regained(state, scan)
+        if found is not None:
+            self._set_pose(state, robot, stamp_ns, found.pose, found.covariance)
+            verdicts[:] = Verdict.USED
+            return
+        fix, verdicts[:], confirms = self._scans.fix_of(state, scan)
         if fix is not None:
             known, before = state.sources.confirmations, state.sources.confirmations.copy()
             self._fuse(state, fix, verdicts, nis)

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_estimator.common.se2 import between, compose
+from swarm_loc_estimator.common.se2 import between, compose, wrap_angle
 from swarm_loc_estimator.filter.measurements import LossReason, Measurements, Verdict
 from swarm_loc_estimator.filter.models import CARTESIAN, POSE_GATE
 from swarm_loc_estimator.filter.sources import CONFIRMED, RELIEF
@@ -258,11 +258,7 @@ def _near(walls: WallMap, variance: float) -> float:
 def _inverted(
     information: FloatArray, imitated: FloatArray, scale: float
 ) -> tuple[FloatArray, FloatArray, int]:
-    """The inverse (3, 3) of an information, 0 where it tells nothing; the covariance; directions known.
-
-    Errors of normals imitate a part (3, 3). By the mean distance of the ends [m], angles compare with
-    positions.
-    """
+    """The inverse (3, 3) of an information, 0 where it tells nothing; the covariance; directions known."""
     unit = np.diag(np.array([1.0, 1.0, 1.0 / scale]))
     values, axes = np.linalg.eigh(np.dot(unit, np.dot(information, unit)))
     vectors = np.ascontiguousarray(axes.T)
@@ -283,7 +279,7 @@ def _inverted(
 def _classified(
     walls: WallMap, ends: FloatArray, origin: FloatArray, variance: FloatArray, pose: FloatArray
 ) -> tuple[int, int, int, float]:
-    """Numbers of beams that fit walls, end where the map is free, go through walls; sum of their misfits."""
+    """Numbers of beams that fit, end where it is free, and go through walls; the sum of squared distances."""
     cos, sin = math.cos(pose[2]), math.sin(pose[2])
     from_x = pose[0] + cos * origin[0] - sin * origin[1]
     from_y = pose[1] + sin * origin[0] + cos * origin[1]
@@ -342,14 +338,34 @@ _SYSTEMATIC_SHARE = 0.7
 _ALIKE_M = 2.0  # Distance within which errors of a map are alike [m]
 _MAX_MISSED, _MAX_AT_START = 10.0, 3.0
 """Fault scores at which a robot is lost whose scans contradict the map, and before its start is confirmed."""
-_ALL, _SURE_FIT = 3, 0.65
+_ALL, SURE_FIT = 3, 0.65
 """Number of directions and share of fitting beams with which a scan confirms a start: elsewhere, walls like
 those at home are seen now and then."""
+_LEFT_OUT, _LEFT_OUT_SHARE = np.array([0.1, 0.1, 0.1]), 0.2
+"""Motion that odometry has left out [m, m, rad], and share of a motion by which calibration changes it."""
+_NEARLY_LOST = 0.7  # Standard deviation, over that of a lost robot, from which nothing is known of a motion
 _ORDER_TURN, _ORDER_KNOWN = 0.03, 12.0
 """Turn during a sweep that tells in which order its beams are measured [rad], and log odds that settle it."""
 _ORDER_WEIGHT, _ORDER_NEWS = 10.0, 4.0
 """Log odds of this order by the misfit of a scan, whose beams err together, and the most by a scan."""
 Sweeps = Mapping[tuple[int, int], LidarSweep]  # Sweeps by robot and stamp of the first beam [ns]
+
+
+class MatchedScan(NamedTuple):
+    """A scan matched where its robot is predicted."""
+
+    robot: int
+    stamp_ns: int
+    walls: WallMap  # With the error of its lidar's map
+    beams: tuple[FloatArray, FloatArray, FloatArray]  # Ends, origin and variances, see `match`
+    predicted: FloatArray  # (3,) pose
+    covariance: FloatArray  # (3, 3) of it
+    found: Match
+    track: FloatArray  # (L, 3) poses by odometry in the middle of the sweep, at each lag
+    back: FloatArray  # (3,) from the pose at its stamp to that in the middle, at the likeliest lag
+    anchor: FloatArray  # (3, 3) of `DelayBelief`, if it is where it was matched
+    reported: FloatArray | None  # (3,) pose by a motion that odometry has left out, if it has
+    follows: bool  # Whether it was matched where the scan before and odometry put it
 
 
 class MapScans:
@@ -364,12 +380,13 @@ class MapScans:
         """The map with the error that the description of a robot says."""
         return walls._replace(variance=walls.variance + self._lidars[robot].map_sigma ** 2)
 
-    def fix_of(
-        self, state: SwarmState, one: Measurements, sweep: LidarSweep
-    ) -> tuple[Measurements | None, Verdict, bool]:
-        """Match the scan of a located robot; its fix (1,), or None and why, and if it confirms a start.
+    def matched(self, state: SwarmState, one: Measurements, sweep: LidarSweep) -> MatchedScan:
+        """Match a scan where its robot is predicted.
 
-        `sweep` has its beams that may end at walls. Fault scores of the state, which has a map, are changed.
+        Args:
+            state: With a map; what is known of the order of beams is changed.
+            one: Row of the scan, whose robot is located in the map.
+            sweep: Its beams that may end at walls.
         """
         robot, stamp_ns = int(one.target), int(one.stamp_ns)
         estimate = estimate_at(state, self.tracks.arrays, self._limits, stamp_ns)
@@ -381,23 +398,51 @@ class MapScans:
         beams, now, track = self.beams(robot, stamp_ns, sweep, delay.lag_s, best)
         back = between(now, track[best])
         _, doubt = at_odometry(delay._replace(seen=compose(pose, back), track=track), now)
-        found = match(walls, *beams, pose, covariance + doubt)
-        if abs(delay.backwards) < _ORDER_KNOWN and self.turned(robot, sweep) > _ORDER_TURN:
-            beams, _, _ = self.beams(robot, stamp_ns, sweep.backwards(), delay.lag_s, best)
-            other = match(walls, *beams, pose, covariance + doubt)
+        covariance = covariance + doubt
+        found = match(walls, *beams, pose, covariance)
+        # Its beams may be measured in the other order.
+        is_open = abs(delay.backwards) < _ORDER_KNOWN and self.turned(robot, sweep) > _ORDER_TURN
+        if is_open or delay.backwards > 0.0:
+            reversed_beams, _, _ = self.beams(robot, stamp_ns, sweep.backwards(), delay.lag_s, best)
+            other = match(walls, *reversed_beams, pose, covariance)
             news = min(max(_ORDER_WEIGHT * (found.misfit - other.misfit), -_ORDER_NEWS), _ORDER_NEWS)
-            delay = delay._replace(backwards=delay.backwards + news)
-            found = other if delay.backwards > 0.0 else found
-        elif delay.backwards > 0.0:
-            beams, _, _ = self.beams(robot, stamp_ns, sweep.backwards(), delay.lag_s, best)
-            found = match(walls, *beams, pose, covariance + doubt)
-        state.delays[robot], driven = delay, 0.0
+            delay = delay._replace(backwards=delay.backwards + (news if is_open else 0.0))
+            if delay.backwards > 0.0:
+                found, beams = other, reversed_beams
+        state.delays[robot] = delay
+        # Odometry may have left out a motion that it reports, or scans agree with it, but not with the pose.
+        sample, reported, follows = self.tracks.at(np.array([robot]), np.array([stamp_ns])), None, False
+        anchor = np.stack([found.pose, now, sample.raw[0]])
+        if not np.isnan(delay.anchor).any():
+            motions = between(delay.anchor, anchor)  # in the map, as odometry is used, and as reported
+            motions[:, 2] = wrap_angle(motions[:, 2])
+            seen, used, moved = motions
+            path, turn = math.hypot(moved[0], moved[1]), abs(moved[2])
+            slack = _LEFT_OUT + _LEFT_OUT_SHARE * np.array([path, path, turn])
+            follows = bool((np.abs(seen - used) < slack).all())
+            limits = self._limits.position_sigma, self._limits.position_sigma, self._limits.heading_sigma
+            is_unknown = (np.diag(covariance) > np.square(_NEARLY_LOST * np.array(limits))).any()
+            if is_unknown or (np.abs(moved - used) > slack).any():
+                reported = compose(delay.anchor[0], moved)
+        return MatchedScan(
+            robot, stamp_ns, walls, beams, pose, covariance, found, track, back, anchor, reported, follows
+        )
+
+    def fix_of(self, state: SwarmState, scan: MatchedScan) -> tuple[Measurements | None, Verdict, bool]:
+        """The fix (1,) of a scan, or None and why there is none, and whether it confirms a start.
+
+        Fault scores of `state` are changed.
+        """
+        robot, stamp_ns, found, driven = scan.robot, scan.stamp_ns, scan.found, 0.0
+        delay = state.delays[robot]
         confirmed = state.sources.confirmations[robot] >= CONFIRMED
         if found.outcome == FITS or (found.outcome == FAR and confirmed):
             if delay.stamp_ns > 0:
-                driven = math.dist(delay.track[best, :2], track[best, :2])
-            delay = learned_delay(delay, stamp_ns, compose(found.pose, back), found.covariance, track)
-            state.delays[robot] = delay
+                best = int(delay.chance.argmax())
+                driven = math.dist(delay.track[best, :2], scan.track[best, :2])
+            seen = compose(found.pose, scan.back)
+            delay = learned_delay(delay, stamp_ns, seen, found.covariance, scan.track)
+            delay = state.delays[robot] = delay._replace(anchor=scan.anchor)
         if found.outcome in (OFF_MAP, FAR):
             state.sources.score[robot] += 1.0
             if state.sources.score[robot] >= (_MAX_MISSED if confirmed else _MAX_AT_START):
@@ -408,14 +453,14 @@ class MapScans:
             return None, Verdict.BLOCKED, False
         state.sources.score[robot] = max(0.0, state.sources.score[robot] - 4.0 * RELIEF)
         # walls err otherwise where it is now than where it was: the error that it shares with them fades
-        fading = 2.0 * _SYSTEMATIC_SHARE * walls.variance * min(1.0, driven / _ALIKE_M)
+        fading = 2.0 * _SYSTEMATIC_SHARE * scan.walls.variance * min(1.0, driven / _ALIKE_M)
         state.filter.add(robot_columns(np.array([robot]))[0], np.diag([fading, fading, 0.0]))
-        pose, doubt = at_odometry(delay, now)
+        pose, doubt = at_odometry(delay, scan.anchor[1])
         fix = about_robots(robot, stamp_ns, pose[None], (found.covariance + doubt)[None], CARTESIAN)
         fix.systematic_share[:] = _SYSTEMATIC_SHARE
         # with a second solution it locates no robot alone: it was sought near the pose that may be wrong
         fix.has_second[:], fix.second[:] = True, fix.value
-        return fix, Verdict.OPEN, found.determined >= _ALL and found.fitting >= _SURE_FIT
+        return fix, Verdict.OPEN, found.determined >= _ALL and found.fitting >= SURE_FIT
 
     def sweep_of(self, one: Measurements) -> LidarSweep | None:
         """The sweep of a row of a scan; None: it is not kept any more."""

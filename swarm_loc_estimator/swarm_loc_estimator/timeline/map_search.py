@@ -25,6 +25,7 @@ from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.numerics import wrap
 from swarm_loc_estimator.common.se2 import between, compose, inverse, wrap_angle
 from swarm_loc_estimator.filter.measurements import Measurements, Verdict
+from swarm_loc_estimator.filter.sources import CONFIRMED
 from swarm_loc_estimator.filter.state import SwarmState
 from swarm_loc_estimator.mapping.grid import LOG_ODDS_CAP, OccupancyMap
 from swarm_loc_estimator.mapping.map_file import load_map
@@ -32,11 +33,15 @@ from swarm_loc_estimator.sensors.lidar import described_delay
 from swarm_loc_estimator.swarm.swarm import MAP_BY_TOPIC, Swarm
 from swarm_loc_estimator.timeline.map_scans import (
     BLOCKED,
+    FAR,
+    FITS,
     FREE,
     OFF_MAP,
+    SURE_FIT,
     WALL,
     MapScans,
     Match,
+    MatchedScan,
     WallMap,
     match,
     wall_map,
@@ -61,6 +66,12 @@ _DECLINE = 0.07
 """How much worse later scans may fit than the first, by which a place was found: wrong places fit it best."""
 _START = np.diag(np.square([0.1, 0.1, 0.05]))
 """Covariance (3, 3) added to that of a place, since the next scans, which see the same walls, replace it."""
+_AROUND = np.array([[0.2, 0.2, 0.1], [0.4, 0.4, 0.2]])
+"""Least and greatest steps in which a located robot is sought around its prediction [m, m, rad]."""
+_OFFSETS = np.stack(np.meshgrid(*[np.arange(-3.0, 4.0)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+_NEAR_BY, _RIVAL = 12, 25.0  # Places around it that are matched, and squared distance of different ones
+_GATED = 12.0  # Squared distance of a scan from the prediction from which it is of little use to the filter
+_SAME = np.diag(np.square([0.05, 0.05, 0.03]))
 _COMPARED, _MATCHES = 400_000, 50  # Numbers of poses that are compared, and that are matched, at a scan
 _GRADES = 100  # Of nearness to a wall, at the first level
 _SEARCH_TURN = 0.1  # Turn during a sweep beyond which it searches no place [rad]
@@ -207,6 +218,43 @@ class MapSearch:
         state.places[robot] = places
         return None, _why_nowhere(places)
 
+    def regained(self, state: SwarmState, scan: MatchedScan) -> FoundPlace | None:
+        """The place of a robot that is not where it was predicted; None: it is, or nobody knows.
+
+        Wheels slip, and pauses or steps too fast for their stamps leave out motions that most drivers go on
+        counting. Where the scan does not fit, it is sought around the prediction and what odometry reports.
+        """
+        square = _squared(scan.found.pose, scan.predicted, scan.covariance + scan.found.covariance)
+        fits = scan.found.outcome in (FITS, FAR) and scan.found.fitting >= SURE_FIT
+        is_known = scan.reported is not None or (scan.follows and fits and square > _GATED)
+        if state.sources.confirmations[scan.robot] < CONFIRMED or (fits and not is_known):
+            return None
+        beams = SweptBeams.thinned(*scan.beams)
+        points = _spread(beams.ends)
+        sigma = np.clip(np.sqrt(np.diag(scan.covariance)), *_AROUND)
+        if scan.reported is not None:  # what is left out may be the whole turn
+            sigma = _AROUND[0]
+        centres = [one for one in (scan.predicted, scan.reported) if one is not None]
+        poses = (np.array(centres)[:, None] + _OFFSETS * sigma).reshape(-1, 3)
+        known = state.map._replace(walls=scan.walls)
+        score = _scores(known, points, poses, 0.75 * sigma[0]) if len(points) else np.zeros(len(poses))
+        order = _largest(score, len(score))
+        kept = order[_separate(poses[order], score[order], _NEAR_BY)]
+        found = [match(scan.walls, *beams, pose, np.diag(sigma**2)) for pose in poses[kept]]
+        found = sorted((one for one in found if one.outcome == FITS), key=_fit, reverse=True)
+        least = SURE_FIT if is_known else max(SURE_FIT, scan.found.fitting + _DECLINE)
+        if not found or found[0].fitting < least:
+            return None
+        best = found[0]
+        for other in found[1:]:
+            square = _squared(best.pose, other.pose, best.covariance + other.covariance + _SAME)
+            if square > _RIVAL and other.fitting > best.fitting - _DECLINE:
+                return None
+        information = np.linalg.inv(best.covariance) + np.diag(sigma**-2)  # walls may not tell all
+        anchor = np.stack([best.pose, *scan.anchor[1:]])
+        state.delays[scan.robot] = state.delays[scan.robot]._replace(anchor=anchor, stamp_ns=-1)
+        return FoundPlace(best.pose, np.linalg.inv(information))
+
     def _add(
         self,
         before: PossiblePlaces | None,
@@ -215,11 +263,7 @@ class MapSearch:
         track: FloatArray,
         known: SearchMap,
     ) -> tuple[PossiblePlaces, FoundPlace | None]:
-        """Follow the places of a robot, if any are known, by a scan at a pose (3,) by odometry.
-
-        Returns:
-            What is known then, and the place where the robot is, once it is found.
-        """
+        """Follow places by a scan at a pose (3,) by odometry; the robot's place, too, once it is found."""
         if before is None or not len(before.transform):
             paused_ns = 0 if before is None else before.pause_ns
             if before is not None and stamp_ns < before.searched_ns + paused_ns:
@@ -439,3 +483,10 @@ def _best(poses: FloatArray, fits: FloatArray) -> IntArray:
     each: IntArray = order[_separate(poses[order], total[order] + 1e-9, len(order))]
     kept: IntArray = each[total[each] > total.max(initial=0.0) - _RULED_OUT]
     return kept
+
+
+def _squared(pose: FloatArray, other: FloatArray, covariance: FloatArray) -> float:
+    """Squared distance of two poses (3,), in variances."""
+    off = other - pose
+    off[2] = wrap_angle(off[2])
+    return float(off @ np.linalg.solve(covariance, off))

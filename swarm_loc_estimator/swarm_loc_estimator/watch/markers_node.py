@@ -8,6 +8,7 @@ subscribes to `swarm/poses`, `swarm/sightings` and, for the twist, `<robot>/odom
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,6 @@ from visualization_msgs.msg import MarkerArray
 from swarm_loc_estimator.common.messages.cdr import CdrError
 from swarm_loc_estimator.common.messages.poses import (
     PLANE,
-    UNKNOWN_COVARIANCE,
     EstimateMessage,
     SwarmPosesReader,
     decode_odometry,
@@ -54,13 +54,12 @@ class MarkersNode(ConfiguredNode[MarkersParameters]):
         self._encoder: MarkersEncoder | None = None
         self._period_ns = round(1e9 / self.params.rate)
         self._sent_ns = 0
-        self._newest_ns = 0
+
         self._seen: tuple[int, Sightings] | None = None
         self._twist: dict[int, tuple[float, float, float]] = {}
         self._markers = self.create_publisher(MarkerArray, "swarm/markers", _RELIABLE)
-        self._filtered = [
-            self.create_publisher(Odometry, f"{name}/odometry/filtered", _RELIABLE) for name in self._names
-        ]
+        topics = [f"{name}/odometry/filtered" for name in self._names]
+        self._filtered = [self.create_publisher(Odometry, topic, _RELIABLE) for topic in topics]
         self._heard: dict[str, Subscription] = {}
         self.create_steady_timer(_LOOK_S, self._look_around)
         self.get_logger().info(f"ready: {len(self._names)} robots of '{self.params.swarm_file}'")
@@ -77,45 +76,35 @@ class MarkersNode(ConfiguredNode[MarkersParameters]):
     def _listen(self, topic: str, message_class: type, use: Any, *, wanted: bool) -> None:
         """Create or destroy a subscription."""
         if wanted and topic not in self._heard:
-            self._heard[topic] = self.create_subscription(message_class, topic, use, _FLEETING, raw=True)
+            take = partial(self._on_message, topic, use)
+            self._heard[topic] = self.create_subscription(message_class, topic, take, _FLEETING, raw=True)
         elif not wanted and topic in self._heard:
             self.destroy_subscription(self._heard.pop(topic))
 
-    def _on_odometry(self, robot: int, data: bytes) -> None:
+    def _on_message(self, topic: str, use: Callable[[bytes], None], data: bytes) -> None:
         try:
-            self._twist[robot] = decode_odometry(data).twist
+            use(data)
         except CdrError:
-            self._warn(f"{self._names[robot]}/odom")
+            self._warn(topic)
+
+    def _on_odometry(self, robot: int, data: bytes) -> None:
+        self._twist[robot] = decode_odometry(data).twist
 
     def _on_sightings(self, data: bytes) -> None:
-        try:
-            self._seen = decode_sightings(data)
-        except CdrError:
-            self._warn("swarm/sightings")
+        self._seen = decode_sightings(data)
 
     def _on_poses(self, data: bytes) -> None:
-        try:
-            estimate = self._reader.read(data)
-        except CdrError:
-            self._warn("swarm/poses")
-            return
+        estimate = self._reader.read(data)
         if estimate.names != self._names:
             self._warn("swarm/poses of another swarm")
             return
         self._publish_odometry(estimate)
-        if (
-            abs(estimate.stamp_ns - self._sent_ns) >= self._period_ns
-            and self._markers.get_subscription_count()
-        ):
+        is_due = abs(estimate.stamp_ns - self._sent_ns) >= self._period_ns
+        if is_due and self._markers.get_subscription_count():
             self._sent_ns = estimate.stamp_ns
             self._encoder = self._encoder or MarkersEncoder(self._swarm, estimate.frame_id)
-            self._markers.publish(self._encoder.encode(estimate, self._sightings_at(estimate.stamp_ns)))
-
-    def _sightings_at(self, stamp_ns: int) -> Sightings | None:
-        """The newest sightings, unless they are old."""
-        if self._seen is None or abs(stamp_ns - self._seen[0]) > _OLD_NS:
-            return None
-        return self._seen[1]
+            seen = self._seen if self._seen and abs(estimate.stamp_ns - self._seen[0]) <= _OLD_NS else None
+            self._markers.publish(self._encoder.encode(estimate, seen[1] if seen else None))
 
     def _publish_odometry(self, estimate: EstimateMessage) -> None:
         """Publish pose in map and twist of the robots whose topics have subscribers."""
@@ -124,17 +113,13 @@ class MarkersNode(ConfiguredNode[MarkersParameters]):
                 continue
             covariance = planar_covariance(0.0, 0.0, 0.0)
             covariance[PLANE] = estimate.covariance[k]
-            twist = self._twist.get(k, _UNKNOWN_TWIST)
-            (message,) = encode_odometry(
-                estimate.frame_id,
-                f"{self._names[k]}/base_link",
+            frames, stamps_ns = (
+                (estimate.frame_id, f"{self._names[k]}/base_link"),
                 np.array([estimate.stamp_ns]),
-                estimate.pose[k : k + 1],
-                np.array([twist]),
-                covariance,
-                UNKNOWN_COVARIANCE,
             )
-            publisher.publish(message)
+            twists = np.array([self._twist.get(k, _UNKNOWN_TWIST)])
+            messages = encode_odometry(*frames, stamps_ns, estimate.pose[k : k + 1], twists, covariance)
+            publisher.publish(messages[0])
 
     def _warn(self, what: str) -> None:
         self.get_logger().warning(f"{what} cannot be read", throttle_duration_sec=_THROTTLE_S)

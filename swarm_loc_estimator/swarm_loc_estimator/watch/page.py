@@ -62,19 +62,14 @@ def pack(kind: str, stamp_ns: int, columns: Mapping[str, npt.NDArray[Any]], **ex
 
 def poses_frame(estimate: EstimateMessage) -> Frame:
     """Estimated poses of all robots; those of unlocated robots are NaN."""
-    pose, covariance = estimate.pose, estimate.covariance
-    single = {
-        "theta": pose[:, 2],
-        "sxx": covariance[:, 0, 0],
-        "sxy": covariance[:, 0, 1],
-        "syy": covariance[:, 1, 1],
-        "stt": covariance[:, 2, 2],
-        "age": estimate.fix_age_s,
-    }
-    columns: dict[str, npt.NDArray[Any]] = {"x": pose[:, 0], "y": pose[:, 1]}
-    columns |= {name: column.astype(np.float32) for name, column in single.items()}
+    places: dict[str, npt.NDArray[Any]] = {"x": estimate.pose[:, 0], "y": estimate.pose[:, 1]}
+    single = {"theta": estimate.pose[:, 2]}
+    for name, i, j in (("sxx", 0, 0), ("sxy", 0, 1), ("syy", 1, 1), ("stt", 2, 2)):
+        single[name] = estimate.covariance[:, i, j]
+    single["age"] = estimate.fix_age_s
+    columns = {name: column.astype(np.float32) for name, column in single.items()}
     states = {"status": estimate.status, "known": estimate.heading_known.astype(np.uint8)}
-    return pack("poses", estimate.stamp_ns, {**columns, **states})
+    return pack("poses", estimate.stamp_ns, {**places, **columns, **states})
 
 
 def sightings_frame(stamp_ns: int, sightings: Sightings) -> Frame:
@@ -168,17 +163,7 @@ class History:
 
 
 _FOLDER = Path(__file__).parent / "page"
-_SCRIPTS = (
-    "frames.js",
-    "store.js",
-    "view.js",
-    "ground.js",
-    "trails.js",
-    "paint.js",
-    "link.js",
-    "panel.js",
-    "actions.js",
-)
+_SCRIPTS = ("frames", "store", "view", "ground", "trails", "paint", "link", "panel", "actions", "main")
 _BODY_PER_WHEELS = 0.66  # Ratio of body radius to wheel separation, as of an e-puck
 
 
@@ -186,7 +171,7 @@ _BODY_PER_WHEELS = 0.66  # Ratio of body radius to wheel separation, as of an e-
 def _parts() -> tuple[str, str, str]:
     """Markup, style and script."""
     read = {path.name: path.read_text(encoding="utf-8") for path in _FOLDER.iterdir() if path.is_file()}
-    own = "\n".join(read[name] for name in (*_SCRIPTS, "main.js"))
+    own = "\n".join(read[f"{name}.js"] for name in _SCRIPTS)
     script = f'{read["uPlot.iife.min.js"]}\n(() => {{\n"use strict";\n{own}\n}})();\n'
     return read["page.html"], read["uPlot.min.css"] + read["page.css"], script
 

@@ -100,10 +100,8 @@ class Access:
 
     def __post_init__(self) -> None:
         if not self.token and not is_loopback(self.address):
-            raise AccessError(
-                f"parameter address = '{self.address}' can be reached by others: set the parameter token,"
-                " which their browsers must then give as ?token=."
-            )
+            remedy = "set the parameter token, which their browsers must then give as ?token="
+            raise AccessError(f"parameter address = '{self.address}' can be reached by others: {remedy}.")
         if self.token and (len(self.token) < MIN_TOKEN_LENGTH or len(set(self.token)) < MIN_DISTINCT):
             need = f"{MIN_TOKEN_LENGTH} characters or more, of which {MIN_DISTINCT} differ"
             raise AccessError(f"parameter token is too weak: it needs {need}.")
@@ -227,7 +225,11 @@ class WatchServer:
         self._loop.set_exception_handler(
             lambda _, about: _LOG.error(about["message"], exc_info=about.get("exception"))
         )
-        self._runner = web.AppRunner(self._application(), access_log=None, shutdown_timeout=1.0, logger=_LOG)
+        application = web.Application()
+        application.router.add_get("/", self._on_page)
+        application.router.add_get("/socket", self._on_socket)
+        application.on_shutdown.append(self._close_all)
+        self._runner = web.AppRunner(application, access_log=None, shutdown_timeout=1.0, logger=_LOG)
         self._listening = threading.Event()
         self._faults: list[OSError] = []
         self._thread = threading.Thread(target=self._run, args=(port,), name="watch_server", daemon=True)
@@ -292,7 +294,9 @@ class WatchServer:
     def _run(self, port: int) -> None:
         asyncio.set_event_loop(self._loop)
         try:
-            self._loop.run_until_complete(self._listen(port))
+            self._loop.run_until_complete(self._runner.setup())
+            site = web.TCPSite(self._runner, self._access.address, port)
+            self._loop.run_until_complete(site.start())
             self._listening.set()
             self._close_slow_requests({})
             self._loop.run_forever()
@@ -303,10 +307,6 @@ class WatchServer:
             self._loop.run_until_complete(self._loop.shutdown_asyncgens())
             self._loop.close()
             self._listening.set()
-
-    async def _listen(self, port: int) -> None:
-        await self._runner.setup()
-        await web.TCPSite(self._runner, self._access.address, port).start()
 
     def _close_slow_requests(self, known: Mapping[Connection, float]) -> None:
         """Close connections that have not become a WebSocket in time, now and once a second.
@@ -320,13 +320,6 @@ class WatchServer:
             if now_s >= since_s + REQUEST_PATIENCE_S and connection.transport:
                 connection.transport.abort()
         self._loop.call_later(_SWEEP_PERIOD_S, self._close_slow_requests, waiting)
-
-    def _application(self) -> web.Application:
-        application = web.Application()
-        application.router.add_get("/", self._on_page)
-        application.router.add_get("/socket", self._on_socket)
-        application.on_shutdown.append(self._close_all)
-        return application
 
     def _check(self, request: web.Request) -> None:
         """Refuse requests without access."""
@@ -390,23 +383,20 @@ class WatchServer:
         if text == RECEIVED:
             viewer.on_received()
             return
-        command = read_command(text)
-        if command is None:
-            viewer.note({"kind": "said", "text": "The page's command cannot be read.", "ok": False})
-            return
-        robot = command["robot"]
-        if not -1 <= robot < len(self._about["names"]):
-            viewer.note({"kind": "said", "text": f"There is no robot number {robot}.", "ok": False})
-            return
-        if command["do"] == "select":
-            viewer.selected = robot
-            return
 
         def answer(said: str, *, ok: bool = True) -> None:
             message = {"kind": "said", "text": said, "ok": ok}
             self._loop.call_soon_threadsafe(viewer.note, message)
 
-        self._on_command(command, answer)
+        command = read_command(text)
+        if command is None:
+            answer("The page's command cannot be read.", ok=False)
+        elif not -1 <= command["robot"] < len(self._about["names"]):
+            answer(f"There is no robot number {command['robot']}.", ok=False)
+        elif command["do"] == "select":
+            viewer.selected = command["robot"]
+        else:
+            self._on_command(command, answer)
 
     async def _close_all(self, _application: web.Application) -> None:
         """Close the connections, which notifies the pages."""

@@ -78,7 +78,7 @@ class RobotCommands:
         self._velocity: dict[int, Publisher] = {}
         self._driven_until_ns: dict[int, int] = {}
         self._obey: Mapping[str, Callable[[Command, Answer], None]] = {
-            "reset": self._on_reset,
+            "reset": lambda _, answer: self._call(self._reset, Trigger.Request(), answer),
             "set_pose": self._on_set_pose,
             "drive": self._on_drive,
         }
@@ -93,13 +93,9 @@ class RobotCommands:
 
     def work(self) -> None:
         """Execute queued commands, and stop robots whose last drive command is too old."""
-        while True:
-            try:
-                command, answer = self._waiting.get_nowait()
-            except queue.Empty:
-                break
-            refusal = self._refusal(command)
-            if refusal:
+        while not self._waiting.empty():  # only this thread takes commands out
+            command, answer = self._waiting.get_nowait()
+            if refusal := self._refusal(command):
                 answer(refusal, ok=False)
             else:
                 self._obey[command["do"]](command, answer)
@@ -118,9 +114,6 @@ class RobotCommands:
         if todo != "drive" and not self._parameters.commands:
             return "Commands are not allowed: parameter commands is false."
         return "" if command["robot"] >= 0 or todo == "reset" else "The command names no robot."
-
-    def _on_reset(self, _command: Command, answer: Answer) -> None:
-        self._call(self._reset, Trigger.Request(), answer)
 
     def _on_set_pose(self, command: Command, answer: Answer) -> None:
         pose = numbers(command.get("pose"), 3)
@@ -232,10 +225,10 @@ class Places:
         except CdrError:
             self._drop("malformed")
             return
-        if not np.isfinite(message.pose).all():
+        if np.isfinite(message.pose).all():
+            self._newest[robot] = (message.stamp_ns, message.pose)
+        else:
             self._drop("not_finite")
-            return
-        self._newest[robot] = (message.stamp_ns, message.pose)
 
     def clear(self) -> None:
         """Clear all places."""
@@ -300,15 +293,24 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         self._sightings: Subscription | None = None
         self._places: list[Places] = []
         for kind, topic in (("truth", "ground_truth"), ("goals", "goal")):
-            topics = [f"{name}/{topic}" for name in self._names]
-            drop = partial(self._drop, f"<robot>/{topic}")
+            topics, drop = (
+                [f"{name}/{topic}" for name in self._names],
+                partial(self._drop, f"<robot>/{topic}"),
+            )
             self._places.append(Places(self, kind, topics, drop, keeps=kind == "goals"))
         self._commands = RobotCommands(self, self._names, self.params, time.monotonic_ns)
         title = self.params.title or path.resolve().parent.name
         first = about(self._swarm, title, teleop=self.params.teleop, commands=self.params.commands)
         access = Access(self.params.address, self.params.token)
         self.server = WatchServer(first, access, self.params.port, self.params.rate, self._commands.order)
-        self._subscribe()
+        raw: Callable[..., Subscription] = partial(self.create_subscription, raw=True)
+        raw(SwarmPoses, "swarm/poses", self._on_poses, _FLEETING)
+        raw(DiagnosticArray, "/diagnostics", self._on_diagnostics, _FLEETING)
+        read, aerial, show = self.create_subscription, self._aerial, self._publish
+        read(AnonymousDetectionArray, "aerial/detections", lambda m: show(aerial.detections(m)), _FLEETING)
+        read(RobotIdentities, "aerial/identities", lambda m: show(aerial.identities(m)), _FLEETING)
+        follow = SubscriptionEventCallbacks(incompatible_qos=self._follow_map)
+        self._map = raw(OccupancyGrid, "map", self._on_map, _LATCHED, event_callbacks=follow)
         self.create_steady_timer(_WORK_S, self._commands.work)
         self.create_steady_timer(_LOOK_S, self._look_around)
         self.start_diagnostics(self._on_diagnostics_timer)
@@ -324,25 +326,6 @@ class WatchNode(ConfiguredNode[WatchParameters]):
         """Close the connections of pages and destroy the node."""
         self.server.close()
         super().destroy_node()
-
-    def _subscribe(self) -> None:
-        raw: Callable[..., Subscription] = partial(self.create_subscription, raw=True)
-        raw(SwarmPoses, "swarm/poses", self._on_poses, _FLEETING)
-        raw(DiagnosticArray, "/diagnostics", self._on_diagnostics, _FLEETING)
-        self.create_subscription(
-            AnonymousDetectionArray,
-            "aerial/detections",
-            lambda message: self._publish(self._aerial.detections(message)),
-            _FLEETING,
-        )
-        self.create_subscription(
-            RobotIdentities,
-            "aerial/identities",
-            lambda message: self._publish(self._aerial.identities(message)),
-            _FLEETING,
-        )
-        follow = SubscriptionEventCallbacks(incompatible_qos=self._follow_map)
-        self._map = raw(OccupancyGrid, "map", self._on_map, _LATCHED, event_callbacks=follow)
 
     def _follow_map(self, _event: object) -> None:
         """Subscribe again if the map's publisher is volatile or best effort."""

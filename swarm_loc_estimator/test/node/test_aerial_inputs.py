@@ -1,7 +1,5 @@
 """Anonymous detections over DDS: who is who comes out, and what is wrong with them is told."""
 
-from __future__ import annotations
-
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from node_world import STEP_NS, T0_NS, TRUE_POSES, Robots, Ros, newest_status, stamp_ns, values_of

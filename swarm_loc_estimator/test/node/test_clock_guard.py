@@ -1,7 +1,5 @@
 """A /clock before zero is dropped, and the node goes on."""
 
-from __future__ import annotations
-
 import pytest
 from builtin_interfaces.msg import Time
 from node_world import Ros, overrides

@@ -1,7 +1,5 @@
 """Infrared matrices and absolute fixes over DDS: robots without odometry are located, faults are named."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

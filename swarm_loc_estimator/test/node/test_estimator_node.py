@@ -1,7 +1,5 @@
 """The estimator node over DDS: what comes in leads to what comes out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

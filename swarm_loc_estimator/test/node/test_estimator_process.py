@@ -1,7 +1,5 @@
 """The estimator as a process: wrong parameters, signals, and a restart in the middle of a run."""
 
-from __future__ import annotations
-
 import math
 import signal
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Fixed cameras over DDS: detections in the namespace of a camera locate a robot; a silent one is named."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The live graph: what comes out over DDS is what replay gives, also after the estimator was killed."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +11,8 @@ from node_world import T0_NS, Ros
 from rclpy.time import Time
 
 from bench.shared.bags import copy_part
-from bench.shared.live import settled
 from swarm_loc_estimator.cli.demo import main
+from swarm_loc_estimator.common.arrays import BoolArray
 from swarm_loc_estimator.common.launch import GraphOptions, graph_nodes
 from swarm_loc_estimator.common.se2 import wrap_angle
 from swarm_loc_estimator.common.trajectory import interpolate
@@ -22,6 +20,7 @@ from swarm_loc_estimator.offline.live_run import (
     ESTIMATOR,
     LiveError,
     LiveGraph,
+    LiveRun,
     Recorder,
     compare_with_replay,
     play_live,
@@ -44,6 +43,24 @@ def bag(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("bags") / "short"
     copy_part(DEMO, folder, 10.0)
     return folder
+
+
+def settled(live: LiveRun) -> BoolArray:
+    """(T,) whether the poses include exactly the inputs that had arrived by their stamp, as far as known.
+
+    There the poses must be equal to those of a replay.
+    """
+    stamp_ns = live.result.stamp_ns
+    counted_ns = np.array(sorted(live.taken), dtype=np.int64)
+    before = np.searchsorted(counted_ns, stamp_ns, side="right")
+    after = np.searchsorted(counted_ns, stamp_ns, side="left") + 1
+    same = np.ones(stamp_ns.size, dtype=bool)
+    for topic, arrival_ns in live.arrival_ns.items():
+        # the messages of a topic come in order: equal counts mean equal messages
+        taken = np.array([0, *(live.taken[at].get(topic, 0) for at in counted_ns.tolist()), arrival_ns.size])
+        arrived = np.searchsorted(arrival_ns, stamp_ns, side="right")
+        same &= (taken[before] == arrived) & (taken[after] == arrived)
+    return same
 
 
 def test_live_poses_are_those_of_replay(bag: Path, tmp_path: Path) -> None:

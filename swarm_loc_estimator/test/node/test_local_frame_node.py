@@ -1,7 +1,5 @@
 """The estimator node without a map: poses are in the frame of a robot until landmarks come."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The radio of the tests with several machines: it delays and loses, and never stands still."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys

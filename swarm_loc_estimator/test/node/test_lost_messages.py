@@ -1,7 +1,5 @@
 """What is lost on the way to the estimator is counted, and nothing else: of one publisher and of several."""
 
-from __future__ import annotations
-
 import time
 from collections import Counter
 from collections.abc import Iterator

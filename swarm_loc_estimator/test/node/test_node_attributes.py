@@ -4,8 +4,6 @@ A node that keeps something of its own as `self._clock` or `self._parameters` ta
 fails when somebody asks for its time or lists its parameters. No type checker sees it: rclpy has no types.
 """
 
-from __future__ import annotations
-
 import ast
 from collections.abc import Iterator
 

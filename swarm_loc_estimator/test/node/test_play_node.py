@@ -1,7 +1,5 @@
 """The player as a process: everything that the bag holds arrives, once and in order."""
 
-from __future__ import annotations
-
 import signal
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The player offers what the publishers of a bag's topics offered."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from node_world import T0_NS, Program, Ros, odometry_bytes

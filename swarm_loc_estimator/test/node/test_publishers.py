@@ -1,7 +1,5 @@
 """Publishers as they come: best effort, more of them than should be, of another type; and other clocks."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """UWB ranges over DDS: the estimator takes them, corrects a pose with them, and names what it drops."""
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 

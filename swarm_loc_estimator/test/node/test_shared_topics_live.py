@@ -1,7 +1,5 @@
 """Robots that send by topics which they share, over DDS, from two gateways."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

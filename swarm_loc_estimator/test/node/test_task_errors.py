@@ -1,7 +1,5 @@
 """An error in a task of the executor is told, and ends the node."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

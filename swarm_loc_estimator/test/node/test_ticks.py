@@ -1,7 +1,5 @@
 """The estimator keeps to its ticks also when many messages wait to be handled, as on a busy machine."""
 
-from __future__ import annotations
-
 from diagnostic_msgs.msg import DiagnosticArray
 from node_world import SECOND, STEP_NS, T0_NS, TRUE_POSES, Robots, Ros, odometry_bytes, stamp_ns
 from rclpy.duration import Duration

@@ -1,7 +1,5 @@
 """Anonymous detections from raw messages to the estimator's columns, and who is who as a message."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Global assignment of anonymous detections to robots, and what the camera sees."""
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np

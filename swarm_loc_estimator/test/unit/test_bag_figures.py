@@ -1,7 +1,5 @@
 """The bags of the repository replay as well as is said of them, and to the same poses every time."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recorded motion capture gives fixes or ground truth in bags, as `localizer_bridge` gives them live."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Profiles of topics from a bag's metadata, as rosbag2 has written them over the years, or damaged."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

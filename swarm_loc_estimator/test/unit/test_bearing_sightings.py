@@ -1,7 +1,5 @@
 """Sightings of a direction alone: they turn and place robots, and errors stay as large as covariances say."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

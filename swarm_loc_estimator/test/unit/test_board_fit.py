@@ -1,7 +1,5 @@
 """The fit of a board: slopes against differences, curves and yaw found again, dead sensors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The command `calibrate_ir`: from a bag to gains in a swarm description, or one sentence why not."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Fits recover the models that a recording was made with, and refuse what holds nothing to fit to."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import asdict, replace
 from pathlib import Path

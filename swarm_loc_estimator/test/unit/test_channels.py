@@ -1,7 +1,5 @@
 """Brightness matrices and absolute fixes from raw messages, into the estimator's columns and poses."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """How commands end."""
 
-from __future__ import annotations
-
 import os
 from argparse import ArgumentTypeError
 from collections.abc import Callable

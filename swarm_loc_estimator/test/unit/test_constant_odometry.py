@@ -1,7 +1,5 @@
 """Odometry that never changes is contradicted by poses that keep moving, and by nothing else."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from core_messages import SECOND, T0

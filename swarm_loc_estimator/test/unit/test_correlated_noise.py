@@ -1,7 +1,5 @@
 """Laws of what a pair of robots tells again: its mean counts, and once, until the robots have turned."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

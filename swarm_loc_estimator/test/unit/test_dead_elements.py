@@ -1,7 +1,5 @@
 """Dead and shaded elements from exchanges alone: found, not named falsely, undecided where little is read."""
 
-from __future__ import annotations
-
 import functools
 
 import numpy as np

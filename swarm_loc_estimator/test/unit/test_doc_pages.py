@@ -1,7 +1,5 @@
 """The pages under doc/ have all numbers of a swarm description and all options of the commands."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import fields

@@ -1,7 +1,5 @@
 """What the estimator publishes, read back; and markers as viewers read them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

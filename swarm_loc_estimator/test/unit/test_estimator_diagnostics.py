@@ -1,10 +1,9 @@
 """What /diagnostics says, from figures alone."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
+from swarm_loc_estimator.common.messages.cdr import RANGE, encode
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE, encode_detections
 from swarm_loc_estimator.common.messages.poses import encode_odometry
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage
@@ -14,7 +13,7 @@ from swarm_loc_estimator.nodes.estimator_diagnostics import Diagnostics, Recent,
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
 from swarm_loc_estimator.sensors.inputs import Ingest
 from swarm_loc_estimator.swarm.error_models import OdometryModel
-from swarm_loc_estimator.swarm.swarm import Robot, Swarm
+from swarm_loc_estimator.swarm.swarm import Robot, Swarm, UwbDevice
 from swarm_loc_estimator.timeline.estimate import LossReport
 from swarm_loc_estimator.timeline.estimator import Estimate, Status
 
@@ -139,6 +138,21 @@ def test_rates_and_lateness_are_those_of_the_interval() -> None:
     assert b.values["odom lateness max [s]"] == "1.5"
     assert b.values["sigma x [m]"] == "2"
     assert (b.warning, b.message) == (False, "tracked")
+
+
+def test_each_pair_of_radios_has_figures_of_its_own() -> None:
+    radios = (UwbDevice(1), UwbDevice(2), UwbDevice(3))
+    robots = (Robot(f"r{one.address}", camera=None, uwb=one) for one in radios)
+    world = World(Swarm(tuple(robots), range_topic="uwb/{from}/{to}"))
+    for topic, count in (("uwb/1/2", 3), ("uwb/1/3", 1)):
+        handle = world.ingest.handle_of[topic]
+        for k in range(count):
+            data = encode({"header": {"stamp": k * SECOND}, "range": 1.0}, RANGE)
+            list(world.ingest.read(MessageBatch.of([SerializedMessage(handle, data, k * SECOND)])))
+    first = world.reports(SECOND, estimate(SECOND, *[Status.TRACKED] * 3), recent(), {})[0]
+    found = {name: value for name, value in first.values.items() if str(name).endswith(" received")}
+    assert found["uwb/1/2 received"] == "3"
+    assert found["uwb/1/3 received"] == "1"
 
 
 def test_a_robot_is_told_apart_as_waiting_lost_silent_or_in_a_foreign_frame() -> None:

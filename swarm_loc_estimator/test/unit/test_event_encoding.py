@@ -1,7 +1,5 @@
 """Events in the `mono` encoding: what is encoded comes back, and broken packets are refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """The scripts of `examples/` print what they promise."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

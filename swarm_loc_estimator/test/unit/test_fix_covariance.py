@@ -1,7 +1,5 @@
 """Fixes of a mapper: what is wrong with its map is wrong with all of them; a single one locates a robot."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

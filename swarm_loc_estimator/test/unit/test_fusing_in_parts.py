@@ -1,7 +1,5 @@
 """Fusing that is spread over many ticks, while time goes on."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from core_messages import SECOND, T0

@@ -1,7 +1,5 @@
 """Fusing keeps to its share of a core, but never lets data grow too old."""
 
-from __future__ import annotations
-
 import pytest
 
 from swarm_loc_estimator.nodes.load import FusionPace

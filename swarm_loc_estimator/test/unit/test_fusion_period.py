@@ -1,7 +1,5 @@
 """Fusion periods: what belongs to one, and when those of large and of small swarms are fused."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A robot is where absolute fixes put it, whatever others say that were located by way of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from core_geometry import wrapped

@@ -1,7 +1,5 @@
 """Which nodes a graph has, and how a node is told who it is."""
 
-from __future__ import annotations
-
 from swarm_loc_estimator.common.launch import GraphOptions, NodeSpec, graph_nodes, parsed_options
 
 

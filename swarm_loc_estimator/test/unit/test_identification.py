@@ -1,7 +1,5 @@
 """Which detection is me: chains and their probabilities."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Recordings of Droplets under a camera: parsing, cleaning, fiducials, and the bag that comes of them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from pathlib import Path

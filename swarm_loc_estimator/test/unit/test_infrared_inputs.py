@@ -1,7 +1,5 @@
 """From brightness matrices to relative measurements: which pose, whose, and why not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

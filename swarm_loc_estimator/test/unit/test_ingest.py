@@ -1,7 +1,5 @@
 """From raw messages to columns; the fast readers agree with the complete ones."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Commands that are interrupted or killed: their workers end with them, and one sentence says so."""
 
-from __future__ import annotations
-
 import os
 import select
 import signal

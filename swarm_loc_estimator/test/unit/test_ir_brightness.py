@@ -1,7 +1,5 @@
 """Expected readings, their slopes, and what goes wrong with eqs (1)-(4) as printed."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from ir_world import droplet, droplet_matrix, random_poses

@@ -3,8 +3,6 @@
 A Droplet cuts at 255 counts and then takes the ambient light off: what saturates reads 240 to 255.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

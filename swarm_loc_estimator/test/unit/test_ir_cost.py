@@ -1,7 +1,5 @@
 """The likelihood's cost is the sum over readings, each by itself, however it is computed."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

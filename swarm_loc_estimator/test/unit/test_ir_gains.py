@@ -1,7 +1,5 @@
 """Gains of elements from recorded matrices, with and without known poses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from ir_world import droplet, nees, pose_errors, random_poses, readings_of

@@ -1,7 +1,5 @@
 """The most likely pose: as sure as theory allows, honest about it, and none where there is none."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The cache of compiled code: found again wherever the sources lie, and never used for other code."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import pickle

@@ -1,7 +1,5 @@
 """Launch options from texts, and files that cannot be used, told before anything starts."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Scans of lidars: what of them is used, motion during a sweep, and the map of a robot that does not stop."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from dataclasses import replace
@@ -10,7 +8,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from core_geometry import wrapped
 from mapping_world import BEAMS, LIDAR, ROOM, SWEEP_NS, LidarRobot, scan_bytes, static
+from numpy.typing import NDArray
 
 from swarm_loc_estimator.cli.replay_map import main
 from swarm_loc_estimator.common.arrays import FloatArray
@@ -203,6 +203,31 @@ def test_a_described_delay_puts_a_sweep_where_it_was_measured(late_ns: int) -> N
     (stop,) = pairer.ready()
     assert stop.stamp_ns[0] == begin_ns
     assert stop.arrival == pytest.approx(robot.odometry(np.array([begin_ns]))[0], abs=1e-4)
+
+
+class Wanderer(LidarRobot):
+    """A robot that stands, and then drives to and fro and looks around."""
+
+    def odometry(self, stamp_ns: NDArray[np.int64]) -> FloatArray:
+        """Poses (n, 3) by odometry at times (n,)."""
+        time_s = np.maximum(1e-9 * stamp_ns - 2.0, 0.0)
+        return np.stack([0.4 * np.sin(0.7 * time_s), 0.0 * time_s, 0.8 * np.sin(1.1 * time_s)], axis=-1)
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("late_ns", [0, 200_000_000])
+def test_the_mapper_finds_that_scans_are_stamped_late(late_ns: int, seed: int) -> None:
+    mapper, robot = CooperativeMapper(), Wanderer(np.random.default_rng(seed))
+    feed = MapperFeed([TURTLE], mapper, {})
+    for at_ns in range(0, 25_000_000_000, ODOMETRY_NS):
+        feed.add(0, MapperInput.ODOMETRY, odometry(at_ns, robot.odometry(np.array([at_ns]))[0]))
+        if at_ns % SWEEP_NS == 0 and at_ns >= SWEEP_NS:
+            scan = robot.scan(at_ns - late_ns)._replace(stamp_ns=at_ns)
+            feed.add(0, MapperInput.SCAN, scan_bytes(scan))
+    assert [("older" in one) for one in feed.late] == [True] * (late_ns > 0)
+    located = mapper.located(0)
+    assert located is not None
+    assert wrapped(located.pose - robot.pose(located.stamp_ns)) == pytest.approx(0.0, abs=0.04)
 
 
 def test_a_robot_that_does_not_stop_makes_a_map() -> None:

@@ -1,7 +1,5 @@
 """Robots with lidars in a known map: poses, replay, order of arrival, wrong starts, descriptions."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable
@@ -129,6 +127,18 @@ def test_scans_that_are_stamped_late_are_named_and_poses_are_right(
         said = re.search(r"set lidar.delay_s to (\S+),", named["lidar of a"].text)
         assert said is not None
         assert float(said[1]) == pytest.approx(-late_s, abs=0.04)
+    assert np.mean(squares) < 4.5
+
+
+def test_a_pause_of_odometry_loses_no_robot_that_is_where_it_then_reports(room: Path) -> None:
+    until_ns, squares = 7_000_000_000, []
+    for seed in range(4):
+        estimator = Estimator(swarm_at(room, LidarRobot.start + np.array([0.03, -0.02, 0.03])))
+        kept = [one for one in sent(until_ns, seed) if not 2_100_000_000 < one[1] < 4_300_000_000]
+        estimates = hand_in(estimator, kept)
+        error = wrapped(estimates[-1].poses[0] - LidarRobot().pose(until_ns))
+        assert all(one.status[0] == Status.TRACKED for one in estimates if one.stamp_ns > 4_600_000_000)
+        squares.append(float(nees(error[None], estimates[-1].covariances)[0]))
     assert np.mean(squares) < 4.5
 
 

@@ -1,7 +1,5 @@
 """Swarms without a map: poses relative to the best connected robot, and their move to `map` as a whole."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

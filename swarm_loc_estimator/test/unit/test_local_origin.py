@@ -1,7 +1,5 @@
 """Coordinates far from the origin of `map`, as in UTM: the same poses and covariances as near it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Poses of bodies become poses of robots: all kinds of messages, offsets, latency, and what is dropped."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Messages that are lost on purpose: by seed and message, whatever is read at once; never ground truth."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A robot that is lost is named with the reason in /diagnostics and in replay's report, one test a reason."""
 
-from __future__ import annotations
-
 import html
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The bags of PushBots give the maps that are said of them, byte for byte the same twice, and their poses."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Once it is warm, the mapper compiles nothing: meanwhile robots would drive on, and fixes come too late."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Law: measurements lie in one order, each once, however they came in."""
 
-from __future__ import annotations
-
 import random
 
 import numpy as np

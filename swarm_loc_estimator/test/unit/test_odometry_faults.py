@@ -1,7 +1,5 @@
 """Odometry that jumps, is reset, or has no pose: what is noticed, what is not believed, what is no fault."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -220,6 +218,29 @@ def test_twists_are_integrated_in_any_order_where_the_pose_is_constant(seed: int
     assert np.hypot(*(moved - pose)[:, :2].T).max() < 0.01 + 0.01 * way
     assert np.abs(se2.wrap_angle(moved[:, 2] - pose[:, 2])).max() < 0.05
     np.testing.assert_array_equal(found.raw, constant(pose))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_twists_are_integrated_where_only_the_heading_is_constant(seed: int) -> None:
+    """As four recorded TurtleBots, whose positions were right."""
+    drive = Drive(seed, 30.0, stops=0.3)
+    rows = every(50, drive)
+    pose, twist = drive.at(rows), drive.rates[rows]
+    tracks, change = fed(rows, np.column_stack([pose[:, :2], np.full(rows.size, 0.5)]), twist)
+    assert tracks.integrates_twist().all()
+    assert change.jumps == 0
+    found = tracks.at(np.zeros(rows.size, dtype=np.int64), stamps_of(rows)).pose
+    moved, way = se2.between(found[0], found), np.hypot(*np.diff(pose[:, :2], axis=0).T).sum()
+    assert np.hypot(*(moved - pose)[:, :2].T).max() < 0.01 + 0.01 * way
+    assert np.abs(se2.wrap_angle(moved[:, 2] - pose[:, 2])).max() < 0.05
+
+
+def test_a_robot_that_drives_straight_on_has_a_heading() -> None:
+    rows = np.arange(0, 60_000, 50)
+    pose = np.column_stack([1e-4 * rows, 0.0 * rows, 0.0 * rows])
+    noise = np.random.default_rng(2).normal([0.1, 0.0, 0.01], [0.0, 0.0, 0.02], (rows.size, 3))
+    tracks, _ = fed(rows, pose, noise)
+    assert not tracks.integrates_twist().any()
 
 
 @pytest.mark.parametrize("bias", [0.0, 0.01])

@@ -1,7 +1,5 @@
 """The estimator reckons in one thread, whatever the machine offers."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

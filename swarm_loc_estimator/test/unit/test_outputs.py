@@ -1,7 +1,5 @@
 """Ready bytes are the messages that they stand for."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bags that are compressed as whole files or message by message, and those of other systems."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One table of parameters makes the node's parameters and those of its page under doc/."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A bag keeps its time: with a clock of the test's own, so without waiting."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest

@@ -1,7 +1,5 @@
 """Once it is warm, the estimator compiles nothing: a tick that does is deaf for seconds."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

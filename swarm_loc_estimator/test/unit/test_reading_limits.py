@@ -1,7 +1,5 @@
 """Saturation and noise from exchanges alone: found as they are, never where there is none to be found."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

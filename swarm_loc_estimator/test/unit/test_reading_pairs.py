@@ -1,7 +1,5 @@
 """Distances and odometry that come one before the other, late, twice, or wrong."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

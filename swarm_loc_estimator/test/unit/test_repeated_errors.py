@@ -1,7 +1,5 @@
 """Errors of sightings that repeat are in the reported covariances, and in no pose."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,13 +1,11 @@
 """Reports of replays: right figures, a page that needs nothing else, pictures of odd results too."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import struct
 from dataclasses import replace
 from html.parser import HTMLParser
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +15,6 @@ from swarm_loc_estimator.offline.report.plots import plot_overview
 from swarm_loc_estimator.offline.report.report import text_report, write_report
 from swarm_loc_estimator.offline.result import ReplayResult
 from swarm_loc_estimator.swarm.swarm import Landmark, Robot, Swarm
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SECOND = 1_000_000_000
 

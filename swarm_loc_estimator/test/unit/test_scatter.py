@@ -1,7 +1,5 @@
 """Sway and noise of cameras are told apart by what different markers have in common."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

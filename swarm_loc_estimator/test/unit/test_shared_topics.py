@@ -1,7 +1,5 @@
 """Messages with the readings of many robots: read as those of each robot alone, bad readings left out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

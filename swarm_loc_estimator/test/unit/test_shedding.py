@@ -1,7 +1,5 @@
 """How much an estimator that is kept busy uses, from times alone."""
 
-from __future__ import annotations
-
 import pytest
 
 from swarm_loc_estimator.nodes.load import MIN_SHARE, Shedding

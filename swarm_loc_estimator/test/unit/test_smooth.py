@@ -1,7 +1,5 @@
 """Smoothing: Jacobians, errors and covariances against the truth, recordings without a solution."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace

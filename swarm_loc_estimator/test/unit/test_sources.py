@@ -1,7 +1,5 @@
 """Laws of the record of sources: poses that rest on suspect sources, and radios that deviate once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The sparse filter beside the dense one: the same where its pattern is full, nearly so where it is not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Parameters of robots and surveyed landmarks in the sparse filter, beside the dense one."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What the sparse filter sums of many measurements, carries from place to place, and orders ahead."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

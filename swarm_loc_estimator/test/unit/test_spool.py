@@ -1,7 +1,5 @@
 """What is spooled comes back as it was, key by key, and stays when the spool is gone."""
 
-from __future__ import annotations
-
 import gc
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """Pictures whose stamps are not exact, and faces that do not sit quite where they should."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

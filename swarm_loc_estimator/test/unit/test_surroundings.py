@@ -1,7 +1,5 @@
 """Maps, goals and aerial images of a run: read from a bag, written for viewers, played on the page."""
 
-from __future__ import annotations
-
 import base64
 import gzip
 import json

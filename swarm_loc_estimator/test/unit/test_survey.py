@@ -1,7 +1,5 @@
 """Surveying landmarks: places, covariances and frames against the truth; wrong ids, lone parts, sentences."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path

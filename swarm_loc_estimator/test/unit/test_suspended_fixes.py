@@ -1,7 +1,5 @@
 """Suspended fixes are used again when they agree."""
 
-from __future__ import annotations
-
 import pytest
 
 from swarm_loc_estimator.filter.measurements import NOBODY, Measurements

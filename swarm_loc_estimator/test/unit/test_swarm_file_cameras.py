@@ -1,7 +1,5 @@
 """Fixed cameras and lying faces in a swarm description, and one sentence for whatever is wrong with them."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 
@@ -45,21 +43,13 @@ def test_fixed_cameras_and_lying_faces_are_read_and_written(tmp_path: Path) -> N
     [
         (", z: 2.5", "", "cameras.up lacks z"),
         ("z: 2.5", "z: .nan", "cameras.up.z is nan but must lie in [-10000, 10000] m"),
-        (
-            "position_sigma: 0.004",
-            "position_sigma: 0.0",
-            "cameras.wall.position_sigma is 0.0 but must lie in",
-        ),
+        ("osition_sigma: 0.004", "osition_sigma: 0.0", "cameras.wall.position_sigma is 0.0 but must lie in"),
         ("z: 2.5", "height: 2.5", "'cameras.up.height' is not a known key"),
         ("residual_position_sigma", "noise", "'cameras.up.sensor.noise' is not a known key"),
         ("  wall:", "  up:", "'up' is given twice"),
         ("  wall:", "  aerial:", "a name in cameras is 'aerial' but must be none of"),
         ("  wall:", "  a b:", "a name in cameras is 'a b' but must be letters"),
-        (
-            "  wall:",
-            "  a:",
-            "name 'a' is given to two robots or cameras, which must differ by more",
-        ),
+        ("  wall:", "  a:", "name 'a' is given to two robots or cameras, which must differ by more"),
         ("  wall:", "  UP:", "name 'up' is given to two robots or cameras"),
         ("  wall:", "  A:", "name 'a' is given to two robots or cameras"),
         ("lies: true", "lies: 1", "types.puck.faces.top.lies is 1 but must be true or false"),

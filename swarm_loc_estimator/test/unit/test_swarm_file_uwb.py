@@ -1,7 +1,5 @@
 """The sections `uwb` and `anchors` of a swarm description."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -43,11 +41,7 @@ def test_a_description_is_read_and_written_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "sentence"),
     [
-        (
-            "address: 7",
-            "address: 31",
-            "uwb.address 31 belongs to both robot 'a' and anchors[0]; ids must be unique.",
-        ),
+        ("ess: 7", "ess: 31", "uwb.address 31 belongs to both robot 'a' and anchors[0]; ids must be unique."),
         ("address: 7, ", "", f"anchors[0] lacks address, {ADDRESS}."),
         ("address: 7", "address: 0", f"anchors[0].address is 0 but must be {ADDRESS}."),
         ("address: 7", "address: '0x0'", f"anchors[0].address is '0x0' but must be {ADDRESS}."),

@@ -1,7 +1,5 @@
 """The swarm description: what is written is read back, and shared things are written once."""
 
-from __future__ import annotations
-
 import string
 from pathlib import Path
 from typing import Any

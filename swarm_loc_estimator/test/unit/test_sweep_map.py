@@ -1,7 +1,5 @@
 """Maps by lidars: correlative matches, loops, odometry that says nothing, and robots with unknown starts."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

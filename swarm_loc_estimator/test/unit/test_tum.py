@@ -1,7 +1,5 @@
 """Trajectories in the format of TUM: written, read again, refused where broken, and as ground truth."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

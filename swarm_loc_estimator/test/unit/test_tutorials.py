@@ -1,7 +1,5 @@
 """The sensor of the tutorial: its code, word by word, with a bag that has its messages."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The page's server, its frames and its access control, without a browser."""
 
-from __future__ import annotations
-
 import asyncio
 import re
 import socket

@@ -1,7 +1,5 @@
 """The wheel of the package works without ROS and without the source tree; its one program is `swarm-loc`."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -14,11 +14,8 @@ from typing import Any
 
 from swarm_loc_estimator.common.node import run_node
 from swarm_loc_msgs.msg import AnonymousDetectionArray
-from swarm_loc_vision.aerial.control_points import PoseFit
 from swarm_loc_vision.aerial.detector import AerialCamera
-from swarm_loc_vision.aerial.ground_control import Ground
-from swarm_loc_vision.aerial.ground_file import load_ground
-from swarm_loc_vision.aerial.parameters import AerialParameters
+from swarm_loc_vision.aerial.ground_control import AerialParameters, Ground, load_ground
 from swarm_loc_vision.common.camera_node import CameraNode
 from swarm_loc_vision.common.images import TRANSPORTS
 
@@ -49,12 +46,21 @@ class AerialCameraNode(CameraNode[AerialParameters]):
         camera = self._camera
         fit = camera.control.fit if camera.control else None
         mean = camera.robots / camera.used if camera.used else 0.0
+        pose = {"control points": "0"}
+        if fit is not None:
+            worst = int(fit.residuals.argmax())
+            pose = {
+                "control points": str(len(fit.names)),
+                "reprojection residual [px]": f"{fit.rms_px:.3g}",
+                "largest residual [px]": f"{fit.residuals[worst]:.3g} of {fit.names[worst]}",
+                "camera height [m]": f"{fit.ground.centre[2]:.4g}",
+            }
         return {
             "images used": str(camera.used),
             "robots per image": f"{mean:.3g}",
             "robots with heading": str(camera.headings),
             "robot diameter [m]": f"{camera.diameter:.4g}" if camera.diameter else "not known yet",
-            **_pose_figures(fit),
+            **pose,
             "moves of the camera": str(camera.control.moves if camera.control else 0),
         }
 
@@ -65,18 +71,6 @@ class AerialCameraNode(CameraNode[AerialParameters]):
             self._said = why
             self.get_logger().error(why)
         return why
-
-
-def _pose_figures(fit: PoseFit | None) -> dict[str, str]:
-    if fit is None:
-        return {"control points": "0"}
-    worst = int(fit.residuals.argmax())
-    return {
-        "control points": str(len(fit.names)),
-        "reprojection residual [px]": f"{fit.rms_px:.3g}",
-        "largest residual [px]": f"{fit.residuals[worst]:.3g} of {fit.names[worst]}",
-        "camera height [m]": f"{fit.ground.centre[2]:.4g}",
-    }
 
 
 main = partial(run_node, "aerial_camera_node", AerialCameraNode)

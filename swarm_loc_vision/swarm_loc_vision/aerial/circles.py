@@ -345,12 +345,12 @@ class Rims:
         if without is not None:
             plain = sampled(self.image.plain, cells)
             values = logarithm(plain - without(places / radius[:, None, None, None]))
-        edges = strongest(values, is_rim, reach, self.polarity, self._least, soft)
-        return steepest(values, reach, self.polarity, edges) if fine else edges
 
-    def _least(self, darkest: FloatArray) -> FloatArray:
-        """Least steps of edges by the logarithm of brightness on their darker side."""
-        return np.maximum(self.min_contrast, _NOISES * self.image.noise * np.exp(-darkest))
+        def least(darkest: FloatArray) -> FloatArray:
+            return np.maximum(self.min_contrast, _NOISES * self.image.noise * np.exp(-darkest))
+
+        edges = strongest(values, is_rim, reach, self.polarity, least, soft)
+        return steepest(values, reach, self.polarity, edges) if fine else edges
 
 
 def likely(rims: Rims, centres: FloatArray, radius: float) -> FloatArray:
@@ -394,22 +394,14 @@ def _fit(
     count = own.sum(axis=1)
     spread = np.sqrt(np.sum(own * residual**2, axis=1) / np.maximum(count - 5, 1))
     used = design * own[..., None]
-    variance = _TOGETHER * _moving(residual, near, spread)
+    # what is alike on opposite sides, as the blur by motion and tilt, does not move a centre
+    half = RAYS // 2
+    both = near[:, :half] & near[:, half:]
+    uneven, pairs = 0.5 * (residual[:, :half] - residual[:, half:]), both.sum(axis=1)
+    seen = 2.0 * np.sum(both * uneven**2, axis=1) / np.maximum(pairs - 2, 1)
+    variance = _TOGETHER * np.where(pairs >= _MIN_PAIRS, seen, spread**2)
     covariance = variance[:, None, None] * np.linalg.inv(np.swapaxes(used, 1, 2) @ design + ridge)[:, :2, :2]
     few = count < _MIN_RAYS
     own[few] = False
     solution = np.where(few[:, None], 0.0, solution[..., 0])
     return solution[:, :2], radius + solution[:, 2], solution[:, 3:], covariance, spread, own
-
-
-def _moving(residual: FloatArray, own: NDArray[np.bool_], spread: FloatArray) -> FloatArray:
-    """(C,) variance of edges without what is alike on opposite sides, which does not move a centre.
-
-    Motion and tilt, for example, blur both sides of a rim.
-    """
-    half = RAYS // 2
-    both = own[:, :half] & own[:, half:]
-    uneven = 0.5 * (residual[:, :half] - residual[:, half:])
-    pairs = both.sum(axis=1)
-    seen = 2.0 * np.sum(both * uneven**2, axis=1) / np.maximum(pairs - 2, 1)
-    return np.asarray(np.where(pairs >= _MIN_PAIRS, seen, spread**2))

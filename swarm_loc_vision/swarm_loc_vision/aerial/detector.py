@@ -29,9 +29,14 @@ from swarm_loc_vision.aerial.circles import (
     likely,
     peaks,
 )
-from swarm_loc_vision.aerial.ground_camera import GroundCamera
-from swarm_loc_vision.aerial.ground_control import NO_GROUND, Ground, GroundControl
-from swarm_loc_vision.aerial.parameters import POLARITIES, AerialSettings
+from swarm_loc_vision.aerial.ground_control import (
+    NO_GROUND,
+    POLARITIES,
+    AerialSettings,
+    Ground,
+    GroundCamera,
+    GroundControl,
+)
 from swarm_loc_vision.aerial.pattern import Marks, find_marks
 from swarm_loc_vision.aerial.rectification import (
     Brightness,
@@ -41,9 +46,8 @@ from swarm_loc_vision.aerial.rectification import (
     noise_of,
     rectification,
 )
-from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, GrayOf
 from swarm_loc_vision.common.camera import Camera
-from swarm_loc_vision.common.images import Gray, ImageError
+from swarm_loc_vision.common.images import CalibratedCamera, Gray, GrayOf, ImageError
 
 # Numbers below were chosen on drawn pictures (bench/aerial/pictures.py), not on those of seeds 101 to 104,
 # which doc/aerial_camera_node.md reports on (`make bench-aerial`).
@@ -147,7 +151,14 @@ class AerialDetector:
             self._grid = rectification(self._ground, self._settings, diameter, _SIZES_PX)
         most = _SPARE_SHARE * self._settings.max_robots + _SPARE
         look = self._look(self._grid, gray, noise_of(gray), diameter)
-        found, dropped = self._discs(look, diameter, most)
+        # discs of the polarity with the higher score
+        wide = diameter / look.grid.metres_per_px
+        kinds: list[tuple[_Found, dict[str, int]]] = []
+        for polarity in self._polarities:
+            rims, centres = self._candidates(look, wide, polarity, most)
+            circles = _outlined(rims, centres, np.full(len(centres), 0.5 * wide))
+            kinds.append(self._chosen(rims, circles, look.grid))
+        found, dropped = max(kinds, key=lambda kind: kind[0].score)
         located = self._located(self._grid, found, dropped)
         if len(located):
             self.diameter = diameter
@@ -160,26 +171,13 @@ class AerialDetector:
         image = brightness(grid.apply(gray), diameter / grid.metres_per_px, noise)
         return _Look(grid, image, Edges(image, grid.seen, self._settings.min_contrast))
 
-    def _discs(self, look: _Look, diameter: float, most: int) -> tuple[_Found, dict[str, int]]:
-        """Discs of the polarity with the higher score, and numbers of dropped ones."""
-        wide = diameter / look.grid.metres_per_px
-        kinds: list[tuple[_Found, dict[str, int]]] = []
-        for polarity in self._polarities:
-            rims, centres = self._candidates(look, wide, polarity, most)
-            circles = _outlined(rims, centres, np.full(len(centres), 0.5 * wide))
-            kinds.append(self._chosen(rims, circles, look.grid))
-        return max(kinds, key=lambda kind: kind[0].score)
-
     def _candidates(self, look: _Look, wide: float, polarity: float, most: int) -> tuple[Rims, FloatArray]:
         """Candidates (C, 2) for discs of about a diameter [px]."""
         centres = peaks(look.edges.votes(wide, polarity), wide, most)
-        rims = Rims(look.image, polarity, self._settings.min_contrast, self._sides(look.grid))
+        foot, grid = self._ground.centre, look.grid
+        sides = Sides((foot[:2] - grid.origin) / grid.metres_per_px, max(grid.height, 0.0) / foot[2])
+        rims = Rims(look.image, polarity, self._settings.min_contrast, sides)
         return rims, likely(rims, centres, 0.5 * wide)
-
-    def _sides(self, grid: Rectification) -> Sides:
-        """The sides of the robots on a grid."""
-        foot = self._ground.centre
-        return Sides((foot[:2] - grid.origin) / grid.metres_per_px, max(grid.height, 0.0) / foot[2])
 
     def _clear(self, circles: Circles) -> NDArray[np.bool_]:
         """Which discs (C,) have clear rims."""
@@ -224,7 +222,9 @@ class AerialDetector:
         # discs that are too weak, or that lack the mark of the others, are no robots
         has_mark = np.isfinite(marks.theta)
         is_strong |= has_mark  # a shadow may weaken a rim, but shows no mark
-        alike = _marked_alike(circles, has_mark) | ~is_strong
+        quality = _rank(circles)
+        alike = has_mark | (circles.coverage >= _CLEAR) | ~is_strong
+        alike |= quality[has_mark].sum() < _MOST * quality.sum()  # few show a mark
         dropped |= {"other_contrast": int(np.sum(~is_strong)), "without_mark": int(np.sum(~alike))}
         kept = alike & is_strong
         circles, marks = circles.select(kept), Marks(*(column[kept] for column in marks))
@@ -232,14 +232,19 @@ class AerialDetector:
         circles = _refined(rims, circles, marks.light)
         places = grid.places(circles.centre)
         # noise of the outline, of pixels, of the camera's pose and of the robots' height
-        of_outline = circles.covariance + _of_motion(circles.oval)
+        # motion during the exposure draws an outline out, and its middle may not be the place at the stamp
+        size, (cos, sin) = np.hypot(*circles.oval.T), circles.oval.T
+        along = size[:, None, None] * np.array([[size + cos, sin], [sin, size - cos]]).transpose(2, 0, 1)
+        of_outline = circles.covariance + 0.5 * _MOTION_SHARE * along
         of_pixel = self._ground.pixel_covariances(places, of_outline * grid.metres_per_px**2)
         of_pixel = of_pixel + settings.pixel_sigma**2 * np.eye(2)
-        spread = self._ground.covariances(places, of_pixel, settings.robot_height_sigma)
+        covariance = np.zeros((len(places), 3, 3))
+        covariance[:, :2, :2] = self._ground.covariances(places, of_pixel, settings.robot_height_sigma)
+        covariance[:, 2, 2] = np.where(np.isfinite(marks.theta), marks.variance, np.pi**2 / 3.0)
         return AerialDetections(
             place=places[:, :2],
             theta=marks.theta,
-            covariance=_with_heading(spread, marks),
+            covariance=covariance,
             pixel=self._ground.pixels(places),
             diameter=2.0 * circles.radius * grid.metres_per_px,
             coverage=circles.coverage,
@@ -293,9 +298,8 @@ def _outlined(rims: Rims, centre: FloatArray, radius: FloatArray) -> Circles:
 def _quality(circles: Circles) -> FloatArray:
     """(C,) quality of discs, 0 to 1, from the coverage and the roundness of their rims."""
     limit = _MAX_SPREAD * circles.radius + _MAX_SPREAD_PX
-    misfit = (circles.spread / limit) ** 2 + np.sum(circles.oval**2, axis=1) / (
-        _MAX_OVAL * circles.radius
-    ) ** 2
+    oval = np.sum(circles.oval**2, axis=1) / (_MAX_OVAL * circles.radius) ** 2
+    misfit = (circles.spread / limit) ** 2 + oval
     return np.asarray(circles.coverage**2 * np.maximum(1.0 - misfit, 0.0))
 
 
@@ -325,15 +329,14 @@ def _with_lids(rims: Rims, circles: Circles, clear: NDArray[np.bool_], size: flo
     usual = commonest(best.radius[has_lid & clear], _quality(best)[has_lid & clear])
     both = 0.5 * (circles.coverage + best.coverage)
     taken = has_lid & ~clear & (np.abs(best.radius / usual - 1.0) <= _SAME_LID) & (both > circles.coverage)
-    lids = best.select(taken)._replace(
-        radius=np.full(int(taken.sum()), size),
+    lids, count = best.select(taken), int(taken.sum())
+    lids = lids._replace(
+        radius=np.full(count, size),
         coverage=both[taken],
-        contrast=np.full(int(taken.sum()), np.median(circles.contrast[clear])),
+        contrast=np.full(count, np.median(circles.contrast[clear])),
+        covariance=lids.covariance + (_LID_SIGMA * size) ** 2 * np.eye(2),
     )
-    return circles.updated(
-        np.flatnonzero(taken),
-        lids._replace(covariance=lids.covariance + (_LID_SIGMA * size) ** 2 * np.eye(2)),
-    )
+    return circles.updated(np.flatnonzero(taken), lids)
 
 
 def _whole(circles: Circles) -> NDArray[np.bool_]:
@@ -348,14 +351,6 @@ def _whole(circles: Circles) -> NDArray[np.bool_]:
     usual = np.median(circles.coverage) if len(circles.coverage) else 0.0
     is_round = (circles.coverage >= _USUAL * usual) & (circles.squareness <= _MAX_SQUARENESS)
     return np.asarray(~alone | is_round)
-
-
-def _marked_alike(circles: Circles, has_mark: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which discs may carry the same pattern: where most show a mark, the others need a high coverage."""
-    quality = _rank(circles)
-    if quality[has_mark].sum() < _MOST * quality.sum():
-        return np.ones(len(quality), np.bool_)
-    return np.asarray(has_mark | (circles.coverage >= _CLEAR))
 
 
 def _inside(grid: Rectification, centre: FloatArray) -> NDArray[np.bool_]:
@@ -407,35 +402,9 @@ def _outer(vectors: FloatArray) -> FloatArray:
     return np.asarray(vectors[:, :, None] * vectors[:, None])
 
 
-def _of_motion(oval: FloatArray) -> FloatArray:
-    """(N, 2, 2) covariance [px^2] of centres whose outlines have second harmonics (N, 2) [px].
-
-    Motion during the exposure draws an outline out. The way may be uneven, so that its middle is not where
-    the robot was at the stamp.
-    """
-    size, (cos, sin) = np.hypot(*oval.T), oval.T
-    along: FloatArray = (
-        0.5
-        * _MOTION_SHARE
-        * size[:, None, None]
-        * np.array([[size + cos, sin], [sin, size - cos]]).transpose(2, 0, 1)
-    )
-    return along
-
-
-def _with_heading(spread: FloatArray, turned: Marks) -> FloatArray:
-    """(N, 3, 3) covariance of x, y and theta from that of x and y (N, 2, 2)."""
-    covariance = np.zeros((len(spread), 3, 3))
-    covariance[:, :2, :2] = spread
-    covariance[:, 2, 2] = np.where(np.isfinite(turned.theta), turned.variance, np.pi**2 / 3.0)
-    return covariance
-
-
 def _nothing(dropped: Mapping[str, int]) -> AerialDetections:
-    none = np.zeros(0)
-    return AerialDetections(
-        np.zeros((0, 2)), none, np.zeros((0, 3, 3)), np.zeros((0, 2)), none, none, dropped
-    )
+    none, pairs = np.zeros(0), np.zeros((0, 2))
+    return AerialDetections(pairs, none, np.zeros((0, 3, 3)), pairs, none, none, dropped)
 
 
 _RATIO = 1.3
@@ -509,22 +478,17 @@ class AerialCamera(CalibratedCamera):
         ground = self.control.look(gray) if self.control else None
         if ground is None:
             raise ImageError("no_control_points", self.why_nothing)
+        if self._detector is None or self._detector[0] is not ground:
+            known = self.diameter
+            self._detector = ground, AerialDetector(self._settings, ground, self._polarity)
+            self._detector[1].diameter = self._detector[1].diameter or known
         try:
-            detections = self._detector_for(ground).detect(gray)
+            detections = self._detector[1].detect(gray)
         except RectificationError as error:
             self._seeing_trouble = str(error)
             raise ImageError("not_visible", str(error)) from error
         self._seeing_trouble = ""
         return detections
-
-    def _detector_for(self, ground: GroundCamera) -> AerialDetector:
-        """The detector for a pose of the camera."""
-        if self._detector is None or self._detector[0] is not ground:
-            known = self.diameter
-            detector = AerialDetector(self._settings, ground, self._polarity)
-            detector.diameter = detector.diameter or known
-            self._detector = ground, detector
-        return self._detector[1]
 
 
 def anonymous_rows(detections: AerialDetections) -> NDArray[np.void]:

@@ -28,11 +28,14 @@ from swarm_loc_estimator.common.command_line import add_set, argument, command, 
 from swarm_loc_estimator.common.parameters import UserError, number_specs
 from swarm_loc_estimator.common.yaml_tree import read_file, tree_text
 from swarm_loc_estimator.swarm.swarm import FixedCamera
-from swarm_loc_vision.aerial.control_points import ControlPointError
-from swarm_loc_vision.aerial.ground_camera import POSE_SIZE, GroundCamera
-from swarm_loc_vision.aerial.ground_control import located
-from swarm_loc_vision.aerial.ground_file import load_ground
-from swarm_loc_vision.aerial.parameters import AerialSettings
+from swarm_loc_vision.aerial.ground_control import (
+    POSE_SIZE,
+    AerialSettings,
+    ControlPointError,
+    GroundCamera,
+    load_ground,
+    located,
+)
 from swarm_loc_vision.common.images import Gray, ImageError, Size, decoded_image
 
 _FROM_OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])

@@ -71,7 +71,15 @@ def find_marks(plain: Plain, centre: FloatArray, radius: FloatArray, polarity: f
     """
     if not len(centre):
         return Marks(*np.zeros((4, 0)))
-    inside = _inside()
+    # places spread evenly over a disc
+    radii = _OUTERMOST * (np.arange(_RINGS) + 0.5) / _RINGS
+    angles = 2.0 * np.pi * np.arange(_SPOKES) / _SPOKES
+    r, a = np.meshgrid(radii, angles, indexing="ij")
+    places = np.stack([r * np.cos(a), r * np.sin(a)], axis=-1).reshape(-1, 2)
+    root = np.sqrt(r / r.mean()).ravel()
+    plane = np.concatenate([np.ones((len(places), 1)), places], axis=1) * root[:, None]
+    inside = _Inside(places, root, np.linalg.qr(plane)[0])
+    # the best of some turns and softnesses, refined
     values = sampled(plain, centre[:, None] + radius[:, None, None] * inside.places).astype(float)
     bare = inside.without_light(values)
     angles = np.tile(2.0 * np.pi * np.arange(_TURNS) / _TURNS, len(_SOFTNESSES))
@@ -81,9 +89,10 @@ def find_marks(plain: Plain, centre: FloatArray, radius: FloatArray, polarity: f
     best = np.argmax(-polarity * bare @ models.T, axis=1)
     found = _refined(bare, inside, angles[best], softnesses[best])
     explained = 1.0 - found.variance / np.maximum(np.sum(bare**2, axis=1), 1e-12)
-    is_seen = (explained >= _MIN_EXPLAINED) & (
-        -polarity * found.step >= _MIN_MARK * np.abs(_rim_steps(plain, centre, radius))
-    )
+    # the mark must explain the light, and be as clear as the rim of its disc
+    rim = [sampled(plain, centre[:, None] + share * radius[:, None, None] * DIRECTIONS) for share in _RIM]
+    rim_step = np.abs(np.median(rim[1] - rim[0], axis=1))
+    is_seen = (explained >= _MIN_EXPLAINED) & (-polarity * found.step >= _MIN_MARK * rim_step)
     # of the headings, for noise of one count in each sample
     information = np.maximum(np.sum(_slope(found, inside) ** 2, axis=1), 1e-12)
     # samples are closer than pixels and share their noise: about every fourth one is independent
@@ -94,17 +103,6 @@ def find_marks(plain: Plain, centre: FloatArray, radius: FloatArray, polarity: f
         np.where(is_seen, found.step, 0.0),
         found.softness,
     )
-
-
-def _inside() -> _Inside:
-    """Places spread evenly over a disc."""
-    radii = _OUTERMOST * (np.arange(_RINGS) + 0.5) / _RINGS
-    angles = 2.0 * np.pi * np.arange(_SPOKES) / _SPOKES
-    r, a = np.meshgrid(radii, angles, indexing="ij")
-    places = np.stack([r * np.cos(a), r * np.sin(a)], axis=-1).reshape(-1, 2)
-    root = np.sqrt(r / r.mean()).ravel()
-    plane = np.concatenate([np.ones((len(places), 1)), places], axis=1) * root[:, None]
-    return _Inside(places, root, np.linalg.qr(plane)[0])
 
 
 def _model(places: FloatArray, angle: FloatArray, softness: FloatArray) -> FloatArray:
@@ -134,11 +132,3 @@ def _refined(bare: FloatArray, inside: _Inside, theta: FloatArray, softness: Flo
         turn = np.sum(slope * rest, axis=1) / np.maximum(np.sum(slope**2, axis=1), 1e-12)
         found = found._replace(theta=found.theta + np.clip(turn, -0.1, 0.1))
     return found
-
-
-def _rim_steps(plain: Plain, centre: FloatArray, radius: FloatArray) -> FloatArray:
-    """(C,) brightness of the surroundings minus that of the disc [counts]."""
-    inner, outer = (
-        sampled(plain, centre[:, None] + share * radius[:, None, None] * DIRECTIONS) for share in _RIM
-    )
-    return np.asarray(np.median(outer - inner, axis=1))

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.aerial.ground_camera import GroundCamera
-from swarm_loc_vision.aerial.parameters import AerialSettings
+from swarm_loc_vision.aerial.ground_control import AerialSettings, GroundCamera
 from swarm_loc_vision.common.images import Gray
 
 Plain = NDArray[np.float32]
@@ -52,14 +51,10 @@ class Rectification:
 def rectification(
     ground: GroundCamera, settings: AerialSettings, diameter: float, size_px: tuple[float, float]
 ) -> Rectification:
-    """The part of a plane in which robots are large enough to be found.
+    """The part of a plane in which robots of a diameter [m] are large enough to be found.
 
-    Args:
-        ground: The camera.
-        settings: Height of the plane, region, and least diameter of robots in the raw image.
-        diameter: Diameter of robots [m].
-        size_px: Least and largest diameter of robots in the rectified image; in between that in the raw
-            image.
+    `size_px` is the least and largest diameter of robots in the rectified image; in between that in the raw
+    image.
 
     Raises:
         RectificationError: The camera does not see the plane, or robots on it look too small.
@@ -83,25 +78,18 @@ def rectification(
     wanted = min(max(native, size_px[0]), size_px[1])
     step = max(diameter / wanted, math.sqrt(float(np.prod(high - low)) / _MAX_AREA))
     columns, rows = (int(n) for n in np.ceil((high - low) / step) + 1)
-    maps = _raw_pixels(ground, low, step, height, (rows, columns))
+    # the raw pixels of the grid, linear between every fourth row and column: off by 0.01 px
+    coarse = [np.arange(n // _EVERY + 2) * _EVERY for n in (columns, rows)]
+    places = np.stack(np.meshgrid(*coarse), axis=-1) * step + low
+    pixels = ground.pixels(np.concatenate([places, np.full((*places.shape[:2], 1), height)], axis=-1))
+    spread = np.array([[1.0 / _EVERY, 0.0, 0.0], [0.0, 1.0 / _EVERY, 0.0]])
+    flags, axes = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP, np.moveaxis(pixels.astype(np.float32), -1, 0)
+    maps = np.asarray([cv2.warpAffine(one, spread, (columns, rows), flags=flags) for one in axes], np.float32)
     most_u, most_v = ground.camera.width - 1, ground.camera.height - 1
     seen = (maps[0] >= 0.0) & (maps[0] <= most_u) & (maps[1] >= 0.0) & (maps[1] <= most_v)
     shrink = native / (diameter / step)
     blur = 0.5 * math.sqrt(max(shrink**2 - 1.0, 0.0)) if shrink > 1.2 else 0.0
     return Rectification(low, step, height, np.where(seen, maps, np.float32(-1.0)), seen, blur)
-
-
-def _raw_pixels(
-    ground: GroundCamera, low: FloatArray, step: float, height: float, shape: tuple[int, int]
-) -> Plain:
-    """(2, rows, columns) raw pixels of a grid, linear between every fourth row and column: off by 0.01 px."""
-    coarse = [np.arange(n // _EVERY + 2) * _EVERY for n in shape]
-    flat = np.stack(np.meshgrid(coarse[1], coarse[0]), axis=-1) * step + low
-    pixels = ground.pixels(np.concatenate([flat, np.full((*flat.shape[:2], 1), height)], axis=-1))
-    spread = np.array([[1.0 / _EVERY, 0.0, 0.0], [0.0, 1.0 / _EVERY, 0.0]])
-    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
-    of = [cv2.warpAffine(pixels[..., k].astype(np.float32), spread, shape[::-1], flags=flags) for k in (0, 1)]
-    return np.asarray(of, np.float32)
 
 
 def _visible(ground: GroundCamera, height: float) -> tuple[FloatArray, FloatArray]:

@@ -11,9 +11,8 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from swarm_loc_estimator.common.health import PATIENCE_S, Report, drop_values, level_of
 from swarm_loc_estimator.common.node import ManagedNode, Parameters
-from swarm_loc_vision.common.calibrated_camera import Calibration
 from swarm_loc_vision.common.camera import CameraError
-from swarm_loc_vision.common.images import TRANSPORTS, ImageError
+from swarm_loc_vision.common.images import TRANSPORTS, Calibration, ImageError
 
 IMAGE_QOS = QoSProfile(depth=2, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Where images arrive faster than they are processed, the middleware drops the oldest ones."""
@@ -50,16 +49,11 @@ class CameraNode(ManagedNode[Parameters]):
         source, self._topic = self._input, self._input.topic
         self._detections = self.create_publisher(self._found, "detections", QoSProfile(depth=10))
         overriding = QoSOverridingOptions([QoSPolicyKind.RELIABILITY])
-        self.create_subscription(
-            CameraInfo,
-            "camera_info",
-            self._on_camera_info,
-            qos_profile_sensor_data,
-            qos_overriding_options=overriding,
-        )
-        self.create_subscription(
-            source.message_class, self._topic, self._on_message, source.qos, qos_overriding_options=overriding
-        )
+        for kind, topic, receive, qos in (
+            (CameraInfo, "camera_info", self._on_camera_info, qos_profile_sensor_data),
+            (source.message_class, self._topic, self._on_message, source.qos),
+        ):
+            self.create_subscription(kind, topic, receive, qos, qos_overriding_options=overriding)
 
     def figures(self) -> dict[str, str]:
         """Values for the diagnostics in addition to images, cost and drops."""
@@ -91,7 +85,9 @@ class CameraNode(ManagedNode[Parameters]):
 
     def report(self) -> None:
         """Publish the state of the camera."""
-        source, missing = self._source, self._missing()
+        source, missing = self._source, self.health.silence(self._topic)
+        if source.camera is None and not source.trouble:
+            missing = f"no messages received on {self.resolve_topic_name('camera_info')}"
         self.health.warn_of("missing", {"": missing} if missing else {}, PATIENCE_S)
         self.health.warn_of_drops()
         trouble = source.trouble or self.trouble() or missing
@@ -102,9 +98,3 @@ class CameraNode(ManagedNode[Parameters]):
             **drop_values(source.drops),
         }
         self.publish_reports(Report(self.status_name, trouble or "detecting", level_of(trouble), values))
-
-    def _missing(self) -> str:
-        """What is not received, a sentence; "": nothing."""
-        if self._source.camera is None and not self._source.trouble:
-            return f"no messages received on {self.resolve_topic_name('camera_info')}"
-        return self.health.silence(self._topic)

@@ -25,15 +25,17 @@ from swarm_loc_estimator.common.messages.cdr import EVENT_PACKETS, nanoseconds
 from swarm_loc_estimator.common.messages.event_encoding import EventError, decode_events
 from swarm_loc_estimator.common.node import ConfiguredNode, message_class, run_node
 from swarm_loc_msgs.msg import LaserDistance, LightBearing, LightBearingArray
-from swarm_loc_vision.events.parameters import EventTrackerParameters, laser_calibration, light_sources
 from swarm_loc_vision.events.tracker import (
+    EventTrackerParameters,
     LightTracker,
     Sighting,
     WindowReport,
     direction,
     direction_jacobian,
+    laser_calibration,
+    light_sources,
 )
-from swarm_loc_vision.laser.calibration import UNKNOWN, Distance
+from swarm_loc_vision.laser.calibration import UNKNOWN
 
 EVENT_QOS = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
 _OUTPUT_QOS = QoSProfile(depth=50)
@@ -71,8 +73,10 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
             self._counts["packets lost on the way"] += message.seq - self._next_seq
         self._next_seq = message.seq + 1
         size = (message.width, message.height)
+        if not 0 < size[0] * size[1] <= _MAX_PIXELS:
+            self.health.drop(f"a sensor of {size[0]} x {size[1]} px is not one of 1 to {_MAX_PIXELS}")
+            return
         try:
-            _check(size)
             events = decode_events(
                 memoryview(message.events), message.encoding, size, is_bigendian=message.is_bigendian
             )
@@ -114,17 +118,14 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
             self._counts["windows without the laser"] += 1
             return message
         self._laser_s = time.monotonic()
-        found = self._distance(seen)
+        found = UNKNOWN
+        if self._calibration is not None:
+            found = self._calibration.distance(seen.v, float(seen.covariance[1, 1]), seen.locking)
         self._counts["distances"] += not math.isnan(found.distance)
         message.distance, message.sigma = found
         message.u_px, message.v_px, message.events = seen.u, seen.v, seen.events
         message.covariance = seen.covariance.ravel()
         return message
-
-    def _distance(self, seen: Sighting) -> Distance:
-        if self._calibration is None:
-            return UNKNOWN
-        return self._calibration.distance(seen.v, float(seen.covariance[1, 1]), seen.locking)
 
     def _light_message(self, seen: Sighting) -> LightBearing:
         lens = self.params.lens
@@ -168,16 +169,6 @@ class EventTrackerNode(ConfiguredNode[EventTrackerParameters]):
                 " more: is it on, at this frequency, and something within its range?"
             )
         return ""
-
-
-def _check(size: tuple[int, int]) -> None:
-    """Refuse an impossible sensor.
-
-    Raises:
-        EventError: It has no pixels, or too many.
-    """
-    if not 0 < size[0] * size[1] <= _MAX_PIXELS:
-        raise EventError(f"a sensor of {size[0]} x {size[1]} px is not one of 1 to {_MAX_PIXELS}")
 
 
 main = partial(run_node, "event_tracker_node", EventTrackerNode)

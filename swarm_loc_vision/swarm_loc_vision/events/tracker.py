@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +21,111 @@ from numpy.typing import NDArray
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.messages.event_encoding import Events
-from swarm_loc_vision.events.parameters import MAX_SOURCES, LightSource, TrackerSettings
+from swarm_loc_estimator.common.parameters import ParameterError, number, text, texts
+from swarm_loc_vision.laser.calibration import LaserCalibration, load_laser
+
+MAX_SOURCES = 32  # Bound on the lights that are looked for at once
+_MIN_HZ, _MAX_HZ = 10.0, 5000.0
+
+
+@dataclass(frozen=True)
+class LightSource:
+    """A light that blinks."""
+
+    frequency: float  # [Hz]
+    # Whether it is in the upper half of the image, as LEDs of other robots, or in the lower half, as the spot
+    # of the robot's own laser
+    is_above: bool
+
+    @property
+    def period_ns(self) -> int:
+        """[ns]."""
+        return round(1e9 / self.frequency)
+
+
+@dataclass(frozen=True)
+class TrackerSettings:
+    """How blinking lights are tracked."""
+
+    window: float = number(0.02, "s", 0.002, 1.0, "length of the windows, each of which makes one report")
+    burst_gap: float = number(2.5e-4, "s", 1e-5, 0.01, "pause of a pixel before the first event of a burst")
+    period_gate: float = number(
+        6e-5, "s", 1e-6, 1e-3, "largest difference of the time between two bursts and the light's period"
+    )
+    radius: float = number(3.5, "px", 1.0, 20.0, "of the circle whose events determine a light's place")
+    min_events: int = number(8, "1", 2, 1000, "events of a light within 3 x 3 pixels, at least")
+    sigma_floor: float = number(
+        0.02, "px", 0.0, 2.0, "standard deviation of a place that more events do not reduce, per axis"
+    )
+
+
+@dataclass(frozen=True)
+class LensSettings:
+    """The event camera's lens, for bearings of lights."""
+
+    focal_px: float = number(90.0, "px", 1.0, 10_000.0, "focal length of the event camera")
+    centre_column: float = number(63.5, "px", -10_000.0, 10_000.0, "column of its optical axis")
+    centre_row: float = number(63.5, "px", -10_000.0, 10_000.0, "row of its optical axis")
+    camera_yaw: float = number(0.0, "rad", -3.15, 3.15, "turn of the camera on the robot, to the left")
+
+
+@dataclass(frozen=True)
+class EventTrackerParameters:
+    """Parameters of `event_tracker_node`."""
+
+    laser_frequency: float = number(
+        450.0, "Hz", 0.0, _MAX_HZ, "of the robot's own laser, in the lower half of the image; 0: none"
+    )
+    light_frequencies: tuple[str, ...] = texts(
+        "of other robots' LEDs, in the upper half of the image, such as 1000 [Hz]; empty: none"
+    )
+    calibration: str = text("", "path of the laser's calibration; empty: the spot without distances")
+    base_frame: str = text("base_link", "frame of distances and bearings: <robot>/base_frame", required=True)
+    lens: LensSettings = field(default_factory=LensSettings, metadata={"numbers_of": LensSettings})
+    settings: TrackerSettings = field(
+        default_factory=TrackerSettings, metadata={"numbers_of": TrackerSettings}
+    )
+
+
+def light_sources(parameters: EventTrackerParameters) -> list[LightSource]:
+    """The lights that are looked for: the laser first where there is one, then LEDs by frequency.
+
+    Raises:
+        ParameterError: A frequency cannot be used.
+    """
+    laser = parameters.laser_frequency
+    sources = [LightSource(_in_range("laser_frequency", laser), is_above=False)] if laser else []
+    lights = sorted({_in_range("light_frequencies", one) for one in parameters.light_frequencies})
+    sources += [LightSource(frequency, is_above=True) for frequency in lights]
+    if not sources:
+        raise ParameterError(
+            "parameters laser_frequency = 0 and light_frequencies = [] leave nothing to track."
+        )
+    if len(sources) > MAX_SOURCES:
+        raise ParameterError(
+            f"parameter light_frequencies has {len(lights)} entries, the most are {MAX_SOURCES - 1}."
+        )
+    return sources
+
+
+def _in_range(name: str, value: float | str) -> float:
+    try:
+        frequency = float(value)
+    except ValueError:
+        frequency = -1.0
+    if not _MIN_HZ <= frequency <= _MAX_HZ:
+        raise ParameterError(f"parameter {name} = {value!r} must lie in [{_MIN_HZ:g}, {_MAX_HZ:g}] Hz.")
+    return frequency
+
+
+def laser_calibration(parameters: EventTrackerParameters) -> LaserCalibration | None:
+    """The laser's calibration; None without one.
+
+    Raises:
+        LaserFileError: It cannot be used.
+    """
+    return load_laser(Path(parameters.calibration)) if parameters.calibration else None
+
 
 _LONG_AGO_NS = -(1 << 62)
 # Checked, with the defaults of `TrackerSettings`, by `make bench-pushbot ARGS="--parts tracker"`.
@@ -87,9 +193,8 @@ class LightTracker:
         self._switches = [max(1.0, 2.0 * settings.window * source.frequency) for source in sources]
         self._density = np.zeros((len(sources), self._height + 2, self._width + 2), np.int32)
         pixels = 2 * self._width * self._height
-        self._bursts = _Bursts(
-            np.empty(pixels, np.int64), np.empty(pixels, np.int64), np.empty(pixels, np.int32)
-        )
+        event_ns, begin_ns = np.empty((2, pixels), np.int64)
+        self._bursts = _Bursts(event_ns, begin_ns, np.empty(pixels, np.int32))
         self._hits: list[_Hits] = []
         self._reset()
 
@@ -128,17 +233,8 @@ class LightTracker:
         source, x, y = np.empty((3, count), np.int32)
         hits = _Hits(source, x, y, np.empty(count, np.int64), np.empty(count, bool))
         gap_ns, gate_ns = round(1e9 * self._settings.burst_gap), round(1e9 * self._settings.period_gate)
-        found = _match(
-            events,
-            self._period_ns,
-            self._is_above,
-            gap_ns,
-            gate_ns,
-            self._width,
-            self._height,
-            self._bursts,
-            hits,
-        )
+        lights, size = (self._period_ns, self._is_above), (self._width, self._height)
+        found = _match(events, *lights, gap_ns, gate_ns, *size, self._bursts, hits)
         self._hits.append(_Hits._make(column[:found] for column in hits))
 
     def _report(self) -> list[Sighting]:
@@ -195,8 +291,13 @@ def _match(
         pixel = (int(events.is_on[k]) * height + y) * width + x
         is_new = now - bursts.event_ns[pixel] > gap_ns
         if is_new:
-            elapsed = now - bursts.begin_ns[pixel]
-            bursts.source[pixel] = _nearest_period(elapsed, 2 * y < height, period_ns, is_above, gate_ns)
+            # the light of this half of the image whose period is nearest to the time between bursts
+            elapsed, nearest = now - bursts.begin_ns[pixel], gate_ns
+            bursts.source[pixel] = -1
+            for light in range(len(period_ns)):
+                off = abs(elapsed - period_ns[light])
+                if is_above[light] == (2 * y < height) and off < nearest:
+                    nearest, bursts.source[pixel] = off, light
             bursts.begin_ns[pixel] = now
         bursts.event_ns[pixel] = now
         if bursts.source[pixel] >= 0:
@@ -204,16 +305,6 @@ def _match(
             hits.time_ns[count], hits.begins[count] = now, is_new
             count += 1
     return count
-
-
-@cached_njit
-def _nearest_period(elapsed: int, above: bool, period_ns: IntArray, is_above: BoolArray, gate_ns: int) -> int:
-    """The light of a half of the image whose period is nearest to a time between bursts; -1: none."""
-    nearest, found = gate_ns, -1
-    for k in range(len(period_ns)):
-        if is_above[k] == above and abs(elapsed - period_ns[k]) < nearest:
-            nearest, found = abs(elapsed - period_ns[k]), k
-    return found
 
 
 @cached_njit
@@ -237,21 +328,14 @@ def _locate(
     near = np.empty(len(hits.x), np.int64)
     for source in range(len(density)):
         if peak[source, 0] >= min_events:
-            count = _near(hits, source, peak[source], radius + _MAX_SHIFT_PX, near)
+            # its events around the peak
+            count, reach = 0, radius + _MAX_SHIFT_PX
+            for k in range(len(hits.x)):
+                du, dv = float(hits.x[k] - peak[source, 1]), float(hits.y[k] - peak[source, 2])
+                if hits.source[k] == source and du * du + dv * dv <= reach * reach:
+                    near[count] = k
+                    count += 1
             _centre(hits, near[:count], peak[source], radius, moments[source])
-
-
-@cached_njit
-def _near(hits: _Hits, source: int, peak: IntArray, reach: float, near: IntArray) -> int:
-    """Fill the indices of the events of a light around its peak; how many they are."""
-    count = 0
-    for k in range(len(hits.x)):
-        if hits.source[k] == source:
-            du, dv = float(hits.x[k] - peak[1]), float(hits.y[k] - peak[2])
-            if du * du + dv * dv <= reach * reach:
-                near[count] = k
-                count += 1
-    return count
 
 
 @cached_njit
@@ -296,5 +380,4 @@ def direction_jacobian(u: float, v: float, focal_px: float) -> FloatArray:
     length = ground + y * y
     root = math.sqrt(ground)
     by_xy = np.array([[1.0 / ground, 0.0], [-x * y / (root * length), root / length]])
-    jacobian: FloatArray = -by_xy / focal_px
-    return jacobian
+    return np.asarray(-by_xy / focal_px)

@@ -79,8 +79,8 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
         self._command = self.create_publisher(Twist, "cmd_vel", QoSProfile(depth=1))
         self.create_subscription(Odometry, "odom", self._on_odometry, _QOS)
         self.create_subscription(LaserDistance, "laser", self._on_laser, _QOS)
-        self.create_timer(_COMMAND_S, self._on_command, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._begin_s = time.monotonic()
+        clock = Clock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(_COMMAND_S, self._send_speed, clock=clock)
         self._speed = 0.0
         self._error: CalibrationError | None = None
 
@@ -91,22 +91,22 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
             return self._fit(drive)
         executor = EventsExecutor()
         executor.add_node(self)
-        done_s = math.inf
+        begin_s, done_s = time.monotonic(), math.inf
         while not stop.requested and time.monotonic() < done_s + _SETTLE_S:
             executor.spin_once(timeout_sec=_WAKE_S)
             if self._error is not None:
                 break
-            if self._drive.is_done or self._is_silent():
-                done_s = min(done_s, time.monotonic())
-            hears_all = min(self._heard_s.values()) > time.monotonic() - 1.0
+            now_s, heard_s = time.monotonic(), min(self._heard_s.values())
+            if self._drive.is_done or now_s > max(begin_s, heard_s) + _PATIENCE_S:
+                done_s = min(done_s, now_s)
+            hears_all = heard_s > now_s - 1.0
             self._speed = self.params.speed if math.isinf(done_s) and hears_all else 0.0
         self._command.publish(Twist())
         executor.shutdown()
         if self._error is not None:
             raise self._error
-        return 130 if stop.requested else self._finish()
-
-    def _finish(self) -> int:
+        if stop.requested:
+            return 130
         if not self._drive.is_done:
             missing = min(self._heard_s, key=lambda name: self._heard_s[name])
             raise CalibrationError(
@@ -122,11 +122,7 @@ class CalibrateLaserNode(ConfiguredNode[CalibrateLaserParameters]):
         print(summary(calibration, drive.count, params.output), file=sys.stdout)
         return 0
 
-    def _is_silent(self) -> bool:
-        last_s = max(self._begin_s, min(self._heard_s.values()))
-        return time.monotonic() > last_s + _PATIENCE_S
-
-    def _on_command(self) -> None:
+    def _send_speed(self) -> None:
         self._command.publish(Twist(linear=Vector3(x=self._speed)))
 
     def _on_odometry(self, message: Odometry) -> None:

@@ -70,17 +70,15 @@ class WallDrive:
         self.driven = (x - begin[0]) * np.cos(begin[2]) + (y - begin[1]) * np.sin(begin[2])
         self._odometry.append((stamp_ns, self.driven))
         while self._waiting and self._waiting[0][0] <= stamp_ns:
-            self._sample(*self._waiting.popleft())
+            at_ns, row = self._waiting.popleft()
+            stamps, driven = np.array(self._odometry, dtype=float).T
+            if at_ns >= stamps[0] and len(self._samples) < _MAX_SAMPLES:
+                self._samples.append((float(np.interp(at_ns, stamps, driven)), row))
 
     def take_row(self, stamp_ns: int, row: float) -> None:
         """Add a row of the spot [px]; it is used once there is odometry before and after it."""
         if np.isfinite(row):
             self._waiting.append((stamp_ns, row))
-
-    def _sample(self, stamp_ns: int, row: float) -> None:
-        stamps, driven = np.array(self._odometry, dtype=float).T
-        if stamp_ns >= stamps[0] and len(self._samples) < _MAX_SAMPLES:
-            self._samples.append((float(np.interp(stamp_ns, stamps, driven)), row))
 
     def drive(self, start_sigma: float, camera_x: float) -> Drive:
         """The samples, for the fit."""
@@ -165,8 +163,7 @@ class Drive:
     @property
     def depths(self) -> FloatArray:
         """(N,) from the camera to the wall [m]."""
-        depths: FloatArray = self.start_distance - self.camera_x - self.driven
-        return depths
+        return np.asarray(self.start_distance - self.camera_x - self.driven)
 
 
 def fit_hyperbola(drive: Drive) -> LaserCalibration:
@@ -179,39 +176,7 @@ def fit_hyperbola(drive: Drive) -> LaserCalibration:
         CalibrationError: Too few samples, too short a drive, or rows that do not follow a hyperbola.
     """
     depths = drive.depths
-    _check(depths)
-    weight = _START_PX / max(drive.start_sigma, 1e-6)
-
-    def residuals(parameters: FloatArray) -> FloatArray:
-        row_at_infinity, focal_base, shift = parameters
-        wrong = drive.rows - row_at_infinity - focal_base / np.maximum(depths + shift, 1e-3)
-        return np.append(wrong, shift * weight)
-
-    design = np.column_stack([np.ones_like(depths), 1.0 / depths])
-    begin = np.append(np.linalg.lstsq(design, drive.rows, rcond=None)[0], 0.0)
-    scale = _START_PX
-    for _ in range(3):  # the loss depends on the noise, which depends on the fit
-        found = least_squares(residuals, begin, loss="cauchy", f_scale=scale, x_scale=[1.0, 1.0, 0.01])
-        begin = found.x
-        scale = _scale_of(residuals(begin)[:-1])
-    row_at_infinity, focal_base, shift = (float(value) for value in begin)
-    if scale > _MAX_RESIDUAL_PX or focal_base <= 0.0:
-        raise CalibrationError(
-            f"the spot's rows follow no hyperbola: {scale:.2g} px off with f b = {focal_base:.3g} px m."
-        )
-    wrong = residuals(begin)[:-1]
-    bias = fit_row_bias(drive.rows, wrong, scale)
-    noise = _scale_of(wrong - bias.at_each(drive.rows))
-    near, far = float(depths.min() + shift), float(depths.max() + shift)
-    return LaserCalibration(row_at_infinity, focal_base, noise, drive.camera_x, 0.95 * near, 1.05 * far, bias)
-
-
-def _scale_of(residuals: FloatArray) -> float:
-    """Robust standard deviation of residuals [px], from their median magnitude."""
-    return max(1.4826 * float(np.median(np.abs(residuals))), 1e-3)
-
-
-def _check(depths: FloatArray) -> None:
+    # the drive must be long enough
     if len(depths) < MIN_SAMPLES:
         raise CalibrationError(
             f"the laser was seen {len(depths)} times on the way to the wall, {MIN_SAMPLES} are needed."
@@ -225,6 +190,37 @@ def _check(depths: FloatArray) -> None:
         raise CalibrationError(
             f"the way from {farthest:.2g} to {nearest:.2g} m is too short: it must halve the distance."
         )
+    # the hyperbola and the start, with a loss whose scale depends on the noise, which depends on the fit
+    weight = _START_PX / max(drive.start_sigma, 1e-6)
+
+    def residuals(parameters: FloatArray) -> FloatArray:
+        row_at_infinity, focal_base, shift = parameters
+        wrong = drive.rows - row_at_infinity - focal_base / np.maximum(depths + shift, 1e-3)
+        return np.append(wrong, shift * weight)
+
+    design = np.column_stack([np.ones_like(depths), 1.0 / depths])
+    begin = np.append(np.linalg.lstsq(design, drive.rows, rcond=None)[0], 0.0)
+    scale = _START_PX
+    for _ in range(3):
+        found = least_squares(residuals, begin, loss="cauchy", f_scale=scale, x_scale=[1.0, 1.0, 0.01])
+        begin = found.x
+        scale = _scale_of(residuals(begin)[:-1])
+    row_at_infinity, focal_base, shift = (float(value) for value in begin)
+    if scale > _MAX_RESIDUAL_PX or focal_base <= 0.0:
+        raise CalibrationError(
+            f"the spot's rows follow no hyperbola: {scale:.2g} px off with f b = {focal_base:.3g} px m."
+        )
+    # what is left is the bias of the tracker, and noise
+    wrong = residuals(begin)[:-1]
+    bias = fit_row_bias(drive.rows, wrong, scale)
+    noise = _scale_of(wrong - bias.at_each(drive.rows))
+    near, far = 0.95 * (nearest + shift), 1.05 * (farthest + shift)
+    return LaserCalibration(row_at_infinity, focal_base, noise, drive.camera_x, near, far, bias)
+
+
+def _scale_of(residuals: FloatArray) -> float:
+    """Robust standard deviation of residuals [px], from their median magnitude."""
+    return max(1.4826 * float(np.median(np.abs(residuals))), 1e-3)
 
 
 def fit_row_bias(rows: FloatArray, residuals: FloatArray, sigma: float) -> RowBias:
@@ -236,9 +232,13 @@ def fit_row_bias(rows: FloatArray, residuals: FloatArray, sigma: float) -> RowBi
     edge = float((rows - residuals).min()) + _EDGE_SIGMAS * sigma
     usual = (np.abs(residuals) < _OUTLIER_SIGMAS * sigma) & (rows >= edge)
     rows, residuals = rows[usual], residuals[usual]
-    knots = _knots(edge, rows)
+    # knots from the edge up to where samples are too few
+    counts = np.bincount(((rows - edge) / STEP_PX).astype(np.int64))
+    sparse = np.flatnonzero(counts < _LEAST_SAMPLES)
+    knots: FloatArray = edge + STEP_PX * np.arange((int(sparse[0]) if len(sparse) else len(counts)) + 1)
     if len(knots) < 2:
         return RowBias()
+    # a fit to each half must serve the other half
     is_even = np.arange(len(rows)) % 2 == 0
     gained = 0.0
     for chosen in (is_even, ~is_even):
@@ -246,14 +246,6 @@ def fit_row_bias(rows: FloatArray, residuals: FloatArray, sigma: float) -> RowBi
         others = residuals[~chosen]
         gained += _loss(others, sigma) - _loss(others - half.at_each(rows[~chosen]), sigma)
     return _fit(knots, rows, residuals, np.ones(len(rows), dtype=bool), sigma) if gained > 0.0 else RowBias()
-
-
-def _knots(first: float, rows: FloatArray) -> FloatArray:
-    """Rows (K,) of the knots from the first one up to where samples are too few."""
-    counts = np.bincount(((rows - first) / STEP_PX).astype(np.int64))
-    sparse = np.flatnonzero(counts < _LEAST_SAMPLES)
-    cells = int(sparse[0]) if len(sparse) else len(counts)
-    return np.asarray(first + STEP_PX * np.arange(cells + 1))
 
 
 def _fit(
@@ -311,10 +303,8 @@ class RowBias:
         """The bias at a tracked row [px]; zero beyond the knots."""
         if not self.reaches(row):
             return 0.0
-        place = (row - self.first_row) / self.step
-        k = math.floor(place)
-        share = place - k
-        return (1.0 - share) * self.offsets[k] + share * self.offsets[k + 1]
+        share, k = math.modf((row - self.first_row) / self.step)
+        return (1.0 - share) * self.offsets[int(k)] + share * self.offsets[int(k) + 1]
 
     def at_each(self, rows: FloatArray) -> FloatArray:
         """The bias (N,) at tracked rows (N,) [px]."""

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
-from swarm_loc_vision.markers.families import Family
-from swarm_loc_vision.markers.layouts import Layout, Words
+from swarm_loc_vision.markers.families import Family, Layout, Words
 
 # Limits of the decoder: checked by random squares and by black squares with a speck in `make bench-vision`,
 # and by test_decoder.py.

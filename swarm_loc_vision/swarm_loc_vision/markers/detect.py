@@ -39,8 +39,7 @@ from swarm_loc_estimator.common.parameters import Value
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
 from swarm_loc_vision.common.camera import CameraError
 from swarm_loc_vision.common.images import TRANSPORTS, ImageError, Transport
-from swarm_loc_vision.markers.detector import CameraDetector
-from swarm_loc_vision.markers.parameters import DetectorParameters, detector_maker
+from swarm_loc_vision.markers.detector import CameraDetector, DetectorParameters, detector_maker
 
 CreateCamera = Callable[[str, Transport], CameraDetector]
 Progress = Callable[[float, str], None]
@@ -118,7 +117,13 @@ class ImageBag:
                     writer.write(f"{name.partition('image_raw')[0]}detections", log_ns, detections)
                 else:
                     if name in info_at:
-                        _calibrate(info_at[name], data)
+                        try:
+                            message = decode(data, _CAMERA_INFO)
+                        except CdrError:
+                            info_at[name].drops["corrupt calibration"] += 1
+                        else:
+                            with suppress(CameraError):  # then `trouble` of the camera states why
+                                info_at[name].calibrate(message)
                     writer.write(name, log_ns, bytes(data))
                 count += 1
             self.losses = reader.losses
@@ -137,17 +142,6 @@ def _detected(camera: CameraDetector, kind: str, data: bytes) -> bytes | None:
         return camera.detect(message)
     except ImageError:
         return None
-
-
-def _calibrate(camera: CameraDetector, data: bytes) -> None:
-    """Set a calibration; if it cannot be used, `trouble` of the camera states why."""
-    try:
-        message = decode(data, _CAMERA_INFO)
-    except CdrError:
-        camera.drops["corrupt calibration"] += 1
-        return
-    with suppress(CameraError):
-        camera.calibrate(message)
 
 
 @command(
@@ -169,7 +163,10 @@ def main(options: argparse.Namespace) -> int:
     for loss in images.losses:
         print(loss)
     for name, camera in images.cameras.items():
-        print(_summary(name, camera))
+        drops = (f", dropped: {reason} {count}" for reason, count in sorted(camera.drops.items()) if count)
+        trouble = f" ({camera.trouble})" if camera.trouble else ""
+        markers = f"{camera.markers} markers ({camera.misfits} fit no square)"
+        print(f"{name or 'camera'}: {markers} in {camera.images} images{''.join(drops)}{trouble}")
     print(f"{count} messages written to {options.output}")
     return 0
 
@@ -184,15 +181,6 @@ def camera_maker(parameters: DetectorParameters) -> CreateCamera:
         return CameraDetector(detector_maker(own), transport.gray_of, parameters.settings.ambiguity)
 
     return create
-
-
-def _summary(name: str, camera: CameraDetector) -> str:
-    """A line about a camera."""
-    drops: Mapping[str, int] = {reason: count for reason, count in sorted(camera.drops.items()) if count}
-    dropped = "".join(f", dropped: {reason} {count}" for reason, count in drops.items())
-    trouble = f" ({camera.trouble})" if camera.trouble else ""
-    markers = f"{camera.markers} markers ({camera.misfits} fit no square)"
-    return f"{name or 'camera'}: {markers} in {camera.images} images{dropped}{trouble}"
 
 
 if __name__ == "__main__":

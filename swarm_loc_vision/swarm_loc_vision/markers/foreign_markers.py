@@ -17,14 +17,11 @@ from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.messages.detections import encode_detections
 from swarm_loc_estimator.common.parameters import ParameterError, autostart, choice, flag, number
-from swarm_loc_vision.common.calibrated_camera import Calibration, camera_of
 from swarm_loc_vision.common.camera import Camera
-from swarm_loc_vision.common.images import ImageError
-from swarm_loc_vision.markers.bodies import SHIFT, PoseSettings, PoseSolver
-from swarm_loc_vision.markers.detector import Detections, detection_rows
+from swarm_loc_vision.common.images import Calibration, ImageError, camera_of
+from swarm_loc_vision.markers.detector import Detections, MarkersInUse, detection_rows, known_markers
 from swarm_loc_vision.markers.families import families
-from swarm_loc_vision.markers.parameters import MarkersInUse, known_markers
-from swarm_loc_vision.markers.pose import square
+from swarm_loc_vision.markers.pose import SHIFT, PoseSettings, PoseSolver, square
 
 _APRILTAG_CENTRE_PX = 0.5
 """Where AprilTag's detector sees the centre of the first pixel; everywhere else it is at 0."""

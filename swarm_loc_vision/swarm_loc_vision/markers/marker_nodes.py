@@ -22,9 +22,14 @@ from swarm_loc_estimator.common.node import message_class, run_node
 from swarm_loc_msgs.msg import MarkerDetectionArray
 from swarm_loc_vision.common.camera_node import CameraNode, Input
 from swarm_loc_vision.common.images import TRANSPORTS
-from swarm_loc_vision.markers.detector import CameraDetector, precompile
+from swarm_loc_vision.markers.detector import (
+    CameraDetector,
+    DetectorParameters,
+    MarkersInUse,
+    detector_maker,
+    precompile,
+)
 from swarm_loc_vision.markers.foreign_markers import KINDS, ForeignMarkers, ForeignParameters
-from swarm_loc_vision.markers.parameters import DetectorParameters, MarkersInUse, detector_maker
 
 Markers = TypeVar("Markers", bound=MarkersInUse)
 

@@ -1,7 +1,5 @@
 """The aerial camera node over DDS: overhead images in, anonymous detections in map out."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -17,10 +15,13 @@ from bench.aerial.pictures import DIAMETER, Look, control_pixels, draw_picture
 from bench.shared.parameter_table import markdown_table
 from swarm_loc_msgs.msg import AnonymousDetectionArray
 from swarm_loc_vision.aerial.aerial_camera_node import AerialCameraNode
-from swarm_loc_vision.aerial.control_points import ControlPoints
-from swarm_loc_vision.aerial.ground_control import Ground
-from swarm_loc_vision.aerial.ground_file import GroundFileError, save_ground
-from swarm_loc_vision.aerial.parameters import AerialParameters
+from swarm_loc_vision.aerial.ground_control import (
+    AerialParameters,
+    ControlPoints,
+    Ground,
+    GroundFileError,
+    save_ground,
+)
 
 pytestmark = pytest.mark.usefixtures("frequent_diagnostics")
 

@@ -1,7 +1,5 @@
 """The marker detector as a managed node, and several of them with an estimator in one process."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The marker detector node over DDS: images in, detections out, and one counted drop for each bad one."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The aerial detector on drawn pictures: all robots that are there are found, and nothing else."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -12,7 +10,7 @@ from bench.aerial.detector import Score, exact, score_picture, surveyed
 from bench.aerial.pictures import DIAMETER, Look, Picture, draw_picture
 from swarm_loc_vision.aerial.circles import DIRECTIONS, SIDES, TOP, Sides
 from swarm_loc_vision.aerial.detector import AerialDetector
-from swarm_loc_vision.aerial.parameters import AerialSettings
+from swarm_loc_vision.aerial.ground_control import AerialSettings
 from swarm_loc_vision.aerial.rectification import RectificationError
 
 SETTINGS = AerialSettings(robot_diameter=DIAMETER)

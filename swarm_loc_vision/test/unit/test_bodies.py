@@ -1,7 +1,5 @@
 """Faces of one robot together."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -13,8 +11,7 @@ from scipy.stats import chi2
 from bench.vision.scenes import CAMERA, project
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import CameraMount, Face, Robot
-from swarm_loc_vision.markers.bodies import Seen, robot_body, solve_bodies, up_of
-from swarm_loc_vision.markers.pose import marker_poses, square
+from swarm_loc_vision.markers.pose import Seen, marker_poses, robot_body, solve_bodies, square, up_of
 
 INTRINSICS = np.array([CAMERA[0, 0], CAMERA[1, 1], CAMERA[0, 2], CAMERA[1, 2]])
 LENGTH, SIGMA_PX = 0.03, 0.1

@@ -1,7 +1,5 @@
 """Cameras by their camera_info: region of interest and binning, and images that do not fit them."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 
@@ -11,9 +9,8 @@ from camera_messages import camera_info
 from scipy.spatial.transform import Rotation
 
 from bench.vision.scenes import CAMERA, FOCAL_PX, HEIGHT, WIDTH, Gray, Look, random_scene
-from swarm_loc_vision.common.calibrated_camera import CalibratedCamera, camera_of
 from swarm_loc_vision.common.camera import Camera, CameraError
-from swarm_loc_vision.common.images import ImageError, gray_image
+from swarm_loc_vision.common.images import CalibratedCamera, ImageError, camera_of, gray_image
 from swarm_loc_vision.markers.detector import Detections, DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import family_named
 

@@ -1,7 +1,5 @@
 """Cameras: the same projection as OpenCV's, and its inverse; what is not calibrated is refused."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

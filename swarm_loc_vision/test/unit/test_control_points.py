@@ -1,7 +1,5 @@
 """Poses of overhead cameras by control points: exact, as unsure as they are, refused where they must be."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,10 +8,18 @@ import pytest
 from aerial_scenes import LENSES, floor_points, over_floor, spread
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.aerial.control_points import ControlPointError, ControlPoints, misfit, solve_pose
-from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground
-from swarm_loc_vision.aerial.ground_file import GroundFileError, load_ground, save_ground
-from swarm_loc_vision.aerial.parameters import AerialSettings
+from swarm_loc_vision.aerial.ground_control import (
+    AerialSettings,
+    ControlPointError,
+    ControlPoints,
+    FloorMarker,
+    Ground,
+    GroundFileError,
+    load_ground,
+    misfit,
+    save_ground,
+    solve_pose,
+)
 from swarm_loc_vision.markers.families import family_named
 
 NOISE = AerialSettings(control_sigma_px=0.5, control_sigma=0.0)

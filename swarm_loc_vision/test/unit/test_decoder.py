@@ -1,7 +1,5 @@
 """Ids from cells: every id in every rotation, and no id from anything else."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

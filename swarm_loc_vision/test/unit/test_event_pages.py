@@ -1,14 +1,12 @@
 """The pages of the event tracker and of the laser's calibration have the parameters as they are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
 
 from bench.shared.parameter_table import markdown_table
 from swarm_loc_estimator.common.parameters import ParameterError
-from swarm_loc_vision.events.parameters import EventTrackerParameters, laser_calibration, light_sources
+from swarm_loc_vision.events.tracker import EventTrackerParameters, laser_calibration, light_sources
 from swarm_loc_vision.laser.calibration import LaserCalibration, save_laser
 
 DOC = Path(__file__).parents[2] / "doc"

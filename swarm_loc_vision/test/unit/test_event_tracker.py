@@ -1,7 +1,5 @@
 """Blinking lights in events: where they are, how sure that is, and what is none of them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from blinking_lights import SIZE, light, noise, together
@@ -9,8 +7,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from swarm_loc_estimator.common.messages.event_encoding import Events
-from swarm_loc_vision.events.parameters import MAX_SOURCES, LightSource, TrackerSettings
-from swarm_loc_vision.events.tracker import LightTracker, WindowReport, direction, direction_jacobian
+from swarm_loc_vision.events.tracker import (
+    MAX_SOURCES,
+    LightSource,
+    LightTracker,
+    TrackerSettings,
+    WindowReport,
+    direction,
+    direction_jacobian,
+)
 
 LASER, LED = LightSource(450.0, is_above=False), LightSource(1000.0, is_above=True)
 SETTINGS = TrackerSettings()

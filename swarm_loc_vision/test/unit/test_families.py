@@ -1,7 +1,5 @@
 """The words of the families, and their images."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Markers of other detectors: their conventions of corners and poses, and what is dropped."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path
@@ -22,11 +20,10 @@ from swarm_loc_estimator.common.messages.cdr import DETECTIONS, decode
 from swarm_loc_estimator.common.messages.detections import DETECTION_DTYPE
 from swarm_loc_estimator.common.parameters import ParameterError
 from swarm_loc_vision.common.images import ImageError
-from swarm_loc_vision.markers.bodies import PoseSettings
 from swarm_loc_vision.markers.detector import precompile
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.markers.foreign_markers import ForeignMarkers, ForeignParameters
-from swarm_loc_vision.markers.pose import square
+from swarm_loc_vision.markers.pose import PoseSettings, square
 
 PAGE = Path(__file__).parents[2] / "doc" / "marker_bridge_node.md"
 TAG = "apriltag_36h11"

@@ -1,7 +1,5 @@
 """The command that locates a fixed camera by control points, and by markers on the floor in pictures."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -13,9 +11,7 @@ from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, Truth, project, ren
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.swarm.swarm import FixedCamera
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_vision.aerial.ground_camera import GroundCamera
-from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground
-from swarm_loc_vision.aerial.ground_file import save_ground
+from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, GroundCamera, save_ground
 from swarm_loc_vision.aerial.locate_camera import main
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.families import family_named

@@ -1,7 +1,5 @@
 """Markers that lie, from noisy corners to measurements; the description of a camera from control points."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -23,14 +21,11 @@ from swarm_loc_estimator.sensors.camera import (
 )
 from swarm_loc_estimator.sensors.sensor import DropCounts
 from swarm_loc_estimator.swarm.swarm import Face, FixedCamera, Robot, Swarm
-from swarm_loc_vision.aerial.control_points import solve_pose
-from swarm_loc_vision.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.aerial.ground_control import AerialSettings, GroundCamera, solve_pose
 from swarm_loc_vision.aerial.locate_camera import fixed_camera
-from swarm_loc_vision.aerial.parameters import AerialSettings
 from swarm_loc_vision.common.camera import Camera
-from swarm_loc_vision.markers.bodies import Seen, robot_body, solve_bodies
 from swarm_loc_vision.markers.detector import Detections, detection_rows
-from swarm_loc_vision.markers.pose import marker_poses, square
+from swarm_loc_vision.markers.pose import Seen, marker_poses, robot_body, solve_bodies, square
 
 INTRINSICS = np.array([CAMERA[0, 0], CAMERA[1, 1], CAMERA[0, 2], CAMERA[1, 2]])
 SIZE, SIGMA_PX = 0.05, 0.1

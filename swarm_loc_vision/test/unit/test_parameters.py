@@ -1,7 +1,5 @@
 """What the parameters say: on the node's page, and about the detector that follows from them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -12,8 +10,8 @@ from bench.vision.scenes import CAMERA, HEIGHT, WIDTH, Look, random_scene
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import save_swarm
 from swarm_loc_vision.common.camera import Camera
+from swarm_loc_vision.markers.detector import DetectorParameters, detector_maker
 from swarm_loc_vision.markers.families import family_named
-from swarm_loc_vision.markers.parameters import DetectorParameters, detector_maker
 
 PAGE = Path(__file__).parents[2] / "doc" / "marker_detector_node.md"
 FAMILY = "aruco_mip_36h12"

@@ -1,7 +1,5 @@
 """Poses from corners: exact, consistent with their covariance, and honest about the mirrored solution."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,11 +1,9 @@
 """Texts that select markers."""
 
-from __future__ import annotations
-
 import pytest
 
 from swarm_loc_estimator.common.parameters import ParameterError
-from swarm_loc_vision.markers.parameters import parse_ids, parse_lengths
+from swarm_loc_vision.markers.detector import parse_ids, parse_lengths
 
 
 def test_ids() -> None:

@@ -1,7 +1,5 @@
 """Sheets of markers: in true size, read by detectors, and every id on them."""
 
-from __future__ import annotations
-
 import io
 import re
 import zlib
@@ -15,24 +13,23 @@ from numpy.typing import NDArray
 
 from swarm_loc_estimator.swarm.swarm import Face, Landmark, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import save_swarm
-from swarm_loc_vision.aerial.ground_control import FloorMarkers
-from swarm_loc_vision.aerial.ground_file import load_ground
+from swarm_loc_vision.aerial.ground_control import FloorMarkers, load_ground
 from swarm_loc_vision.common.camera import Camera
 from swarm_loc_vision.markers.detector import DetectorSettings, MarkerDetector
 from swarm_loc_vision.markers.families import families, family_named
-from swarm_loc_vision.sheets.pages import (
+from swarm_loc_vision.sheets.print_markers import (
     MM_PER_INCH,
     PAPERS,
     Page,
     board_page,
     floor_markers,
+    main,
     outline,
     pages_of,
     save_pdf,
     sheet_figure,
     stickers_of,
 )
-from swarm_loc_vision.sheets.print_markers import main
 
 ROBOTS = tuple(
     Robot(f"epuck{k}", faces=tuple(Face(name, 10 * k + n) for n, name in enumerate(("front", "back"))))

@@ -1,7 +1,5 @@
 """Outputs of cameras' programs: whole or not at all, and never through a link of others."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -9,12 +7,11 @@ import pytest
 
 from bench.shared.full_disk import full_after
 from swarm_loc_estimator.common.files import FileError
-from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground
-from swarm_loc_vision.aerial.ground_file import save_ground
+from swarm_loc_vision.aerial.ground_control import FloorMarker, Ground, save_ground
 from swarm_loc_vision.laser.calibration import LaserCalibration, save_laser
 from swarm_loc_vision.markers.families import family_named
 from swarm_loc_vision.sheets import print_markers
-from swarm_loc_vision.sheets.pages import board_page, save_pdf
+from swarm_loc_vision.sheets.print_markers import board_page, save_pdf
 
 
 def sheets(folder: Path) -> None:

@@ -1,15 +1,12 @@
 """Cameras over a floor with known poses, for tests of the aerial detector."""
 
-from __future__ import annotations
-
 import math
 
 import cv2
 import numpy as np
 
 from swarm_loc_estimator.common.arrays import FloatArray
-from swarm_loc_vision.aerial.control_points import ControlPoints
-from swarm_loc_vision.aerial.ground_camera import GroundCamera
+from swarm_loc_vision.aerial.ground_control import ControlPoints, GroundCamera
 from swarm_loc_vision.common.camera import Camera
 
 LENSES = {

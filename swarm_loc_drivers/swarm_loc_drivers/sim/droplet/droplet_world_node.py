@@ -15,7 +15,7 @@ import numpy as np
 from geometry_msgs.msg import PoseWithCovarianceStamped
 from rclpy.qos import QoSProfile
 
-from swarm_loc_drivers.common.ros_messages import stamp_message, yaw_quaternion
+from swarm_loc_drivers.common.robot_driver_node import stamp_message, yaw_quaternion
 from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.world import (
     STEP_NS,
@@ -41,12 +41,10 @@ class DropletWorldNode(WorldNode[DropletWorldParameters]):
         params = self.params
         swarm, self._world = make_droplet_world(params)
         names = [robot.name for robot in swarm.robots]
-        self.begin(
-            names,
-            STEP_NS,
-            lambda robot: DropletFirmware(SimulatedDroplet(self._world, robot)),
-            clock_steps=_CLOCK_STEPS,
+        self.serve(
+            names, lambda robot: DropletFirmware(SimulatedDroplet(self._world, robot)), params.link_folder
         )
+        self.begin(names, STEP_NS, clock_steps=_CLOCK_STEPS)
         fixed = tuple(swarm.index_of[name] for name in params.fixed)
         self._tracker = Tracker(
             fixed, params.fix_rate, params.fix_sigma, params.fix_heading_sigma, params.seed

@@ -10,20 +10,13 @@ The bytes are those of the cable, without delay. So runs behave like live ones a
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from swarm_loc_drivers.common.odometry import OdometryState
-from swarm_loc_drivers.common.velocity_command import Velocity, VelocityCommand
-from swarm_loc_drivers.droplet.exchange import Brightness
 from swarm_loc_drivers.droplet.hardware import DIRECTIONS, ELEMENTS, WALKS, Gait, gait
-from swarm_loc_drivers.droplet.odometry import CommandedMotion, MotionNoise
-from swarm_loc_drivers.droplet.session import DropletMover, DropletSession, SessionSettings
-from swarm_loc_drivers.sim.droplet.firmware import DropletFirmware
 from swarm_loc_drivers.sim.droplet.infrared import (
     DropletInfrared,
     DropletLight,
@@ -31,77 +24,14 @@ from swarm_loc_drivers.sim.droplet.infrared import (
     InfraredCommand,
     InfraredSettings,
 )
-from swarm_loc_drivers.sim.link_host import ConsoleFirmware
 from swarm_loc_drivers.sim.run import START_NS
-from swarm_loc_drivers.sim.worlds import WorldError, WorldParameters, start_of
+from swarm_loc_drivers.sim.worlds import LinkedWorldParameters, WorldError, start_of
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text, texts
 from swarm_loc_estimator.swarm.ir_board import IrPlatform, RobotIr
 from swarm_loc_estimator.swarm.swarm import Pose2, Robot, Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-
-_TIMEOUT_S = 1.0
-STRIDE_S = 2.0
-
-
-class Cable:
-    """A robot connected by cable: its console and the driver's session, with its model of motion errors.
-
-    `publish` is called with the matrices of exchanges.
-    """
-
-    def __init__(
-        self,
-        world: DropletWorld,
-        robot: int,
-        settings: SessionSettings,
-        noise: MotionNoise,
-        publish: Callable[[Brightness], None],
-    ) -> None:
-        self.counts: Counter[str] = Counter()  # Events of the session by name
-        self._world = world
-        # The firmware at the console
-        self.firmware: ConsoleFirmware = DropletFirmware(SimulatedDroplet(world, robot))
-        self._command = VelocityCommand(
-            _TIMEOUT_S, lambda: world.now_ns, self.counts, lambda: 1e-9 * world.now_ns
-        )
-        self._motion = CommandedMotion(noise)
-        mover = DropletMover(self._command, self._motion, STRIDE_S)
-        self.session = DropletSession(settings, mover, (), publish, self.counts)  # The session of the driver
-
-    def set_velocity(self, velocity: Velocity) -> None:
-        """Command a velocity."""
-        self._command.set(velocity)
-
-    def odometry(self) -> OdometryState:
-        """The session's odometry."""
-        return self._motion.state(self._world.now_ns)
-
-    def step(self) -> None:
-        """Exchange bytes until neither end sends."""
-        data = self.firmware.stream()
-        while not self.session.ended:
-            output = self.session.step(data, self._world.now_ns)
-            if not output:
-                return
-            data = self.firmware.receive(output)
-            if not data:
-                return
-
-
-def run(
-    world: DropletWorld, robots: Sequence[Callable[[], object]], steps: int, control: Callable[[], None]
-) -> None:
-    """Advance a world by steps, with a function that steps each robot, such as `Cable.step`.
-
-    `control` is called after every step, to set velocities and record data.
-    """
-    for _ in range(steps):
-        world.step()
-        for robot in robots:
-            robot()
-        control()
 
 
 @dataclass(frozen=True)
@@ -306,7 +236,7 @@ def _check(ids: Sequence[int], platform: IrPlatform) -> None:
 
 
 @dataclass(frozen=True)
-class DropletWorldParameters(WorldParameters):
+class DropletWorldParameters(LinkedWorldParameters):
     """Parameters of `droplet_world_node`."""
 
     swarm_file: str = text(

@@ -26,7 +26,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 
 from swarm_loc_drivers.common.calibration_file import CameraCalibration
-from swarm_loc_drivers.common.ros_messages import camera_info_message, image_message, stamp_message
+from swarm_loc_drivers.common.robot_driver_node import camera_info_message, image_message, stamp_message
 from swarm_loc_drivers.epuck.hardware import EPUCK_MODELS
 from swarm_loc_drivers.sim.epuck.parts import Unanswered
 from swarm_loc_drivers.sim.epuck.serial_firmware import SerialFirmware
@@ -97,12 +97,8 @@ class EpuckWorldNode(WorldNode[EpuckWorldParameters]):
                 SerialFirmware(body, EPUCK_MODELS[params.model]) if params.link_folder else WifiFirmware(body)
             )
 
-        self.begin(
-            self._names,
-            STEP_NS,
-            firmware_of,
-            first_port=params.first_port,
-        )
+        self.serve(self._names, firmware_of, params.link_folder, first_port=params.first_port)
+        self.begin(self._names, STEP_NS)
         # cameras, on the robots and above
         calibration = params.camera.calibration
         self._cameras = [CameraOutput(self, name, calibration) for name in self._names]

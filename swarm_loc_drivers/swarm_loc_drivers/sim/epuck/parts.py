@@ -19,7 +19,7 @@ from swarm_loc_drivers.epuck.hardware import (
     as_counter,
     raw_of_distance,
 )
-from swarm_loc_drivers.epuck.wifi_protocol import SENSORS_DTYPE
+from swarm_loc_drivers.epuck.wifi_session import SENSORS_DTYPE
 from swarm_loc_estimator.common.arrays import FloatArray
 
 

@@ -10,8 +10,8 @@ from __future__ import annotations
 import struct
 from collections.abc import Generator
 
-from swarm_loc_drivers.epuck import wifi_protocol as wifi
-from swarm_loc_drivers.epuck.hardware import EPUCK2, as_counter, encode_rgb565
+from swarm_loc_drivers.epuck import wifi_session as wifi
+from swarm_loc_drivers.epuck.hardware import EPUCK2, WIFI_HEIGHT, WIFI_WIDTH, as_counter, encode_rgb565
 from swarm_loc_drivers.sim.epuck.parts import EpuckBody, Motors, camera_image, sensor_values
 
 DELAY_NS = 10_000_000  # After reading a command, and after sending a message
@@ -142,4 +142,4 @@ class WifiFirmware:
         newest = self._body.image()
         if newest is not None and newest[1] != self._exposure_ns:
             self._exposure_ns = newest[1]
-            self._image = encode_rgb565(camera_image(self._body, wifi.WIDTH, wifi.HEIGHT, _ZOOM))
+            self._image = encode_rgb565(camera_image(self._body, WIFI_WIDTH, WIFI_HEIGHT, _ZOOM))

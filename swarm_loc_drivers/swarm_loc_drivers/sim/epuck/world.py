@@ -24,8 +24,8 @@ from swarm_loc_drivers.sim.scenarios.eight import ARENA, CAMERA_RATE_HZ, FAMILY
 from swarm_loc_drivers.sim.worlds import (
     WORLDS,
     ErrorModel,
+    LinkedWorldParameters,
     WorldError,
-    WorldParameters,
     hidden_geometry,
     start_of,
 )
@@ -34,8 +34,7 @@ from swarm_loc_estimator.common.parameters import ParameterError, choice, number
 from swarm_loc_estimator.swarm.error_models import OdometryModel
 from swarm_loc_estimator.swarm.swarm import Swarm
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
-from swarm_loc_vision.aerial.ground_control import FloorMarker
-from swarm_loc_vision.aerial.ground_file import load_ground
+from swarm_loc_vision.aerial.ground_control import FloorMarker, load_ground
 from swarm_loc_vision.markers.families import families
 
 GrayImage = NDArray[np.uint8]
@@ -246,7 +245,7 @@ def check_swarm(swarm: Swarm) -> None:
 
 
 @dataclass(frozen=True)
-class EpuckWorldParameters(WorldParameters):
+class EpuckWorldParameters(LinkedWorldParameters):
     """Parameters of `epuck_world_node`; the cameras' are those of `CameraModel` and `OverheadSettings`."""
 
     world: str = choice("w2", tuple(WORLDS), "which errors robots and cameras have; see sim/worlds.py")

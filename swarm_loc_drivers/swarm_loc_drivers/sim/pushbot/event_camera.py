@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.pushbot.hardware import SENSOR_PX
+from swarm_loc_drivers.pushbot.protocol import SENSOR_PX
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.parameters import number
 

@@ -13,7 +13,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.pushbot.hardware import BAUD_RATE, MAX_VELOCITY, TIMESTAMPS, FirmwareGeneration
+from swarm_loc_drivers.pushbot.protocol import BAUD_RATE, MAX_VELOCITY, TIMESTAMPS, FirmwareGeneration
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking
 
 _PERIOD = 50 * 192  # Period of the pulses: 50 us of a timer of 192 MHz

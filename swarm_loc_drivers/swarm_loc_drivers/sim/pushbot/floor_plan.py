@@ -239,6 +239,26 @@ def clearance(walls: FloatArray, discs: FloatArray, radius: float, x: float, y: 
 
 
 @cached_njit
+def is_blocked(walls: FloatArray, radii: FloatArray, poses: FloatArray, robot: int) -> bool:
+    """Whether the body of one of the robots at poses (N, 3) touches a wall (S, 4) or another robot."""
+    x, y = poses[robot, 0], poses[robot, 1]
+    for k in range(len(poses)):
+        away = math.hypot(x - poses[k, 0], y - poses[k, 1])
+        if k != robot and away < radii[robot] + radii[k]:
+            return True
+    return clearance(walls, np.empty((0, 2)), 0.0, x, y) < radii[robot]
+
+
+@cached_njit
+def kept_clear(walls: FloatArray, radii: FloatArray, before: FloatArray, after: FloatArray) -> FloatArray:
+    """The poses (N, 3) `after` a step, in which robots that would hit something have only turned."""
+    for robot in range(len(after)):
+        if is_blocked(walls, radii, after, robot):
+            after[robot, :2] = before[robot, :2]
+    return after
+
+
+@cached_njit
 def is_visible(walls: FloatArray, ax: float, ay: float, bx: float, by: float) -> bool:
     """Whether no wall (S, 4) stands between two points."""
     distance = math.hypot(bx - ax, by - ay)

@@ -12,7 +12,7 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from swarm_loc_drivers.pushbot.hardware import GENERATIONS
+from swarm_loc_drivers.pushbot.protocol import GENERATIONS
 from swarm_loc_drivers.sim.pushbot.firmware import PushbotFirmware
 from swarm_loc_drivers.sim.pushbot.world import (
     STEP_NS,
@@ -31,13 +31,9 @@ class PushbotWorldNode(WorldNode[PushbotWorldParameters]):
         super().__init__("pushbot_world", PushbotWorldParameters, **node_arguments)
         params = self.params
         swarm, self._world = make_pushbot_world(params)
-        self.begin(
-            [robot.name for robot in swarm.robots],
-            STEP_NS,
-            self._firmware_of,
-            first_port=params.first_port,
-            waits=True,
-        )
+        names = [robot.name for robot in swarm.robots]
+        self.serve(names, self._firmware_of, params.link_folder, first_port=params.first_port, waits=True)
+        self.begin(names, STEP_NS)
 
     def _firmware_of(self, robot: int) -> PushbotFirmware:
         generation = GENERATIONS[self.params.firmware]

@@ -12,8 +12,7 @@ from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraNoise, Ev
 from swarm_loc_drivers.sim.pushbot.optics import CAMERA_X_M, LaserOptics, assembled_robots, spot_brightness
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.messages.event_encoding import Events
-from swarm_loc_vision.events.parameters import LightSource, TrackerSettings
-from swarm_loc_vision.events.tracker import LightTracker
+from swarm_loc_vision.events.tracker import LightSource, LightTracker, TrackerSettings
 from swarm_loc_vision.laser.calibration import Drive, fit_hyperbola, save_laser
 
 _STEP_US = 5_000

@@ -14,12 +14,18 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm_loc_drivers.pushbot.hardware import GENERATIONS, SECOND_FIRMWARE
+from swarm_loc_drivers.pushbot.protocol import GENERATIONS, SECOND_FIRMWARE
 from swarm_loc_drivers.sim.differential_drive import Drive, LastingNoise, roll
 from swarm_loc_drivers.sim.pushbot.event_camera import Blinking, CameraNoise
-from swarm_loc_drivers.sim.pushbot.floor_plan import FLOOR_PLANS, FloorPlan, clearance, floor_plan
+from swarm_loc_drivers.sim.pushbot.floor_plan import (
+    FLOOR_PLANS,
+    FloorPlan,
+    floor_plan,
+    is_blocked,
+    kept_clear,
+)
 from swarm_loc_drivers.sim.pushbot.optics import BODY_RADIUS_M, HallSight, Lights, assembled_robots
-from swarm_loc_drivers.sim.worlds import WorldError, WorldParameters, start_of
+from swarm_loc_drivers.sim.worlds import LinkedWorldParameters, WorldError, start_of
 from swarm_loc_estimator.common.arrays import FloatArray
 from swarm_loc_estimator.common.parameters import ParameterError, choice, number, text
 from swarm_loc_estimator.swarm.swarm import Pose2, Swarm
@@ -57,7 +63,7 @@ WHEEL_NOISE, TURN_NOISE = 1e-7, math.radians(0.64)
 
 
 @dataclass(frozen=True)
-class PushbotWorldParameters(WorldParameters):
+class PushbotWorldParameters(LinkedWorldParameters):
     """Parameters of `pushbot_world_node`; the event cameras' are those of `CameraNoise`."""
 
     plan: str = text("corridor", f"the hall: {', '.join(FLOOR_PLANS)}, or the path of a floor plan")
@@ -110,8 +116,9 @@ class PushbotWorld:
         """The event cameras of the robots."""
         self._slip = LastingNoise(rng, (count, 3), STEP_NS * 1e-9, _SLIP_S)
         self._drive = Drive(params.wheel_separation, params.wheel_noise, params.turn_slip)
+        self._radii = np.full(count, BODY_RADIUS_M)
         for robot in range(count):
-            if self._is_blocked(robot, self.poses):
+            if is_blocked(plan.walls, self._radii, self.poses, robot):
                 raise WorldError(f"robot {robot + 1} of the swarm begins within a wall or another robot.")
 
     def step(self) -> None:
@@ -138,15 +145,7 @@ class PushbotWorld:
         turns = np.abs(turn_rate) * step_s / (2.0 * np.pi)
         turn_rate += self._params.turn_noise * np.sqrt(turns) * slip[:, 2] / step_s
         poses = roll(self.poses, 0.5 * (left + right), turn_rate, self._drive, step_s, noise)
-        for robot in range(len(poses)):
-            if self._is_blocked(robot, poses):
-                poses[robot, :2] = self.poses[robot, :2]
-        return poses
-
-    def _is_blocked(self, robot: int, poses: FloatArray) -> bool:
-        others = np.delete(poses[:, :2], robot, axis=0)
-        x, y, _ = poses[robot]
-        return bool(clearance(self._plan.walls, others, BODY_RADIUS_M, x, y) < BODY_RADIUS_M)
+        return kept_clear(self._plan.walls, self._radii, self.poses, poses)
 
     def _look(self, robot: int, before: FloatArray) -> None:
         """Pass the events of a robot's camera since poses `before` (N, 3) to its firmware."""

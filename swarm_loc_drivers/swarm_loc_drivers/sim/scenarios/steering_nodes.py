@@ -23,7 +23,7 @@ from nav_msgs.msg import Odometry
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, qos_profile_sensor_data
 
-from swarm_loc_drivers.common.velocity_command import Velocity
+from swarm_loc_drivers.common.robot_driver import Velocity
 from swarm_loc_drivers.sim.scenarios.droplets import Wander
 from swarm_loc_drivers.sim.scenarios.eight import EightSteering
 from swarm_loc_estimator.common.arrays import FloatArray

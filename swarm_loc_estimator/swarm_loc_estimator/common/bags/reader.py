@@ -8,22 +8,25 @@ from __future__ import annotations
 import itertools
 import shutil
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
-from types import MappingProxyType, TracebackType
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import lz4.frame  # type: ignore[import-untyped]
-import numpy as np
 import zstandard
-from numpy.typing import NDArray
 from rosbags.rosbag2 import ReaderError
 from rosbags.rosbag2.metadata import parse_qos
 from typing_extensions import Self
 
-from swarm_loc_estimator.common.bags.bag_file import BagError, BagTopic, RawMessage, ReadErrors
-from swarm_loc_estimator.common.bags.mcap_file import McapFile
-from swarm_loc_estimator.common.bags.sqlite_file import SqliteFile
+from swarm_loc_estimator.common.bags.bag_file import (
+    BagError,
+    BagTopic,
+    McapFile,
+    RawMessage,
+    ReadErrors,
+    SqliteFile,
+)
 from swarm_loc_estimator.common.files import temporary_folder
 from swarm_loc_estimator.common.health import listed
 from swarm_loc_estimator.common.messages.streams import MessageBatch, SerializedMessage, merge_streams
@@ -72,16 +75,24 @@ def unpack_messages(batches: Iterator[MessageBatch], losses: ReadErrors) -> Iter
     """Unpack the messages that are compressed one by one; what cannot be unpacked is counted and left out."""
     damaged = 0
     for batch in batches:
-        packed = _is_packed(batch)
+        packed = batch.length >= len(_ZSTD)  # whether each message begins like a zstd frame
+        for k, byte in enumerate(_ZSTD):
+            packed[packed] = batch.data[batch.offset[packed] + k] == byte
         if not packed.any():
             yield batch
             continue
         messages, size = [], 0
         for is_packed, (topic, log_ns, data) in zip(packed.tolist(), batch.messages(), strict=True):
-            content = _unpacked_message(data) if is_packed else data
-            if content is None:
-                damaged += 1
-                continue
+            content = data
+            if is_packed:
+                with (
+                    suppress(zstandard.ZstdError),
+                    zstandard.ZstdDecompressor().stream_reader(data) as reader,
+                ):
+                    content = reader.read(MAX_MESSAGE + 1)
+                if content is data or len(content) > MAX_MESSAGE:
+                    damaged += 1
+                    continue
             messages.append(SerializedMessage(topic, content, log_ns))
             size += len(content)
             if size > _MAX_BATCH:
@@ -90,24 +101,6 @@ def unpack_messages(batches: Iterator[MessageBatch], losses: ReadErrors) -> Iter
         yield MessageBatch.of(messages)
     if damaged:
         losses.add(f"{damaged} messages whose compression is damaged were skipped.")
-
-
-def _is_packed(batch: MessageBatch) -> NDArray[np.bool_]:
-    """Whether each message (n,) begins like a zstd frame."""
-    packed = batch.length >= len(_ZSTD)
-    for k, byte in enumerate(_ZSTD):
-        packed[packed] = batch.data[batch.offset[packed] + k] == byte
-    return packed
-
-
-def _unpacked_message(data: bytes) -> bytes | None:
-    """An unpacked message; None if it is damaged or too large."""
-    try:
-        with zstandard.ZstdDecompressor().stream_reader(data) as reader:
-            content = reader.read(MAX_MESSAGE + 1)
-    except zstandard.ZstdError:
-        return None
-    return content if len(content) <= MAX_MESSAGE else None
 
 
 __all__ = ["BagError", "BagReader", "BagTopic", "RawMessage"]
@@ -142,11 +135,9 @@ class BagReader:
         self._files: list[BagFile] = []
         self._own_losses = ReadErrors(path.name)
         self._unpacked = ExitStack()
-        paths = self._find()
         try:
-            self._open(paths)
-            self._check_encodings()
-            self._check_names()
+            self._open()
+            self._check_topics()
         except BaseException:
             self.close()
             raise
@@ -191,11 +182,8 @@ class BagReader:
         return self._batches({t: number_of[t.name] for t in self.topics if t.name in number_of})
 
     def _batches(self, number_of: Mapping[BagTopic, int]) -> Iterator[MessageBatch]:
-        stored = {
-            topic: number_of[here]
-            for topic in self._stored()
-            if (here := self._here(topic)) and here in number_of
-        }
+        names = {topic: here for topic in self._stored() if (here := self._here(topic))}
+        stored = {topic: number_of[here] for topic, here in names.items() if here in number_of}
         ends = [file.time_range_ns for file in self._files]
         streams = [unpack_messages(file.batches(stored), file.losses) for file in self._files]
         if all(before[1] < after[0] for before, after in itertools.pairwise(ends)):
@@ -223,15 +211,13 @@ class BagReader:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
-    def _open(self, paths: list[Path]) -> None:
+    def _open(self) -> None:
         """Open every file; one that is unreadable among readable ones is a loss."""
         errors: list[BagError] = []
-        for path in paths:
+        for path in self._find():
             try:
                 self._files.append(self._open_file(path))
             except BagError as error:  # each file may fail on its own
@@ -251,8 +237,8 @@ class BagReader:
         except BagError as error:
             raise BagError(str(error).replace(str(plain), str(path))) from error
 
-    def _check_encodings(self) -> None:
-        """Name topics that are not serialized as in ROS 2; raises BagError if there are no others."""
+    def _check_topics(self) -> None:
+        """Name topics that cannot be read or are not there; raises BagError if there are no others."""
         stored = self._stored()
         for encoding in dict.fromkeys(topic.encoding for topic in stored):
             if encoding in _ENCODINGS:
@@ -263,14 +249,11 @@ class BagReader:
             self._own_losses.add(f"{said}; {advice}.")
         if stored and not any(topic.encoding in _ENCODINGS for topic in stored):
             raise BagError("\n".join(self._own_losses))
-
-    def _check_names(self) -> None:
-        """Name renamed topics that are not in the bag; raises BagError if none is."""
-        names = {topic.name for topic in self._stored()}
-        missing = [name for name in self._renamed if name not in names]
+        there = {topic.name for topic in stored}
+        missing = [name for name in self._renamed if name not in there]
         if missing and len(missing) == len(self._renamed):
             said = f"'{self._path}' has no topic {listed(missing)}"
-            raise BagError(f"{said}; it has {listed(sorted(names)) or 'none'}.")
+            raise BagError(f"{said}; it has {listed(sorted(there)) or 'none'}.")
         for name in missing:
             self._own_losses.add(f"there is no topic {name}, which {self._renamed[name]} is mapped to.")
 

@@ -117,21 +117,8 @@ mocap4r2_msgs/RigidBodies: std_msgs/Header header, uint32 frame_number, RigidBod
 """.replace(",\n", ",")
 """Types of motion capture, as their packages define them."""
 
-NUMBERS = {
-    "bool": "?",
-    "byte": "B",
-    "char": "B",
-    "int8": "b",
-    "uint8": "B",
-    "int16": "h",
-    "uint16": "H",
-    "int32": "i",
-    "uint32": "I",
-    "int64": "q",
-    "uint64": "Q",
-    "float32": "f",
-    "float64": "d",
-}
+_PRIMITIVE = "bool byte char int8 uint8 int16 uint16 int32 uint32 int64 uint64 float32 float64"
+NUMBERS = dict(zip(_PRIMITIVE.split(), "?BBbBhHiIqQfd", strict=True))
 """Primitive types but strings -> their letter, which `struct` and NumPy share."""
 
 _FIELD = re.compile(r"(?P<type>[\w/]+)(?P<array>\[(?P<count>\d*)\])?\s+(?P<name>[a-z]\w*)\s*$")

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.messages.cdr import (
@@ -96,6 +96,16 @@ def encode_detections(frame_id: str, stamp_ns: int, detections: Rows) -> bytes:
     header = {"stamp": stamp_ns, "frame_id": frame_id}
     message_type = ANONYMOUS_DETECTIONS if detections.dtype == ANONYMOUS_DTYPE else DETECTIONS
     return encode({"header": header, "detections": detections}, message_type)
+
+
+def blank_detections(ids: ArrayLike, content: int) -> Rows:
+    """Detections (n,) of markers by ids (n,), at the origin, without a covariance."""
+    rows = np.zeros(np.shape(ids), DETECTION_DTYPE)
+    rows["id"], rows["content"] = ids, content
+    rows["id_margin"] = rows["corners_px"] = rows["alternative_ratio"] = np.nan
+    rows["covariance"][:, 0, 0] = -1.0
+    rows["alternative_orientation"][:, 3] = 1.0
+    return rows
 
 
 def encode_identities(

@@ -1,0 +1,1 @@
+"""Simulated rooms: robots that drive about by themselves, and sensors as messages."""
