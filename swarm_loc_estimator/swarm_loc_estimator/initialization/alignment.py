@@ -7,6 +7,7 @@ compiled because every waiting robot tries repeatedly; they are not inlined, whi
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -378,7 +379,7 @@ def _refined(constraints: ConstraintArray, begin: FloatArray) -> tuple[FloatArra
 
 
 def _split_errors(
-    constraints: ConstraintArray, track_noise: FloatArray, found: tuple[FloatArray, FloatArray, FloatArray]
+    constraints: ConstraintArray, track_noise: FloatArray, found: Sequence[FloatArray]
 ) -> InitialPose:
     """Split the error of a transform (3,) into its own part and those of the robots that it depends on.
 
