@@ -258,11 +258,7 @@ def _near(walls: WallMap, variance: float) -> float:
 def _inverted(
     information: FloatArray, imitated: FloatArray, scale: float
 ) -> tuple[FloatArray, FloatArray, int]:
-    """The inverse (3, 3) of an information, 0 where it tells nothing; the covariance; directions known.
-
-    Errors of normals imitate a part (3, 3). By the mean distance of the ends [m], angles compare with
-    positions.
-    """
+    """The inverse (3, 3) of an information, 0 where it tells nothing; the covariance; directions known."""
     unit = np.diag(np.array([1.0, 1.0, 1.0 / scale]))
     values, axes = np.linalg.eigh(np.dot(unit, np.dot(information, unit)))
     vectors = np.ascontiguousarray(axes.T)
