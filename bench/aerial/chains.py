@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
-from swarm_loc_estimator.identification.anchors import Scale
-from swarm_loc_estimator.identification.chain import ChainModel, Chains
+from swarm_loc_estimator.identification.chain import ChainModel, Chains, Scale
 from swarm_loc_estimator.identification.picture import Picture, TrackPoint
 
 ComplexArray = NDArray[np.complex128]

@@ -118,7 +118,9 @@ def simulate_gyroscopes(rng: np.random.Generator, run: LivedRun, imu: ImuModel) 
     stamps, rate = np.tile(stamp_ns, len(parts)), np.concatenate(parts)
     arrivals = arrival_ns(rng, stamps, CAMERA_LATENESS)
     velocity = np.column_stack([np.zeros((rate.size, 2)), rate])
-    return in_order_of_arrival([TurnRateRows(robots, stamps, velocity, np.full(rate.size, np.nan), arrivals)])
+    unknown = np.full(velocity.shape, np.nan)
+    rows = TurnRateRows(robots, stamps, velocity, unknown[:, 0], arrivals, unknown)
+    return in_order_of_arrival([rows])
 
 
 def _readings(

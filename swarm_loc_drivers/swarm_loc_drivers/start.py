@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from swarm_loc_estimator.common.command_line import Program
 
+dotbot_node = Program("swarm_loc_drivers.dotbot.dotbot_node")
 droplet_driver_node = Program("swarm_loc_drivers.droplet.droplet_nodes", "run_droplet_driver")
 droplet_fleet_node = Program("swarm_loc_drivers.droplet.droplet_nodes", "run_droplet_fleet")
 droplet_steering_node = Program("swarm_loc_drivers.sim.scenarios.steering_nodes", "run_droplet_steering")

@@ -160,7 +160,7 @@ def start_lines(plan: SwarmPlan, file: str) -> list[str]:
         lines.append(
             f"./run swarm_loc_vision marker_detector_node --ros-args -r __ns:=/{robot}{remapped} {described}"
         )
-    if sensors & {"fix", "mocap"}:
+    if sensors & {"fix", "mocap"} and known.localizer:
         source = "" if "mocap" in sensors else " -p source:=pose  # of vrpn_mocap; its page has others"
         lines.append(f"./run swarm_loc_estimator localizer_bridge --ros-args -p swarm_file:={file}{source}")
     if "uwb" in sensors:

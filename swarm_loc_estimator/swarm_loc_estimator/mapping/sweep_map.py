@@ -240,7 +240,8 @@ class SweepMap:
 
     def drop(self, node: int) -> None:
         """Take back a sweep."""
-        self.drawn.pop(node, None)
+        if self.drawn.pop(node, None) is None:  # the stop of a robot with a laser pointer
+            return
         self._points.counts[node] = 0
         self._ways.cut(node)
         self.loops = [one for one in self.loops if node not in one[:2]]

@@ -2,12 +2,7 @@
 
     ./run swarm_loc_estimator estimator_node --ros-args -p swarm_file:=swarm.yaml
 
-It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness`, `<robot>/fix` and
-`<robot>/initialpose` of the robots in the swarm description, and to `aerial/detections`; with `shared_topics`
-to `swarm/odom`, `swarm/detections` and `swarm/fixes` in their place. It publishes
-`swarm/poses`, `<robot>/pose`, `aerial/identities`, `/diagnostics`, and `/tf` (map to `<robot>/odom`, which no
-other node may publish) or, with `tf_per_robot`, `<robot>/tf`.
-Services: `~/reset`, `~/set_robot_pose`, and those of a managed node. Parameters: see `doc/estimator_node.md`.
+Topics, services and parameters: see `doc/estimator_node.md`. No other node may publish its transforms.
 """
 
 from __future__ import annotations
@@ -45,8 +40,7 @@ _ORDINARY_DROPS = SHED_REASONS | {
     *("aerial_ambiguous", "aerial_unassigned", "duplicate", "gated", "ir_saturated", "ir_too_weak"),
     *("ir_undetermined", "odometry_duplicate", "reset", "too_old", "not_localized"),
 }
-"""Drops that are ordinary and not logged: late, duplicate or outlying data and infrared out of range.
-Drops under overload have a warning of their own."""
+"""Ordinary drops, which are not logged; those under overload have a warning of their own."""
 
 _READ_BYTES = 8_000_000  # Read and thinned out at once: what is read takes more memory than what is left
 INACTIVE = "Nothing was changed: the estimator is not active."  # Answer of the services while it is not
@@ -55,10 +49,7 @@ CreateEstimator = Callable[[Swarm, Settings], Estimator]
 
 
 class EstimatorNode(ManagedNode[EstimatorParameters]):
-    """Takes messages, runs the estimator once per tick and publishes the estimate.
-
-    Tests pass another function that creates the estimator.
-    """
+    """Takes messages, runs the estimator, which tests replace, once per tick, and publishes the estimate."""
 
     def __init__(self, create_estimator: CreateEstimator = Estimator, **node_arguments: Any) -> None:
         super().__init__("estimator", EstimatorParameters, **node_arguments)
@@ -149,8 +140,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
     def _estimate_at(self, now_ns: int, begin_s: float) -> tuple[Estimate, float]:
         """Fuse within the time budget; returns the poses at an instant and the time that fusing took [s].
 
-        Fusing a large swarm takes longer than a tick and is spread over several ticks. In between, poses are
-        predicted by odometry.
+        Fusing a large swarm is spread over several ticks, in between which poses are predicted by odometry.
         """
         is_due = not self._estimator.is_fusing and self._pace.is_due(begin_s, now_ns)
         if is_due:
@@ -196,7 +186,6 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
 
     @property
     def _frame(self) -> str:
-        """Frame of all poses."""
         return f"{self._origin}/start" if self._origin else self.params.map_frame
 
     def report(self) -> None:
@@ -221,8 +210,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         """One report per robot and one for the estimator; warnings are logged."""
         # Load, and what was left out or dropped.
         periods_s = self.params.tick_period_s, self._estimator.settings.fusion_period_s
-        load = diagnostics.load_report(cost, elapsed_s, *periods_s)
-        causes = [load, diagnostics.shedding_report(cost)]
+        causes = [diagnostics.load_report(cost, elapsed_s, *periods_s), diagnostics.shedding_report(cost)]
         for report in causes:
             if report.warning:
                 self.health.warn(report.name, report.message)

@@ -1,7 +1,7 @@
 """Inertial measurement units: turn rates of robots, which replace the turns that the wheels report.
 
-Only the angular velocity is used. The orientation that some IMUs compute drifts like its integral, and
-accelerations say nothing about a robot that drives on a floor.
+Angular velocities are used. Of the orientation that some IMUs compute, the heading drifts like their
+integral; its tilt, by gravity, says which of their parts turns a robot that leans, as on a ramp or on legs.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from swarm_loc_estimator.sensors.sensor import NO_ROWS, DropCounts, Sensor, Sens
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 
 _MAX_RATE = 200.0  # Larger turn rates are no measurements [rad/s]
+_MAX_TILT = 0.5  # An orientation that leans by more against the mount is none, or of other axes [rad]
 
 
 class TurnRateRows(NamedTuple):
@@ -31,9 +32,10 @@ class TurnRateRows(NamedTuple):
     #: (k,) turn rate about the vertical, without calibration [rad/s]; before the conversion NaN, -inf: none
     rate: FloatArray
     arrival_ns: IntArray  #: (k,) arrival times
+    up: FloatArray  #: (k, 3) the vertical in the frame of the IMU, by its orientation; NaN: not known
 
 
-NO_TURN_RATES = TurnRateRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros(0), NO_ROWS)
+NO_TURN_RATES = TurnRateRows(NO_ROWS, NO_ROWS, np.zeros((0, 3)), np.zeros(0), NO_ROWS, np.zeros((0, 3)))
 
 
 class TurnRateSensor(Sensor):
@@ -41,41 +43,36 @@ class TurnRateSensor(Sensor):
 
     name, topic, message_type = "imu", "imu", IMU
     only_expected, unit = True, None
-    optional = MappingProxyType({"rate": math.nan})
+    optional = MappingProxyType({"rate": math.nan, "up": math.nan})
 
     def __init__(self, swarm: Swarm, settings: SensorSettings, drops: DropCounts) -> None:
         super().__init__(swarm, settings, drops)
         # last row of Ry(pitch) Rx(roll): what rates about the axes of the IMU turn about the vertical
-        self._vertical = np.array(
-            [
-                [
-                    -math.sin(one.pitch),
-                    math.cos(one.pitch) * math.sin(one.roll),
-                    math.cos(one.pitch) * math.cos(one.roll),
-                ]
-                for one in (robot.imu for robot in swarm.robots)
-            ]
-        ).reshape(-1, 3)
+        tilts = [(robot.imu.pitch, robot.imu.roll) for robot in swarm.robots]
+        rows = [(-math.sin(p), math.cos(p) * math.sin(r), math.cos(p) * math.cos(r)) for p, r in tilts]
+        self._vertical = np.array(rows).reshape(-1, 3)
 
     @classmethod
     def columns(cls, messages: Messages[Any]) -> TurnRateRows:
         """Convert decoded messages (n,); a first covariance of -1 says that there is no rate."""
-        velocity = np.array(
-            [
-                (message.angular_velocity.x, message.angular_velocity.y, message.angular_velocity.z)
-                for message in messages.decoded
-            ],
-            dtype=float,
-        ).reshape(-1, 3)
+        rates = [
+            (one.angular_velocity.x, one.angular_velocity.y, one.angular_velocity.z)
+            for one in messages.decoded
+        ]
+        velocity = np.array(rates, dtype=float).reshape(-1, 3)
         # the convention of sensor_msgs
         has_none = [message.angular_velocity_covariance[0] == -1.0 for message in messages.decoded]
         rate = np.where(has_none, -np.inf, np.nan)
-        return TurnRateRows(messages.robot, messages.stamp_ns, velocity, rate, messages.arrival_ns)
+        up = np.array([_vertical(message) for message in messages.decoded], dtype=float).reshape(-1, 3)
+        return TurnRateRows(messages.robot, messages.stamp_ns, velocity, rate, messages.arrival_ns, up)
 
     def measure(self, rows: TurnRateRows) -> TurnRateRows:
         """Select finite turn rates of robots with an IMU, turned to the vertical."""
         has_none = rows.rate == -np.inf
-        rows = rows._replace(rate=np.sum(self._vertical[rows.robot] * rows.velocity, axis=1))
+        vertical = self._vertical[rows.robot]
+        leans = np.sum(vertical * rows.up, axis=1) > math.cos(_MAX_TILT)  # False for NaN
+        vertical = np.where(leans[:, None], rows.up, vertical)
+        rows = rows._replace(rate=np.sum(vertical * rows.velocity, axis=1))
         reasons = {
             "imu_no_rate": has_none,
             "imu_non_finite": ~np.isfinite(rows.rate),
@@ -88,3 +85,13 @@ class TurnRateSensor(Sensor):
     def expected_of(cls, robot: Robot) -> bool:
         """Whether the description says that the robot has an IMU."""
         return robot.imu.is_used
+
+
+def _vertical(message: Any) -> tuple[float, float, float]:
+    """The vertical in the frame of an IMU; NaN if its first covariance is -1 or it has no orientation."""
+    q = message.orientation
+    norm = q.x**2 + q.y**2 + q.z**2 + q.w**2
+    if message.orientation_covariance[0] == -1.0 or not 0.5 < norm < 2.0:  # False for NaN
+        return math.nan, math.nan, math.nan
+    x, y = 2.0 * (q.x * q.z - q.w * q.y) / norm, 2.0 * (q.y * q.z + q.w * q.x) / norm
+    return x, y, 1.0 - 2.0 * (q.x**2 + q.y**2) / norm

@@ -58,11 +58,7 @@ class Said(NamedTuple):
 
 
 class Mounts:
-    """Collects static transforms and the frames of sensors.
-
-    Args:
-        swarm: The swarm as described.
-    """
+    """Collects static transforms and the frames of sensors of a described swarm."""
 
     def __init__(self, swarm: Swarm) -> None:
         self._swarm = swarm
@@ -177,7 +173,5 @@ class Mounts:
 def _says(robot: Robot, section: str, key: str) -> bool:
     """Whether the description says a number."""
     model: Any = getattr(robot, section)
-    return (
-        f"{section}.{key}" in robot.said
-        or getattr(model, key) != type(model).__dataclass_fields__[key].default
-    )
+    default = type(model).__dataclass_fields__[key].default
+    return f"{section}.{key}" in robot.said or getattr(model, key) != default

@@ -66,7 +66,8 @@ class KnownRobot:
     lidar: LidarModel = LidarModel()  # Its lidar, as far as its transforms do not say
     lidar_frame: str = ""  # Frame of its scans; "": it has no lidar
     fix: FixModel = FixModel(position_sigma=0.002, heading_sigma=0.01)  # Of fixes without covariance
-    localizer: Localizer = Localizer()  # How motion capture is usually published for it
+    # How motion capture is usually published for it; None: its driver publishes fixes
+    localizer: Localizer | None = Localizer()
     tf_per_robot: bool = False  # Whether it publishes transforms on <robot>/tf, in frames without its name
     image: str = ""  # Namespace of its images below its own
     # Executable of swarm_loc_drivers and its arguments, of {robot} and {file}; "": others drive it
@@ -208,6 +209,8 @@ KNOWN_ROBOTS = MappingProxyType(
             None,
             random_walk=RandomWalk(position=0.01, heading=1.0),
             fix=FixModel(position_sigma=0.01, heading_sigma=0.1),
+            localizer=None,
+            driver="dotbot_node --ros-args -p swarm_file:={file} -p url:=http://localhost:8000",
             sources="random_walk and fix: guesses for 10 cm/s and its Lighthouse.",
         ),
         "crazyflie": KnownRobot(

@@ -98,11 +98,7 @@ class Match(NamedTuple):
 
 
 def wall_map(occupancy: OccupancyMap, path: Path) -> WallMap:
-    """Prepare a map for matching.
-
-    Args:
-        occupancy: The map.
-        path: Its file, for errors.
+    """Prepare a map for matching; its file is for errors.
 
     Raises:
         MapFileError: No cell is occupied, or none is free.
@@ -166,15 +162,10 @@ def match(
     predicted: FloatArray,
     covariance: FloatArray,
 ) -> Match:
-    """Match a sweep to a map from a predicted pose.
+    """Match a sweep to a map from a predicted pose (3,) with its covariance (3, 3).
 
-    Args:
-        walls: The map.
-        ends: (n, 2) ends of beams that met something, in the frame of the robot [m].
-        origin: (2,) the lidar in that frame [m].
-        variance: (n,) of their distances [m^2].
-        predicted: (3,) pose.
-        covariance: (3, 3) of the predicted pose.
+    `ends` (n, 2) are of beams that met something, in the frame of the robot, `origin` (2,) is the lidar there
+    [m], `variance` (n,) that of the distances [m^2].
     """
     pose, scale = predicted.copy(), 1.0
     for k in range(len(ends)):
@@ -213,13 +204,7 @@ def normal_equations(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """The information (3, 3) of a sweep on a pose (3,), the part that normals imitate, and the gradient (3,).
 
-    Args:
-        walls: The map.
-        ends: (n, 2), see `match`.
-        origin: (2,).
-        variance: (n,).
-        pose: (3,) where the beams are compared with the map.
-        reach: Maximum distance from a wall [m]; 0: each beam's own.
+    `reach` is the maximum distance from a wall [m]; 0: each beam's own. For the sweep see `match`.
     """
     count, cos, sin = len(ends), math.cos(pose[2]), math.sin(pose[2])
     rows, residual, noise = np.zeros((count, 6)), np.zeros(count), np.zeros(count)
@@ -273,7 +258,11 @@ def _near(walls: WallMap, variance: float) -> float:
 def _inverted(
     information: FloatArray, imitated: FloatArray, scale: float
 ) -> tuple[FloatArray, FloatArray, int]:
-    """The inverse (3, 3) of an information, 0 where it tells nothing; the covariance; directions known."""
+    """The inverse (3, 3) of an information, 0 where it tells nothing; the covariance; directions known.
+
+    Errors of normals imitate a part (3, 3). By the mean distance of the ends [m], angles compare with
+    positions.
+    """
     unit = np.diag(np.array([1.0, 1.0, 1.0 / scale]))
     values, axes = np.linalg.eigh(np.dot(unit, np.dot(information, unit)))
     vectors = np.ascontiguousarray(axes.T)
@@ -384,14 +373,7 @@ class MatchedScan(NamedTuple):
 
 
 class MapScans:
-    """Matches scans to the known map.
-
-    Args:
-        swarm: Robots with lidars.
-        settings: Thresholds of lost robots.
-        tracks: Odometry of the robots.
-        sweeps: Sweeps by robot and stamp.
-    """
+    """Matches scans to the known map; sweeps are by robot and stamp."""
 
     def __init__(self, swarm: Swarm, settings: Settings, tracks: OdometryTracks, sweeps: Sweeps) -> None:
         self.tracks, self._sweeps = tracks, sweeps

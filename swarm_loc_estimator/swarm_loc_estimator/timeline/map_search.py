@@ -20,7 +20,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from swarm_loc_estimator.common.arrays import BoolArray, FloatArray, IntArray
+from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.common.jit import cached_njit
 from swarm_loc_estimator.common.numerics import wrap
 from swarm_loc_estimator.common.se2 import between, compose, inverse, wrap_angle
@@ -187,22 +187,15 @@ def described_map(swarm: Swarm) -> SearchMap | None:
 
 
 class MapSearch:
-    """Searches places in the known map.
-
-    Args:
-        scans: What knows the beams of sweeps.
-        swarm: The robots.
-    """
+    """Searches places of robots in the known map; `scans` knows the beams of sweeps."""
 
     def __init__(self, scans: MapScans, swarm: Swarm) -> None:
         self._scans, self._robots = scans, swarm.robots
 
     def place_of(self, state: SwarmState, one: Measurements) -> tuple[FoundPlace | None, Verdict]:
-        """Search the place of a robot that is not located, by its scan; returns it once it is found.
+        """Search the place of a robot that is not located, by the row of its scan; returns it once found.
 
-        Args:
-            state: With a map; what is known of places is changed.
-            one: Row of the scan.
+        What the state, which has a map, knows of places is changed.
         """
         robot, stamp_ns, scans = int(one.target), int(one.stamp_ns), self._scans
         sweep, described = scans.sweep_of(one), self._robots[robot]
@@ -279,14 +272,14 @@ class MapSearch:
             look = Look(beams, track)
             begun = PossiblePlaces(np.zeros((0, 3)), np.zeros((0, 1)), (look,), stamp_ns, pause_ns)
             return self._advanced(begun, PlaceSearch(), known), None
-        away, turn = _moved(before.looks[-1].track, track)
+        x, y, turn = between(before.looks[-1].track, track)
+        away, turn = math.hypot(x, y), abs(float(wrap_angle(turn)))
         is_look = away >= _LOOK_M or turn >= _LOOK_TURN
         if not (is_look or before.is_sole):
             return before, None
         # match each place again, and rule out what explains less
-        covariance = np.diag(
-            [_SLIP[0] + _SLIP[2] * away, _SLIP[0] + _SLIP[2] * away, _SLIP[1] + _SLIP[2] * turn]
-        )
+        slip = _SLIP[0] + _SLIP[2] * away
+        covariance = np.diag([slip, slip, _SLIP[1] + _SLIP[2] * turn])
         found = [match(known.walls, *beams, compose(one, track), covariance**2) for one in before.transform]
         poses = np.array([one.pose for one in found])
         fits = np.column_stack([before.fits, [_fit(one) for one in found]])
@@ -338,11 +331,8 @@ class MapSearch:
             else:
                 transform.append(latest)
                 fits.append(own)
-        search = search._replace(
-            poses=search.poses[tried:],
-            transform=(*search.transform, *transform),
-            fits=(*search.fits, *fits),
-        )
+        transforms, every = (*search.transform, *transform), (*search.fits, *fits)
+        search = search._replace(poses=search.poses[tried:], transform=transforms, fits=every)
         return places._replace(search=search) if len(search.poses) else _searched(places, search)
 
 
@@ -351,10 +341,11 @@ def _searched(places: PossiblePlaces, search: PlaceSearch) -> PossiblePlaces:
     transform = np.concatenate([places.transform, np.reshape(search.transform, (-1, 3))])
     fits = np.concatenate([places.fits, np.reshape(search.fits, (-1, len(places.looks)))])
     poses, known = compose(transform, places.looks[-1].track), len(places.transform)
-    others = np.arange(known, len(poses))
-    if known:
-        others = others[_apart(poses[0], poses[known:])]
-    others = np.concatenate([np.arange(known), others])
+    others = np.arange(len(poses))
+    if known:  # other places than the known one
+        off = poses - poses[0]
+        is_apart = (np.hypot(off[:, 0], off[:, 1]) > _APART_M) | (np.abs(wrap_angle(off[:, 2])) > _APART)
+        others = others[is_apart | (others < known)]
     kept = others[_best(poses[others], fits[others])][:_HYPOTHESES]
     kept = kept[fits[kept].sum(axis=1) > 0.0]
     is_complete = len(places.looks) >= _LOOKS
@@ -494,20 +485,8 @@ def _best(poses: FloatArray, fits: FloatArray) -> IntArray:
     return kept
 
 
-def _moved(before: FloatArray, now: FloatArray) -> tuple[float, float]:
-    """Distance [m] and absolute turn [rad] from a pose (3,) to another."""
-    x, y, turn = between(before, now)
-    return math.hypot(x, y), abs(float(wrap_angle(turn)))
-
-
 def _squared(pose: FloatArray, other: FloatArray, covariance: FloatArray) -> float:
     """Squared distance of two poses (3,), in variances."""
     off = other - pose
     off[2] = wrap_angle(off[2])
     return float(off @ np.linalg.solve(covariance, off))
-
-
-def _apart(pose: FloatArray, others: FloatArray) -> BoolArray:
-    """Which poses (n, 3) are other places than a pose (3,)."""
-    off = others - pose
-    return np.asarray((np.hypot(off[:, 0], off[:, 1]) > _APART_M) | (np.abs(wrap_angle(off[:, 2])) > _APART))

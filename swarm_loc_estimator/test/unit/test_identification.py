@@ -10,8 +10,7 @@ from numpy.typing import ArrayLike
 
 from swarm_loc_estimator.common import se2
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
-from swarm_loc_estimator.identification.anchors import Scale
-from swarm_loc_estimator.identification.chain import ChainModel, Chains
+from swarm_loc_estimator.identification.chain import ChainModel, Chains, Scale
 from swarm_loc_estimator.identification.picture import Picture, TrackPoint, gathered_between
 
 SECOND = 10**9

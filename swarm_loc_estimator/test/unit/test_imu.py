@@ -191,6 +191,26 @@ def test_messages_are_read_and_bad_ones_counted() -> None:
         TurnRateSensor.decode(message((0.0, 0.0, 0.0))[:40])
 
 
+@pytest.mark.parametrize("mounted", [0.0, math.pi])
+@pytest.mark.parametrize(("lean", "knows"), [(0.3, True), (0.3, False), (-0.4, True)])
+def test_a_robot_that_leans_turns_about_the_vertical(mounted: float, lean: float, knows: bool) -> None:
+    """By the orientation of its IMU, if it has one; one of another mount is none."""
+    mount, yaw_rate = Rotation.from_euler("X", mounted), 0.7
+    turned = Rotation.from_euler("ZY", [1.0, lean]) * mount
+    velocity = turned.inv().apply([0.0, 0.0, yaw_rate])
+    fields = {"header": {"stamp": T0}, "angular_velocity": dict(zip("xyz", velocity, strict=True))}
+    covariance = [0.0 if knows else -1.0] + [0.0] * 8
+    seen = dict(zip("xyzw", turned.as_quat(), strict=True))
+    data = encode({**fields, "orientation": seen, "orientation_covariance": covariance}, IMU)
+    for described, uses in ((mounted, knows), (mounted + 0.5 * math.pi, False)):
+        swarm = Swarm((Robot("r0", imu=replace(GYRO, roll=math.remainder(described, 2.0 * math.pi))),))
+        ingest = Ingest(swarm)
+        batch = MessageBatch.of([SerializedMessage(ingest.handle_of["r0/imu"], data, T0)])
+        (part,) = ingest.read(batch)
+        rate = TurnRateSensor(swarm, Settings(), DropCounts(1)).measure(part["imu"]).rate[0]
+        assert (abs(rate - yaw_rate) < 1e-9) == uses
+
+
 @given(st.floats(-3.0, 3.0), st.floats(-3.0, 3.0), st.floats(-3.0, 3.0))
 def test_the_mount_is_taken_into_account(roll: float, pitch: float, rate: float) -> None:
     """The IMU measures the robot's turn about the vertical in its own frame."""
@@ -198,7 +218,8 @@ def test_the_mount_is_taken_into_account(roll: float, pitch: float, rate: float)
     mount = Rotation.from_euler("YX", [pitch, roll]).as_matrix()
     velocity = mount.T @ [0.0, 0.0, rate]
     one = np.zeros(1, dtype=np.int64)
-    rows = TurnRateRows(one, one + T0, velocity[None], np.full(1, np.nan), one + T0)
+    unknown = np.full((1, 3), np.nan)
+    rows = TurnRateRows(one, one + T0, velocity[None], unknown[:, 0], one + T0, unknown)
     sensor = TurnRateSensor(Swarm((Robot("r0", imu=imu),)), Settings(), DropCounts(1))
     converted = sensor.measure(rows)
     assert converted.rate[0] == pytest.approx(rate, abs=1e-9)

@@ -300,10 +300,11 @@ def test_turns_of_gyroscopes_replace_those_of_wheels() -> None:
     true_rate = np.diff(np.unwrap(world.truth[..., 2], axis=0), axis=0) / np.diff(at_ns)[:, None] * 1e9
     rate = np.tile(true_rate, (2, 1)).T.ravel() / 1.04
     own = np.repeat(np.array(robots), 2 * len(true_rate))
+    nothing = np.full((rate.size, 3), np.nan)
     turned = replace(
         recording,
         odometry=rows._replace(pose=straight),
-        turn_rates=TurnRateRows(own, stamp_ns, np.zeros((rate.size, 3)), rate, stamp_ns),
+        turn_rates=TurnRateRows(own, stamp_ns, nothing, rate, stamp_ns, nothing),
     )
     imu = ImuModel(turn_noise_density=1e-3, timeout_s=1.0)
     with_imu = tuple(replace(one, imu=imu) for one in world.swarm.robots)

@@ -73,11 +73,6 @@ class AerialSettings:
     )
     max_robots: int = number(200, "1", 1, 2000, "most detections in one image; the clearest are kept")
 
-    @property
-    def region(self) -> tuple[FloatArray, FloatArray]:
-        """Lower and upper bounds (2,) of the searched region [m]."""
-        return np.array([self.x_min, self.y_min]), np.array([self.x_max, self.y_max])
-
 
 @dataclass(frozen=True)
 class AerialParameters:
@@ -227,11 +222,8 @@ class ControlPoints:
 
     def concatenate(self, other: ControlPoints) -> ControlPoints:
         """These points and others."""
-        return ControlPoints(
-            [*self.names, *other.names],
-            np.concatenate([self.places, other.places]),
-            np.concatenate([self.pixels, other.pixels]),
-        )
+        places, pixels = (self.places, other.places), (self.pixels, other.pixels)
+        return ControlPoints([*self.names, *other.names], np.concatenate(places), np.concatenate(pixels))
 
 
 NO_POINTS = ControlPoints((), np.zeros((0, 3)), np.zeros((0, 2)))
@@ -368,11 +360,8 @@ def misfit(fit: PoseFit, points: ControlPoints, settings: AerialSettings) -> str
     if fit.deviations[worst] <= settings.max_residual:
         return ""
     for suspect in np.argsort(-fit.deviations).tolist():
-        rest = ControlPoints(
-            [name for k, name in enumerate(points.names) if k != suspect],
-            np.delete(points.places, suspect, axis=0),
-            np.delete(points.pixels, suspect, axis=0),
-        )
+        columns = (np.delete(one, suspect, axis=0) for one in (points.places, points.pixels))
+        rest = ControlPoints([n for k, n in enumerate(points.names) if k != suspect], *columns)
         try:
             without = solve_pose(fit.ground.camera, rest, settings)
         except ControlPointError:

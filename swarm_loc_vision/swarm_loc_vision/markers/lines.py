@@ -47,14 +47,9 @@ def profile_crossings(
 ) -> None:
     """Find where brightness crosses the middle level between dark and light on profiles across the sides.
 
-    Args:
-        image: (height, width).
-        lens: See `camera.Camera`.
-        quads: (N, 4, 2) clockwise, dark inside [ideal px].
-        reaches: (N,) length of a profile to each side [px].
-        spacing: Distance of profiles along a side, if MAX_PROFILES are enough [px].
-        crossings: (N, 4, MAX_PROFILES, 3) filled with the place along side k, from corner k to k + 1 [px],
-            the distance of the crossing outside of it [px], and the contrast; contrast 0: no crossing.
+    Crossings (N, 4, MAX_PROFILES, 3) are filled with the place along side k, from corner k to k + 1, the
+    distance outside of it [px], and the contrast, 0: no crossing. Profiles have a length (N,) to each side,
+    and a spacing if MAX_PROFILES are enough [px]; for the other arguments see `refine`.
     """
     most = 2 * math.ceil(_MAX_REACH_PX / _STEP_PX) + 1
     profiles = np.empty((4, MAX_PROFILES, most))
@@ -82,7 +77,11 @@ def profile_crossings(
                 out_u, out_v = raw_pixel(lens, middle_u + dv, middle_v - du)  # straight enough over a profile
                 profile = profiles[k, m]
                 if _profile(image, raw_u, raw_v, out_u - raw_u, out_v - raw_v, half, profile):
-                    dark[k, m], light[k, m] = _extremes(profile, half)
+                    # the darkest inner and the lightest outer value
+                    dark[k, m] = light[k, m] = profile[half]
+                    for j in range(half):
+                        dark[k, m] = min(dark[k, m], profile[j])
+                        light[k, m] = max(light[k, m], profile[half + 1 + j])
                     crossings[n, k, m, 0] = along
                     crossings[n, k, m, 2] = light[k, m] - dark[k, m]
                     taken += 1
@@ -106,9 +105,8 @@ def profile_crossings(
 def _common_level(contrasts: FloatArray, dark: FloatArray, light: FloatArray) -> float:
     """The middle level of the clearest quarter of a small marker's profiles.
 
-    Where cells are hardly wider than the blur, a white cell behind the border keeps many profiles from
-    getting dark, and the surroundings of a narrow margin keep them from getting light. Their own middle
-    levels would be biased.
+    Where cells are hardly wider than the blur, white cells behind the border and dark surroundings bias the
+    middle levels of many profiles.
     """
     all_dark, all_light = np.empty(contrasts.size), np.empty(contrasts.size)
     count = 0
@@ -136,16 +134,6 @@ def _profile(image: Gray, u: float, v: float, du: float, dv: float, half: int, p
 
 
 @cached_njit
-def _extremes(profile: FloatArray, half: int) -> tuple[float, float]:
-    """The darkest inner and the lightest outer value of a profile (2 half + 1,)."""
-    dark, light = profile[half], profile[half]
-    for j in range(half):
-        dark = min(dark, profile[j])
-        light = max(light, profile[half + 1 + j])
-    return dark, light
-
-
-@cached_njit
 def _crossing(profile: FloatArray, half: int, level: float) -> tuple[float, bool]:
     """Where a profile (2 half + 1,) rises through a level next to its centre [steps]; whether it does."""
     best, found = 0.0, False
@@ -160,20 +148,22 @@ def _crossing(profile: FloatArray, half: int, level: float) -> tuple[float, bool
 
 @cached_njit
 def read_cells(image: Gray, lens: FloatArray, homographies: FloatArray, side: int, cells: FloatArray) -> None:
-    """Mean brightness in the middle of cells.
+    """Fill cells (N, grid, grid) with the mean brightness in their middle, upper left first.
 
-    Args:
-        image: (height, width).
-        lens: See `camera.Camera`.
-        homographies: (N, 3, 3) from the marker, 0 to 1 along each side, to ideal pixels.
-        side: Cells along a marker's side, border included.
-        cells: (N, grid, grid) filled, upper left first; the marker is in the middle.
+    The marker, with `side` cells along a side, is in the middle. Homographies (N, 3, 3) are those of
+    `homographies`; for the lens see `camera.Camera`.
     """
     grid = cells.shape[1]
     first = 0.5 * (side - grid)
     for n in range(len(homographies)):
         h = homographies[n]
-        points, spread = _points_per_cell(h, side)
+        # points along a cell's side and their distance [cells]: one where the middle cell is small
+        w = 0.5 * (h[2, 0] + h[2, 1]) + h[2, 2]
+        u, v = (0.5 * (h[0, 0] + h[0, 1]) + h[0, 2]) / w, (0.5 * (h[1, 0] + h[1, 1]) + h[1, 2]) / w
+        a, b = (h[0, 0] - u * h[2, 0]) / w, (h[0, 1] - u * h[2, 1]) / w
+        c, d = (h[1, 0] - v * h[2, 0]) / w, (h[1, 1] - v * h[2, 1]) / w
+        cell = math.sqrt(abs(a * d - b * c)) / side
+        points, spread = (1, 0.0) if cell < _MIN_SHARED_CELL_PX else (2, _SPREAD)
         for row in range(grid):
             for column in range(grid):
                 total = 0.0
@@ -191,36 +181,22 @@ def read_cells(image: Gray, lens: FloatArray, homographies: FloatArray, side: in
                 cells[n, row, column] = total / (points * points)
 
 
-@cached_njit
-def _points_per_cell(h: FloatArray, side: int) -> tuple[int, float]:
-    """Number of points along a cell's side, one for small cells, and their distance [cells]."""
-    w = 0.5 * (h[2, 0] + h[2, 1]) + h[2, 2]
-    u, v = (0.5 * (h[0, 0] + h[0, 1]) + h[0, 2]) / w, (0.5 * (h[1, 0] + h[1, 1]) + h[1, 2]) / w
-    a, b = (h[0, 0] - u * h[2, 0]) / w, (h[0, 1] - u * h[2, 1]) / w
-    c, d = (h[1, 0] - v * h[2, 0]) / w, (h[1, 1] - v * h[2, 1]) / w
-    cell = math.sqrt(abs(a * d - b * c)) / side
-    return (1, 0.0) if cell < _MIN_SHARED_CELL_PX else (2, _SPREAD)
-
-
 def homographies(quads: FloatArray) -> FloatArray:
     """(N, 3, 3) from the unit square, clockwise from its upper left (0, 0), to quadrangles (N, 4, 2)."""
     first, second, third, fourth = np.moveaxis(quads, 1, 0)
     uneven = first - second + third - fourth
     a, b = second - third, fourth - third
-    determinant = _cross(a, b)
-    g, h = _cross(uneven, b) / determinant, _cross(a, uneven) / determinant
+
+    def cross(a: FloatArray, b: FloatArray) -> FloatArray:
+        return np.asarray(a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1])
+
+    g, h = cross(uneven, b) / cross(a, b), cross(a, uneven) / cross(a, b)
     result = np.empty((len(quads), 3, 3))
     result[:, :2, 0] = second - first + g[:, None] * second
     result[:, :2, 1] = fourth - first + h[:, None] * fourth
     result[:, :2, 2] = first
     result[:, 2, 0], result[:, 2, 1], result[:, 2, 2] = g, h, 1.0
     return result
-
-
-def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
-    """(N,) cross products of plane vectors (N, 2)."""
-    product: FloatArray = a[:, 0] * b[:, 1] - b[:, 0] * a[:, 1]
-    return product
 
 
 # Lines by crossings: checked by `make bench-vision` and test_detector.py.
@@ -240,14 +216,10 @@ class Corners(NamedTuple):
 
 
 def refine(image: Gray, lens: FloatArray, quads: FloatArray, cells: int, spacing: float = 1.0) -> Corners:
-    """Refine quadrangles by lines fitted to their edges.
+    """Refine quadrangles (N, 4, 2), clockwise, dark inside [ideal px], by lines fitted to their edges.
 
-    Args:
-        image: (height, width).
-        lens: See `camera.Camera`.
-        quads: (N, 4, 2) clockwise, dark inside [ideal px].
-        cells: Cells along a side; profiles reach one cell to each side.
-        spacing: Distance of profiles along a side [px].
+    Profiles reach one of the `cells` of a side to both of its sides, at a spacing along it [px]; for the lens
+    see `camera.Camera`.
     """
     corners = quads.copy()
     covariance = np.zeros((len(quads), 8, 8))
@@ -283,14 +255,9 @@ def _fit_lines(
 
 @cached_njit
 def _fit_line(crossings: FloatArray, line: FloatArray) -> float:
-    """Fit a line by least squares, repeated without outliers.
+    """Fit a line to crossings (M, 3), repeated without outliers; the mean contrast, 0: too few crossings.
 
-    Args:
-        crossings: (M, 3) along, outside, contrast.
-        line: (5,) filled with the offset at `along` = 0, the slope, and var, cov, var of both.
-
-    Returns:
-        The mean contrast, 0 when there are too few crossings.
+    The line (5,) is the offset at the first corner, the slope, and var, cov, var of both.
     """
     offset, slope, limit = 0.0, 0.0, 1e9
     variance, mean_contrast = 0.0, 0.0
@@ -335,14 +302,10 @@ def _fit_line(crossings: FloatArray, line: FloatArray) -> float:
 def intersect(
     corners: FloatArray, ends: FloatArray, of_ends: FloatArray, covariance: FloatArray, contrast: FloatArray
 ) -> None:
-    """Intersect the lines along the sides of quadrangles.
+    """Move the corners (N, 4, 2) of quadrangles to where the lines along their sides meet.
 
-    Args:
-        corners: (N, 4, 2) the quadrangles; moved.
-        ends: (N, 8) distance of each line outside of its side at the first and the last corner [px].
-        of_ends: (N, 8, 8) their covariance [px^2].
-        covariance: (N, 8, 8) of the corners, filled.
-        contrast: (N,) set to 0 where lines do not meet; such corners stay.
+    Ends (N, 8) are the distances of each line outside of its side at the first and the last corner [px], with
+    a covariance (N, 8, 8). That of the corners is filled. Where lines do not meet, the contrast (N,) is 0.
     """
     moved = np.empty((4, 2))
     jacobian = np.empty((8, 8))
@@ -358,11 +321,7 @@ def intersect(
 def _meet(corners: FloatArray, ends: FloatArray, moved: FloatArray, jacobian: FloatArray) -> bool:
     """Intersect the lines along the sides of one quadrangle; False where they do not meet.
 
-    Args:
-        corners: (4, 2) the quadrangle.
-        ends: (8,) distance of each line outside of its side at the first and the last corner.
-        moved: (4, 2) filled with the new corners.
-        jacobian: (8, 8) filled with their derivatives by `ends`.
+    Fills the `moved` corners, and their derivatives by `ends`, see `intersect`.
     """
     normal, direction = np.empty((4, 2)), np.empty((4, 2))
     rest, lengths = np.empty(4), np.empty(4)

@@ -50,17 +50,11 @@ WINDOWS = ((7, 25), (35,))
 
 
 def find_quads(gray: Gray, min_side: float, min_contrast: float, *, touching: bool = False) -> FloatArray:
-    """Find dark quadrangles in full and in half resolution, without duplicates.
+    """(N, 4, 2) corners [px] of dark quadrangles, clockwise in the image, on the boundary of dark and light.
 
-    Args:
-        gray: (height, width).
-        min_side: Minimum side of a quadrangle [px].
-        min_contrast: Minimum difference from the local mean [counts]; raised for noisy images.
-        touching: Whether quadrangles may touch others at their corners: the dark areas are then eroded by a
-            pixel, and the sides lie up to a pixel too far inside.
-
-    Returns:
-        (N, 4, 2) corners, clockwise in the image, on the boundary between dark and light [px].
+    Quadrangles have a minimum side [px] and contrast to the local mean [counts], which noise raises. Where
+    they may touch others at their corners, dark areas are eroded by a pixel, and the sides lie up to a pixel
+    too far inside.
     """
     scaled: NDArray[Any] = cv2.GaussianBlur(gray, (3, 3), _SMOOTHING_PX)
     found: list[FloatArray] = []
@@ -74,7 +68,15 @@ def find_quads(gray: Gray, min_side: float, min_contrast: float, *, touching: bo
             scaled = cv2.resize(even, (width, height), interpolation=cv2.INTER_AREA)
         contrast = max(min_contrast, _NOISE_SIGMAS * _noise(scaled))
         for window in windows:
-            dark = _dark(scaled, window, contrast)
+            # 255 where darker than the local mean; the frame is 0, so that outlines stay inside
+            dark: NDArray[Any] = cv2.blur(scaled, (window, window))
+            cv2.subtract(dark, scaled, dst=dark)  # in place: new arrays of this size cost as much as the rest
+            cv2.threshold(dark, contrast - 0.5, _DARK, cv2.THRESH_BINARY, dst=dark)
+            surplus = -dark.shape[1] % 8
+            if surplus:
+                dark = cv2.copyMakeBorder(dark, 0, 0, 0, surplus, cv2.BORDER_CONSTANT, value=0)
+            dark[[0, -1]] = 0
+            dark[:, [0, -1 - surplus]] = 0
             if touching:
                 dark = np.asarray(cv2.erode(dark, _CROSS), np.uint8)
             rows, columns = dark.shape
@@ -109,19 +111,6 @@ def apart(places: FloatArray, reaches: FloatArray, order: NDArray[np.int64]) -> 
     return kept
 
 
-def _dark(gray: NDArray[Any], window: int, contrast: float) -> NDArray[np.uint8]:
-    """255 where an image is darker than the local mean; its frame is 0, so that outlines stay inside."""
-    dark = cv2.blur(gray, (window, window))
-    cv2.subtract(dark, gray, dst=dark)  # in place: new arrays of this size cost as much as the rest
-    cv2.threshold(dark, contrast - 0.5, _DARK, cv2.THRESH_BINARY, dst=dark)
-    surplus = -dark.shape[1] % 8
-    if surplus:
-        dark = cv2.copyMakeBorder(dark, 0, 0, 0, surplus, cv2.BORDER_CONSTANT, value=0)
-    dark[[0, -1]] = 0
-    dark[:, [0, -1 - surplus]] = 0
-    return np.asarray(dark, np.uint8)
-
-
 @cached_njit
 def _noise(gray: Gray) -> float:
     """Standard deviation of the noise [counts], from second differences, which suppress the image itself."""
@@ -147,14 +136,11 @@ def _follow(
     min_side: float,
     points: IntArray,
 ) -> FloatArray:
-    """Follow each outline once and keep quadrangles.
+    """Follow each outline once and keep quadrangles with sides of `min_side` [px].
 
-    Args:
-        dark: (height * width) 255 where dark; modified, see `_FOLLOWED`.
-        eights: (height, width / 8) the same memory.
-        ahead: (8,) offsets of the neighbours of a pixel in the eight directions.
-        min_side: Minimum side of a quadrangle [px].
-        points: Memory for an outline; longer ones are rejected.
+    `dark` (height * width) is 255 where dark, and modified, see `_FOLLOWED`; `eights` (height, width / 8) is
+    the same memory. `ahead` (8,) are the offsets of a pixel's neighbours. Outlines longer than `points` are
+    rejected.
     """
     height, words = eights.shape
     width = 8 * words
@@ -186,12 +172,10 @@ def _follow(
 
 @cached_njit
 def _outline(dark: NDArray[np.uint8], ahead: NDArray[np.int64], start: int, points: IntArray) -> int:
-    """Follow the outline through a dark pixel that is light to its left.
+    """Follow the outline through a dark pixel that is light to its left; returns the number of its points.
 
-    Border following of Suzuki and Abe (1985), 8-connected.
-
-    Returns:
-        Number of its points. The directions to the next one are written to points[:, 1], where they fit.
+    Border following of Suzuki and Abe (1985), 8-connected. The directions to the next point are written to
+    points[:, 1], where they fit.
     """
     dark[start] = _FOLLOWED
     back = -1
@@ -292,10 +276,7 @@ def _farthest(points: IntArray, length: int, begin: int, end: int) -> int:
 def _sides(
     points: IntArray, length: int, corners: NDArray[np.int64], min_side: float, quad: FloatArray
 ) -> bool:
-    """Whether an outline is straight between its corners; fills the intersections of the sides.
-
-    The lines are moved outwards by half a pixel, from the outermost dark pixels to the boundary.
-    """
+    """Whether an outline is straight between its corners; fills the intersections of the sides."""
     lines = np.empty((4, 3))  # normal (outwards) and offset
     for k in range(4):
         # the chord between two corners
@@ -334,6 +315,7 @@ def _sides(
             return False
         if normal_u * -dv + normal_v * du > 0.0:  # dark is on the left, outwards is right
             normal_u, normal_v = -normal_u, -normal_v
+        # half a pixel outwards, from the outermost dark pixels to the boundary
         lines[k, 0], lines[k, 1] = normal_u, normal_v
         lines[k, 2] = normal_u * (points[begin, 0] + su) + normal_v * (points[begin, 1] + sv) + 0.5
     # neighbouring lines meet near the corners of the outline

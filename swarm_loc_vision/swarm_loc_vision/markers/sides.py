@@ -352,15 +352,16 @@ def _fit_sides(
 
 @cached_njit
 def _set_gaps(pixels: SidePixels, strips: Bits, border: int, noise: float, work: _Work) -> None:
-    """Set `work.gaps` to the displacement of white cells behind the border and its error [px]; 0: none there.
-
-    Displacement and brightness of the white cells are fitted to the residuals of each side.
-    """
+    """Set `work.gaps` to the displacement of white cells behind the border and its error [px]; 0: none."""
+    # displacement and brightness of the white cells are fitted to the residuals of each side
     p, sums = work.p, np.zeros((4, 5))
     work.gaps[:] = 0.0
     for k in range(4):
-        frame, reach = pixels.frames[k], _inner_reach(pixels.frames[k], border, work.windows[k, 0])
-        across, along, _, _, clear = work.windows[k]
+        frame, (across, along, _, _, clear) = pixels.frames[k], work.windows[k]
+        # the range of pixels that depend on the border's inner edge; none if other edges are too close
+        cell = min(frame[NEAR], frame[FAR]) / border
+        reach = min(2.0 * across + 1.0, cell - _CLEAR * across, INNER_REACH_PX)
+        reach = reach if reach > across else 0.0
         for i in range(pixels.first[k], pixels.first[k + 1]):
             a = pixels.along[i]
             s = a / frame[LENGTH]
@@ -384,14 +385,6 @@ def _set_gaps(pixels: SidePixels, strips: Bits, border: int, noise: float, work:
             work.gaps[k, 0] = (sums[k, 1] * sums[k, 4] - sums[k, 2] * sums[k, 3]) / determinant
             by_noise = noise / p[_CONTRAST] * math.sqrt(sums[k, 2] / determinant)
             work.gaps[k, 1] = math.hypot(_BY_FIT * by_noise, _OWN_PX)
-
-
-@cached_njit
-def _inner_reach(frame: FloatArray, border: int, across: float) -> float:
-    """Range of pixels that depend on the border's inner edge; 0 if other edges are too close [px]."""
-    cell = min(frame[NEAR], frame[FAR]) / border
-    reach = min(2.0 * across + 1.0, cell - _CLEAR * across, INNER_REACH_PX)
-    return reach if reach > across else 0.0
 
 
 @cached_njit

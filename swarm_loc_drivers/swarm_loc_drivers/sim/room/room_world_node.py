@@ -10,6 +10,7 @@ capture and fixes. `<robot>/cmd_vel` drives a robot.
 from __future__ import annotations
 
 import heapq
+import time
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,10 +29,14 @@ from swarm_loc_drivers.sim.room.world import (
     room_of,
 )
 from swarm_loc_drivers.sim.world_node import WorldNode
+from swarm_loc_estimator.common.messages.cdr import nanoseconds
 from swarm_loc_estimator.common.node import message_class, run_node
 from swarm_loc_estimator.swarm.swarm_file import load_swarm
+from swarm_loc_msgs.msg import SwarmPoses
 
 _QOS = QoSProfile(depth=20)
+_BEHIND_NS, _PATIENCE_S = 500_000_000, 10.0
+"""Simulated time waits for poses that are older, for so long in real time; then nobody publishes any."""
 _STATIC_QOS = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
@@ -58,6 +63,10 @@ class RoomWorldNode(WorldNode[RoomWorldParameters]):
                 self._static = self.create_publisher(TFMessage, "/tf_static", _STATIC_QOS)
                 self._static.publish(sensor.transforms())
         self._on_the_way: list[tuple[int, Message]] = []
+        # an estimator for which simulated time waits
+        self._located_ns: int | None = None
+        self._held_since_s: float | None = None
+        self.create_subscription(SwarmPoses, "swarm/poses", self._on_poses, _QOS)
 
     def step(self) -> None:
         """Step the world; publish the time and the measurements that arrive now."""
@@ -70,6 +79,20 @@ class RoomWorldNode(WorldNode[RoomWorldParameters]):
         while self._on_the_way and self._on_the_way[0][0] <= now_ns:
             topic, data = heapq.heappop(self._on_the_way)[1]
             self._outputs[topic].publish(data)
+
+    def is_held(self) -> bool:
+        """Whether simulated time waits for an estimator that is behind; up to a limit of real time."""
+        if self._located_ns is None or self._world.now_ns <= self._located_ns + _BEHIND_NS:
+            self._held_since_s = None
+            return False
+        now_s = time.monotonic()
+        self._held_since_s = self._held_since_s or now_s
+        if now_s > self._held_since_s + _PATIENCE_S:
+            self._located_ns = None
+        return True
+
+    def _on_poses(self, message: SwarmPoses) -> None:
+        self._located_ns = nanoseconds(message.header.stamp)
 
     def _on_command(self, robot: int, message: Twist) -> None:
         self._world.command(robot, message.linear.x, message.angular.z)

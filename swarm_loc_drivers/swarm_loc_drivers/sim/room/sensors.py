@@ -83,7 +83,7 @@ class SimulatedSensor:
         return np.array(sigma) * self._rng.standard_normal(len(sigma))
 
 
-class WheelOdometry(SimulatedSensor):
+class ReportedMotion(SimulatedSensor):
     """Reports the motion as it was commanded."""
 
     message_type, rate_hz = ODOMETRY, 20.0
@@ -212,7 +212,7 @@ def cast(
 class Radios(SimulatedSensor):
     """Each radio ranges with one other device at a time, in turn; biases of both ends are added."""
 
-    message_type, rate_hz = RANGE, 10.0
+    message_type, rate_hz = RANGE, 5.0
 
     def _prepared(self) -> list[str]:
         world, swarm = self._world, self._world.swarm
@@ -338,7 +338,7 @@ class MotionCapture(SimulatedSensor):
             yield topic, encode_pose_stamped(localizer.source_frame or "map", stamp_ns, pose[None])[0]
 
 
-class Tracker(SimulatedSensor):
+class TrackedFixes(SimulatedSensor):
     """Fixes without covariance, of robots whose description has a sigma for these."""
 
     message_type, rate_hz = POSE_WITH_COVARIANCE, 10.0
@@ -357,7 +357,7 @@ class Tracker(SimulatedSensor):
             yield topic, encode_fix("map", world.now_ns, pose, np.zeros((3, 3)))
 
 
-KINDS = (WheelOdometry, Gyroscope, Lidar, Radios, CeilingCameras, MotionCapture, Tracker)
+KINDS = (ReportedMotion, Gyroscope, Lidar, Radios, CeilingCameras, MotionCapture, TrackedFixes)
 
 
 def sensors_of(world: RoomWorld) -> list[SimulatedSensor]:

@@ -1,0 +1,1 @@
+"""DotBots by PyDotBot."""

@@ -1,0 +1,121 @@
+"""DotBots through the REST interface of PyDotBot's controller: poses as fixes, and velocities as commands.
+
+    ./run swarm_loc_drivers dotbot_node --ros-args -p swarm_file:=swarm.yaml -p url:=http://localhost:8000
+
+PyDotBot's frame has x to the right and y down in mm, and headings of 0 along y, clockwise; `map` has its
+origin and y up.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import urllib.error
+import urllib.request
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseWithCovarianceStamped, Twist
+from rclpy.qos import QoSProfile
+
+from swarm_loc_estimator.common.arrays import FloatArray
+from swarm_loc_estimator.common.messages.poses import encode_fix
+from swarm_loc_estimator.common.node import ConfiguredNode, run_node
+from swarm_loc_estimator.common.parameters import number, text, texts
+from swarm_loc_estimator.sensors.fix import HEADING_UNKNOWN
+from swarm_loc_estimator.swarm.swarm_file import load_swarm
+
+_TRACK_M = 0.081  # `TRACK_EFFECTIVE_MM` of dotbot/kinematics.py
+_MAX_MM_S = 700
+_QOS = QoSProfile(depth=10)
+
+
+@dataclass(frozen=True)
+class DotbotParameters:
+    """Parameters of `dotbot_node`."""
+
+    swarm_file: str = text("", "path of the swarm description", required=True)
+    url: str = text("http://localhost:8000", "PyDotBot's controller")
+    bodies: tuple[str, ...] = texts(
+        "addresses of robots, such as BADCAFE111111111=dotbot1; empty: in the order of both"
+    )
+    rate: float = number(10.0, "1/s", 0.1, 100.0, "how often poses are asked for")
+    timeout: float = number(0.5, "s", 0.01, 10.0, "for an answer")
+
+
+def pose_of(dotbot: Mapping[str, Any]) -> tuple[FloatArray, bool] | None:
+    """The pose (3,) in `map` of a robot as PyDotBot describes it, and whether its heading is known."""
+    about = dotbot.get("pose") or dotbot.get("lh2_position")
+    if about is None:
+        return None
+    known = about.get("heading_source", "none") != "none"
+    yaw = -0.5 * math.pi - math.radians(about["heading_deg"]) if known else 0.0
+    pose = np.array([1e-3 * about["x"], -1e-3 * about["y"], math.remainder(yaw, 2.0 * math.pi)])
+    return (pose, known) if np.isfinite(pose).all() else None
+
+
+class DotbotNode(ConfiguredNode[DotbotParameters]):
+    """Asks for poses and hands velocities on."""
+
+    def __init__(self, **node_arguments: Any) -> None:
+        super().__init__("dotbot", DotbotParameters, **node_arguments)
+        robots = load_swarm(Path(self.params.swarm_file)).robots
+        self._names = [robot.name for robot in robots]
+        self._models = {robot.name: robot.fix for robot in robots}
+        self._address = {name: body for body, _, name in (one.partition("=") for one in self.params.bodies)}
+        self._seen: dict[str, float] = {}
+        self._wanted: dict[str, Twist] = {}
+        kind = PoseWithCovarianceStamped
+        self._fixes = {name: self.create_publisher(kind, f"{name}/fix", _QOS) for name in self._names}
+        for name in self._names:
+            self.create_subscription(Twist, f"{name}/cmd_vel", partial(self._on_velocity, name), _QOS)
+        self.create_timer(1.0 / self.params.rate, self._ask)
+
+    def _ask(self) -> None:
+        """Publish what has changed since the last answer."""
+        dotbots = {one["address"]: one for one in self._request("GET", "dotbots") or ()}
+        if not self.params.bodies:
+            self._address = dict(zip(self._names, sorted(dotbots), strict=False))
+        for name, address in self._address.items():
+            found = pose_of(dotbots[address]) if address in dotbots and name in self._fixes else None
+            if found is None or self._seen.get(name) == dotbots[address]["last_seen"]:
+                continue
+            self._seen[name] = dotbots[address]["last_seen"]
+            model, (pose, known) = self._models[name], found
+            heading = model.heading_sigma**2 if known else 2.0 * HEADING_UNKNOWN
+            covariance = np.diag([model.position_sigma**2, model.position_sigma**2, heading])
+            stamp_ns = self.get_clock().now().nanoseconds
+            self._fixes[name].publish(encode_fix("map", stamp_ns, pose, covariance))
+        while self._wanted:
+            self._drive(*self._wanted.popitem())
+
+    def _drive(self, name: str, wanted: Twist) -> None:
+        """Command the newest velocity; wheels stop half a second after the last command."""
+        if name in self._address:
+            turn = 0.5 * _TRACK_M * wanted.angular.z
+            speeds = (wanted.linear.x - turn, wanted.linear.x + turn)
+            left, right = (round(max(-_MAX_MM_S, min(_MAX_MM_S, 1e3 * one))) for one in speeds)
+            body = {"left_mm_s": left, "right_mm_s": right}
+            self._request("PUT", f"dotbots/{self._address[name]}/0/wheel_velocity", body)
+
+    def _on_velocity(self, name: str, message: Twist) -> None:
+        self._wanted[name] = message
+
+    def _request(self, method: str, path: str, body: object = None) -> Any:
+        """The decoded answer; None without one, which is logged."""
+        data = None if body is None else json.dumps(body).encode()
+        url = f"{self.params.url}/controller/{path}"
+        request = urllib.request.Request(url, data, {"Content-Type": "application/json"}, method=method)  # noqa: S310
+        try:
+            with urllib.request.urlopen(request, timeout=self.params.timeout) as answer:  # noqa: S310
+                return json.loads(answer.read() or b"null")
+        except (OSError, ValueError, urllib.error.URLError) as error:
+            self.get_logger().warning(f"no answer of {url}: {error}", throttle_duration_sec=10.0)
+            return None
+
+
+main = partial(run_node, "dotbot_node", DotbotNode)
