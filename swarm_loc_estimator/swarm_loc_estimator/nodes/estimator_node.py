@@ -7,7 +7,8 @@ It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness`, `<r
 to `swarm/odom`, `swarm/detections` and `swarm/fixes` in their place. It publishes
 `swarm/poses`, `<robot>/pose`, `aerial/identities`, `/diagnostics`, and `/tf` (map to `<robot>/odom`, which no
 other node may publish) or, with `tf_per_robot`, `<robot>/tf`.
-Services: `~/reset`, `~/set_robot_pose`, and those of a managed node. Parameters: see `doc/estimator_node.md`.
+Services: `~/reset`, `~/refine`, `~/set_robot_pose`, and those of a managed node. Parameters: see
+`doc/estimator_node.md`.
 """
 
 from __future__ import annotations
@@ -47,6 +48,7 @@ from swarm_loc_estimator.nodes.estimator_topics import (
 )
 from swarm_loc_estimator.nodes.load import SHED_REASONS, FusionPace, Shedding, Thinning
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
+from swarm_loc_estimator.nodes.refinement import Refinement
 from swarm_loc_estimator.precompile import precompile, size_of
 from swarm_loc_estimator.sensors.inputs import Ingest, live_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -91,6 +93,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         super().__init__("estimator", EstimatorParameters, **node_arguments)
         self._create_estimator = create_estimator
         self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(Trigger, "~/refine", self._on_refine)
         self.create_service(SetRobotPose, "~/set_robot_pose", self._on_set_robot_pose)
         self.autostart()
 
@@ -125,6 +128,8 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._outputs = EstimateOutputs(self, self._swarm, self.params)
         self._reported_s = time.monotonic()
         self._lost = 0
+        self._refinement = Refinement()
+        self.at_end(self._refinement.stop)
         self._static_transforms = StaticTransforms(self, self._swarm, self._ingest, self.params)
         horizon_s = self.params.settings.horizon_s
         self._inputs = EstimatorInputs(self, self._ingest.topics, self._estimator.drop, horizon_s)
@@ -165,6 +170,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._estimate, fusing_s = self._estimate_at(now_ns, begin_s)
         if self._estimator.time_jumps != self._jumps:
             self._jumps = self._estimator.time_jumps
+            self._refinement.forget()
             self.get_logger().warning("clock jumped back; estimator reset")
         self._follow_frame()
         self._outputs.publish(self._estimate)
@@ -203,6 +209,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             self._measurements.update(thinned.measurements)
             self._cost.note_sightings(sum(thinned.measurements.values()), thinned.shed)
             self._estimator.receive(thinned.messages)
+            self._refinement.keep(thinned.messages)
         # how many measurements were in messages that were not read is not known: as many as usually
         for sensor, count in self._measurements.items():
             unread = self._inputs.unread.pop(sensor, 0)
@@ -299,6 +306,15 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._estimator.reset()
         response.success, response.message = True, "All robots restart at their configured poses."
         self.get_logger().info("estimator reset by service")
+        return response
+
+    def _on_refine(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if not self.is_active:
+            response.message = INACTIVE
+            return response
+        answer = self._refinement.ask(self._estimator.swarm, Path(self.params.swarm_file))
+        response.success, response.message = answer
+        self.get_logger().info(response.message)
         return response
 
     def _on_set_robot_pose(
