@@ -229,8 +229,10 @@ class Recorder(Node):
         """All poses so far, at least one, with ground truth and the counts of dropped inputs."""
         poses = self.poses()
         names = ("stamp_ns", "pose", "covariance", "status", "heading_known")
-        *columns, known = (np.array([getattr(one, name) for one in poses]) for name in names)
-        result = ReplayResult(title, swarm, *columns, heading_known=known)
+        stamp_ns, pose, covariance, status, known = (
+            np.array([getattr(one, name) for one in poses]) for name in names
+        )
+        result = ReplayResult(title, swarm, stamp_ns, pose, covariance, status, heading_known=known)
         return replace(result, truth=truth, counters=dict(self.drops))
 
     def _on_poses(self, data: bytes) -> None:

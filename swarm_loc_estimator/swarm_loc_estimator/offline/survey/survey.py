@@ -176,12 +176,14 @@ def _located(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # straight down, yaw and roll are one angle
         angles = Rotation.from_matrix(rotation.as_matrix() @ FROM_OPTICAL.T).as_euler("ZYX")
-    place, turn = (np.round(one, digits).tolist() for one, digits in ((pose[3:], 5), (angles, 6)))
+    x, y, z = np.round(pose[3:], 5).tolist()
+    yaw, pitch, roll = np.round(angles, 6).tolist()
     position_sigma = max(math.sqrt(0.5 * float(spread[0] + spread[1])), _LEAST_SIGMA)
     yaw_sigma = max(math.sqrt(float(spread[2])), _LEAST_SIGMA)
     if position_sigma > _MOST_SIGMA or yaw_sigma > _MOST_YAW_SIGMA:
         return None
-    return FixedCamera(camera.name, *place, *turn, position_sigma, yaw_sigma, camera.sensor), wrong
+    found = FixedCamera(camera.name, x, y, z, yaw, pitch, roll, position_sigma, yaw_sigma, camera.sensor)
+    return found, wrong
 
 
 def _aligned(points: FloatArray, to: FloatArray) -> FloatArray:
@@ -207,8 +209,8 @@ def _with_anchors(placed: Placed, recording: Recording, swarm: Swarm, paths: Pat
     pose = paths(rows.robot, rows.stamp_ns)
     usable &= np.isfinite(pose).all(axis=1) & np.isfinite(rows.range)
     devices = [one or UwbDevice(0) for one in radios]
-    numbers = [(one.x, one.y, one.z, one.range_bias, one.range_scale) for one in devices]
-    *antenna, bias, scale = np.array(numbers)[rows.robot].T
+    of_radio = np.array([(one.x, one.y, one.z, one.range_bias, one.range_scale) for one in devices])
+    *antenna, bias, scale = of_radio[rows.robot].T
     at = np.column_stack([se2.transform_points(pose, np.column_stack(antenna[:2])), antenna[2]])
     measured = (rows.range - bias) / scale
     # one anchor after the other
