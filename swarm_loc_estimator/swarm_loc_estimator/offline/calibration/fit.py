@@ -310,4 +310,7 @@ def refined(parts: Sequence[Batch], swarm: Swarm, path: Path) -> tuple[bool, str
         return False, f"Nothing is refined: {error}"
     parameters = calibrated_parameters(polar=True, poses=True, ranges=True, truth=False)
     changes = corrections(swarm, done.swarm, parameters)
+    robots = zip(swarm.robots, done.swarm.robots, strict=True)
+    tables = [new.name for old, new in robots if old.response != new.response]
+    changes += [f"Other scale factors by speed: {', '.join(tables)}."] if tables else []
     return True, "\n".join([f"{beside} is proposed in place of {path.name}, which stays in use.", *changes])
