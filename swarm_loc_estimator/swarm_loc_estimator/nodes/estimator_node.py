@@ -2,7 +2,17 @@
 
     ./run swarm_loc_estimator estimator_node --ros-args -p swarm_file:=swarm.yaml
 
+<<<<<<< HEAD
 Topics, services and parameters: see `doc/estimator_node.md`. No other node may publish its transforms.
+=======
+It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness`, `<robot>/fix` and
+`<robot>/initialpose` of the robots in the swarm description, and to `aerial/detections`; with `shared_topics`
+to `swarm/odom`, `swarm/detections` and `swarm/fixes` in their place. It publishes
+`swarm/poses`, `<robot>/pose`, `aerial/identities`, `/diagnostics`, and `/tf` (map to `<robot>/odom`, which no
+other node may publish) or, with `tf_per_robot`, `<robot>/tf`.
+Services: `~/reset`, `~/refine`, `~/set_robot_pose`, and those of a managed node. Parameters: see
+`doc/estimator_node.md`.
+>>>>>>> selfcal
 """
 
 from __future__ import annotations
@@ -27,6 +37,7 @@ from swarm_loc_estimator.nodes import estimator_diagnostics as diagnostics
 from swarm_loc_estimator.nodes import estimator_topics as topics
 from swarm_loc_estimator.nodes.load import SHED_REASONS, FusionPace, Shedding, Thinning
 from swarm_loc_estimator.nodes.parameters import EstimatorParameters
+from swarm_loc_estimator.nodes.refinement import Refinement
 from swarm_loc_estimator.precompile import precompile, size_of
 from swarm_loc_estimator.sensors.inputs import Ingest, live_topics
 from swarm_loc_estimator.swarm.swarm import Swarm
@@ -55,6 +66,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         super().__init__("estimator", EstimatorParameters, **node_arguments)
         self._create_estimator = create_estimator
         self.create_service(Trigger, "~/reset", self._on_reset)
+        self.create_service(Trigger, "~/refine", self._on_refine)
         self.create_service(SetRobotPose, "~/set_robot_pose", self._on_set_robot_pose)
         self.autostart()
 
@@ -89,7 +101,13 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._outputs = topics.EstimateOutputs(self, self._swarm, self.params)
         self._reported_s = time.monotonic()
         self._lost = 0
+<<<<<<< HEAD
         self._static_transforms = topics.StaticTransforms(self, self._swarm, self._ingest, self.params)
+=======
+        self._refinement = Refinement()
+        self.at_end(self._refinement.stop)
+        self._static_transforms = StaticTransforms(self, self._swarm, self._ingest, self.params)
+>>>>>>> selfcal
         horizon_s = self.params.settings.horizon_s
         self._inputs = topics.EstimatorInputs(self, self._ingest.topics, self._estimator.drop, horizon_s)
         frame = self.params.map_frame
@@ -128,6 +146,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._estimate, fusing_s = self._estimate_at(now_ns, begin_s)
         if self._estimator.time_jumps != self._jumps:
             self._jumps = self._estimator.time_jumps
+            self._refinement.forget()
             self.get_logger().warning("clock jumped back; estimator reset")
         self._follow_frame()
         self._outputs.publish(self._estimate)
@@ -165,6 +184,7 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
             self._measurements.update(thinned.measurements)
             self._cost.note_sightings(sum(thinned.measurements.values()), thinned.shed)
             self._estimator.receive(thinned.messages)
+            self._refinement.keep(thinned.messages)
         # how many measurements were in messages that were not read is not known: as many as usually
         for sensor, count in self._measurements.items():
             unread = self._inputs.unread.pop(sensor, 0)
@@ -250,6 +270,15 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._estimator.reset()
         response.success, response.message = True, "All robots restart at their configured poses."
         self.get_logger().info("estimator reset by service")
+        return response
+
+    def _on_refine(self, _request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if not self.is_active:
+            response.message = INACTIVE
+            return response
+        answer = self._refinement.ask(self._estimator.swarm, Path(self.params.swarm_file))
+        response.success, response.message = answer
+        self.get_logger().info(response.message)
         return response
 
     def _on_set_robot_pose(

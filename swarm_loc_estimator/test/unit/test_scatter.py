@@ -5,7 +5,7 @@ import pytest
 
 from swarm_loc_estimator.common.arrays import FloatArray, IntArray
 from swarm_loc_estimator.offline.calibration.models import with_noise
-from swarm_loc_estimator.offline.calibration.scatter import sway_of
+from swarm_loc_estimator.offline.calibration.sightings import sway_of
 from swarm_loc_estimator.swarm.error_models import SensorModel
 from swarm_loc_estimator.swarm.swarm import Robot, Swarm
 

@@ -135,7 +135,6 @@ def _geometries(robot_of: IntArray, same: Callable[[int, list[int]], BoolArray])
 
 
 def _same_directions(directions: FloatArray, k: int, others: list[int]) -> BoolArray:
-    """Whether bearing and heading (of k, 2) are about the same."""
     apart: FloatArray = np.abs(wrap_angle(directions[others] - directions[k])).max(axis=1)
     return apart < _SAME_GEOMETRY
 
@@ -317,20 +316,17 @@ def contradictions(
 
 
 def _median_of_known(values: FloatArray) -> float:
-    """The median of the values that are not NaN; NaN where all are."""
     known = values[np.isfinite(values)]
     return float(np.median(known)) if known.size else math.nan
 
 
 def _same_readings(readings: FloatArray, k: int, others: list[int]) -> BoolArray:
-    """Whether readings (of k, n, n) are about the same."""
     apart = np.abs(readings[others] - readings[k]).max(axis=(1, 2))
     same: BoolArray = apart <= _SAME * np.maximum(readings[others].max(axis=(1, 2)), readings[k].max())
     return same
 
 
 def _rows_of_pairs(exchanges: Exchanges) -> list[NDArray[np.int64]]:
-    """Row indices of each ordered pair of robots, in order of time."""
     pairs = np.stack([exchanges.receiver, exchanges.transmitter])
     _, number = np.unique(pairs, axis=1, return_inverse=True)
     in_order = np.argsort(number.ravel(), kind="stable")
