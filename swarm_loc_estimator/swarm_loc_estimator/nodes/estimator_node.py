@@ -2,17 +2,7 @@
 
     ./run swarm_loc_estimator estimator_node --ros-args -p swarm_file:=swarm.yaml
 
-<<<<<<< HEAD
 Topics, services and parameters: see `doc/estimator_node.md`. No other node may publish its transforms.
-=======
-It subscribes to `<robot>/odom`, `<robot>/detections`, `<robot>/brightness`, `<robot>/fix` and
-`<robot>/initialpose` of the robots in the swarm description, and to `aerial/detections`; with `shared_topics`
-to `swarm/odom`, `swarm/detections` and `swarm/fixes` in their place. It publishes
-`swarm/poses`, `<robot>/pose`, `aerial/identities`, `/diagnostics`, and `/tf` (map to `<robot>/odom`, which no
-other node may publish) or, with `tf_per_robot`, `<robot>/tf`.
-Services: `~/reset`, `~/refine`, `~/set_robot_pose`, and those of a managed node. Parameters: see
-`doc/estimator_node.md`.
->>>>>>> selfcal
 """
 
 from __future__ import annotations
@@ -101,13 +91,9 @@ class EstimatorNode(ManagedNode[EstimatorParameters]):
         self._outputs = topics.EstimateOutputs(self, self._swarm, self.params)
         self._reported_s = time.monotonic()
         self._lost = 0
-<<<<<<< HEAD
-        self._static_transforms = topics.StaticTransforms(self, self._swarm, self._ingest, self.params)
-=======
         self._refinement = Refinement()
         self.at_end(self._refinement.stop)
-        self._static_transforms = StaticTransforms(self, self._swarm, self._ingest, self.params)
->>>>>>> selfcal
+        self._static_transforms = topics.StaticTransforms(self, self._swarm, self._ingest, self.params)
         horizon_s = self.params.settings.horizon_s
         self._inputs = topics.EstimatorInputs(self, self._ingest.topics, self._estimator.drop, horizon_s)
         frame = self.params.map_frame

@@ -1,11 +1,6 @@
 """The estimator node over DDS: what comes in leads to what comes out."""
 
-<<<<<<< HEAD
-=======
-from __future__ import annotations
-
 import time
->>>>>>> selfcal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
