@@ -195,6 +195,7 @@ def match(
         result[i, i] += walls.variance * (_SHARED_TURN / (scale * scale) if i == 2 else _SHARED)
     fitting, blocked, through, misfit = _classified(walls, ends, origin, variance, pose)
     tried = max(fitting + blocked + through, 1)
+    result *= max(1.0, misfit / tried)  # the map errs more than is described
     shift = pose - predicted
     distance = np.dot(shift, np.linalg.solve(covariance + result, shift))
     outcome = FITS
@@ -358,7 +359,7 @@ _ALL, SURE_FIT = 3, 0.65
 those at home are seen now and then."""
 _LEFT_OUT, _LEFT_OUT_SHARE = np.array([0.1, 0.1, 0.1]), 0.2
 """Motion that odometry has left out [m, m, rad], and share of a motion by which calibration changes it."""
-_UNKNOWN_MOTION = np.square([0.5, 0.5, 0.5])  # Variances from which nothing is known of it [m^2, m^2, rad^2]
+_NEARLY_LOST = 0.7  # Standard deviation, over that of a lost robot, from which nothing is known of a motion
 _ORDER_TURN, _ORDER_KNOWN = 0.03, 12.0
 """Turn during a sweep that tells in which order its beams are measured [rad], and log odds that settle it."""
 _ORDER_WEIGHT, _ORDER_NEWS = 10.0, 4.0
@@ -379,9 +380,8 @@ class MatchedScan(NamedTuple):
     track: FloatArray  # (L, 3) poses by odometry in the middle of the sweep, at each lag
     back: FloatArray  # (3,) from the pose at its stamp to that in the middle, at the likeliest lag
     anchor: FloatArray  # (3, 3) of `DelayBelief`, if it is where it was matched
-    reported: (
-        FloatArray | None
-    )  # (3,) pose by a motion that odometry has left out; None: it has left out none
+    reported: FloatArray | None  # (3,) pose by a motion that odometry has left out, if it has
+    follows: bool  # Whether it was matched where the scan before and odometry put it
 
 
 class MapScans:
@@ -434,7 +434,9 @@ class MapScans:
                 found, beams = other, reversed_beams
         state.delays[robot] = delay
         # Odometry may have left out a motion that it reports, or scans agree with it, but not with the pose.
-        sample, reported, follows = self.tracks.at(np.array([robot]), np.array([stamp_ns])), None, False
+        sample = self.tracks.at(np.array([robot]), np.array([stamp_ns]))
+        reported: FloatArray | None = None
+        follows = False
         anchor = np.stack([found.pose, now, sample.raw[0]])
         if not np.isnan(delay.anchor).any():
             motions = between(delay.anchor, anchor)  # in the map, as odometry is used, and as reported
@@ -443,7 +445,9 @@ class MapScans:
             path, turn = math.hypot(moved[0], moved[1]), abs(moved[2])
             slack = _LEFT_OUT + _LEFT_OUT_SHARE * np.array([path, path, turn])
             follows = bool((np.abs(seen - used) < slack).all())
-            if (np.abs(moved - used) > slack).any() or (np.diag(covariance) > _UNKNOWN_MOTION).any():
+            limits = self._limits.position_sigma, self._limits.position_sigma, self._limits.heading_sigma
+            is_unknown = (np.diag(covariance) > np.square(_NEARLY_LOST * np.array(limits))).any()
+            if is_unknown or (np.abs(moved - used) > slack).any():
                 reported = compose(delay.anchor[0], moved)
         return MatchedScan(
             robot, stamp_ns, walls, beams, pose, covariance, found, track, back, anchor, reported, follows
