@@ -186,6 +186,7 @@ def match(
         result[i, i] += walls.variance * (_SHARED_TURN / (scale * scale) if i == 2 else _SHARED)
     fitting, blocked, through, misfit = _classified(walls, ends, origin, variance, pose)
     tried = max(fitting + blocked + through, 1)
+    result *= max(1.0, misfit / tried)  # the map errs more than is described
     shift = pose - predicted
     distance = np.dot(shift, np.linalg.solve(covariance + result, shift))
     outcome = FITS
@@ -411,7 +412,9 @@ class MapScans:
                 found, beams = other, reversed_beams
         state.delays[robot] = delay
         # Odometry may have left out a motion that it reports, or scans agree with it, but not with the pose.
-        sample, reported, follows = self.tracks.at(np.array([robot]), np.array([stamp_ns])), None, False
+        sample = self.tracks.at(np.array([robot]), np.array([stamp_ns]))
+        reported: FloatArray | None = None
+        follows = False
         anchor = np.stack([found.pose, now, sample.raw[0]])
         if not np.isnan(delay.anchor).any():
             motions = between(delay.anchor, anchor)  # in the map, as odometry is used, and as reported

@@ -224,11 +224,13 @@ class MapSearch:
         Wheels slip, and pauses or steps too fast for their stamps leave out motions that most drivers go on
         counting. Where the scan does not fit, it is sought around the prediction and what odometry reports.
         """
+        # whether it is where it was predicted
         square = _squared(scan.found.pose, scan.predicted, scan.covariance + scan.found.covariance)
         fits = scan.found.outcome in (FITS, FAR) and scan.found.fitting >= SURE_FIT
         is_known = scan.reported is not None or (scan.follows and fits and square > _GATED)
         if state.sources.confirmations[scan.robot] < CONFIRMED or (fits and not is_known):
             return None
+        # places around the prediction, and around what odometry reports
         beams = SweptBeams.thinned(*scan.beams)
         points = _spread(beams.ends)
         sigma = np.clip(np.sqrt(np.diag(scan.covariance)), *_AROUND)
@@ -240,6 +242,7 @@ class MapSearch:
         score = _scores(known, points, poses, 0.75 * sigma[0]) if len(points) else np.zeros(len(poses))
         order = _largest(score, len(score))
         kept = order[_separate(poses[order], score[order], _NEAR_BY)]
+        # the one that explains the scan, if no other does
         found = [match(scan.walls, *beams, pose, np.diag(sigma**2)) for pose in poses[kept]]
         found = sorted((one for one in found if one.outcome == FITS), key=_fit, reverse=True)
         least = SURE_FIT if is_known else max(SURE_FIT, scan.found.fitting + _DECLINE)

@@ -11,7 +11,7 @@ from swarm_loc_estimator.mapping.correlation import PoseWindow, field_of, match,
 from swarm_loc_estimator.mapping.mapper import CooperativeMapper
 from swarm_loc_estimator.mapping.scans import Scan, ScanStop
 from swarm_loc_estimator.mapping.settings import MapperSettings
-from swarm_loc_estimator.mapping.sweep_map import LoopTie
+from swarm_loc_estimator.mapping.sweep_map import LoopTie, SweepMap
 
 REACH, NOISE, STEP_NS = 8.0, 0.01, 1_000_000_000
 SIGMA = NOISE / REACH**2
@@ -161,6 +161,30 @@ def test_loops_that_contradict_the_others_are_taken_back(seed: int) -> None:
     assert mapper.graph.poses == pytest.approx(before, abs=2e-3)
     mapper.sweeps.believe(right)
     assert mapper.sweeps.loops == [*loops, *right]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_last_solution_ties_what_was_seen_at_other_times(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Even where no loop was closed; another one changes nothing."""
+    monkeypatch.setattr(SweepMap, "_close_loops", lambda *_: None)
+    mapper = CooperativeMapper()
+    robot = mapper.join(np.zeros(3), np.full(3, 1e-3))
+    truth = drive(mapper, robot, laps(2.0), np.random.default_rng(seed))
+    half = mapper.graph.count // 2
+
+    def apart() -> float:
+        """How far the laps are off each other, which both are off the truth [m]."""
+        error = mapper.graph.poses[:, :2] - truth[:, :2]
+        return float(np.hypot(*(error[half : 2 * half] - error[:half]).T).mean())
+
+    before = apart()
+    mapper.finish()
+    after, poses = apart(), mapper.graph.poses.copy()
+    assert after < 0.2 * before
+    mapper.finish()
+    assert mapper.graph.poses == pytest.approx(poses, abs=2e-3)
 
 
 @pytest.mark.parametrize("seed", range(5))
